@@ -1,0 +1,219 @@
+"""Types of the compiled module. Arrays are C-contiguous float64; inputs are ``(N, n_inputs)``, time first."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal, TypeAlias, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+__version__: str
+
+_F: TypeAlias = NDArray[np.float64]
+_I: TypeAlias = NDArray[np.int64]
+_Experiments: TypeAlias = Sequence[tuple[_F, _F]]
+_Progress: TypeAlias = Callable[[int, int, float], object] | None
+
+# --- signals.rs: every one returns float64 (N,); N = round(duration / Ts) ---------------------------------
+
+def step(*, duration: float, Ts: float, at: float, low: float, high: float) -> _F: ...
+def staircase(*, Ts: float, levels: _F, hold: float) -> _F: ...
+def trapezoid(
+    *, duration: float, Ts: float, start: float, rise: float, hold: float, fall: float,
+    low: float, high: float,
+) -> _F: ...
+def chirp(
+    *, duration: float, Ts: float, f_start: float, f_end: float, amplitude_start: float,
+    amplitude_end: float, offset_start: float, offset_end: float,
+    sweep: Literal["linear", "logarithmic"] = "linear", phase: float = -1.5707963267948966,
+) -> _F: ...
+def random_steps(
+    *, duration: float, Ts: float, low: float, high: float, hold_min: float, hold_max: float,
+    smoothing: float, seed: int,
+) -> _F: ...
+def prbs(*, duration: float, Ts: float, low: float, high: float, hold: float, seed: int) -> _F: ...
+def multisine(
+    *, duration: float, Ts: float, f_low: float, f_high: float, amplitude: float, offset: float,
+    seed: int,
+) -> _F: ...
+def limit(signal: _F, *, Ts: float, low: float, high: float, rate: float, slew: float) -> _F:
+    """Amplitude in [low, high], first difference at most ``rate`` per second, second at most ``slew`` per s^2."""
+
+# --- machine.rs -------------------------------------------------------------------------------------------
+
+@final
+class Machine:
+    """The virtual sewing machine; see docs/CONVENTIONS.md for its parameters."""
+
+    def __new__(cls, parameters: Mapping[str, float] | None = None) -> Machine: ...
+    @staticmethod
+    def default_parameters() -> dict[str, float]: ...
+    @staticmethod
+    def variant_parameters(seed: int) -> dict[str, float]: ...
+    @staticmethod
+    def parameter_units() -> dict[str, str]: ...
+    @property
+    def parameters(self) -> dict[str, float]: ...
+    def reset(self) -> None: ...
+    def step(self, u: float) -> tuple[int, float]:
+        """Hold ``u`` [V] for one sample; counts and true speed [RPM] at its end."""
+    def run(self, u: _F) -> tuple[_I, _F]:
+        """Counts and true speed [RPM] at the instants at which u(k) starts to act: entry 0 is before u[0] acts."""
+    @property
+    def counts(self) -> int: ...
+    @property
+    def speed_rpm(self) -> float: ...
+
+# --- speed.rs ---------------------------------------------------------------------------------------------
+
+def speed_difference(counts: _I, *, Ts: float, counts_per_unit: float) -> _F: ...
+def speed_savgol(counts: _I, *, Ts: float, counts_per_unit: float, window: int, order: int) -> _F: ...
+def speed_kalman(
+    counts: _I, *, Ts: float, counts_per_unit: float, process_noise: float | None = None,
+) -> _F:
+    """RTS smoother; the process noise [unit^2/s^3] is found by maximum likelihood where None."""
+
+# --- models.rs --------------------------------------------------------------------------------------------
+
+@final
+class LinearModel:
+    """y(k) = -sum_i a[i] y(k-1-i) + sum_j sum_i b[j, i] u_j(k-nk-i) + offset, in the data's units."""
+
+    def __new__(cls, a: _F, b: _F, nk: int, offset: float) -> LinearModel: ...
+    @property
+    def a(self) -> _F: ...
+    @property
+    def b(self) -> _F: ...
+    @property
+    def nk(self) -> int: ...
+    @property
+    def offset(self) -> float: ...
+    @property
+    def na(self) -> int: ...
+    def simulate(self, u: _F, y_past: _F) -> _F: ...
+    def predict(self, u: _F, y: _F, y_past: _F, horizon: int) -> _F: ...
+    def estimate_initial_state(self, u: _F, y: _F) -> _F: ...
+
+@final
+class NeuralOE:
+    """Network output-error model; theta = [W1 (H, n_phi) row by row, b1 (H), w2 (H), b2, linear (n_phi)]."""
+
+    def __new__(
+        cls, *, na: int, nb: int, nk: int, n_inputs: int, hidden: int, bypass: bool, theta: _F,
+        u_mean: _F, u_scale: _F, y_mean: float, y_scale: float,
+        output_low: float | None, output_high: float | None,
+    ) -> NeuralOE: ...
+    @property
+    def theta(self) -> _F: ...
+    @property
+    def settings(self) -> dict[str, object]:
+        """Every constructor argument but theta."""
+    @property
+    def na(self) -> int: ...
+    def simulate(self, u: _F, y_past: _F) -> _F: ...
+    def predict(self, u: _F, y: _F, y_past: _F, horizon: int) -> _F: ...
+    def estimate_initial_state(self, u: _F, y: _F) -> _F: ...
+    def jacobian(self, u: _F, y_past: _F) -> tuple[_F, _F]:
+        """Free run (N,) in the data's units and its sensitivities (N, n_theta + na): theta, then y_past."""
+
+@final
+class LinearFit:
+    """A fitted linear model with the story of its fit."""
+
+    @property
+    def model(self) -> LinearModel: ...
+    @property
+    def cost(self) -> float: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def termination(self) -> str: ...
+    @property
+    def trace(self) -> _F: ...
+
+@final
+class NeuralFit:
+    """A trained network with the story of its training."""
+
+    @property
+    def model(self) -> NeuralOE: ...
+    @property
+    def cost(self) -> float:
+        """J = 1/(2N) sum e^2 in scaled units, free run, on the training data."""
+    @property
+    def validation_cost(self) -> float | None: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def termination(self) -> str: ...
+    @property
+    def trace(self) -> _F: ...
+    @property
+    def start(self) -> int:
+        """Which of the starts was chosen."""
+    @property
+    def start_costs(self) -> _F: ...
+
+def fit_arx(experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool) -> LinearModel: ...
+def fit_oe(
+    experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool = True,
+    max_iterations: int = 100, progress: _Progress = None,
+) -> LinearFit: ...
+def fit_neural_oe(
+    experiments: _Experiments, validation: _Experiments, *, na: int, nb: int, nk: int, hidden: int,
+    linear: LinearModel | None, u_mean: _F | None, u_scale: _F | None, y_mean: float | None,
+    y_scale: float | None, saturate: float | None, initial_state: Literal["zero", "measured", "estimated"],
+    weight_decay: float, max_iterations: int, starts: int, seed: int, threads: int,
+    progress: _Progress = None,
+) -> NeuralFit:
+    """Train in free run. With ``linear`` the network gets a bypass that starts there. ``saturate`` widens the
+    training output's range by that fraction and clips the output there; None leaves the output linear."""
+
+# --- control.rs -------------------------------------------------------------------------------------------
+
+_Form: TypeAlias = Literal["standard", "parallel", "per_sample"]
+
+def convert_gains(
+    gains: tuple[float, float, float], *, form: _Form, to: _Form, Ts: float,
+) -> tuple[float, float, float]: ...
+
+@final
+class Controller:
+    """The controller's arithmetic, one sample at a time (paper Fig. 16). Gains in standard form."""
+
+    def __new__(
+        cls, *, Kp: float, Ti: float, Td: float, alpha: float, beta: float, N: float, Tt: float,
+        u_min: float, u_max: float, slew: float, Ts: float, filter_samples: int, filter_time: float,
+    ) -> Controller: ...
+    def step(self, r: float, y: float) -> float: ...
+    def reset(self) -> None: ...
+    @property
+    def filtered(self) -> float:
+        """The feedback after its filter, at the last step."""
+
+_Plant: TypeAlias = Machine | LinearModel | NeuralOE
+
+def closed_loop(
+    plant: _Plant, controller: Controller, reference: _F, *, counts_per_unit: float,
+    encoder_phase: float = 0.5,
+) -> dict[str, _F]:
+    """Keys u, y (true output), feedback (after encoder and filter); all (N,). From rest, controller reset.
+
+    ``counts_per_unit`` is counts per (output unit x second); 0 feeds the plant's output back unquantised.
+    A virtual machine brings its own encoder.
+    """
+
+def fit_fopdt(u: _F, y: _F, *, Ts: float) -> dict[str, float]:
+    """K, T [s], L [s], offset, u_low, u_high, fit_percent, from a step response (paper Eq. 10-11)."""
+
+def table_1(K: float, T: float, L: float) -> dict[str, float]:
+    """Kp, Ti, Td, alpha, beta by the paper's Table 1, interpolated; L/T outside .1 to 1 is an error."""
+
+def tune(
+    plants: Sequence[_Plant], references: Sequence[_F], *, start: Controller, counts_per_unit: float,
+    weights: Mapping[str, float], evaluations: int, seed: int, threads: int,
+    progress: _Progress = None,
+) -> dict[str, object]:
+    """Search Kp, Ti, Td, alpha, beta; returns gains, cost, start_cost, evaluations, trace, termination."""
+
+def step_metrics(y: _F, reference: _F, *, Ts: float, smoothing: float) -> dict[str, float]:
+    """rise_time_ms, reference_rise_time_ms, overshoot_percent of a response to a step or trapezoid."""

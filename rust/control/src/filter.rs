@@ -1,0 +1,1 @@
+//! Feedback filters: moving average, first order lag.

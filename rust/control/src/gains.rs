@@ -1,0 +1,1 @@
+//! Gains of the two-degree-of-freedom PID in their three forms, with exact conversions.

@@ -1,0 +1,1 @@
+//! The two-degree-of-freedom PID controller, one sample at a time.

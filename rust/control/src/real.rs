@@ -1,0 +1,1 @@
+//! The number type of the controller: `f32` or `f64`.

@@ -1,0 +1,1 @@
+//! ARX models by linear least squares.

@@ -1,0 +1,1 @@
+//! A controller and a plant in closed loop, with encoder, feedback filter and limits inside the loop.

@@ -1,0 +1,1 @@
+//! An incremental encoder: position to counts.

@@ -1,0 +1,28 @@
+//! Identification, simulation and tuning of motor drives, without Python.
+//!
+//! A recording becomes a model ([`arx`], [`oe`], [`neural`]), a model and demands become a controller
+//! ([`fopdt`], [`rules`], [`tune`]), and [`closed_loop`] runs that controller on a model or on the
+//! [`machine`]. Times are in seconds; outputs and inputs carry the caller's units.
+
+pub mod arx;
+pub mod closed_loop;
+pub mod data;
+pub mod encoder;
+pub mod error;
+pub mod fopdt;
+pub mod linear;
+pub mod lm;
+pub mod machine;
+pub mod metrics;
+pub mod monitor;
+pub mod neural;
+pub mod oe;
+pub mod random;
+pub mod rules;
+pub mod signals;
+pub mod speed;
+pub mod tune;
+
+pub use data::Record;
+pub use error::{Error, ErrorKind, Result};
+pub use monitor::Monitor;

@@ -1,0 +1,1 @@
+//! Linear difference-equation models: one-step prediction and free-running simulation.

@@ -1,0 +1,1 @@
+//! Levenberg-Marquardt for nonlinear least squares given by normal equations.

@@ -1,0 +1,1 @@
+//! The virtual sewing machine: a physical model of drive, crank and load.

@@ -1,0 +1,1 @@
+//! Errors and fits of a model; rise time and overshoot of a response.

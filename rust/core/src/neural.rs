@@ -1,0 +1,1 @@
+//! The neural output-error model: network, simulation, exact sensitivities, training.

@@ -1,0 +1,1 @@
+//! Speed from encoder counts: difference, Savitzky-Golay, Kalman/RTS smoother.

@@ -1,0 +1,1 @@
+//! Tuning of controller gains by simulated closed loops.

@@ -1,0 +1,79 @@
+//! Arrays and errors across the seam: borrowed in, owned out, core errors as the package's exceptions.
+
+use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::prelude::*;
+use pyo3::types::PyType;
+use sewfast_core::{Error, ErrorKind, Record};
+
+/// Turns a core error into the exception class of `sewfast.errors` that stands for its kind.
+pub fn raise(py: Python<'_>, error: Error) -> PyErr {
+    let class = match error.kind {
+        ErrorKind::Data => "DataError",
+        ErrorKind::Setting => "SettingError",
+        ErrorKind::Fit => "FitError",
+    };
+    match exception(py, class) {
+        Ok(class) => PyErr::from_type(class, error.message),
+        Err(import_error) => import_error,
+    }
+}
+
+fn exception<'py>(py: Python<'py>, class: &str) -> PyResult<Bound<'py, PyType>> {
+    Ok(py
+        .import("sewfast.errors")?
+        .getattr(class)?
+        .cast_into::<PyType>()?)
+}
+
+/// The values of a one-dimensional array, borrowed.
+pub fn slice<'a>(array: &'a PyReadonlyArray1<'_, f64>, name: &str) -> PyResult<&'a [f64]> {
+    array
+        .as_slice()
+        .map_err(|_| not_contiguous(array.py(), name))
+}
+
+/// The values of a two-dimensional array row by row and its number of columns, borrowed.
+pub fn rows<'a>(array: &'a PyReadonlyArray2<'_, f64>, name: &str) -> PyResult<(&'a [f64], usize)> {
+    let columns = array.as_array().ncols();
+    Ok((
+        array
+            .as_slice()
+            .map_err(|_| not_contiguous(array.py(), name))?,
+        columns,
+    ))
+}
+
+fn not_contiguous(py: Python<'_>, name: &str) -> PyErr {
+    let message = format!(
+        "expected a C-contiguous array for {name}, got another memory layout; use numpy.ascontiguousarray"
+    );
+    raise(py, Error::data(message))
+}
+
+/// Borrowed experiments as Python hands them over: a list of `(u, y)`.
+pub type Experiments<'py> = Vec<(PyReadonlyArray2<'py, f64>, PyReadonlyArray1<'py, f64>)>;
+
+/// The experiments as the core's records.
+pub fn records<'a>(py: Python<'_>, experiments: &'a Experiments<'_>) -> PyResult<Vec<Record<'a>>> {
+    let record = |(u, y): &'a (PyReadonlyArray2<'_, f64>, PyReadonlyArray1<'_, f64>)| {
+        let (u, channels) = rows(u, "u")?;
+        Record::new(u, channels, slice(y, "y")?).map_err(|e| raise(py, e))
+    };
+    experiments.iter().map(record).collect()
+}
+
+/// A new one-dimensional array that owns `values`.
+pub fn array1(py: Python<'_>, values: Vec<f64>) -> Bound<'_, PyArray1<f64>> {
+    PyArray1::from_vec(py, values)
+}
+
+/// A new two-dimensional array from `values` row by row.
+pub fn array2(
+    py: Python<'_>,
+    values: Vec<f64>,
+    columns: usize,
+) -> PyResult<Bound<'_, PyArray2<f64>>> {
+    use numpy::PyArrayMethods;
+    let rows = values.len().checked_div(columns).unwrap_or(0);
+    PyArray1::from_vec(py, values).reshape([rows, columns])
+}

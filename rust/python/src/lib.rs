@@ -1,0 +1,21 @@
+//! The Python module `sewfast._core`: convert, release the interpreter, call, convert back.
+
+mod arrays;
+mod control;
+mod machine;
+mod models;
+mod signals;
+mod speed;
+mod watch;
+
+use pyo3::prelude::*;
+
+#[pymodule(gil_used = false)]
+fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    signals::register(module)?;
+    machine::register(module)?;
+    speed::register(module)?;
+    models::register(module)?;
+    control::register(module)
+}
