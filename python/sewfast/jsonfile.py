@@ -1,0 +1,155 @@
+"""JSON files of the package: whole or not at all when written, strict when read."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import secrets
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+from .errors import ModelFileError
+
+LARGEST_FILE = 16 * 1024 * 1024
+"""Bytes that a file may have: a larger one is none of the package's."""
+
+
+def write(
+    path: str | os.PathLike[str], format: str, version: int, payload: Mapping[str, Any]
+) -> None:
+    """Write ``payload`` under its format and version; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    path
+        File to write; an existing one is replaced in one step.
+    format, version
+        Name and number that :func:`read` asks for, stored as ``format`` and ``version``.
+    payload
+        Values that JSON knows: dicts with string keys, lists, text, booleans, None, finite numbers.
+
+    Raises
+    ------
+    ModelFileError
+        A value is not finite or is none that JSON knows, or the folder cannot be written to.
+    """
+    try:
+        document = {"format": format, "version": version, **payload}
+        text = json.dumps(document, allow_nan=False, indent=1) + "\n"
+    except (TypeError, ValueError) as error:
+        raise ModelFileError(
+            f"{path}: expected finite numbers, text, lists and dicts to save, got {error}"
+        ) from error
+    replace(path, text)
+
+
+def replace(path: str | os.PathLike[str], text: str) -> None:
+    """Put ``text`` in place of a file: a temporary name beside it, renamed once it is whole.
+
+    Raises
+    ------
+    ModelFileError
+        The folder does not exist or cannot be written to.
+    """
+    target = Path(path).resolve()
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        try:
+            with temporary.open("x", encoding="utf-8", newline="\n") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(target)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise ModelFileError(
+            f"{path}: cannot be written ({error.strerror}); "
+            "choose a folder that exists and is writable"
+        ) from error
+
+
+def read(path: str | os.PathLike[str], format: str, versions: Collection[int]) -> dict[str, Any]:
+    """Read a document of a known format and version; nothing in it is executed.
+
+    Returns
+    -------
+    dict
+        The whole document, ``version`` included and ``format`` left out.
+
+    Raises
+    ------
+    ModelFileError
+        The file is missing, larger than 16 MB, no JSON, holds a number that is not finite or a key
+        twice, or is of another format or of an unknown version.
+    """
+    document = _parse(path, _text(path))
+    if not isinstance(document, dict):
+        raise ModelFileError(
+            f"{path}: expected a JSON object of format {format!r}, got {type(document).__name__}"
+        )
+    received = document.pop("format", None)
+    if received != format:
+        raise ModelFileError(f"{path}: expected a file of format {format!r}, got {received!r}")
+    version = document.get("version")
+    # True == 1 and 1.0 == 1, yet neither is a version.
+    if type(version) is not int or version not in versions:
+        known = ", ".join(str(v) for v in sorted(versions))
+        raise ModelFileError(
+            f"{path}: expected version {known} of {format!r}, got {version!r}; "
+            "a newer sewfast may be able to read it"
+        )
+    return document
+
+
+def _text(path: str | os.PathLike[str]) -> str:
+    try:
+        with Path(path).open("rb") as file:
+            data = file.read(LARGEST_FILE + 1)
+    except OSError as error:
+        raise ModelFileError(
+            f"{path}: cannot be read ({error.strerror}); check the name"
+        ) from error
+    if len(data) > LARGEST_FILE:
+        raise ModelFileError(f"{path}: expected a file of at most 16 MB, got a larger one")
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ModelFileError(
+            f"{path}: expected UTF-8 text, got binary data; the file is damaged"
+        ) from error
+
+
+def _parse(path: str | os.PathLike[str], text: str) -> Any:
+    try:
+        return json.loads(
+            text,
+            parse_constant=_refuse_constant,
+            parse_float=_finite,
+            object_pairs_hook=_without_repetition,
+        )
+    except (ValueError, RecursionError) as error:
+        raise ModelFileError(
+            f"{path}: expected a whole JSON file, got a damaged one ({error}); save it again"
+        ) from error
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not a finite number")
+
+
+def _finite(digits: str) -> float:
+    value = float(digits)
+    if not math.isfinite(value):
+        raise ValueError(f"{digits} is beyond the range of float64")
+    return value
+
+
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    keys = [key for key, _ in pairs]
+    if len(set(keys)) < len(keys):
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice!r} occurs twice")
+    return dict(pairs)
