@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 __version__: str
 
 _F: TypeAlias = NDArray[np.float64]
-_I: TypeAlias = NDArray[np.int64]
 _Experiments: TypeAlias = Sequence[tuple[_F, _F]]
 _Progress: TypeAlias = Callable[[int, int, float], object] | None
 
@@ -42,9 +41,13 @@ def limit(signal: _F, *, Ts: float, low: float, high: float, rate: float, slew: 
 
 @final
 class Machine:
-    """The virtual sewing machine; see docs/CONVENTIONS.md for its parameters."""
+    """The virtual sewing machine; see docs/CONVENTIONS.md for its parameters.
 
-    def __new__(cls, parameters: Mapping[str, float] | None = None) -> Machine: ...
+    Counts are float64: whole numbers where ``quantisation`` is 1, the exact position in counts where it is 0.
+    """
+
+    def __new__(cls, parameters: Mapping[str, float] | None = None) -> Machine:
+        """Names left out keep their defaults."""
     @staticmethod
     def default_parameters() -> dict[str, float]: ...
     @staticmethod
@@ -54,21 +57,28 @@ class Machine:
     @property
     def parameters(self) -> dict[str, float]: ...
     def reset(self) -> None: ...
-    def step(self, u: float) -> tuple[int, float]:
+    def step(self, u: float) -> tuple[float, float]:
         """Hold ``u`` [V] for one sample; counts and true speed [RPM] at its end."""
-    def run(self, u: _F) -> tuple[_I, _F]:
-        """Counts and true speed [RPM] at the instants at which u(k) starts to act: entry 0 is before u[0] acts."""
+    def run(self, u: _F) -> tuple[_F, _F]:
+        """Counts and true speed [RPM] at the instants at which u(k) starts to act: entry 0 is before u[0] acts.
+
+        Goes on from the present state: call ``reset`` for a run from rest.
+        """
+    def linearise(self, speed_rpm: float) -> dict[str, float]:
+        """Small signals about a steady speed: command [V], current [A], gain [RPM/V], T1 and T2 [s]."""
     @property
-    def counts(self) -> int: ...
+    def counts(self) -> float: ...
     @property
     def speed_rpm(self) -> float: ...
+    @property
+    def current(self) -> float: ...
 
-# --- speed.rs ---------------------------------------------------------------------------------------------
+# --- speed.rs: counts are float64 (N,), whole numbers unless the encoder's quantisation is off ---------------
 
-def speed_difference(counts: _I, *, Ts: float, counts_per_unit: float) -> _F: ...
-def speed_savgol(counts: _I, *, Ts: float, counts_per_unit: float, window: int, order: int) -> _F: ...
+def speed_difference(counts: _F, *, Ts: float, counts_per_unit: float) -> _F: ...
+def speed_savgol(counts: _F, *, Ts: float, counts_per_unit: float, window: int, order: int) -> _F: ...
 def speed_kalman(
-    counts: _I, *, Ts: float, counts_per_unit: float, process_noise: float | None = None,
+    counts: _F, *, Ts: float, counts_per_unit: float, process_noise: float | None = None,
 ) -> _F:
     """RTS smoother; the process noise [unit^2/s^3] is found by maximum likelihood where None."""
 
