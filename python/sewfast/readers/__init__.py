@@ -1,0 +1,7 @@
+"""Files in: CSV, MATLAB `.mat`, NumPy `.npz` and Parquet, read into a `Table` or a `Dataset`."""
+
+from .files import read_table
+from .recording import parse_source, read
+from .table import Table
+
+__all__ = ["Table", "parse_source", "read", "read_table"]

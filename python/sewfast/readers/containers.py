@@ -1,0 +1,171 @@
+"""Files of named arrays (`.mat`, HDF5, `.npz`) -> `Table`."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from ..errors import DataError, SettingError
+from .table import MAX_COLUMNS, Table, freeze
+
+_MAX_DEPTH = 16
+Value: TypeAlias = Any
+"""An array, a mapping of field to value (a struct) or a list of values (struct array, cell)."""
+
+
+def read_npz(path: Path, raw: bytes) -> Table:
+    """Read the arrays of an `.npz` archive; pickled objects are never loaded."""
+    try:
+        with np.load(io.BytesIO(raw), allow_pickle=False) as archive:
+            return _table(path, {name: _npz_member(archive, name) for name in archive.files})
+    except DataError:
+        raise
+    except Exception as e:
+        raise DataError(f"{path}: expected an .npz archive, but it cannot be read: {e}") from e
+
+
+def _npz_member(archive: Any, name: str) -> Value:
+    try:
+        return archive[name]
+    except ValueError as e:
+        if "allow_pickle" in str(e):
+            return "Python objects"
+        raise
+
+
+def read_mat(path: Path, raw: bytes) -> Table:
+    """Read a MATLAB file of version 4, 5 (SciPy) or 7.3 (HDF5, h5py).
+
+    Vectors are columns whichever way they lie. A matrix of shape (N, n) with n <= N gives `NAME.0`
+    to `NAME.n-1`, a struct `NAME.FIELD`, struct arrays and cells `NAME.0`, `NAME.1`, all 0-based.
+    """
+    hdf5 = b"\x89HDF\r\n\x1a\n"
+    is_hdf5 = raw.startswith(hdf5) or raw[512:520] == hdf5
+    try:
+        return _table(path, _hdf5_values(raw) if is_hdf5 else _mat5_values(raw))
+    except (DataError, SettingError):
+        raise
+    except Exception as e:
+        # damaged files make the parsers fail in any way
+        raise DataError(f"{path}: expected a MATLAB file, but it cannot be read: {e}") from e
+
+
+def _mat5_values(raw: bytes) -> dict[str, Value]:
+    try:
+        from scipy.io import loadmat
+    except ImportError as e:
+        raise _missing_extra("scipy") from e
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = loadmat(io.BytesIO(raw))
+    return {name: _plain(v) for name, v in found.items() if not name.startswith("__")}
+
+
+def _plain(value: Any) -> Value:
+    """SciPy's structs and cells as mappings and lists."""
+    names = getattr(getattr(value, "dtype", None), "names", None)
+    if names:
+        items = [{n: _plain(item[n]) for n in names} for item in np.atleast_1d(value).ravel()]
+        return items[0] if len(items) == 1 else items
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        return [_plain(item) for item in value.ravel()]
+    return value
+
+
+def _hdf5_values(raw: bytes) -> dict[str, Value]:
+    try:
+        import h5py
+    except ImportError as e:
+        raise _missing_extra("h5py") from e
+    with h5py.File(io.BytesIO(raw), "r") as file:
+        return {n: _hdf5_value(h5py, file, v, 0) for n, v in file.items() if n != "#refs#"}
+
+
+def _hdf5_value(h5py: Any, file: Any, item: Any, depth: int) -> Value:
+    if depth > _MAX_DEPTH:
+        return "nested too deeply"
+    if isinstance(item, h5py.Group):
+        return _struct({n: _hdf5_value(h5py, file, v, depth + 1) for n, v in item.items()})
+    matlab = item.attrs.get("MATLAB_class")
+    if matlab == b"char":
+        return "text"
+    if "MATLAB_empty" in item.attrs:
+        return np.empty(0)
+    if h5py.check_dtype(ref=item.dtype) is not None:
+        flat = np.asarray(item[()]).T.ravel(order="F")
+        return [_hdf5_value(h5py, file, file[r], depth + 1) for r in flat]
+    array = np.asarray(item[()])
+    # MATLAB writes its column-major arrays with the dimensions reversed; other programs do not
+    return array.T if matlab is not None else array
+
+
+def _struct(fields: dict[str, Value]) -> Value:
+    """A struct; the struct array, where every field is a list of the same length."""
+    lengths = {len(v) if isinstance(v, list) else -1 for v in fields.values()}
+    if len(lengths) != 1 or lengths == {-1}:
+        return fields
+    return [{n: v[k] for n, v in fields.items()} for k in range(lengths.pop())]
+
+
+def _missing_extra(module: str) -> SettingError:
+    return SettingError(
+        f'reading this .mat file needs {module}, which is not installed: pip install "sewfast[mat]"'
+    )
+
+
+def _table(path: Path, values: Mapping[str, Value]) -> Table:
+    columns: dict[str, Any] = {}
+    unusable: dict[str, str] = {}
+    for name, value in values.items():
+        _flatten(name, value, columns, unusable, 0)
+    if len(columns) > MAX_COLUMNS:
+        raise DataError(f"{path}: expected at most {MAX_COLUMNS} columns, received {len(columns)}")
+    if not columns:
+        reason = next(iter(unusable.values()), "it is empty")
+        raise DataError(
+            f"{path}: expected variables with series of numbers, received none; {reason}"
+        )
+    return Table(path, {n: freeze(c) for n, c in columns.items()}, {}, unusable)
+
+
+def _flatten(
+    name: str, value: Value, columns: dict[str, Any], unusable: dict[str, str], depth: int
+) -> None:
+    if isinstance(value, (dict, list)) and depth <= _MAX_DEPTH:
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, item in items:
+            _flatten(f"{name}.{key}", item, columns, unusable, depth + 1)
+        return
+    reason = _reason(value)
+    if reason is not None:
+        unusable[name] = f"variable {name!r} is {reason}; expected a series of real numbers"
+    elif value.ndim == 1 or 1 in value.shape:
+        columns[name] = value.ravel()
+    else:
+        columns.update({f"{name}.{k}": column for k, column in enumerate(value.T)})
+        unusable[name] = (
+            f"variable {name!r} is a matrix of shape {value.shape}; name one of its columns, "
+            f"{name}.0 to {name}.{value.shape[1] - 1}"
+        )
+
+
+def _reason(value: Value) -> str | None:
+    """Why a value is not a column or a matrix of columns; None where it is."""
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "biuf":
+        kind = "complex" if getattr(value, "dtype", np.dtype("U1")).kind == "c" else "not numeric"
+        return kind
+    if value.size <= 1:
+        return "empty" if value.size == 0 else "a single number"
+    if value.ndim > 2:
+        return f"an array of shape {value.shape}"
+    if value.ndim == 2 and 1 not in value.shape and value.shape[0] < value.shape[1]:
+        return (
+            f"a matrix of shape {value.shape} with time along its rows (nothing is transposed by "
+            "guess; store it with one column per signal)"
+        )
+    return None

@@ -1,0 +1,144 @@
+"""One recording file -> `Dataset`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..dataset import Dataset, Experiment, FloatArray
+from ..errors import DataError, SettingError
+from .files import read_table
+from .table import Table
+from .timebase import sample_time
+
+
+def read(
+    path: str | os.PathLike[str] | Table,
+    *,
+    inputs: str | Sequence[str],
+    output: str | None = None,
+    Ts: float | None = None,
+    counts: str | None = None,
+    counts_per_rev: float | None = None,
+    time: str | None = None,
+    channels: Sequence[str] = (),
+) -> Dataset:
+    """Read inputs and an output from one recording.
+
+    Parameters
+    ----------
+    path : path or Table
+        CSV, `.mat`, `.npz` or Parquet; see `read_table`.
+    inputs : str or sequence of str
+        Column names of the inputs.
+    output : str or None
+        Column name of the output. None, without `counts`, leaves the output NaN: enough to
+        simulate from rest.
+    Ts : float or None
+        Sample time [s]. Where the file has a column `t` or `time`, the two must agree within 1 %
+        and this one is used.
+    counts, counts_per_rev : str and float, or None
+        Column of encoder counts. The output is then the speed [RPM] computed from it by a Kalman
+        smoother, and `output` only names it (`speed` by default).
+    time : str or None
+        Name of the time column [s] where it is neither `t` nor `time`.
+    channels : sequence of str
+        Further columns to carry along.
+
+    Returns
+    -------
+    Dataset
+        One experiment, named after the file.
+
+    Raises
+    ------
+    DataError
+        Where the file or a column cannot be used.
+    SettingError
+        Where the sample time is missing or settings contradict each other.
+    """
+    table = path if isinstance(path, Table) else read_table(path)
+    names = (inputs,) if isinstance(inputs, str) else tuple(inputs)
+    if not names:
+        raise SettingError("inputs: expected at least one column name, received none")
+    if (counts is None) != (counts_per_rev is None):
+        raise SettingError(
+            "counts and counts_per_rev belong together: the column of encoder counts and the "
+            f"counts of one turn; received {counts!r} and {counts_per_rev!r}"
+        )
+    names = tuple(table.resolve(n) for n in names)
+    period = sample_time(table, Ts, time)
+    u = _side_by_side(table, names)
+    if counts is None or counts_per_rev is None:
+        y = np.full(len(u), np.nan) if output is None else table[output]
+        name, unit, source = output or "y", table.unit(output) if output else "", None
+    else:
+        y = _speed(table, counts, counts_per_rev, period)
+        name, unit, source = (
+            output or "speed",
+            "RPM",
+            (table.resolve(counts), float(counts_per_rev)),
+        )
+    _require_length(table, name, y, names[0], len(u))
+    extra = {c: table[c] for c in channels}
+    experiment = Experiment(u, y, extra, table.path.name)
+    name = table.resolve(name) if source is None and output is not None else name
+    return Dataset(
+        (experiment,), period, names, name, tuple(table.unit(n) for n in names), unit, source
+    )
+
+
+def _side_by_side(table: Table, names: Sequence[str]) -> FloatArray:
+    first = table[names[0]]
+    for name in names[1:]:
+        _require_length(table, name, table[name], names[0], len(first))
+    return np.column_stack([table[n] for n in names])
+
+
+def _require_length(table: Table, name: str, column: FloatArray, other: str, n: int) -> None:
+    if len(column) != n:
+        raise DataError(
+            f"{table.path}: {name!r} has {len(column)} samples, {other!r} has {n}; "
+            "expected columns of one recording"
+        )
+
+
+def _speed(table: Table, column: str, counts_per_rev: float, Ts: float) -> FloatArray:
+    from ..speed import speed_from_counts
+
+    counts = table[column]
+    bad = np.flatnonzero(~np.isfinite(counts))
+    if len(bad):
+        raise DataError(
+            f"{table.path}: column {column!r}: expected encoder counts in every row, received "
+            f"{counts[bad[0]]} at {table.row(int(bad[0]))}"
+        )
+    return speed_from_counts(counts, Ts=Ts, counts_per_rev=counts_per_rev)
+
+
+def parse_source(text: str) -> tuple[str, tuple[str, ...] | None, str | None]:
+    """Split `FILE:IN:OUT` into file, input names (joined by `+` where several) and output name.
+
+    A text that exists as a file, or has no two colons after a drive letter, is a file alone.
+
+    Examples
+    --------
+    >>> parse_source("run.csv:u:speed")
+    ('run.csv', ('u',), 'speed')
+    >>> parse_source("C:/data/run.csv")
+    ('C:/data/run.csv', None, None)
+    """
+    parts = text.rsplit(":", 2)
+    is_drive = len(parts) == 3 and len(parts[0]) == 1 and parts[0].isalpha()
+    if len(parts) < 3 or is_drive or Path(text).exists():
+        return text, None, None
+    path, inputs, output = parts
+    names = tuple(n.strip() for n in inputs.split("+"))
+    if not path or not output.strip() or not all(names):
+        raise SettingError(
+            f"expected FILE:INPUT:OUTPUT, such as run.csv:u:speed; received {text!r}"
+        )
+    return path, names, output.strip()
