@@ -1,8 +1,9 @@
-"""Training of the 2-2-1 network with 8 tanh in free run, as an expert writes it with numba and NumPy.
+"""Training of the 2-2-1 network with 8 tanh in free run, as an expert writes it with numba.
 
-Parameters theta = [W1 (8 x 4) row by row, b1 (8), w2 (8), b2], J = 1/(2N) sum e^2, Levenberg-Marquardt with mu I damping
-(times 4 on failure, divided by 5 on success). A branch-free exponential lets the compiler vectorise over the hidden units,
-parameters are regrouped so that every inner loop is contiguous, and the normal equations are one BLAS product.
+Parameters theta = [W1 (8 x 4) row by row, b1 (8), w2 (8), b2], J = 1/(2N) sum e^2,
+Levenberg-Marquardt with mu I damping (times 4 on failure, divided by 5 on success). A branch-free
+exponential lets the compiler vectorise over the hidden units, parameters are regrouped so that
+every inner loop is contiguous, and the normal equations are one BLAS product.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numpy as np
 
 HIDDEN = 8
 N_PARAMETERS = 49
-# column of the Jacobian (grouped by regressor) that holds each entry of theta (grouped by hidden unit)
+# column of the Jacobian (grouped by regressor) for each entry of theta (grouped by hidden unit)
 _ORDER = np.concatenate([np.arange(32).reshape(4, 8).T.ravel(), np.arange(32, 49)])
 
 
@@ -72,7 +73,7 @@ def cost(theta, u, y, out):
 
 @numba.njit(fastmath=True)
 def residuals_and_jacobian(theta, u, y, error, jacobian):
-    """Free-run errors and forward sensitivities; columns grouped by regressor so that the loops are contiguous."""
+    """Free-run errors and forward sensitivities; columns grouped by regressor."""
     a, b = theta[0:32:4].copy(), theta[1:32:4].copy()
     c, d = theta[2:32:4].copy(), theta[3:32:4].copy()
     b1, w2, b2 = theta[32:40].copy(), theta[40:48].copy(), theta[48]
