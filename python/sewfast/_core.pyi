@@ -99,6 +99,12 @@ class LinearModel:
     def offset(self) -> float: ...
     @property
     def na(self) -> int: ...
+    @property
+    def is_stable(self) -> bool: ...
+    def poles(self) -> _F:
+        """Real and imaginary parts, (na, 2)."""
+    def dc_gain(self) -> _F:
+        """Steady gain from each input, (n_inputs,)."""
     def simulate(self, u: _F, y_past: _F) -> _F: ...
     def predict(self, u: _F, y: _F, y_past: _F, horizon: int) -> _F: ...
     def estimate_initial_state(self, u: _F, y: _F) -> _F: ...
@@ -138,7 +144,13 @@ class LinearFit:
     @property
     def termination(self) -> str: ...
     @property
+    def remedy(self) -> str:
+        """What to do about the termination."""
+    @property
     def trace(self) -> _F: ...
+    @property
+    def initial_states(self) -> _F:
+        """Past outputs of each experiment, newest first, (n_experiments, na)."""
 
 @final
 class NeuralFit:

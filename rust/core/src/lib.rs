@@ -10,6 +10,8 @@ pub mod data;
 pub mod encoder;
 pub mod error;
 pub mod fopdt;
+mod gram;
+pub mod lagged;
 pub mod linear;
 pub mod lm;
 pub mod machine;

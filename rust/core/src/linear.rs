@@ -1,1 +1,261 @@
-//! Linear difference-equation models: one-step prediction and free-running simulation.
+//! The linear difference equation with offset.
+
+use nalgebra::{Complex, DMatrix};
+
+use crate::lagged::{Lagged, Lags};
+use crate::{Error, Result};
+
+/// `y(k) = -sum_i a[i] y(k-1-i) + sum_j sum_i b[j nb + i] u_j(k-nk-i) + offset`, in the data's units.
+///
+/// ```
+/// use sewfast_core::lagged::Lagged;
+/// use sewfast_core::linear::LinearModel;
+///
+/// let lag = LinearModel::new(vec![-0.9], vec![0.2], 1, 1, 0.0)?;
+/// let y = lag.simulate(&[1.0; 200], 1, &[0.0])?;
+/// assert!((y[199] - lag.dc_gain()[0]).abs() < 1e-6);
+/// # Ok::<(), sewfast_core::Error>(())
+/// ```
+#[derive(Clone, Debug, PartialEq)]
+pub struct LinearModel {
+    a: Vec<f64>,
+    b: Vec<f64>,
+    offset: f64,
+    lags: Lags,
+}
+
+impl LinearModel {
+    /// A model from its coefficients; `b` holds the coefficients of one input after the other.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for empty or uneven coefficients or values that are not finite.
+    pub fn new(a: Vec<f64>, b: Vec<f64>, channels: usize, nk: usize, offset: f64) -> Result<Self> {
+        if channels == 0 || !b.len().is_multiple_of(channels) {
+            return Err(Error::setting(format!(
+                "expected b with the same number of coefficients for each of {channels} inputs, got {}; give b the shape (n_inputs, nb)",
+                b.len()
+            )));
+        }
+        let lags = Lags::new(a.len(), b.len() / channels, nk, channels)?;
+        if a.iter().chain(&b).chain([&offset]).any(|v| !v.is_finite()) {
+            return Err(Error::setting(
+                "expected finite coefficients, got NaN or infinity; identify the model again",
+            ));
+        }
+        Ok(Self { a, b, offset, lags })
+    }
+
+    /// Denominator coefficients after the leading 1.
+    pub fn a(&self) -> &[f64] {
+        &self.a
+    }
+
+    /// Numerator coefficients, one input after the other.
+    pub fn b(&self) -> &[f64] {
+        &self.b
+    }
+
+    /// What the output moves by per sample without any input.
+    pub fn offset(&self) -> f64 {
+        self.offset
+    }
+
+    /// The poles: roots of `z^na + a_1 z^(na-1) + .. + a_na`.
+    pub fn poles(&self) -> Vec<Complex<f64>> {
+        poles(&self.a)
+    }
+
+    /// True where every pole lies inside the unit circle.
+    pub fn is_stable(&self) -> bool {
+        is_stable(&self.a, 0.0)
+    }
+
+    /// Steady gain from each input; infinite for an integrator.
+    pub fn dc_gain(&self) -> Vec<f64> {
+        let denominator = 1.0 + self.a.iter().sum::<f64>();
+        let gain = |b: &[f64]| b.iter().sum::<f64>() / denominator;
+        self.b.chunks_exact(self.lags.nb).map(gain).collect()
+    }
+}
+
+impl Lagged for LinearModel {
+    fn lags(&self) -> Lags {
+        self.lags
+    }
+
+    fn output(&self, phi: &[f64]) -> f64 {
+        let (past, inputs) = phi.split_at(self.lags.na);
+        let moved = self
+            .b
+            .iter()
+            .zip(inputs)
+            .fold(self.offset, |sum, (b, u)| sum + b * u);
+        self.a
+            .iter()
+            .zip(past)
+            .fold(moved, |sum, (a, y)| sum - a * y)
+    }
+
+    fn output_and_slope(&self, phi: &[f64], slope: &mut [f64]) -> f64 {
+        for (slope, a) in slope.iter_mut().zip(&self.a) {
+            *slope = -a;
+        }
+        self.output(phi)
+    }
+}
+
+/// Roots of `z^n + a_1 z^(n-1) + .. + a_n`, the eigenvalues of its companion matrix.
+pub(crate) fn poles(a: &[f64]) -> Vec<Complex<f64>> {
+    let n = a.len();
+    let companion = DMatrix::from_fn(n, n, |row, column| match (row, column) {
+        (0, j) => -a[j],
+        (i, j) => f64::from(u8::from(i == j + 1)),
+    });
+    companion.complex_eigenvalues().iter().copied().collect()
+}
+
+/// Coefficients `a` of the polynomial with these roots, which come in conjugate pairs.
+pub(crate) fn polynomial(roots: &[Complex<f64>]) -> Vec<f64> {
+    let mut coefficients = vec![Complex::new(1.0, 0.0)];
+    for root in roots {
+        coefficients.push(Complex::new(0.0, 0.0));
+        for i in (1..coefficients.len()).rev() {
+            let lower = coefficients[i - 1];
+            coefficients[i] -= root * lower;
+        }
+    }
+    coefficients[1..].iter().map(|c| c.re).collect()
+}
+
+/// True where every root lies inside the unit circle: all reflection coefficients below `1 - margin` (Schur and Cohn).
+pub(crate) fn is_stable(a: &[f64], margin: f64) -> bool {
+    let mut a = a.to_vec();
+    while let Some(reflection) = a.pop() {
+        // NaN is not inside either.
+        let inside = reflection.abs() < 1.0 - margin;
+        if !inside {
+            return false;
+        }
+        let scale = 1.0 / (1.0 - reflection * reflection);
+        let reversed: Vec<f64> = a.iter().rev().copied().collect();
+        for (a, r) in a.iter_mut().zip(reversed) {
+            *a = (*a - reflection * r) * scale;
+        }
+    }
+    true
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn second_order() -> LinearModel {
+        LinearModel::new(vec![-1.5, 0.7], vec![0.5, 0.3, -0.2, 0.1], 2, 2, 0.05).unwrap()
+    }
+
+    #[test]
+    fn simulates_the_difference_equation() {
+        let model = second_order();
+        let u: Vec<f64> = (0..20).map(|k| (k as f64 * 0.7).sin()).collect();
+        let y = model.simulate(&u, 2, &[0.3, -0.4]).unwrap();
+        let input = |k: usize, j: usize| u[k * 2 + j];
+        let expected = 1.5 * y[4] - 0.7 * y[3] + 0.5 * input(3, 0) + 0.3 * input(2, 0)
+            - 0.2 * input(3, 1)
+            + 0.1 * input(2, 1)
+            + 0.05;
+        assert!((y[5] - expected).abs() < 1e-14);
+        let first = 1.5 * 0.3 + 0.7 * 0.4 + 0.8 * input(0, 0) - 0.1 * input(0, 1) + 0.05;
+        assert!((y[0] - first).abs() < 1e-14);
+    }
+
+    #[test]
+    fn predicts_from_measured_outputs_and_at_a_long_horizon_runs_free() {
+        let model = second_order();
+        let u: Vec<f64> = (0..60).map(|k| (k as f64 * 0.9).cos()).collect();
+        let past = [0.2, 0.1];
+        let free = model.simulate(&u, 2, &past).unwrap();
+        let measured: Vec<f64> = (0..30).map(|k| k as f64).collect();
+        let far = model.predict(&u, 2, &measured, &past, 30).unwrap();
+        assert_eq!(far, free);
+        let one = model.predict(&u, 2, &measured, &past, 1).unwrap();
+        let phi = [9.0, 8.0, u[16], u[14], u[17], u[15]];
+        assert_eq!(one[10], model.output(&phi));
+        let same = model.predict(&u, 2, &free, &past, 3).unwrap();
+        assert_eq!(same, free);
+    }
+
+    #[test]
+    fn finds_the_state_a_clean_record_started_from() {
+        let model = second_order();
+        let u: Vec<f64> = (0..40).map(|k| (k as f64 * 1.3).sin()).collect();
+        let y = model.simulate(&u, 2, &[2.0, -1.0]).unwrap();
+        let state = model.estimate_initial_state(&u, 2, &y).unwrap();
+        assert!(
+            (state[0] - 2.0).abs() < 1e-5 && (state[1] + 1.0).abs() < 1e-5,
+            "{state:?}"
+        );
+    }
+
+    #[test]
+    fn gives_no_wild_state_for_a_short_noisy_record() {
+        let model = LinearModel::new(vec![-1.87, 0.8705], vec![0.1228, 0.1224], 1, 1, 0.0).unwrap();
+        let y = [1000.0, 1038.0, 962.0];
+        let state = model.estimate_initial_state(&[2.0; 3], 1, &y).unwrap();
+        assert!(
+            state.iter().all(|s| (800.0..1200.0).contains(s)),
+            "{state:?}"
+        );
+    }
+
+    #[test]
+    fn knows_its_poles_and_gain() {
+        let model = LinearModel::new(vec![-1.5, 0.7], vec![0.5, 0.3], 1, 1, 0.0).unwrap();
+        assert!(model.is_stable());
+        assert!(
+            model
+                .poles()
+                .iter()
+                .all(|p| (p.norm() - 0.7f64.sqrt()).abs() < 1e-12)
+        );
+        assert!((model.dc_gain()[0] - 4.0).abs() < 1e-12);
+        assert!(
+            !LinearModel::new(vec![-1.01], vec![1.0], 1, 1, 0.0)
+                .unwrap()
+                .is_stable()
+        );
+    }
+
+    #[test]
+    fn refuses_what_is_no_model_and_what_does_not_fit_it() {
+        assert!(LinearModel::new(vec![], vec![1.0], 1, 1, 0.0).is_err());
+        assert!(LinearModel::new(vec![0.1], vec![1.0, 2.0, 3.0], 2, 1, 0.0).is_err());
+        assert!(LinearModel::new(vec![f64::NAN], vec![1.0], 1, 1, 0.0).is_err());
+        let model = second_order();
+        assert!(model.simulate(&[1.0; 4], 1, &[0.0; 2]).is_err());
+        assert!(model.simulate(&[1.0; 4], 2, &[0.0; 1]).is_err());
+        assert!(
+            model
+                .predict(&[1.0; 4], 2, &[0.0; 2], &[0.0; 2], 0)
+                .is_err()
+        );
+        let unstable = LinearModel::new(vec![-3.0], vec![1.0], 1, 1, 0.0).unwrap();
+        assert!(
+            unstable
+                .simulate(&[1.0; 2000], 1, &[0.0])
+                .unwrap_err()
+                .message
+                .contains("unstable")
+        );
+    }
+
+    proptest! {
+        #[test]
+        fn schur_cohn_agrees_with_the_roots(radii in prop::collection::vec(-1.3f64..1.3, 1..6)) {
+            let roots: Vec<_> = radii.iter().map(|&r| Complex::new(r, 0.0)).collect();
+            prop_assume!(radii.iter().all(|r| (r.abs() - 1.0).abs() > 1e-3));
+            let stable = radii.iter().all(|r| r.abs() < 1.0);
+            prop_assert_eq!(is_stable(&polynomial(&roots), 0.0), stable);
+        }
+    }
+}

@@ -1,1 +1,430 @@
-//! Levenberg-Marquardt for nonlinear least squares given by normal equations.
+//! Levenberg-Marquardt on normal equations, with named outcomes.
+//!
+//! Minimises `1/2 |e(theta)|^2` through `(J'J + mu D) d = J'e`, `J` being the derivative of the model's output and
+//! `e = y - yhat`. A trial costs a simulation; only an accepted one costs a Jacobian. Damping: `mu` times 4 after a
+//! rejected trial, divided by 5 after an accepted one (Levenberg 1944, Marquardt 1963).
+
+use crate::Monitor;
+
+/// What is minimised. `normal_equations` is only called at the parameters of the last successful `cost`, whose
+/// simulation it may reuse.
+pub trait Problem {
+    /// Number of parameters.
+    fn parameters(&self) -> usize;
+
+    /// Cost at `theta`; none where the simulation diverges, leaves its constraints or is stopped.
+    fn cost(&mut self, theta: &[f64]) -> Option<f64>;
+
+    /// Fills `J'J` (row by row, the lower triangle is enough) and `J'e` at `theta`, scaled as the cost is.
+    fn normal_equations(&mut self, theta: &[f64], jtj: &mut [f64], jte: &mut [f64]);
+}
+
+/// The matrix `D` that `mu` multiplies.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Damping {
+    /// The unit matrix: for parameters of one scale, such as weights of a network.
+    Identity,
+    /// The diagonal of `J'J`: indifferent to the parameters' units.
+    Diagonal,
+}
+
+/// When to stop, and how to damp.
+#[derive(Clone, Copy, Debug)]
+pub struct Settings {
+    /// Jacobians at most.
+    pub max_iterations: usize,
+    /// Kind of damping.
+    pub damping: Damping,
+    /// First `mu`.
+    pub mu: f64,
+    /// Largest cosine between the residual and a column of `J` that counts as zero.
+    pub gradient_tolerance: f64,
+    /// Relative step that counts as zero.
+    pub step_tolerance: f64,
+    /// Relative reduction of the cost that counts as none, five times in a row.
+    pub reduction_tolerance: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            max_iterations: 100,
+            damping: Damping::Diagonal,
+            mu: 1e-3,
+            gradient_tolerance: 1e-10,
+            step_tolerance: 1e-12,
+            reduction_tolerance: 1e-10,
+        }
+    }
+}
+
+/// How the iteration ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Termination {
+    /// The residual is orthogonal to every column of the Jacobian: a minimum.
+    SmallGradient,
+    /// The step no longer changes the parameters.
+    SmallStep,
+    /// The cost no longer falls.
+    SmallReduction,
+    /// The permitted iterations are used up.
+    MaxIterations,
+    /// No damping gave a lower cost.
+    Stalled,
+    /// The start itself has no finite cost.
+    NotFinite,
+    /// A stop was requested.
+    Interrupted,
+}
+
+impl Termination {
+    /// The name that files and Python carry.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::SmallGradient => "small_gradient",
+            Self::SmallStep => "small_step",
+            Self::SmallReduction => "small_reduction",
+            Self::MaxIterations => "max_iterations",
+            Self::Stalled => "stalled",
+            Self::NotFinite => "not_finite",
+            Self::Interrupted => "interrupted",
+        }
+    }
+
+    /// What a user can do about it.
+    pub fn remedy(self) -> &'static str {
+        match self {
+            Self::SmallGradient | Self::SmallStep | Self::SmallReduction => {
+                "converged; nothing to do"
+            }
+            Self::MaxIterations => {
+                "allow more iterations if the trace still falls; for a network this is the usual end"
+            }
+            Self::Stalled => {
+                "the best point found is kept; try more starts, a smaller model or better scaled data"
+            }
+            Self::NotFinite => {
+                "start from other parameters, scale the data, or use a stable linear model as start"
+            }
+            Self::Interrupted => "the best result so far is kept; run again to go on",
+        }
+    }
+}
+
+/// The best parameters found, and how.
+#[derive(Clone, Debug)]
+pub struct Outcome {
+    /// Best parameters.
+    pub theta: Vec<f64>,
+    /// Their cost.
+    pub cost: f64,
+    /// Jacobians taken.
+    pub iterations: usize,
+    /// How it ended.
+    pub termination: Termination,
+    /// Cost at the start and after each accepted step.
+    pub trace: Vec<f64>,
+}
+
+/// Slow iterations in a row that count as the end of progress.
+const PATIENCE: usize = 5;
+/// Rejected trials in a row that count as stalled: `mu` has then grown by more than 1e18.
+const MOST_REJECTIONS: usize = 30;
+/// Damping never falls below this, so that a singular system stays solvable.
+const LEAST_MU: f64 = 1e-14;
+
+/// Minimises `problem` from `start`; `accepted(theta, cost)` sees the start and each accepted step.
+pub fn minimize(
+    problem: &mut impl Problem,
+    start: Vec<f64>,
+    settings: &Settings,
+    monitor: &Monitor,
+    mut accepted: impl FnMut(&[f64], f64),
+) -> Outcome {
+    let mut outcome = Outcome {
+        cost: f64::INFINITY,
+        theta: start,
+        iterations: 0,
+        termination: Termination::NotFinite,
+        trace: Vec::with_capacity(settings.max_iterations + 1),
+    };
+    match problem.cost(&outcome.theta) {
+        Some(cost) if cost.is_finite() => outcome.cost = cost,
+        _ => {
+            if monitor.stopped() {
+                outcome.termination = Termination::Interrupted;
+            }
+            return outcome;
+        }
+    }
+    outcome.trace.push(outcome.cost);
+    accepted(&outcome.theta, outcome.cost);
+    let mut system = System::new(problem.parameters());
+    outcome.termination = iterate(
+        problem,
+        &mut outcome,
+        &mut system,
+        settings,
+        monitor,
+        &mut accepted,
+    );
+    outcome
+}
+
+fn iterate(
+    problem: &mut impl Problem,
+    outcome: &mut Outcome,
+    system: &mut System,
+    settings: &Settings,
+    monitor: &Monitor,
+    accepted: &mut impl FnMut(&[f64], f64),
+) -> Termination {
+    let (mut mu, mut slow) = (settings.mu, 0);
+    for _ in 0..settings.max_iterations {
+        problem.normal_equations(&outcome.theta, &mut system.jtj, &mut system.jte);
+        if monitor.stopped() {
+            return Termination::Interrupted;
+        }
+        outcome.iterations += 1;
+        monitor.advance(1);
+        if system.largest_cosine(outcome.cost) <= settings.gradient_tolerance {
+            return Termination::SmallGradient;
+        }
+        let before = outcome.cost;
+        if let Some(end) = improve(problem, outcome, system, settings, monitor, &mut mu) {
+            return end;
+        }
+        outcome.trace.push(outcome.cost);
+        monitor.report_cost(outcome.cost);
+        accepted(&outcome.theta, outcome.cost);
+        let gained = (before - outcome.cost) > settings.reduction_tolerance * before;
+        slow = if gained { 0 } else { slow + 1 };
+        if slow == PATIENCE {
+            return Termination::SmallReduction;
+        }
+    }
+    Termination::MaxIterations
+}
+
+/// Raises the damping until a trial lowers the cost; says why where none does.
+fn improve(
+    problem: &mut impl Problem,
+    outcome: &mut Outcome,
+    system: &mut System,
+    settings: &Settings,
+    monitor: &Monitor,
+    mu: &mut f64,
+) -> Option<Termination> {
+    for _ in 0..MOST_REJECTIONS {
+        if monitor.stopped() {
+            return Some(Termination::Interrupted);
+        }
+        if system.solve(*mu, settings.damping) {
+            let size = length(&outcome.theta);
+            if length(&system.step) <= settings.step_tolerance * (size + settings.step_tolerance) {
+                return Some(Termination::SmallStep);
+            }
+            for ((trial, theta), step) in system
+                .trial
+                .iter_mut()
+                .zip(&outcome.theta)
+                .zip(&system.step)
+            {
+                *trial = theta + step;
+            }
+            if let Some(cost) = problem.cost(&system.trial).filter(|&c| c < outcome.cost) {
+                outcome.cost = cost;
+                outcome.theta.copy_from_slice(&system.trial);
+                *mu = (*mu / 5.0).max(LEAST_MU);
+                return None;
+            }
+        }
+        *mu *= 4.0;
+    }
+    Some(Termination::Stalled)
+}
+
+fn length(values: &[f64]) -> f64 {
+    values.iter().map(|v| v * v).sum::<f64>().sqrt()
+}
+
+/// The damped normal equations with all buffers of an iteration.
+struct System {
+    size: usize,
+    jtj: Vec<f64>,
+    jte: Vec<f64>,
+    factor: Vec<f64>,
+    step: Vec<f64>,
+    trial: Vec<f64>,
+}
+
+impl System {
+    fn new(size: usize) -> Self {
+        Self {
+            size,
+            jtj: vec![0.0; size * size],
+            jte: vec![0.0; size],
+            factor: vec![0.0; size * size],
+            step: vec![0.0; size],
+            trial: vec![0.0; size],
+        }
+    }
+
+    fn largest_cosine(&self, cost: f64) -> f64 {
+        let residual = (2.0 * cost).sqrt();
+        let cosine = |i: usize| {
+            let column = self.jtj[i * self.size + i].sqrt();
+            if column > 0.0 {
+                self.jte[i].abs() / (column * residual)
+            } else {
+                0.0
+            }
+        };
+        (0..self.size).map(cosine).fold(0.0, f64::max)
+    }
+
+    /// Solves for the step by Cholesky; false where the damped matrix is not positive definite.
+    fn solve(&mut self, mu: f64, damping: Damping) -> bool {
+        let n = self.size;
+        self.factor.copy_from_slice(&self.jtj);
+        for i in 0..n {
+            let diagonal = &mut self.factor[i * n + i];
+            *diagonal += mu
+                * match damping {
+                    Damping::Identity => 1.0,
+                    Damping::Diagonal => diagonal.max(f64::MIN_POSITIVE),
+                };
+        }
+        self.step.copy_from_slice(&self.jte);
+        cholesky(&mut self.factor, n) && {
+            substitute(&self.factor, n, &mut self.step);
+            true
+        }
+    }
+}
+
+/// Replaces the lower triangle of `a` (row by row) by its Cholesky factor; false where `a` is not positive definite.
+pub(crate) fn cholesky(a: &mut [f64], n: usize) -> bool {
+    for i in 0..n {
+        let (above, row) = a.split_at_mut(i * n);
+        for j in 0..i {
+            let other = &above[j * n..j * n + j + 1];
+            let dot: f64 = row[..j].iter().zip(other).map(|(x, y)| x * y).sum();
+            row[j] = (row[j] - dot) / other[j];
+        }
+        let pivot = row[i] - row[..i].iter().map(|x| x * x).sum::<f64>();
+        // Written so that NaN is refused too.
+        if !(pivot > 0.0 && pivot.is_finite()) {
+            return false;
+        }
+        row[i] = pivot.sqrt();
+    }
+    true
+}
+
+/// Solves `L L' x = b` in place.
+pub(crate) fn substitute(factor: &[f64], n: usize, x: &mut [f64]) {
+    for i in 0..n {
+        let dot: f64 = factor[i * n..i * n + i]
+            .iter()
+            .zip(&*x)
+            .map(|(l, x)| l * x)
+            .sum();
+        x[i] = (x[i] - dot) / factor[i * n + i];
+    }
+    for i in (0..n).rev() {
+        x[i] /= factor[i * n + i];
+        let value = x[i];
+        for (x, l) in x[..i].iter_mut().zip(&factor[i * n..i * n + i]) {
+            *x -= l * value;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Rosenbrock's valley as residuals `10 (x1 - x0^2)` and `1 - x0` (More, Garbow and Hillstrom 1981, problem 1).
+    struct Valley;
+
+    impl Problem for Valley {
+        fn parameters(&self) -> usize {
+            2
+        }
+
+        fn cost(&mut self, t: &[f64]) -> Option<f64> {
+            let e = [-10.0 * (t[1] - t[0] * t[0]), t[0] - 1.0];
+            Some(0.5 * (e[0] * e[0] + e[1] * e[1]))
+        }
+
+        fn normal_equations(&mut self, t: &[f64], jtj: &mut [f64], jte: &mut [f64]) {
+            let e = [-10.0 * (t[1] - t[0] * t[0]), 1.0 - t[0]];
+            let j = [[-20.0 * t[0], 10.0], [1.0, 0.0]];
+            for a in 0..2 {
+                jte[a] = j[0][a] * e[0] + j[1][a] * e[1];
+                for b in 0..2 {
+                    jtj[a * 2 + b] = j[0][a] * j[0][b] + j[1][a] * j[1][b];
+                }
+            }
+        }
+    }
+
+    fn run(damping: Damping, max_iterations: usize) -> Outcome {
+        let settings = Settings {
+            damping,
+            max_iterations,
+            ..Settings::default()
+        };
+        minimize(
+            &mut Valley,
+            vec![-1.2, 1.0],
+            &settings,
+            &Monitor::default(),
+            |_, _| {},
+        )
+    }
+
+    #[test]
+    fn finds_the_minimum_and_names_its_end() {
+        for damping in [Damping::Identity, Damping::Diagonal] {
+            let outcome = run(damping, 200);
+            assert!((outcome.theta[0] - 1.0).abs() < 1e-8, "{outcome:?}");
+            assert!(outcome.trace.windows(2).all(|w| w[1] < w[0]));
+            assert_ne!(outcome.termination, Termination::MaxIterations);
+        }
+        assert_eq!(
+            run(Damping::Identity, 2).termination,
+            Termination::MaxIterations
+        );
+    }
+
+    #[test]
+    fn names_a_start_without_a_cost_and_a_stop() {
+        let settings = Settings::default();
+        let start = vec![f64::NAN, 0.0];
+        let bad = minimize(
+            &mut Valley,
+            start,
+            &settings,
+            &Monitor::default(),
+            |_, _| {},
+        );
+        assert_eq!(bad.termination, Termination::NotFinite);
+        let monitor = Monitor::default();
+        monitor.request_stop();
+        let stopped = minimize(&mut Valley, vec![0.0; 2], &settings, &monitor, |_, _| {});
+        assert_eq!(stopped.termination, Termination::Interrupted);
+        assert_eq!(stopped.theta, [0.0; 2]);
+    }
+
+    #[test]
+    fn factors_and_solves() {
+        let mut a = vec![4.0, 0.0, 2.0, 3.0];
+        assert!(cholesky(&mut a, 2));
+        let mut x = vec![10.0, 8.0];
+        substitute(&a, 2, &mut x);
+        assert!((x[0] - 1.75).abs() < 1e-14 && (x[1] - 1.5).abs() < 1e-14);
+        assert!(!cholesky(&mut [1.0, 0.0, 2.0, 1.0], 2));
+    }
+}

@@ -1,1 +1,260 @@
-//! Linear output-error models: free-run least squares with offset and stable poles.
+//! Linear output error: the free run fitted by Levenberg-Marquardt with exact sensitivities and stable poles.
+
+mod problem;
+mod starts;
+
+use problem::OutputError;
+
+use crate::linear::LinearModel;
+use crate::lm::{self, Outcome, Settings, Termination};
+use crate::{Error, Monitor, Record, Result, arx};
+
+/// How many of the candidates are refined.
+const REFINED: usize = 8;
+/// Iterations after which the refined candidates are compared and the best one goes on alone.
+const HEAT: usize = 15;
+
+/// A fitted linear model with the story of its fit.
+#[derive(Clone, Debug)]
+pub struct LinearFit {
+    /// The model.
+    pub model: LinearModel,
+    /// `1/(2N) sum e^2` in free run, in the output's unit squared.
+    pub cost: f64,
+    /// Iterations over all refined starts.
+    pub iterations: usize,
+    /// How the best one ended.
+    pub termination: Termination,
+    /// Cost of the best one at its start and after each accepted step.
+    pub trace: Vec<f64>,
+    /// Past outputs per experiment, newest first, as estimated with the model.
+    pub initial_states: Vec<Vec<f64>>,
+}
+
+/// Fits `LinearModel` in free run over all experiments, with an initial state per experiment.
+///
+/// Least squares is biased by measurement noise, so its model is one candidate among others: instrumental-variable
+/// iterations (SRIV, Young 1976; Steiglitz and McBride 1965) and fixed sets of real and complex poles over the whole
+/// range of time constants, each with its best numerator. The best free runs are refined; steps that would move a pole
+/// out of the unit circle are rejected (Schur-Cohn test), so every accepted step is stable.
+///
+/// # Errors
+/// As [`arx::fit`] for unusable data and settings; `ErrorKind::Fit` where no stable model has a finite free run.
+pub fn fit(
+    records: &[Record],
+    na: usize,
+    nb: usize,
+    nk: usize,
+    offset: bool,
+    max_iterations: usize,
+    monitor: &Monitor,
+) -> Result<LinearFit> {
+    let lags = arx::check(records, na, nb, nk)?;
+    let mut problem = OutputError::new(records, lags, offset, monitor)?;
+    monitor.set_total((max_iterations + (REFINED - 1) * HEAT) as u64);
+    let candidates = starts::candidates(&mut problem, records, monitor);
+    let heats = refined(&mut problem, candidates, max_iterations, monitor);
+    let spent: usize = heats.iter().map(|o| o.iterations).sum();
+    let best = heats
+        .into_iter()
+        .min_by(|x, y| x.cost.total_cmp(&y.cost))
+        .ok_or_else(no_model)?;
+    let left = max_iterations.saturating_sub(best.iterations);
+    let goes_on = best.termination == Termination::MaxIterations && left > 0;
+    let (best, spent) = if goes_on {
+        let rest = lm::minimize(
+            &mut problem,
+            best.theta.clone(),
+            &settings(left),
+            monitor,
+            |_, _| {},
+        );
+        let spent = spent + rest.iterations;
+        (joined(best, rest), spent)
+    } else {
+        (best, spent)
+    };
+    Ok(LinearFit {
+        model: problem.model(&best.theta)?,
+        cost: best.cost,
+        iterations: spent,
+        termination: best.termination,
+        trace: best.trace,
+        initial_states: problem.initial_states(&best.theta),
+    })
+}
+
+/// A few iterations from each of the best candidates; the best candidate as it is where a stop leaves no time for that.
+fn refined(
+    problem: &mut OutputError,
+    candidates: Vec<(f64, Vec<f64>)>,
+    max_iterations: usize,
+    monitor: &Monitor,
+) -> Vec<Outcome> {
+    let heat = settings(max_iterations.min(HEAT));
+    let mut outcomes = Vec::with_capacity(REFINED);
+    for (cost, theta) in candidates.into_iter().take(REFINED) {
+        if !monitor.stopped() {
+            outcomes.push(lm::minimize(problem, theta, &heat, monitor, |_, _| {}));
+        } else if outcomes.is_empty() {
+            outcomes.push(Outcome {
+                theta,
+                cost,
+                iterations: 0,
+                termination: Termination::Interrupted,
+                trace: vec![cost],
+            });
+        }
+    }
+    outcomes.retain(|o| o.cost.is_finite());
+    outcomes
+}
+
+fn settings(max_iterations: usize) -> Settings {
+    Settings {
+        max_iterations,
+        ..Settings::default()
+    }
+}
+
+fn joined(first: Outcome, rest: Outcome) -> Outcome {
+    if rest.cost > first.cost {
+        return Outcome {
+            termination: rest.termination,
+            ..first
+        };
+    }
+    let mut trace = first.trace;
+    trace.extend(rest.trace.iter().skip(1));
+    Outcome { trace, ..rest }
+}
+
+fn no_model() -> Error {
+    Error::fit(
+        "expected a stable model with a finite free run, found none; check units and signs, raise na, or record with more excitation",
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lagged::Lagged;
+    use crate::random::Random;
+
+    fn chirp(samples: usize, scale: f64) -> Vec<f64> {
+        let value = |k: usize| {
+            let t = k as f64 / samples as f64;
+            scale * (1.0 - (40.0 * t + 500.0 * t * t).cos())
+        };
+        (0..samples).map(value).collect()
+    }
+
+    fn noisy(y: &[f64], size: f64, seed: u64) -> Vec<f64> {
+        let mut random = Random::new(seed);
+        y.iter().map(|y| y + size * random.normal()).collect()
+    }
+
+    fn check_reaches_noise(truth: &LinearModel, u: &[f64], size: f64) -> LinearFit {
+        let lags = truth.lags();
+        let clean = truth.simulate(u, 1, &vec![0.0; lags.na]).unwrap();
+        let y = noisy(&clean, size, 5);
+        let records = [Record::new(u, 1, &y).unwrap()];
+        let fit = fit(
+            &records,
+            lags.na,
+            lags.nb,
+            lags.nk,
+            true,
+            100,
+            &Monitor::default(),
+        )
+        .unwrap();
+        assert!(fit.model.is_stable());
+        assert!(fit.trace.windows(2).all(|w| w[1] < w[0]), "{:?}", fit.trace);
+        let run = fit.model.simulate(u, 1, &fit.initial_states[0]).unwrap();
+        let error = clean
+            .iter()
+            .zip(&run)
+            .map(|(c, r)| (c - r).powi(2))
+            .sum::<f64>();
+        let rms = (error / u.len() as f64).sqrt();
+        assert!(rms < 0.1 * size, "{rms} against noise {size}");
+        fit
+    }
+
+    #[test]
+    fn reaches_the_noise_where_least_squares_is_far_off() {
+        // 490 / ((.252 s + 1)(.0074 s + 1)) sampled at 1 ms, with the noise of a counted encoder.
+        let truth = LinearModel::new(
+            vec![-1.86963746, 0.87013806],
+            vec![0.1255, 0.1198],
+            1,
+            1,
+            0.0,
+        )
+        .unwrap();
+        let fit = check_reaches_noise(&truth, &chirp(8000, 2.0), 15.0);
+        assert!((fit.model.dc_gain()[0] / truth.dc_gain()[0] - 1.0).abs() < 0.02);
+    }
+
+    #[test]
+    fn finds_lightly_damped_complex_poles() {
+        let truth = LinearModel::new(vec![-1.9, 0.95], vec![0.02, 0.01], 1, 1, 0.1).unwrap();
+        check_reaches_noise(&truth, &chirp(2000, 3.0), 0.2);
+    }
+
+    #[test]
+    fn keeps_a_state_per_experiment() {
+        let truth = LinearModel::new(vec![-1.7, 0.72], vec![0.05, 0.03], 1, 1, 0.2).unwrap();
+        let u = chirp(500, 1.0);
+        let y1 = truth.simulate(&u, 1, &[4.0, 4.0]).unwrap();
+        let y2 = truth.simulate(&u[..300], 1, &[-2.0, -1.0]).unwrap();
+        let records = [
+            Record::new(&u, 1, &y1).unwrap(),
+            Record::new(&u[..300], 1, &y2).unwrap(),
+        ];
+        let fit = fit(&records, 2, 2, 1, true, 100, &Monitor::default()).unwrap();
+        assert!(fit.cost < 1e-12, "{}", fit.cost);
+        assert!(
+            (fit.initial_states[1][0] + 2.0).abs() < 1e-3,
+            "{:?}",
+            fit.initial_states
+        );
+    }
+
+    #[test]
+    fn stays_stable_on_data_of_an_unstable_system() {
+        let u = chirp(60, 1.0);
+        let unstable = LinearModel::new(vec![-1.1], vec![1.0], 1, 1, 0.0).unwrap();
+        let y = unstable.simulate(&u, 1, &[0.0]).unwrap();
+        let fit = fit(
+            &[Record::new(&u, 1, &y).unwrap()],
+            1,
+            1,
+            1,
+            true,
+            100,
+            &Monitor::default(),
+        )
+        .unwrap();
+        assert!(fit.model.is_stable());
+    }
+
+    #[test]
+    fn returns_what_it_has_when_stopped_and_refuses_short_records() {
+        let u = chirp(500, 1.0);
+        let y = noisy(&u, 0.1, 1);
+        let records = [Record::new(&u, 1, &y).unwrap()];
+        let monitor = Monitor::default();
+        monitor.request_stop();
+        let stopped = fit(&records, 2, 2, 1, true, 100, &monitor);
+        assert_eq!(stopped.unwrap_err().kind, crate::ErrorKind::Fit);
+        let short = [Record::new(&u[..6], 1, &y[..6]).unwrap()];
+        assert!(
+            fit(&short, 2, 2, 1, true, 100, &Monitor::default())
+                .unwrap_err()
+                .message
+                .contains("longer")
+        );
+    }
+}

@@ -1,0 +1,183 @@
+//! The free run of a linear model as a least-squares problem.
+
+use crate::gram::Gram;
+use crate::lagged::{Lagged, Lags, push_past};
+use crate::linear::{LinearModel, is_stable};
+use crate::lm::{Problem, cholesky, substitute};
+use crate::{Error, Monitor, Record, Result};
+
+/// Nearest that a reflection coefficient may come to the unit circle.
+const MARGIN: f64 = 1e-9;
+/// Samples between two looks at the monitor.
+const LOOK: usize = 4096;
+
+/// Parameters: a (na), b (inputs x nb), the offset where there is one, then the past outputs of each experiment.
+pub(super) struct OutputError<'a> {
+    pub lags: Lags,
+    records: &'a [Record<'a>],
+    monitor: &'a Monitor,
+    offset: bool,
+    samples: f64,
+    runs: Vec<Vec<f64>>,
+    gram: Gram,
+    phi: Vec<f64>,
+}
+
+impl<'a> OutputError<'a> {
+    pub fn new(
+        records: &'a [Record<'a>],
+        lags: Lags,
+        offset: bool,
+        monitor: &'a Monitor,
+    ) -> Result<Self> {
+        let samples: usize = records.iter().map(Record::len).sum();
+        let shared = lags.regressors() + usize::from(offset);
+        let parameters = shared + lags.na * records.len();
+        if samples <= parameters {
+            return Err(Error::data(format!(
+                "expected more than {parameters} samples for as many parameters and initial states, got {samples}; record longer or lower na and nb"
+            )));
+        }
+        Ok(Self {
+            lags,
+            records,
+            monitor,
+            offset,
+            samples: samples as f64,
+            runs: records.iter().map(|r| vec![0.0; r.len()]).collect(),
+            gram: Gram::new(shared + lags.na + 1, lags.na),
+            phi: vec![0.0; lags.regressors()],
+        })
+    }
+
+    /// Parameters that all experiments share.
+    pub fn shared(&self) -> usize {
+        self.lags.regressors() + usize::from(self.offset)
+    }
+
+    pub fn model(&self, theta: &[f64]) -> Result<LinearModel> {
+        let (na, n_phi) = (self.lags.na, self.lags.regressors());
+        let offset = if self.offset { theta[n_phi] } else { 0.0 };
+        LinearModel::new(
+            theta[..na].to_vec(),
+            theta[na..n_phi].to_vec(),
+            self.lags.channels,
+            self.lags.nk,
+            offset,
+        )
+    }
+
+    pub fn initial_states(&self, theta: &[f64]) -> Vec<Vec<f64>> {
+        theta[self.shared()..]
+            .chunks_exact(self.lags.na)
+            .map(<[f64]>::to_vec)
+            .collect()
+    }
+
+    /// The best parameters with these poles: everything but `a` enters the free run linearly.
+    pub fn with_poles(&mut self, a: &[f64]) -> Option<(f64, Vec<f64>)> {
+        let (na, n) = (self.lags.na, self.parameters());
+        let mut theta = vec![0.0; n];
+        theta[..na].copy_from_slice(a);
+        self.cost(&theta)?;
+        let (mut jtj, mut jte) = (vec![0.0; n * n], vec![0.0; n]);
+        self.normal_equations(&theta, &mut jtj, &mut jte);
+        let linear = n - na;
+        let mut normal = vec![0.0; linear * linear];
+        for i in 0..linear {
+            normal[i * linear..][..linear].copy_from_slice(&jtj[(i + na) * n + na..][..linear]);
+            // Initial states that have decayed within the first samples leave no trace in the output.
+            normal[i * linear + i] = normal[i * linear + i] * (1.0 + 1e-12) + f64::MIN_POSITIVE;
+        }
+        if !cholesky(&mut normal, linear) {
+            return None;
+        }
+        substitute(&normal, linear, &mut jte[na..]);
+        theta[na..].copy_from_slice(&jte[na..]);
+        Some((self.cost(&theta)?, theta))
+    }
+
+    fn simulate(&mut self, theta: &[f64], model: &LinearModel, experiment: usize) -> Option<f64> {
+        let (lags, record) = (self.lags, &self.records[experiment]);
+        let state = &theta[self.shared() + experiment * lags.na..][..lags.na];
+        self.phi[..lags.na].copy_from_slice(state);
+        let mut sum = 0.0;
+        for k in 0..record.len() {
+            if k % LOOK == 0 && self.monitor.stopped() {
+                return None;
+            }
+            lags.write_inputs(record.u, k, &mut self.phi[lags.na..]);
+            let y = model.output(&self.phi);
+            push_past(&mut self.phi[..lags.na], y);
+            self.runs[experiment][k] = y;
+            sum += (record.y[k] - y) * (record.y[k] - y);
+        }
+        Some(sum)
+    }
+
+    fn sensitivities(&mut self, theta: &[f64], experiment: usize) {
+        let (lags, record, run) = (self.lags, &self.records[experiment], &self.runs[experiment]);
+        let (na, n_phi, shared) = (
+            lags.na,
+            lags.regressors(),
+            lags.regressors() + usize::from(self.offset),
+        );
+        let gains: Vec<f64> = theta[..na].iter().map(|a| -a).collect();
+        self.phi[..na].copy_from_slice(&theta[shared + experiment * na..][..na]);
+        self.gram.clear();
+        for i in 0..na {
+            self.gram.past_mut(i + 1)[shared + i] = 1.0;
+        }
+        for (k, &y) in run.iter().enumerate() {
+            if k % LOOK == 0 && self.monitor.stopped() {
+                return;
+            }
+            lags.write_inputs(record.u, k, &mut self.phi[na..]);
+            let phi = &self.phi;
+            self.gram.push(&gains, shared + na, record.y[k] - y, |row| {
+                for (value, y) in row[..na].iter_mut().zip(&phi[..na]) {
+                    *value = -y;
+                }
+                row[na..n_phi].copy_from_slice(&phi[na..]);
+                row[n_phi..].fill(0.0);
+                row[n_phi..shared].fill(1.0);
+            });
+            push_past(&mut self.phi[..na], y);
+        }
+    }
+}
+
+impl Problem for OutputError<'_> {
+    fn parameters(&self) -> usize {
+        self.shared() + self.lags.na * self.records.len()
+    }
+
+    fn cost(&mut self, theta: &[f64]) -> Option<f64> {
+        if !is_stable(&theta[..self.lags.na], MARGIN) {
+            return None;
+        }
+        let model = self.model(theta).ok()?;
+        let mut sum = 0.0;
+        for experiment in 0..self.records.len() {
+            sum += self.simulate(theta, &model, experiment)?;
+        }
+        Some(0.5 * sum / self.samples).filter(|c| c.is_finite())
+    }
+
+    fn normal_equations(&mut self, theta: &[f64], jtj: &mut [f64], jte: &mut [f64]) {
+        let (shared, na, n) = (self.shared(), self.lags.na, self.parameters());
+        jtj.fill(0.0);
+        jte.fill(0.0);
+        for experiment in 0..self.records.len() {
+            self.sensitivities(theta, experiment);
+            let place = |i: usize| if i < shared { i } else { i + experiment * na };
+            let (sums, width) = self.gram.finish();
+            for i in 0..shared + na {
+                jte[place(i)] += sums[(shared + na) * width + i] / self.samples;
+                for j in 0..=i {
+                    jtj[place(i) * n + place(j)] += sums[i * width + j] / self.samples;
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,192 @@
+//! Bindings of the linear model and its fits.
+
+use numpy::{PyArray1, PyArray2};
+use pyo3::prelude::*;
+use sewfast_core::lagged::Lagged;
+use sewfast_core::{arx, linear, oe};
+
+use super::{Rows, Values};
+use crate::arrays::{Experiments, array1, array2, raise, records, rows, slice};
+use crate::watch::watched;
+
+pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<LinearModel>()?;
+    module.add_class::<LinearFit>()?;
+    module.add_function(wrap_pyfunction!(fit_arx, module)?)?;
+    module.add_function(wrap_pyfunction!(fit_oe, module)?)
+}
+
+/// A linear difference equation with offset.
+#[pyclass(frozen, module = "sewfast._core")]
+pub struct LinearModel {
+    /// The model itself.
+    pub inner: linear::LinearModel,
+}
+
+#[pymethods]
+impl LinearModel {
+    #[new]
+    fn new(py: Python<'_>, a: Values<'_>, b: Rows<'_>, nk: usize, offset: f64) -> PyResult<Self> {
+        let channels = b.as_array().nrows();
+        let (b, _) = rows(&b, "b")?;
+        linear::LinearModel::new(slice(&a, "a")?.to_vec(), b.to_vec(), channels, nk, offset)
+            .map(|inner| Self { inner })
+            .map_err(|e| raise(py, e))
+    }
+
+    #[getter]
+    fn a<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array1(py, self.inner.a().to_vec())
+    }
+
+    #[getter]
+    fn b<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        array2(py, self.inner.b().to_vec(), self.inner.lags().nb)
+    }
+
+    #[getter]
+    fn nk(&self) -> usize {
+        self.inner.lags().nk
+    }
+
+    #[getter]
+    fn offset(&self) -> f64 {
+        self.inner.offset()
+    }
+
+    #[getter]
+    fn na(&self) -> usize {
+        self.inner.lags().na
+    }
+
+    #[getter]
+    fn is_stable(&self) -> bool {
+        self.inner.is_stable()
+    }
+
+    fn poles<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let pairs = self
+            .inner
+            .poles()
+            .iter()
+            .flat_map(|p| [p.re, p.im])
+            .collect();
+        array2(py, pairs, 2)
+    }
+
+    fn dc_gain<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array1(py, self.inner.dc_gain())
+    }
+
+    fn simulate<'py>(
+        &self,
+        py: Python<'py>,
+        u: Rows<'py>,
+        y_past: Values<'py>,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        Ok(array1(py, super::simulate(py, &self.inner, &u, &y_past)?))
+    }
+
+    fn predict<'py>(
+        &self,
+        py: Python<'py>,
+        u: Rows<'py>,
+        y: Values<'py>,
+        y_past: Values<'py>,
+        horizon: usize,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        let run = super::predict(py, &self.inner, &u, &y, &y_past, horizon)?;
+        Ok(array1(py, run))
+    }
+
+    fn estimate_initial_state<'py>(
+        &self,
+        py: Python<'py>,
+        u: Rows<'py>,
+        y: Values<'py>,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        Ok(array1(py, super::initial_state(py, &self.inner, &u, &y)?))
+    }
+}
+
+/// A fitted linear model with the story of its fit.
+#[pyclass(frozen, module = "sewfast._core")]
+pub struct LinearFit {
+    inner: oe::LinearFit,
+}
+
+#[pymethods]
+impl LinearFit {
+    #[getter]
+    fn model(&self) -> LinearModel {
+        LinearModel {
+            inner: self.inner.model.clone(),
+        }
+    }
+
+    #[getter]
+    fn cost(&self) -> f64 {
+        self.inner.cost
+    }
+
+    #[getter]
+    fn iterations(&self) -> usize {
+        self.inner.iterations
+    }
+
+    #[getter]
+    fn termination(&self) -> &'static str {
+        self.inner.termination.name()
+    }
+
+    #[getter]
+    fn remedy(&self) -> &'static str {
+        self.inner.termination.remedy()
+    }
+
+    #[getter]
+    fn trace<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array1(py, self.inner.trace.clone())
+    }
+
+    #[getter]
+    fn initial_states<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let states = self.inner.initial_states.concat();
+        array2(py, states, self.inner.model.lags().na)
+    }
+}
+
+#[pyfunction]
+#[pyo3(signature = (experiments, *, na, nb, nk, offset))]
+fn fit_arx(
+    py: Python<'_>,
+    experiments: Experiments<'_>,
+    na: usize,
+    nb: usize,
+    nk: usize,
+    offset: bool,
+) -> PyResult<LinearModel> {
+    let records = records(py, &experiments)?;
+    let inner = super::released(py, || arx::fit(&records, na, nb, nk, offset))?;
+    Ok(LinearModel { inner })
+}
+
+#[pyfunction]
+#[pyo3(signature = (experiments, *, na, nb, nk, offset = true, max_iterations = 100, progress = None))]
+#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+fn fit_oe(
+    py: Python<'_>,
+    experiments: Experiments<'_>,
+    na: usize,
+    nb: usize,
+    nk: usize,
+    offset: bool,
+    max_iterations: usize,
+    progress: Option<Bound<'_, PyAny>>,
+) -> PyResult<LinearFit> {
+    let records = records(py, &experiments)?;
+    let inner = watched(py, progress.as_ref(), |monitor| {
+        oe::fit(&records, na, nb, nk, offset, max_iterations, monitor)
+    })?;
+    Ok(LinearFit { inner })
+}
