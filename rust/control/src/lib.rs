@@ -1,9 +1,33 @@
 //! Control arithmetic that runs unchanged on a microcontroller, in simulation and against the virtual machine.
 //!
 //! No standard library, no allocation, no dependency.
+//!
+//! ```
+//! use sewfast_control::{Controller, Settings, Standard};
+//!
+//! let gains = Standard { kp: 0.02, ti: 0.25, td: 0.004 };
+//! let settings = Settings { alpha: 0.4, beta: 0.2, u_min: -20.0, u_max: 20.0, ..Settings::new(gains, 1e-3) };
+//! let mut controller = Controller::new(settings, 8, 0.0)?;
+//! let u = controller.step(100.0, 0.0);
+//! let expected: f64 = 0.02 * 60.0 + 0.02 * 100.0 * 1e-3 / 0.25;
+//! assert!((u - expected).abs() < 1e-12);
+//! # Ok::<(), sewfast_control::Refused>(())
+//! ```
 #![no_std]
 
+#[cfg(test)]
+extern crate std;
+
+pub mod controller;
 pub mod filter;
 pub mod gains;
 pub mod pid;
 pub mod real;
+pub mod refused;
+
+pub use controller::Controller;
+pub use filter::{CAPACITY, Feedback};
+pub use gains::{Parallel, PerSample, Standard};
+pub use pid::{Pid, Settings};
+pub use real::Real;
+pub use refused::Refused;
