@@ -1,0 +1,206 @@
+"""The virtual sewing machine: what an experiment is recorded on where there is no machine."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ._core import Machine
+from .errors import DataError, SettingError
+
+__all__ = ["MachineRun", "VirtualMachine"]
+
+_NAME = re.compile(r"virtual(?::(\d+))?")
+_LARGEST_SEED = 2**64 - 1
+
+
+@dataclass(frozen=True, eq=False)
+class MachineRun:
+    """What a machine did under a command, at the instants at which each sample starts to act.
+
+    Attributes
+    ----------
+    counts
+        Encoder counts since the reset, (N,); whole numbers unless quantisation is off.
+    speed_rpm
+        True speed [RPM], (N,). An experiment cannot see it; it is there for tests and scores.
+    """
+
+    counts: NDArray[np.float64]
+    speed_rpm: NDArray[np.float64]
+
+
+class VirtualMachine:
+    """A computed sewing machine: inverter, motor, crank and encoder, sampled every millisecond.
+
+    Equations, parameters and their spread are in docs/CONVENTIONS.md.
+
+    Parameters
+    ----------
+    seed
+        None is the nominal machine; a whole number is another machine of the same type.
+    u_limit
+        Largest command to either side [V].
+    angle_dependence
+        Whether load, inertia and torque vary over the turn of the crank.
+    quantisation
+        Whether the encoder gives whole counts. Without it counts are the exact position.
+    parameters
+        Values by name that replace those of the machine chosen so far.
+
+    Raises
+    ------
+    SettingError
+        For a seed, a parameter's name or a value that cannot be used.
+    """
+
+    Ts = 0.001
+    """Sample time [s]."""
+
+    def __init__(
+        self,
+        seed: int | None = None,
+        *,
+        u_limit: float = 20.0,
+        angle_dependence: bool = True,
+        quantisation: bool = True,
+        parameters: Mapping[str, float] | None = None,
+    ) -> None:
+        values = {} if seed is None else Machine.variant_parameters(_checked_seed(seed))
+        values["u_limit"] = u_limit
+        values["angle_dependence"] = float(angle_dependence)
+        values["quantisation"] = float(quantisation)
+        values.update(parameters or {})
+        self._core = Machine(_checked_values(values))
+        self._name = "virtual" if seed is None else f"virtual:{int(seed)}"
+
+    @classmethod
+    def from_name(cls, name: str) -> VirtualMachine:
+        """The machine of a command line: ``virtual``, or ``virtual:SEED`` for another of the type.
+
+        Raises
+        ------
+        SettingError
+            For any other name.
+        """
+        match = _NAME.fullmatch(name)
+        if match is None:
+            raise SettingError(
+                f"expected 'virtual' or 'virtual:SEED' with a whole number, got {name!r}; "
+                "for example 'virtual:1'"
+            )
+        return cls(None if match[1] is None else int(match[1]))
+
+    @property
+    def name(self) -> str:
+        """``virtual`` or ``virtual:SEED``."""
+        return self._name
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Every parameter by name; :meth:`units` has their units."""
+        return self._core.parameters
+
+    @staticmethod
+    def units() -> dict[str, str]:
+        """The unit of every parameter by name; ``1`` for a pure number, ``switch`` for 0 or 1."""
+        return Machine.parameter_units()
+
+    @property
+    def counts_per_rev(self) -> float:
+        """Encoder counts per turn of the crank."""
+        return self._core.parameters["counts_per_rev"]
+
+    @property
+    def counts(self) -> float:
+        """The encoder's counter now."""
+        return self._core.counts
+
+    @property
+    def speed_rpm(self) -> float:
+        """The true speed now [RPM]."""
+        return self._core.speed_rpm
+
+    @property
+    def current(self) -> float:
+        """The motor current now [A]."""
+        return self._core.current
+
+    def reset(self) -> None:
+        """Back to rest at the initial crank angle, counter at zero."""
+        self._core.reset()
+
+    def step(self, u: float) -> tuple[float, float]:
+        """Hold the command ``u`` [V] for one sample; counts and true speed [RPM] at its end.
+
+        Raises
+        ------
+        DataError
+            Where ``u`` is not finite.
+        """
+        return self._core.step(u)
+
+    def run(self, u: ArrayLike) -> MachineRun:
+        """Hold each command in turn for one sample, going on from the present state.
+
+        Parameters
+        ----------
+        u
+            Commands [V], (N,). Beyond ``u_limit`` they are clipped, as the drive does.
+
+        Raises
+        ------
+        DataError
+            Where ``u`` is not a one-dimensional array of finite numbers.
+        """
+        counts, speed = self._core.run(_commands(u))
+        return MachineRun(counts, speed)
+
+    def linearise(self, speed_rpm: float = 1500.0) -> dict[str, float]:
+        """Small signals at a steady speed: command [V], current [A], gain [RPM/V], T1, T2 [s].
+
+        Raises
+        ------
+        SettingError
+            At standstill and beyond the drive's limits.
+        """
+        return self._core.linearise(speed_rpm)
+
+    def __repr__(self) -> str:
+        return f"VirtualMachine.from_name({self._name!r})"
+
+
+def _checked_seed(seed: int) -> int:
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
+        raise SettingError(f"expected a whole number or None as seed, got {seed!r}")
+    if not 0 <= seed <= _LARGEST_SEED:
+        raise SettingError(f"expected a seed from 0 to {_LARGEST_SEED}, got {seed}")
+    return int(seed)
+
+
+def _checked_values(values: Mapping[str, float]) -> dict[str, float]:
+    checked = {}
+    for name, value in values.items():
+        try:
+            checked[name] = float(value)
+        except (TypeError, ValueError):
+            raise SettingError(
+                f"expected a number for machine parameter {name!r}, got {value!r}"
+            ) from None
+    return checked
+
+
+def _commands(u: ArrayLike) -> NDArray[np.float64]:
+    try:
+        commands = np.ascontiguousarray(u, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise DataError(f"expected numbers as commands, got {type(u).__name__}") from None
+    if np.ndim(u) != 1:
+        raise DataError(
+            f"expected commands of shape (N,), got shape {np.shape(u)}; use u[:, 0] for one column"
+        )
+    return commands

@@ -1,1 +1,0 @@
-//! The virtual sewing machine: a physical model of drive, crank and load.

@@ -1,0 +1,304 @@
+//! The virtual sewing machine: a physical model of drive, crank and load.
+//!
+//! Equations, parameters and derived figures are in `docs/CONVENTIONS.md`; the equations also in [`dynamics`].
+
+mod dynamics;
+mod linearisation;
+mod parameters;
+mod trigonometry;
+
+pub use linearisation::Linearisation;
+pub use parameters::{Entry, Parameters, Spread};
+
+use crate::closed_loop::Plant;
+use crate::encoder::Encoder;
+use crate::{Error, Result};
+use dynamics::{Dynamics, Regime, State};
+use std::f64::consts::TAU;
+
+/// The sample time of the machine [s].
+pub const SAMPLE_TIME: f64 = 1e-3;
+
+/// Integration steps per sample.
+const STEPS: u32 = 4;
+
+/// Parts into which a step is cut that passes an event or the narrow zone of the current's sign.
+const PIECES: u32 = 16;
+
+/// A current that changes its sign by more than this many ripple widths in a step has its step cut.
+const RIPPLES_PER_STEP: f64 = 1.0;
+
+/// Changes of regime after which the rest of a piece is integrated as it is.
+const EVENTS_PER_PIECE: u32 = 8;
+
+const RPM: f64 = 60.0 / TAU;
+
+/// The virtual sewing machine, stepped sample by sample.
+///
+/// ```
+/// use sewfast_core::machine::{Machine, Parameters};
+/// let mut machine = Machine::new(Parameters::default())?;
+/// for _ in 0..2000 {
+///     machine.advance(3.0);
+/// }
+/// assert!((machine.speed_rpm() - 1200.0).abs() < 60.0);
+/// # Ok::<(), sewfast_core::Error>(())
+/// ```
+#[derive(Clone, Debug)]
+pub struct Machine {
+    parameters: Parameters,
+    dynamics: Dynamics,
+    encoder: Encoder,
+    steps: u32,
+    state: State,
+    turns: f64,
+    regime: Regime,
+    voltage: f64,
+}
+
+impl Machine {
+    /// A machine at rest.
+    ///
+    /// # Errors
+    /// As [`Parameters::validated`].
+    pub fn new(parameters: Parameters) -> Result<Self> {
+        let parameters = parameters.validated()?;
+        let counts_per_unit = parameters.counts_per_rev / 60.0;
+        let mut machine = Self {
+            parameters,
+            dynamics: Dynamics::new(&parameters),
+            encoder: match parameters.quantisation != 0.0 {
+                true => Encoder::new(counts_per_unit, parameters.encoder_phase),
+                false => Encoder::ideal(counts_per_unit),
+            },
+            steps: STEPS,
+            state: State {
+                current: 0.0,
+                speed: 0.0,
+                angle: 0.0,
+            },
+            turns: 0.0,
+            regime: Regime {
+                motion: 0.0,
+                limited: 0.0,
+            },
+            voltage: 0.0,
+        };
+        machine.reset();
+        Ok(machine)
+    }
+
+    /// The parameters.
+    pub fn parameters(&self) -> &Parameters {
+        &self.parameters
+    }
+
+    /// Back to rest at the initial crank angle, counter at zero.
+    pub fn reset(&mut self) {
+        let angle = self.parameters.initial_angle;
+        self.state = State {
+            current: 0.0,
+            speed: 0.0,
+            angle,
+        };
+        self.turns = 0.0;
+        self.voltage = 0.0;
+        self.regime = Regime {
+            motion: 0.0,
+            limited: 0.0,
+        };
+        self.settle();
+    }
+
+    /// True speed [RPM].
+    pub fn speed_rpm(&self) -> f64 {
+        self.state.speed * RPM
+    }
+
+    /// Motor current [A].
+    pub fn current(&self) -> f64 {
+        self.state.current
+    }
+
+    /// Speed integrated since the reset [RPM s]: turns times 60.
+    pub fn position(&self) -> f64 {
+        let angle = self.state.angle - self.parameters.initial_angle;
+        (self.turns + angle / TAU) * 60.0
+    }
+
+    /// The encoder, which counts [`Machine::position`].
+    pub fn encoder(&self) -> &Encoder {
+        &self.encoder
+    }
+
+    /// The encoder's counter; a whole number unless quantisation is off.
+    pub fn counts(&self) -> f64 {
+        self.encoder.count(self.position())
+    }
+
+    /// Holds the command `u` [V] for one sample time.
+    pub fn advance(&mut self, u: f64) {
+        let p = &self.parameters;
+        let mean = u.clamp(-p.u_limit, p.u_limit) * p.amplifier_gain;
+        self.voltage = mean.clamp(-p.bus_voltage, p.bus_voltage);
+        if self.regime.limited != 0.0 {
+            self.settle();
+        }
+        let h = SAMPLE_TIME / f64::from(self.steps);
+        for _ in 0..self.steps {
+            self.substep(h);
+        }
+        self.unwind();
+    }
+
+    /// Counts and true speed [RPM] at the instants at which `u[k]` starts to act, from the present state on.
+    ///
+    /// # Errors
+    /// A data error where `u` is not finite.
+    pub fn run(&mut self, u: &[f64]) -> Result<(Vec<f64>, Vec<f64>)> {
+        if let Some(k) = u.iter().position(|value| !value.is_finite()) {
+            return Err(Error::data(format!(
+                "expected finite commands [V], got {} at sample {k}; repair or cut the signal",
+                u[k]
+            )));
+        }
+        let sample = |&u: &f64| {
+            let measured = (self.counts(), self.speed_rpm());
+            self.advance(u);
+            measured
+        };
+        Ok(u.iter().map(sample).unzip())
+    }
+
+    /// Moves whole turns out of the angle, so that it keeps its precision.
+    fn unwind(&mut self) {
+        if self.state.angle.abs() > 16.0 {
+            let turns = (self.state.angle / TAU).floor();
+            self.turns += turns;
+            self.state.angle -= turns * TAU;
+        }
+    }
+
+    #[inline(always)]
+    fn after(&self, h: f64) -> State {
+        self.dynamics
+            .step(&self.state, h, self.voltage, self.regime)
+    }
+
+    #[inline(always)]
+    fn substep(&mut self, h: f64) {
+        let next = self.after(h);
+        if self.margin(&next) >= 0.0 && !self.hops_over_ripple(&next) {
+            self.state = next;
+        } else {
+            (0..PIECES).for_each(|_| self.piece(h / f64::from(PIECES)));
+        }
+    }
+
+    #[inline(always)]
+    fn hops_over_ripple(&self, next: &State) -> bool {
+        let (now, then) = (self.state.current, next.current);
+        now * then < 0.0 && (then - now).abs() > RIPPLES_PER_STEP * self.parameters.ripple_current
+    }
+
+    /// One piece of a step, from event to event.
+    #[cold]
+    fn piece(&mut self, h: f64) {
+        let mut left = h;
+        for _ in 0..EVENTS_PER_PIECE {
+            let next = self.after(left);
+            if self.margin(&next) >= 0.0 {
+                self.state = next;
+                return;
+            }
+            let passed = self.locate(left);
+            self.state = self.after(passed);
+            self.settle();
+            left -= passed;
+        }
+        self.state = self.after(left);
+        self.settle();
+    }
+
+    /// How far the regime is from ending, negative behind its end: the least of its guards.
+    #[inline(always)]
+    fn margin(&self, x: &State) -> f64 {
+        let Regime { motion, limited } = self.regime;
+        let d = &self.dynamics;
+        if motion != 0.0 && limited == 0.0 {
+            return (motion * x.speed).min(d.current_limit - x.current.abs());
+        }
+        let crank = d.crank(x.angle);
+        let motion_left = match motion == 0.0 {
+            true => d.dry_friction(0.0) - (crank.motor_constant * x.current - crank.load).abs(),
+            false => motion * x.speed,
+        };
+        let current_left = match limited == 0.0 {
+            true => d.current_limit - x.current.abs(),
+            false => limited * d.driving_voltage(&crank, x.current, x.speed, self.voltage),
+        };
+        motion_left.min(current_left)
+    }
+
+    /// The time just after the regime's end within `h`, by the Illinois variant of false position.
+    fn locate(&self, h: f64) -> f64 {
+        let margin = |t: f64| self.margin(&self.after(t));
+        let (mut low, mut high) = ((0.0, self.margin(&self.state).max(0.0)), (h, margin(h)));
+        for _ in 0..30 {
+            if high.0 - low.0 <= 1e-12 * h {
+                break;
+            }
+            let t = (low.0 * high.1 - high.0 * low.1) / (high.1 - low.1);
+            let value = margin(t);
+            if value < 0.0 {
+                high = (t, value);
+                low.1 *= 0.5;
+            } else {
+                low = (t, value);
+                high.1 *= 0.5;
+            }
+        }
+        high.0
+    }
+
+    /// Puts the state onto the boundary that it has passed and chooses the regime that holds from there.
+    fn settle(&mut self) {
+        let (d, x) = (&self.dynamics, &mut self.state);
+        let crank = d.crank(x.angle);
+        if self.regime.limited == 0.0 && x.current.abs() >= d.current_limit {
+            x.current = d.current_limit.copysign(x.current);
+            self.regime.limited = x.current.signum();
+        }
+        let drive = d.driving_voltage(&crank, x.current, x.speed, self.voltage);
+        if self.regime.limited * drive < 0.0 {
+            self.regime.limited = 0.0;
+        }
+        if self.regime.motion * x.speed <= 0.0 {
+            x.speed = 0.0;
+            let torque = crank.motor_constant * x.current - crank.load;
+            let holds = torque.abs() <= d.dry_friction(0.0);
+            self.regime.motion = if holds { 0.0 } else { torque.signum() };
+        }
+    }
+}
+
+impl Plant for Machine {
+    fn reset(&mut self) {
+        Machine::reset(self);
+    }
+
+    fn output(&self) -> f64 {
+        self.speed_rpm()
+    }
+
+    fn position(&self) -> f64 {
+        Machine::position(self)
+    }
+
+    fn advance(&mut self, u: f64) {
+        Machine::advance(self, u);
+    }
+}
+
+#[cfg(test)]
+mod tests;
