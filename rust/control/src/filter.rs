@@ -34,6 +34,8 @@ impl<T: Real> MovingAverage<T> {
     /// Forgets everything; the next sample fills the memory.
     pub fn reset(&mut self) {
         self.started = false;
+        // The order of summation is part of the result's last bits.
+        self.next = 0;
     }
 
     /// Takes a sample, gives the average.

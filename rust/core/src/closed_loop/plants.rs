@@ -1,0 +1,158 @@
+//! Plants to close a loop around: identified models, variations for robust tuning.
+
+use super::Plant;
+use crate::lagged::Lagged;
+use crate::{Error, Result};
+
+/// A lagged model as a plant: its regressor is kept from sample to sample.
+#[derive(Clone, Debug)]
+pub struct LaggedPlant<'a, M> {
+    model: &'a M,
+    /// Past outputs, newest first, then the inputs of the regressor.
+    phi: Vec<f64>,
+    /// Past inputs, newest first.
+    inputs: Vec<f64>,
+    na: usize,
+    nk: usize,
+    position: f64,
+    ts: f64,
+}
+
+impl<'a, M: Lagged> LaggedPlant<'a, M> {
+    /// `model` at rest: zero past outputs and inputs. `ts` \[s\] is the sample time it was identified at.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for a model with several inputs or without delay, or an unusable sample time.
+    pub fn new(model: &'a M, ts: f64) -> Result<Self> {
+        let lags = model.lags();
+        if lags.channels != 1 {
+            return Err(Error::setting(format!(
+                "expected a model with one input to close a loop around, got {}; identify it from the command alone",
+                lags.channels
+            )));
+        }
+        if lags.nk == 0 {
+            return Err(Error::setting(
+                "expected a model with a delay nk of 1 or more, got 0: the command is decided after the output is \
+                 measured; identify it again with nk = 1",
+            ));
+        }
+        if !(ts > 0.0 && ts.is_finite()) {
+            return Err(Error::setting(format!(
+                "expected a sample time above 0, got {ts}"
+            )));
+        }
+        Ok(Self {
+            model,
+            phi: vec![0.0; lags.regressors()],
+            inputs: vec![0.0; lags.nk + lags.nb - 1],
+            na: lags.na,
+            nk: lags.nk,
+            position: 0.0,
+            ts,
+        })
+    }
+}
+
+impl<M: Lagged> Plant for LaggedPlant<'_, M> {
+    fn reset(&mut self) {
+        self.phi.fill(0.0);
+        self.inputs.fill(0.0);
+        self.position = 0.0;
+    }
+
+    fn output(&self) -> f64 {
+        self.phi[0]
+    }
+
+    fn position(&self) -> f64 {
+        self.position
+    }
+
+    fn advance(&mut self, u: f64) {
+        push(&mut self.inputs, u);
+        self.phi[self.na..].copy_from_slice(&self.inputs[self.nk - 1..]);
+        let y = self.model.output(&self.phi);
+        // Between samples the output runs straight, so an encoder sees the mean of both ends.
+        self.position += self.ts * (self.phi[0] + y) / 2.0;
+        push(&mut self.phi[..self.na], y);
+    }
+}
+
+fn push(newest_first: &mut [f64], value: f64) {
+    newest_first.rotate_right(1);
+    newest_first[0] = value;
+}
+
+/// Longest extra delay of a [`Varied`] plant, in samples.
+const LONGEST_DELAY: usize = 16;
+
+/// Another plant with its gain scaled and its input delayed: what a tuned controller must bear.
+#[derive(Clone, Debug)]
+pub struct Varied<P> {
+    plant: P,
+    gain: f64,
+    delay: usize,
+    pending: [f64; LONGEST_DELAY],
+    next: usize,
+}
+
+impl<P: Plant> Varied<P> {
+    /// `plant` with its output multiplied by `gain` and its input held back by `delay` samples.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for a gain that is not above 0 or a delay above 16 samples.
+    pub fn new(plant: P, gain: f64, delay: usize) -> Result<Self> {
+        if !(gain > 0.0 && gain.is_finite() && delay <= LONGEST_DELAY) {
+            return Err(Error::setting(format!(
+                "expected a gain above 0 and a delay of at most {LONGEST_DELAY} samples, got {gain} and {delay}; gains \
+                 of 0.8 to 1.25 and delays of 0 to 2 ms are customary"
+            )));
+        }
+        Ok(Self {
+            plant,
+            gain,
+            delay,
+            pending: [0.0; LONGEST_DELAY],
+            next: 0,
+        })
+    }
+
+    fn delayed(&mut self, u: f64) -> f64 {
+        if self.delay == 0 {
+            return u;
+        }
+        let due = std::mem::replace(&mut self.pending[self.next], u);
+        self.next = (self.next + 1) % self.delay;
+        due
+    }
+}
+
+impl<P: Plant> Plant for Varied<P> {
+    fn reset(&mut self) {
+        self.plant.reset();
+        self.pending.fill(0.0);
+        self.next = 0;
+    }
+
+    fn output(&self) -> f64 {
+        self.gain * self.plant.output()
+    }
+
+    fn position(&self) -> f64 {
+        self.gain * self.plant.position()
+    }
+
+    fn advance(&mut self, u: f64) {
+        let due = self.delayed(u);
+        self.plant.advance(due);
+    }
+
+    fn encoder(&self) -> Option<(f64, f64)> {
+        let (counts, scale) = self.plant.encoder()?;
+        if self.gain == 1.0 {
+            return Some((counts, scale));
+        }
+        Some(((self.position() * scale).floor(), scale))
+    }
+}

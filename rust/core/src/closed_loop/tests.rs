@@ -1,0 +1,186 @@
+//! The loop against its linear state-space form, its encoder, its plants and its outcomes.
+
+use nalgebra::{Matrix3, Vector3};
+use sewfast_control::{Settings, Standard};
+
+use super::*;
+use crate::lagged::Lagged;
+use crate::linear::LinearModel;
+
+const TS: f64 = 1e-3;
+
+fn lag() -> LinearModel {
+    LinearModel::new(vec![-0.98], vec![9.8], 1, 1, 0.0).unwrap()
+}
+
+fn controller(settings: Settings<f64>, samples: usize) -> Controller<f64> {
+    Controller::new(settings, samples, 0.0).unwrap()
+}
+
+fn pi(kp: f64, ti: f64) -> Settings<f64> {
+    Settings::new(Standard { kp, ti, td: 0.0 }, TS)
+}
+
+#[test]
+fn equals_the_exact_linear_loop_where_nothing_limits() {
+    let (a, b, kp, ti, alpha) = (0.98, 9.8, 2e-3, 0.05, 0.3);
+    let model = lag();
+    let settings = Settings {
+        alpha,
+        ..pi(kp, ti)
+    };
+    let r = 1000.0;
+    let run = closed_loop(
+        &mut LaggedPlant::new(&model, TS).unwrap(),
+        &mut controller(settings, 1),
+        &[r; 300],
+        Sensor::Ideal,
+    )
+    .unwrap();
+    // State (y, integral, 1): u = kp (r - y - alpha r) + integral + ki (r - y).
+    let ki = kp * TS / ti;
+    #[rustfmt::skip]
+    let step = Matrix3::new(
+        a - b * (kp + ki), b,   b * (kp * (1.0 - alpha) + ki) * r,
+        -ki,               1.0, ki * r,
+        0.0,               0.0, 1.0,
+    );
+    let mut x = Vector3::new(0.0, 0.0, 1.0);
+    for (k, &y) in run.y.iter().enumerate() {
+        assert!((y - x[0]).abs() < 1e-9, "{k}: {y} {}", x[0]);
+        x = step * x;
+    }
+    assert!((run.y[299] - r).abs() < 15.0 && run.outcome == Outcome::Completed);
+}
+
+#[test]
+fn a_model_in_the_loop_gives_what_it_gives_in_free_run() {
+    let model = LinearModel::new(vec![-1.5, 0.54], vec![3.0, 2.0, 1.0], 1, 3, 0.0).unwrap();
+    let mut plant = LaggedPlant::new(&model, TS).unwrap();
+    let reference: Vec<f64> = (0..200)
+        .map(|k| 100.0 * (f64::from(k) / 20.0).sin())
+        .collect();
+    let run = closed_loop(
+        &mut plant,
+        &mut controller(pi(0.01, 0.1), 1),
+        &reference,
+        Sensor::Ideal,
+    );
+    let run = run.unwrap();
+    // The loop starts at rest: the command before the first sample is 0.
+    let mut u = vec![0.0; 4];
+    u.extend(&run.u);
+    let free = model.simulate(&u, 1, &[0.0, 0.0]).unwrap();
+    for (a, b) in run.y.iter().zip(&free[4..]) {
+        assert!((a - b).abs() < 1e-9);
+    }
+}
+
+#[test]
+fn an_encoder_is_quantised_to_whole_counts_and_exact_on_average() {
+    let model = lag();
+    let scale = 1572.0 / 60.0;
+    let sensor = Sensor::new(scale, 0.5).unwrap();
+    let mut plant = LaggedPlant::new(&model, TS).unwrap();
+    let run = closed_loop(
+        &mut plant,
+        &mut controller(pi(1e-3, 0.1), 1),
+        &[500.0; 2000],
+        sensor,
+    );
+    let run = run.unwrap();
+    for measured in &run.feedback {
+        let counts = measured * TS * scale;
+        assert!((counts - counts.round()).abs() < 1e-6);
+    }
+    let mean = |x: &[f64]| x[1000..].iter().sum::<f64>() / 1000.0;
+    assert!((mean(&run.feedback) - mean(&run.y)).abs() < 2.0 * 38.2 / 1000.0);
+    assert!(
+        run.feedback
+            .iter()
+            .zip(&run.y)
+            .any(|(m, y)| (m - y).abs() > 5.0)
+    );
+}
+
+#[test]
+fn says_when_the_loop_diverges() {
+    let unstable = LinearModel::new(vec![-2.0], vec![1.0], 1, 1, 0.0).unwrap();
+    let mut plant = LaggedPlant::new(&unstable, TS).unwrap();
+    let run = closed_loop(
+        &mut plant,
+        &mut controller(pi(1e-9, 1.0), 1),
+        &[1.0; 2000],
+        Sensor::Ideal,
+    );
+    let run = run.unwrap();
+    assert!(matches!(run.outcome, Outcome::Diverged(k) if k == run.y.len() && k < 200));
+    assert!(run.y.iter().chain(&run.u).all(|v| v.is_finite()));
+}
+
+#[test]
+fn repeats_a_run_from_rest() {
+    let model = lag();
+    let mut plant = Varied::new(LaggedPlant::new(&model, TS).unwrap(), 1.25, 2).unwrap();
+    let mut c = controller(
+        Settings {
+            u_max: 3.0,
+            ..pi(2e-3, 0.05)
+        },
+        8,
+    );
+    let sensor = Sensor::new(26.2, 0.5).unwrap();
+    let mut once = || closed_loop(&mut plant, &mut c, &[400.0; 300], sensor).unwrap();
+    assert_eq!(once(), once());
+}
+
+#[test]
+fn a_varied_plant_has_its_gain_and_its_delay() {
+    let model = lag();
+    let settle = |gain, delay| {
+        let mut plant = Varied::new(LaggedPlant::new(&model, TS).unwrap(), gain, delay).unwrap();
+        let y: Vec<f64> = (0..2000)
+            .map(|_| {
+                plant.advance(1.0);
+                plant.output()
+            })
+            .collect();
+        (y[1999], y.iter().take_while(|&&y| y == 0.0).count())
+    };
+    let (nominal, none) = settle(1.0, 0);
+    let (scaled, two) = settle(0.8, 2);
+    assert!((scaled / nominal - 0.8).abs() < 1e-9 && (none, two) == (0, 2));
+    assert!(Varied::new(LaggedPlant::new(&model, TS).unwrap(), 0.0, 0).is_err());
+    assert!(Varied::new(LaggedPlant::new(&model, TS).unwrap(), 1.0, 17).is_err());
+}
+
+#[test]
+fn refuses_what_cannot_be_closed() {
+    let two = LinearModel::new(vec![-0.9], vec![1.0, 1.0], 2, 1, 0.0).unwrap();
+    let direct = LinearModel::new(vec![-0.9], vec![1.0], 1, 0, 0.0).unwrap();
+    assert!(
+        LaggedPlant::new(&two, TS)
+            .unwrap_err()
+            .message
+            .contains("one input")
+    );
+    assert!(
+        LaggedPlant::new(&direct, TS)
+            .unwrap_err()
+            .message
+            .contains("nk")
+    );
+    assert!(LaggedPlant::new(&lag(), 0.0).is_err());
+    assert!(Sensor::new(-1.0, 0.5).is_err() && Sensor::new(1.0, 2.0).is_err());
+    let model = lag();
+    let mut plant = LaggedPlant::new(&model, TS).unwrap();
+    for bad in [&[][..], &[1.0, f64::NAN]] {
+        let run = closed_loop(
+            &mut plant,
+            &mut controller(pi(1.0, 1.0), 1),
+            bad,
+            Sensor::Ideal,
+        );
+        assert!(run.is_err());
+    }
+}
