@@ -6,6 +6,7 @@ pub use plants::{LaggedPlant, Varied};
 
 use sewfast_control::{Controller, Refused};
 
+use crate::encoder::Encoder;
 use crate::{Error, Result};
 
 /// What a controller can be closed around: one input, one output, stepped sample by sample.
@@ -18,63 +19,32 @@ pub trait Plant {
     fn position(&self) -> f64;
     /// Holds `u` for one sample time.
     fn advance(&mut self, u: f64);
-    /// Counts of an encoder of the plant's own and counts per unit second; `None` where it has none.
-    fn encoder(&self) -> Option<(f64, f64)> {
+    /// The encoder that the plant brings along; `None` where it has none.
+    fn encoder(&self) -> Option<&Encoder> {
         None
     }
 }
 
-/// How the output is measured where the plant has no encoder of its own.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Sensor {
-    /// The output itself.
-    Ideal,
-    /// Differences of `floor(position * counts_per_unit + phase)`, as a drive's encoder gives them.
-    Encoder {
-        /// Counts per output unit and second: 1572/60 for speed in RPM and 1,572 counts per turn.
-        counts_per_unit: f64,
-        /// Where in a count the run starts, 0 to 1.
-        phase: f64,
-    },
+/// An encoder for plants that bring none: `floor(position * counts_per_unit + phase)`; `None` for 0 counts.
+///
+/// `counts_per_unit` is counts per output unit and second: 1572/60 for speed in RPM and 1,572 counts per turn.
+///
+/// # Errors
+/// `ErrorKind::Setting` for counts that are negative or not finite, or a phase outside 0 to 1.
+pub fn encoder(counts_per_unit: f64, phase: f64) -> Result<Option<Encoder>> {
+    if !(counts_per_unit >= 0.0 && counts_per_unit.is_finite() && (0.0..1.0).contains(&phase)) {
+        return Err(Error::setting(format!(
+            "expected counts per unit of 0 or more and a phase from 0 to below 1, got {counts_per_unit} and {phase}; \
+             give 0 counts for feedback without quantisation"
+        )));
+    }
+    Ok((counts_per_unit > 0.0).then(|| Encoder::new(counts_per_unit, phase)))
 }
 
-impl Sensor {
-    /// An encoder, or the ideal sensor where `counts_per_unit` is 0.
-    ///
-    /// # Errors
-    /// `ErrorKind::Setting` for counts that are negative or not finite, or a phase outside 0 to 1.
-    pub fn new(counts_per_unit: f64, phase: f64) -> Result<Self> {
-        if !(counts_per_unit >= 0.0 && counts_per_unit.is_finite() && (0.0..=1.0).contains(&phase))
-        {
-            return Err(Error::setting(format!(
-                "expected counts per unit of 0 or more and a phase of 0 to 1, got {counts_per_unit} and {phase}; give \
-                 0 counts for feedback without quantisation"
-            )));
-        }
-        let encoder = Self::Encoder {
-            counts_per_unit,
-            phase,
-        };
-        Ok(if counts_per_unit == 0.0 {
-            Self::Ideal
-        } else {
-            encoder
-        })
-    }
-
-    /// Counts and counts per unit second; `None` without an encoder.
-    fn counts(self, plant: &(impl Plant + ?Sized)) -> Option<(f64, f64)> {
-        plant.encoder().or(match self {
-            Self::Ideal => None,
-            Self::Encoder {
-                counts_per_unit,
-                phase,
-            } => Some((
-                (plant.position() * counts_per_unit + phase).floor(),
-                counts_per_unit,
-            )),
-        })
-    }
+/// The counter of the plant's encoder, or else of the loop's, and its scale; `None` without an encoder.
+fn counts(plant: &(impl Plant + ?Sized), encoder: Option<&Encoder>) -> Option<(f64, f64)> {
+    let encoder = plant.encoder().or(encoder)?;
+    Some((encoder.count(plant.position()), encoder.counts_per_unit()))
 }
 
 /// How a run ended.
@@ -117,21 +87,22 @@ impl Run {
 
     /// Runs the loop from rest over `reference` into this record, whose memory is used again.
     ///
+    /// The output is measured by the plant's encoder, else by `encoder`, else ideally.
     /// Order at a sample: measure, filter, control, limit, apply.
     pub fn record(
         &mut self,
         plant: &mut (impl Plant + ?Sized),
         controller: &mut Controller<f64>,
         reference: &[f64],
-        sensor: Sensor,
+        encoder: Option<&Encoder>,
     ) {
         self.clear();
         plant.reset();
         controller.reset();
         let ts = controller.settings().ts;
-        let mut before = sensor.counts(plant);
+        let mut before = counts(plant, encoder);
         for (k, &r) in reference.iter().enumerate() {
-            let (y, now) = (plant.output(), sensor.counts(plant));
+            let (y, now) = (plant.output(), counts(plant, encoder));
             let measured = match (before, now) {
                 (Some((before, _)), Some((now, scale))) => (now - before) / (ts * scale),
                 _ => y,
@@ -165,11 +136,11 @@ pub fn closed_loop(
     plant: &mut (impl Plant + ?Sized),
     controller: &mut Controller<f64>,
     reference: &[f64],
-    sensor: Sensor,
+    encoder: Option<&Encoder>,
 ) -> Result<Run> {
     check_reference(reference)?;
     let mut run = Run::with_capacity(reference.len());
-    run.record(plant, controller, reference, sensor);
+    run.record(plant, controller, reference, encoder);
     Ok(run)
 }
 

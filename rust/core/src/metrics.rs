@@ -199,12 +199,12 @@ mod tests {
     #[test]
     fn measures_a_response_that_lags_and_overshoots() {
         let r = trapezoid();
-        let y: Vec<f64> = (0..1000)
+        let y: Vec<f64> = (0..1000_usize)
             .map(|k| {
                 if (300..=400).contains(&k) {
                     3090.0
                 } else {
-                    r[if k < 20 { 0 } else { k - 20 }]
+                    r[k.saturating_sub(20)]
                 }
             })
             .collect();

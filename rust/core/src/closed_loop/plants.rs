@@ -1,6 +1,7 @@
 //! Plants to close a loop around: identified models, variations for robust tuning.
 
 use super::Plant;
+use crate::encoder::Encoder;
 use crate::lagged::Lagged;
 use crate::{Error, Result};
 
@@ -148,11 +149,7 @@ impl<P: Plant> Plant for Varied<P> {
         self.plant.advance(due);
     }
 
-    fn encoder(&self) -> Option<(f64, f64)> {
-        let (counts, scale) = self.plant.encoder()?;
-        if self.gain == 1.0 {
-            return Some((counts, scale));
-        }
-        Some(((self.position() * scale).floor(), scale))
+    fn encoder(&self) -> Option<&Encoder> {
+        self.plant.encoder()
     }
 }

@@ -6,6 +6,7 @@ use sewfast_control::{Settings, Standard};
 use super::*;
 use crate::lagged::Lagged;
 use crate::linear::LinearModel;
+use crate::machine::{Machine, Parameters};
 
 const TS: f64 = 1e-3;
 
@@ -34,7 +35,7 @@ fn equals_the_exact_linear_loop_where_nothing_limits() {
         &mut LaggedPlant::new(&model, TS).unwrap(),
         &mut controller(settings, 1),
         &[r; 300],
-        Sensor::Ideal,
+        None,
     )
     .unwrap();
     // State (y, integral, 1): u = kp (r - y - alpha r) + integral + ki (r - y).
@@ -64,7 +65,7 @@ fn a_model_in_the_loop_gives_what_it_gives_in_free_run() {
         &mut plant,
         &mut controller(pi(0.01, 0.1), 1),
         &reference,
-        Sensor::Ideal,
+        None,
     );
     let run = run.unwrap();
     // The loop starts at rest: the command before the first sample is 0.
@@ -80,13 +81,13 @@ fn a_model_in_the_loop_gives_what_it_gives_in_free_run() {
 fn an_encoder_is_quantised_to_whole_counts_and_exact_on_average() {
     let model = lag();
     let scale = 1572.0 / 60.0;
-    let sensor = Sensor::new(scale, 0.5).unwrap();
+    let sensor = encoder(scale, 0.5).unwrap();
     let mut plant = LaggedPlant::new(&model, TS).unwrap();
     let run = closed_loop(
         &mut plant,
         &mut controller(pi(1e-3, 0.1), 1),
         &[500.0; 2000],
-        sensor,
+        sensor.as_ref(),
     );
     let run = run.unwrap();
     for measured in &run.feedback {
@@ -111,7 +112,7 @@ fn says_when_the_loop_diverges() {
         &mut plant,
         &mut controller(pi(1e-9, 1.0), 1),
         &[1.0; 2000],
-        Sensor::Ideal,
+        None,
     );
     let run = run.unwrap();
     assert!(matches!(run.outcome, Outcome::Diverged(k) if k == run.y.len() && k < 200));
@@ -129,8 +130,8 @@ fn repeats_a_run_from_rest() {
         },
         8,
     );
-    let sensor = Sensor::new(26.2, 0.5).unwrap();
-    let mut once = || closed_loop(&mut plant, &mut c, &[400.0; 300], sensor).unwrap();
+    let sensor = encoder(26.2, 0.5).unwrap();
+    let mut once = || closed_loop(&mut plant, &mut c, &[400.0; 300], sensor.as_ref()).unwrap();
     assert_eq!(once(), once());
 }
 
@@ -171,16 +172,41 @@ fn refuses_what_cannot_be_closed() {
             .contains("nk")
     );
     assert!(LaggedPlant::new(&lag(), 0.0).is_err());
-    assert!(Sensor::new(-1.0, 0.5).is_err() && Sensor::new(1.0, 2.0).is_err());
+    assert!(encoder(-1.0, 0.5).is_err() && encoder(1.0, 2.0).is_err());
+    assert_eq!(encoder(0.0, 0.5), Ok(None));
     let model = lag();
     let mut plant = LaggedPlant::new(&model, TS).unwrap();
     for bad in [&[][..], &[1.0, f64::NAN]] {
-        let run = closed_loop(
-            &mut plant,
-            &mut controller(pi(1.0, 1.0), 1),
-            bad,
-            Sensor::Ideal,
-        );
+        let run = closed_loop(&mut plant, &mut controller(pi(1.0, 1.0), 1), bad, None);
         assert!(run.is_err());
     }
+}
+
+#[test]
+fn the_machine_is_measured_by_its_own_encoder() {
+    let machine = |quantisation| {
+        let changes = [("quantisation", quantisation)];
+        Machine::new(Parameters::default().with(changes).unwrap()).unwrap()
+    };
+    let run = |quantisation, encoder: Option<&Encoder>| {
+        let mut c = controller(pi(2e-3, 0.1), 1);
+        closed_loop(&mut machine(quantisation), &mut c, &[1000.0; 500], encoder).unwrap()
+    };
+    let other = Encoder::new(1.0, 0.0);
+    assert_eq!(run(1.0, Some(&other)), run(1.0, None));
+    let count = 60.0 / (1572.0 * TS);
+    assert!(
+        run(1.0, None)
+            .feedback
+            .iter()
+            .all(|y| (y / count - (y / count).round()).abs() < 1e-6)
+    );
+    let ideal = run(0.0, None);
+    assert!(
+        ideal
+            .feedback
+            .windows(2)
+            .zip(ideal.y.windows(2))
+            .all(|(m, y)| (m[1] - (y[0] + y[1]) / 2.0).abs() < 2.0)
+    );
 }

@@ -298,6 +298,10 @@ impl Plant for Machine {
     fn advance(&mut self, u: f64) {
         Machine::advance(self, u);
     }
+
+    fn encoder(&self) -> Option<&Encoder> {
+        Some(Machine::encoder(self))
+    }
 }
 
 #[cfg(test)]
