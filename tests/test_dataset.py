@@ -153,10 +153,13 @@ def test_concat_refuses_what_does_not_belong_together() -> None:
     fast = Dataset.from_arrays(np.ones(9), np.ones(9), 0.02, name="fast")
     with pytest.raises(DataError, match=r"0\.01.*fast"):
         Dataset.concat([make(), fast])
-    with pytest.raises(DataError, match="rad/s"):
+    with pytest.raises(DataError, match="expected the unit 'RPM', received 'rad/s'"):
         Dataset.concat([make(output_unit="RPM"), make(output_unit="rad/s")])
+    with pytest.raises(DataError, match=r"expected 1 inputs.*received 2"):
+        Dataset.concat([make(), make(nu=2)])
     with pytest.raises(DataError, match="none"):
         Dataset.concat([])
+    assert len(Dataset.concat([make(output_unit="RPM"), make()])) == 200
 
 
 def test_channels_follow_the_range() -> None:

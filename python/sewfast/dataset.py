@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -240,12 +240,12 @@ class Dataset:
         return replace(first, experiments=tuple(e for part in parts for e in part.experiments))
 
     def _require_alike(self, other: Dataset) -> None:
-        mine, theirs = ((d.input_units, d.output_unit, len(d.input_names)) for d in (self, other))
-        if mine != theirs:
+        if self.n_inputs != other.n_inputs:
             raise DataError(
-                f"expected the same units in every data set: {mine[0]} -> {mine[1]!r} in "
-                f"{self.source}, received {theirs[0]} -> {theirs[1]!r} in {other.source}"
+                f"expected {self.n_inputs} inputs, as in {self.source}, received {other.n_inputs} "
+                f"in {other.source}"
             )
+        require_same_units(self, other)
         if abs(self.Ts - other.Ts) > 0.01 * self.Ts:
             raise DataError(
                 f"expected one sample time: {self.Ts} s in {self.source}, received {other.Ts} s in "
@@ -372,6 +372,26 @@ class Dataset:
         )
         lines += [f"  {e.name} [{e.range_text}]" for e in self.experiments]
         return "\n".join(lines)
+
+
+def require_same_units(one: HasUnits, other: Dataset) -> None:
+    """Raise `DataError` where a unit is known on both sides and differs."""
+    mine = (*one.input_units, one.output_unit)
+    for unit, received in zip(mine, (*other.input_units, other.output_unit), strict=True):
+        if unit and received and unit != received:
+            raise DataError(
+                f"{other.source}: expected the unit {unit!r}, received {received!r}; convert "
+                "the data"
+            )
+
+
+class HasUnits(Protocol):
+    """A data set or a model."""
+
+    @property
+    def input_units(self) -> tuple[str, ...]: ...
+    @property
+    def output_unit(self) -> str: ...
 
 
 def labelled(name: str, unit: str) -> str:
