@@ -1,0 +1,87 @@
+"""Model files in: versioned JSON -> `Model`."""
+
+from __future__ import annotations
+
+import os
+
+from .. import jsonfile
+from ..errors import ModelFileError, SewfastError
+from .base import FORMAT, VERSION, Model
+from .fields import Fields
+from .linear import ARX, LinearOE
+from .neural import NeuralOE
+
+_KINDS: dict[str, type[ARX] | type[LinearOE] | type[NeuralOE]] = {
+    c.kind: c for c in (ARX, LinearOE, NeuralOE)
+}
+_FIELDS = ("version", "kind", "Ts", "inputs", "output", "counts", "parameters", "training")
+
+
+def load_model(path: str | os.PathLike[str]) -> Model:
+    """Read a model that `Model.save` wrote; nothing in the file is executed.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    Model
+        Equal to the saved one in every bit.
+
+    Raises
+    ------
+    ModelFileError
+        Where the file is missing, damaged, of another format, or of an unknown version or kind;
+        the message names the file and the field.
+    """
+    fields = Fields(os.fspath(path), jsonfile.read(path, FORMAT, (VERSION,)))
+    fields.require_only(_FIELDS)
+    kind = fields.text("kind")
+    if kind not in _KINDS:
+        raise fields.refuse("kind", f"one of {', '.join(_KINDS)}", kind)
+    return _model(fields, _KINDS[kind])
+
+
+def _model(fields: Fields, cls: type[ARX] | type[LinearOE] | type[NeuralOE]) -> Model:
+    inputs, output = fields.objects("inputs"), fields.object("output")
+    if not inputs:
+        raise fields.refuse("inputs", "at least one input", [])
+    core = _core(fields.object("parameters"), cls)
+    _require_width(fields, core, len(inputs))
+    return cls(
+        core,
+        fields.positive("Ts"),
+        tuple(i.text("name") for i in inputs),
+        output.text("name"),
+        tuple(i.text("unit") for i in inputs),
+        output.text("unit"),
+        _counts(fields),
+        fields.object("training").values,
+    )
+
+
+def _core(parameters: Fields, cls: type[ARX] | type[LinearOE] | type[NeuralOE]) -> object:
+    try:
+        return cls.core_from(parameters)
+    except ModelFileError:
+        raise
+    except (SewfastError, ValueError, OverflowError, MemoryError) as e:
+        raise ModelFileError(
+            f"{parameters.path}: field 'parameters': {e}; the file is damaged or was edited"
+        ) from e
+
+
+def _require_width(fields: Fields, core: object, inputs: int) -> None:
+    """Names and parameters must speak of the same number of inputs."""
+    parameters = fields.object("parameters")
+    width = len(parameters.any("b")) if "b" in parameters.values else parameters.integer("n_inputs")
+    if width != inputs:
+        raise fields.refuse("inputs", f"{width} inputs, as in the parameters", fields.any("inputs"))
+
+
+def _counts(fields: Fields) -> tuple[str, float] | None:
+    if fields.any("counts") is None:
+        return None
+    counts = fields.object("counts")
+    return counts.text("column"), counts.positive("counts_per_rev")

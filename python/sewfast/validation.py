@@ -1,0 +1,248 @@
+"""`Validation`: free-run and one-step errors of a model on data."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from .dataset import Dataset, Experiment, FloatArray
+from .errors import DataError
+from .models.base import INIT, Model
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Size of an error series.
+
+    Attributes
+    ----------
+    rmse, max_abs : float
+        Root mean square and largest magnitude [output unit].
+    fit_percent : float
+        100 (1 - |y - yhat| / |y - mean(y)|), Euclidean norms; NaN where y is constant.
+    """
+
+    rmse: float
+    fit_percent: float
+    max_abs: float
+
+    @classmethod
+    def of(cls, y: FloatArray, yhat: FloatArray) -> Scores:
+        """Scores of `yhat` against `y`, both of shape (N,)."""
+        error, spread = np.linalg.norm(y - yhat), np.linalg.norm(y - y.mean())
+        fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else math.nan
+        return cls(float(error / math.sqrt(len(y))), float(fit), float(np.abs(y - yhat).max()))
+
+    def to_json(self) -> dict[str, float | None]:
+        """As JSON values: None where a score is undefined."""
+        return {k: v if math.isfinite(v) else None for k, v in asdict(self).items()}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ExperimentErrors:
+    """Series and scores of one experiment; the first `init` samples are not scored.
+
+    Attributes
+    ----------
+    y, simulated, one_step : array, shape (N,)
+        What is scored against, the free run and the one-step prediction [output unit].
+    """
+
+    name: str
+    range_text: str
+    init: int
+    y: FloatArray
+    simulated: FloatArray
+    one_step: FloatArray
+
+    @property
+    def error(self) -> FloatArray:
+        """Free-run error y - yhat, shape (N,)."""
+        return self.y - self.simulated
+
+    @property
+    def one_step_error(self) -> FloatArray:
+        """One-step error, shape (N,)."""
+        return self.y - self.one_step
+
+    def scored(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """y, free run and one-step prediction after the initial samples."""
+        return self.y[self.init :], self.simulated[self.init :], self.one_step[self.init :]
+
+    @property
+    def simulation_scores(self) -> Scores:
+        y, simulated, _ = self.scored()
+        return Scores.of(y, simulated)
+
+    @property
+    def one_step_scores(self) -> Scores:
+        y, _, one_step = self.scored()
+        return Scores.of(y, one_step)
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """How well a model does on data, in free run (the headline) and one step ahead.
+
+    Attributes
+    ----------
+    simulation, one_step : Scores
+        Over all experiments together; the fit is about their common mean.
+    experiments : tuple of ExperimentErrors
+        Series and scores of each.
+    n : int
+        Samples scored.
+    init : int
+        Samples before those in each experiment; they set the initial state. 0: from rest.
+    unit : str
+        Of the errors.
+    notes : tuple of str
+        What the reader should know, such as inputs beyond the range of the training data.
+    """
+
+    simulation: Scores
+    one_step: Scores
+    experiments: tuple[ExperimentErrors, ...]
+    n: int
+    init: int
+    unit: str
+    model: str
+    against: str
+    notes: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Scores as JSON values."""
+        return {
+            "simulation": self.simulation.to_json(),
+            "one_step": self.one_step.to_json(),
+            "n": self.n,
+            "init": self.init,
+            "unit": self.unit,
+            "against": self.against,
+            "experiments": [
+                {
+                    "name": e.name,
+                    "range": e.range_text,
+                    "n": len(e.y) - e.init,
+                    "simulation": e.simulation_scores.to_json(),
+                    "one_step": e.one_step_scores.to_json(),
+                }
+                for e in self.experiments
+            ],
+            "notes": list(self.notes),
+        }
+
+    def __repr__(self) -> str:
+        s = self.simulation
+        return f"Validation(free run: rmse={s.rmse:.4g}, fit={s.fit_percent:.2f} %, n={self.n})"
+
+    def __str__(self) -> str:
+        state = f"initial state from the first {self.init} samples" if self.init else "from rest"
+        unit = f" [{self.unit}]" if self.unit else ""
+        data = ", ".join(f"{e.name} [{e.range_text}]" for e in self.experiments)
+        lines = [
+            f"{self.model} against {self.against}{unit} on {data}",
+            f"{self.n} samples scored, {state}",
+            f"{'':18}{'rmse' + unit:>16}{'fit [%]':>10}{'largest' + unit:>16}",
+            _row("free run", self.simulation),
+            _row("one step ahead", self.one_step),
+        ]
+        if len(self.experiments) > 1:
+            lines += [
+                _row(f"  {i + 1}, free run", e.simulation_scores) for i, e in self._numbered()
+            ]
+        return "\n".join([*lines, *(f"note: {n}" for n in self.notes)])
+
+    def _numbered(self) -> list[tuple[int, ExperimentErrors]]:
+        return list(enumerate(self.experiments))
+
+
+def validate(
+    model: Model, data: Dataset, *, init: int = INIT, against: str | None = None
+) -> Validation:
+    """Score a model on data that it was not trained on.
+
+    Parameters
+    ----------
+    model : Model
+    data : Dataset
+        Complete inputs and outputs.
+    init : int
+        The first `init` samples of each experiment set the initial state and are not scored; 0
+        starts from rest and scores every sample.
+    against : str or None
+        Name of a channel to score against instead of the measured output (a virtual machine's
+        true speed).
+
+    Raises
+    ------
+    DataError
+        Where data do not fit the model, hold NaN, or leave nothing to score.
+    FitError
+        Where the model is unstable on this input.
+    """
+    data.require_complete()
+    for e in data.experiments:
+        if len(e) <= init:
+            raise DataError(
+                f"{e.name}: expected more than init = {init} samples, received {len(e)}: "
+                "nothing is left to score; lower init (--init) or give a longer range"
+            )
+    series = zip(
+        data.experiments,
+        model.simulate(data, init=init),
+        model.predict(data, init=init),
+        strict=True,
+    )
+    found = tuple(
+        ExperimentErrors(e.name, e.range_text, init, _target(e, against), simulated, one_step)
+        for e, simulated, one_step in series
+    )
+    y, simulated, one_step = (
+        np.concatenate(c) for c in zip(*(e.scored() for e in found), strict=True)
+    )
+    return Validation(
+        Scores.of(y, simulated),
+        Scores.of(y, one_step),
+        found,
+        len(y),
+        init,
+        data.output_unit or model.output_unit,
+        model.title,
+        against or data.output_name,
+        tuple(_beyond_training(model, data)),
+    )
+
+
+def _target(experiment: Experiment, against: str | None) -> FloatArray:
+    if against is None:
+        return experiment.y
+    if against not in experiment.channels:
+        raise DataError(
+            f"{experiment.name}: no channel {against!r}; available: "
+            f"{', '.join(experiment.channels) or 'none'}"
+        )
+    return experiment.channels[against]
+
+
+def _beyond_training(model: Model, data: Dataset) -> list[str]:
+    """Inputs that leave the range that the model has seen by more than a hundredth of it."""
+    notes = []
+    known = model.training.get("input_range", [])
+    for name, (low, high), (least, most) in zip(
+        data.input_names, known, data.input_range, strict=False
+    ):
+        margin = 0.01 * (high - low)
+        if least < low - margin or most > high + margin:
+            notes.append(
+                f"{name} spans {least:g} to {most:g}, the training data {low:g} to "
+                f"{high:g}: the model extrapolates"
+            )
+    return notes
+
+
+def _row(label: str, s: Scores) -> str:
+    return f"{label:18}{s.rmse:16.6g}{s.fit_percent:10.2f}{s.max_abs:16.6g}"
