@@ -168,12 +168,25 @@ class NeuralFit:
     @property
     def termination(self) -> str: ...
     @property
+    def remedy(self) -> str:
+        """What to do about the termination."""
+    @property
     def trace(self) -> _F: ...
     @property
     def start(self) -> int:
         """Which of the starts was chosen."""
     @property
-    def start_costs(self) -> _F: ...
+    def start_costs(self) -> _F:
+        """J that each start was judged by: on validation data, else on training data; inf: failed."""
+    @property
+    def discarded(self) -> int:
+        """Dead starts that were drawn again."""
+    @property
+    def models(self) -> list[NeuralOE]:
+        """Models of all sound starts, best first: an ensemble."""
+    @property
+    def initial_states(self) -> _F:
+        """Past outputs of each training experiment, newest first, (n_experiments, na)."""
 
 def fit_arx(experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool) -> LinearModel: ...
 def fit_oe(
@@ -187,8 +200,13 @@ def fit_neural_oe(
     weight_decay: float, max_iterations: int, starts: int, seed: int, threads: int,
     progress: _Progress = None,
 ) -> NeuralFit:
-    """Train in free run. With ``linear`` the network gets a bypass that starts there. ``saturate`` widens the
-    training output's range by that fraction and clips the output there; None leaves the output linear."""
+    """Train in free run; chosen by J on ``validation``, without it by J on the training data.
+
+    With ``linear``, of the same orders, the network gets a bypass and starts exactly there; without, small random
+    weights and no bypass. ``saturate`` widens the training output's range by that fraction (half at each end) and
+    clips the output there, without slope outside; None leaves it linear. ``threads = 0`` takes all; the bits do not
+    depend on it. ``initial_state`` 'measured' starts each run after its first na samples.
+    """
 
 # --- control.rs -------------------------------------------------------------------------------------------
 

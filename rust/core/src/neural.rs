@@ -1,1 +1,276 @@
-//! The neural output-error model: network, simulation, exact sensitivities, training.
+//! The network output-error model: a free-running network with its scaling.
+
+mod draw;
+mod network;
+mod problem;
+mod scaling;
+mod tanh;
+mod train;
+
+pub use network::{Network, Shape};
+pub use scaling::Scaling;
+pub use tanh::tanh;
+pub use train::{InitialState, NeuralFit, Settings, fit};
+
+use network::Scratch;
+
+use crate::lagged::{Lagged, Lags, push_past};
+use crate::{Error, Result};
+
+/// `f = w2 . tanh(W1 phi + b1) + b2 [+ linear . phi]` in scaled units, clipped to the limits (docs/CONVENTIONS.md).
+#[derive(Clone, Debug)]
+pub struct NeuralOE {
+    theta: Vec<f64>,
+    scaling: Scaling,
+    network: Network,
+}
+
+impl NeuralOE {
+    /// A model from its parameters; `limits` are in scaled units, infinite where the output does not saturate.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for a wrong number of parameters or scales, values that are not finite, or limits that
+    /// leave no room.
+    pub fn new(
+        shape: Shape,
+        theta: Vec<f64>,
+        scaling: Scaling,
+        limits: (f64, f64),
+    ) -> Result<Self> {
+        if theta.len() != shape.parameters() {
+            return Err(Error::setting(format!(
+                "expected {} parameters for this shape, got {}; theta is W1 row by row, b1, w2, b2 and, with a bypass, linear",
+                shape.parameters(),
+                theta.len()
+            )));
+        }
+        if theta.iter().any(|v| !v.is_finite()) {
+            return Err(Error::setting(
+                "expected finite parameters, got NaN or infinity; train the model again",
+            ));
+        }
+        scaling.check(shape.lags.channels)?;
+        let room = limits.0 < limits.1;
+        if !room {
+            return Err(Error::setting(format!(
+                "expected output_low below output_high, got {} and {}; exchange or widen them",
+                limits.0, limits.1
+            )));
+        }
+        let mut network = Network::zero(shape, limits);
+        network.load(&theta);
+        Ok(Self {
+            theta,
+            scaling,
+            network,
+        })
+    }
+
+    /// Parameters, in the order of docs/CONVENTIONS.md.
+    pub fn theta(&self) -> &[f64] {
+        &self.theta
+    }
+
+    /// Orders, hidden units, bypass.
+    pub fn shape(&self) -> Shape {
+        self.network.shape
+    }
+
+    /// Scaling of inputs and output.
+    pub fn scaling(&self) -> &Scaling {
+        &self.scaling
+    }
+
+    /// Limits of the output in scaled units.
+    pub fn limits(&self) -> (f64, f64) {
+        self.network.limits
+    }
+
+    /// Free run in the data's units, and its derivatives row by row: by theta, then by the past outputs.
+    ///
+    /// # Errors
+    /// As [`Lagged::simulate`].
+    pub fn jacobian(
+        &self,
+        u: &[f64],
+        channels: usize,
+        y_past: &[f64],
+    ) -> Result<(Vec<f64>, Vec<f64>)> {
+        let run = self.simulate(u, channels, y_past)?;
+        let (shape, na) = (self.shape(), self.shape().lags.na);
+        let u: Vec<f64> = self.scaling.inputs(u);
+        let columns = shape.columns();
+        let mut gram = shape.gram();
+        let mut scratch = Scratch::new(shape);
+        let mut hidden = vec![[0.0; network::LANES]; shape.blocks()];
+        for (i, &y) in y_past.iter().enumerate() {
+            scratch.phi[i] = self.scaling.output(y);
+            gram.past_mut(i + 1)[shape.state_column() + i] = 1.0;
+        }
+        let mut rows = Vec::with_capacity(run.len() * (columns.len() + na));
+        for k in 0..run.len() {
+            shape.lags.write_inputs(&u, k, &mut scratch.phi[na..]);
+            let phi = &scratch.phi;
+            let y = self
+                .network
+                .forward(|c| phi[c], |block, h| hidden[block] = *h);
+            self.network
+                .push_row(&mut gram, &mut scratch, &hidden, y, 0.0);
+            let row = gram.past_mut(1);
+            rows.extend(columns.iter().map(|&c| row[c] * self.scaling.y_scale));
+            rows.extend_from_slice(&row[shape.state_column()..][..na]);
+            push_past(&mut scratch.phi[..na], y);
+        }
+        Ok((run, rows))
+    }
+}
+
+impl Lagged for NeuralOE {
+    fn lags(&self) -> Lags {
+        self.network.shape.lags
+    }
+
+    fn output(&self, phi: &[f64]) -> f64 {
+        let Lags { na, nb, .. } = self.lags();
+        let scaled = self
+            .network
+            .forward(|c| self.scaling.regressor(phi[c], c, na, nb), |_, _| ());
+        self.scaling.restored(scaled)
+    }
+
+    fn output_and_slope(&self, phi: &[f64], slope: &mut [f64]) -> f64 {
+        let Lags { na, nb, .. } = self.lags();
+        let scaled: Vec<f64> = (0..phi.len())
+            .map(|c| self.scaling.regressor(phi[c], c, na, nb))
+            .collect();
+        self.scaling
+            .restored(self.network.output_and_slope(&scaled, slope))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::Random;
+    use crate::{Monitor, Record};
+    use proptest::prelude::*;
+
+    fn random_model(seed: u64, hidden: usize, bypass: bool, clipped: bool) -> NeuralOE {
+        let mut random = Random::new(seed);
+        let shape = Shape::new(Lags::new(2, 2, 1, 2).unwrap(), hidden, bypass).unwrap();
+        let theta = (0..shape.parameters())
+            .map(|_| random.between(-0.4, 0.4))
+            .collect();
+        let scaling = Scaling {
+            u_mean: vec![0.1, -0.2],
+            u_scale: vec![2.0, 0.5],
+            y_mean: 3.0,
+            y_scale: 20.0,
+        };
+        let limits = if clipped {
+            (-0.3, 0.3)
+        } else {
+            (f64::NEG_INFINITY, f64::INFINITY)
+        };
+        NeuralOE::new(shape, theta, scaling, limits).unwrap()
+    }
+
+    fn moved(model: &NeuralOE, i: usize, by: f64) -> NeuralOE {
+        let mut theta = model.theta().to_vec();
+        theta[i] += by;
+        NeuralOE::new(
+            model.shape(),
+            theta,
+            model.scaling().clone(),
+            model.limits(),
+        )
+        .unwrap()
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(40))]
+        #[test]
+        fn sensitivities_agree_with_differences(seed in any::<u64>(), hidden in 1usize..10, bypass in any::<bool>()) {
+            let model = random_model(seed, hidden, bypass, false);
+            let mut random = Random::stream(seed, 1);
+            let u: Vec<f64> = (0..80).map(|_| random.normal()).collect();
+            let past = [4.0, 2.0];
+            let (run, rows) = model.jacobian(&u, 2, &past).unwrap();
+            let columns = model.theta().len() + 2;
+            for i in 0..model.theta().len() {
+                let ahead = moved(&model, i, 1e-5).simulate(&u, 2, &past).unwrap();
+                let behind = moved(&model, i, -1e-5).simulate(&u, 2, &past).unwrap();
+                for k in 0..run.len() {
+                    let difference = (ahead[k] - behind[k]) / 2e-5;
+                    prop_assert!((rows[k * columns + i] - difference).abs() < 1e-5 * (1.0 + difference.abs()));
+                }
+            }
+        }
+
+        #[test]
+        fn a_clean_record_gives_its_state_back(seed in any::<u64>()) {
+            let model = random_model(seed, 5, true, false);
+            let mut random = Random::stream(seed, 2);
+            let u: Vec<f64> = (0..80).map(|_| random.normal()).collect();
+            let y = model.simulate(&u, 2, &[12.0, -5.0]).unwrap();
+            let state = model.estimate_initial_state(&u, 2, &y).unwrap();
+            let again = model.simulate(&u, 2, &state).unwrap();
+            let worst = y.iter().zip(&again).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            prop_assert!(worst < 1e-3 * model.scaling().y_scale, "{worst}");
+        }
+    }
+
+    #[test]
+    fn a_clipped_sample_has_the_limit_and_no_slope() {
+        let model = random_model(3, 4, true, true);
+        let u: Vec<f64> = (0..100).map(|k| 2.0 * (k as f64).sin()).collect();
+        let (run, rows) = model.jacobian(&u, 2, &[3.0, 3.0]).unwrap();
+        let columns = model.theta().len() + 2;
+        let clipped: Vec<usize> = (0..run.len())
+            .filter(|&k| (run[k] - 3.0).abs() >= 6.0 - 1e-12)
+            .collect();
+        assert!(!clipped.is_empty() && clipped.len() < run.len());
+        for k in clipped {
+            assert!(
+                rows[k * columns..(k + 1) * columns]
+                    .iter()
+                    .all(|&v| v == 0.0)
+            );
+        }
+    }
+
+    #[test]
+    fn an_interrupted_training_returns_its_best() {
+        let u: Vec<f64> = (0..4000).map(|k| (k as f64 * 0.01).sin()).collect();
+        let y: Vec<f64> = u.iter().map(|u| u.powi(3)).collect();
+        let settings = Settings {
+            na: 1,
+            nb: 1,
+            nk: 0,
+            hidden: 8,
+            linear: None,
+            scaling: None,
+            saturate: None,
+            initial_state: InitialState::Measured,
+            weight_decay: 0.0,
+            max_iterations: 100_000,
+            starts: 3,
+            seed: 0,
+            threads: 1,
+        };
+        let monitor = Monitor::default();
+        let record = Record::new(&u, 1, &y).unwrap();
+        let fit = std::thread::scope(|scope| {
+            scope.spawn(|| {
+                while monitor.progress().0 < 5 {
+                    std::thread::yield_now();
+                }
+                monitor.request_stop();
+            });
+            fit(&[record], &[], &settings, &monitor)
+        });
+        let fit = fit.unwrap();
+        assert_eq!(fit.termination, crate::lm::Termination::Interrupted);
+        assert!(fit.cost <= fit.trace[0] && fit.start == 0);
+    }
+}

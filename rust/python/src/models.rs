@@ -1,6 +1,7 @@
 //! Bindings of the core's models.
 
 pub mod linear;
+pub mod neural;
 
 use numpy::{PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
@@ -10,7 +11,8 @@ use sewfast_core::lagged::Lagged;
 use crate::arrays::{raise, rows, slice};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    linear::register(module)
+    linear::register(module)?;
+    neural::register(module)
 }
 
 type Rows<'py> = PyReadonlyArray2<'py, f64>;

@@ -1,0 +1,266 @@
+//! The network's free run as a least-squares problem.
+
+use super::network::{Block, LANES, Network, Scratch, Shape};
+use super::scaling::Scaling;
+use super::train::InitialState;
+use crate::gram::Gram;
+use crate::lagged::push_past;
+use crate::lm::Problem;
+use crate::{Monitor, Record};
+
+/// A free run beyond this many scales has diverged.
+const DIVERGED: f64 = 1e4;
+/// Samples between two looks at the monitor.
+const LOOK: usize = 4096;
+
+/// One experiment in scaled units.
+#[derive(Clone, Debug)]
+pub(super) struct Experiment {
+    pub u: Vec<f64>,
+    pub y: Vec<f64>,
+    /// First simulated sample.
+    pub first: usize,
+    /// Past outputs before it; a guess where they are estimated.
+    pub state: Vec<f64>,
+}
+
+impl Experiment {
+    pub fn new(record: &Record, scaling: &Scaling, na: usize, kind: InitialState) -> Self {
+        let y: Vec<f64> = record.y.iter().map(|&y| scaling.output(y)).collect();
+        let (first, state) = match kind {
+            InitialState::Zero => (0, vec![scaling.output(0.0); na]),
+            InitialState::Measured => (na, y[..na].iter().rev().copied().collect()),
+            InitialState::Estimated => (
+                0,
+                vec![y[..y.len().min(5)].iter().sum::<f64>() / y.len().min(5) as f64; na],
+            ),
+        };
+        Self {
+            u: scaling.inputs(record.u),
+            y,
+            first,
+            state,
+        }
+    }
+
+    /// Simulated samples.
+    pub fn samples(&self) -> usize {
+        self.y.len() - self.first
+    }
+}
+
+/// Parameters: theta, then, where they are estimated, the past outputs of each experiment.
+pub(super) struct FreeRun<'a> {
+    experiments: &'a [Experiment],
+    monitor: &'a Monitor,
+    network: Network,
+    estimated: bool,
+    decay: f64,
+    samples: f64,
+    /// Outputs and hidden outputs of the last simulation, experiment by experiment.
+    runs: Vec<Vec<f64>>,
+    hidden: Vec<Vec<Block>>,
+    gram: Gram,
+    scratch: Scratch,
+    columns: Vec<usize>,
+}
+
+impl<'a> FreeRun<'a> {
+    pub fn new(
+        experiments: &'a [Experiment],
+        network: Network,
+        estimated: bool,
+        decay: f64,
+        monitor: &'a Monitor,
+    ) -> Self {
+        let shape = network.shape;
+        Self {
+            experiments,
+            monitor,
+            estimated,
+            decay,
+            samples: experiments.iter().map(Experiment::samples).sum::<usize>() as f64,
+            runs: experiments.iter().map(|e| vec![0.0; e.samples()]).collect(),
+            hidden: experiments
+                .iter()
+                .map(|e| vec![[0.0; LANES]; e.samples() * shape.blocks()])
+                .collect(),
+            gram: shape.gram(),
+            scratch: Scratch::new(shape),
+            columns: shape.columns(),
+            network,
+        }
+    }
+
+    pub fn shape(&self) -> Shape {
+        self.network.shape
+    }
+
+    /// `theta` followed by the experiments' own states where those are parameters.
+    pub fn start(&self, theta: &[f64]) -> Vec<f64> {
+        let states = self
+            .experiments
+            .iter()
+            .flat_map(|e| e.state.iter().copied());
+        let kept = if self.estimated { usize::MAX } else { 0 };
+        theta.iter().copied().chain(states.take(kept)).collect()
+    }
+
+    /// The part of the cost that is not the squared error: `decay/2 (|W1|^2 + |w2|^2 + .1 |b1|^2)`.
+    pub fn penalty(&self, theta: &[f64]) -> f64 {
+        let weighted = |(i, t): (usize, &f64)| self.decay_of(i) * t * t;
+        0.5 * theta.iter().enumerate().map(weighted).sum::<f64>()
+    }
+
+    /// Weights are held back, the biases less, the linear part and the constant not at all.
+    fn decay_of(&self, parameter: usize) -> f64 {
+        let [bias, second, constant, _] = self.shape().offsets();
+        match parameter {
+            i if i < bias => self.decay,
+            i if i < second => 0.1 * self.decay,
+            i if i < constant => self.decay,
+            _ => 0.0,
+        }
+    }
+
+    /// Share of the last simulation's samples on a limit.
+    pub fn clipped_share(&self) -> f64 {
+        let clipped = self
+            .runs
+            .iter()
+            .flatten()
+            .filter(|&&y| self.network.is_clipped(y))
+            .count();
+        clipped as f64 / self.samples
+    }
+
+    fn state<'t>(&'t self, theta: &'t [f64], experiment: usize) -> &'t [f64] {
+        let (own, na) = (self.shape().parameters(), self.shape().lags.na);
+        if self.estimated {
+            &theta[own + experiment * na..][..na]
+        } else {
+            &self.experiments[experiment].state
+        }
+    }
+
+    /// Sum of squared errors of the free run, whose outputs are stored.
+    fn simulate(&mut self, theta: &[f64], experiment: usize) -> Option<f64> {
+        let (lags, blocks) = (self.shape().lags, self.shape().blocks());
+        let data = &self.experiments[experiment];
+        let mut phi = std::mem::take(&mut self.scratch.phi);
+        phi[..lags.na].copy_from_slice(self.state(theta, experiment));
+        let (run, hidden) = (&mut self.runs[experiment], &mut self.hidden[experiment]);
+        let mut sum = 0.0;
+        for (i, (out, h)) in run
+            .iter_mut()
+            .zip(hidden.chunks_exact_mut(blocks))
+            .enumerate()
+        {
+            let k = data.first + i;
+            lags.write_inputs(&data.u, k, &mut phi[lags.na..]);
+            let y = self
+                .network
+                .forward(|c| phi[c], |block, values| h[block] = *values);
+            push_past(&mut phi[..lags.na], y);
+            *out = y;
+            sum += (data.y[k] - y) * (data.y[k] - y);
+            // NaN is no number below the bound either.
+            let sound = y.abs() < DIVERGED;
+            if !sound || (i % LOOK == 0 && self.monitor.stopped()) {
+                sum = f64::NAN;
+                break;
+            }
+        }
+        self.scratch.phi = phi;
+        sum.is_finite().then_some(sum)
+    }
+
+    fn sensitivities(&mut self, theta: &[f64], experiment: usize) {
+        let (shape, lags) = (self.shape(), self.shape().lags);
+        let data = &self.experiments[experiment];
+        self.gram.clear();
+        if self.estimated {
+            for i in 0..lags.na {
+                self.gram.past_mut(i + 1)[shape.state_column() + i] = 1.0;
+            }
+        }
+        let state = self.state(theta, experiment).to_vec();
+        self.scratch.phi[..lags.na].copy_from_slice(&state);
+        let (run, hidden) = (&self.runs[experiment], &self.hidden[experiment]);
+        for (i, (&y, h)) in run
+            .iter()
+            .zip(hidden.chunks_exact(shape.blocks()))
+            .enumerate()
+        {
+            if i % LOOK == 0 && self.monitor.stopped() {
+                return;
+            }
+            let k = data.first + i;
+            lags.write_inputs(&data.u, k, &mut self.scratch.phi[lags.na..]);
+            self.network
+                .push_row(&mut self.gram, &mut self.scratch, h, y, data.y[k] - y);
+            push_past(&mut self.scratch.phi[..lags.na], y);
+        }
+    }
+
+    /// Adds the experiment's sums to the system.
+    fn scatter(&mut self, experiment: usize, jtj: &mut [f64], jte: &mut [f64]) {
+        let (shape, n) = (self.shape(), jte.len());
+        let (na, first_state) = (shape.lags.na, shape.state_column());
+        let states = if self.estimated { na } else { 0 };
+        let own = shape.parameters();
+        let column = |i: usize| {
+            if i < own {
+                self.columns[i]
+            } else {
+                first_state + i - own
+            }
+        };
+        let place = |i: usize| if i < own { i } else { i + experiment * na };
+        let (sums, width) = self.gram.finish();
+        let scale = 1.0 / self.samples;
+        for i in 0..own + states {
+            let a = column(i);
+            jte[place(i)] += sums[(first_state + na) * width + a] * scale;
+            for j in 0..=i {
+                let b = column(j);
+                jtj[place(i) * n + place(j)] += sums[a.max(b) * width + a.min(b)] * scale;
+            }
+        }
+    }
+}
+
+impl Problem for FreeRun<'_> {
+    fn parameters(&self) -> usize {
+        let states = if self.estimated {
+            self.experiments.len() * self.shape().lags.na
+        } else {
+            0
+        };
+        self.shape().parameters() + states
+    }
+
+    fn cost(&mut self, theta: &[f64]) -> Option<f64> {
+        self.network.load(theta);
+        let mut sum = 0.0;
+        for experiment in 0..self.experiments.len() {
+            sum += self.simulate(theta, experiment)?;
+        }
+        Some(0.5 * sum / self.samples + self.penalty(theta))
+    }
+
+    fn normal_equations(&mut self, theta: &[f64], jtj: &mut [f64], jte: &mut [f64]) {
+        self.network.load(theta);
+        jtj.fill(0.0);
+        jte.fill(0.0);
+        for experiment in 0..self.experiments.len() {
+            self.sensitivities(theta, experiment);
+            self.scatter(experiment, jtj, jte);
+        }
+        for (i, t) in theta.iter().enumerate() {
+            let decay = self.decay_of(i);
+            jtj[i * theta.len() + i] += decay;
+            jte[i] -= decay * t;
+        }
+    }
+}

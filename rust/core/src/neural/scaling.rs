@@ -1,0 +1,104 @@
+//! Between the data's units and the network's.
+
+use crate::{Error, Record, Result};
+
+/// `(u - u_mean)/u_scale` and `(y - y_mean)/y_scale`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scaling {
+    /// What is taken off each input.
+    pub u_mean: Vec<f64>,
+    /// What each input is then divided by.
+    pub u_scale: Vec<f64>,
+    /// What is taken off the output.
+    pub y_mean: f64,
+    /// What the output is then divided by.
+    pub y_scale: f64,
+}
+
+impl Scaling {
+    /// Means and standard deviations over all records.
+    pub fn of(records: &[Record]) -> Self {
+        let channels = records[0].channels;
+        let input = |j: usize| {
+            moments(
+                records
+                    .iter()
+                    .flat_map(move |r| r.u.iter().skip(j).step_by(channels)),
+            )
+        };
+        let (u_mean, u_scale) = (0..channels).map(input).unzip();
+        let (y_mean, y_scale) = moments(records.iter().flat_map(|r| r.y));
+        Self {
+            u_mean,
+            u_scale,
+            y_mean,
+            y_scale,
+        }
+    }
+
+    /// Refuses a scaling that does not fit `channels` inputs.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for wrong lengths, scales that are not positive, values that are not finite.
+    pub fn check(&self, channels: usize) -> Result<()> {
+        if self.u_mean.len() != channels || self.u_scale.len() != channels {
+            return Err(Error::setting(format!(
+                "expected u_mean and u_scale with {channels} values, one per input, got {} and {}",
+                self.u_mean.len(),
+                self.u_scale.len()
+            )));
+        }
+        let scales = self.u_scale.iter().chain([&self.y_scale]);
+        if let Some(scale) = scales.copied().find(|s| !(s.is_finite() && *s > 0.0)) {
+            return Err(Error::setting(format!(
+                "expected positive scales, got {scale}; leave scales out to use standard deviations"
+            )));
+        }
+        if self
+            .u_mean
+            .iter()
+            .chain([&self.y_mean])
+            .any(|m| !m.is_finite())
+        {
+            return Err(Error::setting(
+                "expected finite means, got NaN or infinity; leave them out to use the data's",
+            ));
+        }
+        Ok(())
+    }
+
+    /// All inputs, scaled.
+    pub fn inputs(&self, u: &[f64]) -> Vec<f64> {
+        let channels = self.u_mean.len();
+        let scaled =
+            |(i, u): (usize, &f64)| (u - self.u_mean[i % channels]) / self.u_scale[i % channels];
+        u.iter().enumerate().map(scaled).collect()
+    }
+
+    /// An output, scaled.
+    pub fn output(&self, y: f64) -> f64 {
+        (y - self.y_mean) / self.y_scale
+    }
+
+    /// A scaled output in the data's unit.
+    pub fn restored(&self, scaled: f64) -> f64 {
+        scaled * self.y_scale + self.y_mean
+    }
+
+    /// Entry `c` of a regressor, scaled.
+    #[inline(always)]
+    pub(super) fn regressor(&self, value: f64, c: usize, na: usize, nb: usize) -> f64 {
+        if c < na {
+            return self.output(value);
+        }
+        let j = (c - na) / nb;
+        (value - self.u_mean[j]) / self.u_scale[j]
+    }
+}
+
+fn moments<'a>(values: impl Iterator<Item = &'a f64> + Clone) -> (f64, f64) {
+    let count = values.clone().count() as f64;
+    let mean = values.clone().sum::<f64>() / count;
+    let variance = values.map(|v| (v - mean) * (v - mean)).sum::<f64>() / count;
+    (mean, variance.sqrt())
+}

@@ -1,0 +1,502 @@
+//! Training in free run: many starts in parallel, each by Levenberg-Marquardt, chosen by free run.
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread;
+
+use super::network::{Network, Shape};
+use super::problem::{Experiment, FreeRun};
+use super::scaling::Scaling;
+use super::{NeuralOE, draw};
+use crate::lagged::{Lagged, push_past};
+use crate::linear::LinearModel;
+use crate::lm::{self, Damping, Outcome, Termination};
+use crate::random::Random;
+use crate::{Error, Monitor, Record, Result, arx};
+
+/// Where a free run starts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum InitialState {
+    /// Past outputs zero: a machine at rest.
+    Zero,
+    /// The first `na` outputs are taken as measured; the run starts after them.
+    Measured,
+    /// Parameters of the fit, one set per experiment.
+    Estimated,
+}
+
+/// What to train, and how.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Past outputs.
+    pub na: usize,
+    /// Past values of each input.
+    pub nb: usize,
+    /// Delay in samples.
+    pub nk: usize,
+    /// Hidden units.
+    pub hidden: usize,
+    /// Gives the network a bypass that starts as this model; without it there is no bypass.
+    pub linear: Option<LinearModel>,
+    /// Scaling; means and standard deviations of the training data where there is none.
+    pub scaling: Option<Scaling>,
+    /// The output saturates at the training output's range, whose width is first multiplied by `1 + saturate`.
+    pub saturate: Option<f64>,
+    /// Where each experiment's free run starts.
+    pub initial_state: InitialState,
+    /// Weight of `1/2 (|W1|^2 + |w2|^2 + .1 |b1|^2)` beside J; 1e-8 or less on much data.
+    pub weight_decay: f64,
+    /// Iterations of each start.
+    pub max_iterations: usize,
+    /// Number of starts.
+    pub starts: usize,
+    /// Seed of the starts; start `i` draws from stream `i`.
+    pub seed: u64,
+    /// Threads; 0 takes as many as the machine has. The result does not depend on it.
+    pub threads: usize,
+}
+
+/// A trained network with the story of its training.
+#[derive(Clone, Debug)]
+pub struct NeuralFit {
+    /// The chosen model.
+    pub model: NeuralOE,
+    /// `J = 1/(2N) sum e^2` in scaled units, free run, on the training data, without weight decay.
+    pub cost: f64,
+    /// The same on the validation data, where there are any.
+    pub validation_cost: Option<f64>,
+    /// Iterations of the chosen start.
+    pub iterations: usize,
+    /// How the chosen start ended.
+    pub termination: Termination,
+    /// J of the chosen start, at its beginning and after each accepted step.
+    pub trace: Vec<f64>,
+    /// Which start was chosen.
+    pub start: usize,
+    /// What each start was judged by: J on the validation data, else on the training data; infinite for a failed one.
+    pub start_costs: Vec<f64>,
+    /// Starts that were dead and drawn again.
+    pub discarded: usize,
+    /// Models of all sound starts, best first.
+    pub models: Vec<NeuralOE>,
+    /// Past outputs of each training experiment, newest first, in the data's unit.
+    pub initial_states: Vec<Vec<f64>>,
+}
+
+/// Validation samples from which an unknown initial state is estimated.
+const STATE_SAMPLES: usize = 20;
+/// Draws of one start before it is given up.
+const MOST_DRAWS: usize = 50;
+/// Trainings of one start before it is given up: only those that ended dead are repeated.
+const MOST_TRAININGS: usize = 3;
+/// A start with more than this share of its samples on a limit has no slope to learn from.
+const DEAD_SHARE: f64 = 0.9;
+/// A training that ends above this share of a constant output's J has learnt nothing.
+const DEAD_COST: f64 = 0.9;
+
+/// Trains `settings.starts` networks in free run and chooses by validation J, without validation data by training J.
+///
+/// With validation data each start keeps its best iterate on them, and a start that diverges there is never chosen.
+/// A start is dead where its free run is not finite, lies on a limit almost throughout or ends no better than a
+/// constant output; it is drawn again from its own stream, and counted in `discarded`.
+///
+/// # Errors
+/// `ErrorKind::Data` and `ErrorKind::Setting` for what cannot be trained; `ErrorKind::Fit` where every start failed.
+pub fn fit(
+    records: &[Record],
+    validation: &[Record],
+    settings: &Settings,
+    monitor: &Monitor,
+) -> Result<NeuralFit> {
+    let training = Training::new(records, validation, settings, monitor)?;
+    monitor.set_total((settings.starts * settings.max_iterations) as u64);
+    let results = training.run_all();
+    training.chosen(results)
+}
+
+/// All that the starts share.
+struct Training<'a> {
+    settings: &'a Settings,
+    monitor: &'a Monitor,
+    shape: Shape,
+    scaling: Scaling,
+    limits: (f64, f64),
+    experiments: Vec<Experiment>,
+    validation: Vec<Experiment>,
+    linear: Option<Vec<f64>>,
+    constant_cost: f64,
+}
+
+/// One trained start.
+struct Trained {
+    theta: Vec<f64>,
+    cost: f64,
+    validation_cost: Option<f64>,
+    outcome: Outcome,
+    trace: Vec<f64>,
+    discarded: usize,
+}
+
+impl Trained {
+    fn score(&self) -> f64 {
+        let score = self.validation_cost.unwrap_or(self.cost);
+        if score.is_nan() { f64::INFINITY } else { score }
+    }
+}
+
+impl<'a> Training<'a> {
+    fn new(
+        records: &[Record],
+        validation: &[Record],
+        settings: &'a Settings,
+        monitor: &'a Monitor,
+    ) -> Result<Self> {
+        let lags = arx::check(records, settings.na, settings.nb, settings.nk)?;
+        check(settings)?;
+        let shape = Shape::new(lags, settings.hidden, settings.linear.is_some())?;
+        check_records(records, validation, shape)?;
+        let scaling = settings
+            .scaling
+            .clone()
+            .unwrap_or_else(|| Scaling::of(records));
+        scaling.check(lags.channels)?;
+        let linear = settings.linear.as_ref();
+        let bypass = linear
+            .map(|l| draw::bypass(l, &scaling, shape))
+            .transpose()?;
+        let scaled = |r: &Record| Experiment::new(r, &scaling, lags.na, settings.initial_state);
+        let mut experiments: Vec<Experiment> = records.iter().map(scaled).collect();
+        if let (Some(linear), InitialState::Estimated) = (linear, settings.initial_state) {
+            for (experiment, record) in experiments.iter_mut().zip(records) {
+                let state = linear.estimate_initial_state(record.u, record.channels, record.y)?;
+                experiment.state = state.iter().map(|&y| scaling.output(y)).collect();
+            }
+        }
+        Ok(Self {
+            settings,
+            monitor,
+            shape,
+            limits: limits(&experiments, settings.saturate),
+            constant_cost: constant_cost(&experiments),
+            validation: validation.iter().map(scaled).collect(),
+            experiments,
+            scaling,
+            linear: bypass,
+        })
+    }
+
+    /// The starts' results in their order, whatever the number of threads.
+    fn run_all(&self) -> Vec<Option<Trained>> {
+        let starts = self.settings.starts;
+        let available = || thread::available_parallelism().map_or(1, usize::from);
+        let threads = match self.settings.threads {
+            0 => available(),
+            threads => threads,
+        };
+        let (next, results) = (AtomicUsize::new(0), Mutex::new(Vec::with_capacity(starts)));
+        let work = || {
+            loop {
+                let start = next.fetch_add(1, Ordering::Relaxed);
+                if start >= starts || self.monitor.stopped() {
+                    return;
+                }
+                let trained = self.run(start);
+                let mut results = results.lock().unwrap_or_else(|e| e.into_inner());
+                results.push((start, trained));
+            }
+        };
+        thread::scope(|scope| {
+            for _ in 1..threads.min(starts) {
+                scope.spawn(work);
+            }
+            work();
+        });
+        let mut results = results.into_inner().unwrap_or_else(|e| e.into_inner());
+        results.sort_by_key(|(start, _)| *start);
+        results.into_iter().map(|(_, trained)| trained).collect()
+    }
+
+    /// Trains one start, drawn again while it is dead.
+    fn run(&self, start: usize) -> Option<Trained> {
+        let mut random = Random::stream(self.settings.seed, start as u64);
+        let mut discarded = 0;
+        for training in 0..MOST_TRAININGS {
+            let mut problem = self.problem();
+            let (theta, dead) = self.drawn(&mut problem, &mut random)?;
+            discarded += dead;
+            let mut trained = self.train(&mut problem, theta)?;
+            trained.discarded = discarded;
+            let learnt = trained.cost < DEAD_COST * self.constant_cost;
+            if learnt || training + 1 == MOST_TRAININGS || self.monitor.stopped() {
+                return Some(trained);
+            }
+            discarded += 1;
+        }
+        None
+    }
+
+    fn problem(&self) -> FreeRun<'_> {
+        let network = Network::zero(self.shape, self.limits);
+        let estimated = self.settings.initial_state == InitialState::Estimated;
+        FreeRun::new(
+            &self.experiments,
+            network,
+            estimated,
+            self.settings.weight_decay,
+            self.monitor,
+        )
+    }
+
+    /// Parameters with a free run to learn from, and how many draws had none.
+    fn drawn(&self, problem: &mut FreeRun, random: &mut Random) -> Option<(Vec<f64>, usize)> {
+        for dead in 0..MOST_DRAWS {
+            let theta = match &self.linear {
+                Some(bypass) => draw::beside(bypass, self.shape, random),
+                None => draw::small(self.shape, random),
+            };
+            let theta = problem.start(&theta);
+            let runs = lm::Problem::cost(problem, &theta).is_some();
+            if runs && problem.clipped_share() <= DEAD_SHARE {
+                return Some((theta, dead));
+            }
+            if self.monitor.stopped() {
+                return None;
+            }
+        }
+        None
+    }
+
+    fn train(&self, problem: &mut FreeRun, theta: Vec<f64>) -> Option<Trained> {
+        let settings = lm::Settings {
+            max_iterations: self.settings.max_iterations,
+            damping: Damping::Identity,
+            mu: 1e-2,
+            ..lm::Settings::default()
+        };
+        let own = self.shape.parameters();
+        let mut referee = Referee::new(self);
+        let mut costs = Vec::with_capacity(settings.max_iterations + 1);
+        let outcome = lm::minimize(problem, theta, &settings, self.monitor, |theta, cost| {
+            costs.push((cost, theta[..own].to_vec()));
+            referee.judge(theta, &theta[..own], cost);
+        });
+        let trace: Vec<f64> = costs
+            .iter()
+            .map(|(cost, t)| cost - problem.penalty(t))
+            .collect();
+        let spare = self.settings.max_iterations - outcome.iterations;
+        self.monitor.advance(spare as u64);
+        let (_, validation_cost, theta, cost) = referee.best?;
+        Some(Trained {
+            cost: cost - problem.penalty(&theta),
+            theta,
+            validation_cost,
+            outcome,
+            trace,
+            discarded: 0,
+        })
+    }
+
+    fn chosen(&self, results: Vec<Option<Trained>>) -> Result<NeuralFit> {
+        let score = |t: &Option<Trained>| t.as_ref().map_or(f64::INFINITY, Trained::score);
+        let start_costs: Vec<f64> = results.iter().map(score).collect();
+        let mut order: Vec<usize> = (0..results.len())
+            .filter(|&i| start_costs[i].is_finite())
+            .collect();
+        order.sort_by(|&i, &j| start_costs[i].total_cmp(&start_costs[j]));
+        let models = order
+            .iter()
+            .filter_map(|&i| results[i].as_ref().map(|t| self.model(&t.theta)));
+        let models = models.collect::<Result<Vec<_>>>()?;
+        let discarded = results.iter().flatten().map(|t| t.discarded).sum();
+        let start = *order.first().ok_or_else(no_start)?;
+        let best = results
+            .into_iter()
+            .nth(start)
+            .flatten()
+            .ok_or_else(no_start)?;
+        let stopped = self.monitor.stopped();
+        Ok(NeuralFit {
+            model: models[0].clone(),
+            cost: best.cost,
+            validation_cost: best.validation_cost,
+            iterations: best.outcome.iterations,
+            termination: if stopped {
+                Termination::Interrupted
+            } else {
+                best.outcome.termination
+            },
+            trace: best.trace,
+            start,
+            start_costs,
+            discarded,
+            models,
+            initial_states: self.states(&best.theta),
+        })
+    }
+
+    fn model(&self, theta: &[f64]) -> Result<NeuralOE> {
+        let own = theta[..self.shape.parameters()].to_vec();
+        NeuralOE::new(self.shape, own, self.scaling.clone(), self.limits)
+    }
+
+    fn states(&self, theta: &[f64]) -> Vec<Vec<f64>> {
+        let na = self.shape.lags.na;
+        let estimated = theta[self.shape.parameters()..].chunks_exact(na);
+        let restored = |state: &[f64]| state.iter().map(|&y| self.scaling.restored(y)).collect();
+        match self.settings.initial_state {
+            InitialState::Estimated => estimated.map(restored).collect(),
+            _ => self
+                .experiments
+                .iter()
+                .map(|e| restored(&e.state))
+                .collect(),
+        }
+    }
+}
+
+/// Keeps the best iterate of a start: on the validation data, else on the training data.
+struct Referee<'t> {
+    training: &'t Training<'t>,
+    network: Network,
+    /// Score, validation J, all parameters, cost.
+    best: Option<(f64, Option<f64>, Vec<f64>, f64)>,
+}
+
+impl<'t> Referee<'t> {
+    fn new(training: &'t Training<'t>) -> Self {
+        let network = Network::zero(training.shape, training.limits);
+        Self {
+            training,
+            network,
+            best: None,
+        }
+    }
+
+    fn judge(&mut self, all: &[f64], theta: &[f64], cost: f64) {
+        self.network.load(theta);
+        let validation = (!self.training.validation.is_empty()).then(|| self.validation_cost());
+        let score = validation.unwrap_or(cost);
+        if self.best.as_ref().is_none_or(|b| score < b.0) {
+            self.best = Some((score, validation, all.to_vec(), cost));
+        }
+    }
+
+    /// J over all validation experiments; infinite where one diverges.
+    fn validation_cost(&self) -> f64 {
+        let scores = self.training.validation.iter().map(|e| self.score(e));
+        let (sum, samples) = scores.fold((0.0, 0), |(sum, n), (s, m)| (sum + s, n + m));
+        let cost = 0.5 * sum / samples as f64;
+        if cost.is_nan() { f64::INFINITY } else { cost }
+    }
+
+    /// Sum of squared errors and the number of samples it is taken over.
+    fn score(&self, experiment: &Experiment) -> (f64, usize) {
+        let lags = self.network.shape.lags;
+        let estimated = self.training.settings.initial_state == InitialState::Estimated;
+        let skipped = if estimated {
+            STATE_SAMPLES.min(experiment.y.len() / 2)
+        } else {
+            experiment.first
+        };
+        let mut phi = vec![0.0; lags.regressors()];
+        let state = match estimated {
+            true => {
+                let u = &experiment.u[..skipped * lags.channels];
+                self.network
+                    .estimate_initial_state(u, lags.channels, &experiment.y[..skipped])
+            }
+            false => Ok(experiment.state.clone()),
+        };
+        let Ok(state) = state else {
+            return (f64::INFINITY, 1);
+        };
+        phi[..lags.na].copy_from_slice(&state);
+        let mut sum = 0.0;
+        for k in experiment.first..experiment.y.len() {
+            lags.write_inputs(&experiment.u, k, &mut phi[lags.na..]);
+            let y = self.network.output(&phi);
+            push_past(&mut phi[..lags.na], y);
+            if k >= skipped {
+                sum += (experiment.y[k] - y) * (experiment.y[k] - y);
+            }
+        }
+        (sum, experiment.y.len() - skipped)
+    }
+}
+
+/// The training output's range, its width multiplied by `1 + widened`, in scaled units.
+fn limits(experiments: &[Experiment], widened: Option<f64>) -> (f64, f64) {
+    let Some(widened) = widened else {
+        return (f64::NEG_INFINITY, f64::INFINITY);
+    };
+    let outputs = experiments.iter().flat_map(|e| &e.y);
+    let (low, high) = outputs.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), &y| {
+        (l.min(y), h.max(y))
+    });
+    let margin = 0.5 * widened * (high - low);
+    (low - margin, high + margin)
+}
+
+/// J of the best constant output.
+fn constant_cost(experiments: &[Experiment]) -> f64 {
+    let outputs = || experiments.iter().flat_map(|e| &e.y[e.first..]);
+    let count = outputs().count() as f64;
+    let mean = outputs().sum::<f64>() / count;
+    0.5 * outputs().map(|y| (y - mean) * (y - mean)).sum::<f64>() / count
+}
+
+fn check(settings: &Settings) -> Result<()> {
+    for (name, value) in [
+        ("max_iterations", settings.max_iterations),
+        ("starts", settings.starts),
+    ] {
+        if value == 0 || value > 1_000_000 {
+            return Err(Error::setting(format!(
+                "expected {name} from 1 to 1,000,000, got {value}; 100 iterations and 8 starts are usual"
+            )));
+        }
+    }
+    let sound = settings.weight_decay >= 0.0 && settings.weight_decay.is_finite();
+    if !sound {
+        return Err(Error::setting(format!(
+            "expected a weight decay of 0 or more, got {}; 1e-8 is usual",
+            settings.weight_decay
+        )));
+    }
+    match settings.saturate {
+        Some(widened) if !(widened >= 0.0 && widened.is_finite()) => Err(Error::setting(format!(
+            "expected saturate of 0 or more, got {widened}; .2 widens the output's range by 20 %"
+        ))),
+        _ => Ok(()),
+    }
+}
+
+fn check_records(records: &[Record], validation: &[Record], shape: Shape) -> Result<()> {
+    let (least, channels) = (shape.lags.na + 1, shape.lags.channels);
+    for record in records.iter().chain(validation) {
+        if record.len() < least || record.channels != channels {
+            return Err(Error::data(format!(
+                "expected {least} or more samples of {channels} inputs in every experiment, got {} of {}; leave that experiment out",
+                record.len(),
+                record.channels
+            )));
+        }
+    }
+    let (samples, parameters) = (
+        records.iter().map(Record::len).sum::<usize>(),
+        shape.parameters(),
+    );
+    if samples <= parameters {
+        return Err(Error::data(format!(
+            "expected more than {parameters} samples for as many parameters, got {samples}; record longer or use fewer hidden units"
+        )));
+    }
+    Ok(())
+}
+
+fn no_start() -> Error {
+    Error::fit(
+        "expected a start with a finite free run on training and validation data, found none; give more starts, a linear model to start from, or a smaller network",
+    )
+}

@@ -1,0 +1,292 @@
+//! Bindings of the network output-error model and its training.
+
+use numpy::{PyArray1, PyArray2};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use sewfast_core::lagged::{Lagged, Lags};
+use sewfast_core::neural::{self, InitialState, Scaling, Settings, Shape};
+use sewfast_core::{Error, Result};
+
+use super::linear::LinearModel;
+use super::{Rows, Values};
+use crate::arrays::{Experiments, array1, array2, raise, records, rows, slice};
+use crate::watch::watched;
+
+pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<NeuralOE>()?;
+    module.add_class::<NeuralFit>()?;
+    module.add_function(wrap_pyfunction!(fit_neural_oe, module)?)
+}
+
+type RunAndJacobian<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);
+
+/// Network output-error model.
+#[pyclass(frozen, module = "sewfast._core")]
+pub struct NeuralOE {
+    /// The model itself.
+    pub inner: neural::NeuralOE,
+}
+
+#[pymethods]
+impl NeuralOE {
+    #[new]
+    #[pyo3(signature = (*, na, nb, nk, n_inputs, hidden, bypass, theta, u_mean, u_scale, y_mean, y_scale, output_low, output_high))]
+    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+    fn new(
+        py: Python<'_>,
+        na: usize,
+        nb: usize,
+        nk: usize,
+        n_inputs: usize,
+        hidden: usize,
+        bypass: bool,
+        theta: Values<'_>,
+        u_mean: Values<'_>,
+        u_scale: Values<'_>,
+        y_mean: f64,
+        y_scale: f64,
+        output_low: Option<f64>,
+        output_high: Option<f64>,
+    ) -> PyResult<Self> {
+        let scaling = Scaling {
+            u_mean: slice(&u_mean, "u_mean")?.to_vec(),
+            u_scale: slice(&u_scale, "u_scale")?.to_vec(),
+            y_mean,
+            y_scale,
+        };
+        let limits = (
+            output_low.unwrap_or(f64::NEG_INFINITY),
+            output_high.unwrap_or(f64::INFINITY),
+        );
+        let theta = slice(&theta, "theta")?.to_vec();
+        Lags::new(na, nb, nk, n_inputs)
+            .and_then(|lags| Shape::new(lags, hidden, bypass))
+            .and_then(|shape| neural::NeuralOE::new(shape, theta, scaling, limits))
+            .map(|inner| Self { inner })
+            .map_err(|e| raise(py, e))
+    }
+
+    #[getter]
+    fn theta<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array1(py, self.inner.theta().to_vec())
+    }
+
+    #[getter]
+    fn settings<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let (shape, scaling) = (self.inner.shape(), self.inner.scaling());
+        let limit = |value: f64| value.is_finite().then_some(value);
+        let settings = PyDict::new(py);
+        settings.set_item("na", shape.lags.na)?;
+        settings.set_item("nb", shape.lags.nb)?;
+        settings.set_item("nk", shape.lags.nk)?;
+        settings.set_item("n_inputs", shape.lags.channels)?;
+        settings.set_item("hidden", shape.hidden)?;
+        settings.set_item("bypass", shape.bypass)?;
+        settings.set_item("u_mean", array1(py, scaling.u_mean.clone()))?;
+        settings.set_item("u_scale", array1(py, scaling.u_scale.clone()))?;
+        settings.set_item("y_mean", scaling.y_mean)?;
+        settings.set_item("y_scale", scaling.y_scale)?;
+        settings.set_item("output_low", limit(self.inner.limits().0))?;
+        settings.set_item("output_high", limit(self.inner.limits().1))?;
+        Ok(settings)
+    }
+
+    #[getter]
+    fn na(&self) -> usize {
+        self.inner.lags().na
+    }
+
+    fn simulate<'py>(
+        &self,
+        py: Python<'py>,
+        u: Rows<'py>,
+        y_past: Values<'py>,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        Ok(array1(py, super::simulate(py, &self.inner, &u, &y_past)?))
+    }
+
+    fn predict<'py>(
+        &self,
+        py: Python<'py>,
+        u: Rows<'py>,
+        y: Values<'py>,
+        y_past: Values<'py>,
+        horizon: usize,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        let run = super::predict(py, &self.inner, &u, &y, &y_past, horizon)?;
+        Ok(array1(py, run))
+    }
+
+    fn estimate_initial_state<'py>(
+        &self,
+        py: Python<'py>,
+        u: Rows<'py>,
+        y: Values<'py>,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        Ok(array1(py, super::initial_state(py, &self.inner, &u, &y)?))
+    }
+
+    fn jacobian<'py>(
+        &self,
+        py: Python<'py>,
+        u: Rows<'py>,
+        y_past: Values<'py>,
+    ) -> PyResult<RunAndJacobian<'py>> {
+        let ((u, channels), y_past) = (rows(&u, "u")?, slice(&y_past, "y_past")?);
+        let (run, jacobian) = super::released(py, || self.inner.jacobian(u, channels, y_past))?;
+        let columns = self.inner.theta().len() + self.inner.lags().na;
+        Ok((array1(py, run), array2(py, jacobian, columns)?))
+    }
+}
+
+/// A trained network with the story of its training.
+#[pyclass(frozen, module = "sewfast._core")]
+pub struct NeuralFit {
+    inner: neural::NeuralFit,
+}
+
+#[pymethods]
+impl NeuralFit {
+    #[getter]
+    fn model(&self) -> NeuralOE {
+        NeuralOE {
+            inner: self.inner.model.clone(),
+        }
+    }
+
+    #[getter]
+    fn models(&self) -> Vec<NeuralOE> {
+        let model = |inner: &neural::NeuralOE| NeuralOE {
+            inner: inner.clone(),
+        };
+        self.inner.models.iter().map(model).collect()
+    }
+
+    #[getter]
+    fn cost(&self) -> f64 {
+        self.inner.cost
+    }
+
+    #[getter]
+    fn validation_cost(&self) -> Option<f64> {
+        self.inner.validation_cost
+    }
+
+    #[getter]
+    fn iterations(&self) -> usize {
+        self.inner.iterations
+    }
+
+    #[getter]
+    fn termination(&self) -> &'static str {
+        self.inner.termination.name()
+    }
+
+    #[getter]
+    fn remedy(&self) -> &'static str {
+        self.inner.termination.remedy()
+    }
+
+    #[getter]
+    fn trace<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array1(py, self.inner.trace.clone())
+    }
+
+    #[getter]
+    fn start(&self) -> usize {
+        self.inner.start
+    }
+
+    #[getter]
+    fn start_costs<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array1(py, self.inner.start_costs.clone())
+    }
+
+    #[getter]
+    fn discarded(&self) -> usize {
+        self.inner.discarded
+    }
+
+    #[getter]
+    fn initial_states<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let states = self.inner.initial_states.concat();
+        array2(py, states, self.inner.model.lags().na)
+    }
+}
+
+#[pyfunction]
+#[pyo3(signature = (
+    experiments, validation, *, na, nb, nk, hidden, linear, u_mean, u_scale, y_mean, y_scale, saturate,
+    initial_state, weight_decay, max_iterations, starts, seed, threads, progress = None
+))]
+#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+fn fit_neural_oe(
+    py: Python<'_>,
+    experiments: Experiments<'_>,
+    validation: Experiments<'_>,
+    na: usize,
+    nb: usize,
+    nk: usize,
+    hidden: usize,
+    linear: Option<PyRef<'_, LinearModel>>,
+    u_mean: Option<Values<'_>>,
+    u_scale: Option<Values<'_>>,
+    y_mean: Option<f64>,
+    y_scale: Option<f64>,
+    saturate: Option<f64>,
+    initial_state: &str,
+    weight_decay: f64,
+    max_iterations: usize,
+    starts: usize,
+    seed: u64,
+    threads: usize,
+    progress: Option<Bound<'_, PyAny>>,
+) -> PyResult<NeuralFit> {
+    let scaling = match (u_mean, u_scale, y_mean, y_scale) {
+        (None, None, None, None) => None,
+        (Some(u_mean), Some(u_scale), Some(y_mean), Some(y_scale)) => Some(Scaling {
+            u_mean: slice(&u_mean, "u_mean")?.to_vec(),
+            u_scale: slice(&u_scale, "u_scale")?.to_vec(),
+            y_mean,
+            y_scale,
+        }),
+        _ => return Err(raise(py, half_a_scaling())),
+    };
+    let settings = Settings {
+        na,
+        nb,
+        nk,
+        hidden,
+        linear: linear.map(|l| l.inner.clone()),
+        scaling,
+        saturate,
+        initial_state: parsed(initial_state).map_err(|e| raise(py, e))?,
+        weight_decay,
+        max_iterations,
+        starts,
+        seed,
+        threads,
+    };
+    let (records, validation) = (records(py, &experiments)?, records(py, &validation)?);
+    let inner = watched(py, progress.as_ref(), |monitor| {
+        neural::fit(&records, &validation, &settings, monitor)
+    })?;
+    Ok(NeuralFit { inner })
+}
+
+fn half_a_scaling() -> Error {
+    Error::setting(
+        "expected all of u_mean, u_scale, y_mean, y_scale or none of them, got some; give the rest or leave all out",
+    )
+}
+
+fn parsed(name: &str) -> Result<InitialState> {
+    match name {
+        "zero" => Ok(InitialState::Zero),
+        "measured" => Ok(InitialState::Measured),
+        "estimated" => Ok(InitialState::Estimated),
+        other => Err(Error::setting(format!(
+            "expected initial_state zero, measured or estimated, got {other:?}; choose one of the three"
+        ))),
+    }
+}
