@@ -82,6 +82,10 @@ def test_names_match_the_columns() -> None:
         make(nu=2, input_names=["u", "u"])
 
 
+def test_an_output_may_be_left_out() -> None:
+    assert np.isnan(Dataset.from_arrays(np.ones((4, 2)), None, 1.0).experiments[0].y).all()
+
+
 def test_masked_values_become_nan() -> None:
     y = np.ma.masked_greater(np.arange(5.0), 3.0)
     assert np.isnan(Dataset.from_arrays(np.ones(5), y, 1.0).experiments[0].y[4])

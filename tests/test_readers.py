@@ -190,7 +190,8 @@ def test_a_wrong_column_lists_the_others_and_guesses(tmp_path: Path) -> None:
 
 
 def test_an_output_may_be_absent(tmp_path: Path) -> None:
-    data = read(csv(tmp_path, "t,u\n0,1\n1,2\n"), inputs="u")
+    data = read(csv(tmp_path, "t,u\n0,1\n1,2\n"), inputs="u", name="run 3")
+    assert data.source == "run 3"
     assert np.isnan(data.experiments[0].y).all()
     data.require_inputs()
 

@@ -186,7 +186,7 @@ class Dataset:
     def from_arrays(
         cls,
         u: ArrayLike,
-        y: ArrayLike,
+        y: ArrayLike | None,
         Ts: float,
         *,
         input_names: str | Sequence[str] | None = None,
@@ -201,7 +201,8 @@ class Dataset:
         Parameters
         ----------
         u : array_like, shape (N,) or (N, n_inputs)
-        y : array_like, shape (N,)
+        y : array_like, shape (N,), or None
+            None where nothing was measured: enough to simulate from rest.
         Ts : float
             Sample time [s].
 
@@ -210,6 +211,7 @@ class Dataset:
         DataError
             As for `Experiment` and `Dataset`.
         """
+        y = np.full(np.shape(u)[:1], np.nan) if y is None else y
         experiment = Experiment(u, y, channels or {}, name)  # type: ignore[arg-type]
         width = experiment.u.shape[1]
         default = ("u",) if width == 1 else tuple(f"u{i + 1}" for i in range(width))

@@ -25,6 +25,7 @@ def read(
     counts_per_rev: float | None = None,
     time: str | None = None,
     channels: Sequence[str] = (),
+    name: str | None = None,
 ) -> Dataset:
     """Read inputs and an output from one recording.
 
@@ -47,11 +48,13 @@ def read(
         Name of the time column [s] where it is neither `t` nor `time`.
     channels : sequence of str
         Further columns to carry along.
+    name : str or None
+        Of the experiment, for messages; the file's name where None.
 
     Returns
     -------
     Dataset
-        One experiment, named after the file.
+        One experiment.
 
     Raises
     ------
@@ -72,23 +75,29 @@ def read(
     names = tuple(table.resolve(n) for n in names)
     period = sample_time(table, Ts, time)
     u = _side_by_side(table, names)
-    if counts is None or counts_per_rev is None:
-        y = np.full(len(u), np.nan) if output is None else table[output]
-        name, unit, source = output or "y", table.unit(output) if output else "", None
-    else:
-        y = _speed(table, counts, counts_per_rev, period)
-        name, unit, source = (
-            output or "speed",
-            "RPM",
-            (table.resolve(counts), float(counts_per_rev)),
-        )
-    _require_length(table, name, y, names[0], len(u))
+    y, label, unit, source = _output(table, output, counts, counts_per_rev, period, len(u))
+    _require_length(table, label, y, names[0], len(u))
     extra = {c: table[c] for c in channels}
-    experiment = Experiment(u, y, extra, table.path.name)
-    name = table.resolve(name) if source is None and output is not None else name
-    return Dataset(
-        (experiment,), period, names, name, tuple(table.unit(n) for n in names), unit, source
-    )
+    experiment = Experiment(u, y, extra, name or table.path.name)
+    units = tuple(table.unit(n) for n in names)
+    return Dataset((experiment,), period, names, label, units, unit, source)
+
+
+def _output(
+    table: Table,
+    output: str | None,
+    counts: str | None,
+    counts_per_rev: float | None,
+    Ts: float,
+    n: int,
+) -> tuple[FloatArray, str, str, tuple[str, float] | None]:
+    """Output, its name, its unit and the counts that it comes from."""
+    if counts is not None and counts_per_rev is not None:
+        y = _speed(table, counts, counts_per_rev, Ts)
+        return y, output or "speed", "RPM", (table.resolve(counts), float(counts_per_rev))
+    if output is None:
+        return np.full(n, np.nan), "y", "", None
+    return table[output], table.resolve(output), table.unit(output), None
 
 
 def _side_by_side(table: Table, names: Sequence[str]) -> FloatArray:
