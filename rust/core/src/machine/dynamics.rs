@@ -84,7 +84,7 @@ impl Dynamics {
             inertia: p.inertia,
             inertia_wave: wave(inertia_wave, 2.0, p.inertia_angle),
             motor_constant: p.motor_constant,
-            ripple_wave: wave(ripple, 12.0, p.torque_ripple_angle),
+            ripple_wave: wave(ripple, 4.0, p.torque_ripple_angle),
             load_first: wave(varying * p.load_first, 1.0, p.load_first_angle),
             load_second: wave(varying * p.load_second, 2.0, p.load_second_angle),
             coulomb_torque: p.coulomb_torque,
@@ -94,19 +94,17 @@ impl Dynamics {
         }
     }
 
-    /// What depends on the angle; the harmonics 2, 6 and 12 come from the first by doubling and tripling.
+    /// What depends on the angle; the harmonics 2 and 4 come from the first by doubling.
     #[inline(always)]
     pub fn crank(&self, angle: f64) -> Crank {
         let (s1, c1) = sin_cos(angle);
         let (s2, c2) = (2.0 * s1 * c1, (c1 - s1) * (c1 + s1));
-        let square = s2 * s2;
-        let (s6, c6) = (s2 * (3.0 - 4.0 * square), c2 * (1.0 - 4.0 * square));
-        let (s12, c12) = (2.0 * s6 * c6, (c6 - s6) * (c6 + s6));
+        let (s4, c4) = (2.0 * s2 * c2, (c2 - s2) * (c2 + s2));
         let [jc, js] = self.inertia_wave;
         Crank {
             motor_constant: self.motor_constant
-                + self.ripple_wave[0] * c12
-                + self.ripple_wave[1] * s12,
+                + self.ripple_wave[0] * c4
+                + self.ripple_wave[1] * s4,
             inertia: self.inertia + jc * c2 + js * s2,
             half_slope: js * c2 - jc * s2,
             load: (self.load_first[0] * c1 + self.load_first[1] * s1)

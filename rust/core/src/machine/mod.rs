@@ -25,8 +25,11 @@ const STEPS: u32 = 4;
 /// Parts into which a step is cut that passes an event or the narrow zone of the current's sign.
 const PIECES: u32 = 16;
 
-/// A current that changes its sign by more than this many ripple widths in a step has its step cut.
-const RIPPLES_PER_STEP: f64 = 1.0;
+/// Half the width, in current ripples, of the zone around zero current whose crossing has a step cut.
+const ZONE: f64 = 4.0;
+
+/// Fraction of that zone that the current may move by in an uncut step.
+const STRIDE: f64 = 0.2;
 
 /// Changes of regime after which the rest of a piece is integrated as it is.
 const EVENTS_PER_PIECE: u32 = 8;
@@ -195,10 +198,12 @@ impl Machine {
         }
     }
 
+    /// True where the current moves by much of the narrow zone in which the dead-time error changes its sign.
     #[inline(always)]
     fn hops_over_ripple(&self, next: &State) -> bool {
         let (now, then) = (self.state.current, next.current);
-        now * then < 0.0 && (then - now).abs() > RIPPLES_PER_STEP * self.parameters.ripple_current
+        let zone = ZONE * self.parameters.ripple_current;
+        (then - now).abs() > STRIDE * zone && (now * then < 0.0 || now.abs().min(then.abs()) < zone)
     }
 
     /// One piece of a step, from event to event.

@@ -111,7 +111,7 @@ parameters! {
     load_second: "N m" = 0.03, 0.0, 10.0, Relative(0.15);
     /// Crank angle at which the twice-per-turn load brakes most.
     load_second_angle: "rad" = -0.9, -7.0, 7.0, Absolute(0.3);
-    /// Torque ripple relative to the torque, 12 times per turn (two pole pairs, six steps each).
+    /// Torque ripple relative to the torque, at twice the electrical angle of two pole pairs: 4 times per turn.
     torque_ripple: "1" = 0.03, 0.0, 0.5, Relative(0.3);
     /// Crank angle of a ripple maximum.
     torque_ripple_angle: "rad" = 0.1, -7.0, 7.0, Absolute(0.25);
