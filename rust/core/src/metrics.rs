@@ -110,7 +110,8 @@ impl Edge {
         }
     }
 
-    fn overshoot_percent(&self, y: &[f64]) -> f64 {
+    /// Largest excess of `y` over the final level while the reference holds it, in percent of the step.
+    pub fn overshoot_percent(&self, y: &[f64]) -> f64 {
         let highest = y[self.start..=self.end]
             .iter()
             .fold(0.0, |most, &y| f64::max(most, self.share(y)));
@@ -153,7 +154,7 @@ pub fn step_metrics(y: &[f64], reference: &[f64], ts: f64, smoothing: f64) -> Re
              overshoot are defined for steps and trapezoids",
         )
     })?;
-    let y = smooth(y, (smoothing / ts / 2.0).floor() as usize);
+    let y = smooth(y, ts, smoothing);
     Ok(StepMetrics {
         rise_time: edge.rise(&y) * ts,
         reference_rise_time: edge.rise(reference) * ts,
@@ -161,8 +162,9 @@ pub fn step_metrics(y: &[f64], reference: &[f64], ts: f64, smoothing: f64) -> Re
     })
 }
 
-/// Centred moving average over `2 half + 1` samples, over fewer at the ends.
-fn smooth(y: &[f64], half: usize) -> Vec<f64> {
+/// Centred moving average of about `smoothing` seconds, an odd number of samples; over fewer at the ends.
+pub(crate) fn smooth(y: &[f64], ts: f64, smoothing: f64) -> Vec<f64> {
+    let half = (smoothing / ts / 2.0).floor() as usize;
     let mean = |k: usize| {
         let window = &y[k.saturating_sub(half)..y.len().min(k + half + 1)];
         window.iter().sum::<f64>() / window.len() as f64

@@ -1,1 +1,146 @@
 //! Tuning rules from a first-order-plus-dead-time model: Table 1 of the paper.
+
+use sewfast_control::Standard;
+
+use crate::{Error, Result};
+
+/// `L/T`, `Kp K`, `TI/T`, `TD/T`, alpha, beta; the print heads the third and fourth column K_I/T and K_D/T.
+const TABLE_1: [[f64; 6]; 10] = [
+    [0.1, 12.5, 0.22, 0.04, 0.68, 0.75],
+    [0.2, 6.1, 0.41, 0.08, 0.63, 0.70],
+    [0.3, 4.1, 0.57, 0.11, 0.62, 0.70],
+    [0.4, 3.1, 0.71, 0.15, 0.59, 0.69],
+    [0.5, 2.5, 0.83, 0.18, 0.58, 0.69],
+    [0.6, 2.11, 0.94, 0.21, 0.56, 0.69],
+    [0.7, 1.82, 1.05, 0.24, 0.54, 0.69],
+    [0.8, 1.61, 1.13, 0.28, 0.51, 0.68],
+    [0.9, 1.44, 1.22, 0.31, 0.48, 0.69],
+    [1.0, 1.33, 1.26, 0.34, 0.49, 0.66],
+];
+
+/// What a rule gives: gains in standard form and the two reference parameters.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rule {
+    /// Gains in standard form.
+    pub gains: Standard<f64>,
+    /// Share of the reference taken out of the proportional term.
+    pub alpha: f64,
+    /// Share of the reference taken out of the derivative term.
+    pub beta: f64,
+}
+
+/// What to do where `L/T` lies outside the table.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Outside {
+    /// Refuse.
+    #[default]
+    Error,
+    /// Take the end row. Below .1 that is the row for a dead time of `.1 T`, longer than the plant's: conservative.
+    /// Above 1 its gains are for a shorter dead time than the plant's: not conservative.
+    Nearest,
+}
+
+/// Table 1 for the plant `K e^(-sL) / (1 + sT)`, interpolated in `L/T`.
+///
+/// `Kp K` is interpolated as `Kp K L/T`, which is nearly constant; the rows themselves come out exactly.
+///
+/// # Errors
+/// `ErrorKind::Setting` for a `K` of 0, a `T` that is not above 0, a negative `L`, or `L/T` outside .1 to 1 unless
+/// the nearest row is asked for.
+pub fn table_1(k: f64, t: f64, l: f64, outside: Outside) -> Result<Rule> {
+    if !(k != 0.0 && k.is_finite() && t > 0.0 && t.is_finite() && l >= 0.0 && l.is_finite()) {
+        return Err(Error::setting(format!(
+            "expected a gain K other than 0, T above 0 s and L of 0 s or more, got K = {k}, T = {t}, L = {l}"
+        )));
+    }
+    let ratio = l / t;
+    if outside == Outside::Error && !(0.1..=1.0).contains(&ratio) {
+        return Err(Error::setting(format!(
+            "expected L/T from .1 to 1 for Table 1, got {ratio:.4}; take the nearest row (outside = \"nearest\", which \
+             below .1 means L = .1 T and is conservative), or tune by simulation"
+        )));
+    }
+    let [kp_k, ti, td, alpha, beta] = interpolate(ratio.clamp(0.1, 1.0));
+    let gains = Standard {
+        kp: kp_k / k,
+        ti: ti * t,
+        td: td * t,
+    };
+    Ok(Rule { gains, alpha, beta })
+}
+
+fn interpolate(ratio: f64) -> [f64; 5] {
+    let above = TABLE_1
+        .iter()
+        .position(|row| row[0] >= ratio)
+        .unwrap_or(TABLE_1.len() - 1)
+        .max(1);
+    let (low, high) = (&TABLE_1[above - 1], &TABLE_1[above]);
+    let share = (ratio - low[0]) / (high[0] - low[0]);
+    let between = |low: f64, high: f64| low + share * (high - low);
+    let column = |i: usize| between(low[i], high[i]);
+    let kp_k = between(low[1] * low[0], high[1] * high[0]) / ratio;
+    [kp_k, column(2), column(3), column(4), column(5)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn gives_the_rows_of_the_table() {
+        for row in TABLE_1 {
+            let (k, t) = (490.0, 0.25);
+            let rule = table_1(k, t, row[0] * t, Outside::Error).unwrap();
+            let received = [
+                rule.gains.kp * k,
+                rule.gains.ti / t,
+                rule.gains.td / t,
+                rule.alpha,
+                rule.beta,
+            ];
+            for (a, b) in received.iter().zip(&row[1..]) {
+                assert!((a - b).abs() < 1e-9, "{received:?} {row:?}");
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn lies_between_its_neighbours(ratio in 0.1..1.0_f64, t in 0.01..10.0) {
+            let rule = table_1(2.0, t, ratio * t * (1.0 - 1e-12) + 1e-12 * t, Outside::Nearest).unwrap();
+            let i = ((ratio * 10.0).floor() as usize).clamp(1, 9);
+            let (low, high) = (TABLE_1[i - 1], TABLE_1[i]);
+            let kp_k = rule.gains.kp * 2.0;
+            prop_assert!(kp_k <= low[1] + 1e-9 && kp_k >= high[1] - 1e-9);
+            prop_assert!(rule.gains.ti / t >= low[2] - 1e-9 && rule.gains.ti / t <= high[2] + 1e-9);
+        }
+    }
+
+    #[test]
+    fn refuses_what_lies_outside_unless_the_nearest_row_is_asked_for() {
+        let refused = table_1(490.0, 0.25, 0.0075, Outside::Error).unwrap_err();
+        assert!(refused.message.contains("0.0300") && refused.message.contains("nearest"));
+        assert!(table_1(490.0, 0.25, 0.3, Outside::Error).is_err());
+        let nearest = table_1(490.0, 0.25, 0.0075, Outside::Nearest).unwrap();
+        assert_eq!(
+            nearest,
+            table_1(490.0, 0.25, 0.025, Outside::Error).unwrap()
+        );
+        for (k, t, l) in [
+            (0.0, 1.0, 0.1),
+            (1.0, 0.0, 0.1),
+            (1.0, 1.0, -0.1),
+            (f64::NAN, 1.0, 0.1),
+        ] {
+            assert!(table_1(k, t, l, Outside::Nearest).is_err());
+        }
+    }
+
+    #[test]
+    fn keeps_the_sign_of_a_plant_that_acts_in_reverse() {
+        let rule = table_1(-2.0, 1.0, 0.5, Outside::Error).unwrap();
+        assert_eq!(rule.gains.kp, -1.25);
+    }
+}
