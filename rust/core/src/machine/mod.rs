@@ -23,7 +23,7 @@ pub const SAMPLE_TIME: f64 = 1e-3;
 const STEPS: u32 = 4;
 
 /// Parts into which a step is cut that passes an event or the narrow zone of the current's sign.
-const PIECES: u32 = 16;
+const PIECES: u32 = 8;
 
 /// Half the width, in current ripples, of the zone around zero current whose crossing has a step cut.
 const ZONE: f64 = 4.0;
