@@ -27,15 +27,24 @@ def chirp(
 ) -> _F: ...
 def random_steps(
     *, duration: float, Ts: float, low: float, high: float, hold_min: float, hold_max: float,
-    smoothing: float, seed: int,
-) -> _F: ...
-def prbs(*, duration: float, Ts: float, low: float, high: float, hold: float, seed: int) -> _F: ...
+    smoothing: float, seed: int, start: float | None = None,
+) -> _F:
+    """Half-cosine changes of ``smoothing`` seconds; with ``start`` the signal comes from there."""
+def prbs(*, duration: float, Ts: float, low: float, high: float, hold: float, seed: int) -> _F:
+    """Maximum length sequence of the shortest register whose period covers the signal."""
 def multisine(
     *, duration: float, Ts: float, f_low: float, f_high: float, amplitude: float, offset: float,
     seed: int,
 ) -> _F: ...
+def jumps(
+    *, duration: float, Ts: float, speed_low: float, speed_high: float, change_min: float,
+    level_min: float, level_max: float, hold_min: float, hold_max: float, ramp: float, gain: float,
+    acceleration: float, seed: int,
+) -> _F:
+    """Pulses that saturate a drive, between random speeds that ``speed / gain`` then holds."""
 def limit(signal: _F, *, Ts: float, low: float, high: float, rate: float, slew: float) -> _F:
     """Amplitude in [low, high], first difference at most ``rate`` per second, second at most ``slew`` per s^2."""
+def crest_factor(signal: _F) -> float: ...
 
 # --- machine.rs -------------------------------------------------------------------------------------------
 
@@ -81,6 +90,7 @@ def speed_kalman(
     counts: _F, *, Ts: float, counts_per_unit: float, process_noise: float | None = None,
 ) -> _F:
     """RTS smoother; the process noise [unit^2/s^3] is found by maximum likelihood where None."""
+def unwrap_counts(counts: _F, *, bits: int) -> _F: ...
 
 # --- models.rs --------------------------------------------------------------------------------------------
 

@@ -1,0 +1,370 @@
+"""Named signals: excitations in volt for recordings, references in RPM for closed loops."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import _core
+from .errors import SettingError
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+#: Sample time of every named signal [s].
+TS = 0.001
+#: Steady gain of the drive's middle range [RPM/V] (paper Eq. 8), by which jumps are planned.
+GAIN = 490.0
+#: Acceleration at the drive's current limit [RPM/s].
+ACCELERATION = 25_000.0
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A named signal.
+
+    Attributes
+    ----------
+    name
+        As the command line takes it.
+    unit
+        ``V`` for an excitation, ``RPM`` for a reference.
+    duration_s
+        Length [s].
+    description
+        What it is and what it is for.
+    low, high
+        Limits of the amplitude [unit].
+    rate
+        Limit of the rate of change [unit/s]; infinity sets none.
+    shape
+        Draws the signal for a seed, before the limits.
+    """
+
+    name: str
+    unit: str
+    duration_s: float
+    description: str
+    low: float
+    high: float
+    rate: float
+    shape: Callable[[int], FloatArray]
+
+    def generate(self, seed: int = 0) -> FloatArray:
+        """The samples at ``TS``, within the limits: float64 (N,).
+
+        Raises
+        ------
+        SettingError
+            For a seed that is not a whole number of 0 to 2^64 - 1.
+        """
+        return _core.limit(
+            self.shape(_checked(seed)),
+            Ts=TS,
+            low=self.low,
+            high=self.high,
+            rate=self.rate,
+            slew=math.inf,
+        )
+
+
+def _excitation(
+    name: str, duration: float, description: str, shape: Callable[[int], FloatArray]
+) -> Signal:
+    return Signal(name, "V", duration, description, -20.0, 20.0, math.inf, shape)
+
+
+def _reference(
+    name: str, duration: float, description: str, shape: Callable[[int], FloatArray]
+) -> Signal:
+    return Signal(name, "RPM", duration, description, 0.0, 3500.0, 20_000.0, shape)
+
+
+def _chirp(amplitude: tuple[float, float], offset: tuple[float, float]) -> FloatArray:
+    return _core.chirp(
+        duration=20.0,
+        Ts=TS,
+        f_start=0.1,
+        f_end=3.0,
+        amplitude_start=amplitude[0],
+        amplitude_end=amplitude[1],
+        offset_start=offset[0],
+        offset_end=offset[1],
+    )
+
+
+def _random_voltage(seed: int) -> FloatArray:
+    return _core.random_steps(
+        duration=20.0,
+        Ts=TS,
+        low=0.3,
+        high=6.0,
+        hold_min=0.1,
+        hold_max=0.8,
+        smoothing=0.04,
+        seed=seed,
+    )
+
+
+def _random_speed(seed: int) -> FloatArray:
+    return _core.random_steps(
+        duration=10.0,
+        Ts=TS,
+        low=200.0,
+        high=2000.0,
+        hold_min=0.25,
+        hold_max=0.9,
+        smoothing=0.2,
+        seed=seed,
+        start=0.0,
+    )
+
+
+def _multisine(seed: int) -> FloatArray:
+    return _core.multisine(
+        duration=20.0, Ts=TS, f_low=0.1, f_high=5.0, amplitude=2.7, offset=3.2, seed=seed
+    )
+
+
+def _saturating(seed: int) -> FloatArray:
+    return _core.jumps(
+        duration=20.0,
+        Ts=TS,
+        speed_low=200.0,
+        speed_high=4300.0,
+        change_min=700.0,
+        level_min=16.0,
+        level_max=20.0,
+        hold_min=0.08,
+        hold_max=0.5,
+        ramp=0.0,
+        gain=GAIN,
+        acceleration=ACCELERATION,
+        seed=seed,
+    )
+
+
+def _saturating_2(seed: int) -> FloatArray:
+    # Another stream than `saturating` has for the same seed.
+    return _core.jumps(
+        duration=15.0,
+        Ts=TS,
+        speed_low=500.0,
+        speed_high=4000.0,
+        change_min=1200.0,
+        level_min=18.0,
+        level_max=20.0,
+        hold_min=0.2,
+        hold_max=0.9,
+        ramp=0.02,
+        gain=GAIN,
+        acceleration=ACCELERATION,
+        seed=seed ^ 0x5EED_2,
+    )
+
+
+#: Height [RPM], rise, hold, fall and pause after it [s] of the reference `trapezoids`.
+_TRAPEZOIDS = (
+    (1500.0, 0.25, 0.40, 0.25, 0.3),
+    (3000.0, 0.20, 0.50, 0.30, 0.3),
+    (700.0, 0.15, 0.30, 0.15, 0.2),
+    (3500.0, 0.40, 0.40, 0.25, 0.3),
+    (2200.0, 0.15, 0.35, 0.20, 0.2),
+    (1000.0, 0.35, 0.50, 0.15, 0.3),
+    (2800.0, 0.30, 0.60, 0.40, 0.4),
+)
+
+
+def _trapezoid(height: float, rise: float, hold: float, fall: float, after: float) -> FloatArray:
+    start = 0.1
+    return _core.trapezoid(
+        duration=start + rise + hold + fall + after,
+        Ts=TS,
+        start=start,
+        rise=rise,
+        hold=hold,
+        fall=fall,
+        low=0.0,
+        high=height,
+    )
+
+
+def _trapezoids(seed: int) -> FloatArray:
+    return np.concatenate([_trapezoid(*shape) for shape in _TRAPEZOIDS])
+
+
+def _table(*signals: Signal) -> Mapping[str, Signal]:
+    return MappingProxyType({signal.name: signal for signal in signals})
+
+
+EXCITATIONS = _table(
+    _excitation(
+        "step",
+        3.0,
+        "0 to 5 V at 0.5 s; for the first-order fit",
+        lambda seed: _core.step(duration=3.0, Ts=TS, at=0.5, low=0.0, high=5.0),
+    ),
+    _excitation(
+        "staircase",
+        12.0,
+        "0 to 6 V and back in steps of 1 to 2 V, 1 s each; for the steady gain",
+        lambda seed: _core.staircase(
+            Ts=TS, levels=np.array([0.0, 0.5, 1, 2, 3, 4, 6, 5, 3.5, 2.5, 1.5, 0]), hold=1.0
+        ),
+    ),
+    _excitation(
+        "chirp_lo_hi",
+        20.0,
+        "0.1 to 3 Hz, amplitude 0.5 growing to 4.6 V; the training record of the paper",
+        lambda seed: _chirp((0.5, 4.6), (1.0, 5.2)),
+    ),
+    _excitation(
+        "chirp_hi_lo",
+        20.0,
+        "0.1 to 3 Hz, amplitude 3.4 shrinking to 0.5 V; for validation",
+        lambda seed: _chirp((3.4, 0.5), (3.65, 1.5)),
+    ),
+    _excitation(
+        "random",
+        20.0,
+        "random levels 0.3 to 6 V, held 0.1 to 0.8 s, changes of 40 ms; for validation",
+        _random_voltage,
+    ),
+    _excitation(
+        "prbs",
+        20.0,
+        "maximum length sequence between 1 and 5 V, 50 ms a bit",
+        lambda seed: _core.prbs(duration=20.0, Ts=TS, low=1.0, high=5.0, hold=0.05, seed=seed),
+    ),
+    _excitation(
+        "multisine",
+        20.0,
+        "random phases, every 0.05 Hz from 0.1 to 5 Hz, 0.5 to 5.9 V, crest factor 3 to 4",
+        _multisine,
+    ),
+    _excitation(
+        "saturating",
+        20.0,
+        "pulses of 16 to 20 V between speeds of 200 to 4,300 RPM; drives the current limit",
+        _saturating,
+    ),
+    _excitation(
+        "saturating_2",
+        15.0,
+        "slanted pulses of 18 to 20 V, larger changes, longer holds; for tests, never trained on",
+        _saturating_2,
+    ),
+)
+
+REFERENCES = _table(
+    _reference(
+        "trapezoid",
+        1.5,
+        "0 to 3,000 RPM in 150 ms, held 0.6 s, down in 150 ms",
+        lambda seed: _trapezoid(3000.0, 0.15, 0.6, 0.15, 0.5),
+    ),
+    _reference(
+        "chirp_hi_lo",
+        20.0,
+        "0.1 to 3 Hz, to 2,000 RPM, amplitude shrinking",
+        lambda seed: _chirp((1080.0, 150.0), (1080.0, 400.0)),
+    ),
+    _reference(
+        "chirp_lo_hi",
+        20.0,
+        "0.1 to 3 Hz, to 600 RPM, amplitude growing",
+        lambda seed: _chirp((50.0, 250.0), (50.0, 350.0)),
+    ),
+    _reference(
+        "random",
+        10.0,
+        "from rest, random levels 200 to 2,000 RPM, changes of 200 ms",
+        _random_speed,
+    ),
+    _reference(
+        "trapezoids",
+        sum(0.1 + sum(shape[1:]) for shape in _TRAPEZOIDS),
+        "seven trapezoids of 700 to 3,500 RPM, rises of 150 to 400 ms; for a training recording",
+        _trapezoids,
+    ),
+)
+
+
+def excitation(name: str, seed: int = 0) -> FloatArray:
+    """A named excitation [V] at 1 ms, shape (N,).
+
+    Parameters
+    ----------
+    name
+        One of `EXCITATIONS`; ``-`` and ``_`` are the same.
+    seed
+        Chooses the random signals; the others are the same for every seed.
+
+    Raises
+    ------
+    SettingError
+        For an unknown name, with the known ones, or a seed that is not a whole number from 0.
+
+    Examples
+    --------
+    >>> excitation("step").shape
+    (3000,)
+    """
+    return _named(EXCITATIONS, "excitation", name).generate(seed)
+
+
+def reference(name: str, seed: int = 0) -> FloatArray:
+    """A named reference [RPM] at 1 ms, shape (N,), with at most 20,000 RPM/s.
+
+    Parameters
+    ----------
+    name
+        One of `REFERENCES`; ``-`` and ``_`` are the same.
+    seed
+        Chooses the random reference; the others are the same for every seed.
+
+    Raises
+    ------
+    SettingError
+        For an unknown name, with the known ones, or a seed that is not a whole number from 0.
+    """
+    return _named(REFERENCES, "reference", name).generate(seed)
+
+
+def available() -> tuple[Signal, ...]:
+    """Every named signal, excitations first."""
+    return (*EXCITATIONS.values(), *REFERENCES.values())
+
+
+def crest_factor(signal: NDArray[np.floating]) -> float:
+    """Largest deviation from the mean by the root mean square of the deviations, shape (N,).
+
+    A sine has 1.414, a binary signal 1; lower puts more power into the same amplitude.
+
+    Raises
+    ------
+    DataError
+        For a signal without samples or with values that are not finite.
+    """
+    return _core.crest_factor(np.ascontiguousarray(signal, dtype=np.float64))
+
+
+def _named(table: Mapping[str, Signal], kind: str, name: str) -> Signal:
+    signal = table.get(str(name).replace("-", "_").lower())
+    if signal is None:
+        raise SettingError(
+            f"expected the name of {'an' if kind == 'excitation' else 'a'} {kind}, got {name!r}; "
+            f"the known ones are {', '.join(table)}"
+        )
+    return signal
+
+
+def _checked(seed: int) -> int:
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**64:
+        raise SettingError(f"expected a seed of 0 to 2^64 - 1, got {seed!r}; give a whole number")
+    return int(seed)

@@ -1,1 +1,0 @@
-//! Excitation signals and references.

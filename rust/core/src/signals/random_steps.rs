@@ -1,0 +1,160 @@
+//! Random levels held for random times, with smooth transitions.
+
+use std::f64::consts::PI;
+
+use super::check::{finite, not_negative, ordered, samples};
+use crate::random::Random;
+use crate::{Error, Result};
+
+/// Uniform levels and holds; each change is half a cosine, so the signal never leaves `low .. high`.
+///
+/// A change of `D` within `smoothing` seconds has a rate of at most `pi D / (2 smoothing)`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RandomSteps {
+    /// Length of the signal [s].
+    pub duration: f64,
+    /// Lowest level.
+    pub low: f64,
+    /// Highest level.
+    pub high: f64,
+    /// Shortest time from one change to the next [s].
+    pub hold_min: f64,
+    /// Longest time from one change to the next [s].
+    pub hold_max: f64,
+    /// How long a change takes [s], at most `hold_min`; 0 jumps.
+    pub smoothing: f64,
+    /// Where the signal comes from: it changes to the first level from here. None starts at the first level.
+    pub start: Option<f64>,
+}
+
+impl RandomSteps {
+    /// The sampled signal for `seed`.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for values that are not finite or out of order, a hold below one sample, a smoothing
+    /// longer than the shortest hold, or a length outside 1 to [`super::MAX_SAMPLES`] samples.
+    pub fn generate(&self, ts: f64, seed: u64) -> Result<Vec<f64>> {
+        let n = samples("duration", self.duration, ts)?;
+        self.check(ts)?;
+        let change = (self.smoothing / ts).round() as usize;
+        let mut random = Random::new(seed);
+        let mut next = || random.between(self.low, self.high).min(self.high);
+        let mut to = next();
+        let mut from = self.start.unwrap_or(to);
+        let mut signal = Vec::with_capacity(n);
+        while signal.len() < n {
+            let hold = self.hold(&mut random, ts).min(n - signal.len());
+            signal.extend((0..hold).map(|k| blend(from, to, k + 1, change)));
+            (from, to) = (to, random.between(self.low, self.high).min(self.high));
+        }
+        Ok(signal)
+    }
+
+    fn hold(&self, random: &mut Random, ts: f64) -> usize {
+        let hold = random.between(self.hold_min, self.hold_max);
+        ((hold / ts).round() as usize).max(1)
+    }
+
+    fn check(&self, ts: f64) -> Result<()> {
+        ordered(("low", self.low), ("high", self.high))?;
+        ordered(("hold_min", self.hold_min), ("hold_max", self.hold_max))?;
+        samples("hold_min", self.hold_min, ts)?;
+        not_negative(&[("smoothing", self.smoothing)])?;
+        finite(&[("start", self.start.unwrap_or(0.0))])?;
+        if self.smoothing > self.hold_min {
+            return Err(Error::setting(format!(
+                "expected smoothing of at most hold_min ({} s), got {} s; smooth less or hold longer",
+                self.hold_min, self.smoothing
+            )));
+        }
+        Ok(())
+    }
+}
+
+/// Half a cosine from `from` to `to` within `change` samples; `to` itself from then on.
+fn blend(from: f64, to: f64, k: usize, change: usize) -> f64 {
+    if k >= change {
+        return to;
+    }
+    let share = 0.5 * (1.0 - (PI * k as f64 / change as f64).cos());
+    (from * (1.0 - share) + to * share).clamp(from.min(to), from.max(to))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const STEPS: RandomSteps = RandomSteps {
+        duration: 20.0,
+        low: 0.3,
+        high: 6.0,
+        hold_min: 0.2,
+        hold_max: 0.9,
+        smoothing: 0.1,
+        start: None,
+    };
+
+    #[test]
+    fn repeats_for_a_seed_and_differs_for_another() {
+        let draw = |seed| STEPS.generate(1e-3, seed).unwrap();
+        assert_eq!(draw(1), draw(1));
+        assert_ne!(draw(1), draw(2));
+    }
+
+    #[test]
+    fn comes_from_its_start_without_a_jump() {
+        let steps = RandomSteps {
+            start: Some(0.0),
+            ..STEPS
+        };
+        let signal = steps.generate(1e-3, 3).unwrap();
+        assert!(signal[0] < 0.01 && signal[0] > 0.0);
+    }
+
+    #[test]
+    fn refuses_times_and_levels_out_of_order() {
+        let bad = [
+            RandomSteps { low: 7.0, ..STEPS },
+            RandomSteps {
+                hold_max: 0.1,
+                ..STEPS
+            },
+            RandomSteps {
+                hold_min: 1e-5,
+                smoothing: 0.0,
+                ..STEPS
+            },
+            RandomSteps {
+                smoothing: 0.3,
+                ..STEPS
+            },
+            RandomSteps {
+                start: Some(f64::NAN),
+                ..STEPS
+            },
+            RandomSteps {
+                duration: 1e6,
+                ..STEPS
+            },
+        ];
+        for steps in bad {
+            assert!(steps.generate(1e-3, 0).is_err(), "{steps:?}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn stays_between_its_levels_at_its_rate(
+            seed: u64, low in -1e3..1e3f64, range in 0.0..1e3f64, smoothing in 0.0..0.2f64,
+        ) {
+            let high = low + range;
+            let steps = RandomSteps { low, high, smoothing, ..STEPS };
+            let signal = steps.generate(1e-2, seed).unwrap();
+            prop_assert!(signal.iter().all(|v| (low..=high).contains(v)));
+            let change = (smoothing / 1e-2).round().max(1.0);
+            let fastest = range * (PI / 2.0 / change).sin() + 1e-9;
+            prop_assert!(change < 1.5 || signal.windows(2).all(|w| (w[1] - w[0]).abs() <= fastest));
+        }
+    }
+}

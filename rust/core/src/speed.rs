@@ -1,1 +1,0 @@
-//! Speed from encoder counts: difference, Savitzky-Golay, Kalman/RTS smoother.
