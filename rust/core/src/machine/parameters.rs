@@ -78,7 +78,7 @@ parameters! {
     /// Switching frequency of the inverter.
     pwm_frequency: "Hz" = 10e3, 1e3, 1e6, Fixed;
     /// Dead time between the switches of a leg.
-    dead_time: "s" = 1.2e-6, 0.0, 2e-5, Relative(0.25);
+    dead_time: "s" = 0.4e-6, 0.0, 2e-5, Relative(0.25);
     /// Current ripple, over which the sign of the current in the dead-time error is smoothed.
     ripple_current: "A" = 0.08, 0.02, 10.0, Relative(0.2);
     /// Resistance of winding and inverter.
