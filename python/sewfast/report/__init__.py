@@ -1,0 +1,38 @@
+"""The report: one self-contained HTML page from the artefacts of an experiment."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from .. import jsonfile
+from . import artefacts, canvas, page
+
+__all__ = ["report"]
+
+
+def report(folder: str | os.PathLike[str]) -> Path:
+    """Write `report.html` into a result folder, from what lies there; nothing is computed anew.
+
+    Parameters
+    ----------
+    folder : path
+        What `sewfast demo --out DIR` left: see docs/ARCHITECTURE.md for its layout.
+
+    Returns
+    -------
+    Path
+        The page: one HTML file without scripts or anything to load; an existing one is replaced.
+
+    Raises
+    ------
+    DataError, ModelFileError
+        Where the folder holds no results, or a file in it is missing or damaged; it is named.
+    SettingError
+        Where matplotlib or Jinja2 is not installed.
+    """
+    canvas.require()
+    found = artefacts.load(folder)
+    target = Path(folder) / "report.html"
+    jsonfile.replace(target, page.render(found))
+    return target

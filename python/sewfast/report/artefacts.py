@@ -1,0 +1,174 @@
+"""`Artefacts`: what an experiment left in its result folder, read and checked."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import jsonfile
+from ..errors import DataError, ModelFileError
+from ..readers import read_table
+
+FORMAT = "sewfast.results"
+VERSION = 1
+RECORDINGS = (
+    "step", "chirp_lo_hi", "chirp_hi_lo", "random", "saturating", "saturating_2", "closed_loop",
+)  # fmt: skip
+SCORED = ("chirp_lo_hi", "chirp_hi_lo", "random", "saturating")
+"""Records in `results.json`; `saturating` is the second saturating record, never trained on."""
+MODELS = ("paper", "neural_oe", "oe", "oe_all", "arx")
+REFERENCES = ("trapezoid", "chirp_hi_lo", "chirp_lo_hi", "random")
+PLANTS = ("model", "machine")
+
+Columns: TypeAlias = Mapping[str, NDArray[np.float64]]
+
+_RECORDING = ("t", "u", "counts", "y", "speed_true")
+_RUN = ("t", "r", "u", "y", "feedback")
+
+
+def recording_file(record: str) -> str:
+    """Where in the folder a recording lies."""
+    return f"recordings/{record}.csv"
+
+
+def prediction_file(record: str) -> str:
+    """Where in the folder the models' predictions of a scored record lie."""
+    return f"predictions/{record}.npz"
+
+
+def run_file(reference: str, plant: str) -> str:
+    """Where in the folder a closed loop lies."""
+    return f"runs/{reference}_{plant}.npz"
+
+
+def record_of(scored: str) -> str:
+    """The recording that a scored record's name stands for."""
+    return "saturating_2" if scored == "saturating" else scored
+
+
+@dataclass(frozen=True, eq=False)
+class Artefacts:
+    """Everything that the report shows.
+
+    Attributes
+    ----------
+    results : mapping
+        `results.json`.
+    recordings : mapping of record to columns
+        t [s], u [V], counts, y (speed from counts) [RPM], speed_true [RPM].
+    predictions : mapping of scored record to columns
+        `MODEL_simulation` and `MODEL_one_step` [RPM].
+    runs : mapping of (reference, plant) to columns
+        t [s], r [RPM], u [V], y (true speed) [RPM], feedback [RPM].
+    """
+
+    folder: Path
+    results: Mapping[str, Any]
+    recordings: Mapping[str, Columns]
+    predictions: Mapping[str, Columns]
+    runs: Mapping[tuple[str, str], Columns]
+
+    def value(self, path: str) -> Any:
+        """One value of `results.json` by its dotted path.
+
+        Raises
+        ------
+        ModelFileError
+            Where it is missing.
+        """
+        found: Any = self.results
+        for key in path.split("."):
+            if not isinstance(found, Mapping) or key not in found:
+                raise ModelFileError(
+                    f"{self.folder / 'results.json'}: expected a value {path!r}, found none; "
+                    "run `sewfast demo` again"
+                )
+            found = found[key]
+        return found
+
+    def number(self, path: str) -> float | None:
+        """One number of `results.json` by its dotted path; None where it is undefined there."""
+        found = self.value(path)
+        if found is None:
+            return None
+        if isinstance(found, bool) or not isinstance(found, (int, float)):
+            raise ModelFileError(
+                f"{self.folder / 'results.json'}: expected a number at {path!r}, received "
+                f"{found!r}; run `sewfast demo` again"
+            )
+        return float(found)
+
+
+def load(folder: str | os.PathLike[str]) -> Artefacts:
+    """Read a result folder.
+
+    Raises
+    ------
+    DataError
+        Where the folder is none or holds no results, or a recording or run is damaged.
+    ModelFileError
+        Where `results.json` is damaged or of another version.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DataError(
+            f"{folder}: expected a folder with results, found none; `sewfast demo --out DIR` "
+            "makes one"
+        )
+    if not (folder / "results.json").is_file():
+        raise DataError(
+            f"{folder}: expected a result folder, found no results.json in it; "
+            "`sewfast demo --out DIR` makes one"
+        )
+    results = jsonfile.read(folder / "results.json", FORMAT, {VERSION})
+    predicted = [f"{m}_{kind}" for m in MODELS for kind in ("simulation", "one_step")]
+    recordings = {r: _columns(folder, recording_file(r), _RECORDING) for r in RECORDINGS}
+    predictions = {r: _columns(folder, prediction_file(r), predicted) for r in SCORED}
+    for r, columns in predictions.items():
+        _require_alike(folder / prediction_file(r), columns, recordings[record_of(r)])
+    runs = [(r, p) for r in REFERENCES for p in PLANTS]
+    runs += [("paper_gains", "eq8"), ("paper_gains", "machine")]
+    return Artefacts(
+        folder,
+        results,
+        recordings,
+        predictions,
+        {key: _columns(folder, run_file(*key), _RUN) for key in runs},
+    )
+
+
+def _require_alike(path: Path, columns: Columns, recording: Columns) -> None:
+    received, expected = (len(next(iter(c.values()))) for c in (columns, recording))
+    if received != expected:
+        raise DataError(
+            f"{path}: expected {expected} samples, as many as the recording, received {received}; "
+            "run `sewfast demo` again"
+        )
+
+
+def _columns(folder: Path, name: str, needed: tuple[str, ...] | list[str]) -> Columns:
+    """The needed columns of one file, finite and of one length."""
+    path = folder / name
+    if not path.is_file():
+        raise DataError(f"{path}: expected by the report, found none; run `sewfast demo` again")
+    table = read_table(path)
+    columns = {n: table[n] for n in needed}
+    lengths = {n: len(c) for n, c in columns.items()}
+    if len(set(lengths.values())) > 1:
+        raise DataError(f"{path}: expected columns of one length, received {lengths}")
+    if min(lengths.values()) < 2:
+        raise DataError(f"{path}: expected at least 2 samples, received {min(lengths.values())}")
+    for n, column in columns.items():
+        if not np.isfinite(column).all():
+            k = int(np.argmin(np.isfinite(column)))
+            raise DataError(
+                f"{path}: expected finite values, received {column[k]} in column {n!r}, sample {k};"
+                " run `sewfast demo` again"
+            )
+    return columns

@@ -1,0 +1,141 @@
+"""Closed loops: the paper's Fig. 19 to 22, and what the paper's own gains do."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .. import labels
+from ..artefacts import Artefacts, Columns
+from ..canvas import Picture, draw, legend, panels, svg
+from ..numbers import milliseconds, percent, rpm, volt
+from ..table import Table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_LOOPS = (("19", "trapezoid"), ("20", "chirp_hi_lo"), ("21", "chirp_lo_hi"), ("22", "random"))
+
+_PURPOSE = {
+    "trapezoid": "The hardest reference: 0 to 3,000 RPM in 150 ms, sharper than anything in the "
+    "chirps.",
+    "chirp_hi_lo": "A swing of shrinking amplitude and growing frequency, up to 2,000 RPM.",
+    "chirp_lo_hi": "A swing of growing amplitude and growing frequency, up to 600 RPM.",
+    "random": "Levels between 200 and 2,000 RPM at random.",
+}
+
+_MAGNIFIED = 0.6
+"""Width of the magnified rise [s]."""
+
+
+def loop_pictures(artefacts: Artefacts) -> list[Picture]:
+    """Fig. 19 to 22: the tuned controller on the model and on the machine."""
+    return [_tuned(artefacts, number, reference) for number, reference in _LOOPS]
+
+
+def paper_gain_pictures(artefacts: Artefacts) -> list[Picture]:
+    """Fig. C and D: the paper's gains on the plant of its Eq. 8 and on the virtual machine."""
+    return [
+        _paper_gains(
+            artefacts, "C", "eq8", "model", "on the plant of Eq. 8",
+            "Speed fed back without an encoder, command limited to ±10 V, integral stopped while "
+            "limited. The command switches from limit to limit: the loop leans on the limit.",
+        ),
+        _paper_gains(
+            artefacts, "D", "machine", "machine", "on the virtual machine",
+            "Encoder counts differenced as in the paper, command limited to ±10 V. One count in a "
+            "sample is 38 RPM, which Kd = 0.5 V/RPM turns into 19 V.",
+        ),
+    ]  # fmt: skip
+
+
+def _tuned(artefacts: Artefacts, number: str, reference: str) -> Picture:
+    runs = {p: artefacts.runs[reference, p] for p in ("model", "machine")}
+    names = {"model": "on the identified model", "machine": "on the machine"}
+    title = f"Closed loop, {labels.REFERENCE[reference]} reference"
+    key = f"fig-{number}"
+    alt = f"{title}: reference, speed on model and machine, tracking error and command over time"
+    caption = (
+        f"{_PURPOSE[reference]} The same controller code runs on the identified network "
+        "(prediction) and on the virtual machine."
+    )
+    figure = _loop_figure(runs, names, magnified=reference == "trapezoid")
+    return Picture(
+        key, f"Fig. {number}", title, alt, caption, svg(figure, key, alt),
+        _tuned_numbers(artefacts, reference),
+    )  # fmt: skip
+
+
+def _paper_gains(
+    artefacts: Artefacts, number: str, plant: str, look: str, where: str, caption: str
+) -> Picture:
+    title = f"The paper's gains {where}"
+    key = f"fig-{number.lower()}"
+    alt = f"{title}: reference and speed, tracking error and command over time"
+    runs = {look: artefacts.runs["paper_gains", plant]}
+    figure = _loop_figure(runs, {look: where}, magnified=True)
+    numbers = _numbers(artefacts, {where: f"paper_gains.{plant}"}, with_step=True)
+    return Picture(key, f"Fig. {number}", title, alt, caption, svg(figure, key, alt), numbers)
+
+
+def _loop_figure(runs: dict[str, Columns], names: dict[str, str], *, magnified: bool) -> Figure:
+    heights = [2.0, 1.9, 1.2, 1.2] if magnified else [2.2, 1.3, 1.3]
+    figure, axes = panels(heights, share_x=False)
+    speed, command, error = axes[0, 0], axes[-1, 0], axes[-2, 0]
+    first = next(iter(runs.values()))
+    for look, run in reversed(runs.items()):
+        draw(speed, run["t"], run["y"], look, names[look])
+        draw(error, run["t"], run["r"] - run["y"], look)
+        draw(command, run["t"], run["u"], look)
+    draw(speed, first["t"], first["r"], "reference", "reference")
+    if magnified:
+        _magnify(axes[1, 0], speed, runs)
+    legend(speed)
+    for ax, label in ((speed, "speed [RPM]"), (error, "error [RPM]"), (command, "command [V]")):
+        ax.set_ylabel(label)
+        ax.margins(x=0.01)
+    command.set_xlabel("time [s]")
+    return figure
+
+
+def _magnify(ax: Axes, speed: Axes, runs: dict[str, Columns]) -> None:
+    """The rise, which lasts a few per cent of the record."""
+    first = next(iter(runs.values()))
+    t, r = first["t"], first["r"]
+    start = float(t[int(np.argmax(r > r[0]))]) - 0.1
+    for look, run in (*reversed(runs.items()), ("reference", first)):
+        inside = (run["t"] >= start) & (run["t"] <= start + _MAGNIFIED)
+        draw(ax, run["t"][inside], run["r" if look == "reference" else "y"][inside], look)
+    ax.set_title("magnified: the rise", pad=3)
+    ax.set_ylabel("speed [RPM]")
+    ax.margins(x=0.01)
+    speed.axvspan(start, start + _MAGNIFIED, color="#f3ead2", zorder=0)
+
+
+def _tuned_numbers(artefacts: Artefacts, reference: str) -> Table:
+    path = f"control.{reference}"
+    plants = {"identified model": f"{path}.model", "machine": f"{path}.machine"}
+    apart = rpm(artefacts.number(f"{path}.model_vs_machine_rmse_rpm"))
+    caption = f"Model against machine: {apart} rms."
+    if reference == "trapezoid":
+        rise = milliseconds(artefacts.number(f"{path}.reference_rise_time_ms"))
+        caption += f" The reference itself rises within {rise}."
+    return _numbers(artefacts, plants, with_step=reference == "trapezoid", caption=caption)
+
+
+def _numbers(
+    artefacts: Artefacts, plants: dict[str, str], *, with_step: bool, caption: str = ""
+) -> Table:
+    columns = {"tracking error (rms)": ("rmse_rpm", rpm)}
+    if with_step:
+        columns["10–90 % rise"] = ("rise_time_ms", milliseconds)
+        columns["overshoot"] = ("overshoot_percent", percent)
+    columns["command (rms)"] = ("effort_v", volt)
+    columns["its change per sample (rms)"] = ("chatter_v", volt)
+    rows = tuple(
+        (name, *(text(artefacts.number(f"{path}.{key}")) for key, text in columns.values()))
+        for name, path in plants.items()
+    )
+    return Table(caption, ("plant", *columns), rows)

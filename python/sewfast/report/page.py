@@ -1,0 +1,61 @@
+"""The page: figures, tables and text of a result folder in one HTML document."""
+
+from __future__ import annotations
+
+from importlib import resources
+from typing import Any
+
+from . import figures
+from .artefacts import Artefacts
+from .canvas import style
+from .goals import goals
+from .numbers import milliseconds, percent, rpm, significant
+from .tables import (
+    control_table,
+    gains_table,
+    identification_tables,
+    speed_table,
+)
+
+
+def render(artefacts: Artefacts) -> str:
+    """The report as one self-contained HTML document."""
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FunctionLoader(_source),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        significant=significant, rpm=rpm, percent=percent, milliseconds=milliseconds
+    )
+    return environment.get_template("page.html").render(_context(artefacts))
+
+
+def _source(name: str) -> str:
+    return (resources.files(__package__) / "templates" / name).read_text(encoding="utf-8")
+
+
+def _context(artefacts: Artefacts) -> dict[str, Any]:
+    numbers = {
+        "goals": goals(artefacts),
+        "speed": speed_table(artefacts),
+        "scores": identification_tables(artefacts),
+        "gains": gains_table(artefacts),
+        "control": control_table(artefacts),
+        "number": artefacts.number,
+        "value": artefacts.value,
+    }
+    # drawn last: where a number is missing nothing is drawn in vain
+    with style():
+        return numbers | {
+            "recorded": figures.recorded_pictures(artefacts),
+            "scaled": figures.scaled_pictures(artefacts),
+            "predicted": figures.prediction_pictures(artefacts),
+            "arx": figures.arx_picture(artefacts),
+            "loops": figures.loop_pictures(artefacts),
+            "paper_gains": figures.paper_gain_pictures(artefacts),
+        }
