@@ -193,7 +193,10 @@ class NeuralFit:
         """Dead starts that were drawn again."""
     @property
     def models(self) -> list[NeuralOE]:
-        """Models of all sound starts, best first: an ensemble."""
+        """Models of all starts with a finite cost, sound ones first, then by cost: an ensemble."""
+    @property
+    def sound(self) -> bool:
+        """The model forgets its initial state and stands inputs a quarter larger; else no start did."""
     @property
     def initial_states(self) -> _F:
         """Past outputs of each training experiment, newest first, (n_experiments, na)."""

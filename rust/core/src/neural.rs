@@ -1,6 +1,7 @@
 //! The network output-error model: a free-running network with its scaling.
 
 mod draw;
+mod guard;
 mod network;
 mod problem;
 mod scaling;

@@ -203,6 +203,11 @@ impl NeuralFit {
     }
 
     #[getter]
+    fn sound(&self) -> bool {
+        self.inner.sound
+    }
+
+    #[getter]
     fn discarded(&self) -> usize {
         self.inner.discarded
     }
