@@ -39,7 +39,10 @@ impl Scale {
     }
 }
 
-/// Refuses too few counts, counts that are not finite, and jumps that look like a wrapped counter.
+/// Whole numbers up to this are exact in double precision: 2^53.
+const EXACT: f64 = 9_007_199_254_740_992.0;
+
+/// Refuses too few counts, counts that are not finite or not exact, and jumps that look like a wrapped counter.
 pub(super) fn check(counts: &[f64], at_least: usize) -> Result<()> {
     if counts.len() < at_least {
         return Err(Error::data(format!(
@@ -50,6 +53,12 @@ pub(super) fn check(counts: &[f64], at_least: usize) -> Result<()> {
     if let Some(k) = counts.iter().position(|c| !c.is_finite()) {
         return Err(Error::data(format!(
             "expected finite counts, got {} at sample {k}; cut or repair that part of the recording",
+            counts[k]
+        )));
+    }
+    if let Some(k) = counts.iter().position(|c| c.abs() > EXACT) {
+        return Err(Error::data(format!(
+            "expected counts up to 2^53, got {} at sample {k}; subtract the first count or repair the recording",
             counts[k]
         )));
     }
