@@ -387,6 +387,20 @@ def test_counts_and_turns_belong_together(tmp_path: Path) -> None:
         read(path, inputs="u", output="n", counts_per_rev=100)
 
 
+def test_counts_become_a_speed_in_rpm(tmp_path: Path) -> None:
+    t = np.arange(400) * 1e-3
+    counts = np.floor(100.0 * 20.0 * t)
+    rows = "".join(f"{a:.3f},{1.0},{n}\n" for a, n in zip(t, counts, strict=True))
+    path = csv(tmp_path, "t,u,n\n" + rows)
+    data = read(path, inputs="u", counts="n", counts_per_rev=100)
+    np.testing.assert_allclose(data.experiments[0].y[100:300], 20.0 * 60, rtol=0.01)
+    assert (data.output_name, data.output_unit, data.counts) == ("speed", "RPM", ("n", 100.0))
+    assert read(path, inputs="u", output="w", counts="n", counts_per_rev=100).output_name == "w"
+    holed = csv(tmp_path, "t,u,n\n0,1,0\n1,2,\n2,3,1\n", "holes.csv")
+    with pytest.raises(DataError, match=r"'n'.*encoder counts in every row.*line 3"):
+        read(holed, inputs="u", counts="n", counts_per_rev=100)
+
+
 # --- measured data ----------------------------------------------------------------------------
 
 

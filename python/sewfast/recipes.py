@@ -23,7 +23,11 @@ Story: TypeAlias = dict[str, Any]
 BLOCKS = 8
 HELD_OUT = (2, 5)
 """Blocks to select on: inside the record, where a chirp is neither at its start nor at its end."""
-LEAST_BLOCK = 3 * INIT
+LEAST_BLOCK = 2 * INIT
+DECAYS = (1e-2, 1e-4, 1e-6)
+"""Weight decays that the default network is trained with, the strongest first."""
+ABOUT_AS_WELL = 1.1
+"""Largest ratio to the best held-out error at which a stronger weight decay is taken."""
 WORTH_IT = 0.98
 """The network must bring the free-run error below this part of the linear model's."""
 
@@ -113,20 +117,16 @@ def auto(task: Task) -> Model:
 
 def _from_linear_start(task: Task, always_network: bool) -> Model:
     began = time.perf_counter()
+    linear = _linear_fit(task, began)
     trial = task if task.validation is not None else _with_blocks_held_out(task)
-    linear = _linear_fit(trial, began)
     if trial.validation is None and not always_network:
         return _linear_model(task, linear, began, {"choice": _NOTHING_HELD_OUT})
-    network = _network_fit(trial, linear, began)
+    network, decays = _selected_network(trial, linear, began)
     choice = _comparison(trial, linear, network)
-    is_network = always_network or choice["chosen"] == "neural_oe"
-    if trial is not task:
-        # what was held out to decide is learned from in the end
-        linear = _linear_fit(task, began)
-        network = _network_fit(task, linear, began) if is_network else network
-    if not is_network:
+    if not always_network and choice["chosen"] == "oe":
         return _linear_model(task, linear, began, {"choice": choice})
-    return _network_model(task, network, began, _choice_story(choice, always_network))
+    story = {"samples_fitted": len(trial.data), **decays, **_choice_story(choice, always_network)}
+    return _network_model(task, network, began, story)
 
 
 # --- fits -------------------------------------------------------------------------------------
@@ -146,7 +146,29 @@ def _linear_fit(task: Task, began: float) -> _core.LinearFit:
     return fit
 
 
-def _network_fit(task: Task, linear: _core.LinearFit, began: float) -> _core.NeuralFit:
+def _selected_network(
+    task: Task, linear: _core.LinearFit, began: float
+) -> tuple[_core.NeuralFit, Story]:
+    """The network with the strongest weight decay that does about as well as the best.
+
+    Held-out blocks lie where the drive has been before; a smoother network is the safer one where
+    it has not (the one-standard-error rule: Hastie, Tibshirani, Friedman 2009, section 7.10).
+    """
+    if task.validation is None:
+        return _network_fit(task, linear, DECAYS[0], began), {"weight_decay": DECAYS[0]}
+    fits = [_network_fit(task, linear, decay, began) for decay in DECAYS]
+    errors = [math.sqrt(2.0 * (f.validation_cost or 0.0)) for f in fits]
+    i = next(i for i, error in enumerate(errors) if error <= ABOUT_AS_WELL * min(errors))
+    return fits[i], {
+        "weight_decay": DECAYS[i],
+        "weight_decays": list(DECAYS),
+        "decay_errors": errors,
+    }
+
+
+def _network_fit(
+    task: Task, linear: _core.LinearFit, decay: float, began: float
+) -> _core.NeuralFit:
     fit = _core.fit_neural_oe(
         _arrays(task.data),
         [] if task.validation is None else _arrays(task.validation),
@@ -159,7 +181,7 @@ def _network_fit(task: Task, linear: _core.LinearFit, began: float) -> _core.Neu
         y_scale=None,
         saturate=1.0,
         initial_state="estimated",
-        weight_decay=1e-6,
+        weight_decay=decay,
         max_iterations=task.iterations,
         starts=task.starts,
         seed=task.seed,

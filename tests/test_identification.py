@@ -1,0 +1,243 @@
+"""`identify`: known plants are found, settings and data are checked, the choice is told."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plants import OFFSET, A, B, bent_data, linear_data
+from sewfast.dataset import Dataset
+from sewfast.errors import DataError, Interrupted, SettingError
+from sewfast.identification import identify
+from sewfast.models import ARX, LinearOE, NeuralOE
+from sewfast.readers import read
+from sewfast.validation import validate
+
+DATA = Path(os.environ.get("SEWFAST_DATA", Path(__file__).parents[2] / "shared" / "data"))
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="no measured data (set SEWFAST_DATA)")
+QUICK: dict[str, Any] = {"iterations": 20, "starts": 2, "hidden": 4}
+
+
+# --- recovery ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["arx", "oe"])
+@pytest.mark.parametrize("inputs", [1, 2])
+def test_linear_models_recover_a_linear_plant(kind: Any, inputs: int) -> None:
+    model = identify(linear_data(inputs=inputs), model=kind)
+    assert isinstance(model, (ARX, LinearOE))
+    np.testing.assert_allclose(model.core.a, A, rtol=1e-6)
+    np.testing.assert_allclose(model.core.b, np.vstack([B, 2 * B])[:inputs], rtol=1e-6)
+    assert model.core.offset == pytest.approx(OFFSET, rel=1e-6)
+
+
+def test_output_error_is_unbiased_by_measurement_noise_where_arx_is_not() -> None:
+    data = linear_data(3000, noise=1.0)
+    arx, oe = identify(data, model="arx"), identify(data, model="oe")
+    off = [np.abs(m.core.a - A).max() for m in (arx, oe)]
+    assert off[1] < 0.05 < off[0]
+
+
+def test_two_experiments_are_fitted_together() -> None:
+    data = Dataset.concat([linear_data(200), linear_data(200, seed=5)])
+    model = identify(data, model="oe")
+    np.testing.assert_allclose(model.core.a, A, rtol=1e-6)
+    assert model.training["samples"] == 400
+    assert [d["samples"] for d in model.training["data"]] == [200, 200]
+
+
+def test_the_network_fits_what_no_linear_model_can() -> None:
+    data, fresh = bent_data(), bent_data(seed=9)
+    linear = validate(identify(data, model="oe"), fresh)
+    network = validate(identify(data, model="neural-oe", **QUICK), fresh)
+    assert network.simulation.rmse < 0.5 * linear.simulation.rmse
+
+
+# --- selection --------------------------------------------------------------------------------
+
+
+def test_auto_takes_the_network_where_it_helps_and_says_why() -> None:
+    model = identify(bent_data(noise=0.01), **QUICK)
+    assert isinstance(model, NeuralOE)
+    choice = model.training["choice"]
+    assert choice["chosen"] == "neural_oe"
+    rmse = choice["free_run_rmse"]
+    assert rmse["neural_oe"] < 0.98 * rmse["oe"]
+    assert "free-run error" in choice["reason"]
+    assert [d["range"] for d in choice["held_out"]] == ["200:300", "500:600"]
+    assert model.training["samples"] == 800
+
+
+def test_auto_takes_the_linear_model_where_the_network_does_not_help() -> None:
+    model = identify(linear_data(800, noise=0.5), **QUICK)
+    assert isinstance(model, LinearOE)
+    assert model.training["choice"]["chosen"] == "oe"
+
+
+def test_the_network_says_where_it_does_not_help() -> None:
+    model = identify(linear_data(800, noise=0.5), model="neural_oe", **QUICK)
+    assert isinstance(model, NeuralOE)
+    assert "consider model oe" in model.training["notes"][0]
+
+
+def test_given_validation_data_decide() -> None:
+    other = bent_data(300, seed=4, name="other")
+    model = identify(bent_data(), validation=other, **QUICK)
+    assert model.training["choice"]["held_out"] == [
+        {"name": "other", "range": "0:300", "samples": 300}
+    ]
+
+
+def test_records_too_short_to_hold_out_fall_back_on_the_linear_model() -> None:
+    model = identify(linear_data(150), **QUICK)
+    assert isinstance(model, LinearOE)
+    assert "too short" in model.training["choice"]["reason"]
+
+
+# --- what is promised of every model ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["arx", "oe", "neural_oe", "auto"])
+def test_the_story_is_whole_and_is_json(kind: Any) -> None:
+    model = identify(bent_data(), model=kind, **QUICK)
+    story = json.loads(json.dumps(model.training, allow_nan=False))
+    assert story["data"] == [{"name": "bent", "range": "0:800", "samples": 800}]
+    assert story["cost"] >= 0
+    assert story["cost_horizon"] == ("one step" if kind == "arx" else "free run")
+    assert story["input_range"] == [list(r) for r in bent_data().input_range]
+    for name in ("termination", "initial_state", "seconds", "output_range", "cost_unit"):
+        assert name in story
+
+
+@pytest.mark.parametrize("preset", [None, "paper"])
+def test_a_seed_gives_the_same_bits_at_any_number_of_threads(preset: Any) -> None:
+    one, two = (
+        identify(bent_data(), model="neural_oe", preset=preset, iterations=10, threads=t)
+        for t in (1, 2)
+    )
+    assert isinstance(one, NeuralOE)
+    assert one.parameters() == two.parameters()
+    other = identify(bent_data(), model="neural_oe", preset=preset, iterations=10, seed=1)
+    assert one.parameters() != other.parameters()
+
+
+def test_the_papers_preset_is_the_papers_network() -> None:
+    model = identify(bent_data(), preset="paper", iterations=10)
+    assert isinstance(model, NeuralOE)
+    s = model.settings
+    assert (s["na"], s["nb"], s["nk"], s["hidden"], s["bypass"]) == (2, 2, 1, 8, False)
+    assert (s["u_mean"], s["u_scale"], s["y_mean"], s["y_scale"]) == ([0.0], [10.0], 0.0, 1000.0)
+    low, high = bent_data().output_range
+    width = high - low
+    np.testing.assert_allclose(
+        [s["output_low"], s["output_high"]],
+        [(low - 0.1 * width) / 1000, (high + 0.1 * width) / 1000],
+    )
+    assert model.training["preset"] == "paper"
+
+
+def test_data_are_not_changed() -> None:
+    u, y = np.sin(np.arange(300.0)), np.cumsum(np.sin(np.arange(300.0)))
+    before = u.copy(), y.copy()
+    identify(Dataset.from_arrays(u, y, 1.0), model="oe")
+    np.testing.assert_array_equal(u, before[0])
+    np.testing.assert_array_equal(y, before[1])
+
+
+# --- interruption -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["oe", "neural_oe", "auto"])
+def test_an_interruption_hands_over_the_best_model(kind: Any) -> None:
+    calls = 0
+
+    def stop(done: int, total: int, best: float) -> None:
+        nonlocal calls
+        calls += 1
+        raise KeyboardInterrupt
+
+    data = Dataset.concat([bent_data(20000, seed=s) for s in range(4)])
+    with pytest.raises(KeyboardInterrupt) as caught:
+        identify(data, model=kind, progress=stop)
+    assert calls >= 1
+    if isinstance(caught.value, Interrupted):
+        assert np.isfinite(caught.value.best.simulate(bent_data())[0]).all()
+
+
+# --- bad input --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"model": "narx"}, "auto, arx, oe or neural-oe, received 'narx'"),
+        ({"model": "paper"}, "auto, arx, oe or neural-oe"),
+        ({"preset": "other"}, "'paper' or none"),
+        ({"preset": "paper", "model": "arx"}, "neural-oe"),
+        ({"preset": "paper", "na": 3}, "na = 2"),
+        ({"na": 0}, "na: expected a whole number from 1"),
+        ({"nb": 2.0}, "nb: expected a whole number"),
+        ({"nk": -1}, "nk"),
+        ({"hidden": 0}, "hidden"),
+        ({"starts": 0}, "starts"),
+        ({"seed": -1}, "seed"),
+        ({"iterations": 0}, "iterations"),
+        ({"threads": 0}, "threads"),
+        ({"hidden": True}, "hidden"),
+    ],
+)
+def test_settings_out_of_range_are_refused(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(SettingError, match=words):
+        identify(linear_data(), **options)
+
+
+KINDS = ["arx", "oe", "neural_oe", "auto"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_unusable_data_are_refused(kind: Any) -> None:
+    n = 300
+    u, y = np.sin(np.arange(n)), np.cos(np.arange(n))
+    cases = [
+        (np.ones(n), y, "input 'u' is constant"),
+        (u, np.zeros(n), "output 'y' is constant"),
+        (np.full(n, np.nan), y, "every value is NaN"),
+        (u, np.full(n, np.nan), "every value is NaN"),
+        (u, np.where(np.arange(n) == 250, np.nan, y), "sample 250"),
+        (u[:15], y[:15], "more than 22 samples"),
+    ]
+    for bad_u, bad_y, words in cases:
+        with pytest.raises(DataError, match=words):
+            identify(Dataset.from_arrays(bad_u, bad_y, 0.01), model=kind)
+
+
+def test_too_few_samples_for_the_orders_are_counted() -> None:
+    with pytest.raises(DataError, match="at least 106 samples for 53 parameters, received 98"):
+        identify(linear_data(100), model="neural_oe")
+    with pytest.raises(DataError, match=r"short.*more than 22 samples, received 10"):
+        identify(Dataset.concat([linear_data(), linear_data(10, name="short")]), model="oe")
+
+
+def test_validation_data_must_belong_to_the_training_data() -> None:
+    with pytest.raises(DataError, match="one sample time"):
+        identify(linear_data(), validation=Dataset.from_arrays(np.ones(50), np.ones(50), 0.1))
+    with pytest.raises(DataError, match="more than 20 samples, received 20"):
+        identify(linear_data(), validation=linear_data(20))
+    with pytest.raises(DataError, match="one input"):
+        identify(linear_data(inputs=2), preset="paper")
+
+
+# --- measured data ----------------------------------------------------------------------------
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("file", "least"), [("bldc_cigan/bldc.csv", 80.0), ("dc_motor_un/prbs_open_exp.csv", 75.0)]
+)
+def test_recordings_of_motors_are_identified(file: str, least: float) -> None:
+    train, rest = read(DATA / file, inputs="u", output="y").split(0.6)
+    v = validate(identify(train, model="oe"), rest)
+    assert v.simulation.fit_percent > least
