@@ -1,7 +1,7 @@
 """Types of the compiled module. Arrays are C-contiguous float64; inputs are ``(N, n_inputs)``, time first."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal, TypeAlias, final
+from typing import Any, Literal, TypeAlias, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -252,21 +252,35 @@ def closed_loop(
     """Keys u, y (true output), feedback (after encoder and filter); all (N,). From rest, controller reset.
 
     ``counts_per_unit`` is counts per (output unit x second); 0 feeds the plant's output back unquantised.
-    A virtual machine brings its own encoder.
+    A virtual machine brings its own encoder. The controller passed in is not stepped. A loop that diverges
+    is a FitError.
     """
 
 def fit_fopdt(u: _F, y: _F, *, Ts: float) -> dict[str, float]:
     """K, T [s], L [s], offset, u_low, u_high, fit_percent, from a step response (paper Eq. 10-11)."""
 
-def table_1(K: float, T: float, L: float) -> dict[str, float]:
-    """Kp, Ti, Td, alpha, beta by the paper's Table 1, interpolated; L/T outside .1 to 1 is an error."""
+def table_1(K: float, T: float, L: float, *, nearest: bool = False) -> dict[str, float]:
+    """Kp, Ti, Td, alpha, beta by the paper's Table 1, interpolated; L/T outside .1 to 1 is an error.
+
+    ``nearest`` takes the end row there instead.
+    """
+
+def default_weights() -> dict[str, float]:
+    """chatter, overshoot, overshoot_limit [%], saturation."""
 
 def tune(
     plants: Sequence[_Plant], references: Sequence[_F], *, start: Controller, counts_per_unit: float,
-    weights: Mapping[str, float], evaluations: int, seed: int, threads: int,
-    progress: _Progress = None,
-) -> dict[str, object]:
-    """Search Kp, Ti, Td, alpha, beta; returns gains, cost, start_cost, evaluations, trace, termination."""
+    variations: Sequence[tuple[float, int]], weights: Mapping[str, float], evaluations: int, seed: int,
+    threads: int, progress: _Progress = None,
+) -> dict[str, Any]:
+    """Search Kp, Ti, Td, alpha, beta, and N where the start's is finite.
+
+    Every plant is taken in every variation (gain, extra delay in samples). Weights left out keep their
+    defaults. Returns Kp, Ti, Td, alpha, beta, N, cost, start_cost, evaluations, trace, termination.
+    """
+
+def effort(u: _F, *, u_min: float, u_max: float) -> dict[str, float]:
+    """u_rms, du_rms (change from sample to sample), saturated (share of samples at a limit)."""
 
 def step_metrics(y: _F, reference: _F, *, Ts: float, smoothing: float) -> dict[str, float]:
     """rise_time_ms, reference_rise_time_ms, overshoot_percent of a response to a step or trapezoid."""

@@ -96,6 +96,11 @@ class VirtualMachine:
         return cls(None if match[1] is None else int(match[1]))
 
     @property
+    def core(self) -> Machine:
+        """Its arithmetic; takes part in `sewfast.loop` as a plant."""
+        return self._core
+
+    @property
     def name(self) -> str:
         """``virtual`` or ``virtual:SEED``."""
         return self._name

@@ -185,13 +185,18 @@ impl<T: Real> Pid<T> {
     }
 
     /// The integral to keep when the limits moved the output by `excess`.
+    ///
+    /// Conditional integration still lets the integral move away from the limit, or it could stay there for ever.
     fn without_windup(&self, integral: T, excess: T) -> T {
+        let pushes_on = (integral - self.integral) * excess < T::ZERO;
         if excess == T::ZERO || self.ki == T::ZERO {
             integral
-        } else if self.settings.tt == T::ZERO {
+        } else if self.settings.tt != T::ZERO {
+            integral + self.tracking * excess
+        } else if pushes_on {
             self.integral
         } else {
-            integral + self.tracking * excess
+            integral
         }
     }
 }

@@ -7,7 +7,7 @@ pub use plants::{LaggedPlant, Varied};
 use sewfast_control::{Controller, Refused};
 
 use crate::encoder::Encoder;
-use crate::{Error, Result};
+use crate::{Error, Monitor, Result};
 
 /// What a controller can be closed around: one input, one output, stepped sample by sample.
 pub trait Plant {
@@ -55,10 +55,14 @@ pub enum Outcome {
     Completed,
     /// The output left the finite numbers, or all bounds, at this sample; the record ends before it.
     Diverged(usize),
+    /// A stop was requested; the record ends before this sample.
+    Interrupted(usize),
 }
 
 /// No drive's output is that large in any unit.
 const RUNAWAY: f64 = 1e15;
+/// Samples between two looks at a stop request, a few milliseconds of work.
+const WATCHED: usize = 2048;
 
 /// The record of a run; entry `k` is what was measured and decided at sample `k`.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -95,6 +99,7 @@ impl Run {
         controller: &mut Controller<f64>,
         reference: &[f64],
         encoder: Option<&Encoder>,
+        monitor: &Monitor,
     ) {
         self.clear();
         plant.reset();
@@ -110,6 +115,10 @@ impl Run {
             before = now;
             if !(y.abs() < RUNAWAY && measured.is_finite()) {
                 self.outcome = Outcome::Diverged(k);
+                return;
+            }
+            if k % WATCHED == 0 && monitor.stopped() {
+                self.outcome = Outcome::Interrupted(k);
                 return;
             }
             let u = controller.step(r, measured);
@@ -131,16 +140,18 @@ impl Run {
 /// Runs `controller` on `plant` over `reference`, from rest.
 ///
 /// # Errors
-/// `ErrorKind::Data` for a reference that is empty or not finite. A loop that diverges is an [`Outcome`], not an error.
+/// `ErrorKind::Data` for a reference that is empty or not finite. A loop that diverges or is stopped is an
+/// [`Outcome`], not an error.
 pub fn closed_loop(
     plant: &mut (impl Plant + ?Sized),
     controller: &mut Controller<f64>,
     reference: &[f64],
     encoder: Option<&Encoder>,
+    monitor: &Monitor,
 ) -> Result<Run> {
     check_reference(reference)?;
     let mut run = Run::with_capacity(reference.len());
-    run.record(plant, controller, reference, encoder);
+    run.record(plant, controller, reference, encoder, monitor);
     Ok(run)
 }
 

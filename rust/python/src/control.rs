@@ -1,7 +1,236 @@
-//! Bindings of the core's control.
+//! Bindings of the core's control: the controller, the closed loop, tuning rules, tuning.
 
+mod controller;
+mod plant;
+mod tuning;
+
+use numpy::PyReadonlyArray1;
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use sewfast_control::{Parallel, PerSample, Refused, Standard};
+use sewfast_core::closed_loop::{self as looped, Outcome, Run};
+use sewfast_core::fopdt::fit_fopdt as fit;
+use sewfast_core::metrics::{self, Effort};
+use sewfast_core::rules::{self, Outside};
+use sewfast_core::{Error, Record, Result};
 
-pub fn register(_module: &Bound<'_, PyModule>) -> PyResult<()> {
-    Ok(())
+use crate::arrays::{array1, raise, slice};
+use crate::watch::watched;
+use controller::Controller;
+use plant::Model;
+
+type Values<'py> = PyReadonlyArray1<'py, f64>;
+type Triple = (f64, f64, f64);
+
+pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<Controller>()?;
+    module.add_function(wrap_pyfunction!(convert_gains, module)?)?;
+    module.add_function(wrap_pyfunction!(closed_loop, module)?)?;
+    module.add_function(wrap_pyfunction!(fit_fopdt, module)?)?;
+    module.add_function(wrap_pyfunction!(table_1, module)?)?;
+    module.add_function(wrap_pyfunction!(step_metrics, module)?)?;
+    module.add_function(wrap_pyfunction!(effort, module)?)?;
+    tuning::register(module)
+}
+
+#[pyfunction]
+#[pyo3(signature = (gains, *, form, to, Ts))]
+#[expect(non_snake_case, reason = "the field's name for the sample time")]
+fn convert_gains(py: Python<'_>, gains: Triple, form: &str, to: &str, Ts: f64) -> PyResult<Triple> {
+    converted(gains, form, to, Ts).map_err(|e| raise(py, e))
+}
+
+fn converted((p, i, d): Triple, form: &str, to: &str, ts: f64) -> Result<Triple> {
+    let per_sample = form == "per_sample" || to == "per_sample";
+    if per_sample && !(ts > 0.0 && ts.is_finite()) {
+        return Err(Error::setting(format!(
+            "expected the sample time Ts [s] at which the per-sample gains hold, got {ts}; give Ts above 0"
+        )));
+    }
+    let standard: std::result::Result<Standard<f64>, Refused> = match form {
+        "standard" => Standard {
+            kp: p,
+            ti: i,
+            td: d,
+        }
+        .checked(),
+        "parallel" => Parallel {
+            kp: p,
+            ki: i,
+            kd: d,
+        }
+        .to_standard(),
+        "per_sample" => PerSample {
+            kp: p,
+            ki: i,
+            kd: d,
+            ts,
+        }
+        .to_standard(),
+        _ => return Err(unknown_form(form)),
+    };
+    let standard = standard?;
+    match to {
+        _ if to == form => Ok((p, i, d)),
+        "standard" => Ok((standard.kp, standard.ti, standard.td)),
+        "parallel" => {
+            let g = standard.to_parallel();
+            Ok((g.kp, g.ki, g.kd))
+        }
+        "per_sample" => {
+            let g = standard.to_per_sample(ts);
+            Ok((g.kp, g.ki, g.kd))
+        }
+        _ => Err(unknown_form(to)),
+    }
+}
+
+fn unknown_form(form: &str) -> Error {
+    Error::setting(format!(
+        "expected a form of gains, standard, parallel or per_sample, got '{form}'"
+    ))
+}
+
+#[pyfunction]
+#[pyo3(signature = (plant, controller, reference, *, counts_per_unit, encoder_phase=0.5))]
+fn closed_loop<'py>(
+    py: Python<'py>,
+    plant: &Bound<'py, PyAny>,
+    controller: &Bound<'py, Controller>,
+    reference: Values<'py>,
+    counts_per_unit: f64,
+    encoder_phase: f64,
+) -> PyResult<Bound<'py, PyDict>> {
+    let (model, mut controller) = (Model::of(plant)?, controller.borrow().core.clone());
+    let reference = slice(&reference, "reference")?;
+    let run = watched(py, None, |monitor| {
+        let encoder = looped::encoder(counts_per_unit, encoder_phase)?;
+        let ts = controller.settings().ts;
+        let mut plant = model.plant(ts)?;
+        let encoder = encoder.as_ref();
+        looped::closed_loop(&mut plant, &mut controller, reference, encoder, monitor)
+            .and_then(|run| completed(run, ts))
+    })?;
+    let record = PyDict::new(py);
+    record.set_item("u", array1(py, run.u))?;
+    record.set_item("y", array1(py, run.y))?;
+    record.set_item("feedback", array1(py, run.feedback))?;
+    Ok(record)
+}
+
+fn completed(run: Run, ts: f64) -> Result<Run> {
+    match run.outcome {
+        Outcome::Completed => Ok(run),
+        Outcome::Interrupted(_) => Err(Error::fit("the run was interrupted")),
+        Outcome::Diverged(k) => Err(Error::fit(format!(
+            "expected a loop that stays finite, got one that diverged at {:.4} s; use smaller gains or output limits, \
+             or check the model on new data",
+            k as f64 * ts
+        ))),
+    }
+}
+
+#[pyfunction]
+#[pyo3(signature = (u, y, *, Ts))]
+#[expect(non_snake_case, reason = "the field's name for the sample time")]
+fn fit_fopdt<'py>(
+    py: Python<'py>,
+    u: Values<'py>,
+    y: Values<'py>,
+    Ts: f64,
+) -> PyResult<Bound<'py, PyDict>> {
+    let record = Record::new(slice(&u, "u")?, 1, slice(&y, "y")?).map_err(|e| raise(py, e))?;
+    let found = watched(py, None, |_| fit(record, Ts))?;
+    named(
+        py,
+        [
+            ("K", found.k),
+            ("T", found.t),
+            ("L", found.l),
+            ("offset", found.offset),
+            ("u_low", found.u_low),
+            ("u_high", found.u_high),
+            ("fit_percent", found.fit_percent),
+        ],
+    )
+}
+
+#[pyfunction]
+#[pyo3(signature = (K, T, L, *, nearest=false))]
+#[expect(non_snake_case, reason = "the field's names")]
+fn table_1(py: Python<'_>, K: f64, T: f64, L: f64, nearest: bool) -> PyResult<Bound<'_, PyDict>> {
+    let outside = if nearest {
+        Outside::Nearest
+    } else {
+        Outside::Error
+    };
+    let rule = rules::table_1(K, T, L, outside).map_err(|e| raise(py, e))?;
+    named(
+        py,
+        [
+            ("Kp", rule.gains.kp),
+            ("Ti", rule.gains.ti),
+            ("Td", rule.gains.td),
+            ("alpha", rule.alpha),
+            ("beta", rule.beta),
+        ],
+    )
+}
+
+#[pyfunction]
+#[pyo3(signature = (y, reference, *, Ts, smoothing))]
+#[expect(non_snake_case, reason = "the field's name for the sample time")]
+fn step_metrics<'py>(
+    py: Python<'py>,
+    y: Values<'py>,
+    reference: Values<'py>,
+    Ts: f64,
+    smoothing: f64,
+) -> PyResult<Bound<'py, PyDict>> {
+    let found = metrics::step_metrics(
+        slice(&y, "y")?,
+        slice(&reference, "reference")?,
+        Ts,
+        smoothing,
+    )
+    .map_err(|e| raise(py, e))?;
+    named(
+        py,
+        [
+            ("rise_time_ms", 1e3 * found.rise_time),
+            ("reference_rise_time_ms", 1e3 * found.reference_rise_time),
+            ("overshoot_percent", found.overshoot_percent),
+        ],
+    )
+}
+
+#[pyfunction]
+#[pyo3(signature = (u, *, u_min, u_max))]
+fn effort<'py>(
+    py: Python<'py>,
+    u: Values<'py>,
+    u_min: f64,
+    u_max: f64,
+) -> PyResult<Bound<'py, PyDict>> {
+    let found = Effort::of(slice(&u, "u")?, u_min, u_max);
+    named(
+        py,
+        [
+            ("u_rms", found.u_rms),
+            ("du_rms", found.du_rms),
+            ("saturated", found.saturated),
+        ],
+    )
+}
+
+/// A dict of numbers by name.
+fn named<'py, const N: usize>(
+    py: Python<'py>,
+    values: [(&str, f64); N],
+) -> PyResult<Bound<'py, PyDict>> {
+    let dict = PyDict::new(py);
+    for (name, value) in values {
+        dict.set_item(name, value)?;
+    }
+    Ok(dict)
 }

@@ -218,3 +218,20 @@ fn refuses_settings_out_of_range() {
     assert_eq!(refused(Settings { ts: 0.0, ..good }), "Ts");
     assert_eq!(refused(settings(1.0, 0.0, 0.0)), "Ti");
 }
+
+#[test]
+fn conditional_integration_finds_its_way_off_a_limit() {
+    // With alpha above 1 a falling reference lifts the command: error and excess then have different signs.
+    let s = Settings {
+        alpha: 2.0,
+        u_max: 1.0,
+        ..settings(0.1, 0.1, 0.0)
+    };
+    let mut pid = Pid::new(s).unwrap();
+    for _ in 0..5_000 {
+        pid.step(10.0, 9.0);
+    }
+    assert_eq!(pid.step(0.0, 1.0), 1.0);
+    let last = (0..5_000).map(|_| pid.step(0.0, 1.0)).last().unwrap();
+    assert!(last < 0.0, "{last}");
+}

@@ -10,6 +10,15 @@ use crate::machine::{Machine, Parameters};
 
 const TS: f64 = 1e-3;
 
+fn closed(
+    plant: &mut impl Plant,
+    controller: &mut Controller<f64>,
+    reference: &[f64],
+    encoder: Option<&Encoder>,
+) -> Result<Run> {
+    closed_loop(plant, controller, reference, encoder, &Monitor::default())
+}
+
 fn lag() -> LinearModel {
     LinearModel::new(vec![-0.98], vec![9.8], 1, 1, 0.0).unwrap()
 }
@@ -31,7 +40,7 @@ fn equals_the_exact_linear_loop_where_nothing_limits() {
         ..pi(kp, ti)
     };
     let r = 1000.0;
-    let run = closed_loop(
+    let run = closed(
         &mut LaggedPlant::new(&model, TS).unwrap(),
         &mut controller(settings, 1),
         &[r; 300],
@@ -61,7 +70,7 @@ fn a_model_in_the_loop_gives_what_it_gives_in_free_run() {
     let reference: Vec<f64> = (0..200)
         .map(|k| 100.0 * (f64::from(k) / 20.0).sin())
         .collect();
-    let run = closed_loop(
+    let run = closed(
         &mut plant,
         &mut controller(pi(0.01, 0.1), 1),
         &reference,
@@ -83,7 +92,7 @@ fn an_encoder_is_quantised_to_whole_counts_and_exact_on_average() {
     let scale = 1572.0 / 60.0;
     let sensor = encoder(scale, 0.5).unwrap();
     let mut plant = LaggedPlant::new(&model, TS).unwrap();
-    let run = closed_loop(
+    let run = closed(
         &mut plant,
         &mut controller(pi(1e-3, 0.1), 1),
         &[500.0; 2000],
@@ -108,7 +117,7 @@ fn an_encoder_is_quantised_to_whole_counts_and_exact_on_average() {
 fn says_when_the_loop_diverges() {
     let unstable = LinearModel::new(vec![-2.0], vec![1.0], 1, 1, 0.0).unwrap();
     let mut plant = LaggedPlant::new(&unstable, TS).unwrap();
-    let run = closed_loop(
+    let run = closed(
         &mut plant,
         &mut controller(pi(1e-9, 1.0), 1),
         &[1.0; 2000],
@@ -131,7 +140,7 @@ fn repeats_a_run_from_rest() {
         8,
     );
     let sensor = encoder(26.2, 0.5).unwrap();
-    let mut once = || closed_loop(&mut plant, &mut c, &[400.0; 300], sensor.as_ref()).unwrap();
+    let mut once = || closed(&mut plant, &mut c, &[400.0; 300], sensor.as_ref()).unwrap();
     assert_eq!(once(), once());
 }
 
@@ -177,7 +186,7 @@ fn refuses_what_cannot_be_closed() {
     let model = lag();
     let mut plant = LaggedPlant::new(&model, TS).unwrap();
     for bad in [&[][..], &[1.0, f64::NAN]] {
-        let run = closed_loop(&mut plant, &mut controller(pi(1.0, 1.0), 1), bad, None);
+        let run = closed(&mut plant, &mut controller(pi(1.0, 1.0), 1), bad, None);
         assert!(run.is_err());
     }
 }
@@ -190,7 +199,7 @@ fn the_machine_is_measured_by_its_own_encoder() {
     };
     let run = |quantisation, encoder: Option<&Encoder>| {
         let mut c = controller(pi(2e-3, 0.1), 1);
-        closed_loop(&mut machine(quantisation), &mut c, &[1000.0; 500], encoder).unwrap()
+        closed(&mut machine(quantisation), &mut c, &[1000.0; 500], encoder).unwrap()
     };
     let other = Encoder::new(1.0, 0.0);
     assert_eq!(run(1.0, Some(&other)), run(1.0, None));
@@ -209,4 +218,14 @@ fn the_machine_is_measured_by_its_own_encoder() {
             .zip(ideal.y.windows(2))
             .all(|(m, y)| (m[1] - (y[0] + y[1]) / 2.0).abs() < 2.0)
     );
+}
+
+#[test]
+fn stops_on_request() {
+    let monitor = Monitor::default();
+    monitor.request_stop();
+    let (model, mut c) = (lag(), controller(pi(1.0, 1.0), 1));
+    let mut plant = LaggedPlant::new(&model, TS).unwrap();
+    let run = closed_loop(&mut plant, &mut c, &[1.0; 10], None, &monitor).unwrap();
+    assert_eq!((run.outcome, run.u.len()), (Outcome::Interrupted(0), 0));
 }

@@ -97,7 +97,7 @@ impl<P: Plant + Clone> Bench<P> {
         let mut sum = 0.0;
         for plant in 0..self.plants.len() {
             for reference in 0..task.references.len() {
-                sum += self.one(task, plant, reference, &mut controller);
+                sum += self.one(task, plant, reference, &mut controller, monitor);
                 let hopeless = sum > to_beat * runs || !sum.is_finite();
                 if hopeless || monitor.stopped() {
                     return f64::INFINITY;
@@ -113,10 +113,12 @@ impl<P: Plant + Clone> Bench<P> {
         plant: usize,
         reference: usize,
         controller: &mut Controller<f64>,
+        monitor: &Monitor,
     ) -> f64 {
         let (r, edge) = (task.references[reference], self.edges[reference]);
         let plant = &mut self.plants[plant];
-        self.run.record(plant, controller, r, task.encoder.as_ref());
+        self.run
+            .record(plant, controller, r, task.encoder.as_ref(), monitor);
         if self.run.outcome != Outcome::Completed {
             return f64::INFINITY;
         }

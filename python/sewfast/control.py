@@ -1,0 +1,360 @@
+"""Controllers: `Controller` with its files, coarse tuning from a step response."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import _core, jsonfile
+from .errors import DataError, ModelFileError, SettingError, SewfastError
+from .gains import Form, Gains, real
+from .models.fields import Fields
+from .units import counts_per_unit
+
+__all__ = [
+    "Controller",
+    "Fopdt",
+    "Form",
+    "Gains",
+    "Rule",
+    "fit_fopdt",
+    "load_controller",
+    "paper_controller",
+    "table_1",
+]
+
+FORMAT = "sewfast.controller"
+VERSION = 1
+
+_UNBOUNDED = {
+    "N": math.inf,
+    "Tt": math.inf,
+    "u_min": -math.inf,
+    "u_max": math.inf,
+    "slew": math.inf,
+}
+"""What null means in a file, where JSON has no infinity."""
+_REALS = ("Ts", "alpha", "beta", "N", "Tt", "u_min", "u_max", "slew", "filter_time")
+_OTHERS = ("version", "gains", "u_unit", "y_unit", "filter_samples", "counts_per_rev", "notes")
+
+
+@dataclass(frozen=True)
+class Controller:
+    """A sampled 2-DOF PID with limits, anti-windup and feedback filter (paper Eq. 9, Fig. 16).
+
+    Parameters
+    ----------
+    gains : Gains
+        In any form; they carry the units of the command and of the output.
+    Ts : float
+        Sample time [s].
+    alpha, beta : float
+        Shares of the reference taken out of the proportional and of the derivative term; negative
+        values feed the reference forward.
+    N : float
+        The derivative is filtered with time constant `Td/N`; inf for no filter.
+    Tt : float
+        Time constant of back-calculation [s]; 0 stops the integral while the command is limited.
+    u_min, u_max : float
+        Limits of the command [u]; infinite for none.
+    slew : float
+        Largest change of the command [u/s]; inf for none.
+    filter_samples : int
+        Moving average in the feedback, 1 to 64 samples; 1 for none.
+    filter_time : float
+        First-order lag in the feedback after it [s]; 0 for none.
+    counts_per_rev : float or None
+        The encoder that measures a model's output; None for ideal feedback. A machine has its own.
+    notes : str
+        Where it comes from.
+
+    Raises
+    ------
+    SettingError
+        For a setting outside its range.
+    """
+
+    gains: Gains
+    Ts: float = 0.001
+    alpha: float = 0.0
+    beta: float = 0.0
+    N: float = math.inf
+    Tt: float = 0.0
+    u_min: float = -math.inf
+    u_max: float = math.inf
+    slew: float = math.inf
+    filter_samples: int = 1
+    filter_time: float = 0.0
+    counts_per_rev: float | None = None
+    notes: str = ""
+
+    def __post_init__(self) -> None:
+        for name in _REALS:
+            object.__setattr__(self, name, real(name, getattr(self, name)))
+        if self.gains.Ts is not None and not math.isclose(self.gains.Ts, self.Ts, rel_tol=1e-9):
+            raise SettingError(
+                f"expected gains for the controller's sample time of {self.Ts} s, got per-sample "
+                f"gains at {self.gains.Ts} s; convert them with gains.to('standard')"
+            )
+        if isinstance(self.filter_samples, bool) or not isinstance(
+            self.filter_samples, (int, np.integer)
+        ):
+            raise SettingError(
+                f"expected a whole number for filter_samples, got {self.filter_samples!r}; try 8"
+            )
+        object.__setattr__(self, "filter_samples", int(self.filter_samples))
+        if self.counts_per_rev is not None:
+            object.__setattr__(self, "counts_per_rev", real("counts_per_rev", self.counts_per_rev))
+        if not isinstance(self.notes, str):
+            raise SettingError(f"expected text for notes, got {self.notes!r}")
+        _ = (self.core(), self.counts_per_unit)
+
+    @property
+    def counts_per_unit(self) -> float:
+        """Encoder counts per second at an output of one unit; 0 for ideal feedback."""
+        if self.counts_per_rev is None:
+            return 0.0
+        return counts_per_unit(self.counts_per_rev, self.gains.y_unit)
+
+    def core(self) -> _core.Controller:
+        """The arithmetic itself, at rest: `step(r, y)` once per sample gives the command."""
+        if not 0 <= self.filter_samples <= 2**31:
+            raise SettingError(
+                f"expected 1 to 64 samples for filter_samples, got {self.filter_samples}"
+            )
+        gains = self.gains.to("standard")
+        return _core.Controller(
+            Kp=gains.Kp,
+            Ti=gains.Ti,
+            Td=gains.Td,
+            filter_samples=self.filter_samples,
+            **{name: getattr(self, name) for name in _REALS},
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it as JSON (docs/CONVENTIONS.md, Files); the file appears whole or not at all.
+
+        Raises
+        ------
+        ModelFileError
+            Where the file cannot be written.
+        """
+        jsonfile.write(path, FORMAT, VERSION, self.to_dict())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as JSON values; null stands for a limit or filter that is not there."""
+        values = {name: _bounded(getattr(self, name)) for name in _REALS}
+        return {
+            "gains": {k: _bounded(v) for k, v in self.gains.to_dict().items()},
+            "u_unit": self.gains.u_unit,
+            "y_unit": self.gains.y_unit,
+            **values,
+            "filter_samples": self.filter_samples,
+            "counts_per_rev": self.counts_per_rev,
+            "notes": self.notes,
+        }
+
+    def __str__(self) -> str:
+        u, y = self.gains.u_unit, self.gains.y_unit
+        lag = f", then a lag of {self.filter_time:g} s" if self.filter_time else ""
+        encoder = "ideal" if self.counts_per_rev is None else f"{self.counts_per_rev:g} counts/rev"
+        windup = (
+            "conditional integration" if self.Tt == 0 else f"back-calculation, Tt {self.Tt:g} s"
+        )
+        lines = [
+            f"2-DOF PID at {self.Ts:g} s from {y} to {u}",
+            f"  gains     {self.gains}",
+            f"  reference alpha {self.alpha:.6g}, beta {self.beta:.6g}",
+            f"  derivative filter N {self.N:.6g}",
+            f"  limits    {self.u_min:g} to {self.u_max:g} {u}, slew {self.slew:g} {u}/s; {windup}",
+            f"  feedback  {encoder}, mean of {self.filter_samples} samples{lag}",
+        ]
+        return "\n".join([*lines, f"  notes     {self.notes}"] if self.notes else lines)
+
+
+def load_controller(path: str | os.PathLike[str]) -> Controller:
+    """Read a controller that `Controller.save` wrote; nothing in the file is executed.
+
+    Raises
+    ------
+    ModelFileError
+        Where the file is missing, damaged, of another format or of an unknown version, or holds a
+        setting outside its range; the message names the file and the field.
+    """
+    fields = Fields(os.fspath(path), jsonfile.read(path, FORMAT, (VERSION,)))
+    fields.require_only((*_OTHERS, *_REALS))
+    try:
+        return Controller(
+            gains=_gains(fields),
+            filter_samples=fields.integer("filter_samples"),
+            counts_per_rev=fields.optional_number("counts_per_rev"),
+            notes=fields.text("notes"),
+            **{name: _unbounded(fields, name, _UNBOUNDED) for name in _REALS},
+        )
+    except ModelFileError:
+        raise
+    except SewfastError as error:
+        raise ModelFileError(f"{path}: {error}") from error
+
+
+def _gains(fields: Fields) -> Gains:
+    part = fields.object("gains")
+    form = part.text("form")
+    names = Gains.fields_of(form)
+    if names is None:
+        raise part.refuse("form", "standard, parallel or per_sample", form)
+    part.require_only(("form", *names))
+    values = [_unbounded(part, name, {"Ti": math.inf}) for name in names]
+    units = {"u_unit": fields.text("u_unit"), "y_unit": fields.text("y_unit")}
+    return Gains(form, *values, **units)  # type: ignore[arg-type]
+
+
+def _unbounded(fields: Fields, name: str, unbounded: Mapping[str, float]) -> float:
+    if name in unbounded and fields.any(name) is None:
+        return unbounded[name]
+    return fields.number(name)
+
+
+def _bounded(value: Any) -> Any:
+    return None if isinstance(value, float) and math.isinf(value) else value
+
+
+def paper_controller() -> Controller:
+    """The paper's controller: Kp .02, Ki .02, Kd .5 per sample of 1 ms, alpha .4, beta .2.
+
+    The paper leaves the form open; only as per-sample gains in V/RPM within +-10 V do they track on
+    its own plant, and they lean on that limit: without it the loop is unstable. Raw feedback.
+    """
+    return Controller(
+        gains=Gains.per_sample(0.02, 0.02, 0.5, Ts=0.001),
+        alpha=0.4,
+        beta=0.2,
+        u_min=-10.0,
+        u_max=10.0,
+        counts_per_rev=1572.0,
+        notes="gains of the paper, read as per-sample gains",
+    )
+
+
+@dataclass(frozen=True)
+class Fopdt:
+    """First order plus dead time, `K e^(-sL) / (1 + sT)`, about a step (paper Eq. 10-11).
+
+    Parameters
+    ----------
+    K : float
+        Gain [y/u].
+    T, L : float
+        Time constant and dead time [s].
+    offset : float
+        The output settles at `K u + offset` [y].
+    u_low, u_high : float
+        Input before and after the step [u].
+    fit_percent : float
+        100 (1 - |y - model| / |y - mean(y)|) over the samples used.
+    u_unit, y_unit : str
+        Units of input and output.
+    """
+
+    K: float
+    T: float
+    L: float
+    offset: float = 0.0
+    u_low: float = 0.0
+    u_high: float = 1.0
+    fit_percent: float = math.nan
+    u_unit: str = "V"
+    y_unit: str = "RPM"
+
+    def response(self, t: ArrayLike) -> NDArray[np.float64]:
+        """The output at times `t` [s] after the step, shape as `t`; `t` may be negative."""
+        since = np.maximum(np.asarray(t, dtype=np.float64) - self.L, 0.0)
+        share = -np.expm1(-since / self.T)
+        return np.asarray(self.offset + self.K * (self.u_low + share * (self.u_high - self.u_low)))
+
+    def __str__(self) -> str:
+        return (
+            f"K {self.K:.6g} {self.y_unit}/{self.u_unit}, T {self.T:.6g} s, L {self.L:.6g} s "
+            f"(L/T {self.L / self.T:.3g}), fit {self.fit_percent:.2f} %"
+        )
+
+
+def fit_fopdt(
+    u: ArrayLike, y: ArrayLike, *, Ts: float, u_unit: str = "V", y_unit: str = "RPM"
+) -> Fopdt:
+    """First-order-plus-dead-time approximation of a measured step response.
+
+    Least squares over K, T, L and the level before the step. The record is used from its start to
+    the second step of the input; the first may be anywhere after some samples.
+
+    Parameters
+    ----------
+    u, y : array, shape (N,)
+        Input and output; a raw speed with its quantisation will do.
+    Ts : float
+        Sample time [s].
+
+    Raises
+    ------
+    DataError
+        Without a step, or where the response does not settle or drowns in noise.
+    SettingError
+        For a sample time that is not above 0.
+    """
+    found = _core.fit_fopdt(vector("u", u), vector("y", y), Ts=real("Ts", Ts))
+    return Fopdt(**found, u_unit=u_unit, y_unit=y_unit)
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a tuning rule gives: gains in standard form, alpha, beta."""
+
+    gains: Gains
+    alpha: float
+    beta: float
+
+
+def table_1(fopdt: Fopdt, *, outside: Literal["error", "nearest"] = "error") -> Rule:
+    """Coarse tuning by the paper's Table 1, interpolated in L/T.
+
+    Parameters
+    ----------
+    fopdt : Fopdt
+    outside : "error" or "nearest"
+        What to do where L/T is not in .1 to 1. The nearest row below .1 is the row for `L = .1 T`,
+        a longer dead time than the plant's: conservative. Above 1 it is not.
+
+    Raises
+    ------
+    SettingError
+        Where L/T is outside the table and no row is to be taken instead, or for K = 0 or T <= 0.
+    """
+    if outside not in ("error", "nearest"):
+        raise SettingError(f"expected outside='error' or 'nearest', got {outside!r}")
+    found = _core.table_1(fopdt.K, fopdt.T, fopdt.L, nearest=outside == "nearest")
+    units = {"u_unit": fopdt.u_unit, "y_unit": fopdt.y_unit}
+    gains = Gains.standard(found["Kp"], found["Ti"], found["Td"], **units)
+    return Rule(gains, found["alpha"], found["beta"])
+
+
+def vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """The values as float64, shape (N,), C-contiguous.
+
+    Raises
+    ------
+    DataError
+        For values that are not numbers or not one-dimensional.
+    """
+    try:
+        array = np.ascontiguousarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"expected numbers in {name}, got {error}") from error
+    if np.ndim(values) != 1:
+        raise DataError(f"expected {name} of shape (N,), got {np.shape(values)}; give one column")
+    return array

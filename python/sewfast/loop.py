@@ -1,0 +1,225 @@
+"""A controller on a model or on the virtual machine: `run`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import _core, signals
+from .control import Controller, vector
+from .errors import DataError, SettingError
+from .machine import VirtualMachine
+from .models import Model
+
+FloatArray: TypeAlias = NDArray[np.float64]
+Plant: TypeAlias = Model | VirtualMachine
+
+SMOOTHING = 0.005
+"""Centred moving average of the true output before rise time and overshoot are taken [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoopRun:
+    """What a controller did on a plant; entry k is measured and decided at `t[k]`.
+
+    Attributes
+    ----------
+    t : array, shape (N,)
+        Time [s].
+    r, y, feedback : array, shape (N,)
+        Reference, true output, measured output after encoder and feedback filter [y].
+    u : array, shape (N,)
+        Command after its limits [u].
+    controller : Controller
+    plant, reference : str
+        Their names.
+    """
+
+    t: FloatArray
+    r: FloatArray
+    u: FloatArray
+    y: FloatArray
+    feedback: FloatArray
+    controller: Controller
+    plant: str
+    reference: str
+
+    @property
+    def Ts(self) -> float:
+        """Sample time [s]."""
+        return self.controller.Ts
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The unit of each column by name."""
+        u, y = self.controller.gains.u_unit, self.controller.gains.y_unit
+        return {"t": "s", "r": y, "u": u, "y": y, "feedback": y}
+
+    def columns(self) -> dict[str, FloatArray]:
+        """t, r, u, y, feedback by name, for a file or a plot."""
+        return {name: getattr(self, name) for name in self.units}
+
+    def metrics(self) -> dict[str, float | None]:
+        """How well it tracked and what that took.
+
+        Returns
+        -------
+        dict
+            `rmse` and `max_abs` of r - y [y]; `rise_time_ms`, `reference_rise_time_ms` (10 to 90 %
+            of the first edge) and `overshoot_percent`, None where the reference is no step or
+            trapezoid or the level is not reached; `u_rms`, `du_rms` (change from sample to sample)
+            [u]; `saturated`, the share of samples at a limit.
+        """
+        error = self.r - self.y
+        return {
+            "rmse": float(np.sqrt(np.mean(error**2))),
+            "max_abs": float(np.max(np.abs(error))),
+            **self._step_metrics(),
+            **_core.effort(self.u, u_min=self.controller.u_min, u_max=self.controller.u_max),
+        }
+
+    def _step_metrics(self) -> dict[str, float | None]:
+        try:
+            found = _core.step_metrics(self.y, self.r, Ts=self.Ts, smoothing=SMOOTHING)
+        except DataError:
+            names = ("rise_time_ms", "reference_rise_time_ms", "overshoot_percent")
+            return dict.fromkeys(names)
+        return {name: None if math.isnan(value) else value for name, value in found.items()}
+
+    def __str__(self) -> str:
+        unit = self.units
+        told = self.metrics()
+        lines = [
+            f"{self.reference} on {self.plant}, {len(self.t) * self.Ts:g} s",
+            f"  error     {told['rmse']:.4g} {unit['y']} rms, {told['max_abs']:.4g} at most",
+        ]
+        if told["rise_time_ms"] is not None:
+            lines.append(
+                f"  first edge {told['rise_time_ms']:.1f} ms from 10 to 90 % (reference "
+                f"{told['reference_rise_time_ms']:.1f} ms), "
+                f"overshoot {told['overshoot_percent']:.2f} %"
+            )
+        saturated = 100.0 * (told["saturated"] or 0.0)
+        lines.append(
+            f"  command   {told['u_rms']:.4g} {unit['u']} rms, {told['du_rms']:.4g} from sample to "
+            f"sample, at a limit {saturated:.1f} % of the time"
+        )
+        return "\n".join(lines)
+
+
+def run(
+    controller: Controller,
+    on: Plant,
+    reference: str | ArrayLike,
+    *,
+    seed: int = 0,
+    name: str | None = None,
+) -> ClosedLoopRun:
+    """Run a controller on a model or on a virtual machine, from rest.
+
+    Order at a sample: measure, filter, control, limit, apply. A machine is measured by its own
+    encoder, a model by one of `controller.counts_per_rev`.
+
+    Parameters
+    ----------
+    controller : Controller
+    on : Model or VirtualMachine
+        The plant; a model needs one input. It is not changed.
+    reference : str or array, shape (N,)
+        Name of a reference (`sewfast.signals`) or its samples at the controller's sample time [y].
+    seed : int
+        Chooses a named random reference.
+    name : str, optional
+        Name of the reference in messages and reports.
+
+    Raises
+    ------
+    SettingError
+        Where sample times or units of controller, plant and reference disagree.
+    DataError
+        For a reference that is empty or not finite.
+    FitError
+        Where the loop diverges.
+    """
+    r = reference_samples(reference, controller, seed)
+    check_fits(controller, on)
+    record = _core.closed_loop(
+        on.core, controller.core(), r, counts_per_unit=controller.counts_per_unit
+    )
+    return ClosedLoopRun(
+        t=np.arange(len(r), dtype=np.float64) * controller.Ts,
+        r=r,
+        **record,
+        controller=controller,
+        plant=plant_name(on),
+        reference=name or (reference if isinstance(reference, str) else "reference"),
+    )
+
+
+def reference_samples(
+    reference: str | ArrayLike, controller: Controller, seed: int = 0
+) -> FloatArray:
+    """The samples of a reference given by name or as they are, shape (N,), never the caller's own.
+
+    Raises
+    ------
+    SettingError
+        For an unknown name, or a name where the controller is not in RPM at 1 ms.
+    DataError
+        For samples that are no vector of numbers.
+    """
+    if not isinstance(reference, str):
+        return vector("reference", reference).copy()
+    samples = signals.reference(reference, seed)
+    unit, Ts = controller.gains.y_unit, controller.Ts
+    if unit.lower() != "rpm" or not math.isclose(Ts, signals.TS, rel_tol=1e-9):
+        raise SettingError(
+            f"expected a controller in RPM at {signals.TS} s for the reference {reference!r}, "
+            f"got {unit!r} at {Ts} s; give the reference as samples"
+        )
+    return samples
+
+
+def check_fits(controller: Controller, plant: Any) -> None:
+    """Refuse a plant whose sample time or units are not the controller's.
+
+    Raises
+    ------
+    SettingError
+        Naming both.
+    """
+    if not isinstance(plant, (Model, VirtualMachine)):
+        raise SettingError(
+            f"expected a Model or a VirtualMachine to run on, got {type(plant).__name__}; "
+            "load a model with load_model"
+        )
+    if not math.isclose(plant.Ts, controller.Ts, rel_tol=0.01):
+        raise SettingError(
+            f"expected plant and controller at one sample time, got {plant.Ts} s and "
+            f"{controller.Ts} s; tune a controller for this plant"
+        )
+    for what, theirs, ours in (
+        ("input", plant_units(plant)[0], controller.gains.u_unit),
+        ("output", plant_units(plant)[1], controller.gains.y_unit),
+    ):
+        if theirs and ours and theirs.lower() != ours.lower():
+            raise SettingError(
+                f"expected the plant's {what} in the controller's unit {ours!r}, got {theirs!r}; "
+                "give the gains in the plant's units"
+            )
+
+
+def plant_units(plant: Plant) -> tuple[str, str]:
+    """Units of a plant's first input and of its output; empty where unknown."""
+    if isinstance(plant, VirtualMachine):
+        return "V", "RPM"
+    return plant.input_units[0], plant.output_unit
+
+
+def plant_name(plant: Plant) -> str:
+    """What to call a plant: the machine's name, or the model's kind."""
+    return plant.name if isinstance(plant, VirtualMachine) else plant.kind

@@ -1,0 +1,269 @@
+"""Fine tuning by simulated closed loops: `tune`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import _core
+from .control import Controller, Fopdt, Gains, fit_fopdt, table_1
+from .errors import DataError, FitError, Interrupted, SettingError
+from .loop import Plant, check_fits, plant_units, reference_samples
+from .models import Model
+from .units import REVOLUTIONS_PER_SECOND
+
+Progress: TypeAlias = Callable[[int, int, float], object]
+
+REFERENCES = ("trapezoid", "trapezoids", "random")
+"""References to tune on unless others are given."""
+VARIATIONS = ((1.0, 0), (0.8, 0), (1.25, 0))
+"""Gain and extra delay in samples that one controller has to bear, so that tuned gains transfer."""
+DERIVATIVE_FILTER = 10.0
+"""N to begin with."""
+_STEP_SHARES = (0.25, 0.5, 0.1, 0.05)
+"""Shares of u_max that the first step response is looked for at."""
+_STEP_SAMPLES = (4_000, 16_000, 64_000)
+
+
+@dataclass(frozen=True, eq=False)
+class TuningResult:
+    """The tuned controller and the story of its search.
+
+    Attributes
+    ----------
+    controller : Controller
+        Ready to run.
+    start : Controller
+        What the search began with.
+    cost, start_cost : float
+        Cost of both in the output's unit, mean over plants and references; inf where one diverges.
+    evaluations : int
+        Controllers tried.
+    trace : array
+        The best cost so far, the start's first, then after each generation.
+    termination : str
+        ``evaluations``, ``converged`` or ``interrupted``.
+    weights : mapping
+        What counted how much.
+    """
+
+    controller: Controller
+    start: Controller
+    cost: float
+    start_cost: float
+    evaluations: int
+    trace: NDArray[np.float64]
+    termination: str
+    weights: Mapping[str, float]
+
+    def __str__(self) -> str:
+        unit = self.controller.gains.y_unit
+        return (
+            f"cost {self.cost:.4g} {unit} (start {self.start_cost:.4g}) after {self.evaluations} "
+            f"evaluations, {self.termination}\n{self.controller}"
+        )
+
+
+def tune(
+    models: Plant | Sequence[Plant],
+    references: str | ArrayLike | Sequence[str | ArrayLike] | None = None,
+    *,
+    u_min: float = -20.0,
+    u_max: float = 20.0,
+    counts_per_rev: float | None = 1572.0,
+    filter_samples: int = 8,
+    start: Controller | None = None,
+    weights: Mapping[str, float] | None = None,
+    variations: Sequence[tuple[float, int]] = VARIATIONS,
+    evaluations: int = 1000,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> TuningResult:
+    """Search Kp, Ti, Td, alpha, beta (and N where finite) for the least cost of simulated loops.
+
+    Every candidate runs on every plant in every variation over every reference, with encoder,
+    feedback filter and limits in the loop. The cost is the mean, in the output's unit, of::
+
+        rms(r - y) + R (chatter rms(du)/(u_max - u_min) + overshoot max(o - overshoot_limit, 0)/100
+                        + saturation s)
+
+    with R the references' span, du the command's change from sample to sample, o the overshoot [%]
+    of the 5-ms-smoothed output on steps and trapezoids, s the share of samples at a limit. The
+    search is differential evolution; a seed gives the same bits at any number of threads.
+
+    Parameters
+    ----------
+    models : model, machine or sequence of them
+        Plants that one controller has to serve, with one input, one sample time, the same units.
+    references : str, array of shape (N,), or sequence of them, optional
+        Names (`sewfast.signals`) or samples [y]; `REFERENCES` by default.
+    u_min, u_max : float
+        Limits of the command [u].
+    counts_per_rev : float or None
+        Encoder in the loop of the models; None for ideal feedback.
+    filter_samples : int
+        Moving average in the feedback.
+    start : Controller, optional
+        What to begin with; its limits, filters, encoder and sample time are kept, and the four
+        settings above are not used. By default Table 1 on the first model's own step response.
+    weights : mapping, optional
+        Changes to `default_weights()`.
+    variations : sequence of (gain, delay)
+        Output gain and extra input delay in samples, applied to every plant.
+    evaluations : int
+        Candidates tried.
+    seed : int
+        Seed of the search.
+    threads : int, optional
+        All processors by default.
+    progress : callable, optional
+        Called with (done, total, lowest cost).
+
+    Raises
+    ------
+    SettingError, DataError
+        For plants, references or settings that cannot be used.
+    FitError
+        Where every candidate diverges.
+    Interrupted
+        After Ctrl-C; its `best` is the best controller so far.
+    """
+    plants = list(models) if isinstance(models, Sequence) else [models]
+    if not plants:
+        raise SettingError("expected at least one plant to tune on, got none")
+    if start is None:
+        start = first_controller(
+            plants[0],
+            u_min=u_min,
+            u_max=u_max,
+            counts_per_rev=counts_per_rev,
+            filter_samples=filter_samples,
+        )
+    for plant in plants:
+        check_fits(start, plant)
+    found = _core.tune(
+        [plant.core for plant in plants],
+        [reference_samples(r, start) for r in _each(references)],
+        start=start.core(),
+        counts_per_unit=start.counts_per_unit,
+        variations=[(float(gain), int(delay)) for gain, delay in variations],
+        weights=dict(weights or {}),
+        evaluations=evaluations,
+        seed=seed,
+        threads=threads or os.cpu_count() or 1,
+        progress=progress,
+    )
+    result = _result(found, start, {**default_weights(), **(weights or {})})
+    if result.termination == "interrupted":
+        raise Interrupted(result.controller)
+    return result
+
+
+def default_weights() -> dict[str, float]:
+    """The cost's weights: chatter, overshoot, overshoot_limit [%], saturation; see `tune`."""
+    return _core.default_weights()
+
+
+def first_controller(
+    plant: Plant,
+    *,
+    u_min: float = -20.0,
+    u_max: float = 20.0,
+    counts_per_rev: float | None = 1572.0,
+    filter_samples: int = 8,
+) -> Controller:
+    """A conservative controller from a model's own step response by Table 1 (nearest row).
+
+    The moving average's delay counts as dead time.
+
+    Raises
+    ------
+    SettingError
+        For a machine: record its step response and use `fit_fopdt` and `table_1`.
+    FitError
+        Where no step of the model settles.
+    """
+    if not isinstance(plant, Model):
+        raise SettingError(
+            "expected a model to find a start from, got a machine; give start=, or tune on a model"
+        )
+    u_unit, y_unit = (unit or "?" for unit in plant_units(plant))
+    fopdt = _step_fit(plant, u_max)
+    delayed = replace(fopdt, L=fopdt.L + (filter_samples - 1) / 2 * plant.Ts)
+    rule = table_1(delayed, outside="nearest")
+    gains = Gains.standard(
+        rule.gains.Kp, rule.gains.Ti, rule.gains.Td, u_unit=u_unit, y_unit=y_unit
+    )
+    turns = y_unit.lower() in REVOLUTIONS_PER_SECOND
+    return Controller(
+        gains=gains,
+        Ts=plant.Ts,
+        alpha=rule.alpha,
+        beta=rule.beta,
+        N=DERIVATIVE_FILTER,
+        u_min=u_min,
+        u_max=u_max,
+        filter_samples=filter_samples,
+        counts_per_rev=counts_per_rev if turns else None,
+        notes="Table 1 on the model's step response",
+    )
+
+
+def _step_fit(model: Model, u_max: float) -> Fopdt:
+    """The model's step response, at the first size and length at which it settles."""
+    reason: Exception | None = None
+    for share in _STEP_SHARES:
+        for samples in _STEP_SAMPLES:
+            u = np.zeros(samples)
+            u[samples // 20 :] = share * u_max
+            try:
+                y = model.core.simulate(u[:, None], np.zeros(model.core.na))
+                return fit_fopdt(u, y, Ts=model.Ts)
+            except (DataError, FitError) as error:
+                reason = error
+    raise FitError(
+        f"expected a model whose step response settles, got none up to u = {0.5 * u_max:g} "
+        f"({reason}); give a controller to start from"
+    ) from reason
+
+
+def _each(references: Any) -> list[str | ArrayLike]:
+    """The references one by one: a name or a vector is one, a sequence of those is several."""
+    if references is None:
+        return list(REFERENCES)
+    if isinstance(references, str):
+        return [references]
+    several = not isinstance(references, np.ndarray) and any(
+        isinstance(r, str) or np.ndim(r) for r in references
+    )
+    return list(references) if several or np.ndim(references) == 2 else [references]
+
+
+def _result(
+    found: Mapping[str, Any], start: Controller, weights: Mapping[str, float]
+) -> TuningResult:
+    units = {"u_unit": start.gains.u_unit, "y_unit": start.gains.y_unit}
+    tuned = replace(
+        start,
+        gains=Gains.standard(found["Kp"], found["Ti"], found["Td"], **units),
+        alpha=found["alpha"],
+        beta=found["beta"],
+        N=found["N"],
+        notes="tuned by simulated closed loops",
+    )
+    return TuningResult(
+        controller=tuned,
+        start=start,
+        cost=found["cost"],
+        start_cost=found["start_cost"],
+        evaluations=int(found["evaluations"]),
+        trace=np.asarray(found["trace"]),
+        termination=str(found["termination"]),
+        weights=weights,
+    )
