@@ -1,0 +1,60 @@
+//! How well a linear model runs on from a state that a few samples gave it.
+
+use crate::Record;
+use crate::lagged::Lagged;
+use crate::linear::LinearModel;
+
+/// Samples that set the state of a segment, as in a score's default.
+const INIT: usize = 20;
+/// Segments an experiment is cut into, where it is long enough.
+const SEGMENTS: usize = 8;
+/// Shortest segment, in multiples of `INIT`.
+const SHORTEST: usize = 5;
+
+/// Mean square free-run error over segments of the records, each started from its own first samples.
+///
+/// Where the model cannot hold all of the drive (friction, limits), a slow pole almost cancelled by a zero can lower
+/// the cost by following the record's trend. Nobody can tell that pole's state from a few samples, so such a model
+/// fails whenever it is started anew, which is what a model is for. Infinite where a run leaves the finite numbers.
+pub(super) fn restart_error(model: &LinearModel, records: &[Record]) -> f64 {
+    let (mut sum, mut count) = (0.0, 0);
+    for record in records {
+        let length = (record.len() / SEGMENTS)
+            .max(SHORTEST * INIT)
+            .min(record.len());
+        for start in (0..)
+            .map(|i| i * length)
+            .take_while(|s| s + length <= record.len())
+        {
+            let Some((error, samples)) = segment_error(model, record, start, length) else {
+                return f64::INFINITY;
+            };
+            sum += error;
+            count += samples;
+        }
+    }
+    if count == 0 {
+        f64::INFINITY
+    } else {
+        sum / count as f64
+    }
+}
+
+/// Sum of squared errors and number of samples behind those that set the state.
+fn segment_error(
+    model: &LinearModel,
+    record: &Record,
+    start: usize,
+    length: usize,
+) -> Option<(f64, usize)> {
+    let channels = record.channels;
+    let u = &record.u[start * channels..(start + length) * channels];
+    let y = &record.y[start..start + length];
+    let init = INIT.min(length.div_ceil(SHORTEST));
+    let state = model
+        .estimate_initial_state(&u[..init * channels], channels, &y[..init])
+        .ok()?;
+    let run = model.simulate(u, channels, &state).ok()?;
+    let errors = y.iter().zip(&run).skip(init).map(|(y, r)| (y - r).powi(2));
+    Some((errors.sum(), length - init))
+}
