@@ -1,0 +1,194 @@
+"""The paper's experiment on a virtual machine, stage by stage: `run_demo`."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from .. import __version__
+from ..control import Controller, Fopdt, paper_controller
+from ..machine import VirtualMachine
+from ..report import report
+from ..report.canvas import require
+from ..tuning import TuningResult
+from . import folder, identified, loops, recordings
+
+Progress: TypeAlias = Callable[[int, int, str], object]
+"""Called with stages done, stages in all, and what comes now."""
+
+STAGES = (
+    "recording the machine",
+    "paper's network",
+    "linear models",
+    "closed-loop recording",
+    "default network",
+    "scores",
+    "tuning",
+    "closed loops",
+    "writing",
+)
+
+
+class _Clock:
+    """Tells the progress and how long each stage took."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self._progress = progress
+        self._began: list[float] = []
+
+    def enter(self, stage: str) -> None:
+        if self._progress is not None:
+            self._progress(len(self._began), len(STAGES), stage)
+        self._began.append(time.perf_counter())
+
+    def finish(self) -> None:
+        if self._progress is not None:
+            self._progress(len(STAGES), len(STAGES), "done")
+
+    @property
+    def seconds(self) -> float:
+        return time.perf_counter() - self._began[0]
+
+    def stages(self) -> dict[str, float]:
+        ends = [*self._began[1:], time.perf_counter()]
+        pairs = zip(STAGES, self._began, ends, strict=False)
+        return {stage: end - began for stage, began, end in pairs}
+
+
+def run_demo(
+    out: str | os.PathLike[str],
+    seed: int = 0,
+    *,
+    machine: str = "virtual",
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Carry out the paper's experiment: excite, record, identify, validate, tune, run, report.
+
+    Parameters
+    ----------
+    out : path
+        Result folder (docs/ARCHITECTURE.md); artefacts of an earlier experiment are replaced once
+        this one is through.
+    seed : int
+        Of the random signals, of the networks' starts and of the search for gains.
+    machine : str
+        `virtual`, or `virtual:SEED` for another machine of the type.
+    progress : callable(done, total, stage), optional
+        Called as each stage begins, and at the end.
+
+    Returns
+    -------
+    dict
+        The values of `results.json`.
+
+    Raises
+    ------
+    SettingError
+        For an unknown machine, a seed that is none, or where the report's packages are missing.
+    DataError
+        Where the folder cannot be made.
+    Interrupted
+        On Ctrl-C; an earlier experiment in the folder is left as it was.
+    """
+    require()
+    plant = VirtualMachine.from_name(machine)
+    target = Path(out)
+    folder.prepare(target)
+    clock = _Clock(progress)
+
+    clock.enter("recording the machine")
+    recorded = recordings.open_loop(plant, seed)
+    lo_hi = recorded["chirp_lo_hi"]
+    speed = recordings.speed_numbers(lo_hi)
+
+    clock.enter("paper's network")
+    models = {"paper": identified.paper(recorded, seed)}
+
+    clock.enter("linear models")
+    models["arx"] = identified.linear(recorded, "arx", identified.PAPER_RECORDS)
+    models["oe"] = identified.linear(recorded, "oe", identified.PAPER_RECORDS)
+
+    clock.enter("closed-loop recording")
+    fopdt = recordings.first_order(recorded["step"])
+    coarse = recordings.coarse_controller(fopdt, plant)
+    recorded["closed_loop"] = recordings.closed_loop(plant, coarse)
+
+    clock.enter("default network")
+    models["oe_all"] = identified.linear(recorded, "oe", identified.ALL_RECORDS)
+    models["neural_oe"] = identified.neural(recorded, seed)
+
+    clock.enter("scores")
+    scored = identified.scores(models, recorded)
+
+    clock.enter("tuning")
+    tuning = loops.tuned(models["neural_oe"], coarse, seed)
+
+    clock.enter("closed loops")
+    runs = loops.tuned_runs(tuning.controller, models["neural_oe"], plant, seed)
+    paper_runs = loops.paper_runs(plant)
+
+    clock.enter("writing")
+    controllers = {"paper": paper_controller(), "coarse": coarse, "tuned": tuning.controller}
+    results = {
+        "sewfast": __version__,
+        "machine": plant.name,
+        "seed": seed,
+        "counts_per_rev": plant.counts_per_rev,
+        "speed": speed,
+        "identification": identified.identification_numbers(
+            models, scored, speed["difference"]["cost_floor"]
+        ),
+        **_controller_numbers(fopdt, controllers, tuning),
+        "control": loops.control_numbers(runs),
+        "paper_gains": loops.paper_numbers(paper_runs),
+        "seconds": clock.seconds,
+        "stages": clock.stages(),
+    }
+    folder.write(
+        target,
+        results,
+        recordings=recorded,
+        models=models,
+        controllers=controllers,
+        predictions=identified.predictions(scored),
+        runs=runs | paper_runs,
+    )
+    report(target)
+    clock.finish()
+    return results
+
+
+def _controller_numbers(
+    fopdt: Fopdt, controllers: dict[str, Controller], tuning: TuningResult
+) -> dict[str, Any]:
+    """How the gains came about, for `results.json`."""
+    names = ("K", "T", "L", "offset", "u_low", "u_high", "fit_percent")
+    ratio = fopdt.L / fopdt.T
+    return {
+        "fopdt": {name: getattr(fopdt, name) for name in names},
+        "table_1": {
+            "ratio": ratio,
+            "ratio_used": min(max(ratio, 0.1), 1.0),
+            "in_range": 0.1 <= ratio <= 1.0,
+        },
+        "gains": {name: _gains(c) for name, c in controllers.items()},
+        "limits": {"u_min": tuning.controller.u_min, "u_max": tuning.controller.u_max},
+        "tuning": {
+            "evaluations": tuning.evaluations,
+            "cost": tuning.cost,
+            "start_cost": tuning.start_cost,
+            "termination": tuning.termination,
+        },
+    }
+
+
+def _gains(controller: Controller) -> dict[str, float | None]:
+    """Gains in standard form, null for no integral action."""
+    values = controller.to_dict()
+    gains = controller.gains.to("standard").to_dict()
+    kept = {name: gains[name] for name in ("Kp", "Ti", "Td")}
+    kept["Ti"] = None if kept["Ti"] == float("inf") else kept["Ti"]
+    return kept | {name: values[name] for name in ("alpha", "beta", "N", "filter_samples")}

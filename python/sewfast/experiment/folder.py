@@ -1,0 +1,65 @@
+"""The result folder: every artefact written whole, `results.json` last."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from .. import jsonfile
+from ..control import Controller
+from ..errors import DataError
+from ..loop import ClosedLoopRun
+from ..models import Model
+from ..recording import Recording
+from ..report.artefacts import FORMAT, VERSION, prediction_file, recording_file, run_file
+from ..writers import write_table
+
+_FOLDERS = ("recordings", "models", "controllers", "predictions", "runs")
+
+
+def prepare(folder: Path) -> None:
+    """Make the folder, so that one that cannot be made is refused before a minute's work.
+
+    Raises
+    ------
+    DataError
+        Where it cannot be made.
+    """
+    try:
+        for name in _FOLDERS:
+            (folder / name).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be made ({error.strerror}); choose a folder that is writable"
+        ) from error
+
+
+def write(
+    folder: Path,
+    results: Mapping[str, Any],
+    *,
+    recordings: Mapping[str, Recording],
+    models: Mapping[str, Model],
+    controllers: Mapping[str, Controller],
+    predictions: Mapping[str, Mapping[str, Any]],
+    runs: Mapping[tuple[str, str], ClosedLoopRun],
+) -> None:
+    """Put the artefacts in place of those of an earlier experiment.
+
+    Without `results.json` a folder is refused by the report: an interruption in between leaves no
+    mixture that looks whole.
+    """
+    for name in ("results.json", "report.html"):
+        (folder / name).unlink(missing_ok=True)
+    for name, recording in recordings.items():
+        recording.save(folder / recording_file(name))
+    for name, model in models.items():
+        model.save(folder / "models" / f"{name}.json")
+    for name, controller in controllers.items():
+        controller.save(folder / "controllers" / f"{name}.json")
+    for name, columns in predictions.items():
+        write_table(folder / prediction_file(name), columns)
+    for key, loop in runs.items():
+        write_table(folder / run_file(*key), loop.columns())
+    jsonfile.write(folder / "results.json", FORMAT, VERSION, results)

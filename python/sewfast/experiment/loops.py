@@ -1,0 +1,81 @@
+"""Closed loops of the experiment: the tuned controller, and the paper's gains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from .. import _core
+from ..control import Controller, paper_controller
+from ..loop import ClosedLoopRun, Plant, run
+from ..machine import VirtualMachine
+from ..models import LinearOE, Model
+from ..report.artefacts import PLANTS, REFERENCES
+from ..tuning import TuningResult, tune
+
+Runs = dict[tuple[str, str], ClosedLoopRun]
+
+PAPER_LIMIT = 10.0
+"""Of the command under the paper's gains [V]."""
+
+
+def tuned(model: Model, start: Controller, seed: int) -> TuningResult:
+    """Fine tuning on the model, encoder and filter and limits in the loop."""
+    return tune(model, start=start, seed=seed)
+
+
+def tuned_runs(controller: Controller, model: Model, machine: VirtualMachine, seed: int) -> Runs:
+    """Every reference on the model and on the machine."""
+    plants: dict[str, Plant] = {"model": model, "machine": machine}
+    return {(r, p): run(controller, plants[p], r, seed=seed) for r in REFERENCES for p in PLANTS}
+
+
+def paper_runs(machine: VirtualMachine) -> Runs:
+    """The paper's gains on the plant of its Eq. 8, ideal feedback, and on the machine."""
+    gains = paper_controller()
+    limited = VirtualMachine(parameters=machine.parameters | {"u_limit": PAPER_LIMIT})
+    return {
+        ("paper_gains", "eq8"): run(replace(gains, counts_per_rev=None), eq8(), "trapezoid"),
+        ("paper_gains", "machine"): run(gains, limited, "trapezoid"),
+    }
+
+
+def eq8() -> LinearOE:
+    """The plant of the paper's Eq. 8, as printed."""
+    core = _core.LinearModel(np.array([-1.87, 0.8705]), np.array([[0.1228, 0.1224]]), 1, 0.0)
+    return LinearOE(core, 0.001, ("u",), "y", ("V",), "RPM")
+
+
+def control_numbers(runs: Mapping[tuple[str, str], ClosedLoopRun]) -> dict[str, dict[str, Any]]:
+    """`control` of `results.json`."""
+    return {r: _pair({p: runs[r, p] for p in PLANTS}) for r in REFERENCES}
+
+
+def paper_numbers(runs: Mapping[tuple[str, str], ClosedLoopRun]) -> dict[str, dict[str, Any]]:
+    """`paper_gains` of `results.json`."""
+    return {plant: _numbers(r) for (_, plant), r in runs.items()}
+
+
+def _pair(runs: Mapping[str, ClosedLoopRun]) -> dict[str, Any]:
+    apart = runs["model"].y - runs["machine"].y
+    return {
+        **{plant: _numbers(r) for plant, r in runs.items()},
+        "model_vs_machine_rmse_rpm": float(np.sqrt(np.mean(apart**2))),
+        "reference_rise_time_ms": runs["machine"].metrics()["reference_rise_time_ms"],
+    }
+
+
+def _numbers(loop: ClosedLoopRun) -> dict[str, float | None]:
+    found = loop.metrics()
+    return {
+        "rmse_rpm": found["rmse"],
+        "max_abs_rpm": found["max_abs"],
+        "rise_time_ms": found["rise_time_ms"],
+        "overshoot_percent": found["overshoot_percent"],
+        "effort_v": found["u_rms"],
+        "chatter_v": found["du_rms"],
+        "saturated": found["saturated"],
+    }

@@ -1,0 +1,73 @@
+"""Recordings of the experiment: open-loop excitations, and one closed loop under first gains."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from .. import signals
+from ..control import Controller, Fopdt, fit_fopdt, table_1
+from ..loop import run
+from ..machine import VirtualMachine
+from ..recording import Recording, record
+from ..speed import Method, floor_of_J
+
+EXCITATIONS = ("step", "chirp_lo_hi", "chirp_hi_lo", "random", "saturating", "saturating_2")
+FILTER_SAMPLES = 8
+"""Of the feedback's moving average: one count in a sample is 38 RPM, in eight it is 5."""
+LIMIT = 20.0
+"""Of the command to either side [V]."""
+DERIVATIVE_FILTER = 10.0
+_METHODS: tuple[Method, ...] = ("difference", "savgol", "kalman")
+
+
+def open_loop(machine: VirtualMachine, seed: int) -> dict[str, Recording]:
+    """Every excitation on the machine, each from rest."""
+    return {
+        name: record(machine, signals.excitation(name, seed), name=name) for name in EXCITATIONS
+    }
+
+
+def first_order(step: Recording) -> Fopdt:
+    """Gain, time constant and dead time from the step response (paper Eq. 10-11)."""
+    return fit_fopdt(step.u, step.y, Ts=step.Ts)
+
+
+def coarse_controller(fopdt: Fopdt, machine: VirtualMachine) -> Controller:
+    """Gains by Table 1, nearest row; the delay of the feedback's filter counts as dead time."""
+    delayed = replace(fopdt, L=fopdt.L + (FILTER_SAMPLES - 1) / 2 * machine.Ts)
+    rule = table_1(delayed, outside="nearest")
+    return Controller(
+        gains=rule.gains,
+        Ts=machine.Ts,
+        alpha=rule.alpha,
+        beta=rule.beta,
+        N=DERIVATIVE_FILTER,
+        u_min=-LIMIT,
+        u_max=LIMIT,
+        filter_samples=FILTER_SAMPLES,
+        counts_per_rev=machine.counts_per_rev,
+        notes="Table 1 on the recorded step response",
+    )
+
+
+def closed_loop(machine: VirtualMachine, controller: Controller) -> Recording:
+    """A recording under the first gains, which follow trapezoids.
+
+    The command is replayed: undisturbed, the machine does the same again and shows its counts.
+    """
+    loop = run(controller, machine, "trapezoids")
+    return record(machine, loop.u, name="closed_loop")
+
+
+def speed_numbers(recording: Recording) -> dict[str, dict[str, float]]:
+    """Error and floor of J of each way to a speed, against the true one."""
+    estimates = {m: recording.speed(m) for m in _METHODS}
+    return {
+        method: {
+            "rmse_rpm": float(np.sqrt(np.mean((y - recording.speed_true) ** 2))),
+            "cost_floor": floor_of_J(y, recording.speed_true),
+        }
+        for method, y in estimates.items()
+    }
