@@ -213,6 +213,18 @@ def test_training_beats_the_linear_model_where_the_drive_saturates() -> None:
     assert len(fit.models) == 2
 
 
+def test_paper_preset_reaches_the_noise_for_four_of_five_seeds() -> None:
+    u, clean, y = _drive(6000, 10)
+    preset: dict[str, Any] = {
+        "hidden": 8, "u_mean": np.zeros(1), "u_scale": np.array([10.0]), "y_mean": 0.0,
+        "y_scale": 1000.0, "saturate": 0.2, "initial_state": "measured", "weight_decay": 0.0,
+        "max_iterations": 100, "starts": 4, "threads": 0,
+    }  # fmt: skip
+    floor = 0.5 * _rms((y - clean) / 1000) ** 2
+    costs = [_fit([(u, y)], [], seed=seed, **preset).cost for seed in range(5)]
+    assert sum(cost < 1.8 * floor for cost in costs) >= 4, np.array(costs) / floor
+
+
 def test_training_starts_exactly_at_the_linear_model() -> None:
     u, _, y = _drive(1500, 3)
     linear = _core.fit_oe([(u, y)], na=2, nb=2, nk=1)

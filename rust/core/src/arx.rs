@@ -13,6 +13,20 @@ const RANK_TOLERANCE: f64 = 1e-12;
 
 /// Least squares on `y(k) = -sum a y(k-i) + sum b u(k-nk-i) [+ offset] + e(k)` over all experiments.
 ///
+/// ```
+/// use sewfast_core::lagged::Lagged;
+/// use sewfast_core::linear::LinearModel;
+/// use sewfast_core::{Record, arx};
+///
+/// let truth = LinearModel::new(vec![-0.9], vec![0.2], 1, 1, 0.5)?;
+/// let u: Vec<f64> = (0..200).map(|k| f64::from(k * k % 7)).collect();
+/// let y = truth.simulate(&u, 1, &[0.0])?;
+/// let records = [Record::new(&u, 1, &y)?];
+/// let model = arx::fit(&records, 1, 1, 1, true)?;
+/// assert!((model.a()[0] + 0.9).abs() < 1e-6);
+/// # Ok::<(), sewfast_core::Error>(())
+/// ```
+///
 /// # Errors
 /// `ErrorKind::Data` for too few samples, different numbers of inputs, a constant input or output;
 /// `ErrorKind::Fit` for linearly dependent columns.

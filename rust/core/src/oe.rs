@@ -43,6 +43,20 @@ pub struct LinearFit {
 /// out of the unit circle are rejected (Schur-Cohn test), so every accepted step is stable. Of the refined models the
 /// one is chosen that runs on best when started anew from a few samples ([`restart_error`]).
 ///
+/// ```
+/// use sewfast_core::lagged::Lagged;
+/// use sewfast_core::linear::LinearModel;
+/// use sewfast_core::{Monitor, Record, oe};
+///
+/// let truth = LinearModel::new(vec![-0.9], vec![0.2], 1, 1, 0.5)?;
+/// let u: Vec<f64> = (0..200).map(|k| f64::from(k * k % 7)).collect();
+/// let y = truth.simulate(&u, 1, &[0.0])?;
+/// let records = [Record::new(&u, 1, &y)?];
+/// let model = oe::fit(&records, 1, 1, 1, true, 100, &Monitor::default())?.model;
+/// assert!((model.a()[0] + 0.9).abs() < 1e-6);
+/// # Ok::<(), sewfast_core::Error>(())
+/// ```
+///
 /// # Errors
 /// As [`arx::fit`] for unusable data and settings; `ErrorKind::Fit` where no stable model has a finite free run.
 pub fn fit(
