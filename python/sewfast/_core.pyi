@@ -23,7 +23,7 @@ def trapezoid(
 def chirp(
     *, duration: float, Ts: float, f_start: float, f_end: float, amplitude_start: float,
     amplitude_end: float, offset_start: float, offset_end: float,
-    sweep: Literal["linear", "logarithmic"] = "linear", phase: float = -1.5707963267948966,
+    sweep: Literal["linear", "logarithmic"] = "linear", phase: float = ...,
 ) -> _F: ...
 def random_steps(
     *, duration: float, Ts: float, low: float, high: float, hold_min: float, hold_max: float,

@@ -1,4 +1,4 @@
-"""The exceptions of the package: one family, each also of the built-in kind a caller would expect."""
+"""The exceptions of the package: one family, each also of the built-in kind a caller expects."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 
 class SewfastError(Exception):
-    """Anything that sewfast refuses; the message says what was expected, what came and what to do."""
+    """Anything that sewfast refuses; the message says what was expected, what came, what to do."""
 
 
 class DataError(SewfastError, ValueError):

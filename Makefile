@@ -1,0 +1,104 @@
+# Two commands matter: `make demo` and `make test`. Each needs only Python >= 3.10 and Rust.
+
+PYTHON ?= python3
+VENV := $(CURDIR)/.venv
+BIN := $(VENV)/bin
+OUT ?= demo
+
+# one interpreter and one target folder for every step, so that cargo compiles nothing twice
+export PYO3_PYTHON := $(BIN)/python
+export CARGO_TARGET_DIR := $(CURDIR)/target
+export PYTHONDONTWRITEBYTECODE := 1
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+ifneq ($(wildcard ../shared/data),)
+export SEWFAST_DATA ?= $(abspath ../shared/data)
+endif
+
+RUST := $(shell find rust -name '*.rs' -o -name 'Cargo.toml') Cargo.toml Cargo.lock
+BUILT := $(VENV)/built.stamp
+REPORT := $(VENV)/report.stamp
+DEV := $(VENV)/dev.stamp
+MARKED := test lint rust-lint rust-test no-std python-lint types stubs python-test docs package
+
+.DEFAULT_GOAL := help
+.PHONY: help demo bench clean $(MARKED)
+
+help: ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
+
+demo: $(REPORT) ## the whole experiment on the virtual machine; the report goes to demo/report.html
+	$(BIN)/sewfast demo --out $(OUT)
+
+test: lint rust-test no-std docs package python-test ## every check; ends with pytest's summary
+
+lint: rust-lint python-lint types stubs ## formatting, clippy, ruff, mypy, stubs
+
+rust-lint: $(DEV)
+	cargo fmt --all --check
+	cargo clippy --workspace --all-targets --release --quiet -- -D warnings
+
+python-lint: $(DEV)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(DEV)
+	$(BIN)/mypy
+
+stubs: $(DEV)
+	MYPYPATH=python $(BIN)/python -m mypy.stubtest --allowlist tests/stubtest.txt sewfast._core
+
+rust-test: $(DEV) ## unit, property and documentation tests of the crates
+	cargo test --workspace --release --quiet
+
+no-std: ## links the controller crate into a program without the standard library
+	cargo build --package sewfast-control --release --quiet
+	rustc --edition 2024 --crate-type staticlib -C panic=abort -D warnings \
+	  --extern sewfast_control=target/release/libsewfast_control.rlib \
+	  --out-dir target/bare rust/control/tests/bare/staticlib.rs
+
+python-test: $(DEV) ## pytest, with every snippet of the documentation and every example
+	$(BIN)/python -m pytest
+
+docs: $(DEV) ## the site, in site/index.html; works offline
+	$(BIN)/mkdocs build --strict --quiet
+
+# the wheel comes from the source archive alone and is imported where only numpy is installed
+package: $(DEV) ## source archive -> wheel -> import in a clean environment
+	rm -rf target/package && mkdir -p target/package
+	$(BIN)/maturin sdist --quiet --out target/package
+	tar -xzf target/package/sewfast-*.tar.gz -C target/package
+	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir target/package/wheels target/package/sewfast-*/
+	$(PYTHON) -m venv target/package/venv
+	target/package/venv/bin/pip install --quiet target/package/wheels/sewfast-*.whl
+	cd target/package/venv && bin/python -I $(CURDIR)/tests/clean_import.py
+
+bench: $(VENV)/bench.stamp ## end-to-end benchmarks beside their rivals
+	$(BIN)/python -m pytest benches --benchmark-enable --benchmark-only -o python_files='bench_*.py' -s
+
+clean: ## removes everything that was built; the virtual environment too
+	rm -rf target site demo dist $(VENV)
+	rm -f python/sewfast/_core*.so
+
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+	  { echo 'Python 3.10 or newer is needed; name one: make PYTHON=python3.12'; exit 1; }
+	@command -v cargo >/dev/null || { echo 'Rust is needed: https://rustup.rs'; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(BUILT): $(RUST) pyproject.toml | $(VENV)/bin/python
+	$(BIN)/pip install --quiet 'maturin>=1.9,<2'
+	VIRTUAL_ENV=$(VENV) $(BIN)/maturin develop --release --quiet
+	@touch $@
+
+# sewfast itself is there already, so that pip only adds what its extras name
+$(REPORT): $(BUILT)
+	$(BIN)/pip install --quiet 'sewfast[report]'
+	@touch $@
+
+$(DEV): $(BUILT)
+	$(BIN)/pip install --quiet 'sewfast[dev,docs]'
+	@touch $@
+
+$(VENV)/bench.stamp: $(DEV)
+	$(BIN)/pip install --quiet 'sewfast[bench]'
+	@touch $@

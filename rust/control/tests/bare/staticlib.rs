@@ -1,0 +1,23 @@
+//! A library without the standard library: it links only while the controller crate needs none either.
+//!
+//! Were std anywhere below, its panic handler and this one would collide.
+
+#![no_std]
+
+use core::panic::PanicInfo;
+use sewfast_control::{Controller, Settings, Standard};
+
+#[panic_handler]
+fn halt(_: &PanicInfo<'_>) -> ! {
+    loop {}
+}
+
+/// One control step with fixed gains, as firmware would call it; NaN where the settings are refused.
+#[unsafe(no_mangle)]
+pub extern "C" fn one_step(r: f32, y: f32) -> f32 {
+    let gains = Standard { kp: 0.02, ti: 0.25, td: 0.004 };
+    match Controller::<f32>::new(Settings::new(gains, 1e-3), 1, 0.0) {
+        Ok(mut controller) => controller.step(r, y),
+        Err(_) => f32::NAN,
+    }
+}

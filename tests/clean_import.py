@@ -1,0 +1,25 @@
+"""What must work where only numpy is installed; run by `make package` in a clean environment."""
+
+import sys
+from importlib.metadata import distributions
+
+import sewfast
+
+installed = {d.name for d in distributions()}
+assert installed <= {"sewfast", "numpy", "pip", "setuptools"}, installed
+assert "numpy" not in sys.modules, "import sewfast alone should load nothing"
+
+for name in sewfast.__all__:
+    getattr(sewfast, name)
+
+machine = sewfast.VirtualMachine(1)
+u = sewfast.signals.excitation("step")
+run = machine.run(u)
+speed = sewfast.speed_from_counts(run.counts, machine.Ts, machine.counts_per_rev)
+data = sewfast.Dataset.from_arrays(u, speed, machine.Ts, input_units="V", output_unit="RPM")
+model = sewfast.identify(data, model="oe")
+assert sewfast.validate(model, data).simulation.fit_percent > 90.0
+assert "scipy" not in sys.modules
+assert "matplotlib" not in sys.modules
+
+print("sewfast", sewfast.__version__, "works with numpy alone")

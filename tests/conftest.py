@@ -1,0 +1,23 @@
+"""What every test may ask for: the folder of public recordings."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+_BESIDE = ROOT.parent / "shared" / "data"
+
+if "SEWFAST_DATA" not in os.environ and _BESIDE.is_dir():
+    os.environ["SEWFAST_DATA"] = str(_BESIDE)
+
+
+@pytest.fixture
+def recordings() -> Path:
+    """Folder of the public recordings; the test skips where there is none."""
+    folder = os.environ.get("SEWFAST_DATA")
+    if folder is None:
+        pytest.skip("needs public recordings: set SEWFAST_DATA to their folder (docs/real-data.md)")
+    return Path(folder)
