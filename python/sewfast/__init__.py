@@ -1,5 +1,107 @@
 """From one recording of a motor drive to a verified controller, without risking the machine."""
 
-from ._core import __version__
+from __future__ import annotations
 
-__all__ = ["__version__"]
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from . import signals
+    from ._core import __version__
+    from .control import (
+        Controller,
+        Gains,
+        fit_fopdt,
+        load_controller,
+        paper_controller,
+        table_1,
+    )
+    from .dataset import Dataset, Experiment
+    from .errors import (
+        DataError,
+        FitError,
+        Interrupted,
+        LinkError,
+        ModelFileError,
+        SettingError,
+        SewfastError,
+    )
+    from .identification import identify
+    from .loop import ClosedLoopRun, run
+    from .machine import VirtualMachine
+    from .models import ARX, LinearOE, Model, NeuralOE, load_model
+    from .readers import read, read_table
+    from .speed import speed_from_counts
+    from .tuning import TuningResult, tune
+    from .validation import Validation, validate
+    from .writers import write_table
+
+__all__ = [
+    "ARX",
+    "ClosedLoopRun",
+    "Controller",
+    "DataError",
+    "Dataset",
+    "Experiment",
+    "FitError",
+    "Gains",
+    "Interrupted",
+    "LinearOE",
+    "LinkError",
+    "Model",
+    "ModelFileError",
+    "NeuralOE",
+    "SettingError",
+    "SewfastError",
+    "TuningResult",
+    "Validation",
+    "VirtualMachine",
+    "__version__",
+    "fit_fopdt",
+    "identify",
+    "load_controller",
+    "load_model",
+    "paper_controller",
+    "read",
+    "read_table",
+    "run",
+    "signals",
+    "speed_from_counts",
+    "table_1",
+    "tune",
+    "validate",
+    "write_table",
+]
+
+# names are loaded when first used, so that `import sewfast` and `sewfast --help` cost nothing
+_HOMES = {
+    "_core": "__version__",
+    "control": "Controller Gains fit_fopdt load_controller paper_controller table_1",
+    "dataset": "Dataset Experiment",
+    "errors": "DataError FitError Interrupted LinkError ModelFileError SettingError SewfastError",
+    "identification": "identify",
+    "loop": "ClosedLoopRun run",
+    "machine": "VirtualMachine",
+    "models": "ARX LinearOE Model NeuralOE load_model",
+    "readers": "read read_table",
+    "speed": "speed_from_counts",
+    "tuning": "TuningResult tune",
+    "validation": "Validation validate",
+    "writers": "write_table",
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME_OF:
+        value = getattr(import_module(f".{_HOME_OF[name]}", __name__), name)
+    elif name in __all__:
+        value = import_module(f".{name}", __name__)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

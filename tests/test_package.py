@@ -1,0 +1,51 @@
+"""The package as a whole: its public names, and what importing it costs."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import sewfast
+
+
+@pytest.mark.parametrize("name", sewfast.__all__)
+def test_public_name_is_there(name: str) -> None:
+    assert getattr(sewfast, name) is not None
+    assert name in dir(sewfast)
+
+
+def test_type_checkers_see_every_public_name() -> None:
+    tree = ast.parse(Path(sewfast.__file__).read_text())
+    imports = [n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.level == 1]
+    seen = {alias.name for node in imports for alias in node.names}
+    assert seen == set(sewfast.__all__)
+
+
+def test_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'idenfity'"):
+        sewfast.idenfity  # noqa: B018
+
+
+def _loaded_by(statement: str) -> set[str]:
+    code = f"{statement}\nimport sys\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+def test_import_loads_nothing_heavy() -> None:
+    assert not _loaded_by("import sewfast") & {"numpy", "scipy", "matplotlib", "sewfast._core"}
+
+
+def test_work_loads_no_extra() -> None:
+    names = "identify, validate, tune, run, read, load_model, VirtualMachine"
+    loaded = _loaded_by(f"from sewfast import {names}")
+    assert not loaded & {"scipy", "matplotlib", "h5py", "pyarrow", "jinja2"}
+
+
+def test_help_loads_no_arithmetic() -> None:
+    loaded = _loaded_by("from sewfast.cli.parser import build_parser\nbuild_parser()")
+    assert not loaded & {"scipy", "matplotlib", "sewfast._core"}
