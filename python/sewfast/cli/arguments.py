@@ -1,0 +1,84 @@
+"""Arguments that commands share, and the makers of commands."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from ..errors import SettingError
+
+if TYPE_CHECKING:
+    Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
+else:
+    Commands: TypeAlias = object
+
+Command: TypeAlias = Callable[[argparse.Namespace], "int | None"]
+
+TABLES = (".csv", ".npz", ".mat", ".parquet")
+
+
+class Help(argparse.RawDescriptionHelpFormatter):
+    """Help that keeps its line breaks."""
+
+
+def add_command(
+    commands: Commands, name: str, command: Command, *, summary: str, text: str, examples: str
+) -> argparse.ArgumentParser:
+    """A command with its help: a line for the list, a text above, examples below the options."""
+    parser = commands.add_parser(
+        name, help=summary, description=text, epilog=examples, formatter_class=Help
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    parser.add_argument("--debug", action="store_true", help="show where a fault comes from")
+    parser.set_defaults(command=command)
+    return parser
+
+
+def add_columns(parser: argparse.ArgumentParser, *, from_model: bool) -> None:
+    """Which columns of a recording are input and output, and how it is sampled."""
+    default = "; default: as stored in the model" if from_model else ""
+    parser.add_argument(
+        "--input", action="append", metavar="COL",
+        help=f"column of the input; repeat it for several inputs{default}",
+    )  # fmt: skip
+    parser.add_argument("--output", metavar="COL", help=f"column of the output{default}")
+    parser.add_argument(
+        "--ts", type=float, metavar="S",
+        help="sample time [s]; default: from the column t or time, which must agree within 1 %%",
+    )  # fmt: skip
+    parser.add_argument(
+        "--counts", metavar="COL",
+        help="column of encoder counts; the output is then the speed [RPM] computed from it",
+    )  # fmt: skip
+    parser.add_argument(
+        "--counts-per-rev", type=float, metavar="N", help="encoder counts per revolution"
+    )
+
+
+def add_output(
+    parser: argparse.ArgumentParser, metavar: str, help: str, *, required: bool = False
+) -> None:
+    parser.add_argument("-o", dest="out", metavar=metavar, type=Path, required=required, help=help)
+
+
+def require_place(path: Path | None, suffixes: tuple[str, ...]) -> None:
+    """Refuse an output file that could not be written, before the work is done.
+
+    Raises
+    ------
+    SettingError
+        For an extension that stands for no format, or a folder that does not exist.
+    """
+    if path is None:
+        return
+    if path.suffix.lower() not in suffixes:
+        raise SettingError(
+            f"-o {path}: expected a file ending in {', '.join(suffixes)}, received "
+            f"{path.suffix or 'none'!r}"
+        )
+    if not path.parent.is_dir():
+        raise SettingError(f"-o {path}: the folder {path.parent} does not exist; create it")
+    if path.is_dir():
+        raise SettingError(f"-o {path}: expected a file, received a folder")

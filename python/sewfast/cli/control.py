@@ -1,0 +1,202 @@
+"""`sewfast tune`, `sewfast run`: a controller for a model, and the loop that it closes."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import DataError, Interrupted, SettingError
+from .arguments import TABLES, Commands, add_command, add_output, require_place
+from .output import print_json, print_rows, write_columns
+from .progress import Progress
+
+if TYPE_CHECKING:
+    from ..control import Controller, Gains
+    from ..dataset import FloatArray
+    from ..loop import Plant
+    from ..tuning import TuningResult
+
+FORMS = ("standard", "parallel", "per_sample")
+
+TUNE = """\
+Tune a 2-DOF PID on an identified model, by simulating the loop with the encoder, the feedback
+filter and the command's limits in it. The model alone is used; no machine is touched.
+
+A reference is a named one (`sewfast signals`) or a CSV with columns t [s], r [output unit].
+Named ones are in RPM at 1 ms. Several references are tuned for together.
+"""
+
+TUNE_EXAMPLES = """\
+examples:
+  sewfast tune drive.json -o controller.json
+  sewfast tune drive.json --reference trapezoid --reference random -o controller.json
+  sewfast tune drive.json --reference cycle.csv --u-min -10 --u-max 10 --filter 4 -o controller.json
+"""
+
+RUN = """\
+Close the loop around a model or a virtual machine, with the same controller arithmetic on both.
+
+Columns: t [s], r, u, y (the plant's true output), feedback (y after encoder and filter).
+"""
+
+RUN_EXAMPLES = """\
+examples:
+  sewfast run controller.json --on drive.json --reference trapezoid -o predicted.csv
+  sewfast run controller.json --on virtual --reference trapezoid -o measured.csv
+  sewfast run controller.json --on virtual:7 --reference cycle.csv --json
+"""
+
+
+def add(commands: Commands) -> None:
+    parser = add_command(
+        commands, "tune", tune_command,
+        summary="a controller for a model", text=TUNE, examples=TUNE_EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument("model", metavar="MODEL.json", help="model file that identify wrote")
+    parser.add_argument(
+        "--reference", action="append", metavar="FILE|NAME",
+        help="what to track; may repeat (trapezoid, trapezoids, random)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--u-min", type=float, default=-20.0, metavar="V", help="least command (-20)"
+    )
+    parser.add_argument(
+        "--u-max", type=float, default=20.0, metavar="V", help="largest command (20)"
+    )
+    parser.add_argument(
+        "--counts-per-rev", type=float, metavar="N",
+        help="encoder in the loop; default: the model's own, else 1572 where the output is a speed",
+    )  # fmt: skip
+    parser.add_argument(
+        "--filter", type=int, default=8, metavar="N",
+        help="moving average over N samples of the feedback (8); 1: none",
+    )  # fmt: skip
+    add_output(parser, "CONTROLLER.json", "controller file to write", required=True)
+    parser = add_command(
+        commands, "run", run_command,
+        summary="a closed loop on a model or a machine", text=RUN, examples=RUN_EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument("controller", metavar="CONTROLLER.json", help="file that tune wrote")
+    parser.add_argument(
+        "--on", required=True, metavar="MODEL.json|virtual[:SEED]", help="what to run on"
+    )
+    parser.add_argument("--reference", required=True, metavar="FILE|NAME", help="what to track")
+    add_output(parser, "OUT", "CSV, .npz, .mat or Parquet; default: CSV to standard output")
+
+
+def tune_command(args: argparse.Namespace) -> int | None:
+    from ..models import load_model
+    from ..tuning import tune
+
+    require_place(args.out, (".json",))
+    model = load_model(args.model)
+    counts = args.counts_per_rev or (model.counts[1] if model.counts else 1572.0)
+    references = [_reference(text, model.Ts) for text in args.reference or ()] or None
+    try:
+        with Progress("tune") as progress:
+            found = tune(
+                model,
+                references,
+                u_min=args.u_min,
+                u_max=args.u_max,
+                counts_per_rev=counts,
+                filter_samples=args.filter,
+                progress=progress,
+            )
+    except Interrupted as e:
+        e.best.save(args.out)
+        print(f"interrupted; kept the best so far in {args.out}", file=sys.stderr)
+        return 130
+    found.controller.save(args.out)
+    _show_tuned(args, found)
+    return None
+
+
+def _show_tuned(args: argparse.Namespace, found: TuningResult) -> None:
+    if args.json:
+        print_json(
+            {
+                "file": str(args.out),
+                "cost": found.cost,
+                "start_cost": found.start_cost,
+                "cost_unit": found.controller.gains.y_unit,
+                "evaluations": found.evaluations,
+                "termination": found.termination,
+                "gains": {
+                    g.form: {**g.to_dict(), "units": g.units} for g in _forms(found.controller)
+                },
+                "controller": found.controller.to_dict(),
+            }
+        )
+        return
+    print(found)
+    print("the same gains in every form:")
+    print_rows([_gain_row(g) for g in _forms(found.controller)])
+    print(f"written to {args.out}; try it: sewfast run {args.out} --on MODEL.json|virtual "
+          "--reference NAME")  # fmt: skip
+
+
+def _forms(controller: Controller) -> list[Gains]:
+    return [controller.gains.to(form, Ts=controller.Ts) for form in FORMS]  # type: ignore[arg-type]
+
+
+def _gain_row(gains: Gains) -> list[str]:
+    """Form, then each number with its unit."""
+    values = gains.to_dict()
+    cells = [f"{name} = {values[name]:.6g} {unit}" for name, unit in gains.units.items()]
+    cells += [""] * (4 - len(cells))
+    return [f"  {gains.form.replace('_', '-')}", *cells]
+
+
+def run_command(args: argparse.Namespace) -> None:
+    from ..control import load_controller
+    from ..loop import run
+
+    require_place(args.out, TABLES)
+    controller = load_controller(args.controller)
+    plant = _plant(args.on)
+    reference = _reference(args.reference, controller.Ts)
+    found = run(controller, plant, reference, name=Path(args.reference).stem)
+    summary: dict[str, Any] = {"plant": found.plant, "reference": found.reference}
+    summary |= {"unit": found.units["y"], "n": len(found.t), "Ts": found.Ts, **found.metrics()}
+    lines = str(found).splitlines()
+    write_columns(args.out, found.columns(), found.units, summary, lines, as_json=args.json)
+
+
+def _plant(text: str) -> Plant:
+    """`virtual`, `virtual:SEED`, else a model file."""
+    from ..machine import VirtualMachine
+    from ..models import load_model
+
+    if text.split(":")[0] == "virtual" and not Path(text).exists():
+        return VirtualMachine.from_name(text)
+    return load_model(text)
+
+
+def _reference(text: str, Ts: float) -> str | FloatArray:
+    """The name of a reference, or the samples of a file with columns t, r.
+
+    Raises
+    ------
+    SettingError, DataError
+        For a text that is neither, a file without r, or one at another sample time.
+    """
+    from ..readers import read
+    from ..signals import REFERENCES
+
+    if text.replace("-", "_").lower() in REFERENCES:
+        return text
+    if not Path(text).exists():
+        raise SettingError(
+            f"--reference {text}: expected a CSV file with columns t, r, or one of "
+            f"{', '.join(REFERENCES)}; received neither"
+        )
+    data = read(text, inputs="r")
+    data.require_inputs()
+    if abs(data.Ts - Ts) > 0.01 * Ts:
+        raise DataError(
+            f"{text}: sampled every {data.Ts:g} s, the loop every {Ts:g} s; resample the reference"
+        )
+    return data.experiments[0].u[:, 0].copy()

@@ -1,0 +1,135 @@
+"""DATA arguments -> `Dataset`."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from ..errors import DataError, SettingError
+
+if TYPE_CHECKING:
+    from ..dataset import Dataset
+    from ..models import Model
+    from ..readers import Table
+
+
+def read_training(args: argparse.Namespace) -> Dataset:
+    """Every DATA argument as an experiment; columns from `FILE:IN:OUT` or the options."""
+    from ..dataset import Dataset
+
+    return Dataset.concat([_read_named(source, args) for source in args.data])
+
+
+def _read_named(source: str, args: argparse.Namespace) -> Dataset:
+    from ..readers import parse_source, read, read_table
+
+    path, inputs, output = parse_source(source)
+    table = read_table(path)
+    inputs, output = inputs or args.input, output or args.output
+    if not inputs:
+        raise _unnamed(table, "input", "--input COL")
+    if not output and not args.counts:
+        raise _unnamed(table, "output", "--output COL, or --counts COL --counts-per-rev N")
+    return read(
+        table,
+        inputs=inputs,
+        output=output,
+        Ts=args.ts,
+        counts=args.counts,
+        counts_per_rev=args.counts_per_rev,
+    )
+
+
+def _unnamed(table: Table, what: str, remedy: str) -> SettingError:
+    return SettingError(
+        f"{table.path}: which column is the {what}? available: {', '.join(table.names)}; "
+        f"name it: {remedy}"
+    )
+
+
+def read_for_model(
+    source: str, model: Model, args: argparse.Namespace, *, needs_output: bool = True
+) -> tuple[Dataset, Table]:
+    """One DATA argument with the model's columns, unless the command line names others."""
+    from ..readers import parse_source, read, read_table
+
+    path, inputs, output = parse_source(source)
+    table = read_table(path)
+    columns = model.columns
+    columns["inputs"] = inputs or args.input or columns["inputs"]
+    columns |= _output_columns(output or args.output, args, columns)
+    if not needs_output and not _has_output(table, columns):
+        columns |= {"output": None, "counts": None, "counts_per_rev": None}
+    return read(table, Ts=_sample_time(args.ts, table, model), **columns), table
+
+
+def _output_columns(
+    output: str | None, args: argparse.Namespace, stored: dict[str, Any]
+) -> dict[str, Any]:
+    """What the command line says about the output; counts stay only where it says nothing."""
+    if args.counts is not None or args.counts_per_rev is not None:
+        return {
+            "output": output or stored["output"],
+            "counts": args.counts or stored["counts"],
+            "counts_per_rev": args.counts_per_rev or stored["counts_per_rev"],
+        }
+    if output is not None:
+        return {"output": output, "counts": None, "counts_per_rev": None}
+    return {}
+
+
+def _has_output(table: Table, columns: dict[str, Any]) -> bool:
+    try:
+        table.resolve(columns["counts"] or columns["output"])
+    except DataError:
+        return False
+    return True
+
+
+def _sample_time(given: float | None, table: Table, model: Model) -> float | None:
+    """The model's own sample time where neither the caller nor the file says another."""
+    has_time = any(n.lower() in ("t", "time") for n in table.names)
+    return given if given is not None or has_time else model.Ts
+
+
+def split(data: Dataset, train: str | None, held_out: str | None) -> tuple[Dataset, Dataset | None]:
+    """Training data and what is held out of it; without `train` that is all but the held-out part.
+
+    Raises
+    ------
+    SettingError, DataError
+        Where a range is none, leaves a file, or both overlap.
+    """
+    held = None if held_out is None else data.slice(held_out)
+    if train is None:
+        return (data, None) if held is None else (_without(data, held), held)
+    kept = data.slice(train)
+    if held is not None:
+        _require_apart(kept, held)
+    return kept, held
+
+
+def _without(data: Dataset, held: Dataset) -> Dataset:
+    """What lies before and after the held-out part of each experiment."""
+    from dataclasses import replace
+
+    pieces = []
+    for whole, part in zip(data.experiments, held.experiments, strict=True):
+        after = part.start + len(part)
+        pieces += [whole.cut(0, part.start)] if part.start > 0 else []
+        pieces += [whole.cut(after, len(whole))] if after < len(whole) else []
+    if not pieces:
+        raise SettingError(
+            "--validate: the range covers every sample, so nothing is left to train on; give a "
+            "smaller one, or --train A:B"
+        )
+    return replace(data, experiments=tuple(pieces))
+
+
+def _require_apart(train: Dataset, held: Dataset) -> None:
+    for a, b in zip(train.experiments, held.experiments, strict=True):
+        if a.start < b.start + len(b) and b.start < a.start + len(a):
+            raise SettingError(
+                f"--train {a.range_text} and --validate {b.range_text} overlap in {a.name}; what a "
+                "model was trained on says nothing about it: give ranges that do not overlap"
+            )

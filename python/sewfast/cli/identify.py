@@ -1,0 +1,150 @@
+"""`sewfast identify`: from recordings to a model file."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import TYPE_CHECKING, Any
+
+from ..errors import Interrupted
+from .arguments import Commands, add_columns, add_command, add_output, require_place
+from .data import read_training, split
+from .output import print_json
+from .progress import Progress
+
+if TYPE_CHECKING:
+    from ..dataset import Dataset
+    from ..models import Model
+    from ..validation import Validation
+
+TEXT = """\
+Identify a model of a drive from recordings of its input and its output.
+
+DATA is a CSV, .mat, .npz or Parquet file; several files are several experiments of one drive.
+FILE:IN:OUT names the columns of one file, IN1+IN2 several inputs.
+
+The default, auto, fits linear output error, then a network that starts from it, and keeps the
+network only where it does better in free run on samples that it was not fitted to.
+"""
+
+EXAMPLES = """\
+examples:
+  sewfast identify run.csv --input u --output speed -o drive.json
+      columns u and speed [unit from the header], sample time from the column t
+
+  sewfast identify run.csv --input u --output y --train 0:5000 --validate 5000:8000 -o drive.json
+      the first 5,000 samples train; the next 3,000 choose when to stop, and are scored
+
+  sewfast identify run.csv --input u --counts encoder --counts-per-rev 1572 -o drive.json
+      the speed [RPM] is computed from encoder counts
+
+  sewfast identify slow.csv:u:y fast.csv:volt:rpm -o drive.json
+      two experiments whose columns have different names
+
+  sewfast identify run.mat --input u --output y --ts 0.02 --model oe -o linear.json
+      a file without a time column; linear output error alone
+"""
+
+
+def add(commands: Commands) -> None:
+    parser = add_command(
+        commands, "identify", identify_command,
+        summary="a model from recordings", text=TEXT, examples=EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument("data", nargs="+", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
+    add_columns(parser, from_model=False)
+    _add_model(parser)
+    parser.add_argument(
+        "--train", metavar="A:B",
+        help="samples of each file to train on, 0-based, end excluded; default: all but --validate",
+    )  # fmt: skip
+    parser.add_argument(
+        "--validate", metavar="A:B",
+        help="samples of each file that are held out: they choose, and are scored; default: blocks "
+        "are held out to choose and learned from in the end",
+    )  # fmt: skip
+    add_output(parser, "MODEL.json", "model file to write", required=True)
+
+
+def _add_model(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--model", choices=("auto", "arx", "oe", "neural-oe"), default="auto",
+        help="arx: least squares one step ahead; oe: linear output error; neural-oe: network "
+        "output error; auto (default): oe or neural-oe, whichever does better",
+    )  # fmt: skip
+    parser.add_argument(
+        "--preset", choices=("paper",),
+        help="paper: 8 tanh and a saturated output, u/10, y/1000, random starts, as published",
+    )  # fmt: skip
+    parser.add_argument("--na", type=int, default=2, metavar="N", help="past outputs (2)")
+    parser.add_argument("--nb", type=int, default=2, metavar="N", help="past inputs (2)")
+    parser.add_argument("--nk", type=int, default=1, metavar="N", help="delay [samples] (1)")
+    parser.add_argument("--hidden", type=int, default=8, metavar="N", help="hidden units (8)")
+    parser.add_argument("--starts", type=int, default=4, metavar="N", help="random starts (4)")
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="seed of the starts (0)"
+    )  # fmt: skip
+
+
+def identify_command(args: argparse.Namespace) -> int | None:
+    require_place(args.out, (".json",))
+    train, held = split(read_training(args), args.train, args.validate)
+    try:
+        with Progress("identify") as progress:
+            model = _identify(args, train, held, progress)
+    except Interrupted as e:
+        e.best.save(args.out)
+        print(f"interrupted; kept the best so far in {args.out}", file=sys.stderr)
+        return 130
+    scores = _scores(model, train, held)
+    model.save(args.out)
+    _show(args, model, scores)
+    return None
+
+
+def _identify(
+    args: argparse.Namespace, train: Dataset, held: Dataset | None, progress: Progress
+) -> Model:
+    from ..identification import identify
+
+    return identify(
+        train,
+        model=args.model,
+        preset=args.preset,
+        na=args.na,
+        nb=args.nb,
+        nk=args.nk,
+        hidden=args.hidden,
+        starts=args.starts,
+        seed=args.seed,
+        validation=held,
+        progress=progress,
+    )
+
+
+def _scores(model: Model, train: Dataset, held: Dataset | None) -> dict[str, Validation]:
+    from ..validation import validate
+
+    sets = {"train": train} | ({} if held is None else {"validation": held})
+    return {name: validate(model, data) for name, data in sets.items()}
+
+
+def _show(args: argparse.Namespace, model: Model, scores: dict[str, Validation]) -> None:
+    if args.json:
+        found: dict[str, Any] = {
+            "file": str(args.out),
+            "kind": model.kind,
+            "Ts": model.Ts,
+            **model.orders,
+            "training": dict(model.training),
+            "scores": {name: s.to_json() for name, s in scores.items()},
+        }
+        print_json(found)
+        return
+    print(model)
+    for name, score in scores.items():
+        label = "training data" if name == "train" else "held out to choose"
+        s = score.simulation
+        unit = f" {score.unit}" if score.unit else ""
+        print(f"{label}: free-run fit {s.fit_percent:.2f} %, rmse {s.rmse:.5g}{unit}")
+    print(f"written to {args.out}; score it on another recording: sewfast validate {args.out} DATA")

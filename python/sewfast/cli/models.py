@@ -1,0 +1,131 @@
+"""`sewfast validate`, `sewfast simulate`: what a model says about a recording."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .arguments import TABLES, Commands, add_columns, add_command, add_output, require_place
+from .data import read_for_model
+from .output import print_json, write_columns
+
+if TYPE_CHECKING:
+    from ..dataset import Dataset, FloatArray
+    from ..readers import Table
+
+VALIDATE = """\
+Score a model on a recording that it was not trained on, in free run and one step ahead.
+
+Free run is the headline: the model starts once and lives with its own outputs, as it does when a
+controller is tuned on it. One step ahead is put right by the measured output at every sample.
+"""
+
+VALIDATE_EXAMPLES = """\
+examples:
+  sewfast validate drive.json other.csv
+  sewfast validate drive.json run.csv --range 5000:8334      the part not trained on
+  sewfast validate drive.json other.csv --init 0             from rest; every sample is scored
+  sewfast validate drive.json other.mat:volt:rpm --json
+"""
+
+SIMULATE = """\
+Run a model on the inputs of a recording: t, u, y_hat, one row per row of the recording.
+
+The first --init outputs set the initial state; later ones may be empty. With --init 0 the model
+starts from rest and the recording needs no output at all. Several inputs keep their names.
+"""
+
+SIMULATE_EXAMPLES = """\
+examples:
+  sewfast simulate drive.json run.csv -o prediction.csv
+  sewfast simulate drive.json inputs.csv --init 0 | head
+"""
+
+
+def add(commands: Commands) -> None:
+    parser = add_command(
+        commands, "validate", validate_command,
+        summary="errors of a model on a recording", text=VALIDATE, examples=VALIDATE_EXAMPLES,
+    )  # fmt: skip
+    _add_model_and_data(parser)
+    parser.add_argument(
+        "--range", metavar="A:B", help="samples to score, 0-based, end excluded; default: all"
+    )
+    parser = add_command(
+        commands, "simulate", simulate_command,
+        summary="free run of a model", text=SIMULATE, examples=SIMULATE_EXAMPLES,
+    )  # fmt: skip
+    _add_model_and_data(parser)
+    add_output(parser, "OUT", "CSV, .npz, .mat or Parquet; default: CSV to standard output")
+
+
+def _add_model_and_data(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("model", metavar="MODEL.json", help="model file that identify wrote")
+    parser.add_argument("data", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
+    parser.add_argument(
+        "--init", type=_whole, default=20, metavar="N",
+        help="first samples, which set the initial state and are not scored (20); 0: from rest",
+    )  # fmt: skip
+    add_columns(parser, from_model=True)
+
+
+def _whole(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"expected 0 samples or more, received {value}")
+    return value
+
+
+def validate_command(args: argparse.Namespace) -> None:
+    from ..models import load_model
+    from ..validation import validate
+
+    model = load_model(args.model)
+    data, _ = read_for_model(args.data, model, args)
+    found = validate(model, data if args.range is None else data.slice(args.range), init=args.init)
+    if args.json:
+        print_json(found.to_json())
+    else:
+        print(found)
+
+
+def simulate_command(args: argparse.Namespace) -> None:
+    from ..models import load_model
+
+    require_place(args.out, TABLES)
+    model = load_model(args.model)
+    data, table = read_for_model(args.data, model, args, needs_output=args.init > 0)
+    (y_hat,) = model.simulate(data, init=args.init)
+    columns = {"t": _time(table, data), **_inputs(data), "y_hat": y_hat}
+    units = dict(zip(_input_labels(data), data.input_units, strict=True))
+    units |= {"t": "s", "y_hat": model.output_unit}
+    low, high = float(y_hat.min()), float(y_hat.max())
+    write_columns(
+        args.out,
+        columns,
+        units,
+        {"n": len(y_hat), "init": args.init, "Ts": data.Ts, "y_hat_min": low, "y_hat_max": high},
+        [f"{model.title}, free run of {len(y_hat)} samples: y_hat from {low:.6g} to {high:.6g}"],
+        as_json=args.json,
+    )
+
+
+def _time(table: Table, data: Dataset) -> FloatArray:
+    """The recording's own time where it is in seconds, else counted from 0."""
+    for name in table.names:
+        if name.lower() in ("t", "time") and table.unit(name) in ("", "s"):
+            return table[name]
+    return np.arange(len(data), dtype=np.float64) * data.Ts
+
+
+def _inputs(data: Dataset) -> dict[str, FloatArray]:
+    return dict(zip(_input_labels(data), data.experiments[0].u.T, strict=True))
+
+
+def _input_labels(data: Dataset) -> tuple[str, ...]:
+    """`u` for one input; several keep their names, apart from those of the other columns."""
+    if data.n_inputs == 1:
+        return ("u",)
+    return tuple(f"u_{n}" if n in ("t", "y_hat") else n for n in data.input_names)

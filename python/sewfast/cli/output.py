@@ -1,0 +1,84 @@
+"""Results on standard output: JSON, tables of text, columns as CSV."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+
+def print_json(value: Any) -> None:
+    """Strict JSON: what is not finite becomes null."""
+    print(json.dumps(_finite(value), indent=1, allow_nan=False))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {str(k): _finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    return value
+
+
+def print_rows(rows: Sequence[Sequence[str]]) -> None:
+    """Columns of text, as wide as they need to be; the last one runs free."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (cell.ljust(w) for cell, w in zip(row, widths, strict=True))
+        print("  ".join(cells).rstrip())
+
+
+def write_columns(
+    out: Path | None,
+    columns: Mapping[str, ArrayLike],
+    units: Mapping[str, str],
+    summary: Mapping[str, Any],
+    lines: Sequence[str],
+    *,
+    as_json: bool,
+) -> None:
+    """Columns to `out` and what they say to standard output; without `out` the columns themselves.
+
+    Parameters
+    ----------
+    out : Path or None
+    columns, units
+        As for `write_table`.
+    summary : mapping
+        The result as JSON values.
+    lines : sequence of str
+        The result as text.
+    """
+    from ..writers import write_table
+
+    if out is not None:
+        write_table(out, columns, units=units)
+        summary, lines = {**summary, "file": str(out)}, [*lines, f"written to {out}"]
+    if as_json:
+        print_json(summary if out is not None else {**summary, "columns": _lists(columns)})
+    elif out is not None:
+        print("\n".join(lines))
+    else:
+        _print_csv(columns, units)
+        print("\n".join(lines), file=sys.stderr)
+
+
+def _lists(columns: Mapping[str, ArrayLike]) -> dict[str, list[float]]:
+    import numpy as np
+
+    return {name: np.asarray(c).tolist() for name, c in columns.items()}
+
+
+def _print_csv(columns: Mapping[str, ArrayLike], units: Mapping[str, str]) -> None:
+    from ..dataset import labelled
+
+    print(",".join(labelled(name, units.get(name, "")) for name in columns))
+    for row in zip(*_lists(columns).values(), strict=True):
+        print(",".join(map(repr, row)))

@@ -1,0 +1,64 @@
+"""The parser: every command of `sewfast`, one group of commands per module."""
+
+from __future__ import annotations
+
+import argparse
+
+from . import control, experiment, identify, models, recording
+from .arguments import Commands, Help
+
+DESCRIPTION = """\
+From one recording of a motor drive to a verified controller.
+
+  record  ->  identify  ->  validate  ->  tune  ->  run  ->  report
+"""
+
+EPILOG = """\
+each command explains itself: sewfast COMMAND --help
+
+a first walk, on the virtual sewing machine:
+  sewfast record --on virtual --signal chirp_lo_hi -o chirp.csv
+  sewfast identify chirp.csv --input u --output y -o drive.json
+  sewfast record --on virtual --signal random -o random.csv
+  sewfast validate drive.json random.csv
+  sewfast tune drive.json -o controller.json
+  sewfast run controller.json --on virtual --reference trapezoid -o run.csv
+
+or everything at once, with a report to look at:
+  sewfast demo
+
+results go to standard output, progress and messages to standard error
+
+exit codes:
+  0    done
+  1    a fault in sewfast itself; --debug shows where
+  2    refused: the message says what was expected, what came and what to do
+  130  interrupted by Ctrl-C; the best result so far is kept
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line; a parsed command holds its function as `command`."""
+    parser = argparse.ArgumentParser(
+        prog="sewfast", description=DESCRIPTION, epilog=EPILOG, formatter_class=Help
+    )
+    parser.add_argument("--version", action=_Version, help="print the version and exit")
+    commands: Commands = parser.add_subparsers(
+        title="commands", metavar="COMMAND", dest="name", required=True
+    )
+    for group in (experiment, recording, identify, models, control):
+        group.add(commands)
+    return parser
+
+
+class _Version(argparse.Action):
+    """Prints the version; it lies in the compiled module, which `--help` need not load."""
+
+    def __init__(self, option_strings: list[str], dest: str, help: str | None = None) -> None:
+        super().__init__(option_strings, dest=argparse.SUPPRESS, nargs=0, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from .. import __version__
+
+        print(f"sewfast {__version__}")
+        parser.exit(0)
