@@ -9,7 +9,8 @@ use crate::{Error, Result};
 
 /// Half the width of the interval that weights and biases of hidden units are drawn from.
 const HIDDEN: f64 = 0.5;
-/// The same for the weights of the output. Of 12 starts 11 end well with these two, half of them with .1 for both.
+/// The same for the weights of the output. Both are the best of several pairs on one simulated drive (11 of 12 starts
+/// against 7 with .1 for both); on other drives expect two of three.
 const OUTPUT: f64 = 0.02;
 
 /// `b2` and `linear` with which the network, in scaled units, is this linear model.

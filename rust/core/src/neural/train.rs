@@ -88,7 +88,8 @@ pub struct NeuralFit {
 
 /// Validation samples from which an unknown initial state is estimated.
 const STATE_SAMPLES: usize = 20;
-/// First damping; with small random weights 11 of 12 starts end well at this one, 8 at a hundredth of it.
+/// First damping, the best of .01, .1 and 1 by training cost on one simulated drive: of 12 random starts 9, 10 and 11
+/// ended within 1.3 of the noise floor there. On other drives expect two of three.
 const FIRST_MU: f64 = 1.0;
 /// Draws of one start before it is given up.
 const MOST_DRAWS: usize = 50;
