@@ -84,6 +84,28 @@ def test_the_floor_of_J_of_raw_differences_is_that_of_rounding(lo_hi):
     assert floor_of_J([1.0, 2.0], [1.0, 4.0], y_scale=2.0) == 0.25
 
 
+@pytest.mark.parametrize("seed", [None, 1, 2])
+def test_the_smoother_is_within_one_rpm_of_the_truth_on_lo_hi(seed):
+    run = VirtualMachine(seed).run(excitation("chirp_lo_hi"))
+    speed = speed_from_counts(run.counts, 0.001, 1572)
+    assert rms(speed - run.speed_rpm) < 1.0
+    assert floor_of_J(speed, run.speed_rpm) < 5e-7
+
+
+def test_ripple_is_modelled_where_there_is_some():
+    command = excitation("chirp_lo_hi")[:8000]
+    for angle_dependence in (True, False):
+        counts = VirtualMachine(angle_dependence=angle_dependence).run(command).counts
+        plain = speed_from_counts(counts, 0.001, 1572, ripple_orders=())
+        same = np.array_equal(speed_from_counts(counts, 0.001, 1572), plain)
+        assert same == (not angle_dependence)
+
+
+def test_an_exact_position_gives_the_speed_itself():
+    run = VirtualMachine(quantisation=False).run(excitation("chirp_lo_hi"))
+    assert rms(speed_from_counts(run.counts, 0.001, 1572) - run.speed_rpm) < 0.05
+
+
 @pytest.mark.parametrize(
     ("change", "match"),
     [
@@ -100,6 +122,9 @@ def test_the_floor_of_J_of_raw_differences_is_that_of_rounding(lo_hi):
         ({"process_noise": 0.0}, "process_noise"),
         ({"process_noise": math.nan}, "process_noise"),
         ({"unwrap_bits": 60}, "unwrap_bits"),
+        ({"ripple_orders": [1, 1]}, "ripple_orders"),
+        ({"ripple_orders": [0.5]}, "ripple_orders"),
+        ({"ripple_orders": [-1]}, "ripple_orders"),
     ],
 )
 def test_settings_outside_their_range_are_refused(change, match):

@@ -88,8 +88,12 @@ def speed_difference(counts: _F, *, Ts: float, counts_per_unit: float) -> _F: ..
 def speed_savgol(counts: _F, *, Ts: float, counts_per_unit: float, window: int, order: int) -> _F: ...
 def speed_kalman(
     counts: _F, *, Ts: float, counts_per_unit: float, process_noise: float | None = None,
+    ripple_orders: Sequence[int] = ..., counts_per_rev: float = 1.0,
 ) -> _F:
-    """RTS smoother; the process noise [unit^2/s^3] is found by maximum likelihood where None."""
+    """RTS smoother; the process noise [unit^2/s^3] is found by maximum likelihood where None.
+
+    With ``ripple_orders`` a load that repeats over the turn is modelled too, where that is likelier.
+    """
 def unwrap_counts(counts: _F, *, bits: int) -> _F: ...
 
 # --- models.rs --------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -29,6 +30,7 @@ def speed_from_counts(
     window: int = 41,
     order: int = 3,
     process_noise: float | None = None,
+    ripple_orders: Sequence[int] = (1, 2, 3, 4),
     unwrap_bits: int | None = None,
 ) -> FloatArray:
     """Estimate the speed from the counts of an incremental encoder.
@@ -53,6 +55,9 @@ def speed_from_counts(
     process_noise
         Of ``kalman``: intensity of the jerk [unit^2/s^3]; found by maximum likelihood where None.
         Whole counts are taken as exact to 1/12 count^2; for others that variance is found too.
+    ripple_orders
+        Of ``kalman``: multiples of the shaft's turn at which the load may repeat, 6 at most, as
+        cranks and torque ripple do [4]_; used where the counts make it likelier. () leaves it out.
     unwrap_bits
         Width of a counter that wraps, for example 16.
 
@@ -75,6 +80,7 @@ def speed_from_counts(
     .. [2] H. E. Rauch, F. Tung, C. T. Striebel, AIAA J. 3 (1965) 1445-1450.
     .. [3] P. R. Belanger, P. Dobrovolny, A. Helmy, X. Zhang, Int. J. Robotics Research 17 (1998)
        1225-1233.
+    .. [4] H. Vold, J. Leuridan, SAE Technical Paper 931288 (1993).
 
     Examples
     --------
@@ -93,7 +99,13 @@ def speed_from_counts(
         window, order = _whole("window", window), _whole("order", order)
         return _core.speed_savgol(values, **scale, window=window, order=order)
     if method == "kalman":
-        return _core.speed_kalman(values, **scale, process_noise=process_noise)
+        return _core.speed_kalman(
+            values,
+            **scale,
+            process_noise=process_noise,
+            ripple_orders=[_whole("ripple_orders", order) for order in ripple_orders],
+            counts_per_rev=float(counts_per_rev),
+        )
     raise SettingError(
         f"expected method {', '.join(get_args(Method))}, got {method!r}; choose one of them"
     )
@@ -163,6 +175,8 @@ def _column(values: ArrayLike, name: str = "counts") -> FloatArray:
 
 
 def _whole(name: str, value: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-        raise SettingError(f"expected {name} as a whole number of 0 or more, got {value!r}")
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise SettingError(f"expected {name} as a whole number, got {value!r}; give an int")
+    if not 0 <= value < 2**32:
+        raise SettingError(f"expected {name} of 0 to 2^32 - 1, got {value}; see the docstring")
     return int(value)

@@ -58,7 +58,8 @@ fn speed_savgol<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (counts, *, Ts, counts_per_unit, process_noise = None))]
+#[pyo3(signature = (counts, *, Ts, counts_per_unit, process_noise = None, ripple_orders = Vec::new(),
+    counts_per_rev = 1.0))]
 #[allow(non_snake_case)]
 fn speed_kalman<'py>(
     py: Python<'py>,
@@ -66,9 +67,16 @@ fn speed_kalman<'py>(
     Ts: f64,
     counts_per_unit: f64,
     process_noise: Option<f64>,
+    ripple_orders: Vec<u32>,
+    counts_per_rev: f64,
 ) -> Speed<'py> {
+    let kalman = Kalman {
+        process_noise,
+        ripple_orders: &ripple_orders,
+        counts_per_rev,
+    };
     released(py, &counts, |counts| {
-        Kalman { process_noise }.smooth(counts, Scale::new(Ts, counts_per_unit)?)
+        kalman.smooth(counts, Scale::new(Ts, counts_per_unit)?)
     })
 }
 

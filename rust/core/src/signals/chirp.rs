@@ -19,11 +19,11 @@ pub enum Sweep {
 /// With growing amplitude it is the paper's chirp Lo-Hi, with shrinking amplitude its Hi-Lo.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Chirp {
-    /// Length of the signal [s].
+    /// Length of the signal (s).
     pub duration: f64,
-    /// Frequency at the start [Hz].
+    /// Frequency at the start (Hz).
     pub f_start: f64,
-    /// Frequency at the end [Hz]; it may be the lower one.
+    /// Frequency at the end (Hz); it may be the lower one.
     pub f_end: f64,
     /// Amplitude at the start.
     pub amplitude_start: f64,
@@ -35,7 +35,7 @@ pub struct Chirp {
     pub offset_end: f64,
     /// The way of the frequency.
     pub sweep: Sweep,
-    /// Phase at the start [rad]; -pi/2 starts at the lowest point.
+    /// Phase at the start (rad); -pi/2 starts at the lowest point.
     pub phase: f64,
 }
 

@@ -11,7 +11,7 @@ use crate::{Error, Result};
 /// speeds, not to them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Jumps {
-    /// Length of the signal [s].
+    /// Length of the signal (s).
     pub duration: f64,
     /// Lowest speed aimed at.
     pub speed_low: f64,
@@ -23,15 +23,15 @@ pub struct Jumps {
     pub level_min: f64,
     /// Largest magnitude of a pulse.
     pub level_max: f64,
-    /// Shortest hold between pulses [s].
+    /// Shortest hold between pulses (s).
     pub hold_min: f64,
-    /// Longest hold between pulses [s].
+    /// Longest hold between pulses (s).
     pub hold_max: f64,
-    /// How long the rise to a pulse and the fall from it take [s]; 0 gives rectangular pulses.
+    /// How long the rise to a pulse and the fall from it take (s); 0 gives rectangular pulses.
     pub ramp: f64,
     /// Steady speed per unit of command.
     pub gain: f64,
-    /// Acceleration at the current limit [speed/s].
+    /// Acceleration at the current limit (speed/s).
     pub acceleration: f64,
 }
 

@@ -11,9 +11,9 @@ pub struct Limits {
     pub low: f64,
     /// Highest value.
     pub high: f64,
-    /// Largest rate of change [unit/s]; infinity sets no limit.
+    /// Largest rate of change (unit/s); infinity sets no limit.
     pub rate: f64,
-    /// Largest change of the rate [unit/s^2]; infinity sets no limit.
+    /// Largest change of the rate (unit/s^2); infinity sets no limit.
     pub slew: f64,
 }
 
@@ -47,8 +47,7 @@ impl Limits {
         sample_time(ts)?;
         ordered(("low", self.low), ("high", self.high))?;
         for (name, value) in [("rate", self.rate), ("slew", self.slew)] {
-            // Written so that NaN is refused too.
-            if !(value > 0.0) {
+            if value.is_nan() || value <= 0.0 {
                 return Err(Error::setting(format!(
                     "expected {name} above 0, got {value}; infinity sets no limit"
                 )));

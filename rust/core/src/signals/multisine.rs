@@ -17,11 +17,11 @@ const RESTART: usize = 256;
 /// Random phases give a crest factor near `sqrt(2 ln N)`, about 2.5 to 3.5 (Pintelon and Schoukens 2012, section 5.3).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Multisine {
-    /// Length of the signal and its period [s].
+    /// Length of the signal and its period (s).
     pub duration: f64,
-    /// Lower end of the band [Hz].
+    /// Lower end of the band (Hz).
     pub f_low: f64,
-    /// Upper end of the band [Hz].
+    /// Upper end of the band (Hz).
     pub f_high: f64,
     /// Largest deviation from the offset.
     pub amplitude: f64,

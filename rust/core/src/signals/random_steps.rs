@@ -11,17 +11,17 @@ use crate::{Error, Result};
 /// A change of `D` within `smoothing` seconds has a rate of at most `pi D / (2 smoothing)`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RandomSteps {
-    /// Length of the signal [s].
+    /// Length of the signal (s).
     pub duration: f64,
     /// Lowest level.
     pub low: f64,
     /// Highest level.
     pub high: f64,
-    /// Shortest time from one change to the next [s].
+    /// Shortest time from one change to the next (s).
     pub hold_min: f64,
-    /// Longest time from one change to the next [s].
+    /// Longest time from one change to the next (s).
     pub hold_max: f64,
-    /// How long a change takes [s], at most `hold_min`; 0 jumps.
+    /// How long a change takes (s), at most `hold_min`; 0 jumps.
     pub smoothing: f64,
     /// Where the signal comes from: it changes to the first level from here. None starts at the first level.
     pub start: Option<f64>,

@@ -53,15 +53,15 @@ pub fn staircase(ts: f64, levels: &[f64], hold: f64) -> Result<Vec<f64>> {
 /// A straight rise from `low` to `high`, a hold and a straight fall back to `low`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Trapezoid {
-    /// Length of the signal [s].
+    /// Length of the signal (s).
     pub duration: f64,
-    /// When the rise starts [s].
+    /// When the rise starts (s).
     pub start: f64,
-    /// How long the rise takes [s]; 0 is a step.
+    /// How long the rise takes (s); 0 is a step.
     pub rise: f64,
-    /// How long `high` is held [s].
+    /// How long `high` is held (s).
     pub hold: f64,
-    /// How long the fall takes [s].
+    /// How long the fall takes (s).
     pub fall: f64,
     /// Level before and after.
     pub low: f64,

@@ -33,7 +33,7 @@ impl Scale {
         1.0 / (self.ts * self.counts_per_unit)
     }
 
-    /// White-jerk intensity [unit^2/s^3] in counts and samples [counts^2/sample^5].
+    /// White-jerk intensity (unit^2/s^3) in counts and samples (counts^2/sample^5).
     pub(super) fn jerk_in_counts(&self, process_noise: f64) -> f64 {
         process_noise * self.counts_per_unit.powi(2) * self.ts.powi(5)
     }

@@ -1,16 +1,17 @@
 //! Kalman filter on the position with a Rauch-Tung-Striebel smoother behind it.
 
-use nalgebra::{Matrix3, Vector3};
-
 use super::counts::{Scale, check};
+use super::gains::{Gains, Innovations};
+use super::ripple::{MAX_ORDERS, Noises, Turn, with_ripple};
+use super::search::{golden, grid};
 use crate::{Error, Result};
 
-/// Variance of a position known to one count [count^2].
+/// Variance of a position known to one count (count^2).
 const QUANTISATION: f64 = 1.0 / 12.0;
-/// Riccati steps until the gains count as constant, whatever they do.
-const MAX_TRANSIENT: usize = 50_000;
-/// Decimal exponents of the white-jerk intensity [count^2/sample^5] that are searched.
-const SEARCH: (i32, i32) = (-16, 4);
+/// Samples of each of the eight blocks that stand for a long record.
+const BLOCK: usize = 4_096;
+/// Decimal exponents of the white-jerk intensity (count^2/sample^5) that are searched.
+const SEARCH: (f64, f64) = (-16.0, 4.0);
 /// Accuracy of the search in decades; a tenth of a decade moves the bandwidth by 4 %.
 const TOLERANCE: f64 = 0.02;
 
@@ -25,27 +26,75 @@ const TOLERANCE: f64 = 0.02;
 ///
 /// Where `q` is not given it maximises the likelihood of the innovations. Counts that are not whole numbers come from
 /// an ideal encoder or another sensor: then `var v` is estimated with it.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Kalman {
-    /// Intensity of the white jerk [unit^2/s^3]; None finds it.
+///
+/// With `ripple_orders` whole counts are also tried with a load that repeats over the turn (`ripple.rs`); the
+/// likelier of the two models smooths.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Kalman<'a> {
+    /// Intensity of the white jerk (unit^2/s^3); None finds it.
     pub process_noise: Option<f64>,
+    /// Multiples of the shaft's turn at which the load may repeat; none leaves ripple to the white jerk.
+    pub ripple_orders: &'a [u32],
+    /// Counts of one turn of the shaft.
+    pub counts_per_rev: f64,
 }
 
-impl Kalman {
+impl Default for Kalman<'_> {
+    fn default() -> Self {
+        Self {
+            process_noise: None,
+            ripple_orders: &[],
+            counts_per_rev: 1.0,
+        }
+    }
+}
+
+impl Kalman<'_> {
     /// The smoothed speed of `counts`.
     ///
     /// # Errors
-    /// `ErrorKind::Setting` for a process noise that is not finite and above zero; `ErrorKind::Data` for fewer than 5
-    /// counts, or counts that cannot be used.
+    /// `ErrorKind::Setting` for a process noise or counts per turn that are not finite and above zero, or orders that
+    /// are zero, repeated or more than 6; `ErrorKind::Data` for fewer than 5 counts, or counts that cannot be used.
     pub fn smooth(&self, counts: &[f64], scale: Scale) -> Result<Vec<f64>> {
         check(counts, 5)?;
+        let turn = self.turn()?;
         let q = self.given(scale)?;
         // Counted from the first, so that a large count costs no digits.
         let relative: Vec<f64> = counts.iter().map(|c| c - counts[0]).collect();
-        let (ratio, noise) = noises(&relative, q);
-        let gains = Gains::new(ratio * noise, noise, &relative);
-        let factor = scale.per_count();
-        Ok(gains.smooth(&relative, factor))
+        let (blocks, factor) = (blocks(&relative), scale.per_count());
+        let (jerk, rounding) = noises(&blocks, q);
+        if !turn.orders.is_empty() && is_whole(counts) {
+            let start = Noises {
+                jerk,
+                rounding,
+                wander: 0.0,
+            };
+            let plain = cost(&blocks, jerk);
+            let found = with_ripple(&relative, &blocks, turn, start, q.is_some(), plain, factor);
+            if let Some(speed) = found {
+                return Ok(speed);
+            }
+        }
+        Ok(Gains::new(jerk, rounding, &relative).smooth(&relative, factor))
+    }
+
+    fn turn(&self) -> Result<Turn<'_>> {
+        let (orders, counts_per_rev) = (self.ripple_orders, self.counts_per_rev);
+        let repeated = |i: usize| orders[..i].contains(&orders[i]) || orders[i] == 0;
+        if orders.len() > MAX_ORDERS || (0..orders.len()).any(repeated) {
+            return Err(Error::setting(format!(
+                "expected up to {MAX_ORDERS} different ripple_orders from 1, got {orders:?}; leave some out"
+            )));
+        }
+        if !(counts_per_rev.is_finite() && counts_per_rev > 0.0) {
+            return Err(Error::setting(format!(
+                "expected counts_per_rev finite and above 0, got {counts_per_rev}; give the encoder's"
+            )));
+        }
+        Ok(Turn {
+            orders,
+            counts_per_rev,
+        })
     }
 
     fn given(&self, scale: Scale) -> Result<Option<f64>> {
@@ -61,203 +110,75 @@ impl Kalman {
     }
 }
 
-/// Process noise by measurement noise, and measurement noise [count^2].
-fn noises(counts: &[f64], q: Option<f64>) -> (f64, f64) {
-    let whole = counts.iter().all(|c| c.fract() == 0.0);
-    match q {
-        Some(q) => (q / QUANTISATION, QUANTISATION),
-        None if whole => {
-            let cost = |exponent: f64| {
-                let q = 10f64.powf(exponent);
-                let fit = Gains::new(q, QUANTISATION, counts).innovations(counts);
-                fit.log_variance + fit.square
-            };
-            (10f64.powf(minimise(cost)) / QUANTISATION, QUANTISATION)
-        }
-        None => {
-            let fit =
-                |exponent: f64| Gains::new(10f64.powf(exponent), 1.0, counts).innovations(counts);
-            // With var v = 1 the likelihood is largest for the scale `square / n`, which this cost has put in.
-            let cost = |exponent: f64| {
-                let fit = fit(exponent);
-                fit.log_variance + fit.n * (fit.square / fit.n).max(f64::MIN_POSITIVE).ln()
-            };
-            let exponent = minimise(cost);
-            let best = fit(exponent);
-            // An exactly resting or linear motion leaves no innovation at all; the speed does not depend on the scale.
-            let noise = Some(best.square / best.n).filter(|v| *v > 1e-12);
-            (10f64.powf(exponent), noise.unwrap_or(1e-12))
-        }
+/// The parts of a record that the noises are found from: all of it, or eight blocks spread evenly over a long one.
+fn blocks(counts: &[f64]) -> Vec<&[f64]> {
+    const BLOCKS: usize = 8;
+    if counts.len() <= BLOCKS * BLOCK {
+        return vec![counts];
     }
+    let first = |i: usize| i * (counts.len() - BLOCK) / (BLOCKS - 1);
+    (0..BLOCKS)
+        .map(|i| &counts[first(i)..first(i) + BLOCK])
+        .collect()
+}
+
+fn is_whole(counts: &[f64]) -> bool {
+    counts.iter().all(|c| c.fract() == 0.0)
+}
+
+/// `-2 ln` of the likelihood of whole counts.
+fn cost(blocks: &[&[f64]], q: f64) -> f64 {
+    let fit = innovations(blocks, q, QUANTISATION);
+    fit.log_variance + fit.square
+}
+
+/// Process noise and measurement noise (count^2/sample^5, count^2).
+fn noises(blocks: &[&[f64]], q: Option<f64>) -> (f64, f64) {
+    if let Some(q) = q {
+        return (q, QUANTISATION);
+    }
+    if blocks.iter().all(|counts| is_whole(counts)) {
+        let exponent = minimise(|x| cost(blocks, 10f64.powf(x)));
+        return (10f64.powf(exponent), QUANTISATION);
+    }
+    // With var v = 1 the likelihood is largest for the scale `square / n`, which this cost has put in.
+    let fit = |exponent: f64| innovations(blocks, 10f64.powf(exponent), 1.0);
+    let exponent = minimise(|x| {
+        let fit = fit(x);
+        fit.log_variance + fit.n * (fit.square / fit.n).max(f64::MIN_POSITIVE).ln()
+    });
+    let best = fit(exponent);
+    // An exactly resting or linear motion leaves no innovation at all; the speed does not depend on the scale.
+    let noise = (best.square / best.n).max(1e-12);
+    (10f64.powf(exponent) * noise, noise)
 }
 
 /// The least of `cost` over the searched exponents: a coarse grid, then golden sections around its best point.
 fn minimise(cost: impl Fn(f64) -> f64) -> f64 {
-    let grid = (SEARCH.0..=SEARCH.1).step_by(2).map(f64::from);
-    let costs = grid.map(|x| (x, cost(x)));
-    let best = costs
-        .min_by(|a, b| a.1.total_cmp(&b.1))
-        .map_or(0.0, |b| b.0);
-    let golden = 0.5 * (5f64.sqrt() - 1.0);
-    let (mut a, mut b) = (best - 2.0, best + 2.0);
-    let (mut x1, mut x2) = (b - golden * (b - a), a + golden * (b - a));
-    let (mut f1, mut f2) = (cost(x1), cost(x2));
-    while b - a > TOLERANCE {
-        if f1 < f2 {
-            (b, x2, f2) = (x2, x1, f1);
-            x1 = b - golden * (b - a);
-            f1 = cost(x1);
-        } else {
-            (a, x1, f1) = (x1, x2, f2);
-            x2 = a + golden * (b - a);
-            f2 = cost(x2);
-        }
-    }
-    0.5 * (a + b)
+    let best = grid(SEARCH.0, SEARCH.1, 2.0, &cost);
+    golden(best - 2.0, best + 2.0, TOLERANCE, &cost)
 }
 
-/// What the innovations say about the noises: `sum ln s`, `sum e^2/s` and their number.
-struct Innovations {
-    log_variance: f64,
-    square: f64,
-    n: f64,
-}
-
-/// One sample's gains: the filter's, the smoother's, and the innovation's variance.
-#[derive(Clone, Copy)]
-struct Gain {
-    filter: Vector3<f64>,
-    smoother: Matrix3<f64>,
-    variance: f64,
-}
-
-/// Gains from the first sample until they stop changing; the last one holds from then on.
-struct Gains(Vec<Gain>);
-
-impl Gains {
-    fn new(q: f64, r: f64, counts: &[f64]) -> Self {
-        let (f, noise) = (transition(), jerk(q));
-        let mut p = prior(counts, r);
-        let mut gains: Vec<Gain> = Vec::new();
-        while gains.len() < counts.len().min(MAX_TRANSIENT) {
-            let variance = p[(0, 0)] + r;
-            let filter: Vector3<f64> = p.column(0) / variance;
-            // Joseph's form keeps the covariance positive where the subtraction would cancel.
-            let mut keep = Matrix3::identity();
-            keep.set_column(0, &(keep.column(0) - filter));
-            let updated = keep * p * keep.transpose() + filter * filter.transpose() * r;
-            let ahead = f * updated;
-            p = ahead * f.transpose() + noise;
-            p = (p + p.transpose()) * 0.5;
-            let smoother = smoother(&p, &ahead);
-            let gain = Gain {
-                filter,
-                smoother,
-                variance,
-            };
-            let settled = gains.last().is_some_and(|last| settled(last, &gain));
-            gains.push(gain);
-            if settled {
-                break;
-            }
-        }
-        Self(gains)
-    }
-
-    fn at(&self, k: usize) -> &Gain {
-        &self.0[k.min(self.0.len() - 1)]
-    }
-
-    /// Runs the filter and gathers its innovations; the first three only find the state.
-    fn innovations(&self, counts: &[f64]) -> Innovations {
-        let mut sum = Innovations {
-            log_variance: 0.0,
-            square: 0.0,
-            n: 0.0,
-        };
-        let mut x = Vector3::zeros();
-        for (k, c) in counts.iter().enumerate() {
-            let gain = self.at(k);
-            let e = c - x[0];
-            if k >= 3 {
-                sum.square += e * e / gain.variance;
-            }
-            x = predict(&(x + gain.filter * e));
-        }
-        let transient = self.0.len().min(counts.len());
-        let early = self.0[..transient]
-            .iter()
-            .skip(3)
-            .map(|g| g.variance.ln())
-            .sum::<f64>();
-        let late = (counts.len() - transient) as f64 * self.at(transient).variance.ln();
-        sum.log_variance = early + late;
-        sum.n = counts.len() as f64 - 3.0;
-        sum
-    }
-
-    /// Forward filter, backward smoother; the speed times `factor`.
-    fn smooth(&self, counts: &[f64], factor: f64) -> Vec<f64> {
-        let mut filtered = Vec::with_capacity(counts.len());
-        let mut x = Vector3::zeros();
-        for (k, c) in counts.iter().enumerate() {
-            let updated = x + self.at(k).filter * (c - x[0]);
-            filtered.push(updated);
-            x = predict(&updated);
-        }
-        let mut speed = vec![0.0; counts.len()];
-        let mut later = filtered[counts.len() - 1];
-        speed[counts.len() - 1] = factor * later[1];
-        for k in (0..counts.len() - 1).rev() {
-            later = filtered[k] + self.at(k).smoother * (later - predict(&filtered[k]));
-            speed[k] = factor * later[1];
-        }
-        speed
-    }
-}
-
-fn transition() -> Matrix3<f64> {
-    Matrix3::new(1.0, 1.0, 0.5, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0)
-}
-
-/// Covariance that white jerk of intensity `q` adds in one sample.
-fn jerk(q: f64) -> Matrix3<f64> {
-    let (a, b, c) = (1.0 / 20.0, 1.0 / 8.0, 1.0 / 6.0);
-    Matrix3::new(a, b, c, b, 1.0 / 3.0, 0.5, c, 0.5, 1.0) * q
-}
-
-/// The first position is known to one count; speed and acceleration are as wide as the largest step.
-fn prior(counts: &[f64], r: f64) -> Matrix3<f64> {
-    let step = counts
-        .windows(2)
-        .map(|w| (w[1] - w[0]).abs())
-        .fold(1.0, f64::max);
-    Matrix3::from_diagonal(&Vector3::new(r, step * step, step * step))
-}
-
-/// `C = P(k|k) F' P(k+1|k)^-1`, from `P(k+1|k)` and `F P(k|k)`.
-fn smoother(predicted: &Matrix3<f64>, ahead: &Matrix3<f64>) -> Matrix3<f64> {
-    let solved = predicted.cholesky().map(|factor| factor.solve(ahead));
-    // A covariance that rounding has made singular carries nothing back; it cannot be reached with q > 0.
-    solved.map_or_else(Matrix3::zeros, |c| c.transpose())
-}
-
-fn settled(last: &Gain, gain: &Gain) -> bool {
-    let same = |a: f64, b: f64| (a - b).abs() <= 1e-10 * b.abs();
-    same(last.variance, gain.variance)
-        && last
-            .filter
-            .iter()
-            .zip(&gain.filter)
-            .all(|(a, b)| same(*a, *b))
-}
-
-fn predict(x: &Vector3<f64>) -> Vector3<f64> {
-    Vector3::new(x[0] + x[1] + 0.5 * x[2], x[1] + x[2], x[2])
+fn innovations(blocks: &[&[f64]], q: f64, r: f64) -> Innovations {
+    let of = |counts: &&[f64]| Gains::new(q, r, counts).innovations(counts);
+    let add = |a: Innovations, b: Innovations| Innovations {
+        log_variance: a.log_variance + b.log_variance,
+        square: a.square + b.square,
+        n: a.n + b.n,
+    };
+    let none = Innovations {
+        log_variance: 0.0,
+        square: 0.0,
+        n: 0.0,
+    };
+    blocks.iter().map(of).fold(none, add)
 }
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Vector3;
+
+    use super::super::gains::{jerk, transition};
     use super::*;
     use crate::random::Random;
     use crate::speed::difference;
@@ -308,42 +229,6 @@ mod tests {
     }
 
     #[test]
-    fn equals_the_dense_least_squares_solution() {
-        // The smoother's mean minimises sum (c - x1)^2/r + sum w' Q^-1 w + prior, solved here all at once.
-        let (q, r) = (1e-3, QUANTISATION);
-        let counts = [0.0, 1.0, 3.0, 4.0, 8.0, 11.0, 15.0, 16.0];
-        let smooth = Gains::new(q, r, &counts).smooth(&counts, 1.0);
-        let n = 3 * counts.len();
-        let (f, w) = (transition(), jerk(q).try_inverse().unwrap());
-        let (mut a, mut b) = (nalgebra::DMatrix::zeros(n, n), nalgebra::DVector::zeros(n));
-        let mut add = |i: usize, j: usize, m: Matrix3<f64>| {
-            let mut block = a.fixed_view_mut::<3, 3>(3 * i, 3 * j);
-            block += m;
-        };
-        add(0, 0, prior(&counts, r).try_inverse().unwrap());
-        for (k, c) in counts.iter().enumerate() {
-            let mut seen = Matrix3::zeros();
-            seen[(0, 0)] = 1.0 / r;
-            add(k, k, seen);
-            b[3 * k] = c / r;
-        }
-        for k in 0..counts.len() - 1 {
-            add(k, k, f.transpose() * w * f);
-            add(k + 1, k + 1, w);
-            add(k, k + 1, -f.transpose() * w);
-            add(k + 1, k, -w * f);
-        }
-        let dense = a.lu().solve(&b).unwrap();
-        for (k, v) in smooth.iter().enumerate() {
-            assert!(
-                (v - dense[3 * k + 1]).abs() < 1e-8,
-                "{k}: {v} {}",
-                dense[3 * k + 1]
-            );
-        }
-    }
-
-    #[test]
     fn rests_at_standstill_and_after_it() {
         let scale = Scale::new(1e-3, 26.2).unwrap();
         let still = Kalman::default().smooth(&[7.0; 2000], scale).unwrap();
@@ -373,13 +258,9 @@ mod tests {
                 x[0] + 0.5 * random.normal()
             })
             .collect();
-        let (ratio, noise) = noises(&counts, None);
+        let (q, noise) = noises(&[&counts], None);
         assert!((noise - 0.25).abs() < 0.02, "{noise}");
-        assert!(
-            ((ratio * noise).log10() + 4.0).abs() < 0.15,
-            "{}",
-            ratio * noise
-        );
+        assert!((q.log10() + 4.0).abs() < 0.15, "{q}");
     }
 
     #[test]
@@ -388,6 +269,7 @@ mod tests {
         for q in [0.0, -1.0, f64::NAN, f64::INFINITY] {
             let kalman = Kalman {
                 process_noise: Some(q),
+                ..Kalman::default()
             };
             assert!(kalman.smooth(&[0.0; 9], scale).is_err());
         }
