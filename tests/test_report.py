@@ -145,7 +145,7 @@ def test_figures_fit_on_a_printed_page(page: str) -> None:
         ("identification.neural_oe.random.simulation.rmse_rpm", 18.5, "no worse"),
         ("identification.oe_all.random.simulation.rmse_rpm", 5.9, "no worse"),
         ("identification.neural_oe.saturating.simulation.rmse_rpm", 9.1, "half"),
-        ("paper_gains.eq8.rmse_rpm", 700.0, "per-sample"),
+        ("paper_gains.eq8.rise_time_ms", 201.0, "per-sample"),
         ("control.trapezoid.machine.rise_time_ms", 136.0, "rise within 15 ms"),
         ("control.trapezoid.machine.overshoot_percent", 3.1, "overshoot of 3 %"),
         ("control.random.model_vs_machine_rmse_rpm", 15.1, "predicted closed loop"),

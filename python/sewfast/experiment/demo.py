@@ -13,6 +13,7 @@ from ..control import Controller, Fopdt, paper_controller
 from ..machine import VirtualMachine
 from ..report import report
 from ..report.canvas import require
+from ..signals import excitation
 from ..tuning import TuningResult
 from . import folder, identified, loops, recordings
 
@@ -95,6 +96,7 @@ def run_demo(
     """
     require()
     plant = VirtualMachine.from_name(machine)
+    excitation("random", seed)  # refuses a seed that is none before the folder is made
     target = Path(out)
     folder.prepare(target)
     clock = _Clock(progress)

@@ -118,14 +118,14 @@ def _saturated(a: Artefacts) -> Goal:
 
 
 def _paper_gains(a: Artefacts) -> Goal:
-    error = a.number("paper_gains.eq8.rmse_rpm")
+    rise = a.number("paper_gains.eq8.rise_time_ms")
     overshoot = a.number("paper_gains.eq8.overshoot_percent")
-    known = error is not None and overshoot is not None
+    known = rise is not None and overshoot is not None
     return Goal(
-        "The paper's gains, read as per-sample gains, track on the plant of its Eq. 8 "
-        "(150 RPM rms and 5 % overshoot at most)",
-        f"{rpm(error)} rms, overshoot {percent(overshoot)}",
-        (error or 0.0) <= 150.0 and (overshoot or 0.0) <= 5.0 if known else None,
+        "The paper's gains, read as per-sample gains, track the trapezoid on the plant of its "
+        "Eq. 8: rise of 200 ms at most, where ±10 V allow 186 ms, and 5 % overshoot at most",
+        f"{milliseconds(rise)}, overshoot {percent(overshoot)}",
+        (rise or 0.0) <= 200.0 and (overshoot or 0.0) <= 5.0 if known else None,
     )
 
 

@@ -26,7 +26,7 @@ _PURPOSE = {
     "random": "Levels between 200 and 2,000 RPM at random.",
 }
 
-_MAGNIFIED = 0.6
+_MAGNIFIED = 0.4
 """Width of the magnified rise [s]."""
 
 

@@ -1,0 +1,211 @@
+"""The experiment: whole result folders, honest training sets, the same numbers for the same seed.
+
+Training and tuning are cut short: what is tested is how the pieces fit, not how well they do.
+"""
+
+import functools
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sewfast import identification, tuning
+from sewfast.control import load_controller
+from sewfast.errors import DataError, SettingError
+from sewfast.experiment import STAGES, identified, loops, recordings, run_demo
+from sewfast.machine import VirtualMachine
+from sewfast.models import load_model
+from sewfast.readers import read, read_table
+from sewfast.report import artefacts, report
+from sewfast.validation import validate
+
+SCORES = ("rmse_rpm", "fit_percent")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _short() -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        quick = functools.partial(identification.identify, iterations=3, starts=1)
+        patch.setattr(identified, "identify", quick)
+        patch.setattr(loops, "tune", functools.partial(tuning.tune, evaluations=20))
+        yield
+
+
+@pytest.fixture(scope="module")
+def stages() -> list[tuple[int, int, str]]:
+    return []
+
+
+@pytest.fixture(scope="module")
+def demo(
+    tmp_path_factory: pytest.TempPathFactory, _short: None, stages: list[tuple[int, int, str]]
+) -> Path:
+    out = tmp_path_factory.mktemp("demo") / "results"
+    run_demo(out, seed=3, progress=lambda *told: stages.append(told))
+    return out
+
+
+@pytest.fixture(scope="module")
+def results(demo: Path) -> dict[str, Any]:
+    return dict(json.loads((demo / "results.json").read_text()))
+
+
+def test_the_results_hold_every_score(results: dict[str, Any]) -> None:
+    assert (results["format"], results["version"]) == ("sewfast.results", 1)
+    for model in ("paper", "neural_oe", "oe", "oe_all", "arx"):
+        for record in ("chirp_lo_hi", "chirp_hi_lo", "random", "saturating"):
+            for horizon in ("simulation", "one_step"):
+                found = results["identification"][model][record][horizon]
+                assert all(math.isfinite(found[name]) for name in SCORES)
+    paper = results["identification"]["paper"]
+    assert {"cost", "cost_floor", "iterations", "seconds"} <= set(paper)
+    assert 5e-5 < paper["cost_floor"] < 2e-4
+    assert results["seconds"] > 0.0
+
+
+def test_the_results_hold_every_closed_loop(results: dict[str, Any]) -> None:
+    for reference in ("trapezoid", "chirp_hi_lo", "chirp_lo_hi", "random"):
+        found = results["control"][reference]
+        assert math.isfinite(found["model_vs_machine_rmse_rpm"])
+        for plant in ("model", "machine"):
+            assert math.isfinite(found[plant]["rmse_rpm"])
+            assert {"rise_time_ms", "overshoot_percent"} <= set(found[plant])
+    assert results["control"]["trapezoid"]["reference_rise_time_ms"] == pytest.approx(120.0)
+
+
+def test_nothing_is_trained_on_what_it_is_tested_on(results: dict[str, Any]) -> None:
+    trained = {m: set(v["trained_on"]) for m, v in results["identification"].items()}
+    assert trained["paper"] == trained["arx"] == trained["oe"] == {"chirp_lo_hi"}
+    assert trained["neural_oe"] == trained["oe_all"]
+    assert trained["neural_oe"] == {"chirp_lo_hi", "saturating", "closed_loop"}
+
+
+@pytest.mark.parametrize("name", ["paper", "neural_oe", "oe", "oe_all", "arx"])
+def test_a_saved_model_scores_what_the_results_say(
+    demo: Path, results: dict[str, Any], name: str
+) -> None:
+    model = load_model(demo / "models" / f"{name}.json")
+    path = demo / "recordings" / "saturating_2.csv"
+    data = read(path, inputs="u", output="y", channels=["speed_true"])
+    found = validate(model, data, init=0, against="speed_true")
+    expected = results["identification"][name]["saturating"]
+    assert found.simulation.rmse == pytest.approx(expected["simulation"]["rmse_rpm"], rel=1e-9)
+    assert found.one_step.fit_percent == pytest.approx(expected["one_step"]["fit_percent"])
+
+
+def test_the_saved_controller_gives_the_saved_run_again(demo: Path) -> None:
+    controller = load_controller(demo / "controllers" / "tuned.json")
+    again = loops.run(controller, VirtualMachine(), "random", seed=3)
+    saved = read_table(demo / "runs" / "random_machine.npz")
+    np.testing.assert_array_equal(again.u, saved["u"])
+    np.testing.assert_array_equal(again.y, saved["y"])
+
+
+def test_the_folder_makes_its_report_again(demo: Path) -> None:
+    first = (demo / "report.html").read_text(encoding="utf-8")
+    assert report(demo).read_text(encoding="utf-8") == first
+
+
+def test_no_temporary_file_is_left(demo: Path) -> None:
+    assert not list(demo.rglob("*.tmp"))
+
+
+def test_progress_names_every_stage_and_ends_full(
+    demo: Path, stages: list[tuple[int, int, str]]
+) -> None:
+    n = len(STAGES)
+    assert stages == [*((i, n, name) for i, name in enumerate(STAGES)), (n, n, "done")]
+
+
+def test_the_same_seed_gives_the_same_numbers(demo: Path, tmp_path: Path) -> None:
+    run_demo(tmp_path / "again", seed=3)
+    for name in ("models/neural_oe.json", "controllers/tuned.json", "recordings/random.csv"):
+        first, second = ((folder / name).read_text() for folder in (demo, tmp_path / "again"))
+        assert _timeless(first) == _timeless(second)
+
+
+def _timeless(text: str) -> list[str]:
+    return [line for line in text.splitlines() if "seconds" not in line]
+
+
+@pytest.mark.parametrize("stage", ["tuning", "writing"])
+def test_an_interruption_leaves_an_earlier_experiment_as_it_was(demo: Path, stage: str) -> None:
+    before = {p: p.read_bytes() for p in demo.rglob("*") if p.is_file()}
+
+    def interrupt(done: int, total: int, name: str) -> None:
+        if name == stage:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_demo(demo, seed=4, progress=interrupt)
+    assert {p: p.read_bytes() for p in demo.rglob("*") if p.is_file()} == before
+
+
+def test_a_folder_that_was_interrupted_while_writing_is_no_result(
+    demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sewfast.experiment import folder
+
+    def fail(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(folder, "write_table", fail)
+    out = tmp_path / "cut"
+    with pytest.raises(KeyboardInterrupt):
+        run_demo(out, seed=3)
+    with pytest.raises(DataError, match=r"results\.json"):
+        report(out)
+
+
+@pytest.mark.parametrize("machine", ["real", "virtual:", "virtual:x"])
+def test_an_unknown_machine_is_refused_before_anything_is_made(
+    tmp_path: Path, machine: str
+) -> None:
+    with pytest.raises(SettingError, match="virtual"):
+        run_demo(tmp_path / "out", machine=machine)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "x"])
+def test_a_seed_that_is_none_is_refused_before_anything_is_made(tmp_path: Path, seed: Any) -> None:
+    with pytest.raises(SettingError, match="seed"):
+        run_demo(tmp_path / "out", seed=seed)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_in_the_way_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("mine")
+    with pytest.raises(DataError, match="out"):
+        run_demo(tmp_path / "out")
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_the_plant_of_eq_8_is_the_printed_one() -> None:
+    gain = loops.eq8().core.dc_gain()[0]
+    assert gain == pytest.approx((0.1228 + 0.1224) / (1 - 1.87 + 0.8705))
+
+
+def test_the_papers_gains_track_on_their_plant_and_chatter_on_the_machine() -> None:
+    runs = loops.paper_runs(VirtualMachine())
+    numbers = loops.paper_numbers(runs)
+    assert numbers["eq8"]["rise_time_ms"] == pytest.approx(186.0, abs=5.0)
+    assert numbers["eq8"]["overshoot_percent"] < 5.0
+    assert numbers["machine"]["chatter_v"] > 5.0
+    assert max(np.abs(r.u).max() for r in runs.values()) <= 10.0
+
+
+def test_the_closed_loop_recording_is_the_loop_itself() -> None:
+    machine = VirtualMachine()
+    fopdt = recordings.first_order(recordings.open_loop(machine, 0)["step"])
+    controller = recordings.coarse_controller(fopdt, machine)
+    recording = recordings.closed_loop(machine, controller)
+    loop = loops.run(controller, machine, "trapezoids")
+    np.testing.assert_array_equal(recording.speed_true, loop.y)
+
+
+def test_the_record_scored_as_saturating_is_the_second_one() -> None:
+    assert artefacts.record_of("saturating") == "saturating_2"
+    assert "saturating_2" not in identified.ALL_RECORDS
