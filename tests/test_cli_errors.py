@@ -1,0 +1,309 @@
+"""What the command line refuses, and what is left after a refusal or Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sewfast as api
+from cli import PROGRAM, environment, refused, sewfast
+from sewfast import cli
+
+IDENTIFY = ("identify", "run.csv", "--input", "u", "--output", "y", "-o", "m.json")
+
+
+def recording(n: int = 400) -> dict[str, np.ndarray]:
+    u = np.repeat(np.random.default_rng(0).uniform(0, 5, n // 20), 20)
+    y = np.zeros(n)
+    for k in range(1, n):
+        y[k] = 0.9 * y[k - 1] + 50 * u[k - 1]
+    noise = np.random.default_rng(1).normal(0, 1, n)
+    return {"t": 0.001 * np.arange(n), "u": u, "y": y + noise, "extra": noise}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A good recording, a model and a controller, for one test to spoil."""
+    units = {"u": "V", "y": "RPM"}
+    api.write_table(tmp_path / "run.csv", recording(), units=units)
+    data = api.read(tmp_path / "run.csv", inputs="u", output="y")
+    api.identify(data, model="oe").save(tmp_path / "drive.json")
+    gains = api.Gains.standard(0.001, 0.02)
+    api.Controller(gains, u_min=-20, u_max=20).save(tmp_path / "c.json")
+    return tmp_path
+
+
+def spoil(folder: Path, **columns: np.ndarray) -> None:
+    api.write_table(folder / "run.csv", {**recording(), **columns})
+
+
+def spoiled(name: str, at: int | slice, value: float) -> dict[str, np.ndarray]:
+    column = recording()[name].copy()
+    column[at] = value
+    return {name: column}
+
+
+# --- recordings -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        (spoiled("y", slice(None), np.nan), ["'y'", "NaN"]),
+        (spoiled("y", 7, np.nan), ["'y'", "sample 7"]),
+        (spoiled("u", 7, np.inf), ["'u'", "7"]),
+        (spoiled("u", slice(None), 2.0), ["'u'", "constant"]),
+        (spoiled("y", slice(None), 2.0), ["'y'", "constant"]),
+        (spoiled("t", 9, 0.0), ["'t'", "increasing", "line 11"]),
+        (spoiled("t", 9, 0.0095), ["'t'", "even steps", "1 %"]),
+    ],
+    ids=["all-nan", "nan", "inf", "constant-input", "constant-output", "backwards", "uneven"],
+)
+def test_unusable_columns(
+    folder: Path, columns: dict[str, np.ndarray], expected: list[str]
+) -> None:
+    spoil(folder, **columns)
+    message = refused(folder, *IDENTIFY)
+    for word in ["run.csv", *expected]:
+        assert word in message
+
+
+def test_empty_file(folder: Path) -> None:
+    (folder / "run.csv").write_bytes(b"")
+    assert "empty" in refused(folder, *IDENTIFY)
+
+
+def test_header_alone(folder: Path) -> None:
+    (folder / "run.csv").write_text("t,u,y\n")
+    assert "run.csv" in refused(folder, *IDENTIFY)
+
+
+def test_too_few_samples(folder: Path) -> None:
+    api.write_table(folder / "run.csv", {k: v[10:28] for k, v in recording().items()})
+    assert "samples" in refused(folder, *IDENTIFY)
+
+
+def test_missing_file(folder: Path) -> None:
+    message = refused(
+        folder, "identify", "nil.csv", "--input", "u", "--output", "y", "-o", "m.json"
+    )
+    assert "nil.csv" in message
+    assert "no such file" in message
+
+
+def test_wrong_column_names_what_there_is(folder: Path) -> None:
+    message = refused(
+        folder, "identify", "run.csv", "--input", "v", "--output", "y", "-o", "m.json"
+    )
+    assert "'v'" in message
+    assert "u, y, extra" in message
+
+
+@pytest.mark.parametrize("given", [("--input", "u"), ("--output", "y")])
+def test_unnamed_column_names_the_option(folder: Path, given: tuple[str, str]) -> None:
+    message = refused(folder, "identify", "run.csv", *given, "-o", "m.json")
+    missing = "--output" if given[0] == "--input" else "--input"
+    assert missing in message
+    assert "available: t, u, y, extra" in message
+
+
+def test_sample_time_that_disagrees(folder: Path) -> None:
+    assert "1 %" in refused(folder, *IDENTIFY, "--ts", 0.002)
+    api.write_table(folder / "run.csv", {k: v for k, v in recording().items() if k != "t"})
+    assert "--ts" in refused(folder, *IDENTIFY)
+
+
+def test_counts_need_their_resolution(folder: Path) -> None:
+    assert "counts_per_rev" in refused(folder, *IDENTIFY, "--counts", "extra")
+
+
+# --- settings -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (("--na", 0), "na"),
+        (("--nb", -1), "nb"),
+        (("--hidden", 0), "hidden"),
+        (("--starts", 0), "starts"),
+        (("--seed", -1), "seed"),
+        (("--train", "5:5"), "5:5"),
+        (("--train", "0:9999"), "0:9999"),
+        (("--train", "x"), "A:B"),
+        (("--train", "0:300", "--validate", "200:400"), "overlap"),
+        (("--validate", "0:400"), "nothing is left"),
+        (("--preset", "paper", "--hidden", 9), "paper"),
+        (("--model", "oe", "--preset", "paper"), "paper"),
+        (("--model", "tree"), "--model"),
+        (("--na", "two"), "--na"),
+    ],
+)
+def test_settings_of_identify(folder: Path, options: tuple[object, ...], word: str) -> None:
+    assert word in refused(folder, *IDENTIFY, *options)
+
+
+@pytest.mark.parametrize("out", ["nowhere/m.json", "m.txt", "m"])
+def test_an_output_that_cannot_be_is_refused_before_the_work(folder: Path, out: str) -> None:
+    message = refused(folder, *IDENTIFY[:-1], out, "--starts", 100_000)
+    assert out in message
+
+
+def test_no_command_and_unknown_command(folder: Path) -> None:
+    assert "COMMAND" in refused(folder)
+    assert "learn" in refused(folder, "learn")
+
+
+# --- models, controllers --------------------------------------------------------------------------
+
+
+def test_damaged_model(folder: Path) -> None:
+    text = (folder / "drive.json").read_text()
+    (folder / "drive.json").write_text(text[:50])
+    assert "drive.json" in refused(folder, "validate", "drive.json", "run.csv")
+
+
+@pytest.mark.parametrize("version", [99, "1", None])
+def test_unknown_version(folder: Path, version: object) -> None:
+    document = json.loads((folder / "drive.json").read_text()) | {"version": version}
+    (folder / "drive.json").write_text(json.dumps(document))
+    assert "version 1" in refused(folder, "simulate", "drive.json", "run.csv")
+
+
+def test_a_controller_is_no_model(folder: Path) -> None:
+    message = refused(folder, "validate", "c.json", "run.csv")
+    assert "sewfast.model" in message
+    assert "sewfast.controller" in message
+
+
+def test_data_that_do_not_fit_the_model(folder: Path) -> None:
+    slow = recording() | {"t": 0.01 * np.arange(400)}
+    api.write_table(folder / "slow.csv", slow)
+    assert "0.01" in refused(folder, "validate", "drive.json", "slow.csv")
+    assert "'w'" in refused(folder, "validate", "drive.json", "run.csv", "--input", "w")
+
+
+@pytest.mark.parametrize("options", [("--range", "0:20"), ("--init", -1), ("--init", "x")])
+def test_nothing_left_to_score(folder: Path, options: tuple[object, ...]) -> None:
+    assert "init" in refused(folder, "validate", "drive.json", "run.csv", *options)
+
+
+def test_simulation_without_the_samples_that_start_it(folder: Path) -> None:
+    spoil(folder, **spoiled("y", 7, np.nan))
+    assert "--init" in refused(folder, "simulate", "drive.json", "run.csv")
+
+
+def test_unstable_model(folder: Path) -> None:
+    document = json.loads((folder / "drive.json").read_text())
+    document["parameters"]["a"] = [-30.0, 200.0]
+    (folder / "drive.json").write_text(json.dumps(document))
+    assert "unstable" in refused(folder, "simulate", "drive.json", "run.csv", "-o", "p.csv")
+
+
+@pytest.mark.parametrize("on", ["virtual:x", "virtual:-1", "nil.json", "real"])
+def test_unknown_plant(folder: Path, on: str) -> None:
+    message = refused(folder, "run", "c.json", "--on", on, "--reference", "step.csv")
+    assert on in message
+
+
+@pytest.mark.parametrize("command", ["tune", "run"])
+def test_unknown_reference_names_the_known(folder: Path, command: str) -> None:
+    arguments = {"tune": ("drive.json", "-o", "new.json"), "run": ("c.json", "--on", "virtual")}
+    message = refused(folder, command, *arguments[command], "--reference", "zigzag")
+    assert "zigzag" in message
+    assert "trapezoid" in message
+
+
+def test_reference_file_without_r_or_at_another_rate(folder: Path) -> None:
+    run = ("run", "c.json", "--on", "virtual", "--reference")
+    assert "'r'" in refused(folder, *run, "run.csv")
+    t = 0.01 * np.arange(50)
+    api.write_table(folder / "slow.csv", {"t": t, "r": t})
+    assert "0.01 s" in refused(folder, *run, "slow.csv")
+    api.write_table(folder / "gap.csv", {"t": 0.1 * t, "r": np.where(t > 0.2, np.nan, t)})
+    assert "gap.csv" in refused(folder, *run, "gap.csv")
+
+
+@pytest.mark.parametrize(
+    "options", [("--u-min", 5, "--u-max", -5), ("--filter", 0), ("--counts-per-rev", -1)]
+)
+def test_settings_of_tune(folder: Path, options: tuple[object, ...]) -> None:
+    refused(folder, "tune", "drive.json", "-o", "new.json", *options)
+
+
+def test_record_refuses_unknown_names(folder: Path) -> None:
+    assert "zigzag" in refused(folder, "record", "--on", "virtual", "--signal", "zigzag")
+    assert "moon" in refused(folder, "record", "--on", "moon", "--signal", "step")
+    arguments = ("record", "--on", "virtual", "--signal", "step", "-o", "step.xlsx")
+    assert ".xlsx" in refused(folder, *arguments)
+
+
+def test_report_of_no_results(folder: Path) -> None:
+    assert "results.json" in refused(folder, "report", ".")
+    assert "nil" in refused(folder, "report", "nil")
+
+
+# --- faults, Ctrl-C -------------------------------------------------------------------------------
+
+
+def test_a_fault_is_one_line_and_exit_code_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sewfast.signals.EXCITATIONS", None)
+    assert cli.main(["signals"]) == cli.FAULT
+    err = capsys.readouterr().err
+    assert "please report" in err
+    assert len(err.splitlines()) == 1
+    assert cli.main(["signals", "--debug"]) == cli.FAULT
+    assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs SIGINT")
+def test_ctrl_c_keeps_the_best_model(folder: Path) -> None:
+    api.write_table(folder / "run.csv", recording(4000))
+    command = [*PROGRAM, *IDENTIFY, "--model", "neural-oe", "--hidden", "40", "--starts", "100000"]
+    process = subprocess.Popen(
+        command, cwd=folder, env=environment(), stderr=subprocess.PIPE, text=True
+    )
+    _wait_until_busy(process)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == cli.INTERRUPTED, err
+    assert "kept the best so far in m.json" in err
+    assert api.load_model(folder / "m.json").kind in ("oe", "neural_oe")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs SIGINT")
+def test_ctrl_c_keeps_the_best_controller(folder: Path) -> None:
+    t = 0.001 * np.arange(400_000)
+    api.write_table(folder / "long.npz", {"t": t, "r": 1000.0 + 500.0 * np.sin(t)})
+    arguments = [*PROGRAM, "tune", "drive.json", "--reference", "long.npz", "-o", "new.json"]
+    process = subprocess.Popen(
+        arguments, cwd=folder, env=environment(), stderr=subprocess.PIPE, text=True
+    )
+    _wait_until_busy(process)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == cli.INTERRUPTED, err
+    assert "kept the best so far in new.json" in err
+    assert api.load_controller(folder / "new.json").u_max == 20.0
+
+
+def _wait_until_busy(process: subprocess.Popen[str]) -> None:
+    """Wait for the compiled work to begin: far longer than start-up takes, or until it ends."""
+    for _ in range(40):
+        time.sleep(0.1)
+        assert process.poll() is None, process.communicate()
+
+
+def test_refusals_are_documented(tmp_path: Path) -> None:
+    text = sewfast(tmp_path, "--help").out
+    for code in (cli.DONE, cli.FAULT, cli.REFUSED, cli.INTERRUPTED):
+        assert f"  {code} " in text
