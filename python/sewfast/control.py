@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import _core, jsonfile
 from .errors import DataError, ModelFileError, SettingError, SewfastError
-from .gains import Form, Gains, real
+from .gains import Form, Gains, real, whole
 from .models.fields import Fields
 from .units import counts_per_unit
 
@@ -102,13 +102,7 @@ class Controller:
                 f"expected gains for the controller's sample time of {self.Ts} s, got per-sample "
                 f"gains at {self.gains.Ts} s; convert them with gains.to('standard')"
             )
-        if isinstance(self.filter_samples, bool) or not isinstance(
-            self.filter_samples, (int, np.integer)
-        ):
-            raise SettingError(
-                f"expected a whole number for filter_samples, got {self.filter_samples!r}; try 8"
-            )
-        object.__setattr__(self, "filter_samples", int(self.filter_samples))
+        object.__setattr__(self, "filter_samples", whole("filter_samples", self.filter_samples))
         if self.counts_per_rev is not None:
             object.__setattr__(self, "counts_per_rev", real("counts_per_rev", self.counts_per_rev))
         if not isinstance(self.notes, str):
@@ -124,10 +118,6 @@ class Controller:
 
     def core(self) -> _core.Controller:
         """The arithmetic itself, at rest: `step(r, y)` once per sample gives the command."""
-        if not 0 <= self.filter_samples <= 2**31:
-            raise SettingError(
-                f"expected 1 to 64 samples for filter_samples, got {self.filter_samples}"
-            )
         gains = self.gains.to("standard")
         return _core.Controller(
             Kp=gains.Kp,

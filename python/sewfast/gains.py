@@ -29,6 +29,14 @@ def real(name: str, value: Any) -> float:
     return number
 
 
+def whole(name: str, value: Any) -> int:
+    """The value as an int of 0 to 2^63 - 1; fractions, booleans and text are refused by name."""
+    number = math.nan if isinstance(value, bool) else real(name, value)
+    if not (0 <= number < 2**63 and number.is_integer()):
+        raise SettingError(f"expected a whole number of 0 or more for {name}, got {value!r}")
+    return int(value)
+
+
 @dataclass(frozen=True)
 class Gains:
     """Gains of a PID in one of three forms that must not be mixed (docs/CONVENTIONS.md, Control).

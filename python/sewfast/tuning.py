@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import _core
 from .control import Controller, Fopdt, Gains, fit_fopdt, table_1
 from .errors import DataError, FitError, Interrupted, SettingError
+from .gains import real, whole
 from .loop import Plant, check_fits, plant_units, reference_samples
 from .models import Model
 from .units import REVOLUTIONS_PER_SECOND
@@ -21,13 +22,13 @@ Progress: TypeAlias = Callable[[int, int, float], object]
 
 REFERENCES = ("trapezoid", "trapezoids", "random")
 """References to tune on unless others are given."""
-VARIATIONS = ((1.0, 0), (0.8, 0), (1.25, 0))
-"""Gain and extra delay in samples that one controller has to bear, so that tuned gains transfer."""
+GAINS = (0.8, 1.25)
+"""Plant gains beside the identified one that a controller has to bear, so that it transfers."""
 DERIVATIVE_FILTER = 10.0
 """N to begin with."""
-_STEP_SHARES = (0.25, 0.5, 0.1, 0.05)
+_STEP_SHARES = (0.25, 0.5, 0.1)
 """Shares of u_max that the first step response is looked for at."""
-_STEP_SAMPLES = (4_000, 16_000, 64_000)
+_STEP_SAMPLES = (4_000, 16_000)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +80,8 @@ def tune(
     filter_samples: int = 8,
     start: Controller | None = None,
     weights: Mapping[str, float] | None = None,
-    variations: Sequence[tuple[float, int]] = VARIATIONS,
-    evaluations: int = 1000,
+    variations: Sequence[tuple[float, int]] | None = None,
+    evaluations: int = 600,
     seed: int = 0,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -114,8 +115,10 @@ def tune(
         settings above are not used. By default Table 1 on the first model's own step response.
     weights : mapping, optional
         Changes to `default_weights()`.
-    variations : sequence of (gain, delay)
-        Output gain and extra input delay in samples, applied to every plant.
+    variations : sequence of (gain, delay), optional
+        Output gain and extra input delay in samples, applied to every plant. By default the plant
+        as it is, and with the gains `GAINS` and a delay of a quarter of the moving average, at
+        least one sample: dynamics that identification missed must not upset the loop.
     evaluations : int
         Candidates tried.
     seed : int
@@ -152,17 +155,23 @@ def tune(
         [reference_samples(r, start) for r in _each(references)],
         start=start.core(),
         counts_per_unit=start.counts_per_unit,
-        variations=[(float(gain), int(delay)) for gain, delay in variations],
+        variations=_checked(default_variations(start) if variations is None else variations),
         weights=dict(weights or {}),
-        evaluations=evaluations,
-        seed=seed,
-        threads=threads or os.cpu_count() or 1,
+        evaluations=whole("evaluations", evaluations),
+        seed=whole("seed", seed),
+        threads=whole("threads", os.cpu_count() or 1 if threads is None else threads),
         progress=progress,
     )
     result = _result(found, start, {**default_weights(), **(weights or {})})
     if result.termination == "interrupted":
         raise Interrupted(result.controller)
     return result
+
+
+def default_variations(controller: Controller) -> tuple[tuple[float, int], ...]:
+    """(gain, extra delay in samples) of the plants that a controller is tuned on; see `tune`."""
+    delay = max(1, controller.filter_samples // 4)
+    return ((1.0, 0), *((gain, delay) for gain in GAINS))
 
 
 def default_weights() -> dict[str, float]:
@@ -192,6 +201,11 @@ def first_controller(
     if not isinstance(plant, Model):
         raise SettingError(
             "expected a model to find a start from, got a machine; give start=, or tune on a model"
+        )
+    if not np.isfinite(u_max) or u_max == 0:
+        raise SettingError(
+            f"expected a finite u_max other than 0 to size the step by, got {u_max}; give the "
+            "amplifier's limit"
         )
     u_unit, y_unit = (unit or "?" for unit in plant_units(plant))
     fopdt = _step_fit(plant, u_max)
@@ -231,6 +245,14 @@ def _step_fit(model: Model, u_max: float) -> Fopdt:
         f"expected a model whose step response settles, got none up to u = {0.5 * u_max:g} "
         f"({reason}); give a controller to start from"
     ) from reason
+
+
+def _checked(variations: Sequence[tuple[float, int]]) -> list[tuple[float, int]]:
+    if not variations or not all(np.shape(v) == (2,) for v in variations):
+        raise SettingError(
+            f"expected variations as pairs of a gain and a delay in samples, got {variations!r}"
+        )
+    return [(real("a variation's gain", g), whole("a variation's delay", d)) for g, d in variations]
 
 
 def _each(references: Any) -> list[str | ArrayLike]:

@@ -1,0 +1,171 @@
+"""Tuning by simulation: what it finds, that it repeats, what it refuses."""
+
+import math
+import signal
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sewfast import _core, signals
+from sewfast.control import Controller, Gains
+from sewfast.errors import DataError, FitError, Interrupted, SettingError
+from sewfast.loop import run
+from sewfast.machine import VirtualMachine
+from sewfast.models import LinearOE
+from sewfast.tuning import default_variations, default_weights, first_controller, tune
+
+
+def linear(a: list[float], b: list[float]) -> LinearOE:
+    core = _core.LinearModel(np.array(a), np.array([b]), 1, 0.0)
+    return LinearOE(core, 0.001, ("u",), "y", ("V",), "RPM")
+
+
+def drive(T1: float = 0.252, T2: float = 0.0074, gain: float = 490.0) -> LinearOE:
+    p, q = math.exp(-0.001 / T1), math.exp(-0.001 / T2)
+    b = gain * (1 - p) * (1 - q) / 2
+    return linear([-p - q, p * q], [b, b])
+
+
+SHORT = signals.reference("trapezoid")[:900]
+
+
+def test_starts_from_the_models_own_step_response() -> None:
+    first = first_controller(drive())
+    assert first.gains.Kp == pytest.approx(12.5 / 490, rel=0.05)
+    assert first.gains.Ti == pytest.approx(0.22 * 0.252, rel=0.1)
+    assert (first.filter_samples, first.counts_per_rev, first.u_max) == (8, 1572.0, 20.0)
+    assert run(first, drive(), "trapezoid").metrics()["overshoot_percent"] < 10
+    reverse = first_controller(drive(gain=-490.0))
+    assert reverse.gains.Kp == pytest.approx(-first.gains.Kp, rel=0.05)
+
+
+def test_tuned_gains_track_on_the_model_and_on_the_machine() -> None:
+    result = tune(drive(), "trapezoid", evaluations=500, threads=2)
+    assert result.cost < 0.3 * result.start_cost
+    assert np.all(np.diff(result.trace) <= 0)
+    assert result.trace[-1] == result.cost
+    model = run(result.controller, drive(), "trapezoid").metrics()
+    machine = run(result.controller, VirtualMachine(), "trapezoid").metrics()
+    for told in (model, machine):
+        assert told["rise_time_ms"] == pytest.approx(120, abs=15)
+        assert told["overshoot_percent"] < 3
+    assert machine["rmse"] < 80
+
+
+def test_a_seed_gives_the_same_bits_at_any_number_of_threads() -> None:
+    first, second = (
+        tune(drive(), SHORT, evaluations=120, seed=3, threads=threads) for threads in (1, 3)
+    )
+    assert first.controller == second.controller
+    assert np.array_equal(first.trace, second.trace)
+    other = tune(drive(), SHORT, evaluations=120, seed=4, threads=2)
+    assert other.controller != first.controller
+
+
+def test_one_controller_serves_several_plants_and_a_machine() -> None:
+    start = first_controller(drive())
+    plants = [drive(), drive(T2=0.012), VirtualMachine(1)]
+    result = tune(plants, [SHORT], start=start, variations=[(1.0, 0)], evaluations=150, threads=2)
+    assert result.cost < 0.5 * result.start_cost
+    for plant in plants:
+        assert run(result.controller, plant, SHORT).metrics()["rmse"] < 150
+
+
+def test_weights_buy_what_they_say() -> None:
+    calm, wild = (
+        tune(drive(), SHORT, weights={"chatter": weight}, evaluations=400, threads=2)
+        for weight in (20.0, 0.0)
+    )
+    effort = [run(r.controller, drive(), SHORT).metrics()["du_rms"] for r in (calm, wild)]
+    assert effort[0] < effort[1]
+    assert calm.weights == {**default_weights(), "chatter": 20.0}
+
+
+def test_keeps_what_the_start_says() -> None:
+    start = Controller(
+        Gains.per_sample(0.02, 2e-4, 0.05, Ts=0.001),
+        u_min=-15.0,
+        u_max=15.0,
+        filter_samples=4,
+        filter_time=0.002,
+        counts_per_rev=4000.0,
+        Tt=0.05,
+    )
+    tuned = tune(drive(), SHORT, start=start, evaluations=60, threads=2).controller
+    assert (tuned.u_min, tuned.u_max, tuned.Tt) == (-15.0, 15.0, 0.05)
+    assert (tuned.filter_samples, tuned.filter_time, tuned.counts_per_rev) == (4, 0.002, 4000.0)
+    assert math.isinf(tuned.N)
+    assert tuned.gains.form == "standard"
+    assert default_variations(start) == ((1.0, 0), (0.8, 1), (1.25, 1))
+
+
+def test_references_may_be_one_or_several_names_or_samples() -> None:
+    settings: dict[str, Any] = {"start": first_controller(drive()), "evaluations": 1, "threads": 1}
+    one = tune(drive(), "trapezoid", **settings).cost
+    samples = signals.reference("trapezoid")
+    for same in (samples, list(samples), ["trapezoid"], [samples], [list(samples)]):
+        assert tune(drive(), same, **settings).cost == one
+    assert tune(drive(), ["trapezoid", samples], **settings).cost == one
+    assert tune(drive(), ["trapezoid", "random"], **settings).cost != one
+
+
+def test_progress_is_told_and_ctrl_c_keeps_the_best() -> None:
+    seen: list[tuple[int, int, float]] = []
+
+    def watch(done: int, total: int, best: float) -> None:
+        seen.append((done, total, best))
+
+    timer = threading.Timer(0.3, signal.raise_signal, [signal.SIGINT])
+    timer.start()
+    with pytest.raises(Interrupted) as caught:
+        tune(drive(), evaluations=10_000_000, threads=2, progress=watch)
+    timer.join()
+    assert isinstance(caught.value.best, Controller)
+    assert seen[-1][1] == 10_000_000
+    assert 0 < seen[-1][0] < 10_000_000
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"u_max": math.inf}, "u_max"),
+        ({"u_min": -math.inf}, "limits"),
+        ({"u_max": -30.0}, "u_max"),
+        ({"weights": {"chater": 1.0}}, "chater"),
+        ({"weights": {"chatter": -1.0}}, "chatter"),
+        ({"evaluations": 0}, "evaluation"),
+        ({"evaluations": 1.5}, "evaluations"),
+        ({"seed": -1}, "seed"),
+        ({"threads": 0}, "thread"),
+        ({"variations": []}, "variations"),
+        ({"variations": [1.0]}, "variations"),
+        ({"variations": [(0.0, 0)]}, "gain"),
+        ({"variations": [(1.0, 0.5)]}, "delay"),
+        ({"variations": [(1.0, 99)]}, "delay"),
+        ({"filter_samples": 100}, "filter_samples"),
+        ({"references": "unheard"}, "unheard"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings: dict[str, Any], says: str) -> None:
+    with pytest.raises(SettingError, match=says):
+        tune(drive(), **{"references": SHORT, "evaluations": 2, **settings})
+
+
+def test_plants_that_cannot_be_tuned_on_are_refused() -> None:
+    with pytest.raises(SettingError, match="plant"):
+        tune([], SHORT)
+    with pytest.raises(SettingError, match="machine"):
+        tune(VirtualMachine(), SHORT)
+    with pytest.raises(FitError, match="settles"):
+        tune(linear([-1.0], [1.0]), SHORT)
+    unstable, start = linear([-3.0], [1.0]), first_controller(drive())
+    with pytest.raises(FitError, match="diverge"):
+        tune(unstable, SHORT, start=start, evaluations=30, threads=2)
+
+
+@pytest.mark.parametrize("references", [[], [[]], [[0.0, math.nan]]])
+def test_references_that_cannot_be_run_are_refused(references: Any) -> None:
+    with pytest.raises(DataError, match="reference"):
+        tune(drive(), references, evaluations=2)
