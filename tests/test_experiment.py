@@ -197,6 +197,14 @@ def test_the_papers_gains_track_on_their_plant_and_chatter_on_the_machine() -> N
     assert max(np.abs(r.u).max() for r in runs.values()) <= 10.0
 
 
+def test_only_per_sample_gains_on_rpm_track_on_the_papers_plant() -> None:
+    found = loops.readings()
+    tracking = found.pop("per_sample_rpm")["rmse_rpm"]
+    assert tracking is not None
+    others = [r["rmse_rpm"] for r in found.values()]
+    assert all(error is None or error > 1.5 * tracking for error in others)
+
+
 def test_the_closed_loop_recording_is_the_loop_itself() -> None:
     machine = VirtualMachine()
     fopdt = recordings.first_order(recordings.open_loop(machine, 0)["step"])

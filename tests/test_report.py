@@ -174,7 +174,7 @@ def test_an_undefined_number_is_no_success(folder: Path) -> None:
 
 def test_numbers_of_the_results_stand_on_the_page(folder: Path) -> None:
     change(folder, "control.chirp_hi_lo.model_vs_machine_rmse_rpm", 7.77)
-    assert "7.77 RPM" in report(folder).read_text(encoding="utf-8")
+    assert "7.77\N{NO-BREAK SPACE}RPM" in report(folder).read_text(encoding="utf-8")
 
 
 def test_text_from_the_results_cannot_become_markup(folder: Path) -> None:
@@ -280,8 +280,8 @@ def test_thinning_keeps_extremes_ends_and_order(
         (1.23456, "1.23"),
         (9.996, "10.0"),
         (1234.5, "1,234"),
-        (0.00012, "0.000120"),
-        (8e-5, "8.00 × 10⁻⁵"),
+        (0.0012, "0.00120"),
+        (8e-5, "8.00\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}10⁻⁵"),
         (-3.0, "−3.00"),
         (0.0, "0"),
         (None, "–"),

@@ -110,6 +110,7 @@ def run_demo(
     models = {"paper": identified.paper(recorded, seed)}
 
     clock.enter("linear models")
+    models["arx_raw"] = identified.arx_raw(recorded)
     models["arx"] = identified.linear(recorded, "arx", identified.PAPER_RECORDS)
     models["oe"] = identified.linear(recorded, "oe", identified.PAPER_RECORDS)
 
@@ -145,7 +146,7 @@ def run_demo(
         ),
         **_controller_numbers(fopdt, controllers, tuning),
         "control": loops.control_numbers(runs),
-        "paper_gains": loops.paper_numbers(paper_runs),
+        "paper_gains": loops.paper_numbers(paper_runs) | {"readings": loops.readings()},
         "seconds": clock.seconds,
         "stages": clock.stages(),
     }

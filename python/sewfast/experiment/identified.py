@@ -29,6 +29,12 @@ def paper(recordings: Mapping[str, Recording], seed: int) -> Model:
     return identify(data, model="neural_oe", preset="paper", seed=seed)
 
 
+def arx_raw(recordings: Mapping[str, Recording]) -> Model:
+    """ARX on differences of counts, as the paper's rival was."""
+    lo_hi = recordings["chirp_lo_hi"]
+    return identify(lo_hi.dataset(lo_hi.speed("difference")), model="arx")
+
+
 def linear(
     recordings: Mapping[str, Recording], kind: Literal["arx", "oe"], records: tuple[str, ...]
 ) -> Model:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from .. import _core
-from ..control import Controller, paper_controller
+from ..control import Controller, Gains, paper_controller
+from ..errors import FitError
 from ..loop import ClosedLoopRun, Plant, run
 from ..machine import VirtualMachine
 from ..models import LinearOE, Model
@@ -41,6 +42,32 @@ def paper_runs(machine: VirtualMachine) -> Runs:
         ("paper_gains", "eq8"): run(replace(gains, counts_per_rev=None), eq8(), "trapezoid"),
         ("paper_gains", "machine"): run(gains, limited, "trapezoid"),
     }
+
+
+def readings() -> dict[str, dict[str, float | None]]:
+    """The paper's gains on the plant of its Eq. 8, by the error's unit and the gains' form."""
+    paper = replace(paper_controller(), counts_per_rev=None)
+    numbers = (paper.gains.Kp, paper.gains.Ki, paper.gains.Kd)
+    units = {"rpm": 1.0, "cps": 60.0 / (1572.0 * paper.Ts), "krpm": 1000.0}
+    found = {}
+    for unit, size in units.items():
+        Kp, Ki, Kd = (gain / size for gain in numbers)
+        forms = {
+            "per_sample": Gains.per_sample(Kp, Ki, Kd, Ts=paper.Ts),
+            "continuous": Gains.parallel(Kp, Ki, Kd),
+        }
+        for form, gains in forms.items():
+            found[f"{form}_{unit}"] = _tried(replace(paper, gains=gains))
+    return found
+
+
+def _tried(controller: Controller) -> dict[str, float | None]:
+    names = ("rmse_rpm", "rise_time_ms", "overshoot_percent")
+    try:
+        numbers = _numbers(run(controller, eq8(), "trapezoid"))
+    except FitError:
+        return dict.fromkeys(names)
+    return {name: numbers[name] for name in names}
 
 
 def eq8() -> LinearOE:

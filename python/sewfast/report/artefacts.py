@@ -22,7 +22,7 @@ RECORDINGS = (
 )  # fmt: skip
 SCORED = ("chirp_lo_hi", "chirp_hi_lo", "random", "saturating")
 """Records in `results.json`; `saturating` is the second saturating record, never trained on."""
-MODELS = ("paper", "neural_oe", "oe", "oe_all", "arx")
+MODELS = ("paper", "neural_oe", "oe", "oe_all", "arx", "arx_raw")
 REFERENCES = ("trapezoid", "chirp_hi_lo", "chirp_lo_hi", "random")
 PLANTS = ("model", "machine")
 

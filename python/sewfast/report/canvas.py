@@ -36,8 +36,8 @@ LOOKS: dict[str, dict[str, Any]] = {
     "paper": {"color": "#D55E00", "lw": 1.2, "ls": (0, (4, 1.5))},
     "neural_oe": {"color": "#0072B2", "lw": 1.2, "ls": "-"},
     "oe": {"color": "#007a59", "lw": 1.2, "ls": (0, (6, 1.5, 1, 1.5))},
-    "oe_all": {"color": "#B07800", "lw": 1.2, "ls": (0, (8, 2))},
-    "arx": {"color": "#9b3f77", "lw": 1.3, "ls": (0, (1.5, 1.2))},
+    "arx": {"color": "#B07800", "lw": 1.2, "ls": (0, (8, 2))},
+    "arx_raw": {"color": "#9b3f77", "lw": 1.3, "ls": (0, (1.5, 1.2))},
     "model": {"color": "#D55E00", "lw": 1.3, "ls": (0, (4, 1.8))},
     "machine": {"color": "#56B4E9", "lw": 2.6, "ls": "-"},
     "measured": {"color": "#0072B2", "lw": 1.2, "ls": "-"},
@@ -130,9 +130,11 @@ def thin(x: Float, y: Float, buckets: int = BUCKETS) -> tuple[Float, Float]:
     return x[index], y[index]
 
 
-def draw(ax: Axes, x: Float, y: Float, look: str, label: str | None = None) -> None:
-    """A thinned line in the look of its role."""
-    ax.plot(*thin(x, y), label=label, **LOOKS[look])
+def draw(
+    ax: Axes, x: Float, y: Float, look: str, label: str | None = None, *, width: float | None = None
+) -> None:
+    """A thinned line in the look of its role, or thinner than that."""
+    ax.plot(*thin(x, y), label=label, **LOOKS[look] | ({"lw": width} if width else {}))
 
 
 def legend(ax: Axes, columns: int = 6) -> None:

@@ -7,7 +7,8 @@ MODEL = {
     "neural_oe": "default network",
     "oe": "linear output error",
     "oe_all": "linear output error, all records",
-    "arx": "ARX, least squares",
+    "arx": "ARX, smoothed speed",
+    "arx_raw": "ARX, differenced counts",
 }
 
 RECORD = {

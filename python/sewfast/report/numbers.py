@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 NONE = "–"
+_SPACE = "\N{NO-BREAK SPACE}"
 
 
 def significant(value: float | None, digits: int = 3) -> str:
@@ -15,32 +16,33 @@ def significant(value: float | None, digits: int = 3) -> str:
         return "0"
     # of the rounded value: 9.996 has two digits before the point
     size = int(f"{value:.{digits - 1}e}".split("e")[1])
-    if not -4 <= size <= 5:
+    if not -3 <= size <= 5:
         mantissa = value / 10.0**size
-        return f"{mantissa:.{digits - 1}f} × 10{_raised(size)}".replace("-", "−")
+        text = f"{mantissa:.{digits - 1}f} × 10{_raised(size)}"
+        return text.replace("-", "−").replace(" ", _SPACE)
     return f"{value:,.{max(digits - 1 - size, 0)}f}".replace("-", "−")
 
 
 def rpm(value: float | None) -> str:
     """A speed or its error [RPM]."""
-    return NONE if value is None else f"{significant(value)} RPM"
+    return NONE if value is None else f"{significant(value)}{_SPACE}RPM"
 
 
 def volt(value: float | None) -> str:
     """A command or its change [V]."""
-    return NONE if value is None else f"{significant(value)} V"
+    return NONE if value is None else f"{significant(value)}{_SPACE}V"
 
 
 def percent(value: float | None, digits: int = 2) -> str:
     """A share [%]."""
     if value is None or not math.isfinite(value):
         return NONE
-    return f"{value:.{digits}f} %".replace("-", "−")
+    return f"{value:.{digits}f}{_SPACE}%".replace("-", "−")
 
 
 def milliseconds(value: float | None) -> str:
     """A duration [ms]."""
-    return NONE if value is None else f"{value:.0f} ms"
+    return NONE if value is None else f"{value:.0f}{_SPACE}ms"
 
 
 def _raised(exponent: int) -> str:

@@ -14,6 +14,7 @@ from .tables import (
     control_table,
     gains_table,
     identification_tables,
+    readings_table,
     speed_table,
 )
 
@@ -46,6 +47,7 @@ def _context(artefacts: Artefacts) -> dict[str, Any]:
         "scores": identification_tables(artefacts),
         "gains": gains_table(artefacts),
         "control": control_table(artefacts),
+        "readings": readings_table(artefacts),
         "number": artefacts.number,
         "value": artefacts.value,
     }

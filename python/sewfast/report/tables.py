@@ -37,7 +37,7 @@ def _scores(artefacts: Artefacts, kind: str, caption: str) -> Table:
         cells = [labels.MODEL[m], _trained_on(artefacts, m)]
         for j, r in enumerate(SCORED):
             fit = artefacts.number(f"identification.{m}.{r}.{kind}.fit_percent")
-            cells.append(f"{significant(found[m, r])} ({percent(fit)})")
+            cells.append(f"{significant(found[m, r])}\N{NO-BREAK SPACE}({percent(fit, 1)})")
             known = [x for n in MODELS if (x := found[n, r]) is not None]
             if found[m, r] is not None and found[m, r] == min(known):
                 best.add((i, j + 2))
@@ -131,5 +131,33 @@ def gains_table(artefacts: Artefacts) -> Table:
     return Table(
         "Gains of the controllers, standard form.",
         ("controller", "Kp [V/RPM]", "Ti [ms]", "Td [ms]", "α", "β"),
+        tuple(rows),
+    )
+
+
+def readings_table(artefacts: Artefacts) -> Table:
+    """What the paper's gains do on the plant of Eq. 8, by how they are read."""
+    names = {
+        "per_sample_rpm": "per sample, error in RPM",
+        "continuous_rpm": "continuous time, error in RPM",
+        "per_sample_cps": "per sample, error in counts per sample",
+        "continuous_cps": "continuous time, error in counts per sample",
+        "per_sample_krpm": "per sample, error in 1,000 RPM",
+    }
+    rows = []
+    for key, label in names.items():
+        path = f"paper_gains.readings.{key}"
+        rows.append(
+            (
+                label,
+                significant(artefacts.number(f"{path}.rmse_rpm")),
+                milliseconds(artefacts.number(f"{path}.rise_time_ms")),
+                percent(artefacts.number(f"{path}.overshoot_percent")),
+            )
+        )
+    return Table(
+        "The paper's gains on the plant of Eq. 8, trapezoid to 3,000 RPM; a dash: the speed does "
+        "not get that far, or the loop runs away.",
+        ("reading", "tracking error [RPM rms]", "10–90 % rise", "overshoot"),
         tuple(rows),
     )

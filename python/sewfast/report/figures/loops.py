@@ -28,6 +28,8 @@ _PURPOSE = {
 
 _MAGNIFIED = 0.4
 """Width of the magnified rise [s]."""
+_FINE = 1.2
+"""Line width where the lines do not cover each other."""
 
 
 def loop_pictures(artefacts: Artefacts) -> list[Picture]:
@@ -87,8 +89,8 @@ def _loop_figure(runs: dict[str, Columns], names: dict[str, str], *, magnified: 
     first = next(iter(runs.values()))
     for look, run in reversed(runs.items()):
         draw(speed, run["t"], run["y"], look, names[look])
-        draw(error, run["t"], run["r"] - run["y"], look)
-        draw(command, run["t"], run["u"], look)
+        draw(error, run["t"], run["r"] - run["y"], look, width=_FINE)
+        draw(command, run["t"], run["u"], look, width=_FINE)
     draw(speed, first["t"], first["r"], "reference", "reference")
     if magnified:
         _magnify(axes[1, 0], speed, runs)
