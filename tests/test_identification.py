@@ -241,3 +241,13 @@ def test_recordings_of_motors_are_identified(file: str, least: float) -> None:
     train, rest = read(DATA / file, inputs="u", output="y").split(0.6)
     v = validate(identify(train, model="oe"), rest)
     assert v.simulation.fit_percent > least
+
+
+@needs_data
+def test_the_network_keeps_its_head_where_the_drive_has_not_been() -> None:
+    # the drive coasts to a stop between these two parts, and in neither of them
+    whole = read(DATA / "bldc_cigan/bldc.csv", inputs="u", output="y")
+    train, coast = Dataset.concat([whole[0:2500], whole[3700:5000]]), whole[2500:3700]
+    linear = validate(identify(train, model="oe"), coast)
+    network = validate(identify(train, model="neural_oe", starts=2), coast)
+    assert network.simulation.rmse < 1.2 * linear.simulation.rmse
