@@ -10,6 +10,8 @@ type Point = [f64; DIMENSIONS];
 
 /// Members of the population.
 const MEMBERS: usize = 24;
+/// Members that mutants are drawn to: the best alone would draw all into the first good basin.
+const GOOD: usize = 4;
 /// Members that begin near the start; the others begin anywhere within the bounds.
 const NEAR: usize = 12;
 /// Spread of the members that begin near the start, in shares of the bounds.
@@ -174,9 +176,9 @@ impl Evolution {
             .collect()
     }
 
-    /// `x + F (best - x) + F (a - b)`, some coordinates of `x` kept.
+    /// `x + F (good - x) + F (a - b)`, some coordinates of `x` kept; `good` is one of the best few.
     fn mutant(&mut self, index: usize) -> Point {
-        let (x, best) = (self.members[index].point, self.best().point);
+        let (x, best) = (self.members[index].point, self.good().point);
         let (a, b) = (self.other().point, self.other().point);
         let scale = self.random.between(0.4, 0.9);
         let searched = self.bounds.searched();
@@ -196,6 +198,12 @@ impl Evolution {
             }
         }
         point
+    }
+
+    fn good(&mut self) -> Member {
+        let mut order: [usize; MEMBERS] = std::array::from_fn(|i| i);
+        order.sort_by(|&a, &b| self.members[a].cost.total_cmp(&self.members[b].cost));
+        self.members[order[(self.random.uniform() * GOOD as f64) as usize]]
     }
 
     fn other(&mut self) -> Member {
