@@ -29,8 +29,8 @@ const FEWEST: usize = 10;
 const SETTLED: f64 = 0.95;
 /// Points of the search in each direction.
 const GRID: usize = 21;
-/// Times that the search is narrowed about the best point, each time to a third.
-const ROUNDS: usize = 16;
+/// Times that the search is narrowed about the best point, each time to a half.
+const ROUNDS: usize = 26;
 
 /// Fits the response to the first step in a record with one input.
 ///
@@ -149,12 +149,15 @@ impl<'a> Step<'a> {
         let first = self.at + l.floor() as usize + 1;
         let decay = (-1.0 / t).exp();
         let mut left = (-(first as f64 - self.at as f64 - l) / t).exp();
+        // The sums of squares must not drown in a large level.
+        let from = self.y[0];
         let [mut p, mut pp, mut y, mut py, mut yy] = [0.0; 5];
         for (k, &value) in self.y.iter().enumerate() {
             let phi = if k < first { 0.0 } else { 1.0 - left };
             if k >= first {
                 left *= decay;
             }
+            let value = value - from;
             p += phi;
             pp += phi * phi;
             y += value;
@@ -173,7 +176,7 @@ impl<'a> Step<'a> {
         Candidate {
             t,
             l,
-            level,
+            level: from + level,
             rise,
             cost,
         }
@@ -209,7 +212,7 @@ fn at_share((low, high): (f64, f64), i: usize) -> f64 {
 }
 
 fn narrowed((low, high): (f64, f64), about: f64, least: f64) -> (f64, f64) {
-    let half = (high - low) / 6.0;
+    let half = (high - low) / 4.0;
     ((about - half).max(least), about + half)
 }
 
@@ -255,7 +258,7 @@ mod tests {
     }
 
     proptest! {
-        #![proptest_config(ProptestConfig::with_cases(24))]
+        #![proptest_config(ProptestConfig::with_cases(48))]
         #[test]
         fn recovers_an_exact_response(
             k in prop_oneof![1.0..1000.0, -1000.0..-1.0], t in 0.01..0.4, l in 0.0..0.2,
