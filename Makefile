@@ -10,6 +10,7 @@ export PYO3_PYTHON := $(BIN)/python
 export CARGO_TARGET_DIR := $(CURDIR)/target
 export PYTHONDONTWRITEBYTECODE := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export NO_MKDOCS_2_WARNING := 1
 ifneq ($(wildcard ../shared/data),)
 export SEWFAST_DATA ?= $(abspath ../shared/data)
 endif
