@@ -66,7 +66,7 @@ docs: $(DEV) ## the site, in site/index.html; works offline
 # the wheel comes from the source archive alone and is imported where only numpy is installed
 package: $(DEV) ## source archive -> wheel -> import in a clean environment
 	rm -rf target/package && mkdir -p target/package
-	$(BIN)/maturin sdist --quiet --out target/package
+	$(BIN)/maturin sdist --out target/package
 	tar -xzf target/package/sewfast-*.tar.gz -C target/package
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir target/package/wheels target/package/sewfast-*/
 	$(PYTHON) -m venv target/package/venv

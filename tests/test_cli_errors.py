@@ -265,35 +265,47 @@ def test_a_fault_is_one_line_and_exit_code_1(
     assert "Traceback" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="needs SIGINT")
+needs_sigint = pytest.mark.skipif(sys.platform == "win32", reason="needs SIGINT")
+
+
+@needs_sigint
 def test_ctrl_c_keeps_the_best_model(folder: Path) -> None:
     api.write_table(folder / "run.csv", recording(4000))
-    command = [*PROGRAM, *IDENTIFY, "--model", "neural-oe", "--hidden", "40", "--starts", "100000"]
-    process = subprocess.Popen(
-        command, cwd=folder, env=environment(), stderr=subprocess.PIPE, text=True
-    )
-    _wait_until_busy(process)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == cli.INTERRUPTED, err
+    settings = ("--model", "neural-oe", "--hidden", "40", "--starts", "100000")
+    err = _interrupted(folder, *IDENTIFY, *settings)
     assert "kept the best so far in m.json" in err
     assert api.load_model(folder / "m.json").kind in ("oe", "neural_oe")
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="needs SIGINT")
+@needs_sigint
 def test_ctrl_c_keeps_the_best_controller(folder: Path) -> None:
     t = 0.001 * np.arange(400_000)
     api.write_table(folder / "long.npz", {"t": t, "r": 1000.0 + 500.0 * np.sin(t)})
-    arguments = [*PROGRAM, "tune", "drive.json", "--reference", "long.npz", "-o", "new.json"]
-    process = subprocess.Popen(
-        arguments, cwd=folder, env=environment(), stderr=subprocess.PIPE, text=True
-    )
-    _wait_until_busy(process)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == cli.INTERRUPTED, err
+    err = _interrupted(folder, "tune", "drive.json", "--reference", "long.npz", "-o", "new.json")
     assert "kept the best so far in new.json" in err
     assert api.load_controller(folder / "new.json").u_max == 20.0
+
+
+def _interrupted(folder: Path, *arguments: str) -> str:
+    """Start a command, press Ctrl-C once the compiled work is under way; its messages."""
+    process = subprocess.Popen(
+        [*PROGRAM, *arguments],
+        cwd=folder,
+        env=environment(),
+        stderr=subprocess.PIPE,
+        text=True,
+        # a test run in the background is started with SIGINT ignored, and children inherit that
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    try:
+        _wait_until_busy(process)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=120)
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == cli.INTERRUPTED, err
+    return err
 
 
 def _wait_until_busy(process: subprocess.Popen[str]) -> None:

@@ -44,7 +44,7 @@ const RPM: f64 = 60.0 / TAU;
 /// for _ in 0..2000 {
 ///     machine.advance(3.0);
 /// }
-/// assert!((machine.speed_rpm() - 1200.0).abs() < 60.0);
+/// assert!((machine.speed_rpm() - 1310.0).abs() < 60.0);
 /// # Ok::<(), sewfast_core::Error>(())
 /// ```
 #[derive(Clone, Debug)]
