@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,10 @@ _BESIDE = ROOT.parent / "shared" / "data"
 
 if "SEWFAST_DATA" not in os.environ and _BESIDE.is_dir():
     os.environ["SEWFAST_DATA"] = str(_BESIDE)
+
+# a shell starts background jobs with SIGINT ignored, and so would the tests of Ctrl-C
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

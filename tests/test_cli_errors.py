@@ -294,8 +294,6 @@ def _interrupted(folder: Path, *arguments: str) -> str:
         env=environment(),
         stderr=subprocess.PIPE,
         text=True,
-        # a test run in the background is started with SIGINT ignored, and children inherit that
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
         _wait_until_busy(process)
