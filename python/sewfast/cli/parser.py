@@ -18,7 +18,8 @@ each command explains itself: sewfast COMMAND --help
 
 a first walk, on the virtual sewing machine:
   sewfast record --on virtual --signal chirp_lo_hi -o chirp.csv
-  sewfast identify chirp.csv --input u --output y -o drive.json
+  sewfast record --on virtual --signal saturating -o pulses.csv
+  sewfast identify chirp.csv pulses.csv --input u --output y -o drive.json
   sewfast record --on virtual --signal random -o random.csv
   sewfast validate drive.json random.csv
   sewfast tune drive.json -o controller.json
