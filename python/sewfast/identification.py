@@ -22,7 +22,8 @@ _RECIPES: dict[str, Callable[[Task], Model]] = {
     "neural_oe": recipes.neural_oe,
     "paper": recipes.paper,
 }
-_STARTS = 4
+_STARTS = {"paper": 8}
+_USUAL_STARTS = 4
 
 
 def identify(
@@ -34,7 +35,7 @@ def identify(
     nb: int = 2,
     nk: int = 1,
     hidden: int = 8,
-    starts: int = _STARTS,
+    starts: int | None = None,
     seed: int = 0,
     iterations: int = 100,
     validation: Dataset | None = None,
@@ -57,8 +58,9 @@ def identify(
         Past outputs, past inputs and delay [samples] in the regressor.
     hidden : int
         Hidden units of the network.
-    starts : int
-        Random starts of the network's training; the best one is kept.
+    starts : int or None
+        Random starts of the network's training; the best one is kept. None: 4, for the preset
+        `paper`, which has no linear model to start from, 8.
     seed : int
         Of the starts. A seed gives the same model at any number of threads.
     iterations : int
@@ -97,6 +99,7 @@ def identify(
         raise SettingError(f"model: expected auto, arx, oe or neural-oe, received {model!r}")
     if preset is not None:
         kind = _preset(preset, kind, (na, nb, nk, hidden))
+    starts = _STARTS.get(kind, _USUAL_STARTS) if starts is None else starts
     threads = _cores() if threads is None else threads
     task = Task(data, validation, na, nb, nk, hidden, starts, seed, iterations, threads, progress)
     _require_settings(task)

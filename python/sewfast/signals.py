@@ -168,6 +168,9 @@ def _saturating_2(seed: int) -> FloatArray:
     )
 
 
+_SLOW_RPM = 400.0
+"""Speed between the trapezoids of the training reference."""
+
 #: Height [RPM], rise, hold, fall and pause after it [s] of the reference `trapezoids`.
 _TRAPEZOIDS = (
     (1500.0, 0.25, 0.40, 0.25, 0.3),
@@ -180,7 +183,9 @@ _TRAPEZOIDS = (
 )
 
 
-def _trapezoid(height: float, rise: float, hold: float, fall: float, after: float) -> FloatArray:
+def _trapezoid(
+    height: float, rise: float, hold: float, fall: float, after: float, low: float = 0.0
+) -> FloatArray:
     start = 0.1
     return _core.trapezoid(
         duration=start + rise + hold + fall + after,
@@ -189,13 +194,15 @@ def _trapezoid(height: float, rise: float, hold: float, fall: float, after: floa
         rise=rise,
         hold=hold,
         fall=fall,
-        low=0.0,
+        low=low,
         high=height,
     )
 
 
 def _trapezoids(seed: int) -> FloatArray:
-    return np.concatenate([_trapezoid(*shape) for shape in _TRAPEZOIDS])
+    # Down to a slow run, not to rest: a crank that friction holds tells a model nothing of the drive.
+    rise = np.linspace(0.0, _SLOW_RPM, round(0.1 / TS))
+    return np.concatenate([rise, *(_trapezoid(*shape, low=_SLOW_RPM) for shape in _TRAPEZOIDS)])
 
 
 def _table(*signals: Signal) -> Mapping[str, Signal]:
@@ -288,8 +295,8 @@ REFERENCES = _table(
     ),
     _reference(
         "trapezoids",
-        sum(0.1 + sum(shape[1:]) for shape in _TRAPEZOIDS),
-        "seven trapezoids of 700 to 3,500 RPM, rises of 150 to 400 ms; for a training recording",
+        0.1 + sum(0.1 + sum(shape[1:]) for shape in _TRAPEZOIDS),
+        "seven trapezoids from 400 to 700-3,500 RPM, rises of 150 to 400 ms; to train on",
         _trapezoids,
     ),
 )

@@ -80,7 +80,9 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--nb", type=int, default=2, metavar="N", help="past inputs (2)")
     parser.add_argument("--nk", type=int, default=1, metavar="N", help="delay [samples] (1)")
     parser.add_argument("--hidden", type=int, default=8, metavar="N", help="hidden units (8)")
-    parser.add_argument("--starts", type=int, default=4, metavar="N", help="random starts (4)")
+    parser.add_argument(
+        "--starts", type=int, metavar="N", help="random starts (4; preset paper: 8)"
+    )
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="seed of the starts (0)"
     )  # fmt: skip

@@ -7,6 +7,7 @@ mod problem;
 mod scaling;
 mod tanh;
 mod train;
+mod warm;
 
 pub use network::{Network, Shape};
 pub use scaling::Scaling;

@@ -7,7 +7,7 @@ use std::thread;
 use super::network::{Network, Shape};
 use super::problem::{Experiment, FreeRun};
 use super::scaling::Scaling;
-use super::{NeuralOE, draw, guard};
+use super::{NeuralOE, draw, guard, warm};
 use crate::lagged::{Lagged, push_past};
 use crate::linear::LinearModel;
 use crate::lm::{self, Damping, Outcome, Termination};
@@ -262,7 +262,7 @@ impl<'a> Training<'a> {
         for dead in 0..MOST_DRAWS {
             let theta = match &self.linear {
                 Some(bypass) => draw::beside(bypass, self.shape, random),
-                None => draw::small(self.shape, random),
+                None => self.warm(draw::small(self.shape, random)),
             };
             let theta = problem.start(&theta);
             let runs = lm::Problem::cost(problem, &theta).is_some();
@@ -274,6 +274,17 @@ impl<'a> Training<'a> {
             }
         }
         None
+    }
+
+    /// The draw with an output layer that predicts one step ahead.
+    fn warm(&self, mut theta: Vec<f64>) -> Vec<f64> {
+        let mut network = Network::zero(self.shape, self.limits);
+        network.load(&theta);
+        let [_, second, _, _] = self.shape.offsets();
+        if let Some(output) = warm::output_layer(&network, &self.experiments) {
+            theta[second..second + output.len()].copy_from_slice(&output);
+        }
+        theta
     }
 
     fn train(&self, problem: &mut FreeRun, theta: Vec<f64>) -> Option<Trained> {
