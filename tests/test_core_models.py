@@ -270,7 +270,7 @@ def test_two_inputs_and_long_delays_are_learnt() -> None:
     y = np.zeros(1500)
     for k in range(3, 1500):
         y[k] = 0.8 * y[k - 1] + np.tanh(u[k - 3, 0]) + 0.3 * u[k - 3, 1] ** 2
-    fit = _fit([(u, y)], [], na=1, nb=1, nk=3, hidden=6, max_iterations=150, starts=8)
+    fit = _fit([(u, y)], [], na=1, nb=1, nk=3, hidden=8, max_iterations=150, starts=4)
     run = fit.model.simulate(u, fit.initial_states[0])
     assert _rms(run - y) < 0.05 * np.std(y)
 

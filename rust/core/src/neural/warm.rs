@@ -54,7 +54,7 @@ mod tests {
     use super::super::train::InitialState;
     use super::*;
     use crate::Record;
-    use crate::lagged::Lags;
+    use crate::lagged::{Lagged, Lags};
     use crate::random::Random;
 
     #[test]
