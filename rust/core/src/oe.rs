@@ -15,6 +15,8 @@ use crate::{Error, Monitor, Record, Result, arx};
 const REFINED: usize = 8;
 /// Candidates looked at for their restarts.
 const RESTARTED: usize = 40;
+/// Restart errors within this ratio say nothing about which model is the better one; the cost does.
+const ABOUT_AS_WELL: f64 = 1.05;
 /// Iterations after which the refined candidates are compared and the best one goes on alone.
 const HEAT: usize = 30;
 
@@ -40,8 +42,9 @@ pub struct LinearFit {
 /// Least squares is biased by measurement noise, so its model is one candidate among others: instrumental-variable
 /// iterations (SRIV, Young 1976; Steiglitz and McBride 1965) and fixed sets of real and complex poles over the whole
 /// range of time constants, each with its best numerator. The best free runs are refined; steps that would move a pole
-/// out of the unit circle are rejected (Schur-Cohn test), so every accepted step is stable. Of the refined models the
-/// one is chosen that runs on best when started anew from a few samples ([`restart_error`]).
+/// out of the unit circle are rejected (Schur-Cohn test), so every accepted step is stable. Of the refined models that
+/// run on about as well as the best when started anew from a few samples ([`restart_error`]) the one with the lowest
+/// cost is chosen.
 ///
 /// ```
 /// use sewfast_core::lagged::Lagged;
@@ -118,13 +121,16 @@ fn promising(
     first.iter().chain(others).take(REFINED).cloned().collect()
 }
 
-/// The outcome that restarts best; among equals the one with the lowest cost.
+/// The outcome with the lowest cost among those that restart about as well as the best one.
 fn chosen(problem: &OutputError, records: &[Record], outcomes: Vec<Outcome>) -> Option<Outcome> {
-    let key = |o: Outcome| (restarted(problem, records, &o.theta), o);
-    let order = |x: &(f64, Outcome), y: &(f64, Outcome)| {
-        x.0.total_cmp(&y.0).then(x.1.cost.total_cmp(&y.1.cost))
-    };
-    outcomes.into_iter().map(key).min_by(order).map(|(_, o)| o)
+    let ranked: Vec<(f64, Outcome)> = outcomes
+        .into_iter()
+        .map(|o| (restarted(problem, records, &o.theta), o))
+        .collect();
+    let least = ranked.iter().map(|r| r.0).fold(f64::INFINITY, f64::min);
+    let good = ranked.into_iter().filter(|r| r.0 <= ABOUT_AS_WELL * least);
+    good.map(|(_, outcome)| outcome)
+        .min_by(|x, y| x.cost.total_cmp(&y.cost))
 }
 
 fn restarted(problem: &OutputError, records: &[Record], theta: &[f64]) -> f64 {
