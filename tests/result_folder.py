@@ -96,6 +96,7 @@ def results() -> dict[str, object]:
     }
     identification["paper"] |= {
         "cost": 1.2e-4, "cost_floor": 8e-5, "cost_true": 5e-5, "cost_one_step": 9e-7,
+        "cost_ideal": 4e-5,
         "iterations": 100,
     }  # fmt: skip
     loop = {

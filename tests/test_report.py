@@ -141,6 +141,7 @@ def test_figures_fit_on_a_printed_page(page: str) -> None:
     [
         ("speed.kalman.rmse_rpm", 1.3, "within 1 RPM"),
         ("identification.paper.cost", 1.6e-4, "encoder's floor"),
+        ("identification.paper.cost_ideal", 1.1e-4, "without encoder steps"),
         ("identification.oe.random.simulation.fit_percent", 94.0, "95 %"),
         ("identification.neural_oe.random.simulation.rmse_rpm", 18.5, "no worse"),
         ("identification.oe_all.random.simulation.rmse_rpm", 5.9, "no worse"),

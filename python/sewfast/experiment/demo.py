@@ -108,6 +108,7 @@ def run_demo(
 
     clock.enter("paper's network")
     models = {"paper": identified.paper(recorded, seed)}
+    ideal = identified.ideal_cost(plant, seed)
 
     clock.enter("linear models")
     models["arx_raw"] = identified.arx_raw(recorded)
@@ -135,15 +136,17 @@ def run_demo(
 
     clock.enter("writing")
     controllers = {"paper": paper_controller(), "coarse": coarse, "tuned": tuning.controller}
+    identification = identified.identification_numbers(
+        models, scored, speed["difference"]["cost_floor"]
+    )
+    identification["paper"]["cost_ideal"] = ideal
     results = {
         "sewfast": __version__,
         "machine": plant.name,
         "seed": seed,
         "counts_per_rev": plant.counts_per_rev,
         "speed": speed,
-        "identification": identified.identification_numbers(
-            models, scored, speed["difference"]["cost_floor"]
-        ),
+        "identification": identification,
         **_controller_numbers(fopdt, controllers, tuning),
         "control": loops.control_numbers(runs),
         "paper_gains": loops.paper_numbers(paper_runs) | {"readings": loops.readings()},

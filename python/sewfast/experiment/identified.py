@@ -9,9 +9,11 @@ import numpy as np
 
 from ..dataset import Dataset
 from ..identification import identify
+from ..machine import VirtualMachine
 from ..models import Model
-from ..recording import Recording
+from ..recording import Recording, record
 from ..report.artefacts import SCORED, record_of
+from ..signals import excitation
 from ..validation import Validation, validate
 
 PAPER_RECORDS = ("chirp_lo_hi",)
@@ -27,6 +29,18 @@ def paper(recordings: Mapping[str, Recording], seed: int) -> Model:
     lo_hi = recordings["chirp_lo_hi"]
     data = lo_hi.dataset(lo_hi.speed("difference"))
     return identify(data, model="neural_oe", preset="paper", seed=seed)
+
+
+def ideal_cost(machine: VirtualMachine, seed: int) -> float:
+    """J of the paper's network in free run on Lo-Hi, on a machine without encoder and turn.
+
+    Exact position instead of counts, and load, inertia and torque at their means over the turn.
+    """
+    parameters = machine.parameters | {"angle_dependence": 0.0, "quantisation": 0.0}
+    ideal = VirtualMachine(parameters=parameters)
+    lo_hi = record(ideal, excitation("chirp_lo_hi", seed), name="ideal", method="difference")
+    model = identify(lo_hi.dataset(), model="neural_oe", preset="paper", seed=seed)
+    return float(model.training["cost"])
 
 
 def arx_raw(recordings: Mapping[str, Recording]) -> Model:
@@ -64,10 +78,10 @@ def predictions(
     """Per scored record the series of every model, as the report draws them."""
     columns: dict[str, dict[str, Any]] = {r: {} for r in SCORED}
     for model, by_record in scored.items():
-        for record, validation in by_record.items():
+        for name, validation in by_record.items():
             series = validation.experiments[0]
-            columns[record][f"{model}_simulation"] = series.simulated
-            columns[record][f"{model}_one_step"] = series.one_step
+            columns[name][f"{model}_simulation"] = series.simulated
+            columns[name][f"{model}_one_step"] = series.one_step
     return columns
 
 

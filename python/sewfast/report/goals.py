@@ -37,6 +37,7 @@ def goals(artefacts: Artefacts) -> tuple[Goal, ...]:
     """Every goal, judged."""
     return (
         _speed(artefacts),
+        _ideal(artefacts),
         _cost(artefacts),
         _linear(artefacts),
         _no_worse(artefacts),
@@ -64,6 +65,16 @@ def _speed(a: Artefacts) -> Goal:
         "Speed estimated from encoder counts within 1 RPM rms of the truth on the Lo-Hi chirp",
         rpm(error),
         _at_most(error, 1.0),
+    )
+
+
+def _ideal(a: Artefacts) -> Goal:
+    cost = a.number("identification.paper.cost_ideal")
+    return Goal(
+        "The paper's network on a machine without encoder steps and without dependence on the "
+        "crank angle: free-run cost J of 1e-4 at most",
+        f"J = {significant(cost)}",
+        _at_most(cost, 1e-4),
     )
 
 

@@ -16,7 +16,7 @@ RECORD = {
     "chirp_lo_hi": "chirp Lo-Hi",
     "chirp_hi_lo": "chirp Hi-Lo",
     "random": "random",
-    "saturating": "saturating, second",
+    "saturating": "saturating",
 }
 
 REFERENCE = {

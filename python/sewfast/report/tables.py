@@ -31,18 +31,19 @@ def _scores(artefacts: Artefacts, kind: str, caption: str) -> Table:
         for m in MODELS
         for r in SCORED
     }
+    told = kind == "simulation"
     rows = []
     best = set()
     for i, m in enumerate(MODELS):
-        cells = [labels.MODEL[m], _trained_on(artefacts, m)]
+        cells = [labels.MODEL[m], *([_trained_on(artefacts, m)] if told else [])]
         for j, r in enumerate(SCORED):
             fit = artefacts.number(f"identification.{m}.{r}.{kind}.fit_percent")
             cells.append(f"{significant(found[m, r])}\N{NO-BREAK SPACE}({percent(fit, 1)})")
             known = [x for n in MODELS if (x := found[n, r]) is not None]
             if found[m, r] is not None and found[m, r] == min(known):
-                best.add((i, j + 2))
+                best.add((i, j + 1 + told))
         rows.append(tuple(cells))
-    header = ("model", "trained on", *(labels.RECORD[r] for r in SCORED))
+    header = ("model", *(["trained on"] if told else []), *(labels.RECORD[r] for r in SCORED))
     return Table(caption, header, tuple(rows), frozenset(best))
 
 

@@ -41,12 +41,12 @@ def paper_gain_pictures(artefacts: Artefacts) -> list[Picture]:
     """Fig. C and D: the paper's gains on the plant of its Eq. 8 and on the virtual machine."""
     return [
         _paper_gains(
-            artefacts, "C", "eq8", "model", "on the plant of Eq. 8",
+            artefacts, "C", "eq8", "on the plant of Eq. 8",
             "Speed fed back without an encoder, command limited to ±10 V, integral stopped while "
             "limited. The command switches from limit to limit: the loop leans on the limit.",
         ),
         _paper_gains(
-            artefacts, "D", "machine", "machine", "on the virtual machine",
+            artefacts, "D", "machine", "on the virtual machine",
             "Encoder counts differenced as in the paper, command limited to ±10 V. One count in a "
             "sample is 38 RPM, which Kd = 0.5 V/RPM turns into 19 V.",
         ),
@@ -71,13 +71,13 @@ def _tuned(artefacts: Artefacts, number: str, reference: str) -> Picture:
 
 
 def _paper_gains(
-    artefacts: Artefacts, number: str, plant: str, look: str, where: str, caption: str
+    artefacts: Artefacts, number: str, plant: str, where: str, caption: str
 ) -> Picture:
     title = f"The paper's gains {where}"
     key = f"fig-{number.lower()}"
     alt = f"{title}: reference and speed, tracking error and command over time"
-    runs = {look: artefacts.runs["paper_gains", plant]}
-    figure = _loop_figure(runs, {look: where}, magnified=True)
+    runs = {"measured": artefacts.runs["paper_gains", plant]}
+    figure = _loop_figure(runs, {"measured": where}, magnified=True)
     numbers = _numbers(artefacts, {where: f"paper_gains.{plant}"}, with_step=True)
     return Picture(key, f"Fig. {number}", title, alt, caption, svg(figure, key, alt), numbers)
 
