@@ -48,4 +48,4 @@ def test_work_loads_no_extra() -> None:
 
 def test_help_loads_no_arithmetic() -> None:
     loaded = _loaded_by("from sewfast.cli.parser import build_parser\nbuild_parser()")
-    assert not loaded & {"scipy", "matplotlib", "sewfast._core"}
+    assert not loaded & {"numpy", "scipy", "matplotlib", "sewfast._core"}

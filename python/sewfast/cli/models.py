@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from .arguments import TABLES, Commands, add_columns, add_command, add_output, require_place
 from .data import read_for_model
 from .output import print_json, write_columns
@@ -114,6 +112,8 @@ def simulate_command(args: argparse.Namespace) -> None:
 
 def _time(table: Table, data: Dataset) -> FloatArray:
     """The recording's own time where it is in seconds, else counted from 0."""
+    import numpy as np
+
     for name in table.names:
         if name.lower() in ("t", "time") and table.unit(name) in ("", "s"):
             return table[name]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 
-import numpy as np
-
 from .arguments import TABLES, Commands, add_command, add_output, require_place
 from .output import print_json, print_rows, write_columns
 
@@ -49,6 +47,8 @@ def add(commands: Commands) -> None:
 
 
 def record_command(args: argparse.Namespace) -> None:
+    import numpy as np
+
     from ..machine import VirtualMachine
     from ..signals import excitation
     from ..speed import speed_from_counts
