@@ -60,7 +60,7 @@ impl LinearModel {
         self.offset
     }
 
-    /// The poles: roots of `z^na + a_1 z^(na-1) + .. + a_na`.
+    /// The poles: roots of `z^na + a_1 z^(na-1) + .. + a_na`; NaN where they overflow.
     pub fn poles(&self) -> Vec<Complex<f64>> {
         poles(&self.a)
     }
@@ -104,14 +104,18 @@ impl Lagged for LinearModel {
     }
 }
 
-/// Roots of `z^n + a_1 z^(n-1) + .. + a_n`, the eigenvalues of its companion matrix.
+/// Roots of `z^n + a_1 z^(n-1) + .. + a_n`, the eigenvalues of its companion matrix; NaN where they overflow.
 pub(crate) fn poles(a: &[f64]) -> Vec<Complex<f64>> {
     let n = a.len();
     let companion = DMatrix::from_fn(n, n, |row, column| match (row, column) {
         (0, j) => -a[j],
         (i, j) => f64::from(u8::from(i == j + 1)),
     });
-    companion.complex_eigenvalues().iter().copied().collect()
+    // without a limit the QR iteration never ends on coefficients whose squares overflow
+    companion.try_schur(f64::EPSILON, 200 * n.max(1)).map_or_else(
+        || vec![Complex::new(f64::NAN, f64::NAN); n],
+        |schur| schur.complex_eigenvalues().iter().copied().collect(),
+    )
 }
 
 /// Coefficients `a` of the polynomial with these roots, which come in conjugate pairs.
@@ -224,6 +228,13 @@ mod tests {
                 .unwrap()
                 .is_stable()
         );
+    }
+
+    #[test]
+    fn ends_on_poles_that_overflow() {
+        let model = LinearModel::new(vec![1e300, -1e300, 1e300], vec![1.0], 1, 1, 0.0).unwrap();
+        assert_eq!(model.poles().len(), 3);
+        assert!(!model.is_stable());
     }
 
     #[test]
