@@ -164,6 +164,11 @@ def test_each_verdict_follows_from_its_number(
     assert missed[0].verdict == "not reached"
 
 
+def test_the_summary_shows_the_network_beside_both_linear_models(page: str) -> None:
+    summary = page.split('id="summary"')[1].split("</dl>")[0]
+    assert all(value in summary for value in (">6.00", ">18.0", ">20.0"))
+
+
 def test_an_undefined_number_is_no_success(folder: Path) -> None:
     document = json.loads((folder / "results.json").read_text())
     document["control"]["trapezoid"]["machine"]["rise_time_ms"] = None
