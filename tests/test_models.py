@@ -2,6 +2,7 @@
 
 import copy
 import json
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -277,3 +278,27 @@ def test_values_that_are_not_finite_are_never_written(tmp_path: Path) -> None:
     with pytest.raises(ModelFileError, match=r"m.json"):
         exact(training={"cost": float("nan")}).save(tmp_path / "m.json")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("made", [exact, network])
+def test_models_can_be_copied_and_sent_to_other_processes(made: Any) -> None:
+    model = made(training={"samples": 3}, counts=("counts", 1572.0))
+    data = linear_data()
+    for twin in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model), copy.copy(model)):
+        assert type(twin) is type(model)
+        assert twin.to_dict() == model.to_dict()
+        assert np.array_equal(twin.simulate(data)[0], model.simulate(data)[0])
+
+
+@pytest.mark.parametrize("wrong", [None, "data.csv", np.ones((50, 1))])
+def test_what_is_no_data_set_is_refused_with_the_way_to_make_one(wrong: Any) -> None:
+    for use in (exact().simulate, exact().predict, exact().validate, identify):
+        with pytest.raises(DataError, match=r"expected a Dataset.*from_arrays"):
+            use(wrong)
+
+
+@pytest.mark.parametrize("init", [2.5, -1, True, "20", None])
+def test_an_init_that_is_no_count_is_refused(init: Any) -> None:
+    for use in (exact().simulate, exact().validate):
+        with pytest.raises(SettingError, match="init: expected a whole number"):
+            use(linear_data(), init=init)

@@ -31,6 +31,13 @@ def drive(T1: float = 0.252, T2: float = 0.0074, gain: float = 490.0) -> LinearO
 SHORT = signals.reference("trapezoid")[:900]
 
 
+def test_a_model_with_two_inputs_is_refused_by_name() -> None:
+    core = _core.LinearModel(np.array([-0.9]), np.array([[0.1], [0.2]]), 1, 0.0)
+    two = LinearOE(core, 0.001, ("u", "load"), "y", ("V", "N m"), "RPM")
+    with pytest.raises(SettingError, match=r"one input.*got 2"):
+        tune(two, [SHORT])
+
+
 def test_starts_from_the_models_own_step_response() -> None:
     first = first_controller(drive())
     assert first.gains.Kp == pytest.approx(12.5 / 490, rel=0.05)

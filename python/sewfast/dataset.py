@@ -32,6 +32,15 @@ def _as_float(values: ArrayLike, what: str) -> FloatArray:
     return array
 
 
+def require_dataset(data: object, what: str) -> None:
+    """A `Dataset`, or a `DataError` that says how to make one."""
+    if not isinstance(data, Dataset):
+        raise DataError(
+            f"{what}: expected a Dataset, received {type(data).__name__}; make one with "
+            "sewfast.read or Dataset.from_arrays"
+        )
+
+
 def _as_column(values: ArrayLike, what: str, n: int | None = None) -> FloatArray:
     array = _as_float(values, what)
     if array.ndim != 1:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Literal, TypeAlias
 
 from . import recipes
-from .dataset import Dataset
+from .dataset import Dataset, require_dataset
 from .errors import DataError, SettingError
 from .models import Model
 from .models.base import INIT
@@ -135,12 +135,14 @@ def _require_settings(task: Task) -> None:
 
 
 def _require_data(task: Task, kind: str) -> None:
+    require_dataset(task.data, "data")
     task.data.require_complete()
     task.data.require_excited()
     _require_enough(task, kind)
     if kind == "paper" and task.data.n_inputs != 1:
         raise DataError(f"preset 'paper' has one input, the data have {task.data.n_inputs}")
     if task.validation is not None:
+        require_dataset(task.validation, "validation")
         task.validation.require_complete()
         Dataset.concat([task.data, task.validation])
         _require_longer(task.validation, INIT)

@@ -231,6 +231,11 @@ def first_controller(
 
 def _step_fit(model: Model, u_max: float) -> Fopdt:
     """The model's step response, at the first size and length at which it settles."""
+    if len(model.input_names) != 1:
+        raise SettingError(
+            f"expected a model with one input to tune on, got {len(model.input_names)}; identify "
+            "it from the command alone"
+        )
     reason: Exception | None = None
     for share in _STEP_SHARES:
         for samples in _STEP_SAMPLES:

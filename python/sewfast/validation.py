@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from .dataset import Dataset, Experiment, FloatArray
+from .dataset import Dataset, Experiment, FloatArray, require_dataset
 from .errors import DataError
-from .models.base import INIT, Model
+from .models.base import INIT, Model, require_init
 
 
 @dataclass(frozen=True)
@@ -184,6 +184,8 @@ def validate(
     FitError
         Where the model is unstable on this input.
     """
+    require_dataset(data, "data")
+    require_init(init)
     data.require_complete()
     for e in data.experiments:
         if len(e) <= init:

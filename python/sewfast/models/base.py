@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import numpy as np
 
 from .. import jsonfile
-from ..dataset import Dataset, Experiment, FloatArray, labelled, require_same_units
+from ..dataset import (
+    Dataset,
+    Experiment,
+    FloatArray,
+    labelled,
+    require_dataset,
+    require_same_units,
+)
 from ..errors import DataError, SettingError
 
 if TYPE_CHECKING:
@@ -21,6 +28,13 @@ FORMAT = "sewfast.model"
 VERSION = 1
 INIT = 20
 """Samples that set the initial state, unless told otherwise."""
+
+
+def require_init(init: int) -> None:
+    """A whole number of samples, or a `SettingError`."""
+    whole = isinstance(init, (int, np.integer)) and not isinstance(init, bool)
+    if not whole or init < 0:
+        raise SettingError(f"init: expected a whole number of 0 or more, received {init!r}")
 
 
 class Core(Protocol):
@@ -159,8 +173,7 @@ class Model(ABC):
 
     def initial_state(self, experiment: Experiment, init: int) -> FloatArray:
         """Past outputs y(-1), y(-2), .. of an experiment, from its first `init` samples."""
-        if init < 0:
-            raise SettingError(f"init: expected 0 or more samples, received {init}")
+        require_init(init)
         if init == 0:
             return np.zeros(self.core.na)
         if init > len(experiment):
@@ -179,6 +192,7 @@ class Model(ABC):
         return past
 
     def _require_match(self, data: Dataset) -> None:
+        require_dataset(data, "data")
         if data.n_inputs != len(self.input_names):
             raise DataError(
                 f"{data.source}: expected {len(self.input_names)} inputs "
@@ -214,6 +228,12 @@ class Model(ABC):
             Where the file cannot be written.
         """
         jsonfile.write(path, FORMAT, VERSION, self.to_dict())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # the compiled model is made again from its numbers, as when a file is read
+        from .files import from_dict
+
+        return from_dict, (self.to_dict(),)
 
     def __repr__(self) -> str:
         orders = ", ".join(f"{k}={v}" for k, v in self.orders.items())

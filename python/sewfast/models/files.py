@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
 from .. import jsonfile
 from ..errors import ModelFileError, SewfastError
@@ -35,7 +36,15 @@ def load_model(path: str | os.PathLike[str]) -> Model:
         Where the file is missing, damaged, of another format, or of an unknown version or kind;
         the message names the file and the field.
     """
-    fields = Fields(os.fspath(path), jsonfile.read(path, FORMAT, (VERSION,)))
+    return _read(Fields(os.fspath(path), jsonfile.read(path, FORMAT, (VERSION,))))
+
+
+def from_dict(values: dict[str, Any]) -> Model:
+    """The model that `Model.to_dict` gave these values."""
+    return _read(Fields("model", {"version": VERSION} | values))
+
+
+def _read(fields: Fields) -> Model:
     fields.require_only(_FIELDS)
     kind = fields.text("kind")
     if kind not in _KINDS:
