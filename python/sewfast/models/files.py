@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from typing import Any
 
 from .. import jsonfile
@@ -66,8 +67,21 @@ def _model(fields: Fields, cls: type[ARX] | type[LinearOE] | type[NeuralOE]) -> 
         tuple(i.text("unit") for i in inputs),
         output.text("unit"),
         _counts(fields),
-        fields.object("training").values,
+        _training(fields.object("training"), len(inputs)),
     )
+
+
+def _training(training: Fields, inputs: int) -> Mapping[str, Any]:
+    """What is read back later must have its form; the rest is the trainer's own record."""
+    known = training.values
+    if "input_range" in known and training.matrix("input_range").shape != (inputs, 2):
+        raise training.refuse("input_range", f"{inputs} pairs of numbers", known["input_range"])
+    if "data" in known:
+        for source in training.objects("data"):
+            source.text("name")
+    if "notes" in known:
+        training.items("notes")
+    return known
 
 
 def _core(parameters: Fields, cls: type[ARX] | type[LinearOE] | type[NeuralOE]) -> object:
