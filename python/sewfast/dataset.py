@@ -351,13 +351,13 @@ class Dataset:
     def require_excited(self) -> None:
         """Raise `DataError` where an input or the output never moves: nothing to identify from."""
         for i, name in enumerate(self.input_names):
-            if all(np.ptp(e.u[:, i]) == 0.0 for e in self.experiments):
+            if all(np.min(e.u[:, i]) == np.max(e.u[:, i]) for e in self.experiments):
                 raise DataError(
                     f"{self.source}: input {name!r} is constant at "
                     f"{self.experiments[0].u[0, i]:g}; expected an input that moves; "
                     "record with an excitation (`sewfast signals`)"
                 )
-        if all(np.ptp(e.y) == 0.0 for e in self.experiments):
+        if all(np.min(e.y) == np.max(e.y) for e in self.experiments):
             raise DataError(
                 f"{self.source}: output {self.output_name!r} is constant at "
                 f"{self.experiments[0].y[0]:g}; expected an output that follows the input; check "
