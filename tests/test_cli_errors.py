@@ -207,6 +207,39 @@ def test_unstable_model(folder: Path) -> None:
     assert "unstable" in refused(folder, "simulate", "drive.json", "run.csv", "-o", "p.csv")
 
 
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("input_range", None), ("input_range", [[1]]), ("input_range", 3), ("data", 1), ("notes", 1)],
+)
+def test_damaged_training_record(folder: Path, field: str, value: object) -> None:
+    document = json.loads((folder / "drive.json").read_text())
+    document["training"][field] = value
+    (folder / "drive.json").write_text(json.dumps(document))
+    assert field in refused(folder, "validate", "drive.json", "run.csv")
+
+
+def test_init_that_is_no_number(folder: Path) -> None:
+    message = refused(folder, "validate", "drive.json", "run.csv", "--init", "x")
+    assert "expected a whole number of samples, 0 or more, received 'x'" in message
+
+
+def test_values_whose_span_overflows(folder: Path) -> None:
+    spoil(folder, y=np.where(np.arange(400) % 2, 1e308, -1e308))
+    assert "expected" in refused(folder, *IDENTIFY, "--model", "oe")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_standard_output_on_a_full_disk(folder: Path) -> None:
+    with open("/dev/full", "w") as full:
+        found = subprocess.run(
+            [*PROGRAM, "validate", "drive.json", "run.csv", "--json"],
+            cwd=folder, env=environment(), stdout=full, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+    assert found.returncode == 2
+    assert "free some space" in found.stderr
+    assert "fault" not in found.stderr
+
+
 @pytest.mark.parametrize("on", ["virtual:x", "virtual:-1", "nil.json", "real"])
 def test_unknown_plant(folder: Path, on: str) -> None:
     message = refused(folder, "run", "c.json", "--on", on, "--reference", "step.csv")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+import errno
 import os
 import sys
 import traceback
@@ -39,14 +41,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         # the reader of the pipe has seen enough; the interpreter must not flush into it again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
-    except Exception as e:
-        if args.debug:
-            traceback.print_exc()
+    except OSError as e:
+        if e.errno not in (errno.ENOSPC, errno.EDQUOT):
+            return _fault(args, e)
+        # what is still buffered must not raise again when the interpreter flushes it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _say(
-            f"sewfast {args.name}: a fault in sewfast: {type(e).__name__}: {e}; please report it "
-            "with the output of the same command and --debug",
-            FAULT,
+            f"sewfast {args.name}: expected room for the output, received "
+            f"{e.strerror!r}; free some space or write elsewhere",
+            REFUSED,
         )
+    except Exception as e:
+        return _fault(args, e)
+
+
+def _fault(args: argparse.Namespace, e: Exception) -> int:
+    if args.debug:
+        traceback.print_exc()
+    return _say(
+        f"sewfast {args.name}: a fault in sewfast: {type(e).__name__}: {e}; please report it "
+        "with the output of the same command and --debug",
+        FAULT,
+    )
 
 
 def _say(message: str, code: int) -> int:

@@ -70,9 +70,14 @@ def _add_model_and_data(parser: argparse.ArgumentParser) -> None:
 
 
 def _whole(text: str) -> int:
-    value = int(text)
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
     if value < 0:
-        raise argparse.ArgumentTypeError(f"expected 0 samples or more, received {value}")
+        raise argparse.ArgumentTypeError(
+            f"expected a whole number of samples, 0 or more, received {text!r}"
+        )
     return value
 
 
