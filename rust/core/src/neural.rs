@@ -4,6 +4,7 @@ mod draw;
 mod guard;
 mod network;
 mod problem;
+mod referee;
 mod scaling;
 mod tanh;
 mod train;

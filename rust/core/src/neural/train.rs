@@ -6,9 +6,10 @@ use std::thread;
 
 use super::network::{Network, Shape};
 use super::problem::{Experiment, FreeRun};
+use super::referee::Referee;
 use super::scaling::Scaling;
 use super::{NeuralOE, draw, guard, warm};
-use crate::lagged::{Lagged, push_past};
+use crate::lagged::Lagged;
 use crate::linear::LinearModel;
 use crate::lm::{self, Damping, Outcome, Termination};
 use crate::random::Random;
@@ -86,8 +87,6 @@ pub struct NeuralFit {
     pub initial_states: Vec<Vec<f64>>,
 }
 
-/// Validation samples from which an unknown initial state is estimated.
-const STATE_SAMPLES: usize = 20;
 /// First damping, the best of .01, .1 and 1 by training cost on one simulated drive: of 12 random starts 9, 10 and 11
 /// ended within 1.3 of the noise floor there. On other drives expect two of three.
 const FIRST_MU: f64 = 1.0;
@@ -124,14 +123,14 @@ pub fn fit(
 }
 
 /// All that the starts share.
-struct Training<'a> {
-    settings: &'a Settings,
+pub(super) struct Training<'a> {
+    pub settings: &'a Settings,
     monitor: &'a Monitor,
-    shape: Shape,
+    pub shape: Shape,
     scaling: Scaling,
-    limits: (f64, f64),
+    pub limits: (f64, f64),
     experiments: Vec<Experiment>,
-    validation: Vec<Experiment>,
+    pub validation: Vec<Experiment>,
     linear: Option<Vec<f64>>,
     constant_cost: f64,
 }
@@ -381,76 +380,6 @@ impl<'a> Training<'a> {
                 .map(|e| restored(&e.state))
                 .collect(),
         }
-    }
-}
-
-/// Keeps the best iterate of a start: on the validation data, else on the training data.
-struct Referee<'t> {
-    training: &'t Training<'t>,
-    network: Network,
-    /// Score, validation J, all parameters, cost.
-    best: Option<(f64, Option<f64>, Vec<f64>, f64)>,
-}
-
-impl<'t> Referee<'t> {
-    fn new(training: &'t Training<'t>) -> Self {
-        let network = Network::zero(training.shape, training.limits);
-        Self {
-            training,
-            network,
-            best: None,
-        }
-    }
-
-    fn judge(&mut self, all: &[f64], theta: &[f64], cost: f64) {
-        self.network.load(theta);
-        let validation = (!self.training.validation.is_empty()).then(|| self.validation_cost());
-        let score = validation.unwrap_or(cost);
-        if self.best.as_ref().is_none_or(|b| score < b.0) {
-            self.best = Some((score, validation, all.to_vec(), cost));
-        }
-    }
-
-    /// J over all validation experiments; infinite where one diverges.
-    fn validation_cost(&self) -> f64 {
-        let scores = self.training.validation.iter().map(|e| self.score(e));
-        let (sum, samples) = scores.fold((0.0, 0), |(sum, n), (s, m)| (sum + s, n + m));
-        let cost = 0.5 * sum / samples as f64;
-        if cost.is_nan() { f64::INFINITY } else { cost }
-    }
-
-    /// Sum of squared errors and the number of samples it is taken over.
-    fn score(&self, experiment: &Experiment) -> (f64, usize) {
-        let lags = self.network.shape.lags;
-        let estimated = self.training.settings.initial_state == InitialState::Estimated;
-        let skipped = if estimated {
-            STATE_SAMPLES.min(experiment.y.len() / 2)
-        } else {
-            experiment.first
-        };
-        let mut phi = vec![0.0; lags.regressors()];
-        let state = match estimated {
-            true => {
-                let u = &experiment.u[..skipped * lags.channels];
-                self.network
-                    .estimate_initial_state(u, lags.channels, &experiment.y[..skipped])
-            }
-            false => Ok(experiment.state.clone()),
-        };
-        let Ok(state) = state else {
-            return (f64::INFINITY, 1);
-        };
-        phi[..lags.na].copy_from_slice(&state);
-        let mut sum = 0.0;
-        for k in experiment.first..experiment.y.len() {
-            lags.write_inputs(&experiment.u, k, &mut phi[lags.na..]);
-            let y = self.network.output(&phi);
-            push_past(&mut phi[..lags.na], y);
-            if k >= skipped {
-                sum += (experiment.y[k] - y) * (experiment.y[k] - y);
-            }
-        }
-        (sum, experiment.y.len() - skipped)
     }
 }
 

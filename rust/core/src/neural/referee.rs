@@ -1,0 +1,79 @@
+//! Which iterate of a start is kept: the best on the validation data, else the best on the training data.
+
+use super::network::Network;
+use super::problem::Experiment;
+use super::train::{InitialState, Training};
+use crate::lagged::{Lagged, push_past};
+
+/// Validation samples from which an unknown initial state is estimated.
+const STATE_SAMPLES: usize = 20;
+
+/// Keeps the best iterate of a start: on the validation data, else on the training data.
+pub(super) struct Referee<'t> {
+    training: &'t Training<'t>,
+    pub network: Network,
+    /// Score, validation J, all parameters, cost.
+    pub best: Option<(f64, Option<f64>, Vec<f64>, f64)>,
+}
+
+impl<'t> Referee<'t> {
+    pub fn new(training: &'t Training<'t>) -> Self {
+        let network = Network::zero(training.shape, training.limits);
+        Self {
+            training,
+            network,
+            best: None,
+        }
+    }
+
+    pub fn judge(&mut self, all: &[f64], theta: &[f64], cost: f64) {
+        self.network.load(theta);
+        let validation = (!self.training.validation.is_empty()).then(|| self.validation_cost());
+        let score = validation.unwrap_or(cost);
+        if self.best.as_ref().is_none_or(|b| score < b.0) {
+            self.best = Some((score, validation, all.to_vec(), cost));
+        }
+    }
+
+    /// J over all validation experiments; infinite where one diverges.
+    fn validation_cost(&self) -> f64 {
+        let scores = self.training.validation.iter().map(|e| self.score(e));
+        let (sum, samples) = scores.fold((0.0, 0), |(sum, n), (s, m)| (sum + s, n + m));
+        let cost = 0.5 * sum / samples as f64;
+        if cost.is_nan() { f64::INFINITY } else { cost }
+    }
+
+    /// Sum of squared errors and the number of samples it is taken over.
+    fn score(&self, experiment: &Experiment) -> (f64, usize) {
+        let lags = self.network.shape.lags;
+        let estimated = self.training.settings.initial_state == InitialState::Estimated;
+        let skipped = if estimated {
+            STATE_SAMPLES.min(experiment.y.len() / 2)
+        } else {
+            experiment.first
+        };
+        let mut phi = vec![0.0; lags.regressors()];
+        let state = match estimated {
+            true => {
+                let u = &experiment.u[..skipped * lags.channels];
+                self.network
+                    .estimate_initial_state(u, lags.channels, &experiment.y[..skipped])
+            }
+            false => Ok(experiment.state.clone()),
+        };
+        let Ok(state) = state else {
+            return (f64::INFINITY, 1);
+        };
+        phi[..lags.na].copy_from_slice(&state);
+        let mut sum = 0.0;
+        for k in experiment.first..experiment.y.len() {
+            lags.write_inputs(&experiment.u, k, &mut phi[lags.na..]);
+            let y = self.network.output(&phi);
+            push_past(&mut phi[..lags.na], y);
+            if k >= skipped {
+                sum += (experiment.y[k] - y) * (experiment.y[k] - y);
+            }
+        }
+        (sum, experiment.y.len() - skipped)
+    }
+}
