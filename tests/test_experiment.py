@@ -144,6 +144,15 @@ def test_an_interruption_leaves_an_earlier_experiment_as_it_was(demo: Path, stag
     assert {p: p.read_bytes() for p in demo.rglob("*") if p.is_file()} == before
 
 
+def test_an_interruption_before_writing_leaves_no_folder(tmp_path: Path) -> None:
+    def interrupt(done: int, total: int, name: str) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_demo(tmp_path / "new", progress=interrupt)
+    assert not (tmp_path / "new").exists()
+
+
 def test_a_folder_that_was_interrupted_while_writing_is_no_result(
     demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

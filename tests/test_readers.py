@@ -424,3 +424,12 @@ def test_mat_4_and_long_rows() -> None:
     assert len(drives) == 500
     box = read(DATA / "silverbox/SNLS80mV.mat", inputs="V1", output="V2", Ts=1 / 610.35)
     assert len(box) == 131072
+
+
+def test_one_column_is_not_input_and_output(tmp_path: Path) -> None:
+    path = tmp_path / "drive.csv"
+    path.write_text("t,u,y\n" + "".join(f"{k},{k % 3},{k}\n" for k in range(9)))
+    with pytest.raises(SettingError, match="'u' twice"):
+        read(path, inputs="u", output="u")
+    with pytest.raises(SettingError, match="'y' twice"):
+        read(path, inputs=["y", "y"])

@@ -99,8 +99,15 @@ def run_demo(
     excitation("random", seed)  # refuses a seed that is none before the folder is made
     target = Path(out)
     folder.prepare(target)
-    clock = _Clock(progress)
+    try:
+        return _carry_out(target, plant, seed, _Clock(progress))
+    except BaseException:
+        folder.abandon(target)
+        raise
 
+
+def _carry_out(target: Path, plant: VirtualMachine, seed: int, clock: _Clock) -> dict[str, Any]:
+    """The stages, one after the other; the folder is written at the end."""
     clock.enter("recording the machine")
     recorded = recordings.open_loop(plant, seed)
     lo_hi = recorded["chirp_lo_hi"]

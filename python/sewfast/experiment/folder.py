@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ _FOLDERS = ("recordings", "models", "controllers", "predictions", "runs")
 
 
 def prepare(folder: Path) -> None:
-    """Make the folder, so that one that cannot be made is refused before a minute's work.
+    """Make the folder itself, so that one that cannot be made is refused before a minute's work.
 
     Raises
     ------
@@ -27,12 +28,17 @@ def prepare(folder: Path) -> None:
         Where it cannot be made.
     """
     try:
-        for name in _FOLDERS:
-            (folder / name).mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(
             f"{folder}: cannot be made ({error.strerror}); choose a folder that is writable"
         ) from error
+
+
+def abandon(folder: Path) -> None:
+    """Take the folder away again where nothing has been put into it."""
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def write(
@@ -52,6 +58,8 @@ def write(
     """
     for name in ("results.json", "report.html"):
         (folder / name).unlink(missing_ok=True)
+    for name in _FOLDERS:
+        (folder / name).mkdir(exist_ok=True)
     for name, recording in recordings.items():
         recording.save(folder / recording_file(name))
     for name, model in models.items():

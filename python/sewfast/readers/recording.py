@@ -73,6 +73,7 @@ def read(
             f"counts of one turn; received {counts!r} and {counts_per_rev!r}"
         )
     names = tuple(table.resolve(n) for n in names)
+    _require_distinct(names, None if output is None or counts else table.resolve(output))
     period = sample_time(table, Ts, time)
     u = _side_by_side(table, names)
     y, label, unit, source = _output(table, output, counts, counts_per_rev, period, len(u))
@@ -81,6 +82,15 @@ def read(
     experiment = Experiment(u, y, extra, name or table.path.name)
     units = tuple(table.unit(n) for n in names)
     return Dataset((experiment,), period, names, label, units, unit, source)
+
+
+def _require_distinct(inputs: tuple[str, ...], output: str | None) -> None:
+    twice = next((n for i, n in enumerate(inputs) if n in inputs[:i] or n == output), None)
+    if twice is not None:
+        raise SettingError(
+            f"expected different columns as inputs and output, received {twice!r} twice; "
+            "name the column that was measured as output"
+        )
 
 
 def _output(
