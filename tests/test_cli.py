@@ -221,7 +221,7 @@ def test_validate_prints_a_table_or_json(walk: Path) -> None:
 def test_simulate_is_the_free_run_of_the_api(tmp_path: Path, walk: Path) -> None:
     sewfast(tmp_path, "simulate", walk / "drive.json", walk / "two.csv", "-o", "p.csv")
     head, rows = header_and_rows(tmp_path / "p.csv")
-    assert head == ["t [s]", "u [V]", "y_hat [RPM]"]
+    assert head == ["t", "u", "y_hat"]
     data = api.read(walk / "two.csv", inputs="u", output="speed")
     (expected,) = api.load_model(walk / "drive.json").simulate(data)
     np.testing.assert_array_equal([float(r[2]) for r in rows], expected)
@@ -254,7 +254,7 @@ def test_several_inputs_keep_their_names(tmp_path: Path) -> None:
     arguments = ("--input", "left", "--input", "right", "--output", "y", "--model", "arx")
     sewfast(tmp_path, "identify", "belt.csv", *arguments, "-o", "m.json")
     sewfast(tmp_path, "simulate", "m.json", "belt.csv", "-o", "p.csv")
-    assert header_and_rows(tmp_path / "p.csv")[0] == ["t [s]", "left", "right", "y_hat"]
+    assert header_and_rows(tmp_path / "p.csv")[0] == ["t", "left", "right", "y_hat"]
 
 
 # --- tune, run ----------------------------------------------------------------------------------

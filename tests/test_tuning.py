@@ -10,7 +10,9 @@ import pytest
 
 from sewfast import _core, signals
 from sewfast.control import Controller, Gains
+from sewfast.dataset import Dataset
 from sewfast.errors import DataError, FitError, Interrupted, SettingError
+from sewfast.identification import identify
 from sewfast.loop import run
 from sewfast.machine import VirtualMachine
 from sewfast.models import LinearOE
@@ -176,3 +178,19 @@ def test_plants_that_cannot_be_tuned_on_are_refused() -> None:
 def test_references_that_cannot_be_run_are_refused(references: Any) -> None:
     with pytest.raises(DataError, match="reference"):
         tune(drive(), references, evaluations=2)
+
+
+def test_a_model_without_units_is_taken_in_volt_and_rpm_and_says_so() -> None:
+    u = np.repeat([0.0, 2.0, 1.0, 3.0], 600)
+    y = np.zeros_like(u)
+    for k in range(1, len(u)):
+        y[k] = 0.99 * y[k - 1] + 4.9 * u[k - 1]
+    model = identify(Dataset.from_arrays(u, y, 1e-3), model="arx", na=1, nb=1)
+    found = tune(model, "trapezoid", evaluations=40).controller
+    assert (found.gains.u_unit, found.gains.y_unit) == ("V", "RPM")
+    assert "command in V, output in RPM" in found.notes
+    stated = Dataset.from_arrays(u, y, 1e-3, input_units="V", output_unit="RPM")
+    assert (
+        "taken"
+        not in tune(identify(stated, model="arx", na=1, nb=1), evaluations=40).controller.notes
+    )

@@ -162,7 +162,7 @@ def tune(
         threads=whole("threads", os.cpu_count() or 1 if threads is None else threads),
         progress=progress,
     )
-    result = _result(found, start, {**default_weights(), **(weights or {})})
+    result = _result(found, start, {**default_weights(), **(weights or {})}, _assumed(plants[0]))
     if result.termination == "interrupted":
         raise Interrupted(result.controller)
     return result
@@ -207,7 +207,7 @@ def first_controller(
             f"expected a finite u_max other than 0 to size the step by, got {u_max}; give the "
             "amplifier's limit"
         )
-    u_unit, y_unit = (unit or "?" for unit in plant_units(plant))
+    u_unit, y_unit = stated_units(plant)
     fopdt = _step_fit(plant, u_max)
     delayed = replace(fopdt, L=fopdt.L + (filter_samples - 1) / 2 * plant.Ts)
     rule = table_1(delayed, outside="nearest")
@@ -225,8 +225,21 @@ def first_controller(
         u_max=u_max,
         filter_samples=filter_samples,
         counts_per_rev=counts_per_rev if turns else None,
-        notes="Table 1 on the model's step response",
+        notes="Table 1 on the model's step response" + _assumed(plant),
     )
+
+
+def stated_units(plant: Plant) -> tuple[str, str]:
+    """Units of command and output; what a model leaves open counts as volt and RPM."""
+    u_unit, y_unit = plant_units(plant)
+    return u_unit or "V", y_unit or "RPM"
+
+
+def _assumed(plant: Plant) -> str:
+    """What was taken for granted about the units, for a controller's notes."""
+    names = ("command in V", "output in RPM")
+    open_ = [n for n, unit in zip(names, plant_units(plant), strict=True) if not unit]
+    return f"; the model states no unit, taken: {', '.join(open_)}" if open_ else ""
 
 
 def _step_fit(model: Model, u_max: float) -> Fopdt:
@@ -273,7 +286,7 @@ def _each(references: Any) -> list[str | ArrayLike]:
 
 
 def _result(
-    found: Mapping[str, Any], start: Controller, weights: Mapping[str, float]
+    found: Mapping[str, Any], start: Controller, weights: Mapping[str, float], assumed: str
 ) -> TuningResult:
     units = {"u_unit": start.gains.u_unit, "y_unit": start.gains.y_unit}
     tuned = replace(
@@ -282,7 +295,7 @@ def _result(
         alpha=found["alpha"],
         beta=found["beta"],
         N=found["N"],
-        notes="tuned by simulated closed loops",
+        notes="tuned by simulated closed loops" + assumed,
     )
     return TuningResult(
         controller=tuned,

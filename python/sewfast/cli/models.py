@@ -102,13 +102,11 @@ def simulate_command(args: argparse.Namespace) -> None:
     data, table = read_for_model(args.data, model, args, needs_output=args.init > 0)
     (y_hat,) = model.simulate(data, init=args.init)
     columns = {"t": _time(table, data), **_inputs(data), "y_hat": y_hat}
-    units = dict(zip(_input_labels(data), data.input_units, strict=True))
-    units |= {"t": "s", "y_hat": model.output_unit}
     low, high = float(y_hat.min()), float(y_hat.max())
     write_columns(
         args.out,
         columns,
-        units,
+        {},
         {"n": len(y_hat), "init": args.init, "Ts": data.Ts, "y_hat_min": low, "y_hat_max": high},
         [f"{model.title}, free run of {len(y_hat)} samples: y_hat from {low:.6g} to {high:.6g}"],
         as_json=args.json,
@@ -126,11 +124,7 @@ def _time(table: Table, data: Dataset) -> FloatArray:
 
 
 def _inputs(data: Dataset) -> dict[str, FloatArray]:
-    return dict(zip(_input_labels(data), data.experiments[0].u.T, strict=True))
-
-
-def _input_labels(data: Dataset) -> tuple[str, ...]:
     """`u` for one input; several keep their names, apart from those of the other columns."""
-    if data.n_inputs == 1:
-        return ("u",)
-    return tuple(f"u_{n}" if n in ("t", "y_hat") else n for n in data.input_names)
+    names = tuple(f"u_{n}" if n in ("t", "y_hat") else n for n in data.input_names)
+    labels = ("u",) if data.n_inputs == 1 else names
+    return dict(zip(labels, data.experiments[0].u.T, strict=True))
