@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import math
 import os
-import secrets
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
+from .atomic import replace_file
 from .errors import ModelFileError
 
 LARGEST_FILE = 16 * 1024 * 1024
@@ -53,17 +53,8 @@ def replace(path: str | os.PathLike[str], text: str) -> None:
     ModelFileError
         The folder does not exist or cannot be written to.
     """
-    target = Path(path).resolve()
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
     try:
-        try:
-            with temporary.open("x", encoding="utf-8", newline="\n") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(target)
-        finally:
-            temporary.unlink(missing_ok=True)
+        replace_file(path, text.encode())
     except OSError as error:
         raise ModelFileError(
             f"{path}: cannot be written ({error.strerror}); "

@@ -207,7 +207,7 @@ def first_controller(
             f"expected a finite u_max other than 0 to size the step by, got {u_max}; give the "
             "amplifier's limit"
         )
-    u_unit, y_unit = stated_units(plant)
+    u_unit, y_unit = _stated_units(plant)
     fopdt = _step_fit(plant, u_max)
     delayed = replace(fopdt, L=fopdt.L + (filter_samples - 1) / 2 * plant.Ts)
     rule = table_1(delayed, outside="nearest")
@@ -229,7 +229,7 @@ def first_controller(
     )
 
 
-def stated_units(plant: Plant) -> tuple[str, str]:
+def _stated_units(plant: Plant) -> tuple[str, str]:
     """Units of command and output; what a model leaves open counts as volt and RPM."""
     u_unit, y_unit = plant_units(plant)
     return u_unit or "V", y_unit or "RPM"

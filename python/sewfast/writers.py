@@ -6,7 +6,6 @@ import csv
 import io
 import os
 import re
-import secrets
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .atomic import replace_file
 from .dataset import labelled
 from .errors import DataError, SettingError
 
@@ -62,17 +62,8 @@ def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
     DataError
         Where the folder does not exist or cannot be written to.
     """
-    target = Path(path).resolve()
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
     try:
-        try:
-            with temporary.open("xb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(target)
-        finally:
-            temporary.unlink(missing_ok=True)
+        replace_file(path, content)
     except OSError as e:
         raise DataError(
             f"{path}: cannot be written ({e.strerror}); choose a folder that exists and is writable"

@@ -2,6 +2,9 @@
 
 use crate::{Error, Result};
 
+/// Samples from which an unknown initial state is estimated, as in a score's default (docs/CONVENTIONS.md, `init`).
+pub(crate) const STATE_SAMPLES: usize = 20;
+
 /// Orders of a lagged model; the regressor is the one of docs/CONVENTIONS.md (paper Eq. 2).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Lags {

@@ -3,10 +3,7 @@
 use super::network::Network;
 use super::problem::Experiment;
 use super::train::{InitialState, Training};
-use crate::lagged::{Lagged, push_past};
-
-/// Validation samples from which an unknown initial state is estimated.
-const STATE_SAMPLES: usize = 20;
+use crate::lagged::{Lagged, STATE_SAMPLES, push_past};
 
 /// Keeps the best iterate of a start: on the validation data, else on the training data.
 pub(super) struct Referee<'t> {

@@ -1,14 +1,12 @@
 //! How well a linear model runs on from a state that a few samples gave it.
 
 use crate::Record;
-use crate::lagged::Lagged;
+use crate::lagged::{Lagged, STATE_SAMPLES};
 use crate::linear::LinearModel;
 
-/// Samples that set the state of a segment, as in a score's default.
-const INIT: usize = 20;
 /// Segments an experiment is cut into, where it is long enough.
 const SEGMENTS: usize = 8;
-/// Shortest segment, in multiples of `INIT`.
+/// Shortest segment, in multiples of `STATE_SAMPLES`.
 const SHORTEST: usize = 5;
 
 /// Mean square free-run error over segments of the records, each started from its own first samples.
@@ -20,7 +18,7 @@ pub(super) fn restart_error(model: &LinearModel, records: &[Record]) -> f64 {
     let (mut sum, mut count) = (0.0, 0);
     for record in records {
         let length = (record.len() / SEGMENTS)
-            .max(SHORTEST * INIT)
+            .max(SHORTEST * STATE_SAMPLES)
             .min(record.len());
         for start in (0..)
             .map(|i| i * length)
@@ -50,7 +48,7 @@ fn segment_error(
     let channels = record.channels;
     let u = &record.u[start * channels..(start + length) * channels];
     let y = &record.y[start..start + length];
-    let init = INIT.min(length.div_ceil(SHORTEST));
+    let init = STATE_SAMPLES.min(length.div_ceil(SHORTEST));
     let state = model
         .estimate_initial_state(&u[..init * channels], channels, &y[..init])
         .ok()?;
