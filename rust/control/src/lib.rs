@@ -1,4 +1,5 @@
-//! Control arithmetic that runs unchanged on a microcontroller, in simulation and against the virtual machine.
+//! Control arithmetic that runs unchanged on a microcontroller, in simulation and against the virtual machine; and the
+//! frames by which such a drive talks to its host.
 //!
 //! No standard library, no allocation, no dependency.
 //!
@@ -21,6 +22,7 @@ extern crate std;
 pub mod controller;
 pub mod filter;
 pub mod gains;
+pub mod link;
 pub mod pid;
 pub mod real;
 pub mod refused;
