@@ -1,0 +1,312 @@
+"""`read_recording`: an MCAP recording in whatever state -> `RecordedFile`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..dataset import FloatArray, labelled
+from ..errors import DataError
+from . import walk
+from .container import MAGIC, Message
+from .header import MOST_MISSING, Header, plain
+from .samples import EXACT, Block, decode, parse
+from .topics import Topic
+
+LARGEST_FILE = 4 << 30
+"""Bytes: more than a day of four columns at 1 kHz."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RecordedFile:
+    """What was read from a recording file.
+
+    Attributes
+    ----------
+    path : Path
+    header : Header
+    columns : mapping of name to array of shape (N,)
+        float64, row k is sample k; NaN in gaps and where nothing was measured.
+    gaps : tuple of (first, count)
+        Samples that are not there.
+    events : tuple of mapping
+        `kind`, `index` (int or None), `elapsed` [s], `detail`, in the order written.
+    outcome : str
+        How the recording ended by its own account; "torn" where that is missing.
+    damage : tuple of str
+        What was found damaged and left out.
+    """
+
+    path: Path
+    header: Header
+    columns: Mapping[str, FloatArray]
+    gaps: tuple[tuple[int, int], ...]
+    events: tuple[Mapping[str, Any], ...]
+    outcome: str
+    damage: tuple[str, ...]
+
+    def __len__(self) -> int:
+        """Samples from the first to the last, those in gaps included."""
+        return len(next(iter(self.columns.values())))
+
+    @property
+    def received(self) -> int:
+        """Samples that are there."""
+        return len(self) - sum(count for _, count in self.gaps)
+
+    @property
+    def complete(self) -> bool:
+        """Ended as planned, no gap, no damage."""
+        planned = self.header.n in (None, self.received)
+        return self.outcome == "complete" and not self.gaps and not self.damage and planned
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of each column, `t` included; pure numbers have none."""
+        known = {name: unit for name, unit in self.header.columns.items() if unit not in ("", "1")}
+        return {"t": "s", **known}
+
+    def table_columns(self) -> dict[str, FloatArray]:
+        """`t` [s] and the columns, as they are exported."""
+        t = np.round(np.arange(len(self)) * self.header.Ts, 9)
+        return {"t": t, **self.columns}
+
+    def __repr__(self) -> str:
+        return f"RecordedFile({self.path.name!r}, {self.summary})"
+
+    @property
+    def summary(self) -> str:
+        """How much is there, in one line."""
+        planned = "" if self.header.n is None else f" of {self.header.n}"
+        gaps = f"{len(self.gaps)} gap(s)" if self.gaps else "no gap"
+        damage = f"{len(self.damage)} damage(s)" if self.damage else "no damage"
+        return f"{self.received}{planned} samples, {self.outcome}, {gaps}, {damage}"
+
+    def __str__(self) -> str:
+        columns = ", ".join(labelled(n, self.units.get(n, "")) for n in self.columns)
+        lines = [
+            f"{self.path}: {self.summary}",
+            f"  {self.header.name}, Ts = {self.header.Ts:g} s, started {self.header.started}",
+            f"  columns   {columns}",
+        ]
+        lines += _described("device", self.header.device) + _described(
+            "settings", self.header.settings
+        )
+        lines += [f"  gap       samples {a}:{a + n}" for a, n in self.gaps[:_SHOWN]]
+        lines += _more(len(self.gaps), "gaps")
+        lines += [f"  event     {_event(e)}" for e in self.events[:_SHOWN]]
+        lines += _more(len(self.events), "events")
+        lines += [f"  damage    {text}" for text in self.damage[:_SHOWN]]
+        return "\n".join(lines + _more(len(self.damage), "places of damage"))
+
+
+_SHOWN = 20
+
+
+def _described(label: str, content: Mapping[str, Any]) -> list[str]:
+    return [f"  {label:<8}  {key}: {value}" for key, value in content.items()]
+
+
+def _more(count: int, what: str) -> list[str]:
+    return [f"  ... {count - _SHOWN} more {what}"] if count > _SHOWN else []
+
+
+def _event(event: Mapping[str, Any]) -> str:
+    at = "" if event["index"] is None else f" at sample {event['index']}"
+    detail = ", ".join(f"{key} {value}" for key, value in event["detail"].items())
+    return f"{event['kind']}{at}" + (f": {detail}" if detail else "")
+
+
+def read_recording(path: str | os.PathLike[str]) -> RecordedFile:
+    """Read a recording; what is damaged or missing is left out and named.
+
+    Parameters
+    ----------
+    path : path
+        An MCAP file that `RecordWriter` wrote, also one whose writer was killed.
+
+    Returns
+    -------
+    RecordedFile
+
+    Raises
+    ------
+    DataError
+        Where the file cannot be read, is no MCAP file, or none of the two copies of its header
+        message is whole.
+    """
+    path = Path(path)
+    return decode_recording(path, _bytes(path))
+
+
+def _bytes(path: Path) -> bytes:
+    if path.is_dir():
+        raise DataError(f"{path}: expected a file, received a folder")
+    try:
+        size = path.stat().st_size
+        if size > LARGEST_FILE:
+            raise DataError(
+                f"{path}: expected a recording of at most {LARGEST_FILE >> 30} GiB, received "
+                f"{size} bytes; record in parts"
+            )
+        return path.read_bytes()
+    except FileNotFoundError as e:
+        raise DataError(f"{path}: no such file; check the name and the folder") from e
+    except (OSError, ValueError) as e:
+        raise DataError(f"{path}: cannot be read: {e}") from e
+
+
+def decode_recording(path: Path, raw: bytes) -> RecordedFile:
+    """As `read_recording`, from the file's bytes."""
+    found = _Contents()
+    stop: int | None = None
+    for chunk in walk.chunks(raw):
+        whole = (
+            walk.is_start(raw, chunk.start)
+            if stop is None
+            else walk.is_index(raw, stop, chunk.start)
+        )
+        if not whole:
+            found.damage.append(f"bytes {stop or 0}:{chunk.start} are damaged and left out")
+        for message in chunk.messages:
+            found.take(message)
+        stop = chunk.stop
+    if found.header is None:
+        raise _headless(path, raw, found.damage)
+    if stop is not None and (fault := walk.ending_fault(raw, stop)):
+        found.damage.append(fault)
+    return found.assemble(path, found.header)
+
+
+def _headless(path: Path, raw: bytes, damage: list[str]) -> DataError:
+    if not raw.startswith(MAGIC):
+        return DataError(
+            f"{path}: expected a recording (MCAP), received a file of another kind or one damaged "
+            "from its first bytes on"
+        )
+    reason = next((text for text in damage if Topic.HEADER.path in text), "none is whole")
+    return DataError(
+        f"{path}: expected an MCAP file with the message {Topic.HEADER.path} of sewfast: {reason}; "
+        "a file of another program, one that a program has compressed, or one damaged from its "
+        "start on cannot be read as a recording"
+    )
+
+
+class _Contents:
+    """What the messages of one file add up to."""
+
+    def __init__(self) -> None:
+        self.header: Header | None = None
+        self.damage: list[str] = []
+        self.blocks: list[Block] = []
+        self.events: list[Mapping[str, Any]] = []
+        self.completeness: Mapping[str, Any] | None = None
+        self._next = 0
+        self._received = 0
+        self._last_event = -1
+
+    def take(self, message: Message) -> None:
+        """Add a message; one that makes no sense is left out as damage."""
+        if message.topic is Topic.HEADER and self.header is not None:
+            return
+        try:
+            self._take(message.topic, parse(message.data), message.sequence)
+        except ValueError as e:
+            self.damage.append(f"a message on {message.topic.path} is left out: {e}")
+
+    def _take(self, topic: Topic, content: Mapping[str, Any], sequence: int) -> None:
+        if topic is Topic.HEADER:
+            self.header = Header.from_json(content)
+        elif self.header is None:
+            raise ValueError("it comes before the header")
+        elif topic is Topic.SAMPLES:
+            self._take_samples(decode(content, self.header.columns), len(self.header.columns))
+        elif topic is Topic.EVENTS:
+            self._take_event(_checked_event(content), sequence)
+        else:
+            self.completeness = _checked_completeness(content)
+
+    def _take_samples(self, block: Block, width: int) -> None:
+        first, end = int(block.numbers[0]), int(block.numbers[-1]) + 1
+        if first < self._next:
+            raise ValueError(f"sample {first} follows sample {self._next - 1}")
+        received = self._received + len(block.numbers)
+        if (end - received) * width > MOST_MISSING:
+            raise ValueError(f"samples up to {end} leave gaps of more than {MOST_MISSING} values")
+        self.blocks.append(block)
+        self._next, self._received = end, received
+
+    def _take_event(self, event: Mapping[str, Any], sequence: int) -> None:
+        if sequence <= self._last_event:
+            raise ValueError(f"event {sequence} follows event {self._last_event}")
+        self.events.append(event)
+        self._last_event = sequence
+
+    def assemble(self, path: Path, header: Header) -> RecordedFile:
+        end = self._end(len(header.columns))
+        there = np.zeros(end, dtype=bool)
+        columns = {name: np.full(end, np.nan) for name in header.columns}
+        for block in self.blocks:
+            there[block.numbers] = True
+            for column, values in zip(columns.values(), block.columns, strict=True):
+                column[block.numbers] = values
+        for column in columns.values():
+            column.flags.writeable = False
+        return RecordedFile(
+            path,
+            header,
+            MappingProxyType(columns),
+            _runs(~there),
+            tuple(self.events),
+            "torn" if self.completeness is None else self.completeness["outcome"],
+            tuple(self.damage),
+        )
+
+    def _end(self, width: int) -> int:
+        """Samples that there should be, by the file's own account where it has one."""
+        if self.completeness is None:
+            return self._next
+        lost = self.completeness["received"] - self._received
+        if lost:
+            self.damage.append(f"{lost} of {self.completeness['received']} samples are left out")
+        end: int = self.completeness["end"]
+        if end < self._next or (end - self._received) * width > MOST_MISSING:
+            self.damage.append(f"its account ends at sample {end}, its samples at {self._next}")
+            return self._next
+        return end
+
+
+def _checked_event(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    index, elapsed = content.get("index"), content.get("elapsed")
+    detail = content.get("detail")
+    known = isinstance(content.get("kind"), str) and isinstance(detail, dict)
+    if not known or not (index is None or _is_number(index)) or type(elapsed) not in (int, float):
+        raise ValueError("it is no event")
+    plain("event", dict(content))
+    kept = {"kind": content["kind"], "index": index, "elapsed": elapsed, "detail": detail}
+    return MappingProxyType(kept)
+
+
+def _checked_completeness(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    numbers = _is_number(content.get("received")) and _is_number(content.get("end"))
+    if not isinstance(content.get("outcome"), str) or not numbers:
+        raise ValueError("it is no account of completeness")
+    return content
+
+
+def _is_number(value: object) -> bool:
+    return type(value) is int and 0 <= value <= EXACT
+
+
+def _runs(missing: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
+    """(first, count) of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], missing, [False])).astype(np.int8)))
+    pairs = edges.reshape(-1, 2)
+    return tuple((int(a), int(b - a)) for a, b in pairs)

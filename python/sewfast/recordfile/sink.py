@@ -1,0 +1,77 @@
+"""A file that grows by whole pieces: what is in it is complete, whatever stops the writer."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+from ..errors import DataError, SettingError
+
+
+class Sink:
+    """An open file; a piece that cannot be written as a whole is taken back.
+
+    Parameters
+    ----------
+    path : Path
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    SettingError
+        Where the file exists and may not be replaced.
+    DataError
+        Where it cannot be made: a folder, no such folder, no permission.
+    """
+
+    def __init__(self, path: Path, *, overwrite: bool) -> None:
+        self.path = path
+        self.size = 0
+        self.crc = 0
+        flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
+        try:
+            # without O_EXCL two writers could meet in one file
+            self._file = os.open(path, flags | (os.O_TRUNC if overwrite else os.O_EXCL), 0o666)
+        except FileExistsError as e:
+            if path.is_dir():
+                raise DataError(f"{path}: expected a file to write, received a folder") from e
+            raise SettingError(
+                f"{path}: the file exists and is kept; choose another name, or overwrite=True "
+                "(--overwrite)"
+            ) from e
+        except OSError as e:
+            raise DataError(
+                f"{path}: cannot be written ({e.strerror}); choose a folder that exists and is "
+                "writable"
+            ) from e
+
+    def append(self, piece: bytes) -> None:
+        """Hand a piece to the operating system: from then on `kill -9` cannot take it away.
+
+        Raises
+        ------
+        OSError
+            Where it does not fit; the file then ends where the piece would have begun.
+        """
+        rest = memoryview(piece)
+        try:
+            while rest:
+                rest = rest[os.write(self._file, rest) :]
+        except OSError:
+            with suppress(OSError):
+                os.ftruncate(self._file, self.size)
+            raise
+        self.size += len(piece)
+        self.crc = zlib.crc32(piece, self.crc)
+
+    def sync(self) -> None:
+        """Ask for what was appended to be on the disk itself, against a loss of power."""
+        with suppress(OSError):
+            os.fsync(self._file)
+
+    def close(self) -> None:
+        with suppress(OSError):
+            os.close(self._file)
