@@ -1,0 +1,10 @@
+//! The host's end of the link to a drive (docs/PROTOCOL.md), as parts without a port of their own.
+
+pub mod anomalies;
+pub mod receiver;
+pub mod samples;
+pub mod sequence;
+
+pub use anomalies::{Anomaly, Counters, Kind};
+pub use receiver::Receiver;
+pub use samples::{Channel, Encoding};
