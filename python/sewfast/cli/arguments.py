@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, TypeAlias
 from ..errors import SettingError
 
 if TYPE_CHECKING:
+    from ..live import Kind
+
     Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
 else:
     Commands: TypeAlias = object
@@ -55,6 +57,24 @@ def add_columns(parser: argparse.ArgumentParser, *, from_model: bool) -> None:
     parser.add_argument(
         "--counts-per-rev", type=float, metavar="N", help="encoder counts per revolution"
     )
+
+
+def add_view(parser: argparse.ArgumentParser) -> None:
+    """How a running record or run is watched: `args.live` is a `sewfast.live.Kind`."""
+    parser.add_argument(
+        "--live", metavar="KIND", type=_kind, default="auto",
+        help="watch it run: terminal, none, plotjuggler[:HOST:PORT], foxglove[:PORT]; auto (the "
+        "default) is a plot on standard error where that is a terminal",
+    )  # fmt: skip
+
+
+def _kind(text: str) -> Kind:
+    from ..live import Kind
+
+    try:
+        return Kind.parse(text)
+    except SettingError as e:
+        raise argparse.ArgumentTypeError(str(e)) from e
 
 
 def add_output(

@@ -1,0 +1,7 @@
+"""The live view: what a running record or run looks like while it happens."""
+
+from .feed import Feed
+from .kind import Kind
+from .view import View, open_view
+
+__all__ = ["Feed", "Kind", "View", "open_view"]

@@ -1,0 +1,248 @@
+"""`Feed`: the newest samples of a running record, between the link's thread and a view's."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError, SettingError
+from .speed import speed_over_window
+
+FloatArray = NDArray[np.float64]
+
+SPEED = "speed"
+"""Name of the column that a feed derives from counts."""
+
+WHOLE_S = 30.0
+"""A record of at most this length [s] is kept whole."""
+
+SCROLL_S = 10.0
+"""Of a longer record, or one without a planned end, this much is kept [s]."""
+
+_LEAST, _MOST = 4096, 131_072
+"""Samples of a column that are kept, at 8 bytes each."""
+
+_SPARE_S = 2.0
+"""Kept beyond what a picture spans, for a view that comes late [s]."""
+
+
+class Feed:
+    """Samples from one thread to another, which never makes the first one wait.
+
+    `put` copies a batch into a ring of fixed size and returns; it takes no lock, and what a view
+    has not read by the time the ring comes round is lost to the view (never to the recording). Any
+    number of views may read.
+
+    Parameters
+    ----------
+    columns : mapping of str to str
+        Name of each streamed column and its unit ("" for none). `u` is the command, `r` a
+        reference, `counts` accumulated encoder counts.
+    Ts : float
+        Sample time [s].
+    n : int or None
+        Samples that are planned; None where nobody knows.
+    title : str
+        What is recorded, in a few words.
+    counts_per_rev : float, optional
+        With it and a column `counts`, the column `speed` [RPM] is derived; NaN where a sample of
+        its window is missing.
+    speed_window : float
+        What that speed is the mean over [s].
+
+    Attributes
+    ----------
+    columns : dict of str to str
+        With the derived speed.
+    end : int
+        Number of the sample after the newest one.
+    received, gaps : int
+        Samples that came; jumps between batches.
+    window : int
+        Samples that a picture spans: all planned ones of a short record, else the last seconds.
+    closed : threading.Event
+        Set where no sample follows.
+
+    Raises
+    ------
+    SettingError
+        Without columns, or where a number is outside its range.
+    """
+
+    def __init__(
+        self,
+        columns: Mapping[str, str],
+        Ts: float,
+        n: int | None,
+        title: str,
+        *,
+        counts_per_rev: float | None = None,
+        speed_window: float = 0.02,
+    ) -> None:
+        _require(bool(columns), "at least one column", "none", "name what is streamed")
+        _require_above_zero("Ts", Ts)
+        _require_above_zero("speed_window", speed_window)
+        if n is not None:
+            _require_above_zero("n", n)
+        if counts_per_rev is not None:
+            _require_above_zero("counts_per_rev", counts_per_rev)
+        self.Ts, self.n, self.title = float(Ts), n, title
+        self._streamed = {name: row for row, name in enumerate(columns)}
+        self._per_rev = counts_per_rev if "counts" in columns else None
+        self._lag = max(1, round(speed_window / Ts))
+        self.columns = _with_speed(columns, derived=self._derives)
+        self._size, self.window = _extent(self.Ts, n)
+        self._rows = np.full((len(columns), self._size), np.nan)
+        # which sample a place of the ring holds: a gap costs nothing when it is put
+        self._holds = np.full(self._size, -1, dtype=np.int64)
+        self._claimed = 0
+        self.end = 0
+        self.received = 0
+        self.gaps = 0
+        self._said: deque[tuple[int, str]] = deque(maxlen=64)
+        self._sayings = 0
+        self.closed = threading.Event()
+
+    @property
+    def _derives(self) -> bool:
+        return self._per_rev is not None and SPEED not in self._streamed
+
+    @property
+    def missing(self) -> int:
+        """Samples up to the newest one that did not come."""
+        return max(self.end - self.received, 0)
+
+    def put(self, first: int, columns: Mapping[str, NDArray[np.generic]]) -> None:
+        """Add a batch; called by the thread that owns the link.
+
+        Parameters
+        ----------
+        first : int
+            Number of the batch's first sample, from 0 at the start of the record; what lies
+            between it and the sample after the last batch is a gap.
+        columns : mapping of str to array, shape (k,)
+            Copied. A column that is left out is NaN; one that the feed does not know is ignored.
+
+        Raises
+        ------
+        DataError
+            For columns of different length.
+        """
+        if self.closed.is_set() or first < 0 or not columns:
+            return
+        count = len(next(iter(columns.values())))
+        end = first + count
+        self._claimed = max(self._claimed, end)
+        kept = min(count, self._size)
+        start = end - kept
+        place = start % self._size
+        head = min(kept, self._size - place)
+        self._write(slice(place, place + head), start, count - kept, columns, count)
+        if head < kept:
+            self._write(slice(0, kept - head), start + head, count - kept + head, columns, count)
+        self.gaps += first > self.end
+        self.received += count
+        self.end = max(self.end, end)
+
+    def _write(
+        self,
+        places: slice,
+        first: int,
+        skip: int,
+        columns: Mapping[str, NDArray[np.generic]],
+        count: int,
+    ) -> None:
+        """Copy what follows the first `skip` samples of a batch into neighbouring places."""
+        width = places.stop - places.start
+        for name, row in self._streamed.items():
+            values = columns.get(name)
+            if values is None:
+                self._rows[row, places] = np.nan
+            elif len(values) == count:
+                self._rows[row, places] = values[skip : skip + width]
+            else:
+                raise DataError(
+                    f"expected every column of a batch to have {count} samples, received "
+                    f"{len(values)} of {name}; put whole batches"
+                )
+        self._holds[places] = np.arange(first, first + width)
+
+    def say(self, text: str) -> None:
+        """Add a line of status, such as "tripped: speed limit"; the newest are kept."""
+        self._sayings += 1
+        self._said.append((self._sayings, text))
+
+    def said(self, after: int = 0) -> list[tuple[int, str]]:
+        """The lines whose number is above `after`, with their numbers, the oldest first."""
+        for _ in range(3):
+            try:
+                return [line for line in self._said if line[0] > after]
+            except RuntimeError:  # one was added meanwhile
+                continue
+        return []
+
+    def close(self) -> None:
+        """Say that no sample follows; the views finish."""
+        self.closed.set()
+
+    def read(self, start: int, stop: int) -> dict[str, FloatArray]:
+        """Samples `start` to `stop - 1` of every column in `columns`, NaN where there is none.
+
+        Parameters
+        ----------
+        start, stop : int
+            At most a ring's length apart.
+
+        Returns
+        -------
+        dict of str to array, shape (stop - start,)
+        """
+        if not self._derives:
+            return dict(zip(self._streamed, self._copy(start, stop), strict=True))
+        rows = self._copy(start - self._lag, stop)
+        found = {name: rows[row, self._lag :] for name, row in self._streamed.items()}
+        counts = rows[self._streamed["counts"]]
+        found[SPEED] = speed_over_window(counts, self._lag, self.Ts, self._per_rev or 1.0)
+        return found
+
+    def _copy(self, start: int, stop: int) -> FloatArray:
+        """The rows of a range; what the writer overtook meanwhile is NaN."""
+        wanted = np.arange(start, stop)
+        places = wanted % self._size
+        rows = self._rows[:, places]
+        known = self._holds[places] == wanted
+        known &= wanted >= self._claimed - self._size
+        rows[:, ~known] = np.nan
+        return rows
+
+    @property
+    def oldest(self) -> int:
+        """The oldest sample that a view can count on until it has read it."""
+        return max(0, self.end - self._size + self._size // 16)
+
+
+def _extent(Ts: float, n: int | None) -> tuple[int, int]:
+    """Samples in the ring, and of those the samples that a picture spans."""
+    whole = n is not None and n * Ts <= WHOLE_S
+    wanted = n if n is not None and whole else math.ceil(SCROLL_S / Ts)
+    size = min(max(wanted + math.ceil(_SPARE_S / Ts), _LEAST), _MOST)
+    return size, min(wanted, size - size // 8)
+
+
+def _with_speed(columns: Mapping[str, str], *, derived: bool) -> dict[str, str]:
+    return {**columns, SPEED: "RPM"} if derived else dict(columns)
+
+
+def _require(ok: bool, expected: str, received: object, remedy: str) -> None:
+    if not ok:
+        raise SettingError(f"a feed expected {expected}, received {received}; {remedy}")
+
+
+def _require_above_zero(name: str, value: float) -> None:
+    ok = math.isfinite(value) and value > 0
+    _require(ok, f"{name} finite and above 0", value, f"give {name} as a positive number")
