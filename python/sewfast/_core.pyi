@@ -288,3 +288,46 @@ def effort(u: _F, *, u_min: float, u_max: float) -> dict[str, float]:
 
 def step_metrics(y: _F, reference: _F, *, Ts: float, smoothing: float) -> dict[str, float]:
     """rise_time_ms, reference_rise_time_ms, overshoot_percent of a response to a step or trapezoid."""
+
+# --- link.rs: see docs/PROTOCOL.md ------------------------------------------------------------------------
+
+def link_frame(kind: int, tag: int, sequence: int, time: int, body: bytes) -> bytes:
+    """A frame as it is sent, with its closing zero; a body of more than 231 bytes is a SettingError."""
+
+_Anomaly: TypeAlias = Literal[
+    "missing", "repeated", "late", "reset", "rejected", "echoed", "malformed", "untaken"
+]
+
+@final
+class LinkReceiver:
+    """Receives what a device sends. Damaged, repeated and late frames are counted, listed and not used.
+
+    What is kept for a caller that takes nothing is bounded: 131,072 samples and 16,384 anomalies.
+    """
+
+    def __new__(cls) -> LinkReceiver: ...
+    def expect(self, channels: Sequence[tuple[int, int]], period_us: int) -> None:
+        """Encoding and steps per unit of the channels streamed from now on; drops samples not taken."""
+    def feed(self, data: bytes) -> list[tuple[int, int, int, int, bytes]]:
+        """Whole frames in order, as kind, tag, sequence, time [us], body.
+
+        Samples are not among them, save before ``expect``.
+        """
+    def take(self) -> tuple[NDArray[np.int64], list[_F]]:
+        """Device times [us] (N,) and one column per channel (N,), in its unit, since the last call.
+
+        Counts go on beyond 32 bits; they start anew after a reset of the device.
+        """
+    @property
+    def counters(self) -> dict[str, int]:
+        """frames, samples, rejected, missing, repeated, late, resets, echoed, malformed, untaken, clipped, overflows, unlisted.
+
+        Frames that came late are among the missing. ``clipped`` and ``overflows`` count batches whose flags say so;
+        ``unlisted`` are entries for which ``anomalies`` had no room.
+        """
+    def anomalies(self) -> list[tuple[_Anomaly, int, int]]:
+        """Kind, frame number and count of what went wrong since the last call, oldest first.
+
+        missing: the first of ``count`` frames. reset: the first frame of the boot that came, and how many before it
+        did not. rejected: the number expected then. untaken: ``count`` samples found no room.
+        """

@@ -2,6 +2,7 @@
 
 mod arrays;
 mod control;
+mod link;
 mod machine;
 mod models;
 mod signals;
@@ -17,5 +18,6 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     machine::register(module)?;
     speed::register(module)?;
     models::register(module)?;
-    control::register(module)
+    control::register(module)?;
+    link::register(module)
 }
