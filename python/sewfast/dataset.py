@@ -13,8 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import DataError, SettingError
+from .runs import runs
 
 FloatArray: TypeAlias = NDArray[np.float64]
+
+SHORTEST_PIECE = 100
+"""Samples between two gaps that `Dataset.split_at_gaps` keeps at least."""
 
 
 def _as_float(values: ArrayLike, what: str) -> FloatArray:
@@ -122,6 +126,12 @@ class Experiment:
         """Its place in the recording, as `A:B`."""
         return f"{self.start}:{self.start + len(self)}"
 
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Where inputs and output are finite, shape (N,)."""
+        known: NDArray[np.bool_] = np.isfinite(self.u).all(axis=1) & np.isfinite(self.y)
+        return known
+
     def cut(self, start: int, stop: int) -> Experiment:
         """Samples `start` to `stop`, end excluded, as views.
 
@@ -158,6 +168,8 @@ class Dataset:
         Units as text, empty where unknown.
     counts : tuple (column, counts_per_rev) or None
         Set where the output is a speed [RPM] computed from an encoder's counts.
+    notes : tuple of str
+        What was left out when the data set was made.
 
     Raises
     ------
@@ -172,6 +184,7 @@ class Dataset:
     input_units: tuple[str, ...] = ("",)
     output_unit: str = ""
     counts: tuple[str, float] | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.experiments:
@@ -248,7 +261,11 @@ class Dataset:
         first = parts[0]
         for other in parts[1:]:
             first._require_alike(other)
-        return replace(first, experiments=tuple(e for part in parts for e in part.experiments))
+        return replace(
+            first,
+            experiments=tuple(e for part in parts for e in part.experiments),
+            notes=tuple(note for part in parts for note in part.notes),
+        )
 
     def _require_alike(self, other: Dataset) -> None:
         if self.n_inputs != other.n_inputs:
@@ -336,6 +353,40 @@ class Dataset:
         rest = tuple(e.cut(k, len(e)) for e, k in zip(self.experiments, at, strict=True))
         return replace(self, experiments=first), replace(self, experiments=rest)
 
+    def split_at_gaps(self, shortest: int = SHORTEST_PIECE) -> Dataset:
+        """The pieces without NaN between the gaps, each as an experiment of its own.
+
+        Parameters
+        ----------
+        shortest : int
+            Samples that a piece must have; shorter ones are left out, which `notes` says. The
+            initial state alone takes 20.
+
+        Raises
+        ------
+        SettingError
+            Where `shortest` is no whole number above 0.
+        DataError
+            Where no piece is left.
+        """
+        if isinstance(shortest, bool) or not isinstance(shortest, int) or shortest < 1:
+            raise SettingError(f"shortest: expected a number of samples above 0, got {shortest!r}")
+        pieces = [(e, a, n) for e in self.experiments for a, n in runs(e.measured)]
+        kept = tuple(e.cut(a, a + n) for e, a, n in pieces if n >= shortest)
+        if not kept:
+            longest = max((n for _, _, n in pieces), default=0)
+            raise DataError(
+                f"{self.source}: expected a piece of at least {shortest} samples without a gap, "
+                f"received {longest} at most; record again, or lower `shortest`"
+            )
+        dropped = tuple(
+            f"{e.name}: samples {e.start + a}:{e.start + a + n} between gaps are left out, fewer "
+            f"than {shortest}"
+            for e, a, n in pieces
+            if n < shortest
+        )
+        return replace(self, experiments=kept, notes=(*self.notes, *dropped))
+
     def require_inputs(self) -> None:
         """Raise `DataError` that names the first input value that is not finite."""
         for e in self.experiments:
@@ -382,6 +433,7 @@ class Dataset:
             f"  output  {labelled(self.output_name, self.output_unit)}: {low:g} to {high:g}"
         )
         lines += [f"  {e.name} [{e.range_text}]" for e in self.experiments]
+        lines += [f"  note    {note}" for note in self.notes]
         return "\n".join(lines)
 
 
@@ -430,5 +482,6 @@ def _require_finite(column: FloatArray, what: str, start: int) -> None:
     k = int(np.argmax(bad))
     raise DataError(
         f"{what}: expected finite values, received {column[k]} at sample {start + k} (0-based; "
-        f"{int(bad.sum())} such in {len(column)} samples); repair it or choose a range without it"
+        f"{int(bad.sum())} such in {len(column)} samples); repair it, choose a range without it, "
+        "or take the pieces between: Dataset.split_at_gaps (--split-at-gaps)"
     )

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from .dataset import Dataset
 from .errors import DataError
 from .machine import VirtualMachine
+from .recordfile import Header, save_columns
 from .speed import Method, speed_from_counts
 from .writers import write_table
 
@@ -84,14 +87,31 @@ class Recording:
             channels={"speed_true": self.speed_true},
         )
 
+    def header(self, **settings: Any) -> Header:
+        """What its file says of it; `settings` are what is needed to record it again."""
+        return Header(
+            self.name,
+            self.Ts,
+            {name: UNITS.get(name, "1") for name in self.columns() if name != "t"},
+            len(self),
+            self.counts_per_rev,
+            {"kind": "virtual"},
+            settings,
+        )
+
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the columns as CSV, `.npz`, `.mat` or Parquet, whole or not at all.
+        """Write the columns as CSV, `.npz`, `.mat`, Parquet or MCAP, whole or not at all.
 
         Raises
         ------
         DataError, SettingError
             As for `sewfast.writers.write_table`.
         """
+        if Path(path).suffix.lower() == ".mcap":
+            columns = self.columns()
+            del columns["t"]
+            save_columns(path, self.header(), columns)
+            return
         write_table(path, self.columns(), units=UNITS)
 
     def __repr__(self) -> str:

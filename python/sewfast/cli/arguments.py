@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from ..errors import SettingError
 
 if TYPE_CHECKING:
+    from ..dataset import Dataset
     from ..live import Kind
 
     Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
@@ -19,6 +21,7 @@ else:
 Command: TypeAlias = Callable[[argparse.Namespace], "int | None"]
 
 TABLES = (".csv", ".npz", ".mat", ".parquet")
+RECORDINGS = (*TABLES, ".mcap")
 
 
 class Help(argparse.RawDescriptionHelpFormatter):
@@ -55,7 +58,10 @@ def add_columns(parser: argparse.ArgumentParser, *, from_model: bool) -> None:
         help="column of encoder counts; the output is then the speed [RPM] computed from it",
     )  # fmt: skip
     parser.add_argument(
-        "--counts-per-rev", type=float, metavar="N", help="encoder counts per revolution"
+        "--counts-per-rev",
+        type=float,
+        metavar="N",
+        help="encoder counts per revolution; a recording (.mcap) states them itself",
     )
 
 
@@ -75,6 +81,23 @@ def _kind(text: str) -> Kind:
         return Kind.parse(text)
     except SettingError as e:
         raise argparse.ArgumentTypeError(str(e)) from e
+
+
+def add_split(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--split-at-gaps", action="store_true",
+        help="take the pieces between samples that are missing as experiments of their own",
+    )  # fmt: skip
+
+
+def split_at_gaps(data: Dataset, args: argparse.Namespace) -> Dataset:
+    """The data, in pieces where that is asked for; what is left out goes to standard error."""
+    if not args.split_at_gaps:
+        return data
+    pieces = data.split_at_gaps()
+    for note in pieces.notes:
+        print(note, file=sys.stderr)
+    return pieces
 
 
 def add_output(

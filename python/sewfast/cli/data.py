@@ -25,19 +25,33 @@ def _read_named(source: str, args: argparse.Namespace) -> Dataset:
 
     path, inputs, output = parse_source(source)
     table = read_table(path)
-    inputs, output = inputs or args.input, output or args.output
+    inputs, output = inputs or tuple(args.input or ()), output or args.output
+    counts = args.counts
+    if table.counts_per_rev is not None:
+        inputs, counts = _of_recording(table, inputs, output, counts)
     if not inputs:
         raise _unnamed(table, "input", "--input COL")
-    if not output and not args.counts:
+    if not output and not counts:
         raise _unnamed(table, "output", "--output COL, or --counts COL --counts-per-rev N")
     return read(
         table,
         inputs=inputs,
         output=output,
         Ts=args.ts,
-        counts=args.counts,
+        counts=counts,
         counts_per_rev=args.counts_per_rev,
     )
+
+
+def _of_recording(
+    table: Table, inputs: tuple[str, ...] | None, output: str | None, counts: str | None
+) -> tuple[tuple[str, ...] | None, str | None]:
+    """Inputs and counts of a recording, which has columns `u` and `counts` of its own."""
+    if not inputs and "u" in table:
+        inputs = ("u",)
+    if counts is None and output is None and "counts" in table:
+        counts = "counts"
+    return inputs, counts
 
 
 def _unnamed(table: Table, what: str, remedy: str) -> SettingError:
@@ -58,6 +72,7 @@ def read_for_model(
     columns = model.columns
     columns["inputs"] = inputs or args.input or columns["inputs"]
     columns |= _output_columns(output or args.output, args, columns)
+    columns |= _recorded_columns(table, columns, args, chosen=output or args.output)
     if not needs_output and not _has_output(table, columns):
         columns |= {"output": None, "counts": None, "counts_per_rev": None}
     return read(table, Ts=_sample_time(args.ts, table, model), **columns), table
@@ -75,6 +90,19 @@ def _output_columns(
         }
     if output is not None:
         return {"output": output, "counts": None, "counts_per_rev": None}
+    return {}
+
+
+def _recorded_columns(
+    table: Table, columns: dict[str, Any], args: argparse.Namespace, *, chosen: str | None
+) -> dict[str, Any]:
+    """What a recording knows better than the model: its encoder, and its counts for its speed."""
+    if table.counts_per_rev is None or args.counts_per_rev is not None:
+        return {}
+    if columns["counts"]:
+        return {"counts_per_rev": table.counts_per_rev}
+    if chosen is None and "counts" in table and not _has_output(table, columns):
+        return {"counts": "counts", "counts_per_rev": table.counts_per_rev}
     return {}
 
 

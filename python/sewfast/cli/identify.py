@@ -7,7 +7,15 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from ..errors import Interrupted
-from .arguments import Commands, add_columns, add_command, add_output, require_place
+from .arguments import (
+    Commands,
+    add_columns,
+    add_command,
+    add_output,
+    add_split,
+    require_place,
+    split_at_gaps,
+)
 from .data import read_training, split
 from .output import print_json
 from .progress import Progress
@@ -20,7 +28,7 @@ if TYPE_CHECKING:
 TEXT = """\
 Identify a model of a drive from recordings of its input and its output.
 
-DATA is a CSV, .mat, .npz or Parquet file; several files are several experiments of one drive.
+DATA is a CSV, .mat, .npz, Parquet or MCAP file; several files are several experiments of one drive.
 FILE:IN:OUT names the columns of one file, IN1+IN2 several inputs.
 
 The default, auto, fits linear output error, then a network that starts from it, and keeps the
@@ -38,6 +46,9 @@ examples:
   sewfast identify run.csv --input u --counts encoder --counts-per-rev 1572 -o drive.json
       the speed [RPM] is computed from encoder counts
 
+  sewfast identify run.mcap -o drive.json
+      a recording of a device: input u, speed from its counts
+
   sewfast identify slow.csv:u:y fast.csv:volt:rpm -o drive.json
       two experiments whose columns have different names
 
@@ -53,6 +64,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument("data", nargs="+", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
     add_columns(parser, from_model=False)
+    add_split(parser)
     _add_model(parser)
     parser.add_argument(
         "--train", metavar="A:B",
@@ -91,6 +103,8 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
 def identify_command(args: argparse.Namespace) -> int | None:
     require_place(args.out, (".json",))
     train, held = split(read_training(args), args.train, args.validate)
+    train = split_at_gaps(train, args)
+    held = None if held is None else split_at_gaps(held, args)
     try:
         with Progress("identify") as progress:
             model = _identify(args, train, held, progress)

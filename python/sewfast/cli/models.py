@@ -5,7 +5,16 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from .arguments import TABLES, Commands, add_columns, add_command, add_output, require_place
+from .arguments import (
+    TABLES,
+    Commands,
+    add_columns,
+    add_command,
+    add_output,
+    add_split,
+    require_place,
+    split_at_gaps,
+)
 from .data import read_for_model
 from .output import print_json, write_columns
 
@@ -48,6 +57,7 @@ def add(commands: Commands) -> None:
         summary="errors of a model on a recording", text=VALIDATE, examples=VALIDATE_EXAMPLES,
     )  # fmt: skip
     _add_model_and_data(parser)
+    add_split(parser)
     parser.add_argument(
         "--range", metavar="A:B", help="samples to score, 0-based, end excluded; default: all"
     )
@@ -87,7 +97,8 @@ def validate_command(args: argparse.Namespace) -> None:
 
     model = load_model(args.model)
     data, _ = read_for_model(args.data, model, args)
-    found = validate(model, data if args.range is None else data.slice(args.range), init=args.init)
+    part = split_at_gaps(data if args.range is None else data.slice(args.range), args)
+    found = validate(model, part, init=args.init)
     if args.json:
         print_json(found.to_json())
     else:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from ..recordfile import Header
+
 
 def print_json(value: Any) -> None:
     """Strict JSON: what is not finite becomes null."""
@@ -44,6 +46,7 @@ def write_columns(
     lines: Sequence[str],
     *,
     as_json: bool,
+    header: Header | None = None,
 ) -> None:
     """Columns to `out` and what they say to standard output; without `out` the columns themselves.
 
@@ -56,11 +59,11 @@ def write_columns(
         The result as JSON values.
     lines : sequence of str
         The result as text.
+    header : Header or None
+        What an `.mcap` file says of itself.
     """
-    from ..writers import write_table
-
     if out is not None:
-        write_table(out, columns, units=units)
+        _write(out, columns, units, header)
         summary, lines = {**summary, "file": str(out)}, [*lines, f"written to {out}"]
     if as_json:
         print_json(summary if out is not None else {**summary, "columns": _lists(columns)})
@@ -69,6 +72,19 @@ def write_columns(
     else:
         _print_csv(columns, units)
         print("\n".join(lines), file=sys.stderr)
+
+
+def _write(
+    out: Path, columns: Mapping[str, ArrayLike], units: Mapping[str, str], header: Header | None
+) -> None:
+    if header is not None and out.suffix.lower() == ".mcap":
+        from ..recordfile import save_columns
+
+        save_columns(out, header, {name: columns[name] for name in header.columns})
+        return
+    from ..writers import write_table
+
+    write_table(out, columns, units=units)
 
 
 def _lists(columns: Mapping[str, ArrayLike]) -> dict[str, list[float]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from .arguments import TABLES, Commands, add_command, add_output, require_place
+from .arguments import RECORDINGS, Commands, add_command, add_output, require_place
 from .output import print_json, print_rows, write_columns
 
 RECORD = """\
@@ -19,6 +19,7 @@ RECORD_EXAMPLES = """\
 examples:
   sewfast record --on virtual --signal chirp_lo_hi -o chirp.csv
   sewfast record --on virtual:7 --signal random --seed 3 -o random.parquet
+  sewfast record --on virtual --signal step -o step.mcap
 """
 
 SIGNALS = """\
@@ -39,7 +40,7 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="seed of a random signal (0)"
     )
-    add_output(parser, "OUT", "CSV, .npz, .mat or Parquet; default: CSV to standard output")
+    add_output(parser, "OUT", "CSV, .npz, .mat, Parquet or .mcap; default: CSV to standard output")
     add_command(
         commands, "signals", signals_command,
         summary="the named signals", text=SIGNALS, examples="example:\n  sewfast signals",
@@ -50,10 +51,11 @@ def record_command(args: argparse.Namespace) -> None:
     import numpy as np
 
     from ..machine import VirtualMachine
+    from ..recordfile import Header
     from ..signals import excitation
     from ..speed import speed_from_counts
 
-    require_place(args.out, TABLES)
+    require_place(args.out, RECORDINGS)
     machine = VirtualMachine.from_name(args.on)
     u = excitation(args.signal, args.seed)
     run = machine.run(u)
@@ -86,6 +88,15 @@ def record_command(args: argparse.Namespace) -> None:
             f"{low:.0f} to {high:.0f} RPM; y is within {error:.2g} RPM rms of the true speed"
         ],
         as_json=args.json,
+        header=Header(
+            args.signal,
+            machine.Ts,
+            {"u": "V", "counts": "1", "y": "RPM", "speed_true": "RPM"},
+            len(u),
+            machine.counts_per_rev,
+            {"kind": "virtual", "name": machine.name},
+            {"signal": args.signal, "seed": args.seed},
+        ),
     )
 
 

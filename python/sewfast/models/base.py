@@ -186,7 +186,8 @@ class Model(ABC):
             k = experiment.start + int(np.argmin(np.isfinite(y)))
             raise DataError(
                 f"{experiment.name}: the initial state needs the first {init} outputs, but sample "
-                f"{k} (0-based) is not finite; lower init (--init), or 0 to start from rest"
+                f"{k} (0-based) is not finite; lower init (--init), 0 to start from rest, or take "
+                "the pieces between gaps: Dataset.split_at_gaps (--split-at-gaps)"
             )
         past: FloatArray = self.core.estimate_initial_state(experiment.u[:init], y)
         return past

@@ -1,4 +1,4 @@
-"""Files in: CSV, MATLAB `.mat`, NumPy `.npz` and Parquet, read into a `Table` or a `Dataset`."""
+"""Files in: CSV, `.mat`, `.npz`, Parquet and MCAP, read into a `Table` or a `Dataset`."""
 
 from .files import read_table
 from .recording import parse_source, read

@@ -8,12 +8,13 @@ from pathlib import Path
 from ..errors import DataError
 from .containers import read_mat, read_npz
 from .delimited import read_delimited
+from .mcap import MAGIC, read_mcap
 from .parquet import read_parquet
 from .table import Table
 
 
 def read_table(path: str | os.PathLike[str]) -> Table:
-    """Read all columns of a CSV, `.mat`, `.npz` or Parquet file.
+    """Read all columns of a CSV, `.mat`, `.npz`, Parquet or MCAP file.
 
     Parameters
     ----------
@@ -34,6 +35,8 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     """
     path = Path(path)
     raw = _bytes(path)
+    if raw.startswith(MAGIC) or path.suffix.lower() == ".mcap":
+        return read_mcap(path, raw)
     if raw.startswith(b"PAR1"):
         return read_parquet(path, raw)
     if raw.startswith(b"PK\x03\x04"):
@@ -43,7 +46,7 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     if path.suffix.lower() in (".npz", ".parquet", ".npy"):
         raise DataError(
             f"{path}: expected a {path.suffix} file, but its content is of another kind or "
-            "damaged; supported are CSV, .mat, .npz and Parquet"
+            "damaged; supported are CSV, .mat, .npz, Parquet and recordings (.mcap)"
         )
     return read_delimited(path, raw)
 

@@ -10,9 +10,13 @@ import numpy as np
 
 from ..dataset import Dataset, Experiment, FloatArray
 from ..errors import DataError, SettingError
+from ..runs import runs
 from .files import read_table
 from .table import Table
 from .timebase import sample_time
+
+SHORTEST = 5
+"""Counts in a row that the Kalman smoother needs; the speed of a shorter piece is NaN."""
 
 
 def read(
@@ -32,7 +36,7 @@ def read(
     Parameters
     ----------
     path : path or Table
-        CSV, `.mat`, `.npz` or Parquet; see `read_table`.
+        CSV, `.mat`, `.npz`, Parquet or MCAP; see `read_table`.
     inputs : str or sequence of str
         Column names of the inputs.
     output : str or None
@@ -43,7 +47,8 @@ def read(
         and this one is used.
     counts, counts_per_rev : str and float, or None
         Column of encoder counts. The output is then the speed [RPM] computed from it by a Kalman
-        smoother, and `output` only names it (`speed` by default).
+        smoother, each piece between gaps (NaN) for itself, and `output` only names it (`speed` by
+        default). A recording (MCAP) states the counts of one turn itself.
     time : str or None
         Name of the time column [s] where it is neither `t` nor `time`.
     channels : sequence of str
@@ -67,6 +72,8 @@ def read(
     names = (inputs,) if isinstance(inputs, str) else tuple(inputs)
     if not names:
         raise SettingError("inputs: expected at least one column name, received none")
+    if counts is not None and counts_per_rev is None:
+        counts_per_rev = table.counts_per_rev
     if (counts is None) != (counts_per_rev is None):
         raise SettingError(
             "counts and counts_per_rev belong together: the column of encoder counts and the "
@@ -129,13 +136,26 @@ def _speed(table: Table, column: str, counts_per_rev: float, Ts: float) -> Float
     from ..speed import speed_from_counts
 
     counts = table[column]
-    bad = np.flatnonzero(~np.isfinite(counts))
+    bad = np.flatnonzero(np.isinf(counts))
     if len(bad):
         raise DataError(
-            f"{table.path}: column {column!r}: expected encoder counts in every row, received "
+            f"{table.path}: column {column!r}: expected encoder counts, received "
             f"{counts[bad[0]]} at {table.row(int(bad[0]))}"
         )
-    return speed_from_counts(counts, Ts=Ts, counts_per_rev=counts_per_rev)
+    if not np.isnan(counts).any():
+        return speed_from_counts(counts, Ts=Ts, counts_per_rev=counts_per_rev)
+    pieces = [(a, n) for a, n in runs(~np.isnan(counts)) if n >= SHORTEST]
+    if not pieces:
+        k = int(np.argmax(np.isnan(counts)))
+        raise DataError(
+            f"{table.path}: column {column!r}: expected at least {SHORTEST} encoder counts in a "
+            f"row, received gaps everywhere, the first one at {table.row(k)}; record again"
+        )
+    speed = np.full(len(counts), np.nan)
+    for first, count in pieces:
+        piece = counts[first : first + count]
+        speed[first : first + count] = speed_from_counts(piece, Ts, counts_per_rev)
+    return speed
 
 
 def parse_source(text: str) -> tuple[str, tuple[str, ...] | None, str | None]:

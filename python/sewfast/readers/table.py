@@ -32,6 +32,10 @@ class Table:
         Columns that are there but hold no series of numbers, each with the reason.
     lines : sequence of int or None
         Line of each row in a text file, 1-based.
+    Ts : float or None
+        Sample time [s] where the file states it.
+    counts_per_rev : float or None
+        Encoder counts of one turn, of the column `counts`, where the file states it.
     """
 
     path: Path
@@ -39,6 +43,8 @@ class Table:
     units: Mapping[str, str] = field(default_factory=dict)
     unusable: Mapping[str, str] = field(default_factory=dict)
     lines: Sequence[int] | None = None
+    Ts: float | None = None
+    counts_per_rev: float | None = None
 
     @property
     def names(self) -> tuple[str, ...]:

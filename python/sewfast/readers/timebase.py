@@ -34,6 +34,8 @@ def sample_time(table: Table, given: float | None, column: str | None = None) ->
     """
     if given is not None and not (math.isfinite(given) and given > 0):
         raise SettingError(f"Ts: expected a positive sample time in seconds, received {given}")
+    if table.Ts is not None and column is None:
+        return table.Ts if given is None else _agreed(table, "the header", table.Ts, given)
     name = table.resolve(column) if column is not None else _find(table)
     if name is None:
         if given is None:
@@ -42,11 +44,13 @@ def sample_time(table: Table, given: float | None, column: str | None = None) ->
             )
         return float(given)
     found = _even_period(table, name)
-    if given is None:
-        return found
+    return found if given is None else _agreed(table, f"column {name!r}", found, given)
+
+
+def _agreed(table: Table, source: str, found: float, given: float) -> float:
     if abs(found - given) > TOLERANCE * given:
         raise DataError(
-            f"{table.path}: column {name!r} says Ts = {found:.6g} s, but {given:.6g} s was given; "
+            f"{table.path}: {source} says Ts = {found:.6g} s, but {given:.6g} s was given; "
             "they must agree within 1 %"
         )
     return float(given)

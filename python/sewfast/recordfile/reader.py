@@ -10,10 +10,10 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..dataset import FloatArray, labelled
 from ..errors import DataError
+from ..runs import runs
 from . import walk
 from .container import MAGIC, Message
 from .header import MOST_MISSING, Header, plain
@@ -263,7 +263,7 @@ class _Contents:
             path,
             header,
             MappingProxyType(columns),
-            _runs(~there),
+            runs(~there),
             tuple(self.events),
             "torn" if self.completeness is None else self.completeness["outcome"],
             tuple(self.damage),
@@ -303,10 +303,3 @@ def _checked_completeness(content: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def _is_number(value: object) -> bool:
     return type(value) is int and 0 <= value <= EXACT
-
-
-def _runs(missing: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
-    """(first, count) of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], missing, [False])).astype(np.int8)))
-    pairs = edges.reshape(-1, 2)
-    return tuple((int(a), int(b - a)) for a, b in pairs)
