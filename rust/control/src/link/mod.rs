@@ -15,12 +15,23 @@
 //! ```
 
 pub mod cobs;
+mod command;
 pub mod crc;
+pub mod device;
 pub mod frame;
+mod guard;
+pub mod identity;
+mod profile;
+mod session;
+mod stream;
+mod transmit;
+mod watchdog;
 pub mod wire;
 
 #[cfg(test)]
 mod dice;
 
+pub use device::{Device, Measurement, Output, Reason, State};
 pub use frame::{Deframer, Frame, HEADER, Header, MAX_BODY, MAX_FRAME, MAX_WIRE, Rejected, encode};
+pub use identity::{Channel, Encoding, Identity, Limits, Source, capability};
 pub use wire::{Body, Fields};

@@ -1,0 +1,285 @@
+//! What a host can say, read from the bodies of its frames.
+
+use super::Fields;
+use super::device::State;
+use super::identity::Limits;
+use crate::{Controller, Refused, Settings, Standard};
+
+/// Shortest and longest time of a watchdog \[us\].
+const WATCHDOG: core::ops::RangeInclusive<u32> = 1_000..=10_000_000;
+/// The longest body of ECHO.
+const MAX_ECHO: usize = 200;
+/// The kind of HELLO, which needs neither tag nor session.
+pub(super) const HELLO: u8 = 0x01;
+
+/// Why a command was not done: result and detail of its reply.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Refusal {
+    pub(super) result: u8,
+    pub(super) detail: u32,
+}
+
+impl Refusal {
+    const fn new(result: u8, detail: u32) -> Self {
+        Self { result, detail }
+    }
+    pub(super) const fn unknown(kind: u8) -> Self {
+        Self::new(1, kind as u32)
+    }
+    pub(super) const fn length(body: &[u8]) -> Self {
+        Self::new(2, body.len() as u32)
+    }
+    pub(super) const fn value(index: u32) -> Self {
+        Self::new(3, index)
+    }
+    pub(super) const fn state(state: State) -> Self {
+        Self::new(4, state as u32)
+    }
+    pub(super) const fn tag(tag: u16) -> Self {
+        Self::new(5, tag as u32)
+    }
+    pub(super) const fn limit(index: u32) -> Self {
+        Self::new(6, index)
+    }
+    pub(super) const fn room(fits: u32) -> Self {
+        Self::new(7, fits)
+    }
+    pub(super) const fn unsupported(index: u32) -> Self {
+        Self::new(8, index)
+    }
+    pub(super) const fn order(offset: u32) -> Self {
+        Self::new(9, offset)
+    }
+    pub(super) const fn version(version: u8) -> Self {
+        Self::new(10, version as u32)
+    }
+    pub(super) const MOVING: Self = Self::new(11, 0);
+    pub(super) const NO_LIMITS: Self = Self::new(12, 0);
+
+    /// `Ok` where `holds`.
+    pub(super) fn unless(self, holds: bool) -> Result<(), Self> {
+        if holds { Ok(()) } else { Err(self) }
+    }
+}
+
+/// Values that are to be added to the profile.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Upload<'a> {
+    pub(super) table: u8,
+    pub(super) offset: u32,
+    /// As they came: i16 or f32, by table.
+    pub(super) values: &'a [u8],
+}
+
+/// Gains and filter of the controller, and the unit of its feedback.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Gains {
+    settings: Settings<f32>,
+    filter_time: f32,
+    filter_samples: u8,
+    /// Counts per second of one unit of feedback.
+    pub(super) counts_per_unit: f32,
+}
+
+impl Gains {
+    /// The controller, whose output the volt limit clips as its own limits do, so that its integral knows.
+    ///
+    /// # Errors
+    /// The first setting that is outside its range.
+    pub(super) fn controller(&self, volt: f32, ts: f32) -> Result<Controller<f32>, Refused> {
+        let Settings { u_min, u_max, .. } = self.settings;
+        // not f32::max and f32::min, which would hide a NaN
+        let clipped = Settings {
+            u_min: if u_min < -volt { -volt } else { u_min },
+            u_max: if u_max > volt { volt } else { u_max },
+            ts,
+            ..self.settings
+        };
+        Controller::new(clipped, self.filter_samples.into(), self.filter_time)
+    }
+
+    /// # Errors
+    /// The field that is outside its range, or beyond the volt limit.
+    pub(super) fn check(&self, volt: f32, ts: f32) -> Result<(), Refusal> {
+        let field = |refused: Refused| index_of(refused.name);
+        let free = self.controller(f32::INFINITY, ts);
+        free.map_err(|refused| Refusal::value(field(refused)))?;
+        let unit = self.counts_per_unit * ts;
+        Refusal::value(11).unless(unit > 0.0 && unit.is_finite())?;
+        let clipped = self.controller(volt, ts);
+        clipped.map_err(|refused| Refusal::limit(field(refused)))?;
+        Ok(())
+    }
+}
+
+/// The index of a setting among the fields of GAINS.
+fn index_of(name: &str) -> u32 {
+    match name {
+        "Kp" => 0,
+        "Ti" => 1,
+        "Td" => 2,
+        "alpha" => 3,
+        "beta" => 4,
+        "N" => 5,
+        "Tt" => 6,
+        "u_min" => 7,
+        "u_max" => 8,
+        "slew" => 9,
+        "filter_time" => 10,
+        _ => 12,
+    }
+}
+
+/// How a run goes.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Start {
+    pub(super) mode: u8,
+    pub(super) watchdog: u32,
+    pub(super) at: u64,
+    pub(super) length: u32,
+    pub(super) mask: u16,
+    pub(super) batch: u8,
+}
+
+/// A command with its fields, of the right length but otherwise as they came.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Command<'a> {
+    Hello { from: u8, to: u8, session: u32 },
+    Describe { channel: u8 },
+    Status,
+    Limits(Limits),
+    Arm { watchdog: u32 },
+    Stop,
+    Clear,
+    Upload(Upload<'a>),
+    Gains(Gains),
+    Start(Start),
+    Echo(&'a [u8]),
+}
+
+impl<'a> Command<'a> {
+    /// # Errors
+    /// An unknown kind, a body of the wrong length.
+    pub(super) fn of(kind: u8, body: &'a [u8]) -> Result<Self, Refusal> {
+        let mut fields = Fields::new(body);
+        let command = match kind {
+            HELLO => hello(&mut fields),
+            0x02 => fields.u8().map(|channel| Self::Describe { channel }),
+            0x03 => Some(Self::Status),
+            0x04 => limits(&mut fields),
+            0x05 => fields.u32().map(|watchdog| Self::Arm { watchdog }),
+            0x06 => Some(Self::Stop),
+            0x07 => Some(Self::Clear),
+            0x08 => upload(&mut fields),
+            0x09 => gains(&mut fields),
+            0x0A => start(&mut fields),
+            0x0B => Some(Self::Echo(fields.rest())).filter(|_| body.len() <= MAX_ECHO),
+            _ => return Err(Refusal::unknown(kind)),
+        };
+        let whole = command.filter(|_| fields.is_empty());
+        whole.ok_or(Refusal::length(body))
+    }
+}
+
+fn hello<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
+    Some(Command::Hello {
+        from: fields.u8()?,
+        to: fields.u8()?,
+        session: fields.u32()?,
+    })
+}
+
+fn limits<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
+    Some(Command::Limits(Limits {
+        volt: fields.f32()?,
+        speed: fields.f32()?,
+        acceleration: fields.f32()?,
+        current: fields.f32()?,
+    }))
+}
+
+fn upload<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
+    let (table, offset) = (fields.u8()?, fields.u32()?);
+    let values = fields.rest();
+    // a table that does not exist is refused for that
+    let width = if table == 0 { 2 } else { 4 };
+    let whole = values.len() & (width - 1) == 0;
+    whole.then_some(Command::Upload(Upload {
+        table,
+        offset,
+        values,
+    }))
+}
+
+fn gains<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
+    let gains = Standard {
+        kp: fields.f32()?,
+        ti: fields.f32()?,
+        td: fields.f32()?,
+    };
+    let settings = Settings {
+        gains,
+        alpha: fields.f32()?,
+        beta: fields.f32()?,
+        n: fields.f32()?,
+        tt: fields.f32()?,
+        u_min: fields.f32()?,
+        u_max: fields.f32()?,
+        slew: fields.f32()?,
+        ts: 0.0,
+    };
+    Some(Command::Gains(Gains {
+        settings,
+        filter_time: fields.f32()?,
+        counts_per_unit: fields.f32()?,
+        filter_samples: fields.u8()?,
+    }))
+}
+
+fn start<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
+    Some(Command::Start(Start {
+        mode: fields.u8()?,
+        watchdog: fields.u32()?,
+        at: fields.u64()?,
+        length: fields.u32()?,
+        mask: fields.u16()?,
+        batch: fields.u8()?,
+    }))
+}
+
+/// # Errors
+/// A time out of its range, with the index of its field.
+pub(super) fn check_watchdog(time: u32, index: u32) -> Result<(), Refusal> {
+    Refusal::value(index).unless(WATCHDOG.contains(&time))
+}
+
+/// What a heartbeat adds to its watchdog time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Beat {
+    Keep,
+    Drive(f32),
+    Credit(u64),
+}
+
+/// A heartbeat: how long the device may go on, and what else.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Heartbeat {
+    pub(super) watchdog: u32,
+    pub(super) beat: Beat,
+}
+
+impl Heartbeat {
+    /// `None` where kind, length or a value is wrong.
+    pub(super) fn of(kind: u8, body: &[u8]) -> Option<Self> {
+        let mut fields = Fields::new(body);
+        let watchdog = fields.u32().filter(|time| WATCHDOG.contains(time))?;
+        let beat = match kind {
+            0x20 => Beat::Keep,
+            0x21 => Beat::Drive(fields.f32().filter(|u| u.is_finite())?),
+            0x22 => Beat::Credit(fields.u64()?),
+            _ => return None,
+        };
+        fields.end()?;
+        Some(Self { watchdog, beat })
+    }
+}

@@ -1,0 +1,442 @@
+//! A device without its hardware: bytes and time in, bytes and command out (docs/PROTOCOL.md).
+//!
+//! ```
+//! use sewfast_control::link::{Channel, Device, Encoding, Identity, Limits, Measurement, Source, State, capability};
+//!
+//! static CHANNELS: [Channel; 2] = [
+//!     Channel { encoding: Encoding::Counts, steps_per_unit: 1, name: "counts", unit: "1", source: Source::Counts },
+//!     Channel { encoding: Encoding::Steps, steps_per_unit: 1000, name: "u", unit: "V", source: Source::Command },
+//! ];
+//! let mut device = Device::<1000>::new(Identity {
+//!     boot_id: 1,
+//!     name: "my drive",
+//!     firmware: "0.1",
+//!     period: 1000,
+//!     counts_per_rev: 1572.0,
+//!     capabilities: capability::PROFILE | capability::PID | capability::DRIVE,
+//!     ceilings: Limits { volt: 20.0, speed: 4000.0, acceleration: f32::INFINITY, current: f32::INFINITY },
+//!     channels: &CHANNELS,
+//! })?;
+//! for k in 1..=10 {
+//!     let output = device.sample(1000 * k, &Measurement { counts: 0, current: f32::NAN, further: &[] });
+//!     assert!(!output.enabled && output.u == 0.0);
+//! }
+//! assert_eq!(device.state(), State::Idle);
+//! # Ok::<(), sewfast_control::Refused>(())
+//! ```
+
+use super::command::{Gains, Start};
+use super::guard::Guard;
+use super::identity::{Identity, Limits, capability};
+use super::profile::Profile;
+use super::session::Session;
+use super::stream::Stream;
+use super::transmit::{Transmit, Weight};
+use super::watchdog::Watchdog;
+use super::{Body, Deframer};
+use crate::{Controller, Refused};
+use core::num::NonZeroU64;
+
+mod execute;
+mod run;
+#[cfg(test)]
+mod tests;
+
+/// Period of BEAT while not running \[us\].
+const BEAT: u64 = 200_000;
+
+/// What the hardware measured at a sample.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Measurement<'a> {
+    /// The counter; it may wrap.
+    pub counts: i32,
+    /// \[A\]; NaN where the device measures none.
+    pub current: f32,
+    /// What [`Source::Further`](super::Source::Further) names.
+    pub further: &'a [f32],
+}
+
+/// What the hardware must do until the next output.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Output {
+    /// Command \[V\]; 0 where not enabled.
+    pub u: f32,
+    /// Whether the drive may be on.
+    pub enabled: bool,
+}
+
+impl Output {
+    /// Command 0, drive off.
+    pub const SAFE: Self = Self {
+        u: 0.0,
+        enabled: false,
+    };
+}
+
+/// What the device is about; values as in the protocol.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum State {
+    /// Waits for ten good samples in a row.
+    Boot = 0,
+    /// Safe.
+    Idle = 1,
+    /// Safe, ready to start.
+    Armed = 2,
+    /// Commands.
+    Running = 3,
+    /// Safe until cleared.
+    Tripped = 4,
+}
+
+/// Why a run ended before its time; values as in the protocol.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reason {
+    /// It did not.
+    None = 0,
+    /// The host fell silent.
+    Watchdog = 1,
+    /// Too fast.
+    Speed = 2,
+    /// Too fast a change of speed.
+    Acceleration = 3,
+    /// Too much current.
+    Current = 4,
+    /// The profile ran dry before its end.
+    Underrun = 5,
+    /// A command was refused while running.
+    BadCommand = 6,
+    /// Another host said HELLO while running.
+    HostChanged = 7,
+    /// A measurement was not finite.
+    Measurement = 8,
+    /// A large command moved nothing.
+    NoMotion = 9,
+    /// The firmware's stop input.
+    StopInput = 10,
+    /// A control period was late, early or lost.
+    Late = 11,
+}
+
+/// A run that is planned, under way or over.
+#[derive(Clone, Debug)]
+struct Run {
+    number: u32,
+    start: Start,
+    /// When it shall begin; none once it has.
+    planned: Option<u64>,
+    began: u64,
+    samples: u32,
+    /// The command of mode 2.
+    drive: f32,
+    controller: Option<Controller<f32>>,
+    /// Most that a sample came late \[us\].
+    latest: u32,
+    late_before: bool,
+}
+
+impl Run {
+    const NONE: Self = Self {
+        number: 0,
+        start: Start {
+            mode: 0,
+            watchdog: 0,
+            at: 0,
+            length: 0,
+            mask: 0,
+            batch: 0,
+        },
+        planned: None,
+        began: 0,
+        samples: 0,
+        drive: 0.0,
+        controller: None,
+        latest: 0,
+        late_before: false,
+    };
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Event {
+    Boot = 1,
+    Armed = 2,
+    Started = 3,
+    Finished = 4,
+    Stopped = 5,
+    Tripped = 6,
+    Cleared = 7,
+}
+
+/// A device that holds `CAPACITY` values of a profile and `TRANSMIT` bytes of frames to be sent.
+///
+/// Call all its methods from one context, or guard them: [`sample`](Self::sample) once each period,
+/// [`receive`](Self::receive) when bytes have come, then [`poll`](Self::poll), whose output must be applied, then
+/// [`transmit`](Self::transmit). Nothing is sent between a command that makes the output safe and the call that hands out
+/// that output. Time is in microseconds and must not run backwards; where it does, it stands still here.
+#[derive(Clone, Debug)]
+pub struct Device<const CAPACITY: usize, const TRANSMIT: usize = 2048> {
+    deframer: Deframer,
+    core: Core<CAPACITY, TRANSMIT>,
+}
+
+impl<const CAPACITY: usize, const TRANSMIT: usize> Device<CAPACITY, TRANSMIT> {
+    /// A device at boot.
+    ///
+    /// # Errors
+    /// The first field of the identity that is outside its range.
+    pub fn new(identity: Identity) -> Result<Self, Refused> {
+        Ok(Self {
+            deframer: Deframer::new(),
+            core: Core::new(identity)?,
+        })
+    }
+
+    /// Takes bytes that have come, in pieces of any length. Apply the output of [`poll`](Self::poll) afterwards.
+    pub fn receive(&mut self, now: u64, bytes: &[u8]) {
+        self.core.watch(now);
+        let mut input = bytes;
+        while let Some(frame) = self.deframer.next(&mut input) {
+            match frame {
+                Ok(frame) => self.core.frame(&frame),
+                Err(_) => self.core.refused = self.core.refused.wrapping_add(1),
+            }
+        }
+    }
+
+    /// Takes the measurement of a control period, gives the command until the next one.
+    ///
+    /// `now` is when the sample was taken. A sample that was left out, or came much too late, ends a run, as its times
+    /// would be wrong.
+    pub fn sample(&mut self, now: u64, measurement: &Measurement<'_>) -> Output {
+        self.core.sample(now, measurement);
+        self.hand_out()
+    }
+
+    /// The command at any time between samples; checks the watchdog and that samples are being taken.
+    pub fn poll(&mut self, now: u64) -> Output {
+        self.core.watch(now);
+        self.core.beat();
+        self.hand_out()
+    }
+
+    fn hand_out(&mut self) -> Output {
+        self.core.owed = false;
+        self.core.output
+    }
+
+    /// Moves bytes that wait to be sent to `out`; how many.
+    pub fn transmit(&mut self, out: &mut [u8]) -> usize {
+        if self.core.owed {
+            return 0;
+        }
+        self.core.transmit.take(out)
+    }
+
+    /// Ends what is under way for a reason of the firmware's own. Apply the output of [`poll`](Self::poll) afterwards.
+    pub fn trip(&mut self, now: u64, reason: Reason) {
+        self.core.watch(now);
+        self.core.trip(reason, 0.0);
+    }
+
+    /// The connection is closed: half a frame is forgotten and time runs by itself again.
+    pub fn disconnect(&mut self) {
+        self.deframer = Deframer::new();
+        self.core.credit = None;
+    }
+
+    /// What the device is about.
+    pub fn state(&self) -> State {
+        self.core.state
+    }
+
+    /// Why it tripped last.
+    pub fn reason(&self) -> Reason {
+        self.core.reason
+    }
+
+    /// Until when a host lets the time of a device on credit advance; `None` where it runs by itself.
+    pub fn credit(&self) -> Option<u64> {
+        self.core.credit
+    }
+
+    /// How often ARM was executed since boot: where this has changed, a computed machine returns to its initial state before the
+    /// next sample.
+    pub fn armed_count(&self) -> u32 {
+        self.core.armed
+    }
+
+    /// What the device says about itself.
+    pub fn identity(&self) -> &Identity {
+        &self.core.identity
+    }
+}
+
+/// The state machine behind the frames.
+#[derive(Clone, Debug)]
+struct Core<const CAPACITY: usize, const TRANSMIT: usize> {
+    identity: Identity,
+    schema: u32,
+    period: NonZeroU64,
+    /// Period \[s\].
+    ts: f32,
+    transmit: Transmit<TRANSMIT>,
+    session: Option<Session>,
+    credit: Option<u64>,
+    watchdog: Watchdog,
+    limits: Option<Limits>,
+    guard: Guard,
+    gains: Option<Gains>,
+    profile: Profile<CAPACITY>,
+    stream: Stream,
+    run: Run,
+    state: State,
+    reason: Reason,
+    output: Output,
+    /// A safe output has not been handed out yet.
+    owed: bool,
+    /// The latest time that was heard.
+    now: u64,
+    /// When the last sample was due: the grid of a run, whatever the samples' jitter.
+    due: u64,
+    last_beat: u64,
+    good: u8,
+    armed: u32,
+    received: u32,
+    refused: u32,
+}
+
+impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
+    fn new(identity: Identity) -> Result<Self, Refused> {
+        identity.check()?;
+        let ts = (f64::from(identity.period) / 1e6) as f32;
+        let mut core = Self {
+            identity,
+            schema: identity.schema(),
+            period: NonZeroU64::new(identity.period.into()).unwrap_or(NonZeroU64::MIN),
+            ts,
+            transmit: Transmit::new(identity.tag()),
+            session: None,
+            credit: None,
+            watchdog: Watchdog::new(identity.period),
+            limits: None,
+            guard: Guard::new(identity.period, ts, identity.counts_per_rev),
+            gains: None,
+            profile: Profile::new(),
+            stream: Stream::new(identity.channels),
+            run: Run::NONE,
+            state: State::Boot,
+            reason: Reason::None,
+            output: Output::SAFE,
+            owed: false,
+            now: 0,
+            due: 0,
+            last_beat: 0,
+            good: 0,
+            armed: 0,
+            received: 0,
+            refused: 0,
+        };
+        core.event(Event::Boot, Reason::None, 0.0);
+        Ok(core)
+    }
+
+    /// Lets time pass: the watchdog, and whether samples still come.
+    fn watch(&mut self, now: u64) {
+        self.now = self.now.max(now);
+        self.check_watchdog();
+        let overdue = self.now.saturating_sub(self.due);
+        if self.state == State::Running && overdue >= self.period.get().saturating_mul(2) {
+            self.trip(Reason::Late, overdue as f32);
+        }
+    }
+
+    fn check_watchdog(&mut self) {
+        if !self.watchdog.is_out(self.now) {
+            return;
+        }
+        match self.state {
+            State::Running => self.trip(Reason::Watchdog, 0.0),
+            State::Armed => self.stop(Reason::Watchdog),
+            _ => {}
+        }
+    }
+
+    /// Ends what is under way; only CLEAR leads on.
+    fn trip(&mut self, reason: Reason, value: f32) {
+        match self.state {
+            State::Boot => self.good = 0,
+            State::Tripped => {}
+            _ => {
+                self.halt(State::Tripped);
+                self.reason = reason;
+                self.event(Event::Tripped, reason, value);
+            }
+        }
+    }
+
+    /// Ends what is under way.
+    fn stop(&mut self, reason: Reason) {
+        self.halt(State::Idle);
+        self.event(Event::Stopped, reason, 0.0);
+    }
+
+    /// The one way out of running and armed.
+    fn halt(&mut self, state: State) {
+        self.owed |= self.output.enabled;
+        self.output = Output::SAFE;
+        self.state = state;
+        self.run.planned = None;
+        self.flush();
+        self.profile.rewind();
+    }
+
+    /// Sends the batch under way.
+    fn flush(&mut self) {
+        if self.stream.is_empty() {
+            return;
+        }
+        let (time, mut body) = (self.stream.time(), Body::new());
+        self.stream.flush(self.transmit.overflowed, &mut body);
+        let bytes = body.bytes().unwrap_or(&[]);
+        if self.transmit.send(Weight::Stream, 0xC0, time, bytes) {
+            self.transmit.overflowed = false;
+        }
+    }
+
+    fn event(&mut self, event: Event, reason: Reason, value: f32) {
+        let mut body = Body::new();
+        body.u8(event as u8).u8(self.state as u8).u8(reason as u8);
+        body.u32(self.run.number).u32(self.run.samples).f32(value);
+        self.send(Weight::Answer, 0xC1, &body);
+    }
+
+    /// BEAT, where it is time for one.
+    fn beat(&mut self) {
+        let due = self.now.saturating_sub(self.last_beat) >= BEAT;
+        if self.state == State::Running || !due {
+            return;
+        }
+        self.last_beat = self.now;
+        let mut body = Body::new();
+        body.u32(self.identity.boot_id).u8(self.state as u8);
+        body.u8(self.reason as u8).f32(self.guard.speed());
+        self.send(Weight::Stream, 0xC2, &body);
+    }
+
+    fn send(&mut self, weight: Weight, kind: u8, body: &Body) {
+        let bytes = body.bytes().unwrap_or(&[]);
+        self.transmit.send(weight, kind, self.now, bytes);
+    }
+
+    fn can(&self, bits: u32) -> bool {
+        self.identity.can(bits)
+    }
+
+    /// The limits in force; before any are set, those of the device.
+    fn bounds(&self) -> Limits {
+        self.limits.unwrap_or(self.identity.ceilings)
+    }
+
+    fn on_credit(&self) -> bool {
+        self.can(capability::CREDIT)
+    }
+}

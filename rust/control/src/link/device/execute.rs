@@ -1,0 +1,345 @@
+//! What the host says is done, or refused.
+
+use super::{Core, Event, Reason, Run, State, Weight};
+use crate::link::command::{
+    Beat, Command, Gains, HELLO, Heartbeat, Refusal, Start, Upload, check_watchdog,
+};
+use crate::link::identity::{Limits, VERSION, capability};
+use crate::link::profile::Table;
+use crate::link::session::{Order, Reply, Session};
+use crate::link::{Body, Fields, Frame};
+
+/// How far ahead a run can be planned \[us\].
+const AHEAD: u64 = 10_000_000;
+
+type Done = Result<(), Refusal>;
+
+impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
+    /// A frame that arrived whole.
+    pub(super) fn frame(&mut self, frame: &Frame<'_>) {
+        self.received = self.received.wrapping_add(1);
+        match frame.header.kind {
+            HELLO => {
+                let reply = self.answer(frame);
+                self.send(Weight::Answer, reply.kind, &reply.body);
+            }
+            0x00..0x20 => self.command(frame),
+            0x20..0x40 => self.heartbeat(frame),
+            _ => {}
+        }
+    }
+
+    fn command(&mut self, frame: &Frame<'_>) {
+        let (tag, sequence) = (frame.header.tag, frame.header.sequence);
+        let Some(session) = &mut self.session else {
+            return;
+        };
+        if tag != self.identity.tag() {
+            let reply = reply(frame, &Err(Refusal::tag(tag)), &Body::new());
+            return self.send(Weight::Answer, reply.kind, &reply.body);
+        }
+        match Order::of(sequence, session.command) {
+            Order::Old => {}
+            Order::Repeated => {
+                if let Some(reply) = session.reply.clone() {
+                    self.send(Weight::Answer, reply.kind, &reply.body);
+                }
+            }
+            Order::New => {
+                session.command = sequence;
+                let reply = self.answer(frame);
+                self.send(Weight::Answer, reply.kind, &reply.body);
+                if let Some(session) = &mut self.session {
+                    session.reply = Some(reply);
+                }
+            }
+        }
+    }
+
+    fn answer(&mut self, frame: &Frame<'_>) -> Reply {
+        let mut body = Body::new();
+        let command = Command::of(frame.header.kind, frame.body);
+        let result = command.and_then(|command| self.execute(command, &mut body));
+        if result.is_err() && self.state == State::Running {
+            self.trip(Reason::BadCommand, frame.header.kind.into());
+        }
+        reply(frame, &result, &body)
+    }
+
+    fn heartbeat(&mut self, frame: &Frame<'_>) {
+        let Some(session) = &mut self.session else {
+            return;
+        };
+        let sequence = frame.header.sequence;
+        let in_order = Order::of(sequence, session.heartbeat) == Order::New;
+        if frame.header.tag != self.identity.tag() || !in_order {
+            return;
+        }
+        session.heartbeat = sequence;
+        let Some(heartbeat) = Heartbeat::of(frame.header.kind, frame.body) else {
+            if self.state == State::Running {
+                self.trip(Reason::BadCommand, frame.header.kind.into());
+            }
+            return;
+        };
+        self.watchdog.feed(self.now, heartbeat.watchdog);
+        match heartbeat.beat {
+            Beat::Drive(u) if self.state == State::Running => self.run.drive = u,
+            Beat::Credit(until) if self.on_credit() => self.credit = Some(until),
+            _ => {}
+        }
+    }
+
+    fn execute(&mut self, command: Command<'_>, body: &mut Body) -> Done {
+        match command {
+            Command::Hello { from, to, session } => self.hello(from, to, session, body),
+            Command::Describe { channel } => {
+                let described = self.identity.describe(channel, body);
+                described.ok_or(Refusal::value(0))
+            }
+            Command::Status => {
+                self.status(body);
+                Ok(())
+            }
+            Command::Limits(limits) => self.set_limits(limits, body),
+            Command::Arm { watchdog } => self.arm(watchdog),
+            Command::Stop => {
+                if matches!(self.state, State::Armed | State::Running) {
+                    self.stop(Reason::None);
+                }
+                body.u8(self.state as u8);
+                Ok(())
+            }
+            Command::Clear => self.clear(),
+            Command::Upload(upload) => self.upload(upload, body),
+            Command::Gains(gains) => self.set_gains(gains),
+            Command::Start(start) => self.start(start, body),
+            Command::Echo(bytes) => {
+                body.add(bytes);
+                Ok(())
+            }
+        }
+    }
+
+    fn hello(&mut self, from: u8, to: u8, number: u32, body: &mut Body) -> Done {
+        Refusal::version(VERSION).unless((from..=to).contains(&VERSION))?;
+        if self.session.as_ref().map(|session| session.number) != Some(number) {
+            self.change_host(number);
+        }
+        if self.on_credit() && self.credit.is_none() {
+            self.credit = Some(self.now);
+        }
+        body.u8(VERSION).u32(self.identity.boot_id).u32(self.schema);
+        body.u8(self.state as u8);
+        body.u8(self.identity.channels.len() as u8);
+        body.u32(self.identity.period);
+        body.u32(self.identity.capabilities).u32(CAPACITY as u32);
+        body.f32(self.identity.counts_per_rev);
+        body.text(self.identity.name, 24);
+        body.text(self.identity.firmware, 16);
+        Ok(())
+    }
+
+    /// Nothing that another host has said moves a motor.
+    fn change_host(&mut self, number: u32) {
+        match self.state {
+            State::Running => self.trip(Reason::HostChanged, 0.0),
+            State::Armed => self.stop(Reason::HostChanged),
+            _ => {}
+        }
+        self.session = Some(Session::new(number));
+        self.credit = None;
+        self.gains = None;
+        self.profile.clear(Table::Commands);
+    }
+
+    fn status(&self, body: &mut Body) {
+        let run = &self.run;
+        body.u8(self.state as u8).u8(self.reason as u8);
+        body.u8(run.start.mode).u16(self.stream.mask());
+        body.u32(run.number).u64(run.planned.unwrap_or(run.began));
+        body.u32(run.samples).u32(run.start.length);
+        body.u32(self.profile.end());
+        body.f32(self.guard.speed()).i32(self.guard.counts());
+        body.u32(self.received).u32(self.refused);
+        body.u32(self.transmit.dropped()).u32(run.latest);
+        body.u32(self.session.as_ref().map_or(0, |session| session.number));
+    }
+
+    fn set_limits(&mut self, limits: Limits, body: &mut Body) -> Done {
+        let ceilings = self.identity.ceilings;
+        if limits != Limits::NONE {
+            self.allow(&[State::Idle])?;
+            self.check_limits(&limits)?;
+            self.limits = Some(limits);
+        }
+        for limits in [self.limits.unwrap_or(Limits::NONE), ceilings] {
+            for limit in limits.fields() {
+                body.f32(limit);
+            }
+        }
+        Ok(())
+    }
+
+    fn check_limits(&self, limits: &Limits) -> Done {
+        let ceilings = self.identity.ceilings.fields();
+        let unmeasured = !self.can(capability::CURRENT) && limits.current.is_finite();
+        Refusal::unsupported(3).unless(!unmeasured || limits.current <= 0.0)?;
+        for (index, (limit, ceiling)) in (0..).zip(limits.fields().into_iter().zip(ceilings)) {
+            Refusal::value(index).unless(limit > 0.0)?;
+            Refusal::limit(index).unless(limit <= ceiling)?;
+        }
+        Ok(())
+    }
+
+    fn allow(&self, states: &[State]) -> Done {
+        Refusal::state(self.state).unless(states.contains(&self.state))
+    }
+
+    fn arm(&mut self, watchdog: u32) -> Done {
+        self.allow(&[State::Idle])?;
+        check_watchdog(watchdog, 0)?;
+        Refusal::NO_LIMITS.unless(self.limits.is_some())?;
+        Refusal::MOVING.unless(self.guard.at_rest())?;
+        if self.can(capability::COMPUTED) {
+            self.guard.forget();
+        }
+        self.armed = self.armed.wrapping_add(1);
+        self.state = State::Armed;
+        self.watchdog.feed(self.now, watchdog);
+        self.event(Event::Armed, Reason::None, 0.0);
+        Ok(())
+    }
+
+    fn clear(&mut self) -> Done {
+        self.allow(&[State::Idle, State::Tripped])?;
+        if self.state == State::Tripped {
+            self.state = State::Idle;
+            self.event(Event::Cleared, Reason::None, 0.0);
+        }
+        Ok(())
+    }
+
+    fn upload(&mut self, upload: Upload<'_>, body: &mut Body) -> Done {
+        self.allow(&[State::Idle, State::Armed, State::Running])?;
+        let (table, needed) = match upload.table {
+            0 => (Table::Commands, capability::PROFILE),
+            1 => (Table::References, capability::PID),
+            _ => return Err(Refusal::unsupported(0)),
+        };
+        Refusal::unsupported(0).unless(self.can(needed))?;
+        let count = values(table, upload.values, 1.0).count() as u32;
+        let anew = upload.offset == 0 && self.state != State::Running;
+        let known = if anew {
+            Refusal::room(CAPACITY as u32).unless(count as usize <= CAPACITY)?;
+            0
+        } else {
+            self.profile.place(table, upload.offset, count)?
+        };
+        let steps = self.identity.steps_per_volt();
+        let limit = self.profile_limit(table);
+        for (index, value) in (0..).zip(values(table, upload.values, steps)) {
+            Refusal::limit(index).unless(value.abs() <= limit)?;
+        }
+        if anew {
+            self.profile.clear(table);
+        }
+        for value in values(table, upload.values, steps).skip(known as usize) {
+            self.profile.push(value);
+        }
+        body.u32(self.profile.end()).u32(self.profile.room());
+        Ok(())
+    }
+
+    /// The largest value of a profile; a reference is a speed in the unit of the gains, in RPM before there are any.
+    fn profile_limit(&self, table: Table) -> f32 {
+        let limits = self.bounds();
+        match (table, &self.gains) {
+            (Table::Commands, _) => limits.volt,
+            (Table::References, None) => limits.speed.min(f32::MAX),
+            (Table::References, Some(gains)) => {
+                let counts = limits.speed * (self.identity.counts_per_rev / 60.0);
+                (counts / gains.counts_per_unit).min(f32::MAX)
+            }
+        }
+    }
+
+    fn set_gains(&mut self, gains: Gains) -> Done {
+        self.allow(&[State::Idle, State::Armed])?;
+        Refusal::unsupported(0).unless(self.can(capability::PID))?;
+        gains.check(self.bounds().volt, self.ts)?;
+        self.gains = Some(gains);
+        Ok(())
+    }
+
+    fn start(&mut self, start: Start, body: &mut Body) -> Done {
+        self.allow(&[State::Armed])?;
+        self.check_mode(start.mode)?;
+        check_watchdog(start.watchdog, 1)?;
+        let in_time = (self.now..=self.now.saturating_add(AHEAD)).contains(&start.at);
+        Refusal::value(2).unless(start.at == 0 || in_time)?;
+        Refusal::value(3).unless(start.length > 0 || start.mode == 2)?;
+        Refusal::value(4).unless(self.stream.knows(start.mask))?;
+        Refusal::value(5).unless(self.stream.fits(start.mask, start.batch))?;
+        let at = self.on_grid(start.at);
+        self.run = Run {
+            number: self.run.number.wrapping_add(1),
+            start,
+            planned: Some(at),
+            ..Run::NONE
+        };
+        self.watchdog.feed(self.now, start.watchdog);
+        body.u32(self.run.number).u64(at);
+        Ok(())
+    }
+
+    /// What the mode needs is there, and within the limits that are in force now.
+    fn check_mode(&self, mode: u8) -> Done {
+        let (needed, table) = match mode {
+            0 => (capability::PROFILE, Some(Table::Commands)),
+            1 => (capability::PID, Some(Table::References)),
+            2 => (capability::DRIVE, None),
+            _ => return Err(Refusal::value(0)),
+        };
+        Refusal::unsupported(0).unless(self.can(needed))?;
+        if let Some(table) = table {
+            Refusal::value(3).unless(self.profile.holds(table))?;
+            let within = self.profile.peak() <= self.profile_limit(table);
+            Refusal::limit(0).unless(within)?;
+        }
+        if mode == 1 {
+            let gains = self.gains.as_ref().ok_or(Refusal::value(0))?;
+            let limited = gains.controller(self.bounds().volt, self.ts);
+            Refusal::limit(0).unless(limited.is_ok())?;
+        }
+        Ok(())
+    }
+
+    /// When the first sample at `at` or later is due, but not before the next one.
+    fn on_grid(&self, at: u64) -> u64 {
+        let (period, ahead) = (self.period.get(), at.saturating_sub(self.due));
+        let periods = (ahead.saturating_add(period - 1) / self.period).max(1);
+        self.due.saturating_add(periods.saturating_mul(period))
+    }
+}
+
+/// Commands in volt or references, as they came.
+fn values(table: Table, bytes: &[u8], steps: f32) -> impl Iterator<Item = f32> {
+    let mut fields = Fields::new(bytes);
+    core::iter::from_fn(move || match table {
+        Table::Commands => fields.i16().map(|value| f32::from(value) / steps),
+        Table::References => fields.f32(),
+    })
+}
+
+/// The frame that answers another one.
+fn reply(frame: &Frame<'_>, result: &Done, content: &Body) -> Reply {
+    let mut body = Body::new();
+    body.u32(frame.header.sequence);
+    match result {
+        Ok(()) => body.u8(0).add(content.bytes().unwrap_or(&[])),
+        Err(refusal) => body.u8(refusal.result).u32(refusal.detail),
+    };
+    let kind = frame.header.kind | 0x80;
+    Reply { kind, body }
+}

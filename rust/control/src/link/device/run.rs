@@ -1,0 +1,158 @@
+//! A control period: measure, limits, filter, control, limit, apply.
+
+use super::{Core, Event, Measurement, Output, Reason, State, capability};
+use crate::link::guard::Trip;
+use crate::link::identity::{Limits, Source};
+
+/// Good samples in a row that end the boot.
+const GOOD: u8 = 10;
+
+impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
+    pub(super) fn sample(&mut self, now: u64, measurement: &Measurement<'_>) {
+        self.now = self.now.max(now);
+        self.guard.take(measurement.counts);
+        self.watchdog.count();
+        self.check_watchdog();
+        self.keep_time(now);
+        match self.state {
+            State::Boot => self.settle(measurement),
+            State::Armed => self.begin_if_due(),
+            _ => {}
+        }
+        if self.state == State::Running {
+            self.step(measurement);
+        }
+        self.beat();
+    }
+
+    /// The firmware's measurements have become trustworthy.
+    fn settle(&mut self, measurement: &Measurement<'_>) {
+        let good = self.is_good(measurement);
+        self.good = if good { self.good.saturating_add(1) } else { 0 };
+        if self.good >= GOOD {
+            self.state = State::Idle;
+        }
+    }
+
+    fn is_good(&self, measurement: &Measurement<'_>) -> bool {
+        let current = measurement.current.is_finite() || !self.can(capability::CURRENT);
+        current && measurement.further.iter().all(|value| value.is_finite())
+    }
+
+    /// Sets when this sample was due. A run has a grid, off which it ends; without one the samples come as they come.
+    fn keep_time(&mut self, now: u64) {
+        let planned = self.state == State::Armed && self.run.planned.is_some();
+        if self.state != State::Running && !planned {
+            self.due = self.now;
+            return;
+        }
+        let period = self.period.get();
+        self.due = self.due.saturating_add(period);
+        let (late, early) = (now.saturating_sub(self.due), self.due.saturating_sub(now));
+        self.run.latest = self.run.latest.max(u32::try_from(late).unwrap_or(u32::MAX));
+        let half = late >= period / 2;
+        // a sample that was lost leaves all that follow a period late, less the jitter
+        let off = late >= period || early > period / 2 || half && self.run.late_before;
+        self.run.late_before = half;
+        if !off {
+            return;
+        }
+        if planned {
+            self.stop(Reason::Late);
+            self.due = self.now;
+        } else {
+            self.trip(Reason::Late, late as f32 - early as f32);
+        }
+    }
+
+    fn begin_if_due(&mut self) {
+        if self.run.planned.is_none_or(|at| self.due < at) {
+            return;
+        }
+        let (start, limits) = (self.run.start, self.bounds());
+        self.run.planned = None;
+        self.run.began = self.due;
+        self.run.controller = match (start.mode, &self.gains) {
+            (1, Some(gains)) => gains.controller(limits.volt, self.ts).ok(),
+            _ => None,
+        };
+        self.guard.begin();
+        self.stream.begin(start.mask, start.batch);
+        self.state = State::Running;
+        self.event(Event::Started, Reason::None, 0.0);
+    }
+
+    fn step(&mut self, measurement: &Measurement<'_>) {
+        let length = self.run.start.length;
+        if length != 0 && self.run.samples >= length {
+            self.halt(State::Idle);
+            return self.event(Event::Finished, Reason::None, 0.0);
+        }
+        match self.command_for(measurement) {
+            Ok((u, reference, clipped)) => {
+                self.output = Output { u, enabled: true };
+                self.record(measurement, reference, clipped);
+            }
+            Err((reason, value)) => self.trip(reason, value),
+        }
+    }
+
+    /// Command, reference, whether the command was clipped.
+    fn command_for(&mut self, measurement: &Measurement<'_>) -> Result<(f32, f32, bool), Trip> {
+        let limits = self.limits.unwrap_or(Limits::NONE);
+        if !self.is_good(measurement) {
+            return Err((Reason::Measurement, f32::NAN));
+        }
+        let measured = self.can(capability::CURRENT);
+        let current = if measured { measurement.current } else { 0.0 };
+        self.guard.check(&limits, current)?;
+        let (wanted, reference) = self.wanted()?;
+        if !wanted.is_finite() {
+            return Err((Reason::Measurement, wanted));
+        }
+        let u = wanted.max(-limits.volt).min(limits.volt);
+        self.guard.expect_motion(&limits, u)?;
+        let limited = self.run.controller.is_some() && u.abs() == limits.volt;
+        Ok((u, reference, u != wanted || limited))
+    }
+
+    fn wanted(&mut self) -> Result<(f32, f32), Trip> {
+        if self.run.start.mode == 2 {
+            return Ok((self.run.drive, f32::NAN));
+        }
+        let dry = (Reason::Underrun, self.run.samples as f32);
+        let value = self.profile.play().ok_or(dry)?;
+        if self.run.start.mode == 0 {
+            return Ok((value, f32::NAN));
+        }
+        let (Some(controller), Some(gains)) = (&mut self.run.controller, &self.gains) else {
+            return Err((Reason::BadCommand, 0.0));
+        };
+        let feedback = self.guard.change() as f32 / (self.ts * gains.counts_per_unit);
+        Ok((controller.step(value, feedback), value))
+    }
+
+    fn record(&mut self, measurement: &Measurement<'_>, reference: f32, clipped: bool) {
+        if !self.stream.accepts(measurement.counts) {
+            self.flush();
+        }
+        let (output, controller) = (self.output, &self.run.controller);
+        let value = |source| match source {
+            Source::Counts => measurement.counts as f32,
+            Source::Command => output.u,
+            Source::Current => measurement.current,
+            Source::Reference => reference,
+            Source::Feedback => controller.as_ref().map_or(f32::NAN, |c| c.filtered()),
+            Source::Further(index) => {
+                let further = measurement.further.get(usize::from(index));
+                further.copied().unwrap_or(f32::NAN)
+            }
+        };
+        self.stream
+            .push(self.due, measurement.counts, clipped, value);
+        if self.stream.is_full() {
+            self.flush();
+        }
+        self.run.samples = self.run.samples.wrapping_add(1);
+    }
+}

@@ -1,0 +1,247 @@
+//! What a device says about itself: names, period, ceilings, channels.
+
+use super::Body;
+use super::crc::Crc;
+use crate::Refused;
+
+/// The version of the protocol that is spoken here.
+pub const VERSION: u8 = 1;
+/// As many channels as the mask of START has bits.
+pub const MAX_CHANNELS: usize = 16;
+
+/// Bits of [`Identity::capabilities`].
+pub mod capability {
+    /// Plays uploaded commands.
+    pub const PROFILE: u32 = 1;
+    /// Runs the PID along uploaded references.
+    pub const PID: u32 = 1 << 1;
+    /// Holds the command that the host sends.
+    pub const DRIVE: u32 = 1 << 2;
+    /// Its time advances by the host's credit.
+    pub const CREDIT: u32 = 1 << 3;
+    /// Measures the current.
+    pub const CURRENT: u32 = 1 << 4;
+    /// A computed machine, which ARM takes back to its initial state.
+    pub const COMPUTED: u32 = 1 << 5;
+}
+
+/// How a channel's samples are written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Encoding {
+    /// The first as i32, each further one as i16 difference to the one before.
+    Counts = 0,
+    /// i16 in steps of `1/steps_per_unit`.
+    Steps = 1,
+    /// f32.
+    Float = 2,
+}
+
+impl Encoding {
+    /// The bytes that so many samples take.
+    pub(super) fn size(self, samples: usize) -> usize {
+        match self {
+            Self::Counts if samples == 0 => 0,
+            Self::Counts => 2 + 2 * samples,
+            Self::Steps => 2 * samples,
+            Self::Float => 4 * samples,
+        }
+    }
+}
+
+/// Where the device takes a channel's value from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Source {
+    /// The counter.
+    Counts,
+    /// The command as applied.
+    Command,
+    /// The measured current.
+    Current,
+    /// The reference; NaN where the PID does not run.
+    Reference,
+    /// The feedback after its filter; NaN where the PID does not run.
+    Feedback,
+    /// One of [`Measurement::further`](super::Measurement::further).
+    Further(u8),
+}
+
+/// A signal that can be streamed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Channel {
+    /// How its samples are written.
+    pub encoding: Encoding,
+    /// Steps per unit of [`Encoding::Steps`].
+    pub steps_per_unit: u32,
+    /// At most 15 bytes.
+    pub name: &'static str,
+    /// At most 7 bytes.
+    pub unit: &'static str,
+    /// Where the value comes from.
+    pub source: Source,
+}
+
+/// What the device keeps within.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Limits {
+    /// Largest command to either side \[V\].
+    pub volt: f32,
+    /// Largest speed to either side \[RPM\].
+    pub speed: f32,
+    /// Largest acceleration to either side \[RPM/s\].
+    pub acceleration: f32,
+    /// Largest current to either side \[A\].
+    pub current: f32,
+}
+
+impl Limits {
+    /// Not set.
+    pub(super) const NONE: Self = Self {
+        volt: 0.0,
+        speed: 0.0,
+        acceleration: 0.0,
+        current: 0.0,
+    };
+
+    pub(super) fn fields(&self) -> [f32; 4] {
+        [self.volt, self.speed, self.acceleration, self.current]
+    }
+}
+
+/// What a device is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Identity {
+    /// Another one, in its low 16 bits, than at the boot before.
+    pub boot_id: u32,
+    /// At most 24 bytes.
+    pub name: &'static str,
+    /// At most 16 bytes.
+    pub firmware: &'static str,
+    /// Control period \[us\].
+    pub period: u32,
+    /// Counts per turn of the motor.
+    pub counts_per_rev: f32,
+    /// Bits of [`capability`].
+    pub capabilities: u32,
+    /// The limits of the limits; infinite where there is none.
+    pub ceilings: Limits,
+    /// The counter, the command, then what else there is.
+    pub channels: &'static [Channel],
+}
+
+impl Identity {
+    /// Whether the device has every capability in `bits`.
+    pub fn can(&self, bits: u32) -> bool {
+        self.capabilities & bits == bits
+    }
+
+    /// The low 16 bits of the boot id, which every frame carries.
+    pub(super) fn tag(&self) -> u16 {
+        self.boot_id as u16
+    }
+
+    /// Steps of the command's channel per volt.
+    pub(super) fn steps_per_volt(&self) -> f32 {
+        self.channels.get(1).map_or(1, |u| u.steps_per_unit) as f32
+    }
+
+    /// # Errors
+    /// The first field that is outside its range.
+    pub(super) fn check(&self) -> Result<(), Refused> {
+        let unless = Refused::unless;
+        short(self.name, "name", 24, "at most 24 bytes")?;
+        short(self.firmware, "firmware", 16, "at most 16 bytes")?;
+        let period = self.period;
+        let holds = (10..=1_000_000).contains(&period);
+        unless(holds, "period", "10 us to 1 s", period.into())?;
+        let counts = self.counts_per_rev;
+        let holds = counts > 0.0 && counts.is_finite();
+        let expected = "a finite number above 0";
+        unless(holds, "counts_per_rev", expected, counts.into())?;
+        self.check_ceilings()?;
+        self.check_channels()
+    }
+
+    fn check_ceilings(&self) -> Result<(), Refused> {
+        let ceilings = self.ceilings;
+        let names = ["volt", "speed", "acceleration", "current"];
+        for (name, ceiling) in names.into_iter().zip(ceilings.fields()) {
+            let expected = "a ceiling above 0, or inf";
+            Refused::unless(ceiling > 0.0, name, expected, ceiling.into())?;
+        }
+        let volt = ceilings.volt;
+        let holds = volt * self.steps_per_volt() <= i16::MAX.into();
+        let expected = "a ceiling that the steps of the second channel can hold";
+        Refused::unless(holds, "volt", expected, volt.into())?;
+        let holds = self.can(capability::CURRENT) || ceilings.current == f32::INFINITY;
+        let expected = "inf where the current is not measured";
+        Refused::unless(holds, "current", expected, ceilings.current.into())
+    }
+
+    fn check_channels(&self) -> Result<(), Refused> {
+        let count = self.channels.len();
+        let holds = (2..=MAX_CHANNELS).contains(&count);
+        let expected = "2 to 16 channels";
+        Refused::unless(holds, "channels", expected, count as f64)?;
+        for (index, channel) in self.channels.iter().enumerate() {
+            channel.check(index, self.can(capability::CURRENT))?;
+        }
+        Ok(())
+    }
+
+    /// The reply to DESCRIBE after its result; `None` where there is no such channel.
+    pub(super) fn describe(&self, index: u8, body: &mut Body) -> Option<()> {
+        let channel = self.channels.get(usize::from(index))?;
+        body.u8(index).u8(channel.encoding as u8);
+        body.u32(channel.steps_per_unit);
+        body.text(channel.name, 15).text(channel.unit, 7);
+        Some(())
+    }
+
+    /// CRC-32 of version, period and the descriptions of all channels.
+    pub(super) fn schema(&self) -> u32 {
+        let mut crc = Crc::new()
+            .update(&[VERSION])
+            .update(&self.period.to_le_bytes());
+        let mut body = Body::new();
+        for index in 0..self.channels.len() as u8 {
+            body.clear();
+            self.describe(index, &mut body);
+            crc = crc.update(body.bytes().unwrap_or(&[]));
+        }
+        crc.value()
+    }
+}
+
+impl Channel {
+    fn check(&self, index: usize, measures_current: bool) -> Result<(), Refused> {
+        let unless = Refused::unless;
+        let at = index as f64;
+        short(self.name, "channel name", 15, "at most 15 bytes")?;
+        short(self.unit, "channel unit", 7, "at most 7 bytes")?;
+        let counts = (self.encoding, self.source) == (Encoding::Counts, Source::Counts);
+        let holds = counts == (self.encoding == Encoding::Counts) && (index != 0 || counts);
+        let expected = "the counter as counts in channel 0, no other source as counts";
+        unless(holds, "channels", expected, at)?;
+        let command = (self.encoding, self.source) == (Encoding::Steps, Source::Command);
+        let expected = "the command in steps in channel 1";
+        unless(index != 1 || command, "channels", expected, at)?;
+        let holds = self.encoding != Encoding::Steps || self.steps_per_unit > 0;
+        unless(
+            holds,
+            "steps_per_unit",
+            "above 0",
+            self.steps_per_unit.into(),
+        )?;
+        let holds = self.source != Source::Current || measures_current;
+        unless(holds, "channels", "no current where none is measured", at)
+    }
+}
+
+fn short(
+    text: &str,
+    name: &'static str,
+    most: usize,
+    expected: &'static str,
+) -> Result<(), Refused> {
+    Refused::unless(text.len() <= most, name, expected, text.len() as f64)
+}
