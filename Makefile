@@ -51,11 +51,16 @@ stubs: $(DEV)
 rust-test: $(DEV) ## unit, property and documentation tests of the crates
 	cargo test --workspace --release --quiet
 
-no-std: ## links the controller crate into a program without the standard library
+no-std: ## links the controller crate without the standard library, and its frames without a path that panics
 	cargo build --package sewfast-control --release --quiet
 	rustc --edition 2024 --crate-type staticlib -C panic=abort -D warnings \
 	  --extern sewfast_control=target/release/libsewfast_control.rlib \
 	  --out-dir target/bare rust/control/tests/bare/staticlib.rs
+ifeq ($(shell uname),Linux)
+	rustc --edition 2024 --crate-type cdylib -C panic=abort -C opt-level=s -C lto=fat -C embed-bitcode=yes -D warnings \
+	  --extern sewfast_control=target/release/libsewfast_control.rlib -C link-args='-nostdlib -lc -Wl,-z,defs' \
+	  --out-dir target/bare rust/control/tests/bare/no_panic.rs
+endif
 
 python-test: $(DEV) ## pytest, with every snippet of the documentation and every example
 	$(BIN)/python -m pytest

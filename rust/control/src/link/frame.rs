@@ -181,11 +181,11 @@ impl Deframer {
         if self.skipping {
             return true;
         }
-        let end = self.length.saturating_add(piece.len());
-        match self.block.get_mut(self.length..end) {
+        let room = self.block.get_mut(self.length..);
+        match room.and_then(|room| room.get_mut(..piece.len())) {
             Some(place) => {
                 place.copy_from_slice(piece);
-                self.length = end;
+                self.length += piece.len();
             }
             None => {
                 self.length = 0;

@@ -122,11 +122,11 @@ impl Body {
     /// Add bytes as they are.
     #[inline]
     pub fn add(&mut self, bytes: &[u8]) -> &mut Self {
-        let end = self.length.saturating_add(bytes.len());
-        match self.bytes.get_mut(self.length..end) {
+        let room = self.bytes.get_mut(self.length..);
+        match room.and_then(|room| room.get_mut(..bytes.len())) {
             Some(place) => {
                 place.copy_from_slice(bytes);
-                self.length = end;
+                self.length += bytes.len();
             }
             None => self.overfull = true,
         }
