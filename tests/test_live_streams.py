@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 import struct
 import sys
@@ -81,10 +82,12 @@ def test_tail_of_a_fast_record_is_thinned() -> None:
         clock.now += 0.02
         rows = [row for _, row in tail.rows()]
         ticks = np.rint([1000 * row["t"] for row in rows]).astype(int)
-        assert set(np.diff(ticks)) == {80}
-        assert (ticks % 80 == 0).all()
+        if first >= 40_000:
+            assert set(np.diff(ticks)) == {80}
+            assert (ticks % 80 == 0).all()
         sent += len(rows)
-    assert 0 < sent <= RATE
+    # the second that could be made up for, and the one that passed
+    assert 0 < sent <= 2 * RATE
 
 
 def test_tail_that_comes_late_takes_what_is_left() -> None:
@@ -167,7 +170,7 @@ def test_host_without_an_address_is_refused() -> None:
 
 
 def subscribe(port: int) -> socket.socket:
-    """A raw client that has asked for the topic /drive, and reads only what it is told to."""
+    """A raw client that has asked for the topic /drive, and reads no further."""
     client = socket.socket()
     # before connecting, so that the window is small from the start
     client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -179,9 +182,10 @@ def subscribe(port: int) -> socket.socket:
         b"Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n"
     )
     found = b""
-    while b'"topic":"/drive"' not in found:
+    while (channel := re.search(rb'"id":(\d+),"topic":"/drive"', found)) is None:
         found += client.recv(4096)
-    ask = json.dumps({"op": "subscribe", "subscriptions": [{"id": 7, "channelId": 1}]}).encode()
+    wanted = {"id": 7, "channelId": int(channel[1])}
+    ask = json.dumps({"op": "subscribe", "subscriptions": [wanted]}).encode()
     # a client's frame: text, final, masked with zeros
     client.sendall(bytes([0x81, 0x80 | len(ask)]) + bytes(4) + ask)
     return client
@@ -190,8 +194,15 @@ def subscribe(port: int) -> socket.socket:
 def test_foxglove_client_receives_samples_and_status() -> None:
     pytest.importorskip("foxglove", reason="needs the foxglove extra")
     connect = pytest.importorskip("websockets.sync.client").connect
-    f = feed()
+    f, done = feed(), threading.Event()
     samples, texts, topics = [], [], {}
+
+    def put() -> None:
+        for first in range(0, 100_000, 10):
+            f.put(first, batch(first))
+            if done.wait(0.005):
+                return
+
     with (
         open_view("foxglove:0", f) as view,
         connect(f"ws://127.0.0.1:{view.port}", subprotocols=["foxglove.sdk.v1"]) as client,
@@ -210,18 +221,21 @@ def test_foxglove_client_receives_samples_and_status() -> None:
                 }
             )
         )
-        time.sleep(0.2)
-        for first in range(0, 200, 10):
-            f.put(first, batch(first))
-            time.sleep(0.005)
-        f.say("tripped: speed limit")
+        writer = threading.Thread(target=put)
+        writer.start()
         while len(samples) < 200 or not texts:
             message = client.recv(timeout=10)
             _, subscription, stamp = struct.unpack_from("<BIQ", message)
             (samples if subscription == 1 else texts).append((stamp, strict(message[13:])))
-    assert [round(1000 * row["t"]) for _, row in samples] == list(range(200))
+            if len(samples) == 1:
+                f.say("tripped: speed limit")
+        done.set()
+        writer.join()
+    ticks = [round(1000 * row["t"]) for _, row in samples]
+    assert ticks == list(range(ticks[0], ticks[0] + len(ticks)))
     assert samples[150][1]["speed"] == pytest.approx(381.6794)
     np.testing.assert_allclose(np.diff([s for s, _ in samples]), 1_000_000, atol=2000)
+    assert {text["message"] for _, text in texts} == {"tripped: speed limit"}
     assert texts[0][1]["message"] == "tripped: speed limit"
     schema = json.loads(topics["/drive"]["schema"])
     assert schema["properties"]["u"] == {"type": "number", "description": "V"}
@@ -238,7 +252,7 @@ def resident() -> int:
 def test_foxglove_client_that_never_reads_holds_nothing_up() -> None:
     pytest.importorskip("foxglove", reason="needs the foxglove extra")
     f = Feed(
-        {f"column_{k:02}_of_a_rather_wide_record": "V" for k in range(40)}, 0.001, None, "hang"
+        {f"column_{k:02}_of_a_rather_wide_record": "V" for k in range(60)}, 0.001, None, "hang"
     )  # fmt: skip
     wide = {name: np.random.default_rng(0).normal(size=10) for name in f.columns}
 
@@ -247,16 +261,19 @@ def test_foxglove_client_that_never_reads_holds_nothing_up() -> None:
             f.put(first + 10 * k, wide)
             time.sleep(0.002)
 
-    with open_view("foxglove:0", f) as view, subscribe(view.port):
+    with open_view("foxglove:0", f) as view, subscribe(view.port) as client:
         fill(0, 300)
+        while b'"column_00_of' not in client.recv(4096):
+            continue
+        # from here on it does not read
         before = resident()
-        # 50 samples a look of 2.5 kB each: many times what the server keeps
-        fill(3000, 1200)
+        # 20 MB of messages, of which the server keeps 1,024
+        fill(3000, 700)
         grown = resident() - before
-        assert f.received == 15_000
+        assert f.received == 10_000
         began = time.monotonic()
     assert time.monotonic() - began < 5
-    assert grown < 16e6
+    assert grown < 10e6
 
 
 def test_foxglove_port_that_is_taken_is_refused() -> None:

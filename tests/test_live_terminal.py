@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
@@ -33,13 +34,15 @@ class Terminal:
         self._ours, self.theirs = os.openpty()
         self.screen = pyte.Screen(columns, rows)
         self._stream = pyte.ByteStream(self.screen)
+        self._lock = threading.Lock()
         self.output = b""
         self.resize(columns, rows)
         self._reader: threading.Thread | None = None
 
     def resize(self, columns: int, rows: int) -> None:
         fcntl.ioctl(self._ours, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
-        self.screen.resize(rows, columns)
+        with self._lock:
+            self.screen.resize(rows, columns)
 
     def read(self) -> None:
         """Read in the background, as a terminal does."""
@@ -53,6 +56,18 @@ class Terminal:
         if reading:
             self.read()
 
+    def fill(self) -> None:
+        """Write until it takes no more."""
+        pen = os.open(os.ttyname(self.theirs), os.O_WRONLY | os.O_NONBLOCK)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(pen, b"x" * 100)
+        os.close(pen)
+
+    def hang_up(self) -> None:
+        """Go away, as a terminal whose window is closed."""
+        os.close(self._ours)
+
     def _read(self) -> None:
         while True:
             try:
@@ -62,7 +77,8 @@ class Terminal:
             if not chunk:
                 return
             self.output += chunk
-            self._stream.feed(chunk)
+            with self._lock:
+                self._stream.feed(chunk)
 
     def finish(self) -> list[str]:
         """Lines of the screen once all was written, without the empty ones at the end."""
@@ -210,9 +226,15 @@ def test_encoding_without_braille(terminal: Terminal) -> None:
     assert b"\x1b[36m*" in terminal.output
 
 
-def test_blocked_terminal_holds_nothing_up(terminal: Terminal) -> None:
+@pytest.mark.parametrize("anew", [True, False], ids=["opened anew", "shared"])
+def test_blocked_terminal_holds_nothing_up(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch, anew: bool
+) -> None:
     """Nobody reads: puts go on, and the end comes."""
     terminal.attach(reading=False)
+    terminal.fill()
+    if not anew:
+        monkeypatch.setattr(os, "ttyname", _no_name)
     f = feed(None)
     began = time.monotonic()
     with open_view("terminal", f):
@@ -223,10 +245,37 @@ def test_blocked_terminal_holds_nothing_up(terminal: Terminal) -> None:
             time.sleep(0.02)
         assert f.received == 30_000
     assert time.monotonic() - began < 10
-    writers = [t for t in threading.enumerate() if t.name == "live view"]
-    for thread in writers:
-        thread.join(10)
-    assert not any(t.is_alive() for t in writers)
+    # what still waits for a shared terminal is let go
+    terminal.hang_up()
+    for thread in threading.enumerate():
+        if thread.name == "live view":
+            thread.join(10)
+            assert not thread.is_alive()
+
+
+def _no_name(_: int) -> str:
+    raise OSError("no name")
+
+
+def test_shared_terminal_is_drawn_on(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it cannot be opened anew."""
+    monkeypatch.setattr(os, "ttyname", _no_name)
+    terminal.attach()
+    f = feed()
+    with open_view("terminal", f):
+        play(f, 0.3)
+    lines = terminal.finish()
+    assert lines[0] == "record sine"
+    assert lines[-1] == "gap of 50 samples at 1.000 s"
+
+
+def test_terminal_that_goes_away_costs_the_record_nothing(terminal: Terminal) -> None:
+    terminal.attach(reading=False)
+    f = feed()
+    with open_view("terminal", f):
+        terminal.hang_up()
+        play(f, 0.3)
+    assert f.received == 1950
 
 
 def test_not_a_terminal_is_silent(

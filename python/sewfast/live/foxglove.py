@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from typing import Any
 
 from ..errors import SettingError
@@ -50,6 +51,8 @@ class FoxgloveView:
                 "the Foxglove view expected the package foxglove-sdk, received none; "
                 'pip install "sewfast[foxglove]"'
             ) from e
+        # a client that goes away is no news; who wants it asks Python's logging for it
+        logging.getLogger("foxglove").addHandler(logging.NullHandler())
         self._sdk: Any = foxglove
         self._context = foxglove.Context()
         try:

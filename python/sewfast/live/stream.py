@@ -14,7 +14,7 @@ PERIOD_S = 0.02
 
 RATE = 2500
 """Samples that a stream sends in a second at most; of a faster record every second one, or
-fewer."""
+fewer. What was not used in the last second may be made up for."""
 
 
 class Tail:
@@ -31,19 +31,21 @@ class Tail:
         self._feed, self._now = feed, now
         self._next = 0
         self._looked = now()
+        self._allowed = float(RATE)
         self._began: float | None = None
         self._said = 0
 
     def rows(self) -> Iterator[tuple[float, dict[str, float]]]:
         """Wall time [s] and columns of each sample that is sent; a missing value is left out."""
         feed, stop = self._feed, self._feed.end
-        allowed = self._allowance()
+        self._refill()
         start = max(self._next, feed.oldest)
         if stop <= start:
             return
         if self._began is None:
             self._began = self._looked - stop * feed.Ts
-        stride = math.ceil((stop - start) / allowed)
+        stride = math.ceil((stop - start) / max(self._allowed, 1.0))
+        self._allowed -= (stop - start) / stride
         # the same samples whenever the look was: multiples of the stride
         first = -(-start // stride) * stride
         columns = {name: c[first - start :: stride] for name, c in feed.read(start, stop).items()}
@@ -59,11 +61,11 @@ class Tail:
         """Wall time of the last look [s]."""
         return self._looked
 
-    def _allowance(self) -> int:
-        """How many samples may be sent, for the time since the last look."""
+    def _refill(self) -> None:
+        """What may be sent grows with time (a token bucket)."""
         now = self._now()
-        passed, self._looked = now - self._looked, now
-        return max(50, math.ceil(RATE * min(max(passed, 0.0), 1.0)))
+        passed, self._looked = max(now - self._looked, 0.0), now
+        self._allowed = min(self._allowed + RATE * passed, RATE)
 
     def said(self) -> Iterator[str]:
         """The lines of status since the last look."""

@@ -1,4 +1,4 @@
-"""`Tty`: a terminal that is written to without ever waiting for it longer than told."""
+"""`Tty`: a terminal that is written to without waiting for it longer than told."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ class Tty:
     """The terminal behind a text stream.
 
     It is opened anew where the system lets it: only then can writing be non-blocking without
-    making the terminal so for everybody who shares it.
+    making the terminal so for everybody who shares it. Elsewhere a write waits as long as the
+    terminal is blocked.
 
     Parameters
     ----------
@@ -55,17 +56,21 @@ class Tty:
         rest = memoryview(text.encode(self.encoding or "ascii", "replace"))
         stuck = time.monotonic()
         while rest:
-            try:
-                written = os.write(self._fd, rest)
-            except BlockingIOError:
-                written = 0
-            if written:
+            if written := self._write_some(rest):
                 rest, stuck = rest[written:], time.monotonic()
             elif not wait(time.monotonic() - stuck):
                 return False
-            else:
-                select.select([], [self._fd], [], _SLICE_S)
         return True
+
+    def _write_some(self, rest: memoryview) -> int:
+        """Bytes written, 0 where the terminal took none for a moment."""
+        # Windows waits for sockets only
+        if os.name != "nt" and not select.select([], [self._fd], [], _SLICE_S)[1]:
+            return 0
+        try:
+            return os.write(self._fd, rest)
+        except BlockingIOError:
+            return 0
 
     def close(self) -> None:
         os.close(self._fd)

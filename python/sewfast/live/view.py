@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Protocol
 
 from ..errors import SettingError
@@ -68,7 +68,13 @@ def open_view(kind: str | Kind, feed: Feed) -> Iterator[View | None]:
         feed.close()
         thread.join(CLOSE_S)
         for e in failures:
-            print(f"the live view ended early: {type(e).__name__}: {e}", file=sys.stderr)
+            _tell(e)
+
+
+def _tell(e: Exception) -> None:
+    # standard error may be the very terminal that has gone away
+    with suppress(OSError, ValueError):
+        print(f"the live view ended early: {type(e).__name__}: {e}", file=sys.stderr, flush=True)
 
 
 def _run(view: View, feed: Feed, failures: list[Exception]) -> None:
