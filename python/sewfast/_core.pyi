@@ -331,3 +331,19 @@ class LinkReceiver:
         missing: the first of ``count`` frames. reset: the first frame of the boot that came, and how many before it
         did not. rejected: the number expected then. untaken: ``count`` samples found no room.
         """
+
+# --- host_loop.rs -----------------------------------------------------------------------------------------
+
+def host_loop(
+    port: int, controller: Controller, reference: _F, *, tag: int, command: int, heartbeat: int, device_period: int,
+    ratio: int, watchdog: int, batch: int, mask: int, channels: Sequence[tuple[int, int]], counts_per_unit: float,
+    lock_memory: bool = False, progress: _Progress = None,
+) -> dict[str, Any]:
+    """Drive a device in mode 2 from the open descriptor ``port``; every time is in microseconds.
+
+    ``command`` and ``heartbeat`` are the sequences last used in the session; ``channels`` are encoding and steps per unit
+    of the channels in ``mask``. Keys: outcome (name; reason, value, command, result, detail, text where they apply),
+    ticks (number, late, age, fresh, y, feedback, u; all (n,)), missed, unsent, times (int64) and columns of the samples,
+    start, round_trip, stopped, taken and device_late (None where the device did not say), counters, sequences, memory
+    (None: not asked for; empty: locked; else the refusal). Ctrl-C is an outcome, not an exception.
+    """

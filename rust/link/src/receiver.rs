@@ -79,6 +79,14 @@ impl Receiver {
             .unwrap_or_default()
     }
 
+    /// Appends times and columns of the samples since the last call to `columns`, which has one for each channel; both keep
+    /// their memory.
+    pub fn append_to(&mut self, columns: &mut Columns) {
+        if let Some(samples) = self.intake.samples.as_mut() {
+            samples.append_to(columns);
+        }
+    }
+
     /// How often everything has happened.
     pub const fn counters(&self) -> &Counters {
         &self.intake.log.counters

@@ -171,6 +171,14 @@ impl Samples {
         Batch::Taken(count, flags)
     }
 
+    /// Moves the samples since the last call to the end of `columns`.
+    pub fn append_to(&mut self, columns: &mut Columns) {
+        columns.0.append(&mut self.columns.0);
+        for (column, more) in columns.1.iter_mut().zip(&mut self.columns.1) {
+            column.append(more);
+        }
+    }
+
     /// The samples since the last call.
     pub fn take(&mut self) -> Columns {
         let (times, values) = &mut self.columns;

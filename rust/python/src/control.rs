@@ -16,7 +16,7 @@ use sewfast_core::{Error, Record, Result};
 
 use crate::arrays::{array1, raise, slice};
 use crate::watch::watched;
-use controller::Controller;
+pub use controller::Controller;
 use plant::Model;
 
 type Values<'py> = PyReadonlyArray1<'py, f64>;

@@ -2,6 +2,7 @@
 
 mod arrays;
 mod control;
+mod host_loop;
 mod link;
 mod machine;
 mod models;
@@ -17,6 +18,7 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     signals::register(module)?;
     machine::register(module)?;
     speed::register(module)?;
+    host_loop::register(module)?;
     models::register(module)?;
     control::register(module)?;
     link::register(module)

@@ -1,0 +1,348 @@
+//! The loop without port or clock: time and bytes in, at most one frame out.
+
+use sewfast_control::Controller;
+use sewfast_control::link::{Body, Header, MAX_WIRE, encode};
+use sewfast_core::Result;
+
+use super::age::Age;
+use super::history::History;
+use super::kind;
+use super::outcome::Outcome;
+use super::request::Request;
+use super::settings::Settings;
+use super::status::Status;
+use super::ticks::{Tick, Ticks};
+use crate::anomalies::Counters;
+use crate::receiver::Receiver;
+use crate::samples::Channel;
+
+/// What the loop is waiting for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Phase {
+    Arming,
+    Starting,
+    Running,
+    Stopping,
+    Asking,
+    Done,
+}
+
+/// A controller that drives a device in mode 2: arms and starts it, says a command each period, stops it.
+#[derive(Debug)]
+pub struct HostLoop {
+    pub(super) receiver: Receiver,
+    pub(super) state: State,
+    wire: [u8; MAX_WIRE],
+}
+
+/// Everything but the receiver, which lends out the frame that changes this.
+#[derive(Debug)]
+pub(super) struct State {
+    pub settings: Settings,
+    pub controller: Controller<f64>,
+    pub reference: Vec<f64>,
+    pub phase: Phase,
+    pub outcome: Option<Outcome>,
+    pub request: Request,
+    pub command: u32,
+    pub heartbeat: u32,
+    pub fed: u64,
+    pub start: i64,
+    pub deadline: u64,
+    pub next: usize,
+    pub newest: Option<i64>,
+    pub used: Option<i64>,
+    pub heard: u64,
+    pub age: Age,
+    pub round_trip: Option<u64>,
+    pub stopped: bool,
+    pub status: Option<Status>,
+    pub history: History,
+    pub ticks: Ticks,
+}
+
+impl HostLoop {
+    /// A loop at rest that has sent nothing; `channels` are those of the mask, counts first, and `reference` has a value for
+    /// each of its periods.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for settings that no loop can run with.
+    pub fn new(
+        settings: Settings,
+        channels: &[Channel],
+        mut controller: Controller<f64>,
+        reference: Vec<f64>,
+    ) -> Result<Self> {
+        settings.check(channels.len(), reference.len(), controller.settings().ts)?;
+        controller.reset();
+        let mut receiver = Receiver::new();
+        receiver.expect(channels, settings.device_period)?;
+        let samples = (reference.len() * settings.ratio as usize).min(super::ROOM);
+        let mut body = Body::new();
+        body.u32(settings.watchdog);
+        let state = State {
+            settings,
+            controller,
+            phase: Phase::Arming,
+            outcome: None,
+            request: Request::new(kind::ARM, settings.command.wrapping_add(1), body),
+            command: settings.command.wrapping_add(1),
+            heartbeat: settings.heartbeat,
+            fed: 0,
+            start: 0,
+            deadline: 0,
+            next: 0,
+            newest: None,
+            used: None,
+            heard: 0,
+            age: Age::default(),
+            round_trip: None,
+            stopped: false,
+            status: None,
+            history: History::with_capacity(samples, channels.len()),
+            ticks: Ticks::with_capacity(reference.len().min(super::ROOM)),
+            reference,
+        };
+        Ok(Self {
+            receiver,
+            state,
+            wire: [0; MAX_WIRE],
+        })
+    }
+
+    /// Takes what was received up to `now` \[us\] and gives the frame to send, or nothing.
+    ///
+    /// A call before [`wake`](Self::wake) only listens. A deadline missed by more than a period is skipped and counted.
+    pub fn tick(&mut self, now: u64, received: &[u8]) -> &[u8] {
+        self.listen(now, received);
+        let said = match self.state.phase {
+            Phase::Running => self.state.drive(now),
+            Phase::Done => None,
+            _ => self.state.ask(now),
+        };
+        let length = said.and_then(|(header, body)| encode(&header, body.bytes()?, &mut self.wire));
+        self.wire.get(..length.unwrap_or(0)).unwrap_or_default()
+    }
+
+    /// When [`tick`](Self::tick) is to be called at the latest \[us\].
+    pub fn wake(&self) -> u64 {
+        let state = &self.state;
+        match state.phase {
+            Phase::Running => state.deadline,
+            Phase::Starting => state.request.due().min(state.keep_due()),
+            Phase::Done => 0,
+            _ => state.request.due(),
+        }
+    }
+
+    /// Ends the loop: the next frame out is STOP, and no command to the motor follows it.
+    pub fn stop(&mut self, why: Outcome) {
+        self.state.stop(why);
+    }
+
+    /// Counts a command that did not leave.
+    pub fn unsent(&mut self) {
+        self.state.ticks.unsent += 1;
+    }
+
+    /// True once everything has been said and answered, or given up.
+    pub fn done(&self) -> bool {
+        self.state.phase == Phase::Done
+    }
+
+    /// Ends the loop without another word: there is no port to say it on.
+    pub fn abandon(&mut self, why: Outcome) {
+        self.state.stop(why);
+        self.state.phase = Phase::Done;
+    }
+
+    /// How it ended; none while it runs.
+    pub fn outcome(&self) -> Option<&Outcome> {
+        self.state.outcome.as_ref()
+    }
+
+    /// What was decided at each tick.
+    pub fn ticks(&self) -> &Ticks {
+        &self.state.ticks
+    }
+
+    /// Every sample of the run that came.
+    pub fn history(&self) -> &History {
+        &self.state.history
+    }
+
+    /// What the device says of the run that has ended, where that answer came.
+    pub fn status(&self) -> Option<&Status> {
+        self.state.status.as_ref()
+    }
+
+    /// Device time of the run's first sample \[us\]; 0 where it never began.
+    pub fn start(&self) -> i64 {
+        self.state.start
+    }
+
+    /// The shortest time in which a command was answered \[us\].
+    pub fn round_trip(&self) -> Option<u64> {
+        self.state.round_trip
+    }
+
+    /// How often frames were lost, refused or late on the way to the host.
+    pub fn counters(&self) -> &Counters {
+        self.receiver.counters()
+    }
+
+    /// True once the device has answered STOP.
+    pub fn stopped(&self) -> bool {
+        self.state.stopped
+    }
+
+    /// Sequences of the last command and of the last heartbeat, from which the session goes on.
+    pub fn sequences(&self) -> (u32, u32) {
+        (self.state.command, self.state.heartbeat)
+    }
+
+    /// Ticks that are over, and how many there are in all.
+    pub fn progress(&self) -> (usize, usize) {
+        (self.state.next, self.state.reference.len())
+    }
+}
+
+type Said = Option<(Header, Body)>;
+
+impl State {
+    /// Sends the request under way, again, or gives it up; feeds the watchdog of an armed device meanwhile.
+    fn ask(&mut self, now: u64) -> Said {
+        if self.request.exhausted(now) {
+            self.give_up();
+        }
+        if self.phase == Phase::Done {
+            return None;
+        }
+        if now >= self.request.due() {
+            self.request.sent += 1;
+            self.request.at = now;
+            self.fed = now;
+            let header = self.header(self.request.kind, self.request.sequence, now);
+            return Some((header, self.request.body));
+        }
+        if self.phase == Phase::Starting && now >= self.keep_due() {
+            let mut body = Body::new();
+            body.u32(self.settings.watchdog);
+            return Some((self.heartbeat(kind::KEEP, now), body));
+        }
+        None
+    }
+
+    fn give_up(&mut self) {
+        match self.phase {
+            Phase::Arming | Phase::Starting => self.stop(Outcome::Unanswered(self.request.kind)),
+            _ => self.phase = Phase::Done,
+        }
+    }
+
+    /// When an armed device needs the next heartbeat.
+    fn keep_due(&self) -> u64 {
+        self.fed
+            .saturating_add(u64::from(self.settings.watchdog / 4))
+    }
+
+    /// A tick, where its deadline has come: measure, control, command.
+    fn drive(&mut self, now: u64) -> Said {
+        if now < self.deadline {
+            return None;
+        }
+        let (late, period) = (now - self.deadline, self.settings.period());
+        let missed = usize::try_from(late / period).unwrap_or(usize::MAX);
+        let left = self.reference.len() - self.next;
+        self.ticks.missed += missed.min(left) as u64;
+        self.next += missed.min(left);
+        self.deadline = now - late % period + period;
+        let Some(&r) = self.reference.get(self.next) else {
+            self.stop(Outcome::Completed);
+            return self.ask(now);
+        };
+        if now.saturating_sub(self.heard) > u64::from(self.settings.watchdog) {
+            self.stop(Outcome::Silent);
+            return self.ask(now);
+        }
+        let u = self.control(now, late, r);
+        self.next += 1;
+        let mut body = Body::new();
+        body.u32(self.settings.watchdog).f32(u as f32);
+        Some((self.heartbeat(kind::DRIVE, now), body))
+    }
+
+    /// The command for this tick, from the speed over the newest period; without a new sample the last command stays.
+    fn control(&mut self, now: u64, late: u64, r: f64) -> f64 {
+        let newest = self.history.newest();
+        let fresh = newest > self.used;
+        let y = match newest {
+            // ARM is refused unless the motor stands.
+            None if self.next == 0 => 0.0,
+            Some(_) if fresh => {
+                let period = self.settings.period().cast_signed();
+                self.history.rate(period, self.start) / self.settings.counts_per_unit
+            }
+            _ => f64::NAN,
+        };
+        self.used = newest;
+        let u = self.controller.step(r, y);
+        self.ticks.push(Tick {
+            number: self.next,
+            late,
+            age: newest.and_then(|time| self.age.of(now, time)),
+            fresh,
+            y,
+            feedback: self.controller.filtered(),
+            u,
+        });
+        u
+    }
+
+    /// Ends the loop for the first reason that is given.
+    pub fn stop(&mut self, why: Outcome) {
+        if self.outcome.is_none() {
+            self.outcome = Some(why);
+        }
+        if matches!(self.phase, Phase::Arming | Phase::Starting | Phase::Running) {
+            self.phase = Phase::Stopping;
+            self.request(kind::STOP, Body::new());
+        }
+    }
+
+    /// Puts the next command under way.
+    pub fn request(&mut self, kind: u8, body: Body) {
+        self.command = self.command.wrapping_add(1);
+        self.request = Request::new(kind, self.command, body);
+    }
+
+    /// START of mode 2, at the next sample, for as long as the reference.
+    pub fn start_body(&self) -> Body {
+        let s = &self.settings;
+        let mut body = Body::new();
+        body.u8(2).u32(s.watchdog).u64(0).u32(self.length());
+        body.u16(s.mask).u8(s.batch);
+        body
+    }
+
+    /// Samples of the device in the whole run.
+    pub fn length(&self) -> u32 {
+        u32::try_from(self.reference.len() as u64 * u64::from(self.settings.ratio))
+            .unwrap_or(u32::MAX)
+    }
+
+    fn heartbeat(&mut self, kind: u8, now: u64) -> Header {
+        self.heartbeat = self.heartbeat.wrapping_add(1);
+        self.fed = now;
+        self.header(kind, self.heartbeat, now)
+    }
+
+    fn header(&self, kind: u8, sequence: u32, time: u64) -> Header {
+        Header {
+            kind,
+            tag: self.settings.tag,
+            sequence,
+            time,
+        }
+    }
+}
