@@ -351,6 +351,37 @@ def test_an_export_holds_the_same_values(made: Made, tmp_path: Path, ending: str
         assert (table.unit("u"), table.unit("counts"), table.unit("t")) == ("V", "", "s")
 
 
+def test_an_export_with_one_message_a_sample_is_a_recording(made: Made, tmp_path: Path) -> None:
+    out = tmp_path / "curves.mcap"
+    export(made.path, out)
+    found, whole = read_recording(out), read_recording(made.path)
+    for name, column in whole.columns.items():
+        np.testing.assert_array_equal(found.columns[name], column)
+    assert (found.header, found.gaps, found.outcome) == (whole.header, whole.gaps, whole.outcome)
+    assert list(map(dict, found.events)) == list(map(dict, whole.events))
+    assert found.damage == ()
+    mcap = pytest.importorskip("mcap.reader")
+    reader = mcap.make_reader(io.BytesIO(out.read_bytes()), validate_crcs=True)
+    rows = list(reader.iter_messages("/sewfast/samples"))
+    assert len(rows) == 980
+    for schema, _, message in rows:
+        content = json.loads(message.data)
+        assert_valid(content, json.loads(schema.data))
+        assert message.log_time == 1769860800 * 10**9 + content["index"] * 10**6
+    assert reader.get_summary().statistics.message_count == 980 + 2 + 2 + 1
+
+
+def test_a_torn_recording_is_repaired_but_stays_torn(made: Made, tmp_path: Path) -> None:
+    mcap = pytest.importorskip("mcap.reader")
+    (tmp_path / "torn.mcap").write_bytes(made.raw[: len(made.raw) // 2])
+    torn = export(tmp_path / "torn.mcap", tmp_path / "whole.mcap")
+    found = read_recording(tmp_path / "whole.mcap")
+    assert (found.outcome, found.damage, found.received) == ("torn", (), torn.received)
+    with (tmp_path / "whole.mcap").open("rb") as file:
+        assert mcap.make_reader(file).get_summary() is not None
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["torn.mcap", "whole.mcap"]
+
+
 def test_columns_are_saved_whole_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     given = signals(250)

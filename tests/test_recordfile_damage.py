@@ -162,7 +162,7 @@ class Forged:
 
     def add(self, topic: Topic, data: bytes, *, leading: bool = False) -> None:
         message = Message(topic, 0, 0, data)
-        self.raw += self._assembler.chunk(message, len(self.raw), leading=leading)
+        self.raw += self._assembler.chunk([message], len(self.raw), leading=leading)
 
 
 GOOD = {"index": [0, 1], "t": [0.0, 0.001], "u": [1.5, 2.5]}

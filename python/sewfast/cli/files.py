@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from .arguments import TABLES, Commands, add_command, add_output, require_place
+from .arguments import RECORDINGS, Commands, add_command, add_output, require_place
 from .output import print_json
 
 if TYPE_CHECKING:
@@ -18,7 +18,8 @@ its settings. A recording whose recorder was killed reads up to that moment ("to
 
 EXPORT = """\
 Write the columns of a recording (.mcap) with their time t to a file that other programs read.
-Rows in gaps are not a number. Events, settings and the device's identity stay in the recording.
+Rows in gaps are not a number. Events, settings and the device's identity go into .mcap only, which
+has one message a sample, so that PlotJuggler and Foxglove draw curves.
 """
 
 
@@ -35,7 +36,7 @@ def add(commands: Commands) -> None:
         "  sewfast export run.mcap -o run.mat",
     )  # fmt: skip
     parser.add_argument("recording", metavar="RECORDING.mcap", help="recording")
-    add_output(parser, "OUT", "CSV, .npz, .mat or Parquet", required=True)
+    add_output(parser, "OUT", "CSV, .npz, .mat, Parquet or .mcap", required=True)
 
 
 def show_command(args: argparse.Namespace) -> None:
@@ -51,7 +52,7 @@ def show_command(args: argparse.Namespace) -> None:
 def export_command(args: argparse.Namespace) -> None:
     from ..recordfile import export
 
-    require_place(args.out, TABLES)
+    require_place(args.out, RECORDINGS)
     found = export(args.recording, args.out)
     if args.json:
         print_json({**_content(found), "file": str(args.out)})

@@ -1,10 +1,10 @@
-"""MCAP records as bytes: https://mcap.dev/spec; one message a chunk, uncompressed, CRCs on."""
+"""MCAP records as bytes: https://mcap.dev/spec; chunks of one topic, uncompressed, CRCs on."""
 
 from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from .topics import Topic, schema
@@ -22,7 +22,8 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")
 """Channel, sequence, log time, publish time."""
 FOOTER_BODY = struct.Struct("<QQI")
 """Start of the summary, start of its offsets, CRC-32 of both."""
-_ENTRY = struct.Struct("<QQQH")
+_PLACE = struct.Struct("<QQ")
+_ENTRY = struct.Struct("<QQQQHI")
 
 
 class Message(NamedTuple):
@@ -50,15 +51,15 @@ def opening() -> bytes:
     return MAGIC + _record(HEADER, _text("") + _text(LIBRARY))
 
 
-def catalogue(columns: Mapping[str, str]) -> bytes:
+def catalogue(columns: Mapping[str, str], *, single: bool) -> bytes:
     """Schema and channel records of all topics."""
-    return b"".join(_record(SCHEMA, _schema(topic, columns)) for topic in Topic) + b"".join(
+    return b"".join(_record(SCHEMA, _schema(topic, columns, single)) for topic in Topic) + b"".join(
         _record(CHANNEL, _channel(topic)) for topic in Topic
     )
 
 
-def _schema(topic: Topic, columns: Mapping[str, str]) -> bytes:
-    data = schema(topic, columns)
+def _schema(topic: Topic, columns: Mapping[str, str], single: bool) -> bytes:
+    data = schema(topic, columns, single=single)
     head = struct.pack("<H", topic) + _text(topic.schema_name) + _text("jsonschema")
     return head + struct.pack("<I", len(data)) + data
 
@@ -71,30 +72,40 @@ def _channel(topic: Topic) -> bytes:
 class Assembler:
     """Chunks and the summary of one file, as bytes to append.
 
-    It keeps 26 bytes a chunk for the summary, so that its memory stays small over hours.
+    It keeps 38 bytes a chunk for the summary, so that its memory stays small over hours.
     """
 
-    def __init__(self, columns: Mapping[str, str]) -> None:
-        self._catalogue = catalogue(columns)
+    def __init__(self, columns: Mapping[str, str], *, single: bool = False) -> None:
+        self._catalogue = catalogue(columns, single=single)
         self._index = bytearray()
         self._counts = dict.fromkeys(Topic, 0)
 
-    def chunk(self, message: Message, at: int, *, leading: bool = False) -> bytes:
-        """A chunk with one message, and its index; `at` is where in the file it will stand."""
-        body = MESSAGE_HEAD.pack(
-            message.topic, self._counts[message.topic], message.log_time, message.publish_time
-        )
-        before = self._catalogue if leading else b""
-        records = before + _record(MESSAGE, body + message.data)
+    def chunk(self, messages: Sequence[Message], at: int, *, leading: bool = False) -> bytes:
+        """A chunk of messages on one topic, and its index; `at` is where in the file it will stand.
+
+        The first chunk is `leading`: schemas and channels stand in it.
+        """
+        topic = messages[0].topic
+        records = bytearray(self._catalogue if leading else b"")
+        places = bytearray()
+        for message in messages:
+            places += _PLACE.pack(message.log_time, len(records))
+            records += _record(MESSAGE, self._message(message))
+        times = [message.log_time for message in messages]
         size = len(records)
         head = CHUNK_HEAD.pack(
-            CHUNK, CHUNK_HEAD.size - RECORD.size + size, message.log_time, message.log_time,
+            CHUNK, CHUNK_HEAD.size - RECORD.size + size, min(times), max(times),
             size, zlib.crc32(records), 0, size,
         )  # fmt: skip
+        index = _record(MESSAGE_INDEX, struct.pack("<HI", topic, len(places)) + places)
+        self._index += _ENTRY.pack(min(times), max(times), at, size, topic, len(index))
+        return head + bytes(records) + index
+
+    def _message(self, message: Message) -> bytes:
+        sequence = self._counts[message.topic]
         self._counts[message.topic] += 1
-        self._index += _ENTRY.pack(message.log_time, at, size, message.topic)
-        position = struct.pack("<HIQQ", message.topic, 16, message.log_time, len(before))
-        return head + records + _record(MESSAGE_INDEX, position)
+        times = (message.log_time, message.publish_time)
+        return MESSAGE_HEAD.pack(message.topic, sequence, *times) + message.data
 
     def ending(self, at: int, data_crc: int) -> bytes:
         """All that follows the last chunk; `at` is where it will stand."""
@@ -115,11 +126,12 @@ class Assembler:
         return end + summary + offsets + footer + struct.pack("<I", crc) + MAGIC
 
     def _statistics(self) -> bytes:
-        times = [log_time for log_time, *_ in _ENTRY.iter_unpack(self._index)]
+        entries = list(_ENTRY.iter_unpack(self._index))
+        first, last = min(e[0] for e in entries), max(e[1] for e in entries)
         counts = b"".join(struct.pack("<HQ", t, n) for t, n in self._counts.items() if n)
         body = struct.pack(
-            "<QHIIIIQQI", len(times), len(Topic), len(Topic), 0, 0, len(times),
-            min(times), max(times), len(counts),
+            "<QHIIIIQQI", sum(self._counts.values()), len(Topic), len(Topic), 0, 0, len(entries),
+            first, last, len(counts),
         )  # fmt: skip
         return _record(STATISTICS, body + counts)
 
@@ -129,13 +141,12 @@ class Assembler:
         )
 
 
-def _chunk_index(log_time: int, at: int, size: int, topic: int) -> bytes:
+def _chunk_index(first: int, last: int, at: int, size: int, topic: int, index: int) -> bytes:
     length = CHUNK_HEAD.size + size
-    index_length = RECORD.size + struct.calcsize("<HIQQ")
     return (
-        struct.pack("<QQQQ", log_time, log_time, at, length)
+        struct.pack("<QQQQ", first, last, at, length)
         + struct.pack("<IHQ", 10, topic, at + length)
-        + struct.pack("<QIQQ", index_length, 0, size, size)
+        + struct.pack("<QIQQ", index, 0, size, size)
     )
 
 

@@ -1,24 +1,27 @@
-"""A recording -> CSV, Parquet, `.mat` or `.npz`."""
+"""A recording -> CSV, Parquet, `.mat`, `.npz`, or MCAP with one message a sample."""
 
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 from ..writers import write_table
+from .curves import save_curves
 from .reader import RecordedFile, read_recording
 
 
 def export(path: str | os.PathLike[str], out: str | os.PathLike[str]) -> RecordedFile:
     """Write a recording's columns with `t` in the format that the extension of `out` says.
 
-    Gaps stay NaN rows. Events, settings and the device's identity stay in the recording.
+    Gaps are rows of NaN. Events, settings and the device's identity go into `.mcap` only.
 
     Parameters
     ----------
     path : path
         The recording.
     out : path
-        `.csv`, `.parquet`, `.mat` or `.npz`.
+        `.csv`, `.parquet`, `.mat`, `.npz`, or `.mcap`: one message a sample, for programs that
+        plot; also the repair of a file that lacks its end.
 
     Returns
     -------
@@ -33,5 +36,8 @@ def export(path: str | os.PathLike[str], out: str | os.PathLike[str]) -> Recorde
         Where the extension is unknown or its package is not installed.
     """
     recording = read_recording(path)
-    write_table(out, recording.table_columns(), units=recording.units)
+    if Path(out).suffix.lower() == ".mcap":
+        save_curves(out, recording)
+    else:
+        write_table(out, recording.table_columns(), units=recording.units)
     return recording

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from ..dataset import FloatArray
 from ..errors import DataError
 
+MOST_GAPS_LISTED = 10_000
+"""Gaps that the completeness message spells out; they follow from the samples anyway."""
 EXACT = 2**53
 """Whole numbers up to here are exact in float64."""
 
@@ -124,7 +126,10 @@ def decode(content: Mapping[str, Any], names: Iterable[str]) -> Block:
 
 
 def _column(content: Mapping[str, Any], name: str, kinds: tuple[type, ...]) -> FloatArray:
-    values = content.get(name)
+    values = content.get(name, ())
+    if type(values) in kinds:
+        # one message a sample
+        values = [values]
     # the exact type: True is no number here, and NumPy would take text for one
     if not isinstance(values, list) or not set(map(type, values)) <= set(kinds):
         raise ValueError(f"column {name!r} is missing or holds no numbers")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import secrets
 import zlib
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ..errors import DataError, SettingError
@@ -75,3 +77,26 @@ class Sink:
     def close(self) -> None:
         with suppress(OSError):
             os.close(self._file)
+
+
+@contextmanager
+def replacing(target: Path) -> Iterator[Path]:
+    """A temporary name beside a file, which takes the file's place where the block succeeds.
+
+    Raises
+    ------
+    DataError
+        Where the file cannot be written.
+    """
+    if target.is_dir():
+        raise DataError(f"{target}: expected a file to write, received a folder")
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        yield temporary
+        temporary.replace(target)
+    except OSError as e:
+        raise DataError(
+            f"{target}: cannot be written ({e.strerror}); choose a folder that exists and has room"
+        ) from e
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -25,9 +25,12 @@ class Topic(IntEnum):
         return f"sewfast.{self.name.title()}"
 
 
-def schema(topic: Topic, columns: Mapping[str, str]) -> bytes:
-    """JSON schema of a topic's messages, for a recording with these columns."""
-    content = _object(**_PROPERTIES[topic]) if topic in _PROPERTIES else _samples(columns)
+def schema(topic: Topic, columns: Mapping[str, str], *, single: bool = False) -> bytes:
+    """JSON schema of a topic's messages, for a recording with these columns.
+
+    `single` is for one message a sample: numbers in place of arrays.
+    """
+    content = _object(**_PROPERTIES[topic]) if topic in _PROPERTIES else _samples(columns, single)
     return json.dumps({"title": topic.schema_name, **content}).encode()
 
 
@@ -35,18 +38,18 @@ def _object(**properties: Any) -> dict[str, Any]:
     return {"type": "object", "properties": properties, "required": list(properties)}
 
 
-def _array(kind: str | list[str], description: str) -> dict[str, Any]:
-    return {"type": "array", "items": {"type": kind}, "description": description}
-
-
-def _samples(columns: Mapping[str, str]) -> dict[str, Any]:
-    own = {
-        "index": _array("integer", "number of the sample, 0 at the start"),
-        "t": _array("number", "time since the start [s]"),
-    }
+def _samples(columns: Mapping[str, str], single: bool) -> dict[str, Any]:
     # null is a value that was not measured
-    given = {name: _array(["number", "null"], f"[{unit}]") for name, unit in columns.items()}
-    return _object(**own, **given)
+    given = {name: (["number", "null"], f"[{unit}]") for name, unit in columns.items()}
+    own = {
+        "index": ("integer", "number of the sample, 0 at the start"),
+        "t": ("number", "time since the start [s]"),
+    }
+    properties: dict[str, Any] = {}
+    for name, (kind, description) in {**own, **given}.items():
+        value = {"type": kind} if single else {"type": "array", "items": {"type": kind}}
+        properties[name] = {**value, "description": description}
+    return {"type": "object", "properties": properties, "required": list(properties)}
 
 
 _WHOLE = {"type": "integer"}

@@ -14,18 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import DataError, SettingError
+from ..errors import DataError
 from . import samples
 from .container import Assembler, Message, opening
 from .header import MOST_MISSING, Header, plain
-from .sink import Sink
+from .sink import Sink, replacing
 from .topics import Topic
 
 MESSAGE_SAMPLES = 100
 """Samples at which a message is written."""
 OLDEST = 0.2
 """Seconds that a sample waits for a full message; the operating system has it within .25 s."""
-MOST_GAPS_LISTED = 10_000
 
 
 class RecordWriter:
@@ -190,7 +189,7 @@ class RecordWriter:
 
     def _skip_to(self, first: int) -> None:
         self._write_pending()
-        if len(self._gaps) < MOST_GAPS_LISTED:
+        if len(self._gaps) < samples.MOST_GAPS_LISTED:
             self._gaps.append((self._next, first - self._next))
         self._gap_count += 1
 
@@ -317,7 +316,7 @@ class RecordWriter:
             raise self._fail(e) from e
 
     def _append(self, message: Message, *, leading: bool = False) -> None:
-        self._sink.append(self._assembler.chunk(message, self._sink.size, leading=leading))
+        self._sink.append(self._assembler.chunk([message], self._sink.size, leading=leading))
 
     def _fail(self, error: OSError) -> DataError:
         self._failure = error
@@ -381,15 +380,5 @@ def save_columns(
     DataError
         Where columns do not match the header or the file cannot be written.
     """
-    target = Path(path)
-    if target.is_dir():
-        raise SettingError(f"{target}: expected a file to write, received a folder")
-    temporary = target.with_name(f".{target.name}.{os.urandom(4).hex()}.tmp")
-    try:
-        with RecordWriter(temporary, header) as writer:
-            writer.samples(0, columns)
-        temporary.replace(target)
-    except OSError as e:
-        raise DataError(f"{target}: cannot be written ({e.strerror})") from e
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(Path(path)) as temporary, RecordWriter(temporary, header) as writer:
+        writer.samples(0, columns)
