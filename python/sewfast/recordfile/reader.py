@@ -180,7 +180,7 @@ def decode_recording(path: Path, raw: bytes) -> RecordedFile:
         stop = chunk.stop
     if found.header is None:
         raise _headless(path, raw, found.damage)
-    if stop is not None and (fault := walk.ending_fault(raw, stop)):
+    if stop is not None and (fault := walk.ending_fault(raw, stop, damaged=bool(found.damage))):
         found.damage.append(fault)
     return found.assemble(path, found.header)
 

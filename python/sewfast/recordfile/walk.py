@@ -111,8 +111,11 @@ def is_index(raw: bytes, start: int, stop: int) -> bool:
     return True
 
 
-def ending_fault(raw: bytes, start: int) -> str | None:
-    """What is wrong behind the last chunk; None where the checksums of the whole file hold."""
+def ending_fault(raw: bytes, start: int, *, damaged: bool) -> str | None:
+    """What is wrong behind the last chunk; None where the checksums of the whole file hold.
+
+    In a file known to be `damaged` the checksum over all of it says nothing new.
+    """
     at = start
     for _, begin, end in records(raw, start, len(raw)):
         if not is_index(raw, begin - RECORD.size, end):
@@ -120,15 +123,12 @@ def ending_fault(raw: bytes, start: int) -> str | None:
         at = end
     if at == len(raw):
         return "the end is missing"
-    if raw[at] != DATA_END or not _holds_data_crc(raw, at):
-        return f"bytes {at}:{len(raw)} are damaged or torn, or the index before them is damaged"
-    return None if _holds_summary_crc(raw) else "the index at the end is damaged"
-
-
-def _holds_data_crc(raw: bytes, at: int) -> bool:
     begin = at + RECORD.size
-    whole = begin + 4 <= len(raw) and RECORD.unpack_from(raw, at)[1] == 4
-    return whole and _u32(raw, begin) == zlib.crc32(memoryview(raw)[:at])
+    if raw[at] != DATA_END or begin + 4 > len(raw) or RECORD.unpack_from(raw, at)[1] != 4:
+        return f"bytes {at}:{len(raw)} are damaged or torn"
+    if not damaged and _u32(raw, begin) != zlib.crc32(memoryview(raw)[:at]):
+        return "an index between the chunks or the file's checksum is damaged; no sample is lost"
+    return None if _holds_summary_crc(raw) else "the index at the end is damaged"
 
 
 def _holds_summary_crc(raw: bytes) -> bool:
