@@ -63,6 +63,7 @@ COMMANDS = [
     "tune",
     "run",
     "report",
+    "ports",
 ]
 
 

@@ -1,0 +1,340 @@
+"""`Connection`: a session with a device, its commands, its heartbeats, its way back."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from .. import _core
+from ..errors import LinkError
+from . import wire
+from .clock import Clock
+from .ports import Port
+from .wire import Event, Identity, Kind, Reply
+
+REPEAT = 0.1
+"""Time after which a command that was not answered is sent again [s]."""
+STOP_REPEAT = 0.01
+"""The same for STOP, within any usual watchdog time."""
+PATIENCE = 1.0
+"""Time after which a command is given up [s]."""
+RETRY = 0.05
+"""Time between two attempts to open a port that vanished [s]."""
+SILENCE = 0.02
+"""Longest wait for bytes in one turn [s]; Ctrl-C and cancelling are seen at least as often."""
+
+
+@dataclass
+class _Command:
+    """A command under way, with its attempts."""
+
+    kind: int
+    sequence: int
+    frame: bytes
+    first_sent: float
+    last_sent: float
+    reply: Reply | None = None
+
+
+class Connection:
+    """A session with the device behind a port; one thread uses it.
+
+    Everything happens in `turn`: one read, what came is handed on, what is due is sent. A port that
+    fails shows in the next turn, so that sending never raises.
+
+    Parameters
+    ----------
+    port : Port
+        Open; the connection closes it.
+    watchdog : float
+        Time that the device goes on without a word from here [s].
+    patience : float
+        How long to wait for the first answer [s]; many boards restart when their port opens.
+    resume : float
+        How long to try to get a vanished port back during a run [s].
+
+    Raises
+    ------
+    LinkError
+        Where nothing answers, or what answers speaks otherwise.
+    """
+
+    def __init__(self, port: Port, *, watchdog: float, patience: float, resume: float) -> None:
+        self.port = port
+        self.receiver = _core.LinkReceiver()
+        self.watchdog = watchdog
+        self.watchdog_us = round(watchdog * 1e6)
+        self.resume = resume
+        self.session = secrets.randbelow(2**32 - 1) + 1
+        self.clock = Clock()
+        self.events: deque[Event] = deque(maxlen=256)
+        #: Greatest time of the device that any of its frames told [us].
+        self.newest = 0
+        #: Called at the end of each turn; a run takes its samples there and sends heartbeats.
+        self.each_turn: Callable[[], None] | None = None
+        #: Whether a vanished port is to be opened again.
+        self.resumable = False
+        #: Seconds that the port was away, each time.
+        self.outages: list[float] = []
+        self._sequence = 0
+        self._beats = 0
+        self._command: _Command | None = None
+        self._failed: LinkError | None = None
+        self._greeting: Reply | None = None
+        self._tag: int | None = None
+        self._bytes = 0
+        self.identity = self._greet(patience)
+        self._tag = self.identity.tag
+
+    # --- turns ----------------------------------------------------------------------------------
+
+    def turn(self, wait: float = SILENCE) -> bool:
+        """Read once, waiting at most `wait` seconds, hand on what came, send what is due.
+
+        Returns
+        -------
+        bool
+            Whether anything came.
+
+        Raises
+        ------
+        LinkError
+            Where the port is lost for good, the device has been reset, or a command stays without
+            an answer.
+        """
+        came = False
+        try:
+            if self._failed is not None:
+                raise self._failed
+            came = self._hear(wait)
+        except LinkError as error:
+            self._recover(error)
+        if self._command is not None:
+            self._repeat(self._command)
+        if self.each_turn is not None:
+            self.each_turn()
+        return came
+
+    def _hear(self, wait: float) -> bool:
+        data = self.port.read(wait)
+        if not data:
+            return False
+        self._bytes += len(data)
+        received = time.monotonic()
+        foreign = None
+        for kind, tag, _, device_us, body in self.receiver.feed(data):
+            if self._tag is not None and tag != self._tag:
+                foreign = tag
+            else:
+                self._take(kind, device_us, body, received)
+        if foreign is not None:
+            self._failed = DeviceReset(
+                f"{self.port.url}: expected the device to go on, it has been reset; its motor is "
+                "without command: see to its supply, connect again, set the limits and start anew"
+            )
+            raise self._failed
+        return True
+
+    def _take(self, kind: int, device_us: int, body: bytes, received: float) -> None:
+        self.newest = max(self.newest, device_us)
+        if kind == wire.EVENT:
+            event = wire.event(device_us, body)
+            if event is not None:
+                self.events.append(event)
+        elif wire.REPLY < kind < wire.SAMPLES:
+            answer = wire.reply(kind, device_us, body)
+            if answer is not None:
+                self._answered(*answer, received)
+
+    def _answered(self, sequence: int, reply: Reply, received: float) -> None:
+        if reply.kind == Kind.HELLO:
+            self._greeting = reply
+            return
+        command = self._command
+        if command is None or sequence != command.sequence or reply.kind != command.kind:
+            return
+        command.reply = reply
+        if not self.identity.on_credit:
+            self.clock.add(command.first_sent, reply.time_us, received)
+
+    # --- commands -------------------------------------------------------------------------------
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a command is under way."""
+        return self._command is not None
+
+    def begin(self, kind: Kind, body: bytes = b"") -> None:
+        """Send a command and return; turns repeat it until `answer` has its reply."""
+        assert self._command is None, "one command at a time"
+        self._sequence = (self._sequence + 1) & 0xFFFFFFFF
+        frame = self._frame(kind, self._sequence, body)
+        now = time.monotonic()
+        self._command = _Command(kind, self._sequence, frame, now, now)
+        self._send(frame)
+
+    def answer(self) -> Reply | None:
+        """The reply to the command under way, once; None as long as there is none."""
+        if self._command is None or self._command.reply is None:
+            return None
+        reply, self._command = self._command.reply, None
+        return reply
+
+    def request(self, kind: Kind, body: bytes = b"") -> Reply:
+        """Send a command and take turns until it is answered.
+
+        Raises
+        ------
+        LinkError
+            Where no answer comes or the port fails; a refusal is a reply.
+        """
+        while self.is_busy:
+            self.turn()
+            self.answer()
+        self.begin(kind, body)
+        try:
+            while (reply := self.answer()) is None:
+                self.turn(STOP_REPEAT if kind == Kind.STOP else SILENCE)
+        except BaseException:
+            self._command = None
+            raise
+        return reply
+
+    def ask(self, kind: Kind, body: bytes = b"") -> bytes:
+        """The body of a command's reply.
+
+        Raises
+        ------
+        LinkError
+            As `request`, and where the device refuses.
+        """
+        return self.request(kind, body).checked()
+
+    def status(self) -> wire.Status:
+        """Ask the device how it is."""
+        return wire.status(self.request(Kind.STATUS))
+
+    def stop(self) -> None:
+        """STOP, at once, whatever is under way; returns when the device has confirmed it.
+
+        Raises
+        ------
+        LinkError
+            Where it was not confirmed: then the device's watchdog stops the motor.
+        """
+        self._command = None
+        # what an interrupted write has left is closed by a zero
+        self._send(b"\0")
+        self.ask(Kind.STOP)
+
+    def _repeat(self, command: _Command) -> None:
+        now = time.monotonic()
+        pause = STOP_REPEAT if command.kind == Kind.STOP else REPEAT
+        if command.reply is not None or now - command.last_sent < pause:
+            return
+        if now - command.first_sent >= PATIENCE:
+            self._command = None
+            raise LinkError(
+                f"{self.port.url}: expected an answer to {Kind(command.kind).name}, none came "
+                f"within {PATIENCE:g} s; check cable and device, then connect again"
+            )
+        command.last_sent = now
+        self._send(command.frame)
+
+    # --- heartbeats -----------------------------------------------------------------------------
+
+    def keep(self) -> None:
+        """Tell the device that the host is there."""
+        self._beat(Kind.KEEP, wire.watchdog(self.watchdog_us))
+
+    def drive(self, u: float) -> None:
+        """The command of a direct run [V]; a heartbeat too."""
+        self._beat(Kind.DRIVE, wire.drive(self.watchdog_us, u))
+
+    def grant(self, until: int) -> None:
+        """Let the time of a device on credit advance to `until` [us]; a heartbeat too."""
+        self._beat(Kind.CREDIT, wire.credit(self.watchdog_us, until))
+
+    def _beat(self, kind: Kind, body: bytes) -> None:
+        self._beats = (self._beats + 1) & 0xFFFFFFFF
+        self._send(self._frame(kind, self._beats, body))
+
+    def _frame(self, kind: Kind, sequence: int, body: bytes) -> bytes:
+        now_us = time.monotonic_ns() // 1000
+        return _core.link_frame(kind, self._tag or 0, sequence, now_us, body)
+
+    def _send(self, frame: bytes) -> None:
+        if self._failed is None:
+            try:
+                self.port.write(frame)
+            except LinkError as error:
+                self._failed = error
+
+    # --- greeting and return --------------------------------------------------------------------
+
+    def _greet(self, patience: float) -> Identity:
+        """HELLO until it is answered; the same session again changes nothing on the device."""
+        frame = b"\0" + _core.link_frame(Kind.HELLO, 0, 0, 0, wire.hello(self.session))
+        deadline = time.monotonic() + patience
+        self._greeting, expected = None, self._tag
+        # a device that was reset meanwhile is to be heard too
+        self._tag = None
+        try:
+            while self._greeting is None:
+                if time.monotonic() >= deadline:
+                    raise self._nobody(patience)
+                self.port.write(frame)
+                again = time.monotonic() + REPEAT
+                while self._greeting is None and time.monotonic() < again:
+                    self._hear(SILENCE)
+        finally:
+            self._tag = expected
+        return wire.identity(self._greeting.checked())
+
+    def _nobody(self, patience: float) -> LinkError:
+        heard = "nothing came"
+        remedy = "check cable, supply and that the firmware speaks this protocol (docs/PROTOCOL.md)"
+        if self._bytes:
+            heard = f"{self._bytes} bytes came that are no frames for this host"
+            remedy = f"check the baud rate ({self.port.baud}) and what runs on the device"
+        return LinkError(
+            f"{self.port.url}: expected a device to answer HELLO within {patience:g} s, {heard}; "
+            f"{remedy}"
+        )
+
+    def _recover(self, error: LinkError) -> None:
+        """Open the port again and confirm the session; the device may have gone on meanwhile."""
+        if not self.resumable or isinstance(error, DeviceReset):
+            raise error
+        self._failed = None
+        lost = time.monotonic()
+        identity = self._return(lost, error)
+        if identity.boot != self.identity.boot:
+            self._failed = DeviceReset(
+                f"{error}; it came back, but the device has been reset meanwhile: connect again, "
+                "set the limits and start anew"
+            )
+            raise self._failed
+        self.outages.append(time.monotonic() - lost)
+
+    def _return(self, lost: float, error: LinkError) -> Identity:
+        while True:
+            try:
+                self.port.reopen()
+                return self._greet(REPEAT)
+            except LinkError as failed:
+                if time.monotonic() - lost + RETRY > self.resume:
+                    message = f"{error}; it did not come back within {self.resume:g} s"
+                    raise LinkError(message) from failed
+            time.sleep(RETRY)
+
+    def close(self) -> None:
+        """Give the port back."""
+        self.port.close()
+
+
+class DeviceReset(LinkError):
+    """The device has lost its run and its limits; no way leads back into this session."""

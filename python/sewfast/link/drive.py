@@ -1,0 +1,425 @@
+"""`Drive`: a motor drive behind a port; `connect` opens it."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from types import TracebackType
+from typing import Literal
+
+from ..control import Controller
+from ..errors import LinkError, SettingError
+from ..gains import real
+from ..units import counts_per_unit
+from . import profile as profiles
+from . import wire
+from .clock import ClockBounds
+from .connection import Connection, DeviceReset
+from .plan import Layout, Outcome, Plan, Sink, layout, require_capable
+from .ports import open_port
+from .run import Run
+from .wire import Channel, Identity, Kind, Limits, Status
+
+PATIENCE = 3.0
+REST_US = 120_000
+"""Device's time without a count after which a motor is at rest; ARM wants 100 ms."""
+STEP_US = 20_000
+
+
+class Drive:
+    """A motor drive behind a port, made by `connect`; a context manager whose end stops the motor.
+
+    One thread uses it. Nothing here starts a motor but `stream`.
+
+    Parameters
+    ----------
+    link : Connection
+        Greeted; the drive closes it.
+    """
+
+    def __init__(self, link: Connection) -> None:
+        self._link = link
+        self._channels = _describe(link)
+        #: What became of the last run, also of one that ended in an exception.
+        self.outcome: Outcome | None = None
+        self._await_measurement()
+
+    def __enter__(self) -> Drive:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            self.stop()
+        except DeviceReset:
+            # its motor is without command, and whoever ran it has been told
+            pass
+        except LinkError:
+            if error is None:
+                raise
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Give the port back without a word to the device."""
+        self._link.close()
+
+    # --- what it is -------------------------------------------------------------------------------
+
+    @property
+    def identity(self) -> Identity:
+        """Who the device is and what it offers."""
+        return self._link.identity
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """What it can stream."""
+        return self._channels
+
+    @property
+    def clock(self) -> ClockBounds | None:
+        """Bounds of the clocks' difference; None on credit, where there is no wall clock."""
+        return None if self.identity.on_credit else self._link.clock.bounds()
+
+    def __str__(self) -> str:
+        i = self.identity
+        names = ", ".join(f"{c.name} [{c.unit}]" if c.unit else c.name for c in self.channels)
+        return (
+            f"{i.name} (firmware {i.firmware}) on {self._link.port.url}: {i.Ts * 1e3:g} ms, "
+            f"{i.counts_per_rev:g} counts/rev; {names}"
+        )
+
+    def status(self) -> Status:
+        """Ask the device how it is.
+
+        Raises
+        ------
+        LinkError
+            Where the port or the device failed; so from every method.
+        """
+        return self._link.status()
+
+    def echo(self, data: bytes = b"") -> float:
+        """Seconds until up to 200 bytes come back."""
+        sent = time.monotonic()
+        if self._link.ask(Kind.ECHO, data) != data:
+            raise LinkError("expected the bytes sent to ECHO, got others; mend the firmware")
+        return time.monotonic() - sent
+
+    # --- what it may do ---------------------------------------------------------------------------
+
+    def limits(self) -> Limits:
+        """The limits in force and the device's ceilings."""
+        return wire.limits(self._link.ask(Kind.LIMITS, wire.set_limits((0.0,) * 4)))
+
+    def set_limits(
+        self,
+        *,
+        volt: float | None = None,
+        speed_rpm: float | None = None,
+        acceleration: float | None = None,
+        current: float | None = None,
+    ) -> Limits:
+        """Set limits that the device enforces at every sample; it forgets them when it is reset.
+
+        Parameters
+        ----------
+        volt, speed_rpm, acceleration, current : float or None
+            Largest magnitudes [V, RPM, RPM/s, A]; None keeps what is set, or else takes the
+            device's ceiling.
+
+        Raises
+        ------
+        SettingError
+            For a limit that is not above 0 or is above the device's ceiling.
+        """
+        present = self.limits()
+        given = {
+            "volt": volt, "speed_rpm": speed_rpm, "acceleration": acceleration, "current": current
+        }  # fmt: skip
+        values = [
+            _limit(name, value, now, ceiling)
+            for (name, value), now, ceiling in zip(
+                given.items(), present.values, present.ceilings, strict=True
+            )
+        ]
+        return wire.limits(self._link.ask(Kind.LIMITS, wire.set_limits(values)))
+
+    def set_controller(self, controller: Controller) -> None:
+        """Load a controller into the device; its encoder is the device's own.
+
+        Raises
+        ------
+        SettingError
+            Where sample time or units are not the device's.
+        """
+        units = {c.name: c.unit for c in self.channels}
+        gains = controller.gains.to("standard")
+        _require_units(gains.u_unit, units.get("u", ""), "command")
+        _require_units(gains.y_unit, units.get("feedback", "RPM"), "output")
+        scale = counts_per_unit(self.identity.counts_per_rev, gains.y_unit)
+        c = controller
+        values = (
+            gains.Kp, gains.Ti, gains.Td, c.alpha, c.beta, c.N, c.Tt, c.u_min, c.u_max, c.slew,
+            c.filter_time, scale,
+        )  # fmt: skip
+        self._link.ask(Kind.GAINS, wire.gains(values, c.filter_samples))
+
+    def arm(self) -> None:
+        """Make it ready to start; its watchdog takes it back to idle when the host falls silent."""
+        self._link.ask(Kind.ARM, wire.watchdog(self._link.watchdog_us))
+
+    def stop(self) -> None:
+        """Command 0 and drive disabled, at once; returns when the device has confirmed it."""
+        self._link.stop()
+
+    def clear(self) -> None:
+        """Take a trip back, once its cause is known; the device is idle then."""
+        self._link.ask(Kind.CLEAR)
+
+    def wait_for_rest(self, timeout: float = 10.0) -> None:
+        """Wait until the encoder has not moved for a while.
+
+        Parameters
+        ----------
+        timeout : float
+            Longest wait [s], of the device's time where it runs on credit.
+
+        Raises
+        ------
+        LinkError
+            Where the motor still moves then.
+        """
+        status = self.status()
+        since = began = status.time_us
+        deadline = time.monotonic() + timeout + (5.0 if self.identity.on_credit else 0.0)
+        while status.time_us - since < REST_US:
+            if status.time_us - began > timeout * 1e6 or time.monotonic() > deadline:
+                raise LinkError(
+                    f"expected the motor at rest within {timeout:g} s, it turns at "
+                    f"{status.speed_rpm:.0f} RPM; brake it or wait longer"
+                )
+            self._let_pass(STEP_US)
+            before, status = status, self.status()
+            if status.counts != before.counts:
+                since = status.time_us
+
+    def upload(
+        self, values: object, *, what: Literal["commands", "references"] = "commands"
+    ) -> int:
+        """Load the start of a profile into the idle device.
+
+        Parameters
+        ----------
+        values : array, shape (N,)
+            Commands [V] or references [RPM].
+
+        Returns
+        -------
+        int
+            Values that fitted; `stream` sends the rest while it runs.
+        """
+        if what not in ("commands", "references"):
+            raise SettingError(f"expected what='commands' or 'references', got {what!r}")
+        plan = Plan("commands", values)  # type: ignore[arg-type]
+        run = Run(
+            self._link, plan, Layout(self.channels[:2], 1), self._profile(what, plan), _Nobody()
+        )
+        run.upload()
+        assert run.profile is not None
+        return run.profile.end
+
+    def layout(self, plan: Plan) -> Layout:
+        """The channels that a run of `plan` would stream, and how many samples go into a frame.
+
+        Raises
+        ------
+        SettingError
+            Where the baud rate does not carry the columns asked for; it names those to leave out.
+        """
+        return layout(plan, self.channels, self.identity, self._baud())
+
+    # --- runs -------------------------------------------------------------------------------------
+
+    def stream(self, plan: Plan, sink: Sink, *, cancel: threading.Event | None = None) -> Outcome:
+        """Run a plan and hand every sample to `sink` as it comes.
+
+        Waits for rest, uploads, arms, starts and takes samples until the end. Whatever goes wrong
+        meanwhile, Ctrl-C included, STOP is the next thing sent; then the motor is given time to
+        come to rest and the exception goes on. `outcome` says what became of the run even then.
+
+        Parameters
+        ----------
+        plan : Plan
+        sink : Sink
+        cancel : threading.Event or None
+            Set it in another thread to stop the run; that is no error.
+
+        Returns
+        -------
+        Outcome
+            A trip is an outcome: `state` is "tripped" and `reason` says why.
+
+        Raises
+        ------
+        SettingError
+            Before anything moves: no limits set, values beyond them, columns beyond the baud rate,
+            a mode or controller that the device does not take.
+        LinkError
+            Where port or device failed.
+        """
+        run = self._prepare(plan, sink)
+        try:
+            run.upload()
+            run.begin()
+            self.outcome = run.finish() if run.play(cancel) else run.abort(None)
+        except BaseException as error:
+            self.outcome = run.abort(error)
+            self._settle()
+            raise
+        if self.outcome.reason == "cancelled":
+            self._settle()
+        return self.outcome
+
+    def _prepare(self, plan: Plan, sink: Sink) -> Run:
+        require_capable(plan, self.identity)
+        what = "references" if plan.mode == "controller" else "commands"
+        profile = None if plan.mode == "direct" else self._profile(what, plan)
+        streamed = self.layout(plan)
+        self._require_idle()
+        if plan.controller is not None:
+            self.set_controller(plan.controller)
+        self.wait_for_rest()
+        self.outcome = None
+        return Run(self._link, plan, streamed, profile, sink)
+
+    def _profile(self, what: str, plan: Plan) -> profiles.Profile:
+        limits = self.limits()
+        if not limits.are_set:
+            raise SettingError(
+                "expected limits set on the device, it has none since its boot; set them to what "
+                "motor and machine stand: drive.set_limits(volt=..., speed_rpm=..., ...)"
+            )
+        if what == "references":
+            return profiles.references(plan.values, limits)
+        return profiles.commands(plan.values, self.channels[1], limits)
+
+    def _baud(self) -> float:
+        port = self._link.port
+        unbound = self.identity.on_credit or port.url.startswith("socket://")
+        return math.inf if unbound else port.baud
+
+    def _require_idle(self) -> None:
+        status = self.status()
+        if status.state == "tripped":
+            raise LinkError(
+                f"expected an idle device, it has tripped: {status.reason}; find out why, then "
+                "clear it (drive.clear())"
+            )
+        if status.state in ("armed", "running"):
+            self.stop()
+
+    def _settle(self) -> None:
+        """Rest after a stop, where the device can say so."""
+        if self.outcome is not None and self.outcome.state != "unknown":
+            try:
+                self.wait_for_rest()
+            except LinkError:
+                return
+
+    def _let_pass(self, us: int) -> None:
+        if self.identity.on_credit:
+            self._link.grant(self._link.newest + us)
+            return
+        until = time.monotonic() + us * 1e-6
+        while (rest := until - time.monotonic()) > 0.0:
+            self._link.turn(rest)
+
+    def _await_measurement(self) -> None:
+        """Boot ends by itself after some good samples; one on credit needs time for them."""
+        deadline = time.monotonic() + 1.0
+        while self.status().state == "boot" and time.monotonic() < deadline:
+            self._let_pass(STEP_US)
+
+
+class _Nobody:
+    def samples(self, first: int, columns: object) -> None: ...
+
+    def event(self, kind: str, index: int, **detail: object) -> None: ...
+
+
+def connect(url: str, *, baud: int = 115_200, watchdog: float = 0.05, resume: float = 1.0) -> Drive:
+    """Open a port and greet the drive behind it; sets nothing and moves nothing.
+
+    Parameters
+    ----------
+    url : str
+        A serial port's path, a COM name or ``socket://host:port``.
+    baud : int
+        Bits per second of a serial port.
+    watchdog : float
+        Time after which the device stops a motor whose host has fallen silent, .001 to 10 s.
+    resume : float
+        How long a run waits for a port that vanished [s]; the motor turns on only as long as
+        `watchdog` allows.
+
+    Returns
+    -------
+    Drive
+        Use it in a ``with`` block: leaving it stops the motor.
+
+    Raises
+    ------
+    LinkError
+        Where the port does not open or nothing answers; the message says what to do.
+    SettingError
+        For a setting outside its range.
+    """
+    if not 0.001 <= real("watchdog", watchdog) <= 10.0:
+        raise SettingError(f"expected a watchdog of .001 to 10 s, got {watchdog}; .05 suits most")
+    if not 0.0 <= real("resume", resume) < math.inf:
+        raise SettingError(f"expected resume of 0 s or more, got {resume}; 1 suits most")
+    port = open_port(url, baud)
+    try:
+        return Drive(Connection(port, watchdog=watchdog, patience=PATIENCE, resume=resume))
+    except BaseException:
+        port.close()
+        raise
+
+
+def _describe(link: Connection) -> tuple[Channel, ...]:
+    identity = link.identity
+    bodies = [link.ask(Kind.DESCRIBE, bytes([k])) for k in range(identity.channels)]
+    if wire.schema_hash(identity.version, identity.period_us, bodies) != identity.schema:
+        raise LinkError(
+            "expected channels that match the device's schema hash, got others; connect again, "
+            "or mend the firmware"
+        )
+    channels = tuple(map(wire.channel, bodies))
+    if (channels[0].encoding, channels[1].encoding) != (0, 1):
+        raise LinkError("expected channel 0 to be counts and 1 the command; mend the firmware")
+    return channels
+
+
+def _limit(name: str, value: float | None, present: float, ceiling: float) -> float:
+    if value is None:
+        return present if present else ceiling
+    if not 0.0 < real(name, value) <= ceiling * (1.0 + 1e-6):
+        raise SettingError(
+            f"expected {name} above 0 and at most {ceiling:g}, the device's ceiling, got {value}; "
+            "lower it"
+        )
+    return min(value, ceiling)
+
+
+def _require_units(given: str, device: str, what: str) -> None:
+    if given.lower() != device.lower():
+        raise SettingError(
+            f"expected a controller whose {what} is in {device}, as the device's, got {given}; "
+            "convert its gains"
+        )

@@ -1,0 +1,244 @@
+"""`Plan`: what a run is to do; `Sink`: who takes its samples; `Outcome`: what became of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..control import Controller, vector
+from ..errors import SettingError
+from . import wire
+from .clock import ClockBounds
+from .wire import Channel, Identity
+
+Mode: TypeAlias = Literal["commands", "controller", "direct"]
+Columns: TypeAlias = Mapping[str, NDArray[np.float64]]
+
+DEFAULTS: dict[str, tuple[str, ...]] = {
+    "commands": ("speed_true",),
+    "controller": ("speed_true", "feedback", "r"),
+    "direct": ("speed_true",),
+}
+"""Streamed beside `counts` and `u` where the device has them; a low baud rate drops the last."""
+BATCH = 10
+SPARE = 0.1
+_CAPABILITIES = {"commands": wire.PROFILE, "controller": wire.PID, "direct": wire.DIRECT}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run is to do.
+
+    Parameters
+    ----------
+    mode : "commands", "controller" or "direct"
+        Play `values` as commands; run `controller` along them on the device; or send each as a
+        command when its time has come, which is only for slow plants.
+    values : array, shape (N,)
+        Commands in the unit of channel `u`, or references in the unit of the controller's output.
+    controller : Controller or None
+        Of mode "controller".
+    columns : sequence of str or None
+        Channels to stream beside `counts` and `u`; None for those of the mode that the baud rate
+        carries.
+    batch : int or None
+        Samples in a frame; None for the smallest number from 10 on that the baud rate carries.
+
+    Raises
+    ------
+    DataError
+        For values that are not numbers or not one-dimensional.
+    SettingError
+        For a mode, values or a controller that do not go together.
+    """
+
+    mode: Mode
+    values: NDArray[np.float64]
+    controller: Controller | None = None
+    columns: Sequence[str] | None = None
+    batch: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.mode not in wire.MODES:
+            raise SettingError(f"expected a mode out of {', '.join(wire.MODES)}, got {self.mode!r}")
+        values = vector("values", self.values).copy()
+        if not 0 < len(values) < 2**32 or not np.all(np.isfinite(values)):
+            raise SettingError(
+                f"expected at least one value, all finite, got {len(values)} of which "
+                f"{int(np.count_nonzero(~np.isfinite(values)))} are not; mend the signal"
+            )
+        values.setflags(write=False)
+        object.__setattr__(self, "values", values)
+        if (self.controller is None) == (self.mode == "controller"):
+            raise SettingError(
+                f"expected a controller in mode 'controller' and none elsewhere, got "
+                f"{'none' if self.controller is None else 'one'} in mode {self.mode!r}"
+            )
+
+
+class Sink(Protocol):
+    """Takes what a run delivers; called on the thread of the run, so it must be quick."""
+
+    def samples(self, first: int, columns: Columns) -> None:
+        """Samples `first`, `first + 1`, ..., no gap between them: arrays (n,) by channel."""
+
+    def event(self, kind: str, index: int, **detail: object) -> None:
+        """Something happened at sample `index`.
+
+        Kinds: those of the device (armed, started, finished, stopped, tripped), and gap, port_lost,
+        resumed, reset, stop_unconfirmed.
+        """
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a run.
+
+    Parameters
+    ----------
+    state : str
+        Of the device at the end.
+    reason : str
+        "finished", "stopped", "cancelled", "interrupted", "failed", or why the device tripped.
+    received : int
+        Samples that arrived.
+    taken : int or None
+        Samples that the device has taken; None where it could not be asked.
+    gaps : tuple of (first, count)
+        Samples that are missing.
+    anomalies : tuple of (kind, sequence, count)
+        Frames that were not in order: of which kind, from which sequence number, how many.
+    clock : ClockBounds or None
+        None on credit, where there is no wall clock.
+    columns : tuple of str
+        Channels streamed.
+    batch : int
+        Samples in a frame.
+    counters : mapping
+        How many frames and samples, in and out of order.
+    """
+
+    state: str
+    reason: str
+    received: int
+    taken: int | None
+    gaps: tuple[tuple[int, int], ...]
+    anomalies: tuple[tuple[str, int, int], ...]
+    clock: ClockBounds | None
+    columns: tuple[str, ...] = ()
+    batch: int = 0
+    counters: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every sample that the device took has arrived."""
+        return self.taken == self.received and not self.gaps
+
+    def __str__(self) -> str:
+        of = "an unknown number" if self.taken is None else f"{self.taken}"
+        gaps = ", ".join(f"{n} from sample {k}" for k, n in self.gaps[:5]) or "none"
+        more = f" and {len(self.gaps) - 5} more" if len(self.gaps) > 5 else ""
+        return f"{self.reason} ({self.state}); {self.received} of {of} samples; gaps: {gaps}{more}"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The channels that a run streams and how many samples go into a frame."""
+
+    channels: tuple[Channel, ...]
+    batch: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(c.name for c in self.channels)
+
+    @property
+    def mask(self) -> int:
+        return sum(1 << c.number for c in self.channels)
+
+
+def require_capable(plan: Plan, identity: Identity) -> None:
+    """Refuse what the device does not offer.
+
+    Raises
+    ------
+    SettingError
+    """
+    if not identity.capabilities & _CAPABILITIES[plan.mode]:
+        raise SettingError(
+            f"expected a device that offers mode {plan.mode!r}, {identity.name!r} does not; "
+            "choose another mode or update its firmware"
+        )
+    controller = plan.controller
+    if controller and not math.isclose(controller.Ts, identity.Ts, rel_tol=1e-6):
+        raise SettingError(
+            f"expected a controller for the device's period of {identity.Ts:g} s, got one for "
+            f"{controller.Ts:g} s; tune it at that sample time"
+        )
+
+
+def layout(plan: Plan, channels: Sequence[Channel], identity: Identity, baud: float) -> Layout:
+    """Channels and batch that the link carries with a tenth to spare.
+
+    Parameters
+    ----------
+    baud : float
+        Bits per second; inf where nothing limits them.
+
+    Raises
+    ------
+    SettingError
+        Where the columns asked for are unknown or too much; the message names those to leave out.
+    """
+    names = {c.name: c for c in channels}
+    wanted = DEFAULTS[plan.mode] if plan.columns is None else tuple(plan.columns)
+    if plan.columns is None:
+        wanted = tuple(w for w in wanted if w in names)
+    unknown = [w for w in wanted if w not in names]
+    if unknown:
+        raise SettingError(
+            f"expected columns out of {', '.join(names)}, got {', '.join(unknown)}; "
+            "the device streams no others"
+        )
+    extra = [names[w] for w in wanted if names[w].number > 1]
+    for count in range(len(extra), -1, -1):
+        chosen = tuple(sorted({*channels[:2], *extra[:count]}, key=lambda c: c.number))
+        batch = _batch(plan, chosen, identity, baud)
+        if batch is not None and (count == len(extra) or plan.columns is None):
+            return Layout(chosen, batch)
+        if batch is not None:
+            raise _too_much(plan, extra[count:], identity, baud)
+    raise _too_much(plan, extra, identity, baud)
+
+
+def _batch(plan: Plan, chosen: Sequence[Channel], identity: Identity, baud: float) -> int | None:
+    """The smallest batch that fits, or the one asked for if it does."""
+    encodings = [c.encoding for c in chosen]
+    tries = range(BATCH, 101) if plan.batch is None else (plan.batch,)
+    fits = (b for b in tries if _fits(encodings, b, identity, baud))
+    found = next(fits, None)
+    if found is None and plan.batch is None:
+        found = next((b for b in range(BATCH, 0, -1) if _fits(encodings, b, identity, baud)), None)
+    return found
+
+
+def _fits(encodings: Sequence[int], batch: int, identity: Identity, baud: float) -> bool:
+    body = wire.body_size(encodings, batch)
+    if not 1 <= batch <= 255 or body > wire.MAX_BODY:
+        return False
+    seconds = batch * identity.Ts
+    return wire.wire_size(body) * 10.0 / seconds <= (1.0 - SPARE) * baud
+
+
+def _too_much(plan: Plan, out: Sequence[Channel], identity: Identity, baud: float) -> SettingError:
+    leave = f"leave out {', '.join(c.name for c in out)}" if out else "use a longer period"
+    batch = "any batch" if plan.batch is None else f"batches of {plan.batch}"
+    return SettingError(
+        f"expected columns that {baud:g} baud carries each {identity.Ts:g} s with a tenth to spare "
+        f"in {batch}, got more; {leave}, or raise the baud rate of both sides"
+    )

@@ -1,0 +1,307 @@
+"""Ports: a serial device or a socket as bytes in and out; the ports of this computer."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import time
+from abc import ABC, abstractmethod
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlsplit
+
+from ..errors import LinkError, SettingError
+from .failures import FAILURES, explain
+
+CHUNK = 65_536
+"""Bytes asked for at once; a port gives what it has."""
+WRITE_TIMEOUT = 1.0
+CONNECT_TIMEOUT = 5.0
+
+
+class Port(ABC):
+    """Bytes in and out; every way it can fail is a `LinkError`.
+
+    Parameters
+    ----------
+    url : str
+        What was asked for, as messages repeat it.
+    baud : int
+        Bits per second; a socket has none and keeps the number only.
+    """
+
+    def __init__(self, url: str, baud: int) -> None:
+        self.url = url
+        self.baud = baud
+        self._open()
+
+    @abstractmethod
+    def _open(self) -> None: ...
+
+    @abstractmethod
+    def read(self, timeout: float) -> bytes:
+        """What has come, as soon as anything has; empty after `timeout` seconds without a byte.
+
+        Raises
+        ------
+        LinkError
+            Where the port vanished, the other side closed it, or it is closed.
+        """
+
+    @abstractmethod
+    def write(self, data: bytes) -> None:
+        """All of `data`, or an error.
+
+        Raises
+        ------
+        LinkError
+            Where the port vanished or takes no bytes for a second.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Give it back; more than once does no harm, and nothing is raised."""
+
+    def reopen(self) -> None:
+        """Close it and open the same again.
+
+        Raises
+        ------
+        LinkError
+            Where it is not there (yet).
+        """
+        self.close()
+        self._open()
+
+    def _write(self, descriptor: int, data: bytes) -> None:
+        left, deadline = memoryview(data), time.monotonic() + WRITE_TIMEOUT
+        while left:
+            try:
+                left = left[os.write(descriptor, left) :]
+            except BlockingIOError:
+                rest = max(0.0, deadline - time.monotonic())
+                if not select.select((), (descriptor,), (), rest)[1]:
+                    raise TimeoutError(f"{len(left)} of {len(data)} bytes not taken") from None
+
+
+class SerialPort(Port):
+    """A serial device by its path or COM name; nobody else may open it meanwhile."""
+
+    _serial: Any = None
+
+    def _open(self) -> None:
+        module = _pyserial()
+        try:
+            self._serial = module.Serial(
+                self.url, self.baud, timeout=0, write_timeout=WRITE_TIMEOUT, exclusive=True
+            )
+        except FAILURES as error:
+            raise explain(self.url, "open", error) from error
+        # only Linux has it, and only some drivers there
+        with suppress(AttributeError, *FAILURES):
+            self._serial.set_low_latency_mode(True)
+
+    def read(self, timeout: float) -> bytes:
+        try:
+            data = _read(self._serial, timeout)
+        except FAILURES as error:
+            raise explain(self.url, "read", error) from error
+        if data is None:
+            raise explain(self.url, "read", OSError("it is ready, but holds nothing"))
+        return data
+
+    def write(self, data: bytes) -> None:
+        try:
+            if os.name == "nt":
+                _require(self._serial).write(data)
+            else:
+                self._write(_require(self._serial).fileno(), data)
+        except FAILURES as error:
+            raise explain(self.url, "write", error) from error
+
+    def close(self) -> None:
+        if self._serial is not None:
+            # a port that has vanished cannot be given back
+            with suppress(*FAILURES):
+                self._serial.close()
+            self._serial = None
+
+
+class SocketPort(Port):
+    """A TCP connection, `socket://host:port`; bytes that wait when it opens are kept."""
+
+    _socket: socket.socket | None = None
+
+    def _open(self) -> None:
+        address = _address(self.url)
+        try:
+            self._socket = socket.create_connection(address, CONNECT_TIMEOUT)
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._socket.setblocking(False)
+        except FAILURES as error:
+            raise explain(self.url, "open", error) from error
+
+    def read(self, timeout: float) -> bytes:
+        try:
+            connection = _require(self._socket)
+            if not select.select((connection,), (), (), timeout)[0]:
+                return b""
+            data = bytes(connection.recv(CHUNK))
+        except BlockingIOError:
+            return b""
+        except FAILURES as error:
+            raise explain(self.url, "read", error) from error
+        if not data:
+            raise explain(self.url, "read", ConnectionError("the other side closed it"))
+        return data
+
+    def write(self, data: bytes) -> None:
+        try:
+            connection = _require(self._socket)
+            connection.settimeout(WRITE_TIMEOUT)
+            try:
+                connection.sendall(data)
+            finally:
+                connection.setblocking(False)
+        except FAILURES as error:
+            raise explain(self.url, "write", error) from error
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+def open_port(url: str, baud: int = 115_200) -> Port:
+    """Open a serial port or a socket.
+
+    Parameters
+    ----------
+    url : str
+        A device's path, a COM name or ``socket://host:port``.
+    baud : int
+        Bits per second of a serial port.
+
+    Raises
+    ------
+    LinkError
+        Where it cannot be opened; the message says why and what to do.
+    SettingError
+        For a name of another kind, or where pyserial is not installed.
+    """
+    if not isinstance(baud, int) or isinstance(baud, bool) or baud <= 0:
+        raise SettingError(f"expected baud as a whole number above 0, got {baud!r}; try 115200")
+    if url.startswith("socket://"):
+        return SocketPort(url, baud)
+    if "://" in url or not url or url.split(":")[0] == "virtual":
+        raise SettingError(
+            f"expected a serial port's path (/dev/ttyUSB0), a COM name (COM3) or "
+            f"socket://HOST:PORT, got {url!r}; `sewfast ports` lists the serial ports"
+        )
+    return SerialPort(url, baud)
+
+
+@dataclass(frozen=True)
+class PortInfo:
+    """A serial port of this computer.
+
+    Parameters
+    ----------
+    path : str
+        What `open_port` takes.
+    description : str
+    vid, pid : int or None
+        Of a USB port.
+    serial_number : str or None
+        Of a USB port.
+    problem : str or None
+        Why it cannot be opened and what to do; None where nothing speaks against it.
+    """
+
+    path: str
+    description: str
+    vid: int | None
+    pid: int | None
+    serial_number: str | None
+    problem: str | None
+
+    @property
+    def can_open(self) -> bool:
+        """Whether nothing is known that speaks against opening it."""
+        return self.problem is None
+
+
+def list_ports() -> list[PortInfo]:
+    """The serial ports of this computer, by path.
+
+    None is opened: that alone would restart many boards.
+
+    Raises
+    ------
+    SettingError
+        Where pyserial is not installed.
+    """
+    _pyserial()
+    from serial.tools.list_ports import comports
+
+    ports = [
+        PortInfo(p.device, p.description, p.vid, p.pid, p.serial_number, _problem(p.device))
+        for p in comports()
+    ]
+    return sorted(ports, key=lambda p: p.path)
+
+
+def _problem(path: str) -> str | None:
+    if os.name == "nt" or os.access(path, os.R_OK | os.W_OK):
+        return None
+    kind = PermissionError if os.path.exists(path) else FileNotFoundError
+    return str(explain(path, "open", kind(None, "permission denied")))
+
+
+def _pyserial() -> Any:
+    try:
+        import serial
+    except ImportError as error:
+        raise SettingError(
+            'serial ports need pyserial, which is not installed: pip install "sewfast[link]"; '
+            "socket://HOST:PORT works without"
+        ) from error
+    return serial
+
+
+def _address(url: str) -> tuple[str, int]:
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if not host or not port or parts.path not in ("", "/"):
+        raise SettingError(
+            f"expected socket://HOST:PORT with a port of 1 to 65535, got {url!r}; "
+            "as in socket://localhost:5000"
+        )
+    return host, port
+
+
+def _read(port: Any, timeout: float) -> bytes | None:
+    """None where the port is ready and gives nothing: a device that is gone."""
+    _require(port)
+    if os.name == "nt":
+        port.timeout = timeout
+        first = port.read(1)
+        port.timeout = 0
+        return bytes(first) + bytes(port.read(CHUNK)) if first else b""
+    if not select.select((port.fd,), (), (), timeout)[0]:
+        return b""
+    try:
+        return os.read(int(port.fd), CHUNK) or None
+    except BlockingIOError:
+        return b""
+
+
+def _require(port: Any) -> Any:
+    if port is None:
+        raise LinkError("it is closed")
+    return port

@@ -1,0 +1,351 @@
+"""`Run`: one run on a device, from its upload to the last sample, with its way out."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import LinkError
+from . import wire
+from .connection import SILENCE, Connection, DeviceReset
+from .plan import Columns, Layout, Outcome, Plan, Sink
+from .profile import Profile
+from .wire import Event, Kind, Reply, Status
+
+ASK = 0.5
+"""Time between two STATUS in real time [s]; each of them bounds the clocks."""
+CREDIT_SHARE = 0.8
+"""Share of the watchdog time that a device on credit may run ahead."""
+AGAIN = 0.002
+"""Time after which credit that brought nothing is granted again [s]."""
+_ENDS = ("finished", "stopped", "tripped")
+
+
+class Run:
+    """One run: `upload`, `begin`, `play`, `finish` in this order, or `abort` at any time.
+
+    Parameters
+    ----------
+    link : Connection
+    plan : Plan
+    layout : Layout
+    profile : Profile or None
+        None in mode "direct".
+    sink : Sink
+    """
+
+    def __init__(
+        self, link: Connection, plan: Plan, layout: Layout, profile: Profile | None, sink: Sink
+    ) -> None:
+        self.link, self.plan, self.layout, self.profile = link, plan, layout, profile
+        self.sink = sink
+        self.length = len(plan.values)
+        self.period = link.identity.period_us
+        self.run = -1
+        #: The device's time of sample 0 [us]; None before the device has said it.
+        self.start_us: int | None = None
+        #: Index of the sample that comes next.
+        self.next = 0
+        self.received = 0
+        self.gaps: list[tuple[int, int]] = []
+        self.ended = False
+        self._sink_works = True
+        self._last: Status | None = None
+        self._lead = round(CREDIT_SHARE * link.watchdog_us)
+        self._granted = 0
+        self._beaten = self._heard = self._asked = 0.0
+        self._outages = len(link.outages)
+        self._counters = dict(link.receiver.counters)
+        pause = 3.0 * layout.batch * self.period * 1e-6
+        self._silence = 0.02 if self._on_credit else max(0.1, pause)
+
+    @property
+    def _on_credit(self) -> bool:
+        return self.link.identity.on_credit
+
+    # --- to the start -----------------------------------------------------------------------------
+
+    def upload(self) -> None:
+        """As much of the profile as fits before it is played."""
+        profile = self.profile
+        while profile is not None and (piece := profile.piece(self._room())) is not None:
+            before = profile.end
+            profile.answered(self.link.request(Kind.UPLOAD, piece))
+            if profile.end == before:
+                raise LinkError(
+                    f"expected room for {self.link.identity.capacity} values, the device takes no "
+                    f"more than {before}; mend the firmware"
+                )
+
+    def begin(self) -> None:
+        """Arm and start; the motor moves from here on."""
+        link, layout = self.link, self.layout
+        link.receiver.expect([(c.encoding, c.steps_per_unit) for c in layout.channels], self.period)
+        link.receiver.take()
+        link.events.clear()
+        link.resumable = True
+        link.each_turn = self._each_turn
+        link.ask(Kind.ARM, wire.watchdog(link.watchdog_us))
+        mode = wire.MODES[self.plan.mode]
+        body = wire.start(mode, link.watchdog_us, 0, self.length, layout.mask, layout.batch)
+        self.run, start_us = wire.started(link.ask(Kind.START, body))
+        self._heard = self._asked = time.monotonic()
+        self.start_us = start_us
+
+    # --- the run ----------------------------------------------------------------------------------
+
+    def play(self, cancel: threading.Event | None) -> bool:
+        """Pump until the run has ended; False where it was cancelled."""
+        while not self.ended:
+            if cancel is not None and cancel.is_set():
+                return False
+            self.link.turn(self._wait())
+            reply = self.link.answer()
+            if reply is not None:
+                self._answered(reply)
+            self._events()
+            if len(self.link.outages) != self._outages:
+                self._resumed()
+            if not self.link.is_busy and not self.ended:
+                self._ask(time.monotonic())
+        return True
+
+    def _wait(self) -> float:
+        if self._on_credit:
+            return AGAIN
+        rest = self._beaten + self.link.watchdog / 4.0 - time.monotonic()
+        return min(max(rest, 0.0), SILENCE)
+
+    def _each_turn(self) -> None:
+        if self.start_us is not None:
+            self.collect(self.start_us)
+        now = time.monotonic()
+        if self._on_credit:
+            self._grant(now)
+        elif now - self._beaten >= self.link.watchdog / 4.0:
+            self._beaten = now
+            self._beat()
+
+    def _beat(self) -> None:
+        if self.plan.mode == "direct":
+            self.link.drive(self._command())
+        else:
+            self.link.keep()
+
+    def _command(self) -> float:
+        """The command whose time has come, by the newest time heard of the device."""
+        if self.start_us is None:
+            return 0.0
+        k = (self.link.newest - self.start_us) // self.period + 1
+        return float(self.plan.values[min(max(k, 0), self.length - 1)])
+
+    def _grant(self, now: float) -> None:
+        if self.start_us is None:
+            return
+        until = self.link.newest + self._lead
+        if self.profile is not None and not self.profile.is_whole:
+            # the device must not play what it has not got yet
+            until = min(until, self.start_us + (self.profile.end - 1) * self.period)
+        further = until - self._granted
+        if 4 * further >= self._lead or now - self._beaten >= AGAIN:
+            self._beaten = now
+            self._granted = until
+            if self.plan.mode == "direct":
+                self.link.drive(self._command())
+            self.link.grant(until)
+
+    def _ask(self, now: float) -> None:
+        """The next command where one is due: a piece of the profile, or STATUS."""
+        piece = None if self.profile is None else self.profile.piece(self._room())
+        if piece is not None:
+            self.link.begin(Kind.UPLOAD, piece)
+            return
+        silent = now - max(self._heard, self._asked) >= self._silence
+        if silent or (not self._on_credit and now - self._asked >= ASK):
+            self._asked = now
+            self.link.begin(Kind.STATUS)
+
+    def _room(self) -> int:
+        """Values that fit: one has room once the one `capacity` before it has been played."""
+        assert self.profile is not None
+        return self.link.identity.capacity + self.next - self.profile.end
+
+    def _answered(self, reply: Reply) -> None:
+        if reply.kind == Kind.UPLOAD and self.profile is not None:
+            self.profile.answered(reply)
+        elif reply.kind == Kind.STATUS:
+            self._last = wire.status(reply)
+            going = self._last.run == self.run and self._last.state in ("armed", "running")
+            self.ended = self.ended or not going
+
+    def _events(self) -> None:
+        while self.link.events:
+            self._event(self.link.events.popleft())
+
+    def _event(self, event: Event) -> None:
+        mine = event.run == self.run
+        if mine and event.name in _ENDS:
+            self.ended = True
+        detail = {"reason": event.reason, "state": event.state, "device_us": event.time_us}
+        if math.isfinite(event.value):
+            detail["value"] = event.value
+        self._tell(event.name, event.samples if mine else 0, **detail)
+
+    def _resumed(self) -> None:
+        away = self.link.outages[self._outages :]
+        self._outages = len(self.link.outages)
+        self._tell("port_lost", self.next)
+        self._tell("resumed", self.next, seconds=sum(away))
+        status = self.link.status()
+        mine = status.run == self.run
+        if mine and status.state in ("armed", "running"):
+            return
+        if not mine or status.state == "tripped":
+            what = f"had tripped: {status.reason}" if mine else "runs something else"
+            raise LinkError(
+                f"{self.link.port.url}: expected the run to go on after {sum(away):.2f} s without "
+                f"the port, the device {what}, after {status.taken} samples; see to cable and "
+                f"plug, or give the watchdog more time than {self.link.watchdog:g} s"
+            )
+        self.ended = True
+
+    # --- samples ----------------------------------------------------------------------------------
+
+    def collect(self, start_us: int) -> None:
+        """Hand what the receiver holds to the sink, one call for each stretch without a gap."""
+        times, columns = self.link.receiver.take()
+        n = len(times)
+        if not n:
+            return
+        first, last = int(times[0]), int(times[-1])
+        self._heard = time.monotonic()
+        self.link.newest = max(self.link.newest, last)
+        named = dict(zip(self.layout.names, columns, strict=True))
+        if last - first == (n - 1) * self.period:
+            self._deliver((first - start_us) // self.period, named)
+            return
+        index = (times - start_us) // self.period
+        cuts = [0, *(np.flatnonzero(np.diff(index) != 1) + 1).tolist(), n]
+        for a, b in pairwise(cuts):
+            self._deliver(int(index[a]), {name: c[a:b] for name, c in named.items()})
+
+    def _deliver(self, first: int, columns: dict[str, NDArray[np.float64]]) -> None:
+        count = len(columns["counts"])
+        if first < self.next:
+            # of the run before, or repeated
+            columns = {name: c[self.next - first :] for name, c in columns.items()}
+            count, first = count - (self.next - first), self.next
+            if count <= 0:
+                return
+        if first > self.next:
+            self._gap(first - self.next)
+        self._hand_over(first, count, columns)
+
+    def _hand_over(self, first: int, count: int, columns: Columns) -> None:
+        self.next = first + count
+        if self._sink_works:
+            try:
+                self.sink.samples(first, columns)
+            except BaseException as error:
+                # whether it has them is not known: listed as missing rather than unlisted
+                self.gaps.append((first, count))
+                self._sink_works = not isinstance(error, Exception)
+                raise
+        self.received += count
+
+    def _gap(self, count: int) -> None:
+        self.gaps.append((self.next, count))
+        self._tell("gap", self.next, count=count)
+        self.next += count
+
+    def _tell(self, kind: str, index: int, **detail: object) -> None:
+        if self._sink_works:
+            try:
+                self.sink.event(kind, index, **detail)
+            except Exception:
+                self._sink_works = False
+                raise
+
+    # --- the end ----------------------------------------------------------------------------------
+
+    def finish(self, reason: str | None = None) -> Outcome:
+        """Ask the device what it has taken, and list what did not arrive.
+
+        Parameters
+        ----------
+        reason : str or None
+            Why the host ended it; None where the device did.
+        """
+        status = self.link.status()
+        if self.start_us is not None:
+            self.collect(self.start_us)
+        self._events()
+        self._leave()
+        taken = status.taken if status.run == self.run else 0
+        if taken > self.next:
+            self._gap(taken - self.next)
+        ended = "finished" if taken == self.length else "stopped"
+        if status.state == "tripped":
+            ended = status.reason
+        return self._outcome(status.state, reason or ended, taken)
+
+    def abort(self, error: BaseException | None) -> Outcome:
+        """Stop the motor before anything else, then save what has arrived.
+
+        Parameters
+        ----------
+        error : BaseException or None
+            Why; None where the run was cancelled.
+        """
+        self.link.each_turn = None
+        reason = "cancelled" if error is None else "failed"
+        if isinstance(error, KeyboardInterrupt):
+            reason = "interrupted"
+        try:
+            self.link.stop()
+            return self._save(reason)
+        except LinkError as failed:
+            return self._unconfirmed(reason, failed)
+        finally:
+            self._leave()
+
+    def _save(self, reason: str) -> Outcome:
+        try:
+            return self.finish(reason)
+        except LinkError:
+            raise
+        except Exception:
+            # the sink's error is raised already, or a second one: the motor has stopped
+            self._sink_works = False
+            return self.finish(reason)
+
+    def _unconfirmed(self, reason: str, failed: LinkError) -> Outcome:
+        try:
+            if self.start_us is not None:
+                self.collect(self.start_us)
+            kind = "reset" if isinstance(failed, DeviceReset) else "stop_unconfirmed"
+            self._tell(kind, self.next, message=str(failed))
+        except Exception:
+            self._sink_works = False
+        return self._outcome("unknown", reason, None)
+
+    def _leave(self) -> None:
+        self.link.each_turn = None
+        self.link.resumable = False
+
+    def _outcome(self, state: str, reason: str, taken: int | None) -> Outcome:
+        link = self.link
+        now: dict[str, Any] = dict(link.receiver.counters)
+        counters = {k: int(v) - int(self._counters.get(k, 0)) for k, v in now.items()}
+        return Outcome(
+            state=state, reason=reason, received=self.received, taken=taken, gaps=tuple(self.gaps),
+            anomalies=tuple(link.receiver.anomalies()),
+            clock=None if self._on_credit else link.clock.bounds(),
+            columns=self.layout.names, batch=self.layout.batch, counters=counters,
+        )  # fmt: skip

@@ -1,0 +1,477 @@
+"""Runs on a drive: every sample accounted for, and the motor stopped whatever happens."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import link_device as script
+from link_device import ScriptedDevice
+from sewfast import Controller, Gains
+from sewfast.errors import LinkError, SettingError
+from sewfast.link import Drive, Plan, connect
+
+U = 3.0 * np.sin(np.arange(400) / 20.0)
+
+
+class Kept:
+    """A sink that keeps everything; `on_samples` may do more."""
+
+    def __init__(self, on_samples: Callable[[int], object] = lambda first: None) -> None:
+        self.blocks: list[tuple[int, dict[str, np.ndarray]]] = []
+        self.events: list[tuple[str, int, dict[str, Any]]] = []
+        self._on_samples = on_samples
+
+    def samples(self, first, columns):
+        self._on_samples(first)
+        self.blocks.append((first, {name: c.copy() for name, c in columns.items()}))
+
+    def event(self, kind, index, **detail):
+        self.events.append((kind, index, detail))
+
+    @property
+    def kinds(self) -> list[str]:
+        return [kind for kind, _, _ in self.events]
+
+    def indexes(self) -> np.ndarray:
+        return np.concatenate([f + np.arange(len(c["u"])) for f, c in self.blocks])
+
+    def column(self, name: str) -> np.ndarray:
+        return np.concatenate([c[name] for _, c in self.blocks])
+
+
+@pytest.fixture
+def device(tmp_path) -> Iterator[ScriptedDevice]:
+    with ScriptedDevice(tmp_path) as served:
+        yield served
+
+
+@pytest.fixture
+def drive(device) -> Iterator[Drive]:
+    with connect(device.url) as connected:
+        connected.set_limits(volt=10.0, speed_rpm=4000.0)
+        yield connected
+
+
+def stops(device: ScriptedDevice) -> list[float]:
+    return [at for at, kind in device.arrived if kind == script.STOP]
+
+
+def once(action: Callable[[], object], at: int = 100) -> Callable[[int], None]:
+    done: list[int] = []
+
+    def act(first: int) -> None:
+        if first >= at and not done:
+            done.append(first)
+            action()
+
+    return act
+
+
+def starts(device: ScriptedDevice) -> list[bytes]:
+    return [body for kind, body in device.executed if kind == script.START]
+
+
+# --- what is done -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["pty", "tcp"])
+def test_every_sample_of_a_run_arrives(tmp_path, kind):
+    with ScriptedDevice(tmp_path, kind) as device, connect(device.url) as drive:
+        drive.set_limits(volt=10.0)
+        sink = Kept()
+        outcome = drive.stream(Plan("commands", U), sink)
+    assert (outcome.state, outcome.reason) == ("idle", "finished")
+    assert outcome.is_complete
+    assert outcome.received == outcome.taken == len(U)
+    assert outcome == drive.outcome
+    np.testing.assert_array_equal(sink.indexes(), np.arange(len(U)))
+    np.testing.assert_allclose(sink.column("u"), U, atol=0.0005 + 1e-9)
+    np.testing.assert_allclose(sink.column("speed_true"), 10.0 * sink.column("u"), rtol=1e-6)
+    assert sink.kinds == ["started", "finished"]
+
+
+def test_a_profile_longer_than_the_memory_is_fed_while_it_runs(tmp_path):
+    with ScriptedDevice(tmp_path, capacity=130) as device, connect(device.url) as drive:
+        drive.set_limits(volt=10.0)
+        sink = Kept()
+        outcome = drive.stream(Plan("commands", U), sink)
+    assert outcome.is_complete
+    np.testing.assert_allclose(sink.column("u"), U, atol=0.0005 + 1e-9)
+
+
+def test_a_controller_runs_on_the_device(device, drive):
+    gains = Gains.parallel(0.01, 0.1, 0.0)
+    controller = Controller(gains, alpha=0.1, u_min=-8.0, u_max=8.0, filter_samples=4)
+    sink = Kept()
+    r = np.linspace(0.0, 1000.0, 200)
+    outcome = drive.stream(Plan("controller", r, controller, columns=("r",)), sink)
+    assert outcome.columns == ("counts", "u", "r")
+    assert outcome.is_complete
+    np.testing.assert_allclose(sink.column("r"), r, rtol=1e-6)
+    (body,) = [body for kind, body in device.executed if kind == script.GAINS]
+    *values, filter_samples = struct.unpack("<12fB", body)
+    expected = (0.01, 0.1, 0.0, 0.1, 0.0, math.inf, 0.0, -8.0, 8.0, math.inf, 0.0, 1572 / 60)
+    np.testing.assert_allclose(values, expected, rtol=1e-6)
+    assert filter_samples == 4
+
+
+def test_direct_commands_are_sent_as_their_time_comes(device, drive):
+    sink = Kept()
+    values = np.repeat([1.0, 2.0, 3.0], 150)
+    outcome = drive.stream(Plan("direct", values), sink)
+    assert outcome.is_complete
+    u = sink.column("u")
+    assert set(u[100:140]) == {1.0}
+    assert set(u[-40:]) == {3.0}
+    assert np.all(np.diff(u) >= 0.0)
+
+
+def test_the_clock_of_the_device_is_known_within_its_round_trips(drive):
+    clock = drive.stream(Plan("commands", U), Kept()).clock
+    assert clock is not None
+    assert clock.consistent
+    assert clock.drift_ppm[0] <= 0.0 <= clock.drift_ppm[1]
+    # the device counts from its own boot on the same clock
+    assert clock.offset_s[0] < clock.offset_s[1] < clock.offset_s[0] + 0.1
+
+
+def test_heartbeats_go_on_while_a_run_lasts_and_no_longer(device, drive):
+    drive.stream(Plan("commands", U), Kept())
+    drive.status()
+    beats = device.heartbeats
+    assert beats >= 400 / 50
+    drive.wait_for_rest()
+    assert device.heartbeats == beats
+
+
+# --- what is refused ----------------------------------------------------------------------------
+
+
+def test_nothing_starts_without_limits(device):
+    with connect(device.url) as drive:
+        assert not drive.limits().are_set
+        with pytest.raises(SettingError, match=r"expected limits set .*drive\.set_limits"):
+            drive.stream(Plan("commands", U), Kept())
+    assert device.limits == (0.0,) * 4
+    assert not starts(device)
+
+
+def test_limits_left_out_keep_what_is_set_or_take_the_ceiling(drive):
+    assert drive.limits().values == (10.0, 4000.0, 1e6, 10.0)
+    drive.set_limits(current=2.0)
+    assert drive.limits().values == (10.0, 4000.0, 1e6, 2.0)
+    for value in (0.0, -1.0, 21.0, math.nan):
+        with pytest.raises(SettingError, match="volt"):
+            drive.set_limits(volt=value)
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        (Plan("commands", np.full(10, 10.01)), r"within \+-10 V, got 10\.01 at sample 0"),
+        (Plan("commands", U, columns=("torque",)), r"got torque; the device streams no others"),
+        (
+            Plan("controller", U, Controller(Gains.standard(1.0, 0.1), Ts=0.002)),
+            r"period of 0\.001 s, got one for 0\.002 s",
+        ),
+        (
+            Plan("controller", U, Controller(Gains.standard(1.0, 0.1, y_unit="rad/s"))),
+            r"in RPM, as the device's, got rad/s",
+        ),
+        (
+            Plan("controller", np.array([4001.0]), Controller(Gains.standard(1.0, 0.1))),
+            r"within \+-4000 RPM",
+        ),
+        (
+            Plan("commands", U, columns=("r", "feedback", "speed_true")),
+            r"115200 baud .* leave out feedback, speed_true",
+        ),
+        (Plan("commands", U, batch=1), r"in batches of 1, got more"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_before_anything_moves(device, drive, plan, message):
+    with pytest.raises(SettingError, match=message):
+        drive.stream(plan, Kept())
+    assert not starts(device)
+    assert not stops(device)
+
+
+def test_a_mode_that_the_device_does_not_offer(tmp_path):
+    with (
+        ScriptedDevice(tmp_path, capabilities=1) as device,
+        connect(device.url) as drive,
+        pytest.raises(SettingError, match="mode 'direct', 'script' does not"),
+    ):
+        drive.stream(Plan("direct", U), Kept())
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"mode": "dance", "values": U},
+        {"mode": "commands", "values": []},
+        {"mode": "commands", "values": [1.0, math.nan]},
+        {"mode": "controller", "values": U},
+        {"mode": "commands", "values": U, "controller": Controller(Gains.standard(1.0, 0.1))},
+    ],
+)
+def test_what_is_no_plan(given):
+    with pytest.raises(SettingError, match="expected"):
+        Plan(**given)
+
+
+def test_a_tripped_device_is_not_cleared_by_itself(device, drive):
+    device.do(lambda: device.trip(2, 4100.0))
+    while drive.status().state != "tripped":
+        pass
+    with pytest.raises(LinkError, match=r"it has tripped: speed; find out why"):
+        drive.stream(Plan("commands", U), Kept())
+    assert not starts(device)
+    drive.clear()
+    assert drive.status().state == "idle"
+
+
+# --- what goes wrong ----------------------------------------------------------------------------
+
+
+def every(n: int, change: Callable[[bytes], list[bytes]]) -> Callable[[int, bytes], list[bytes]]:
+    """Every n-th frame of samples as `change` has it."""
+    count = 0
+
+    def mangle(kind: int, wire: bytes) -> list[bytes]:
+        nonlocal count
+        count += kind == 0xC0
+        return change(wire) if kind == 0xC0 and count % n == 0 else [wire]
+
+    return mangle
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda wire: [],
+        lambda wire: [wire[:9] + bytes([wire[9] ^ 4]) + wire[10:]],
+        lambda wire: [wire[:-7]],
+    ],
+    ids=["lost", "damaged", "torn"],
+)
+def test_each_gap_is_listed(device, drive, change):
+    device.mangle = every(7, change)
+    sink = Kept()
+    outcome = drive.stream(Plan("commands", U), sink)
+    missing = np.setdiff1d(np.arange(len(U)), sink.indexes())
+    listed = np.concatenate([first + np.arange(n) for first, n in outcome.gaps])
+    assert len(missing)
+    np.testing.assert_array_equal(missing, listed)
+    assert outcome.taken == len(U)
+    assert outcome.received == len(sink.indexes())
+    assert not outcome.is_complete
+    assert [(k, d["count"]) for kind, k, d in sink.events if kind == "gap"] == list(outcome.gaps)
+    np.testing.assert_allclose(sink.column("u"), U[sink.indexes()], atol=0.0005 + 1e-9)
+
+
+def test_what_is_lost_at_the_end_is_a_gap_too(device, drive):
+    device.mangle = lambda kind, wire: [] if kind in (0xC0, 0xC1) else [wire]
+    outcome = drive.stream(Plan("commands", U[:100]), Kept())
+    assert outcome.gaps == ((0, 100),)
+    assert outcome.reason == "finished"
+
+
+def test_repeated_frames_are_used_once(device, drive):
+    device.mangle = lambda kind, wire: [wire, wire]
+    sink = Kept()
+    outcome = drive.stream(Plan("commands", U), sink)
+    assert outcome.is_complete
+    np.testing.assert_array_equal(sink.indexes(), np.arange(len(U)))
+    assert outcome.counters["repeated"] > 0
+    assert {kind for kind, _, _ in outcome.anomalies} == {"repeated"}
+
+
+def test_a_trip_is_an_outcome(device, drive):
+    def trip(first: int) -> None:
+        if first >= 100:
+            device.do(lambda: device.state == script.RUNNING and device.trip(3, 123.0))
+
+    sink = Kept(trip)
+    outcome = drive.stream(Plan("commands", U), sink)
+    assert (outcome.state, outcome.reason) == ("tripped", "acceleration")
+    assert outcome.received == outcome.taken < len(U)
+    (event,) = [e for e in sink.events if e[0] == "tripped"]
+    assert event[1] == outcome.taken
+    assert event[2]["value"] == 123.0
+
+
+def test_a_reset_ends_the_run_with_what_has_come(device, drive):
+    sink = Kept(once(lambda: device.do(device.reset)))
+    with pytest.raises(LinkError, match=r"it has been reset; .*set the limits"):
+        drive.stream(Plan("commands", U), sink)
+    assert drive.outcome is not None
+    assert drive.outcome.reason == "failed"
+    assert drive.outcome.received == len(sink.indexes()) >= 100
+    assert sink.kinds[-1] == "reset"
+    with pytest.raises(LinkError, match="connect again"):
+        drive.status()
+
+
+def test_a_dead_device_is_given_up_with_a_clear_error(device, drive, monkeypatch):
+    monkeypatch.setattr("sewfast.link.connection.PATIENCE", 0.1)
+
+    def die(first: int) -> None:
+        device.intercept = lambda frame: True
+        device.mangle = lambda kind, wire: []
+
+    with pytest.raises(LinkError, match=r"an answer to STATUS, none came within 0\.1 s"):
+        drive.stream(Plan("commands", U), sink := Kept(die))
+    assert drive.outcome is not None
+    assert drive.outcome.state == "unknown"
+    assert sink.kinds[-1] == "stop_unconfirmed"
+    device.intercept = lambda frame: False
+    device.mangle = lambda kind, wire: [wire]
+
+
+# --- stopping -----------------------------------------------------------------------------------
+
+
+def test_an_error_of_the_sink_stops_the_motor_first(device, drive):
+    def full(first: int) -> None:
+        if first >= 50:
+            raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        drive.stream(Plan("commands", U), sink := Kept(full))
+    assert device.state == script.IDLE
+    assert len(stops(device)) == 1
+    outcome = drive.outcome
+    assert outcome is not None
+    assert outcome.reason == "failed"
+    assert outcome.taken is not None
+    assert outcome.taken < len(U)
+    listed = sum(count for _, count in outcome.gaps)
+    assert outcome.received + listed == outcome.taken
+    assert len(sink.indexes()) <= outcome.received
+
+
+@pytest.mark.parametrize("where", ["in a wait", "in the sink"])
+def test_ctrl_c_stops_the_motor_within_a_tenth_of_a_second(device, drive, where):
+    pressed: list[float] = []
+
+    def press() -> None:
+        pressed.append(time.monotonic())
+        os.kill(os.getpid(), signal.SIGINT)
+
+    sink = Kept(once(press) if where == "in the sink" else lambda first: None)
+    timer = threading.Timer(0.15, press)
+    if where == "in a wait":
+        timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        drive.stream(Plan("commands", np.tile(U, 5)), sink)
+    timer.cancel()
+    assert stops(device)[0] - pressed[0] < 0.1
+    assert device.state == script.IDLE
+    outcome = drive.outcome
+    assert outcome is not None
+    assert outcome.reason == "interrupted"
+    assert outcome.received + sum(n for _, n in outcome.gaps) == outcome.taken
+    assert sink.kinds[-1] == "stopped"
+
+
+def test_cancelling_stops_the_motor_and_is_no_error(device, drive):
+    cancel = threading.Event()
+    sink = Kept(lambda first: cancel.set() if first >= 100 else None)
+    outcome = drive.stream(Plan("commands", U), sink, cancel=cancel)
+    assert outcome.reason == "cancelled"
+    assert outcome.is_complete
+    assert outcome.taken is not None
+    assert 100 < outcome.taken < len(U)
+    np.testing.assert_array_equal(sink.indexes(), np.arange(outcome.taken))
+    assert len(stops(device)) == 1
+
+
+def test_a_lost_stop_is_repeated(device, drive):
+    swallowed = iter([True, True])
+    device.intercept = lambda frame: frame[0] == script.STOP and next(swallowed, False)
+    cancel = threading.Event()
+    sink = Kept(lambda first: cancel.set())
+    assert drive.stream(Plan("commands", U), sink, cancel=cancel).reason == "cancelled"
+    assert len(stops(device)) == 3
+    assert device.state == script.IDLE
+
+
+def test_leaving_the_block_stops_the_motor(device):
+    with connect(device.url, watchdog=5.0) as drive:
+        drive.set_limits(volt=5.0)
+        drive.arm()
+        assert drive.status().state == "armed"
+    assert device.state == script.IDLE
+
+
+# --- a port that comes and goes -----------------------------------------------------------------
+
+
+def replug(device: ScriptedDevice, away: float) -> None:
+    """Pull the cable now and plug it in again after a while; the device goes on meanwhile."""
+    device.wire.unplug()
+    if away < 10.0:
+        threading.Timer(away, lambda: device.do(device.wire.plug)).start()
+
+
+@pytest.mark.parametrize("kind", ["pty", "tcp"])
+def test_a_run_goes_on_after_the_port_was_away(tmp_path, kind):
+    with (
+        ScriptedDevice(tmp_path, kind) as device,
+        connect(device.url, watchdog=2.0) as drive,
+    ):
+        drive.set_limits(volt=10.0)
+        sink = Kept(once(lambda: device.do(lambda: replug(device, 0.15))))
+        outcome = drive.stream(Plan("commands", np.tile(U, 2)), sink)
+    assert outcome.reason == "finished"
+    assert outcome.taken == 800
+    assert outcome.received == len(sink.indexes())
+    assert outcome.received + sum(n for _, n in outcome.gaps) == 800
+    assert [k for k in sink.kinds if k in ("port_lost", "resumed")] == ["port_lost", "resumed"]
+
+
+def test_a_run_that_tripped_meanwhile_says_so(device):
+    with connect(device.url, watchdog=0.05) as drive:
+        drive.set_limits(volt=10.0)
+        sink = Kept(once(lambda: device.do(lambda: replug(device, 0.3))))
+        with pytest.raises(LinkError, match=r"it had tripped: watchdog|device had tripped: watch"):
+            drive.stream(Plan("commands", np.tile(U, 2)), sink)
+        assert drive.outcome is not None
+        assert drive.outcome.state == "tripped"
+        assert drive.outcome.taken is not None
+        assert drive.outcome.taken < 800
+
+
+def test_a_device_that_was_reset_meanwhile_says_so(device):
+    def lose() -> None:
+        replug(device, 0.1)
+        device.reset()
+
+    with connect(device.url, watchdog=2.0) as drive:
+        drive.set_limits(volt=10.0)
+        sink = Kept(once(lambda: device.do(lose)))
+        with pytest.raises(LinkError, match=r"came back, but the device has been reset"):
+            drive.stream(Plan("commands", U), sink)
+
+
+def test_a_port_that_stays_away(device):
+    sink = Kept(once(lambda: device.do(lambda: replug(device, math.inf))))
+    drive = connect(device.url, watchdog=2.0, resume=0.2)
+    drive.set_limits(volt=10.0)
+    with pytest.raises(LinkError, match=r"vanished .*did not come back within 0\.2 s"):
+        drive.stream(Plan("commands", U), sink)
+    drive.close()
+    assert sink.kinds[-1] == "stop_unconfirmed"
+    assert Path(device.url).exists() is False
