@@ -1,6 +1,7 @@
 """Types of the compiled module. Arrays are C-contiguous float64; inputs are ``(N, n_inputs)``, time first."""
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal, TypeAlias, final
 
 import numpy as np
@@ -347,3 +348,27 @@ def host_loop(
     start, round_trip, stopped, taken and device_late (None where the device did not say), counters, sequences, memory
     (None: not asked for; empty: locked; else the refusal). Ctrl-C is an outcome, not an exception.
     """
+
+# --- device.rs --------------------------------------------------------------------------------------------
+
+@final
+class DeviceServer:
+    """The virtual device on a thread of its own; `sewfast.link.VirtualDevice` checks the arguments."""
+
+    def __new__(
+        cls, machine: Machine, *, name: str, pty: bool, link: Path | None, address: str, fast: bool,
+        baud: int | None, faults: str, seed: int, once: bool, duration: float | None, fault_log: Path | None,
+        trace: Path | None,
+    ) -> DeviceServer:
+        """Opens the port; raises LinkError where it cannot. ``link`` is of a pty, ``address`` of TCP."""
+    @property
+    def port(self) -> str: ...
+    def wait(self, timeout: float) -> bool:
+        """Whether serving has ended, after at most ``timeout`` seconds."""
+    def stop(self) -> None: ...
+    def cause(self, fault: str, seconds: float | None = None) -> None: ...
+    def faults(self) -> dict[str, dict[str, int]]:
+        """By ``to_host`` and ``to_device``, then by kind."""
+    def statistics(self) -> dict[str, int]: ...
+    def trace(self) -> list[dict[str, Any]]: ...
+    def problem(self) -> str | None: ...

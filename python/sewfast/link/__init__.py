@@ -4,6 +4,7 @@ from .clock import ClockBounds
 from .drive import Drive, connect
 from .plan import Layout, Outcome, Plan, Sink
 from .ports import Port, PortInfo, list_ports, open_port
+from .virtual import VirtualDevice
 from .wire import Channel, Event, Identity, Limits, Status
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "PortInfo",
     "Sink",
     "Status",
+    "VirtualDevice",
     "connect",
     "list_ports",
     "open_port",

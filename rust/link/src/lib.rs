@@ -5,6 +5,7 @@ pub mod host_loop;
 pub mod receiver;
 pub mod samples;
 pub mod sequence;
+pub mod server;
 
 pub use anomalies::{Anomaly, Counters, Kind};
 pub use receiver::Receiver;

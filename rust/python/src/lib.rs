@@ -2,6 +2,7 @@
 
 mod arrays;
 mod control;
+mod device;
 mod host_loop;
 mod link;
 mod machine;
@@ -21,5 +22,6 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     host_loop::register(module)?;
     models::register(module)?;
     control::register(module)?;
-    link::register(module)
+    link::register(module)?;
+    device::register(module)
 }

@@ -1,0 +1,233 @@
+"""`VirtualDevice`: the virtual sewing machine behind a port, as a context manager."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import weakref
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, TypeAlias
+
+from .._core import DeviceServer
+from ..errors import SettingError
+from ..machine import VirtualMachine
+
+__all__ = ["VirtualDevice"]
+
+Faults: TypeAlias = "str | Mapping[str, float | tuple[float, float]]"
+
+_LARGEST_SEED = 2**64 - 1
+_BAUD = (300, 100_000_000)
+
+
+class VirtualDevice:
+    """The virtual sewing machine served on a port, with the state machine of a real device.
+
+    It is there from the construction to `stop`, the end of the `with`, or the end of the interpreter; a thread
+    without the interpreter serves it.
+
+    Parameters
+    ----------
+    machine
+        ``virtual`` or ``virtual:SEED``.
+    fast
+        Time advances only by the host's credit while a session is open, as fast as the port carries.
+    faults
+        What goes wrong: ``"drop=.001,flip=1e-4,stall=1e-4:0.2"``, or a mapping from kind to rate or to (rate,
+        seconds). Kinds are drop, flip, duplicate, reorder, delay, stall, reset, unplug; rates are per frame.
+    seed
+        Seed of the faults.
+    baud
+        Bits a second that the port carries each way; None is no limit.
+    endpoint
+        ``"pty"`` or ``"tcp"``; None takes a pty where the system has them.
+    link
+        Symbolic link to the pty; None makes one in a temporary folder. It stays the name when the port was unplugged.
+    address
+        HOST:PORT to listen on; port 0 takes a free one.
+    once
+        End when the first host has gone.
+    duration
+        End after so many seconds.
+    fault_log, trace
+        Files that get a line of JSON for each fault, and for each change of the output and of who is there.
+
+    Raises
+    ------
+    SettingError
+        For a setting that cannot be used.
+    LinkError
+        Where the port or a file cannot be had.
+    """
+
+    def __init__(
+        self,
+        machine: str = "virtual",
+        *,
+        fast: bool = False,
+        faults: Faults = "",
+        seed: int = 0,
+        baud: int | None = None,
+        endpoint: Literal["pty", "tcp"] | None = None,
+        link: str | os.PathLike[str] | None = None,
+        address: str = "127.0.0.1:0",
+        once: bool = False,
+        duration: float | None = None,
+        fault_log: str | os.PathLike[str] | None = None,
+        trace: str | os.PathLike[str] | None = None,
+    ) -> None:
+        plant = VirtualMachine.from_name(machine)
+        pty = _checked_endpoint(endpoint, link) == "pty"
+        _check_range("seed", seed, 0, _LARGEST_SEED)
+        if baud is not None:
+            _check_range("baud", baud, *_BAUD)
+        if duration is not None and not 0.0 < duration < 1e9:
+            raise SettingError(f"expected a duration above 0 s, got {duration!r}")
+        folder = tempfile.mkdtemp(prefix="sewfast-") if pty and link is None else None
+        try:
+            self._server = DeviceServer(
+                plant.core,
+                name=plant.name,
+                pty=pty,
+                link=Path(folder, "port") if folder is not None else _path(link),
+                address=address,
+                fast=fast,
+                baud=baud,
+                faults=_faults_text(faults),
+                seed=seed,
+                once=once,
+                duration=duration,
+                fault_log=_path(fault_log),
+                trace=_path(trace),
+            )
+        except BaseException:
+            _end(None, folder)
+            raise
+        self._end = weakref.finalize(self, _end, self._server, folder)
+
+    @property
+    def port(self) -> str:
+        """What a host opens: a path, or ``socket://HOST:PORT``."""
+        return self._server.port
+
+    @property
+    def running(self) -> bool:
+        """Whether it is being served."""
+        return not self._server.wait(0.0)
+
+    def wait(self, timeout: float) -> bool:
+        """Wait for the end of serving, at most for `timeout` seconds; whether it has come."""
+        return self._server.wait(timeout)
+
+    def stop(self) -> None:
+        """End serving and remove the port; a second time does nothing.
+
+        Raises
+        ------
+        LinkError
+            Where serving had died.
+        """
+        self._end()
+
+    def cause(self, fault: str, seconds: float | None = None) -> None:
+        """Cause a fault: stall, reset and unplug within 20 ms, others with the next frame from the device.
+
+        Parameters
+        ----------
+        fault
+            Its kind.
+        seconds
+            How long a stall lasts or the port is gone; None as long as by default.
+
+        Raises
+        ------
+        SettingError
+            For an unknown kind or an unusable time.
+        """
+        if seconds is not None and not 0.0 < seconds <= 60.0:
+            raise SettingError(f"expected a time above 0 and at most 60 s, got {seconds!r}")
+        self._server.cause(fault, seconds)
+
+    @property
+    def faults(self) -> dict[str, int]:
+        """Faults so far by kind, both ways together."""
+        to_host, to_device = self._server.faults().values()
+        return {kind: count + to_device[kind] for kind, count in to_host.items()}
+
+    @property
+    def statistics(self) -> dict[str, int]:
+        """How serving went so far.
+
+        Counts of ``samples``, of samples ``late`` by a period or more, how late the latest was [us], how often the clock was
+        ``set_back`` because catching up was hopeless, bytes to the host, hosts ``refused`` because one was there.
+        """
+        return self._server.statistics()
+
+    @property
+    def problem(self) -> str | None:
+        """Why a log file ended early, where one did."""
+        return self._server.problem()
+
+    def trace(self) -> list[dict[str, Any]]:
+        """The server's account of the output, oldest first.
+
+        Each entry has ``event`` (on, off, connected, gone, stalled, unplugged, plugged, reset), ``device_us``, ``seconds``
+        (since the server began), ``state``, and of the last intact heartbeat before it ``heartbeat_us``,
+        ``heartbeat_seconds`` and ``watchdog_us``, None where none had come since the boot.
+        """
+        return self._server.trace()
+
+    def __enter__(self) -> VirtualDevice:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    def __repr__(self) -> str:
+        return f"<VirtualDevice on {self.port}>"
+
+
+def _end(server: DeviceServer | None, folder: str | None) -> None:
+    try:
+        if server is not None:
+            server.stop()
+    finally:
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _path(path: str | os.PathLike[str] | None) -> Path | None:
+    return None if path is None else Path(path)
+
+
+def _checked_endpoint(endpoint: str | None, link: object) -> str:
+    endpoint = endpoint or ("pty" if os.name == "posix" else "tcp")
+    if endpoint not in ("pty", "tcp"):
+        raise SettingError(f"expected 'pty' or 'tcp' as endpoint, got {endpoint!r}")
+    if link is not None and endpoint != "pty":
+        raise SettingError(f"expected a link only to a pty, got {link!r} with endpoint 'tcp'")
+    return endpoint
+
+
+def _check_range(name: str, value: int, low: int, high: int) -> None:
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    if not whole or not low <= value <= high:
+        raise SettingError(f"expected a whole number from {low} to {high} as {name}, got {value!r}")
+
+
+def _faults_text(faults: Faults) -> str:
+    if isinstance(faults, str):
+        return faults
+    items = []
+    for kind, value in faults.items():
+        rate, *seconds = value if isinstance(value, tuple) else (value,)
+        items.append(f"{kind}={rate!r}" + "".join(f":{s!r}" for s in seconds))
+    return ",".join(items)

@@ -1,0 +1,350 @@
+//! One direction of the link between device and port: frame by frame, with faults and at the rate of a serial line.
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+use super::bucket::Bucket;
+use super::faults::{Fate, Fault, Faults, Injector};
+use super::log::FaultLog;
+
+/// What is longer without a zero is no frame and passes as it is.
+const LONGEST: usize = 512;
+
+/// How long a frame waits for the one that is to overtake it.
+const PATIENCE: Duration = Duration::from_millis(20);
+
+/// The way of a line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Direction {
+    /// From the device.
+    ToHost,
+    /// From the host.
+    ToDevice,
+}
+
+impl Direction {
+    /// Its name in the log.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::ToHost => "to_host",
+            Self::ToDevice => "to_device",
+        }
+    }
+}
+
+/// A frame that is not due yet.
+#[derive(Debug)]
+struct Packet {
+    due: Instant,
+    bytes: Vec<u8>,
+}
+
+/// Bytes under way in one direction.
+#[derive(Debug)]
+pub struct Line {
+    direction: Direction,
+    injector: Injector,
+    delay: Duration,
+    /// Faults to come, whatever the injector says.
+    forced: VecDeque<Fault>,
+    /// A frame whose zero has not come yet.
+    partial: Vec<u8>,
+    /// A frame that the next one overtakes.
+    overtaken: Option<Packet>,
+    late: VecDeque<Packet>,
+    ready: VecDeque<u8>,
+    /// The frame before lost its closing zero: the next one is damaged with it.
+    joined: bool,
+    bucket: Option<Bucket>,
+}
+
+impl Line {
+    /// An empty line; `baud` paces it.
+    pub fn new(
+        direction: Direction,
+        faults: Faults,
+        seed: u64,
+        baud: Option<u32>,
+        now: Instant,
+    ) -> Self {
+        Self {
+            direction,
+            injector: Injector::new(faults, seed, direction as u64),
+            delay: faults.duration(Fault::Delay),
+            forced: VecDeque::new(),
+            partial: Vec::with_capacity(LONGEST),
+            overtaken: None,
+            late: VecDeque::new(),
+            ready: VecDeque::new(),
+            joined: false,
+            bucket: baud.map(|baud| Bucket::new(baud, now)),
+        }
+    }
+
+    /// Does `fault` to the next frame.
+    pub fn force(&mut self, fault: Fault) {
+        self.forced.push_back(fault);
+    }
+
+    /// Takes bytes in; what they do to link and device goes to `events`.
+    pub fn push(
+        &mut self,
+        mut bytes: &[u8],
+        now: Instant,
+        log: &mut FaultLog,
+        events: &mut Vec<Fault>,
+    ) {
+        while let Some(at) = bytes.iter().position(|&byte| byte == 0) {
+            let (frame, rest) = bytes.split_at(at + 1);
+            self.partial.extend_from_slice(frame);
+            self.frame(now, log, events);
+            bytes = rest;
+        }
+        self.partial.extend_from_slice(bytes);
+        if self.partial.len() > LONGEST {
+            self.frame(now, log, events);
+        }
+    }
+
+    /// Sends the frame in `partial` on its way.
+    fn frame(&mut self, now: Instant, log: &mut FaultLog, events: &mut Vec<Fault>) {
+        let bytes = std::mem::take(&mut self.partial);
+        // a lone zero brings the other side into step; it is no frame
+        if bytes.len() > 1 {
+            let fate = self.fate();
+            for event in fate.events.into_iter().flatten() {
+                log.record(event, self.direction, &bytes);
+                events.push(event);
+            }
+            self.befall(&bytes, fate, now, log);
+        } else {
+            self.emit(&bytes, now, log);
+        }
+        self.partial = bytes;
+        self.partial.clear();
+    }
+
+    fn fate(&mut self) -> Fate {
+        let fate = self.injector.next();
+        let frame = self.forced.pop_front().or(fate.frame);
+        Fate { frame, ..fate }
+    }
+
+    fn befall(&mut self, bytes: &[u8], fate: Fate, now: Instant, log: &mut FaultLog) {
+        if let Some(fault) = fate.frame {
+            log.record(fault, self.direction, bytes);
+        }
+        let mut copies = 1;
+        match fate.frame {
+            Some(Fault::Drop) => return,
+            Some(Fault::Flip) => {
+                let mut damaged = bytes.to_vec();
+                let bit = (fate.chance % (8 * bytes.len() as u64)) as usize;
+                damaged[bit / 8] ^= 1 << (bit % 8);
+                return self.pass(&damaged, now, log);
+            }
+            Some(Fault::Reorder) if self.overtaken.is_none() => {
+                let (due, bytes) = (now + PATIENCE, bytes.to_vec());
+                self.overtaken = Some(Packet { due, bytes });
+                return;
+            }
+            Some(Fault::Duplicate) => copies = 2,
+            Some(Fault::Delay) => self.late.push_back(Packet {
+                due: now + self.delay,
+                bytes: Vec::new(),
+            }),
+            _ => {}
+        }
+        (0..copies).for_each(|_| self.emit(bytes, now, log));
+        self.overtake(now, log);
+    }
+
+    /// Sends a frame, and the one that it overtakes behind it.
+    fn pass(&mut self, bytes: &[u8], now: Instant, log: &mut FaultLog) {
+        self.emit(bytes, now, log);
+        self.overtake(now, log);
+    }
+
+    fn overtake(&mut self, now: Instant, log: &mut FaultLog) {
+        if let Some(packet) = self.overtaken.take() {
+            self.emit(&packet.bytes, now, log);
+        }
+    }
+
+    fn emit(&mut self, bytes: &[u8], now: Instant, log: &mut FaultLog) {
+        if self.joined && bytes.len() > 1 {
+            log.record(Fault::Flip, self.direction, bytes);
+        }
+        self.joined = bytes.last().is_some_and(|&byte| byte != 0);
+        match self.late.back() {
+            None => self.ready.extend(bytes),
+            Some(last) => self.late.push_back(Packet {
+                due: last.due.max(now),
+                bytes: bytes.to_vec(),
+            }),
+        }
+    }
+
+    /// Lets pass what is due.
+    pub fn settle(&mut self, now: Instant, log: &mut FaultLog) {
+        if self.overtaken.as_ref().is_some_and(|held| held.due <= now) {
+            self.overtake(now, log);
+        }
+        while self.late.front().is_some_and(|packet| packet.due <= now) {
+            let packet = self.late.pop_front();
+            self.ready.extend(packet.into_iter().flat_map(|p| p.bytes));
+        }
+    }
+
+    /// How many bytes lie in it, whole frames and parts.
+    pub fn backlog(&self) -> usize {
+        let late: usize = self.late.iter().map(|packet| packet.bytes.len()).sum();
+        self.ready.len() + self.partial.len() + late
+    }
+
+    /// How many bytes may pass now at the line's rate.
+    pub fn allowance(&mut self, now: Instant) -> usize {
+        let bucket = self.bucket.as_mut();
+        bucket.map_or(usize::MAX, |bucket| bucket.allowance(now))
+    }
+
+    /// So many bytes have passed at the line's rate.
+    pub fn spend(&mut self, bytes: usize) {
+        if let Some(bucket) = &mut self.bucket {
+            bucket.spend(bytes);
+        }
+    }
+
+    /// What has arrived at the far end, in one piece.
+    pub fn arrived(&mut self) -> &[u8] {
+        self.ready.make_contiguous()
+    }
+
+    /// Removes the first `bytes` of what has arrived.
+    pub fn consume(&mut self, bytes: usize) {
+        self.ready.drain(..bytes);
+    }
+
+    /// Whether anything has arrived.
+    pub fn has_arrived(&self) -> bool {
+        !self.ready.is_empty()
+    }
+
+    /// When to look again although nothing comes in: something is due, or the rate lets more pass.
+    pub fn wakes_in(&self, now: Instant, paced: bool) -> Option<Duration> {
+        let late = self.late.front().map(|packet| packet.due);
+        let held = self.overtaken.as_ref().map(|packet| packet.due);
+        let due = late.into_iter().chain(held).min();
+        let due = due.map(|due| due.saturating_duration_since(now));
+        let refill = self.bucket.as_ref().filter(|_| paced);
+        due.into_iter().chain(refill.map(Bucket::refilled_in)).min()
+    }
+
+    /// Loses what is under way: the cable is out.
+    pub fn clear(&mut self) {
+        self.partial.clear();
+        self.overtaken = None;
+        self.late.clear();
+        self.ready.clear();
+        self.joined = false;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sewfast_control::link::{Header, MAX_WIRE, encode};
+
+    fn frame(sequence: u32) -> Vec<u8> {
+        let header = Header {
+            kind: 0xC0,
+            tag: 1,
+            sequence,
+            time: 1000,
+        };
+        let mut wire = [0; MAX_WIRE];
+        let length = encode(&header, b"body", &mut wire).unwrap();
+        wire[..length].to_vec()
+    }
+
+    fn line(faults: &str) -> Line {
+        let faults = Faults::parse(faults).unwrap();
+        Line::new(Direction::ToHost, faults, 1, None, Instant::now())
+    }
+
+    fn push(line: &mut Line, sequence: u32, now: Instant, log: &mut FaultLog) {
+        line.push(&frame(sequence), now, log, &mut Vec::new());
+    }
+
+    /// Sends frames 0, 1, 2 with a fault in the second and lets `wait` pass.
+    fn sent(fault: Fault, wait: Duration) -> (Vec<u8>, FaultLog) {
+        let (mut line, mut log, now) = (line(""), FaultLog::default(), Instant::now());
+        push(&mut line, 0, now, &mut log);
+        line.force(fault);
+        push(&mut line, 1, now, &mut log);
+        push(&mut line, 2, now, &mut log);
+        line.settle(now + wait, &mut log);
+        (line.arrived().to_vec(), log)
+    }
+
+    #[test]
+    fn passes_bytes_however_they_are_cut() {
+        let bytes: Vec<u8> = (0..50).flat_map(frame).collect();
+        for size in [1, 7, 64, 1000] {
+            let (mut line, mut log) = (line(""), FaultLog::default());
+            for piece in bytes.chunks(size) {
+                line.push(piece, Instant::now(), &mut log, &mut Vec::new());
+            }
+            assert_eq!(line.arrived(), bytes);
+        }
+    }
+
+    #[test]
+    fn does_to_a_frame_what_the_fault_says() {
+        let of = |sequences: &[u32]| sequences.iter().flat_map(|&k| frame(k)).collect::<Vec<_>>();
+        let now = |fault| sent(fault, Duration::ZERO);
+        assert_eq!(now(Fault::Drop).0, of(&[0, 2]));
+        assert_eq!(now(Fault::Duplicate).0, of(&[0, 1, 1, 2]));
+        assert_eq!(now(Fault::Reorder).0, of(&[0, 2, 1]));
+        assert_eq!(now(Fault::Delay).0, of(&[0]));
+        assert_eq!(sent(Fault::Delay, Duration::from_secs(1)).0, of(&[0, 1, 2]));
+        let (flipped, log) = now(Fault::Flip);
+        let wrong: u32 = flipped
+            .iter()
+            .zip(of(&[0, 1, 2]))
+            .map(|(a, b)| (a ^ b).count_ones())
+            .sum();
+        assert_eq!((wrong, log.count(Fault::Flip, Direction::ToHost)), (1, 1));
+    }
+
+    #[test]
+    fn lets_an_overtaken_frame_go_where_nothing_follows() {
+        let (mut line, mut log, now) = (line("reorder=1"), FaultLog::default(), Instant::now());
+        push(&mut line, 5, now, &mut log);
+        assert!(!line.has_arrived());
+        line.settle(now + PATIENCE, &mut log);
+        assert_eq!(line.arrived(), frame(5));
+    }
+
+    #[test]
+    fn names_both_frames_that_a_lost_zero_joins() {
+        let (mut line, mut log, now) = (line(""), FaultLog::default(), Instant::now());
+        let mut open = frame(1);
+        *open.last_mut().unwrap() = 4;
+        line.emit(&open, now, &mut log);
+        line.emit(&frame(2), now, &mut log);
+        line.emit(&frame(3), now, &mut log);
+        assert_eq!(log.count(Fault::Flip, Direction::ToHost), 1);
+    }
+
+    #[test]
+    fn keeps_what_is_no_frame_within_bounds() {
+        let (mut line, mut log) = (line("drop=.5"), FaultLog::default());
+        for _ in 0..1000 {
+            line.push(&[1; 100], Instant::now(), &mut log, &mut Vec::new());
+            let length = line.arrived().len();
+            line.consume(length);
+            assert!(line.backlog() <= LONGEST);
+        }
+    }
+}

@@ -1,0 +1,214 @@
+//! The virtual sewing machine behind a pty or TCP port, with the state machine of a real device.
+//!
+//! A [`Server`] owns a thread that serves the drive until it is stopped. Time is real, or advances by the host's credit; faults
+//! and the rate of a serial line lie between device and port.
+
+mod bucket;
+mod clock;
+mod faults;
+mod line;
+mod log;
+mod port;
+#[cfg(unix)]
+mod pty;
+mod rig;
+mod serving;
+mod shared;
+mod tcp;
+mod trace;
+
+use std::io;
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use sewfast_core::machine::Machine;
+
+pub use faults::{Fault, Faults, KINDS};
+pub use line::Direction;
+pub use log::Counts;
+pub use rig::{CAPACITY, PERIOD};
+pub use shared::Statistics;
+pub use trace::{Entry, Happening, Heartbeat};
+
+use log::FaultLog;
+use port::{Port, explained};
+use rig::Rig;
+use serving::Serving;
+use shared::{Order, Shared};
+use trace::Trace;
+
+/// Where the drive is served.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Endpoint {
+    /// A pseudo-terminal, with a symbolic link to it where one is named.
+    Pty(Option<PathBuf>),
+    /// A TCP port, as `127.0.0.1:0`.
+    Tcp(String),
+}
+
+/// What is served, where and how.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// The drive's machine.
+    pub machine: Machine,
+    /// The name that the device gives; beyond 24 bytes it is cut.
+    pub name: String,
+    /// The port.
+    pub endpoint: Endpoint,
+    /// Time advances by the host's credit.
+    pub fast: bool,
+    /// Bits a second in both directions; `None` as fast as the port is.
+    pub baud: Option<u32>,
+    /// What goes wrong.
+    pub faults: Faults,
+    /// The seed of the faults.
+    pub seed: u64,
+    /// Ends when the first host has gone.
+    pub once: bool,
+    /// Ends after this time.
+    pub duration: Option<Duration>,
+    /// A line of JSON for each fault.
+    pub fault_log: Option<PathBuf>,
+    /// A line of JSON for each change of the output and of who is there.
+    pub trace: Option<PathBuf>,
+}
+
+/// A drive that is being served.
+#[derive(Debug)]
+pub struct Server {
+    shared: Arc<Shared>,
+    thread: Mutex<Option<JoinHandle<()>>>,
+}
+
+impl Server {
+    /// Opens the port and serves the drive on a thread of its own.
+    ///
+    /// # Errors
+    /// Where the port, a file or the thread cannot be had.
+    pub fn start(settings: Settings) -> io::Result<Self> {
+        let began = Instant::now();
+        let port = opened(&settings.endpoint)?;
+        let named = |path: &Option<PathBuf>, e: io::Error| match path {
+            Some(path) => explained(&e, &path.display().to_string()),
+            None => e,
+        };
+        let log = FaultLog::new(settings.fault_log.as_deref())
+            .map_err(|e| named(&settings.fault_log, e))?;
+        let trace =
+            Trace::new(settings.trace.as_deref(), began).map_err(|e| named(&settings.trace, e))?;
+        let shared = Arc::new(Shared::default());
+        shared.renamed(port.name());
+        let served = Arc::clone(&shared);
+        let thread = thread::Builder::new().name("sewfast-device".into());
+        let machine = settings.machine.clone();
+        let rig = Rig::new(machine, kept(&settings.name), first_boot(), settings.fast);
+        let rig = rig.map_err(io::Error::other)?;
+        let thread = thread.spawn(move || {
+            let _end = End(&served);
+            Serving::new(&settings, &served, port, rig, log, trace).run();
+        })?;
+        Ok(Self {
+            shared,
+            thread: Mutex::new(Some(thread)),
+        })
+    }
+
+    /// What a host opens; a pseudo-terminal without a link has another name after it was unplugged.
+    pub fn port(&self) -> String {
+        self.shared.port()
+    }
+
+    /// Waits for the end of serving, at most for `timeout`; whether it has come.
+    pub fn wait(&self, timeout: Duration) -> bool {
+        self.shared.wait(timeout)
+    }
+
+    /// Causes a fault: stall, reset and unplug within 20 ms, the others with the next frame from the device.
+    pub fn cause(&self, fault: Fault, lasts: Option<Duration>) {
+        self.shared.order(Order::Fault(fault, lasts));
+    }
+
+    /// Faults so far, by [`Direction`] and [`Fault`].
+    pub fn faults(&self) -> Counts {
+        self.shared.faults()
+    }
+
+    /// How serving went so far.
+    pub fn statistics(&self) -> Statistics {
+        self.shared.statistics()
+    }
+
+    /// The account of the output so far.
+    pub fn trace(&self) -> Vec<Entry> {
+        self.shared.entries()
+    }
+
+    /// Why a log file ended early, where one did.
+    pub fn problem(&self) -> Option<String> {
+        self.shared.problem()
+    }
+
+    /// Ends serving and removes the port.
+    ///
+    /// # Errors
+    /// Where the serving thread had died.
+    pub fn stop(&self) -> io::Result<()> {
+        self.shared.stop.store(true, Ordering::Relaxed);
+        let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
+        match thread.take().map(JoinHandle::join) {
+            Some(Err(_)) => Err(io::Error::other(
+                "the thread of the virtual device has died",
+            )),
+            _ => Ok(()),
+        }
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = self.stop();
+    }
+}
+
+/// Says that serving has ended, in whatever way.
+struct End<'a>(&'a Shared);
+
+impl Drop for End<'_> {
+    fn drop(&mut self) {
+        self.0.ended();
+    }
+}
+
+fn opened(endpoint: &Endpoint) -> io::Result<Box<dyn Port>> {
+    match endpoint {
+        #[cfg(unix)]
+        Endpoint::Pty(link) => Ok(Box::new(pty::Pty::open(link.clone())?)),
+        #[cfg(not(unix))]
+        Endpoint::Pty(_) => Err(io::Error::new(
+            io::ErrorKind::Unsupported,
+            "this system has no pseudo-terminals; serve on TCP",
+        )),
+        Endpoint::Tcp(address) => Ok(Box::new(tcp::Tcp::listen(address)?)),
+    }
+}
+
+/// A device's name lives as long as the program, as it does in a firmware.
+fn kept(name: &str) -> &'static str {
+    let end = (0..=name.len().min(24))
+        .rev()
+        .find(|&end| name.is_char_boundary(end));
+    Box::leak(name[..end.unwrap_or(0)].into())
+}
+
+/// A boot id out of the time, whose low 16 bits are not 0, the tag of HELLO.
+fn first_boot() -> u32 {
+    let time = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .unwrap_or_default();
+    let mixed = (time.as_nanos() as u64 ^ u64::from(std::process::id()) << 32)
+        .wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    (mixed >> 32) as u32 | 1
+}

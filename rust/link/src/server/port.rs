@@ -1,0 +1,51 @@
+//! The place where a host connects: a pseudo-terminal or a TCP port.
+
+use std::fmt::Debug;
+use std::io;
+use std::time::Duration;
+
+/// What to wait for.
+#[derive(Clone, Copy, Debug)]
+pub struct Interest {
+    /// Bytes from the host can be taken.
+    pub read: bool,
+    /// Bytes for the host are there.
+    pub write: bool,
+}
+
+/// A port with at most one host; nothing in it blocks but [`Port::wait`].
+pub trait Port: Debug + Send {
+    /// What a host opens.
+    fn name(&self) -> String;
+
+    /// Looks who is there; true while a host is.
+    fn connected(&mut self) -> bool;
+
+    /// Bytes from the host; 0 where none are there. A host that has gone shows in [`Port::connected`] next.
+    fn read(&mut self, buffer: &mut [u8]) -> usize;
+
+    /// Bytes to the host; how many went.
+    fn write(&mut self, bytes: &[u8]) -> usize;
+
+    /// Sleeps until `interest` can be served, and at most for `timeout`.
+    fn wait(&mut self, interest: Interest, timeout: Duration);
+
+    /// Makes the port vanish.
+    fn unplug(&mut self);
+
+    /// Makes it come back.
+    ///
+    /// # Errors
+    /// Where the system does not give it.
+    fn plug(&mut self) -> io::Result<()>;
+
+    /// Hosts that were sent away because one was there.
+    fn refused(&self) -> u64 {
+        0
+    }
+}
+
+/// An error that says what was being done.
+pub fn explained(error: &io::Error, what: &str) -> io::Error {
+    io::Error::new(error.kind(), format!("{what}: {error}"))
+}

@@ -1,0 +1,185 @@
+//! The virtual drive: the computed sewing machine behind the state machine of a device.
+
+use sewfast_control::link::{
+    Channel, Device, Encoding, Identity, Limits, Measurement, Output, Source, State, capability,
+};
+use sewfast_core::machine::Machine;
+use sewfast_core::{Error, Result};
+
+/// Values that the profile's memory holds: 8 s of commands, so that longer signals must be fed while they run.
+pub const CAPACITY: usize = 8192;
+
+/// Control period [us], the sample time of the machine.
+pub const PERIOD: u32 = 1000;
+
+const CAPABILITIES: u32 = capability::PROFILE
+    | capability::PID
+    | capability::DRIVE
+    | capability::CURRENT
+    | capability::COMPUTED;
+
+const CHANNELS: [Channel; 6] = [
+    channel("counts", "1", Encoding::Counts, 1, Source::Counts),
+    channel("u", "V", Encoding::Steps, 1000, Source::Command),
+    channel("current", "A", Encoding::Steps, 1000, Source::Current),
+    channel("r", "RPM", Encoding::Float, 1, Source::Reference),
+    channel("feedback", "RPM", Encoding::Float, 1, Source::Feedback),
+    channel("speed_true", "RPM", Encoding::Float, 1, Source::Further(0)),
+];
+
+const fn channel(
+    name: &'static str,
+    unit: &'static str,
+    encoding: Encoding,
+    steps_per_unit: u32,
+    source: Source,
+) -> Channel {
+    Channel {
+        encoding,
+        steps_per_unit,
+        name,
+        unit,
+        source,
+    }
+}
+
+/// The machine, the device before it and the device's place in time.
+pub struct Rig {
+    device: Box<Device<CAPACITY>>,
+    machine: Machine,
+    /// What the counter showed at the machine's last return to its initial state.
+    counted: i64,
+    /// When the next sample is due [us].
+    next: u64,
+    output: Output,
+}
+
+impl Rig {
+    /// A drive that boots now; `credit` says whether the host may grant it time.
+    ///
+    /// # Errors
+    /// A setting error for a machine that a device cannot stand for.
+    pub fn new(machine: Machine, name: &'static str, boot_id: u32, credit: bool) -> Result<Self> {
+        let identity = Identity {
+            boot_id,
+            name,
+            firmware: env!("CARGO_PKG_VERSION"),
+            period: PERIOD,
+            counts_per_rev: machine.parameters().counts_per_rev as f32,
+            capabilities: CAPABILITIES | if credit { capability::CREDIT } else { 0 },
+            ceilings: Limits {
+                volt: machine.parameters().u_limit as f32,
+                speed: f32::INFINITY,
+                acceleration: f32::INFINITY,
+                current: f32::INFINITY,
+            },
+            channels: &CHANNELS,
+        };
+        Ok(Self {
+            device: Box::new(booted(identity)?),
+            machine,
+            counted: 0,
+            next: u64::from(PERIOD),
+            output: Output::SAFE,
+        })
+    }
+
+    /// Boots anew: another boot id, time and counter from 0, the motor without command and the machine as it stands.
+    pub fn reboot(&mut self) {
+        let boot_id = following(self.boot_id());
+        let identity = *self.device.identity();
+        if let Ok(device) = booted(Identity {
+            boot_id,
+            ..identity
+        }) {
+            *self.device = device;
+        }
+        self.counted = -(self.machine.counts() as i64);
+        self.next = u64::from(PERIOD);
+        self.output = Output::SAFE;
+    }
+
+    /// The boot id.
+    pub fn boot_id(&self) -> u32 {
+        self.device.identity().boot_id
+    }
+
+    /// When the next sample is due [us].
+    pub fn next(&self) -> u64 {
+        self.next
+    }
+
+    /// The state.
+    pub fn state(&self) -> State {
+        self.device.state()
+    }
+
+    /// How far the host lets time advance; `None` where no session is open.
+    pub fn credit(&self) -> Option<u64> {
+        self.device.credit()
+    }
+
+    /// What the device's output was last.
+    pub fn output(&self) -> Output {
+        self.output
+    }
+
+    /// Takes the sample that is due and lets the machine go on for a period.
+    pub fn sample(&mut self) {
+        let speed = self.machine.speed_rpm() as f32;
+        let measured = Measurement {
+            counts: self.counts() as i32,
+            current: self.machine.current() as f32,
+            further: &[speed],
+        };
+        self.output = self.device.sample(self.next, &measured);
+        let u = if self.output.enabled {
+            self.output.u
+        } else {
+            0.0
+        };
+        self.machine.advance(f64::from(u));
+        self.next += u64::from(PERIOD);
+    }
+
+    fn counts(&self) -> i64 {
+        self.counted + self.machine.counts() as i64
+    }
+
+    /// Gives the device one frame, or a part of one, that has come.
+    pub fn receive(&mut self, now: u64, frame: &[u8]) {
+        let armed = self.device.armed_count();
+        self.device.receive(now, frame);
+        if self.device.armed_count() != armed {
+            // the counter goes on, so that the device sees no motion where there was none
+            self.counted = self.counts();
+            self.machine.reset();
+        }
+        self.output = self.device.poll(now);
+    }
+
+    /// The host has gone.
+    pub fn disconnect(&mut self) {
+        self.device.disconnect();
+    }
+
+    /// Moves bytes for the host into `buffer`; how many.
+    pub fn transmit(&mut self, buffer: &mut [u8]) -> usize {
+        self.device.transmit(buffer)
+    }
+}
+
+fn booted(identity: Identity) -> Result<Device<CAPACITY>> {
+    let device = Device::new(identity);
+    device.map_err(|refused| Error::setting(refused.to_string()))
+}
+
+/// The next boot id whose low 16 bits are neither those of this one nor 0, the tag of HELLO.
+fn following(boot_id: u32) -> u32 {
+    let next = boot_id.wrapping_add(1);
+    if next as u16 == 0 {
+        next.wrapping_add(1)
+    } else {
+        next
+    }
+}

@@ -1,0 +1,370 @@
+//! The loop between port and drive: read, advance, write, wait.
+
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use super::Settings;
+use super::clock::Clock;
+use super::faults::{Fault, Faults};
+use super::line::{Direction, Line};
+use super::log::FaultLog;
+use super::port::{Interest, Port};
+use super::rig::{PERIOD, Rig};
+use super::shared::{Order, Shared, Statistics};
+use super::trace::{Happening, Trace};
+
+/// How long a stop request may go unheard.
+const ATTENTION: Duration = Duration::from_millis(20);
+
+/// Samples on credit between two looks at the port.
+const BATCH: usize = 512;
+
+/// Behind by more than this the clock gives up catching up and is set back [us].
+const HOPELESS: u64 = 1_000_000;
+
+/// Bytes for the host that wait outside the device: a serial port's own memory is small, so that the device's memory is
+/// what overflows. On credit time waits instead.
+const WAITING_PACED: usize = 256;
+const WAITING: usize = 4096;
+const WAITING_ON_CREDIT: usize = 16_384;
+
+/// A served drive: everything that the loop owns.
+pub struct Serving<'a> {
+    shared: &'a Shared,
+    port: Box<dyn Port>,
+    rig: Rig,
+    clock: Clock,
+    inbound: Line,
+    outbound: Line,
+    log: FaultLog,
+    trace: Trace,
+    faults: Faults,
+    events: Vec<Fault>,
+    fast: bool,
+    once: bool,
+    /// When serving ends at the latest.
+    ends: Option<Instant>,
+    room: usize,
+    connected: bool,
+    met: bool,
+    stalled: Option<Instant>,
+    unplugged: Option<Instant>,
+    statistics: Statistics,
+}
+
+impl<'a> Serving<'a> {
+    /// A drive that boots now behind `port`.
+    pub fn new(
+        settings: &Settings,
+        shared: &'a Shared,
+        port: Box<dyn Port>,
+        rig: Rig,
+        log: FaultLog,
+        trace: Trace,
+    ) -> Self {
+        let now = Instant::now();
+        let line = |direction| {
+            Line::new(
+                direction,
+                settings.faults,
+                settings.seed,
+                settings.baud,
+                now,
+            )
+        };
+        Self {
+            shared,
+            port,
+            rig,
+            clock: Clock::new(now),
+            inbound: line(Direction::ToDevice),
+            outbound: line(Direction::ToHost),
+            log,
+            trace,
+            faults: settings.faults,
+            events: Vec::new(),
+            fast: settings.fast,
+            once: settings.once,
+            ends: settings.duration.map(|duration| now + duration),
+            room: match (settings.fast, settings.baud) {
+                (true, _) => WAITING_ON_CREDIT,
+                (false, Some(_)) => WAITING_PACED,
+                (false, None) => WAITING,
+            },
+            connected: false,
+            met: false,
+            stalled: None,
+            unplugged: None,
+            statistics: Statistics::default(),
+        }
+    }
+
+    /// Serves until asked to stop.
+    pub fn run(mut self) {
+        while !self.finished() {
+            self.orders();
+            self.restore();
+            self.presence();
+            self.receive();
+            self.advance();
+            self.transmit();
+            self.happen();
+            self.report();
+            self.wait();
+        }
+        self.report();
+    }
+
+    fn finished(&self) -> bool {
+        let left = self.once && self.met && !self.connected && self.unplugged.is_none();
+        self.shared.stop.load(Ordering::Relaxed)
+            || self.ends.is_some_and(|ends| Instant::now() >= ends)
+            // the watchdog is given the time to end what was left running
+            || left && !self.rig.output().enabled
+    }
+
+    /// Does what the owner of the server has asked for.
+    fn orders(&mut self) {
+        for order in self.shared.orders() {
+            match order {
+                Order::Fault(fault @ (Fault::Stall | Fault::Reset | Fault::Unplug), seconds) => {
+                    self.log.record(fault, Direction::ToHost, &[]);
+                    self.strike(fault, seconds);
+                }
+                Order::Fault(fault, _) => self.outbound.force(fault),
+            }
+        }
+    }
+
+    /// Ends a stall; plugs the port in again.
+    fn restore(&mut self) {
+        let now = Instant::now();
+        self.stalled = self.stalled.filter(|&until| until > now);
+        if self.unplugged.is_some_and(|until| until <= now) {
+            // the name may be taken for a moment: then it is tried again
+            let plugged = self.port.plug().is_ok();
+            self.unplugged = (!plugged).then_some(now + Duration::from_millis(50));
+            if plugged {
+                self.note(Happening::Plugged);
+                self.shared.renamed(self.port.name());
+            }
+        }
+    }
+
+    fn presence(&mut self) {
+        let connected = self.unplugged.is_none() && self.port.connected();
+        if connected == self.connected {
+            return;
+        }
+        self.connected = connected;
+        self.met |= connected;
+        self.inbound.clear();
+        self.outbound.clear();
+        if connected {
+            // what the last host did not read to its end stops here
+            self.outbound
+                .push(&[0], Instant::now(), &mut self.log, &mut self.events);
+            self.note(Happening::Connected);
+        } else {
+            self.rig.disconnect();
+            self.note(Happening::Gone);
+        }
+    }
+
+    fn flows(&self) -> bool {
+        self.connected && self.stalled.is_none()
+    }
+
+    /// From the port through the line to the device, frame by frame.
+    fn receive(&mut self) {
+        let now = Instant::now();
+        if self.flows() && self.inbound.backlog() < WAITING {
+            let mut buffer = [0; 4096];
+            let room = self.inbound.allowance(now).min(buffer.len());
+            let length = if room > 0 {
+                self.port.read(&mut buffer[..room])
+            } else {
+                0
+            };
+            self.inbound.spend(length);
+            self.inbound
+                .push(&buffer[..length], now, &mut self.log, &mut self.events);
+        }
+        self.inbound.settle(now, &mut self.log);
+        self.keep_time();
+        if self.inbound.has_arrived() && self.flows() {
+            self.deliver();
+        }
+    }
+
+    fn deliver(&mut self) {
+        let now = Instant::now();
+        let time = self.clock.read(now).min(self.rig.next());
+        let boot_id = self.rig.boot_id();
+        let bytes = self.inbound.arrived();
+        self.trace.observe(bytes, boot_id, time, now);
+        for frame in bytes.split_inclusive(|&byte| byte == 0) {
+            self.rig.receive(time, frame);
+            self.trace
+                .output(self.rig.output().enabled, time, self.rig.state());
+        }
+        let length = bytes.len();
+        self.inbound.consume(length);
+    }
+
+    /// How far the host lets time advance; `None` where it runs by itself.
+    fn credit(&self) -> Option<u64> {
+        let granted = (self.fast && self.connected).then(|| self.rig.credit());
+        granted.flatten()
+    }
+
+    /// Sets the clock running or has it stand, and takes the samples that are due by it.
+    fn keep_time(&mut self) {
+        let now = Instant::now();
+        self.log.time = self.clock.read(now);
+        if self.credit().is_some() {
+            self.clock.stand(self.log.time.min(self.rig.next()));
+            return;
+        }
+        self.clock.run(now);
+        let time = self.clock.read(now);
+        if time > self.rig.next() + HOPELESS {
+            self.clock.set(self.rig.next(), now);
+            self.statistics.set_back += 1;
+        }
+        while self.rig.next() <= self.clock.read(now) {
+            let late = self.clock.read(now) - self.rig.next();
+            self.statistics.late += u64::from(late >= u64::from(PERIOD));
+            self.statistics.latest_us = self.statistics.latest_us.max(late);
+            self.sample();
+        }
+    }
+
+    fn sample(&mut self) {
+        let due = self.rig.next();
+        self.rig.sample();
+        self.statistics.samples += 1;
+        self.trace
+            .output(self.rig.output().enabled, due, self.rig.state());
+        self.collect();
+    }
+
+    /// Spends the host's credit.
+    fn advance(&mut self) {
+        let Some(until) = self.credit() else { return };
+        let mut left = BATCH;
+        while self.rig.next() <= until && left > 0 && self.outbound.backlog() < self.room {
+            self.clock.stand(self.rig.next());
+            self.sample();
+            left -= 1;
+        }
+        if self.rig.next() > until {
+            let time = self.clock.read(Instant::now()).max(until);
+            self.clock.stand(time);
+        }
+    }
+
+    /// From the device into the line; into the void where nobody is there.
+    fn collect(&mut self) {
+        let mut buffer = [0; 1024];
+        while self.outbound.backlog() < self.room {
+            let length = self.rig.transmit(&mut buffer);
+            if length == 0 {
+                return;
+            }
+            if self.connected {
+                let (now, bytes) = (Instant::now(), &buffer[..length]);
+                self.outbound
+                    .push(bytes, now, &mut self.log, &mut self.events);
+            }
+        }
+    }
+
+    /// From the line to the port.
+    fn transmit(&mut self) {
+        self.collect();
+        let now = Instant::now();
+        self.outbound.settle(now, &mut self.log);
+        if !self.flows() || !self.outbound.has_arrived() {
+            return;
+        }
+        let allowance = self.outbound.allowance(now);
+        let bytes = self.outbound.arrived();
+        let bytes = &bytes[..bytes.len().min(allowance)];
+        let written = if bytes.is_empty() {
+            0
+        } else {
+            self.port.write(bytes)
+        };
+        self.outbound.spend(written);
+        self.outbound.consume(written);
+        self.statistics.bytes_to_host += written as u64;
+    }
+
+    /// What the lines' faults do to link and device.
+    fn happen(&mut self) {
+        for fault in std::mem::take(&mut self.events) {
+            self.strike(fault, None);
+        }
+    }
+
+    fn strike(&mut self, fault: Fault, lasts: Option<Duration>) {
+        let until = Instant::now() + lasts.unwrap_or(self.faults.duration(fault));
+        match fault {
+            Fault::Stall => {
+                self.stalled = Some(until);
+                self.note(Happening::Stalled);
+            }
+            Fault::Unplug => {
+                self.port.unplug();
+                self.unplugged = Some(until);
+                self.note(Happening::Unplugged);
+            }
+            Fault::Reset => self.reset(),
+            _ => {}
+        }
+    }
+
+    fn reset(&mut self) {
+        self.trace
+            .output(false, self.clock.read(Instant::now()), self.rig.state());
+        self.trace.rebooted();
+        self.rig.reboot();
+        self.clock.set(0, Instant::now());
+        self.note(Happening::Reset);
+    }
+
+    fn note(&mut self, happening: Happening) {
+        let time = self.clock.read(Instant::now());
+        self.trace.note(happening, time, self.rig.state());
+    }
+
+    fn report(&mut self) {
+        self.statistics.refused = self.port.refused();
+        self.shared
+            .report(&self.statistics, &self.log, &mut self.trace);
+    }
+
+    fn wait(&mut self) {
+        let now = Instant::now();
+        let credit = self.credit();
+        let flows = self.flows();
+        let busy = credit.is_some_and(|until| self.rig.next() <= until)
+            && self.outbound.backlog() < self.room;
+        let write = flows && self.outbound.has_arrived() && self.outbound.allowance(now) > 0;
+        let read = flows && self.inbound.backlog() < WAITING && self.inbound.allowance(now) > 0;
+        let paced = |line: &Line, open: bool| line.wakes_in(now, flows && !open);
+        let due = [
+            self.clock.until(self.rig.next(), now),
+            paced(&self.inbound, read),
+            paced(&self.outbound, write || !self.outbound.has_arrived()),
+            self.ends.map(|ends| ends.saturating_duration_since(now)),
+        ];
+        let until = |moment: Option<Instant>| moment.map(|m| m.saturating_duration_since(now));
+        let moments = [until(self.stalled), until(self.unplugged)];
+        let timeout = due.into_iter().chain(moments).flatten().min();
+        let timeout = timeout.unwrap_or(ATTENTION).min(ATTENTION);
+        let timeout = if busy { Duration::ZERO } else { timeout };
+        self.port.wait(Interest { read, write }, timeout);
+    }
+}

@@ -1,0 +1,192 @@
+//! The server's own account: when the output went on and off, and when the last heartbeat before it had come.
+
+use std::fs::File;
+use std::io::{self, LineWriter, Write};
+use std::path::Path;
+use std::time::Instant;
+
+use sewfast_control::link::{Deframer, Fields, State};
+
+/// What happened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Happening {
+    /// The output was enabled.
+    On,
+    /// The output was made safe.
+    Off,
+    /// A host came.
+    Connected,
+    /// The host went.
+    Gone,
+    /// Nothing passes from here on.
+    Stalled,
+    /// The port vanished.
+    Unplugged,
+    /// The port came back.
+    Plugged,
+    /// The device booted anew.
+    Reset,
+}
+
+impl Happening {
+    /// Its name in the file.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::On => "on",
+            Self::Off => "off",
+            Self::Connected => "connected",
+            Self::Gone => "gone",
+            Self::Stalled => "stalled",
+            Self::Unplugged => "unplugged",
+            Self::Plugged => "plugged",
+            Self::Reset => "reset",
+        }
+    }
+}
+
+/// The last intact frame with a watchdog time that reached the device since its boot.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Heartbeat {
+    /// When it came, by the device's clock [us].
+    pub device_us: u64,
+    /// When it came, in seconds since the server began.
+    pub seconds: f64,
+    /// Its watchdog time [us].
+    pub watchdog_us: u32,
+}
+
+/// One line of the account.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Entry {
+    /// What happened.
+    pub happening: Happening,
+    /// When, by the device's clock [us].
+    pub device_us: u64,
+    /// When, in seconds since the server began.
+    pub seconds: f64,
+    /// The device's state after it.
+    pub state: u8,
+    /// The heartbeat before it.
+    pub heartbeat: Option<Heartbeat>,
+}
+
+impl Entry {
+    fn json(&self) -> String {
+        let heartbeat = self.heartbeat.map_or_else(String::new, |h| {
+            format!(
+                ",\"heartbeat_us\":{},\"heartbeat_seconds\":{:.6},\"watchdog_us\":{}",
+                h.device_us, h.seconds, h.watchdog_us
+            )
+        });
+        format!(
+            "{{\"event\":\"{}\",\"device_us\":{},\"seconds\":{:.6},\"state\":{}{heartbeat}}}",
+            self.happening.name(),
+            self.device_us,
+            self.seconds,
+            self.state,
+        )
+    }
+}
+
+/// The account as it grows. Heartbeats are found by a receiver of its own, not asked of the device that it watches.
+#[derive(Debug)]
+pub struct Trace {
+    began: Instant,
+    entries: Vec<Entry>,
+    file: Option<LineWriter<File>>,
+    deframer: Deframer,
+    heartbeat: Option<Heartbeat>,
+    enabled: bool,
+    /// Why the file ended early.
+    pub broken: Option<String>,
+}
+
+impl Trace {
+    /// With a file where `path` names one.
+    ///
+    /// # Errors
+    /// Where the file cannot be made.
+    pub fn new(path: Option<&Path>, began: Instant) -> io::Result<Self> {
+        let file = path.map(File::create).transpose()?;
+        Ok(Self {
+            began,
+            entries: Vec::new(),
+            file: file.map(LineWriter::new),
+            deframer: Deframer::new(),
+            heartbeat: None,
+            enabled: false,
+            broken: None,
+        })
+    }
+
+    /// Takes the entries since the last time.
+    pub fn fresh(&mut self) -> impl Iterator<Item = Entry> + '_ {
+        self.entries.drain(..)
+    }
+
+    /// Looks at bytes that reach the device of boot id `boot_id` at `device_us`.
+    pub fn observe(&mut self, mut bytes: &[u8], boot_id: u32, device_us: u64, now: Instant) {
+        let seconds = self.seconds(now);
+        while let Some(frame) = self.deframer.next(&mut bytes) {
+            let Ok(frame) = frame else { continue };
+            if frame.header.tag != boot_id as u16 {
+                continue;
+            }
+            let mut body = Fields::new(frame.body);
+            let watchdog_us = match frame.header.kind {
+                0x05 | 0x20..=0x22 => body.u32(),
+                0x0A => body.u8().and_then(|_| body.u32()),
+                _ => None,
+            };
+            if let Some(watchdog_us) = watchdog_us {
+                self.heartbeat = Some(Heartbeat {
+                    device_us,
+                    seconds,
+                    watchdog_us,
+                });
+            }
+        }
+    }
+
+    /// Notes a change of the output.
+    #[inline]
+    pub fn output(&mut self, enabled: bool, device_us: u64, state: State) {
+        if enabled != self.enabled {
+            self.enabled = enabled;
+            let change = if enabled {
+                Happening::On
+            } else {
+                Happening::Off
+            };
+            self.note(change, device_us, state);
+        }
+    }
+
+    /// Notes anything.
+    pub fn note(&mut self, happening: Happening, device_us: u64, state: State) {
+        let entry = Entry {
+            happening,
+            device_us,
+            seconds: self.seconds(Instant::now()),
+            state: state as u8,
+            heartbeat: self.heartbeat,
+        };
+        self.entries.push(entry);
+        if let Some(file) = &mut self.file
+            && let Err(error) = writeln!(file, "{}", entry.json())
+        {
+            self.broken = Some(error.to_string());
+            self.file = None;
+        }
+    }
+
+    /// Forgets the heartbeats of the boot before.
+    pub fn rebooted(&mut self) {
+        self.heartbeat = None;
+        self.enabled = false;
+    }
+
+    fn seconds(&self, now: Instant) -> f64 {
+        now.saturating_duration_since(self.began).as_secs_f64()
+    }
+}
