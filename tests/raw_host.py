@@ -1,4 +1,4 @@
-"""A host of few lines over bare file descriptors, after docs/PROTOCOL.md; shares no code with ours."""
+"""A host over bare file descriptors, after docs/PROTOCOL.md; it shares no code with ours."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "golden"))
 
-import link_frames as golden  # noqa: E402
+import link_frames as golden
 
 HELLO, DESCRIBE, STATUS, LIMITS, ARM, STOP, CLEAR, UPLOAD, GAINS, START, ECHO = range(1, 12)
 KEEP, DRIVE, CREDIT = 0x20, 0x21, 0x22

@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -86,24 +86,24 @@ def device_command(args: argparse.Namespace) -> None:
     from ..link.virtual import VirtualDevice
 
     with _signals_as_interrupts():
-        with VirtualDevice(
-            args.machine,
-            fast=args.fast,
-            faults=args.faults,
-            seed=args.seed,
-            baud=args.baud,
-            endpoint="tcp" if args.tcp is not None else None,
-            link=args.link,
-            address=args.tcp or "127.0.0.1:0",
-            once=args.once,
-            duration=args.duration,
-            fault_log=args.fault_log,
-            trace=args.trace,
-        ) as device:
-            try:
-                _serve(device, as_json=args.json)
-            except KeyboardInterrupt:
-                pass
+        with (
+            VirtualDevice(
+                args.machine,
+                fast=args.fast,
+                faults=args.faults,
+                seed=args.seed,
+                baud=args.baud,
+                endpoint="tcp" if args.tcp is not None else None,
+                link=args.link,
+                address=args.tcp or "127.0.0.1:0",
+                once=args.once,
+                duration=args.duration,
+                fault_log=args.fault_log,
+                trace=args.trace,
+            ) as device,
+            suppress(KeyboardInterrupt),
+        ):
+            _serve(device, as_json=args.json)
         _say_result(device, as_json=args.json)
 
 

@@ -26,18 +26,20 @@ _BAUD = (300, 100_000_000)
 class VirtualDevice:
     """The virtual sewing machine served on a port, with the state machine of a real device.
 
-    It is there from the construction to `stop`, the end of the `with`, or the end of the interpreter; a thread
-    without the interpreter serves it.
+    It is there from the construction to `stop`, the end of the `with`, or the end of the
+    interpreter; a thread without the interpreter serves it.
 
     Parameters
     ----------
     machine
         ``virtual`` or ``virtual:SEED``.
     fast
-        Time advances only by the host's credit while a session is open, as fast as the port carries.
+        Time advances only by the host's credit while a session is open, as fast as the port
+        carries.
     faults
-        What goes wrong: ``"drop=.001,flip=1e-4,stall=1e-4:0.2"``, or a mapping from kind to rate or to (rate,
-        seconds). Kinds are drop, flip, duplicate, reorder, delay, stall, reset, unplug; rates are per frame.
+        What goes wrong: ``"drop=.001,flip=1e-4,stall=1e-4:0.2"``, or a mapping from kind to rate
+        or to (rate, seconds). Kinds are drop, flip, duplicate, reorder, delay, stall, reset,
+        unplug; rates are per frame.
     seed
         Seed of the faults.
     baud
@@ -45,7 +47,8 @@ class VirtualDevice:
     endpoint
         ``"pty"`` or ``"tcp"``; None takes a pty where the system has them.
     link
-        Symbolic link to the pty; None makes one in a temporary folder. It stays the name when the port was unplugged.
+        Symbolic link to the pty; None makes one in a temporary folder. It stays the name when the
+        port was unplugged.
     address
         HOST:PORT to listen on; port 0 takes a free one.
     once
@@ -53,7 +56,8 @@ class VirtualDevice:
     duration
         End after so many seconds.
     fault_log, trace
-        Files that get a line of JSON for each fault, and for each change of the output and of who is there.
+        Files that get a line of JSON for each fault, and for each change of the output and of who
+        is there.
 
     Raises
     ------
@@ -133,7 +137,7 @@ class VirtualDevice:
         self._end()
 
     def cause(self, fault: str, seconds: float | None = None) -> None:
-        """Cause a fault: stall, reset and unplug within 20 ms, others with the next frame from the device.
+        """Cause a fault: stall, reset, unplug at once, others with the next frame to the host.
 
         Parameters
         ----------
@@ -161,8 +165,9 @@ class VirtualDevice:
     def statistics(self) -> dict[str, int]:
         """How serving went so far.
 
-        Counts of ``samples``, of samples ``late`` by a period or more, how late the latest was [us], how often the clock was
-        ``set_back`` because catching up was hopeless, bytes to the host, hosts ``refused`` because one was there.
+        Counts of ``samples``, of samples ``late`` by a period or more, how late the latest was
+        [us], how often the clock was ``set_back`` because catching up was hopeless, bytes to the
+        host, hosts ``refused`` because one was there.
         """
         return self._server.statistics()
 
@@ -174,9 +179,10 @@ class VirtualDevice:
     def trace(self) -> list[dict[str, Any]]:
         """The server's account of the output, oldest first.
 
-        Each entry has ``event`` (on, off, connected, gone, stalled, unplugged, plugged, reset), ``device_us``, ``seconds``
-        (since the server began), ``state``, and of the last intact heartbeat before it ``heartbeat_us``,
-        ``heartbeat_seconds`` and ``watchdog_us``, None where none had come since the boot.
+        Each entry has ``event`` (on, off, connected, gone, stalled, unplugged, plugged, reset),
+        ``device_us``, ``seconds`` (since the server began), ``state``, and of the last intact
+        heartbeat before it ``heartbeat_us``, ``heartbeat_seconds`` and ``watchdog_us``, None where
+        none had come since the boot.
         """
         return self._server.trace()
 
