@@ -209,6 +209,31 @@ mod tests {
     }
 
     #[test]
+    fn leftovers_do_not_add_up_while_the_boot_goes_on() {
+        let mut sequence = Sequence::new();
+        sequence.judge(1, 70);
+        sequence.judge(2, 0);
+        for n in 0..40 {
+            assert_eq!(sequence.judge(1, 71 + n), Verdict::Late);
+            if n % 10 == 9 {
+                assert_eq!(sequence.judge(2, n / 10 + 1), Verdict::InOrder);
+            }
+        }
+    }
+
+    #[test]
+    fn half_of_all_numbers_lie_ahead() {
+        let judged = |ahead: u32| {
+            let mut sequence = Sequence::new();
+            sequence.judge(1, 999);
+            sequence.judge(1, 1000u32.wrapping_add(ahead))
+        };
+        assert_eq!(judged(HALF - 1), Verdict::Missing(HALF - 1));
+        assert_eq!(judged(HALF), Verdict::Late);
+        assert_eq!(judged(u32::MAX), Verdict::Repeated);
+    }
+
+    #[test]
     fn a_boot_that_has_the_tag_of_the_one_before_the_last_is_found() {
         let mut sequence = Sequence::new();
         sequence.judge(1, 70);

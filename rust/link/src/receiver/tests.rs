@@ -325,6 +325,27 @@ fn noise_is_one_entry_and_echoes_do_not_count_as_the_device() {
 }
 
 #[test]
+fn counts_start_anew_after_a_reset() {
+    let mut receiver = receiver();
+    for (tag, counts) in [(1, i32::MAX), (2, i32::MIN)] {
+        let mut body = Body::new();
+        body.u8(0).i32(counts).i16(0);
+        let header = Header {
+            kind: SAMPLES,
+            tag,
+            ..Header::default()
+        };
+        let mut wire = [0; MAX_WIRE];
+        let length = encode(&header, body.bytes().unwrap(), &mut wire).unwrap();
+        receiver.feed(&wire[..length], |_| {});
+    }
+    assert_eq!(
+        receiver.take().1[0],
+        [f64::from(i32::MAX), f64::from(i32::MIN)]
+    );
+}
+
+#[test]
 fn samples_come_out_as_frames_until_channels_are_expected() {
     let (mut dice, mut receiver) = (Dice(34), Receiver::new());
     let mut device = Device {
