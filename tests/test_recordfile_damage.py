@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import textwrap
+import time
 import tracemalloc
 import zlib
 from pathlib import Path
@@ -282,7 +283,7 @@ def assert_whole_up_to(path: Path, written: int, message: str) -> None:
     found = read_recording(path)
     assert str(path) in message
     assert f"whole up to sample {len(found)} " in message
-    assert written - 110 <= len(found) <= written + 10
+    assert 0 < len(found) <= written + 10
     np.testing.assert_array_equal(found.columns["u"], np.arange(len(found)) / 3)
     assert (found.outcome, found.gaps) == ("torn", ())
     assert found.damage == ("the end is missing",)
@@ -331,15 +332,23 @@ def test_a_read_only_folder_is_refused(tmp_path: Path) -> None:
         os.seteuid(user)
 
 
+def record_on(writer: RecordWriter) -> None:
+    """The thread that writes takes its time until it says that it cannot."""
+    for k in range(100, 10_000):
+        time.sleep(0.001)
+        writer.samples(k, {"u": [1.0]})
+
+
 def test_a_failed_writer_stays_failed(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     path = tmp_path / "run.mcap"
     writer = RecordWriter(path, header(columns={"u": "V"}))
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 100, hard))
+        writer.samples(0, {"u": np.ones(100) / 3})
         with pytest.raises(DataError, match="whole up to sample 0"):
-            writer.samples(0, {"u": np.ones(100) / 3})
-        for call in (lambda: writer.samples(200, {"u": [1.0]}), lambda: writer.event("x")):
+            record_on(writer)
+        for call in (lambda: writer.samples(20_000, {"u": [1.0]}), lambda: writer.event("x")):
             with pytest.raises(DataError, match="whole up to sample 0"):
                 call()
         with pytest.raises(DataError, match="whole up to sample 0"):

@@ -24,6 +24,11 @@ _TAKEN = ("t", "index")
 _EMPTY: Mapping[str, Any] = MappingProxyType({})
 
 
+def bearable(missing: int, columns: int) -> bool:
+    """Whether a reader would allocate the rows of gaps of `missing` samples altogether."""
+    return missing * columns <= MOST_MISSING
+
+
 def now() -> str:
     """The time of day in UTC, ISO 8601, to the microsecond."""
     return datetime.now(timezone.utc).isoformat(timespec="microseconds")

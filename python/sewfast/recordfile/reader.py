@@ -16,7 +16,7 @@ from ..errors import DataError
 from ..runs import runs
 from . import walk
 from .container import MAGIC, Message
-from .header import MOST_MISSING, Header, plain
+from .header import MOST_MISSING, Header, bearable, plain
 from .samples import EXACT, Block, decode, parse
 from .topics import Topic
 
@@ -238,7 +238,7 @@ class _Contents:
         if first < self._next:
             raise ValueError(f"sample {first} follows sample {self._next - 1}")
         received = self._received + len(block.numbers)
-        if (end - received) * width > MOST_MISSING:
+        if not bearable(end - received, width):
             raise ValueError(f"samples up to {end} leave gaps of more than {MOST_MISSING} values")
         self.blocks.append(block)
         self._next, self._received = end, received
@@ -277,7 +277,7 @@ class _Contents:
         if lost:
             self.damage.append(f"{lost} of {self.completeness['received']} samples are left out")
         end: int = self.completeness["end"]
-        if end < self._next or (end - self._received) * width > MOST_MISSING:
+        if end < self._next or not bearable(end - self._received, width):
             self.damage.append(f"its account ends at sample {end}, its samples at {self._next}")
             return self._next
         return end

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -16,15 +15,9 @@ from numpy.typing import ArrayLike
 
 from ..errors import DataError
 from . import samples
-from .container import Assembler, Message, opening
-from .header import MOST_MISSING, Header, plain
-from .sink import Sink, replacing
-from .topics import Topic
-
-MESSAGE_SAMPLES = 100
-"""Samples at which a message is written."""
-OLDEST = 0.2
-"""Seconds that a sample waits for a full message; the operating system has it within .25 s."""
+from .filing import Block, End, Event, Filing
+from .header import MOST_MISSING, Header, bearable, plain
+from .sink import replacing
 
 
 class RecordWriter:
@@ -52,7 +45,9 @@ class RecordWriter:
     Notes
     -----
     Leaving the ``with`` block closes the file: "complete", "interrupted" after Ctrl-C, "failed"
-    after another exception. The methods may be called from any thread.
+    after another exception. A thread of its own owns the file, so that neither a slow disk nor
+    Ctrl-C comes between a sample and its place; that the disk is full is said by the next call.
+    Events may come from any thread, samples from one at a time.
 
     Examples
     --------
@@ -71,38 +66,12 @@ class RecordWriter:
     ) -> None:
         self.path = Path(path)
         self.header = header
-        self._sink = Sink(self.path, overwrite=overwrite)
-        self._assembler = Assembler(header.columns)
+        self._filing = Filing(self.path, header, overwrite=overwrite)
         self._opened = time.monotonic()
         self._next = 0
-        self._written = 0
         self._received = 0
-        self._gaps: list[tuple[int, int]] = []
-        self._gap_count = 0
-        self._pending: dict[str, list[Any]] = {name: [] for name in header.columns}
-        self._first = 0
-        self._since = 0.0
-        self._failure: OSError | None = None
         self._closed = False
-        self._change = threading.Condition()
-        self._write_header()
-        self._ager = threading.Thread(target=self._age, name="sewfast-recording", daemon=True)
-        self._ager.start()
-
-    def _write_header(self) -> None:
-        """Twice: a recording cannot be read without it, and one copy may be damaged."""
-        at = self.header.start_ns()
-        message = Message(Topic.HEADER, at, at, self.header.encode())
-        try:
-            self._sink.append(opening())
-            self._append(message, leading=True)
-            self._append(message)
-        except OSError as e:
-            self._sink.close()
-            self.path.unlink(missing_ok=True)
-            raise DataError(
-                f"{self.path}: cannot be written ({e.strerror}); free some space or write elsewhere"
-            ) from e
+        self._told = False
 
     def __enter__(self) -> RecordWriter:
         return self
@@ -145,17 +114,12 @@ class RecordWriter:
         first = _index("first", first)
         values = self._matching(columns)
         count = len(next(iter(values.values())))
-        with self._change:
-            self._require_open()
-            self._require_new(first, count)
-            if count == 0:
-                return
-            if first > self._next:
-                self._skip_to(first)
-            self._wait_with(first, values)
+        self._require_open()
+        self._require_new(first, count)
+        if count:
+            self._filing.put(Block(first, values))
             self._next = first + count
             self._received += count
-            self._write_full()
 
     def _matching(self, columns: Mapping[str, ArrayLike]) -> dict[str, list[Any]]:
         if set(columns) != set(self.header.columns):
@@ -177,33 +141,12 @@ class RecordWriter:
                 f"{self.path}: expected samples from {self._next} on, received {first} to "
                 f"{first + count - 1}; a sample is written once"
             )
-        if not self._within_reach(first):
+        missing = first - self._received
+        if not bearable(missing, len(self.header.columns)) or first + count > samples.EXACT:
             raise DataError(
                 f"{self.path}: expected gaps of at most {MOST_MISSING} values altogether, received "
                 f"sample {first} after {self._received} samples; start a new recording"
             )
-
-    def _within_reach(self, end: int) -> bool:
-        missing = end - self._received
-        return missing * len(self.header.columns) <= MOST_MISSING and end <= samples.EXACT
-
-    def _skip_to(self, first: int) -> None:
-        self._write_pending()
-        if len(self._gaps) < samples.MOST_GAPS_LISTED:
-            self._gaps.append((self._next, first - self._next))
-        self._gap_count += 1
-
-    def _wait_with(self, first: int, values: Mapping[str, list[Any]]) -> None:
-        if not self._waiting:
-            self._first = first
-            self._since = time.monotonic()
-            self._change.notify()
-        for name, column in values.items():
-            self._pending[name] += column
-
-    @property
-    def _waiting(self) -> int:
-        return len(next(iter(self._pending.values())))
 
     def event(self, kind: str, index: int | None = None, **detail: Any) -> None:
         """Write down that something happened, at once.
@@ -226,12 +169,11 @@ class RecordWriter:
         """
         index = None if index is None else _index("index", index)
         content = plain(f"event {kind!r}", {"kind": str(kind), "index": index, "detail": detail})
-        with self._change:
-            self._require_open()
-            elapsed = time.monotonic() - self._opened
-            content["elapsed"] = round(elapsed, 6)
-            at = self.header.start_ns() + round(elapsed * 1e9)
-            self._write(Topic.EVENTS, content, at if index is None else self.header.time_ns(index))
+        self._require_open()
+        elapsed = time.monotonic() - self._opened
+        content["elapsed"] = round(elapsed, 6)
+        since = self.header.start_ns() + round(elapsed * 1e9)
+        self._filing.put(Event(content, since if index is None else self.header.time_ns(index)))
 
     def close(self, outcome: str = "complete") -> None:
         """Write what waits, the completeness record and the index; a closed file stays closed.
@@ -246,113 +188,24 @@ class RecordWriter:
         DataError
             Where that could not be written; the samples before it are whole.
         """
-        with self._change:
-            if self._closed:
-                return
+        if not self._closed:
+            self._filing.put(End(str(outcome)))
             self._closed = True
-            self._change.notify()
-        self._ager.join()
         try:
-            if self._failure is None:
-                self._finish(outcome)
-            else:
-                raise self._refusal(self._failure)
-        finally:
-            self._sink.close()
-
-    def _finish(self, outcome: str) -> None:
-        end = self._next
-        planned = self.header.n
-        due = end if planned is None or outcome != "complete" else planned
-        if due > end and self._within_reach(due):
-            # what was planned and never came is a gap as well
-            self._skip_to(due)
-            end = due
-        content = {
-            "outcome": str(outcome),
-            "received": self._received,
-            "expected": planned,
-            "end": end,
-            "gap_count": self._gap_count,
-            "gaps": self._gaps,
-        }
-        self._write_pending()
-        self._write(Topic.COMPLETENESS, content, self.header.time_ns(end))
-        try:
-            self._sink.append(self._assembler.ending(self._sink.size, self._sink.crc))
-        except OSError as e:
-            raise self._fail(e) from e
-        self._sink.sync()
-
-    def _write_full(self) -> None:
-        while self._waiting >= MESSAGE_SAMPLES:
-            self._write_samples(MESSAGE_SAMPLES)
-
-    def _write_pending(self) -> None:
-        if self._waiting:
-            self._write_samples(self._waiting)
-
-    def _write_samples(self, count: int) -> None:
-        """The `count` samples that wait longest, as one message."""
-        columns = {name: values[:count] for name, values in self._pending.items()}
-        data = samples.encode(self._first, self.header.Ts, columns)
-        begin, end = self._first, self._first + count - 1
-        self._put(
-            Message(Topic.SAMPLES, self.header.time_ns(end), self.header.time_ns(begin), data)
-        )
-        for values in self._pending.values():
-            del values[:count]
-        self._first += count
-        self._written = self._first
-        self._since = time.monotonic()
-
-    def _write(self, topic: Topic, content: Mapping[str, Any], at: int) -> None:
-        self._put(Message(topic, at, at, samples.dumps(content)))
-
-    def _put(self, message: Message) -> None:
-        try:
-            self._append(message)
-        except OSError as e:
-            raise self._fail(e) from e
-
-    def _append(self, message: Message, *, leading: bool = False) -> None:
-        self._sink.append(self._assembler.chunk([message], self._sink.size, leading=leading))
-
-    def _fail(self, error: OSError) -> DataError:
-        self._failure = error
-        for values in self._pending.values():
-            values.clear()
-        return self._refusal(error)
-
-    def _refusal(self, error: OSError) -> DataError:
-        return DataError(
-            f"{self.path}: expected room for the recording, received {error.strerror!r}; the file "
-            f"is whole up to sample {self._written} (end excluded, {self._sink.size} bytes); free "
-            "some space and record again"
-        )
+            self._filing.finish()
+        except KeyboardInterrupt:
+            # one Ctrl-C must not cost the end of the file, a second one may
+            self._filing.finish()
+            raise
+        if self._filing.failure is not None and not self._told:
+            self._told = True
+            raise self._filing.refusal(self._filing.failure)
 
     def _require_open(self) -> None:
-        if self._failure is not None:
-            raise self._refusal(self._failure)
+        if self._filing.failure is not None:
+            raise self._filing.refusal(self._filing.failure)
         if self._closed:
             raise DataError(f"{self.path}: the recording is closed; start a new one")
-
-    def _age(self) -> None:
-        """Write what has waited for long enough; a thread of its own, as samples may stay out."""
-        with self._change:
-            while not self._closed and self._failure is None:
-                if not self._waiting:
-                    self._change.wait()
-                    continue
-                left = self._since + OLDEST - time.monotonic()
-                if left > 0:
-                    self._change.wait(left)
-                    continue
-                try:
-                    self._write_pending()
-                except DataError:
-                    # kept in `_failure`: the next call says it
-                    return
 
 
 def _index(what: str, value: object) -> int:
