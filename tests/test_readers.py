@@ -397,7 +397,7 @@ def test_counts_become_a_speed_in_rpm(tmp_path: Path) -> None:
     assert (data.output_name, data.output_unit, data.counts) == ("speed", "RPM", ("n", 100.0))
     assert read(path, inputs="u", output="w", counts="n", counts_per_rev=100).output_name == "w"
     holed = csv(tmp_path, "t,u,n\n0,1,0\n1,2,\n2,3,1\n", "holes.csv")
-    with pytest.raises(DataError, match=r"'n'.*encoder counts in a row.*line 3"):
+    with pytest.raises(DataError, match=r"'n'.*encoder counts in a row.*sample 1"):
         read(holed, inputs="u", counts="n", counts_per_rev=100)
 
 

@@ -26,7 +26,15 @@ class ModelFileError(SewfastError, ValueError):
 
 
 class LinkError(SewfastError, OSError):
-    """A port or the device behind it failed."""
+    """A port or the device behind it failed, or the device tripped.
+
+    Attributes
+    ----------
+    recording
+        What a run had brought until then, where there was one: a `Recording` or a `ClosedLoopRun`.
+    """
+
+    recording: Any = None
 
 
 class Interrupted(KeyboardInterrupt):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +16,11 @@ from .control import Controller, vector
 from .errors import DataError, SettingError
 from .machine import VirtualMachine
 from .models import Model
+from .speed import speed_or_nan
+
+if TYPE_CHECKING:
+    from .link.drive import Drive
+    from .live import Kind
 
 FloatArray: TypeAlias = NDArray[np.float64]
 Plant: TypeAlias = Model | VirtualMachine
@@ -72,31 +79,38 @@ class ClosedLoopRun:
             `rmse` and `max_abs` of r - y [y]; `rise_time_ms`, `reference_rise_time_ms` (10 to 90 %
             of the first edge) and `overshoot_percent`, None where the reference is no step or
             trapezoid or the level is not reached; `u_rms`, `du_rms` (change from sample to sample)
-            [u]; `saturated`, the share of samples at a limit.
+            [u]; `saturated`, the share of samples at a limit. Samples that a link lost (NaN) do not
+            count; with any of them there is no rise time and no overshoot.
         """
         error = self.r - self.y
+        error = error[np.isfinite(error)]
+        u = self.u[np.isfinite(self.u)]
         return {
-            "rmse": float(np.sqrt(np.mean(error**2))),
-            "max_abs": float(np.max(np.abs(error))),
+            "rmse": float(np.sqrt(np.mean(error**2))) if len(error) else None,
+            "max_abs": float(np.max(np.abs(error))) if len(error) else None,
             **self._step_metrics(),
-            **_core.effort(self.u, u_min=self.controller.u_min, u_max=self.controller.u_max),
+            **_core.effort(u, u_min=self.controller.u_min, u_max=self.controller.u_max),
         }
 
     def _step_metrics(self) -> dict[str, float | None]:
+        names = ("rise_time_ms", "reference_rise_time_ms", "overshoot_percent")
+        if not np.all(np.isfinite(self.y - self.r)):
+            return dict.fromkeys(names)
         try:
             found = _core.step_metrics(self.y, self.r, Ts=self.Ts, smoothing=SMOOTHING)
         except DataError:
-            names = ("rise_time_ms", "reference_rise_time_ms", "overshoot_percent")
             return dict.fromkeys(names)
         return {name: None if math.isnan(value) else value for name, value in found.items()}
 
     def __str__(self) -> str:
         unit = self.units
         told = self.metrics()
-        lines = [
-            f"{self.reference} on {self.plant}, {len(self.t) * self.Ts:g} s",
-            f"  error     {told['rmse']:.4g} {unit['y']} rms, {told['max_abs']:.4g} at most",
-        ]
+        lines = [f"{self.reference} on {self.plant}, {len(self.t) * self.Ts:g} s"]
+        if told["rmse"] is None:
+            return f"{lines[0]}; no sample came"
+        lines.append(
+            f"  error     {told['rmse']:.4g} {unit['y']} rms, {told['max_abs']:.4g} at most"
+        )
         if told["rise_time_ms"] is not None:
             lines.append(
                 f"  first edge {told['rise_time_ms']:.1f} ms from 10 to 90 % (reference "
@@ -113,28 +127,42 @@ class ClosedLoopRun:
 
 def run(
     controller: Controller,
-    on: Plant,
+    on: Plant | Drive,
     reference: str | ArrayLike,
     *,
     seed: int = 0,
     name: str | None = None,
+    file: str | os.PathLike[str] | None = None,
+    live: str | Kind = "none",
 ) -> ClosedLoopRun:
-    """Run a controller on a model or on a virtual machine, from rest.
+    """Run a controller on a model, on a virtual machine or on a drive, from rest.
 
-    Order at a sample: measure, filter, control, limit, apply. A machine is measured by its own
-    encoder, a model by one of `controller.counts_per_rev`.
+    Order at a sample: measure, filter, control, limit, apply. A machine or drive is measured by
+    its own encoder, a model by one of `controller.counts_per_rev`.
 
     Parameters
     ----------
     controller : Controller
-    on : Model or VirtualMachine
-        The plant; a model needs one input. It is not changed.
+    on : Model, VirtualMachine or Drive
+        The plant. A model needs one input and is not changed; so is a virtual machine. A drive
+        (`sewfast.link`) runs the controller itself, in single precision; its limits must have been
+        set.
     reference : str or array, shape (N,)
         Name of a reference (`sewfast.signals`) or its samples at the controller's sample time [y].
     seed : int
         Chooses a named random reference.
     name : str, optional
         Name of the reference in messages and reports.
+    file : path, optional
+        Of a drive: MCAP recording to write while it runs.
+    live : str
+        Of a drive: see `sewfast.live.open_view`.
+
+    Returns
+    -------
+    ClosedLoopRun
+        Of a drive, `y` is the speed estimated from its counts, or its true speed where it is a
+        virtual one.
 
     Raises
     ------
@@ -144,8 +172,16 @@ def run(
         For a reference that is empty or not finite.
     FitError
         Where the loop diverges.
+    LinkError
+        Where the port or the drive failed or tripped; the motor is stopped, `recording` holds what
+        came.
+    Interrupted
+        On Ctrl-C, of a drive; the motor is stopped, `best` is the run up to there.
     """
     r = reference_samples(reference, controller, seed)
+    title = name or (reference if isinstance(reference, str) else "reference")
+    if not isinstance(on, (Model, VirtualMachine)):
+        return _run_on(_require_drive(on), controller, r, title, file, live)
     check_fits(controller, on)
     record = _core.closed_loop(
         on.core, controller.core(), r, counts_per_unit=controller.counts_per_unit
@@ -156,7 +192,65 @@ def run(
         **record,
         controller=controller,
         plant=plant_name(on),
-        reference=name or (reference if isinstance(reference, str) else "reference"),
+        reference=title,
+    )
+
+
+def _require_drive(on: Any) -> Drive:
+    """What is neither model nor virtual machine; the link's modules need not be loaded to tell."""
+    if not hasattr(on, "stream"):
+        raise SettingError(
+            "expected a Model, a VirtualMachine or a Drive to run on, got "
+            f"{type(on).__name__}; load a model with load_model, or connect to a drive"
+        )
+    drive: Drive = on
+    return drive
+
+
+def _run_on(
+    drive: Drive,
+    controller: Controller,
+    r: FloatArray,
+    name: str,
+    file: str | os.PathLike[str] | None,
+    live: str | Kind,
+) -> ClosedLoopRun:
+    from .link.plan import Plan
+    from .link.play import Played, Stopped, play
+
+    def made(played: Played) -> ClosedLoopRun:
+        return _of_drive(played.columns, drive, controller, r, name)
+
+    plan = Plan("controller", r, controller)
+    try:
+        return made(play(drive, plan, name=name, file=file, live=live))
+    except Stopped as stopped:
+        raise stopped.as_error(made, file) from stopped.cause
+
+
+def _of_drive(
+    columns: Mapping[str, FloatArray],
+    drive: Drive,
+    controller: Controller,
+    r: FloatArray,
+    name: str,
+) -> ClosedLoopRun:
+    """The run as the drive told it; what it did not stream is known all the same, or is NaN."""
+    identity = drive.identity
+    counts = columns["counts"]
+    speed = columns.get("speed_true")
+    n = len(counts)
+    if speed is None:
+        speed = speed_or_nan(counts, identity.Ts, identity.counts_per_rev, "kalman")
+    return ClosedLoopRun(
+        t=np.arange(n, dtype=np.float64) * identity.Ts,
+        r=r[:n],
+        u=columns["u"],
+        y=speed,
+        feedback=columns.get("feedback", np.full(n, np.nan)),
+        controller=controller,
+        plant=identity.name,
+        reference=name,
     )
 
 

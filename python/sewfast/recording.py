@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,8 +15,12 @@ from .dataset import Dataset
 from .errors import DataError
 from .machine import VirtualMachine
 from .recordfile import Header, save_columns
-from .speed import Method, speed_from_counts
+from .speed import Method, speed_from_counts, speed_or_nan
 from .writers import write_table
+
+if TYPE_CHECKING:
+    from .link.drive import Drive
+    from .live import Kind
 
 FloatArray = NDArray[np.float64]
 
@@ -36,18 +40,22 @@ class Recording:
         Encoder counts, read before `u[k]` acts.
     y : array, shape (N,)
         Speed [RPM] estimated from the counts.
-    speed_true : array, shape (N,)
-        The virtual machine's true speed [RPM], for scores only.
+    speed_true : array, shape (N,), or None
+        The virtual machine's true speed [RPM], for scores only; None where there is no such thing.
     Ts, counts_per_rev : float
         Sample time [s], counts of one turn.
     name : str
         Of the excitation.
+
+    Notes
+    -----
+    Samples that the link to a drive lost are NaN in every column.
     """
 
     u: FloatArray
     counts: FloatArray
     y: FloatArray
-    speed_true: FloatArray
+    speed_true: FloatArray | None
     Ts: float
     counts_per_rev: float
     name: str
@@ -56,21 +64,17 @@ class Recording:
         return len(self.u)
 
     def columns(self) -> dict[str, FloatArray]:
-        """t, u, counts, y and speed_true by name, as in a recording file."""
-        return {
-            "t": np.arange(len(self), dtype=np.float64) * self.Ts,
-            "u": self.u,
-            "counts": self.counts,
-            "y": self.y,
-            "speed_true": self.speed_true,
-        }
+        """t, u, counts, y and, where known, speed_true by name, as in a recording file."""
+        t = np.arange(len(self), dtype=np.float64) * self.Ts
+        known = {} if self.speed_true is None else {"speed_true": self.speed_true}
+        return {"t": t, "u": self.u, "counts": self.counts, "y": self.y, **known}
 
     def speed(self, method: Method) -> FloatArray:
         """The speed [RPM] estimated from the counts by another method, shape (N,)."""
         return speed_from_counts(self.counts, self.Ts, self.counts_per_rev, method=method)
 
     def dataset(self, y: ArrayLike | None = None) -> Dataset:
-        """Command and speed for `identify`; the true speed rides along as channel `speed_true`.
+        """Command and speed for `identify`; a true speed rides along as channel `speed_true`.
 
         Parameters
         ----------
@@ -84,7 +88,7 @@ class Recording:
             input_units="V",
             output_unit="RPM",
             name=self.name,
-            channels={"speed_true": self.speed_true},
+            channels={} if self.speed_true is None else {"speed_true": self.speed_true},
         )
 
     def header(self, **settings: Any) -> Header:
@@ -119,39 +123,99 @@ class Recording:
 
 
 def record(
-    machine: VirtualMachine, u: ArrayLike, *, name: str = "array", method: Method = "kalman"
+    machine: VirtualMachine | Drive,
+    u: ArrayLike,
+    *,
+    name: str = "array",
+    method: Method = "kalman",
+    file: str | os.PathLike[str] | None = None,
+    live: str | Kind = "none",
+    settings: Mapping[str, Any] | None = None,
 ) -> Recording:
     """Excite a machine from rest and record it.
 
     Parameters
     ----------
-    machine : VirtualMachine
-        Reset first, and left where the run ends.
+    machine : VirtualMachine or Drive
+        A virtual machine is reset first, and left where the run ends. A drive (`sewfast.link`)
+        waits for rest, is armed and started; its limits must have been set.
     u : array, shape (N,)
         Command [V] at the machine's sample time; see `sewfast.signals.excitation`.
     name : str
         Of the excitation, for messages and files.
     method : "kalman", "savgol" or "difference"
         How the speed is estimated from the counts.
+    file : path, optional
+        MCAP recording to write: of a drive while it runs, so that nothing is lost.
+    live : str
+        Of a drive: see `sewfast.live.open_view`.
+    settings : mapping, optional
+        What else the file says of the recording.
 
     Returns
     -------
     Recording
-        The command as given: beyond its limit the machine clips it.
+        Of a virtual machine the command as given: beyond its limit the machine clips it. Of a
+        drive the command as applied.
 
     Raises
     ------
     DataError
         Where `u` is not one-dimensional and finite, or too short for a speed.
+    LinkError
+        Where the port or the drive failed or tripped; the motor is stopped, `recording` holds what
+        came.
+    Interrupted
+        On Ctrl-C, of a drive; the motor is stopped, `best` is the recording up to there.
     """
     command = np.array(u, dtype=np.float64)
     if command.ndim != 1:
         raise DataError(
             f"expected an excitation of shape (N,), received {command.shape}; pass one column"
         )
+    if not isinstance(machine, VirtualMachine):
+        return _record_on(machine, command, name, method, file, live, settings)
     machine.reset()
     run = machine.run(command)
     y = speed_from_counts(run.counts, machine.Ts, machine.counts_per_rev, method=method)
-    return Recording(
+    made = Recording(
         command, run.counts, y, run.speed_rpm, machine.Ts, machine.counts_per_rev, name
     )
+    if file is not None:
+        made.save(file)
+    return made
+
+
+def _record_on(
+    drive: Drive,
+    command: FloatArray,
+    name: str,
+    method: Method,
+    file: str | os.PathLike[str] | None,
+    live: str | Kind,
+    settings: Mapping[str, Any] | None,
+) -> Recording:
+    from .link.plan import Plan
+    from .link.play import Played, Stopped, play
+
+    def recording(played: Played) -> Recording:
+        return _of_drive(played.columns, drive, name, method)
+
+    try:
+        plan = Plan("commands", command)
+        return recording(play(drive, plan, name=name, file=file, live=live, settings=settings))
+    except Stopped as stopped:
+        raise stopped.as_error(recording, file) from stopped.cause
+
+
+def _of_drive(
+    columns: Mapping[str, FloatArray], drive: Drive, name: str, method: Method
+) -> Recording:
+    """Counts from the first sample on; the speed as far as gaps let it be known."""
+    per_rev = drive.identity.counts_per_rev
+    counts = columns["counts"]
+    known = counts[np.isfinite(counts)]
+    counts = counts - known[0] if len(known) else counts
+    y = speed_or_nan(counts, drive.identity.Ts, per_rev, method)
+    true = columns.get("speed_true")
+    return Recording(columns["u"], counts, y, true, drive.identity.Ts, per_rev, name)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import _core
 from .errors import DataError, SettingError
+from .runs import runs
 from .units import counts_per_unit
 
 FloatArray: TypeAlias = NDArray[np.float64]
@@ -109,6 +110,48 @@ def speed_from_counts(
     raise SettingError(
         f"expected method {', '.join(get_args(Method))}, got {method!r}; choose one of them"
     )
+
+
+SHORTEST = 5
+"""Counts in a row that the Kalman smoother needs."""
+
+
+def speed_between_gaps(
+    counts: FloatArray, Ts: float, counts_per_rev: float, *, method: Method = "kalman"
+) -> FloatArray:
+    """As `speed_from_counts`, each piece between gaps (NaN) for itself.
+
+    NaN in gaps and in pieces that are too short for the method; shape (N,).
+
+    Raises
+    ------
+    DataError
+        Where no piece is long enough.
+    """
+    if not np.isnan(counts).any():
+        return speed_from_counts(counts, Ts, counts_per_rev, method=method)
+    shortest = {"kalman": SHORTEST, "savgol": 41, "difference": 2}[method]
+    pieces = [(a, n) for a, n in runs(~np.isnan(counts)) if n >= shortest]
+    if not pieces:
+        raise DataError(
+            f"expected at least {shortest} encoder counts in a row, received gaps everywhere, the "
+            f"first one at sample {int(np.argmax(np.isnan(counts)))} (0-based); record again"
+        )
+    speed = np.full(len(counts), np.nan)
+    for first, count in pieces:
+        piece = counts[first : first + count]
+        speed[first : first + count] = speed_from_counts(piece, Ts, counts_per_rev, method=method)
+    return speed
+
+
+def speed_or_nan(
+    counts: FloatArray, Ts: float, counts_per_rev: float, method: Method
+) -> FloatArray:
+    """As `speed_between_gaps`, all NaN where too little came for a speed."""
+    try:
+        return speed_between_gaps(counts, Ts, counts_per_rev, method=method)
+    except DataError:
+        return np.full(len(counts), np.nan)
 
 
 def floor_of_J(estimate: ArrayLike, truth: ArrayLike, y_scale: float = 1000.0) -> float:

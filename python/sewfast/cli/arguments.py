@@ -65,7 +65,7 @@ def add_columns(parser: argparse.ArgumentParser, *, from_model: bool) -> None:
     )
 
 
-def add_view(parser: argparse.ArgumentParser) -> None:
+def add_view(parser: argparse._ActionsContainer) -> None:
     """How a running record or run is watched: `args.live` is a `sewfast.live.Kind`."""
     parser.add_argument(
         "--live", metavar="KIND", type=_kind, default="auto",

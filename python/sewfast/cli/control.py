@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import DataError, Interrupted, SettingError
-from .arguments import TABLES, Commands, add_command, add_output, require_place
+from .arguments import RECORDINGS, TABLES, Commands, add_command, add_output, require_place
+from .drive import add_drive, is_port, opened, recording_place
 from .output import print_json, print_rows, write_columns
 from .progress import Progress
 
 if TYPE_CHECKING:
     from ..control import Controller, Gains
     from ..dataset import FloatArray
-    from ..loop import Plant
+    from ..loop import ClosedLoopRun, Plant
     from ..tuning import TuningResult
 
 FORMS = ("standard", "parallel", "per_sample")
@@ -36,9 +37,13 @@ examples:
 """
 
 RUN = """\
-Close the loop around a model or a virtual machine, with the same controller arithmetic on both.
+Close the loop around a model, a virtual machine or a drive, with the same controller arithmetic.
 
-Columns: t [s], r, u, y (the plant's true output), feedback (y after encoder and filter).
+Columns: t [s], r, u, y (the plant's true output; of a real drive the speed estimated from its
+counts), feedback (y after encoder and filter).
+
+On a drive the controller runs on the device; the run is written as MCAP while it lasts, and
+another ending of -o is made from it afterwards. Ctrl-C stops the motor and keeps the file.
 """
 
 RUN_EXAMPLES = """\
@@ -46,6 +51,8 @@ examples:
   sewfast run controller.json --on drive.json --reference trapezoid -o predicted.csv
   sewfast run controller.json --on virtual --reference trapezoid -o measured.csv
   sewfast run controller.json --on virtual:7 --reference cycle.csv --json
+  sewfast run controller.json --on /dev/ttyUSB0 --reference trapezoid -o measured.mcap \\
+      --limits volt=10,speed=3500,acceleration=30000,current=15
 """
 
 
@@ -76,14 +83,18 @@ def add(commands: Commands) -> None:
     add_output(parser, "CONTROLLER.json", "controller file to write", required=True)
     parser = add_command(
         commands, "run", run_command,
-        summary="a closed loop on a model or a machine", text=RUN, examples=RUN_EXAMPLES,
+        summary="a closed loop on a model, a machine or a drive", text=RUN, examples=RUN_EXAMPLES,
     )  # fmt: skip
     parser.add_argument("controller", metavar="CONTROLLER.json", help="file that tune wrote")
     parser.add_argument(
-        "--on", required=True, metavar="MODEL.json|virtual[:SEED]", help="what to run on"
+        "--on", required=True, metavar="MODEL.json|virtual[:SEED]|PORT", help="what to run on"
     )
     parser.add_argument("--reference", required=True, metavar="FILE|NAME", help="what to track")
-    add_output(parser, "OUT", "CSV, .npz, .mat or Parquet; default: CSV to standard output")
+    add_output(
+        parser, "OUT",
+        "CSV, .npz, .mat or Parquet, of a drive .mcap too; default: CSV to standard output",
+    )  # fmt: skip
+    add_drive(parser)
 
 
 def tune_command(args: argparse.Namespace) -> int | None:
@@ -150,18 +161,42 @@ def _gain_row(gains: Gains) -> list[str]:
     return [f"  {gains.form.replace('_', '-')}", *cells]
 
 
-def run_command(args: argparse.Namespace) -> None:
+def run_command(args: argparse.Namespace) -> int | None:
     from ..control import load_controller
     from ..loop import run
 
-    require_place(args.out, TABLES)
+    require_place(args.out, RECORDINGS if is_port(args.on) else TABLES)
     controller = load_controller(args.controller)
-    plant = _plant(args.on)
+    name = Path(args.reference).stem
+    if not is_port(args.on):
+        plant = _plant(args.on)
+        reference = _reference(args.reference, controller.Ts)
+        _show_run(args, run(controller, plant, reference, name=name), None)
+        return None
+    place = recording_place(args.out)
     reference = _reference(args.reference, controller.Ts)
-    found = run(controller, plant, reference, name=Path(args.reference).stem)
+    try:
+        with opened(args) as drive:
+            found = run(controller, drive, reference, name=name, file=place, live=args.live)
+    except Interrupted as e:
+        print(f"interrupted; {len(e.best.t)} samples are in {place}", file=sys.stderr)
+        return 130
+    _show_run(args, found, place)
+    return None
+
+
+def _show_run(args: argparse.Namespace, found: ClosedLoopRun, place: Path | None) -> None:
+    """The columns and what they say; `place` already holds those of a drive."""
     summary: dict[str, Any] = {"plant": found.plant, "reference": found.reference}
     summary |= {"unit": found.units["y"], "n": len(found.t), "Ts": found.Ts, **found.metrics()}
     lines = str(found).splitlines()
+    if place is not None and args.out == place:
+        summary["file"] = str(place)
+        if args.json:
+            print_json(summary)
+        else:
+            print("\n".join([*lines, f"written to {place}"]))
+        return
     write_columns(args.out, found.columns(), found.units, summary, lines, as_json=args.json)
 
 

@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from ..errors import Interrupted, SettingError
 from .arguments import RECORDINGS, Commands, add_command, add_output, require_place
+from .drive import add_drive, is_port, opened, recording_place
 from .output import print_json, print_rows, write_columns
+
+if TYPE_CHECKING:
+    from ..dataset import FloatArray
+    from ..recording import Recording
 
 RECORD = """\
 Excite a machine with a named signal and record what its encoder says.
@@ -13,6 +22,9 @@ Excite a machine with a named signal and record what its encoder says.
 Columns: t [s], u [V], counts, y [RPM] (the speed estimated from the counts) and, of a virtual
 machine, speed_true [RPM], which no experiment could see; it is there for scores.
 virtual:SEED is another machine of the same type.
+
+On a drive the recording is written as MCAP while it runs, so that whatever happens what came is
+kept; another ending of -o is made from it afterwards. Ctrl-C stops the motor and keeps the file.
 """
 
 RECORD_EXAMPLES = """\
@@ -20,6 +32,8 @@ examples:
   sewfast record --on virtual --signal chirp_lo_hi -o chirp.csv
   sewfast record --on virtual:7 --signal random --seed 3 -o random.parquet
   sewfast record --on virtual --signal step -o step.mcap
+  sewfast record --on /dev/ttyUSB0 --signal step -o step.mcap \\
+      --limits volt=10,speed=3500,acceleration=30000,current=15
 """
 
 SIGNALS = """\
@@ -31,9 +45,12 @@ List the named signals: excitations [V] for `record --signal`, references [RPM] 
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "record", record_command,
-        summary="a recording of the virtual machine", text=RECORD, examples=RECORD_EXAMPLES,
+        summary="a recording of a drive or of the virtual machine", text=RECORD,
+        examples=RECORD_EXAMPLES,
     )  # fmt: skip
-    parser.add_argument("--on", required=True, metavar="virtual[:SEED]", help="the machine")
+    parser.add_argument(
+        "--on", required=True, metavar="virtual[:SEED]|PORT", help="virtual machine, or drive"
+    )
     parser.add_argument(
         "--signal", required=True, metavar="NAME", help="an excitation; see `sewfast signals`"
     )
@@ -41,63 +58,96 @@ def add(commands: Commands) -> None:
         "--seed", type=int, default=0, metavar="N", help="seed of a random signal (0)"
     )
     add_output(parser, "OUT", "CSV, .npz, .mat, Parquet or .mcap; default: CSV to standard output")
+    add_drive(parser)
     add_command(
         commands, "signals", signals_command,
         summary="the named signals", text=SIGNALS, examples="example:\n  sewfast signals",
     )  # fmt: skip
 
 
-def record_command(args: argparse.Namespace) -> None:
-    import numpy as np
-
-    from ..machine import VirtualMachine
-    from ..recordfile import Header
+def record_command(args: argparse.Namespace) -> int | None:
     from ..signals import excitation
-    from ..speed import speed_from_counts
 
     require_place(args.out, RECORDINGS)
-    machine = VirtualMachine.from_name(args.on)
     u = excitation(args.signal, args.seed)
-    run = machine.run(u)
-    y = speed_from_counts(run.counts, machine.Ts, machine.counts_per_rev)
-    error = float(np.sqrt(np.mean((y - run.speed_rpm) ** 2)))
-    low, high = float(run.speed_rpm.min()), float(run.speed_rpm.max())
+    if not is_port(args.on):
+        _record_virtual(args, u)
+        return None
+    place = recording_place(args.out)
+    settings = {"signal": args.signal, "seed": args.seed}
+    try:
+        with opened(args) as drive:
+            from ..recording import record
+
+            made = record(drive, u, name=args.signal, file=place, live=args.live, settings=settings)
+            name = drive.identity.name
+    except Interrupted as e:
+        print(f"interrupted; {len(e.best)} samples are in {place}", file=sys.stderr)
+        return 130
+    _write(args, made, name, place)
+    return None
+
+
+def _record_virtual(args: argparse.Namespace, u: FloatArray) -> None:
+    from ..machine import VirtualMachine
+    from ..recording import record
+
+    if not args.on.startswith("virtual"):
+        raise SettingError(
+            f"--on {args.on}: expected virtual[:SEED], a serial port or socket://HOST:PORT, got "
+            "neither; `sewfast ports` lists the serial ports"
+        )
+    machine = VirtualMachine.from_name(args.on)
+    _write(args, record(machine, u, name=args.signal), machine.name, None)
+
+
+def _write(args: argparse.Namespace, made: Recording, machine: str, place: Path | None) -> None:
+    """The columns and what they say; `place` already holds those of a drive."""
+    from ..recording import UNITS
+
+    summary, line = _told(made, machine)
+    summary |= {"signal": args.signal, "seed": args.seed}
+    if place is not None and args.out == place:
+        if args.json:
+            print_json({**summary, "file": str(place)})
+        else:
+            print(f"{line}\nwritten to {place}")
+        return
     write_columns(
-        args.out,
-        {
-            "t": np.arange(len(u)) * machine.Ts,
-            "u": u,
-            "counts": run.counts,
-            "y": y,
-            "speed_true": run.speed_rpm,
-        },
-        {"t": "s", "u": "V", "y": "RPM", "speed_true": "RPM"},
-        {
-            "machine": machine.name,
-            "signal": args.signal,
-            "seed": args.seed,
-            "n": len(u),
-            "Ts": machine.Ts,
-            "counts_per_rev": machine.counts_per_rev,
-            "speed_min_rpm": low,
-            "speed_max_rpm": high,
-            "speed_estimate_rmse_rpm": error,
-        },
-        [
-            f"{machine.name}, {args.signal}: {len(u)} samples of {machine.Ts * 1e3:g} ms, "
-            f"{low:.0f} to {high:.0f} RPM; y is within {error:.2g} RPM rms of the true speed"
-        ],
-        as_json=args.json,
-        header=Header(
-            args.signal,
-            machine.Ts,
-            {"u": "V", "counts": "1", "y": "RPM", "speed_true": "RPM"},
-            len(u),
-            machine.counts_per_rev,
-            {"kind": "virtual", "name": machine.name},
-            {"signal": args.signal, "seed": args.seed},
-        ),
+        args.out, made.columns(), UNITS, summary, [line], as_json=args.json,
+        header=made.header(signal=args.signal, seed=args.seed),
+    )  # fmt: skip
+
+
+def _told(made: Recording, machine: str) -> tuple[dict[str, Any], str]:
+    """A recording in numbers and in a line."""
+    import numpy as np
+
+    speed = made.y if made.speed_true is None else made.speed_true
+    known = speed[np.isfinite(speed)]
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    missing = int(np.count_nonzero(np.isnan(made.u)))
+    summary: dict[str, Any] = {
+        "machine": machine,
+        "n": len(made),
+        "missing": missing,
+        "Ts": made.Ts,
+        "counts_per_rev": made.counts_per_rev,
+        "speed_min_rpm": low,
+        "speed_max_rpm": high,
+    }
+    line = (
+        f"{machine}, {made.name}: {len(made)} samples of {made.Ts * 1e3:g} ms, "
+        f"{low:.0f} to {high:.0f} RPM"
     )
+    if missing:
+        line += f"; {missing} samples were lost on the way (NaN)"
+    if made.speed_true is not None:
+        error = made.y - made.speed_true
+        rmse = float(np.sqrt(np.nanmean(error**2)))
+        summary["speed_estimate_rmse_rpm"] = rmse
+        line += f"; y is within {rmse:.2g} RPM rms of the true speed"
+    return summary, line
 
 
 def signals_command(args: argparse.Namespace) -> None:

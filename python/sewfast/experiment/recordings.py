@@ -63,11 +63,13 @@ def closed_loop(machine: VirtualMachine, controller: Controller) -> Recording:
 
 def speed_numbers(recording: Recording) -> dict[str, dict[str, float]]:
     """Error and floor of J of each way to a speed, against the true one."""
+    true = recording.speed_true
+    assert true is not None, "of a virtual machine"
     estimates = {m: recording.speed(m) for m in _METHODS}
     return {
         method: {
-            "rmse_rpm": float(np.sqrt(np.mean((y - recording.speed_true) ** 2))),
-            "cost_floor": floor_of_J(y, recording.speed_true),
+            "rmse_rpm": float(np.sqrt(np.mean((y - true) ** 2))),
+            "cost_floor": floor_of_J(y, true),
         }
         for method, y in estimates.items()
     }

@@ -10,13 +10,9 @@ import numpy as np
 
 from ..dataset import Dataset, Experiment, FloatArray
 from ..errors import DataError, SettingError
-from ..runs import runs
 from .files import read_table
 from .table import Table
 from .timebase import sample_time
-
-SHORTEST = 5
-"""Counts in a row that the Kalman smoother needs; the speed of a shorter piece is NaN."""
 
 
 def read(
@@ -133,7 +129,7 @@ def _require_length(table: Table, name: str, column: FloatArray, other: str, n: 
 
 
 def _speed(table: Table, column: str, counts_per_rev: float, Ts: float) -> FloatArray:
-    from ..speed import speed_from_counts
+    from ..speed import speed_between_gaps
 
     counts = table[column]
     bad = np.flatnonzero(np.isinf(counts))
@@ -142,20 +138,10 @@ def _speed(table: Table, column: str, counts_per_rev: float, Ts: float) -> Float
             f"{table.path}: column {column!r}: expected encoder counts, received "
             f"{counts[bad[0]]} at {table.row(int(bad[0]))}"
         )
-    if not np.isnan(counts).any():
-        return speed_from_counts(counts, Ts=Ts, counts_per_rev=counts_per_rev)
-    pieces = [(a, n) for a, n in runs(~np.isnan(counts)) if n >= SHORTEST]
-    if not pieces:
-        k = int(np.argmax(np.isnan(counts)))
-        raise DataError(
-            f"{table.path}: column {column!r}: expected at least {SHORTEST} encoder counts in a "
-            f"row, received gaps everywhere, the first one at {table.row(k)}; record again"
-        )
-    speed = np.full(len(counts), np.nan)
-    for first, count in pieces:
-        piece = counts[first : first + count]
-        speed[first : first + count] = speed_from_counts(piece, Ts, counts_per_rev)
-    return speed
+    try:
+        return speed_between_gaps(counts, Ts, counts_per_rev)
+    except DataError as e:
+        raise DataError(f"{table.path}: column {column!r}: {e}") from e
 
 
 def parse_source(text: str) -> tuple[str, tuple[str, ...] | None, str | None]:

@@ -50,7 +50,6 @@ pub(super) struct State {
     pub start: i64,
     pub deadline: u64,
     pub next: usize,
-    pub awaited: bool,
     pub newest: Option<i64>,
     pub used: Option<i64>,
     pub heard: u64,
@@ -93,7 +92,6 @@ impl HostLoop {
             start: 0,
             deadline: 0,
             next: 0,
-            awaited: false,
             newest: None,
             used: None,
             heard: 0,
@@ -228,7 +226,9 @@ impl State {
             return Some((header, self.request.body));
         }
         if self.phase == Phase::Starting && now >= self.keep_due() {
-            return Some(self.keep(now));
+            let mut body = Body::new();
+            body.u32(self.settings.watchdog);
+            return Some((self.heartbeat(kind::KEEP, now), body));
         }
         None
     }
@@ -258,7 +258,8 @@ impl State {
         self.next += missed.min(left);
         self.deadline = now - late % period + period;
         let Some(&r) = self.reference.get(self.next) else {
-            return self.await_end(now);
+            self.stop(Outcome::Completed);
+            return self.ask(now);
         };
         if now.saturating_sub(self.heard) > u64::from(self.settings.watchdog) {
             self.stop(Outcome::Silent);
@@ -269,22 +270,6 @@ impl State {
         let mut body = Body::new();
         body.u32(self.settings.watchdog).f32(u as f32);
         Some((self.heartbeat(kind::DRIVE, now), body))
-    }
-
-    /// The device's last sample comes up to a period after the host's last tick: one more period is its own to end the run.
-    fn await_end(&mut self, now: u64) -> Said {
-        if self.awaited {
-            self.stop(Outcome::Completed);
-            return self.ask(now);
-        }
-        self.awaited = true;
-        Some(self.keep(now))
-    }
-
-    fn keep(&mut self, now: u64) -> (Header, Body) {
-        let mut body = Body::new();
-        body.u32(self.settings.watchdog);
-        (self.heartbeat(kind::KEEP, now), body)
     }
 
     /// The command for this tick, from the speed over the newest period; without a new sample the last command stays.

@@ -1,0 +1,204 @@
+"""`play`: a plan on a drive, into memory or a recording file, in front of a live view."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..dataset import FloatArray
+from ..errors import Interrupted, LinkError, SewfastError
+from ..live import Feed, Kind, open_view
+from ..recordfile import Header, RecordWriter, read_recording
+from .drive import Drive
+from .plan import Outcome, Plan
+from .recorder import Recorder
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """What came of a plan.
+
+    Attributes
+    ----------
+    columns : dict of name to array, shape (N,)
+        Row k is sample k of the run; NaN where the link lost it. N is what the device took, the
+        planned number after a whole run.
+    outcome : Outcome
+        How it ended.
+    """
+
+    columns: dict[str, FloatArray]
+    outcome: Outcome
+
+
+class Stopped(Exception):
+    """A run that did not end by itself: `cause` stopped it, `played` is what had come."""
+
+    def __init__(self, played: Played, cause: BaseException) -> None:
+        super().__init__(str(cause))
+        self.played = played
+        self.cause = cause
+
+    def as_error(
+        self, made: Callable[[Played], Any], file: str | os.PathLike[str] | None
+    ) -> BaseException:
+        """`Interrupted` after Ctrl-C, else the cause; both carry what `made` makes of the run."""
+        result = made(self.played)
+        if isinstance(self.cause, KeyboardInterrupt):
+            return Interrupted(result)
+        kept = f"; what came is in {file}" if file is not None else ""
+        error = LinkError(f"{self.cause}{kept}") if kept else self.cause
+        if isinstance(error, LinkError):
+            error.recording = result
+        return error
+
+
+def play(
+    drive: Drive,
+    plan: Plan,
+    *,
+    name: str,
+    file: str | os.PathLike[str] | None = None,
+    live: str | Kind = "none",
+    overwrite: bool = True,
+    settings: Mapping[str, Any] | None = None,
+) -> Played:
+    """Run a plan and keep its samples.
+
+    Parameters
+    ----------
+    drive : Drive
+    plan : Plan
+    name : str
+        Of the excitation or reference.
+    file : path, optional
+        An MCAP recording, written as the samples come; without it they are in memory only.
+    live : str or Kind
+        See `sewfast.live.open_view`.
+    overwrite : bool
+        Whether an existing file may be replaced.
+    settings : mapping, optional
+        What else the file says of the run.
+
+    Raises
+    ------
+    Stopped
+        Where port, device, disk or Ctrl-C ended it; the motor has been stopped and the file closed.
+    LinkError
+        Where the device tripped; the message has the reason and names the file.
+    SettingError, DataError
+        Before anything moves.
+    """
+    columns = drive.columns(plan)
+    n = len(plan.values)
+    feed = Feed(columns, drive.identity.Ts, n, name, counts_per_rev=_counts_per_rev(drive))
+    with ExitStack() as open_things:
+        open_things.enter_context(open_view(live, feed))
+        writer = _writer(file, drive, plan, name, columns, overwrite, settings or {})
+        recorder = Recorder(columns, n, writer=writer, feed=feed)
+        played = _streamed(drive, plan, recorder, writer)
+    if played.outcome.reason != "finished":
+        raise Stopped(played, LinkError(_not_finished(played.outcome, n)))
+    return played
+
+
+def _counts_per_rev(drive: Drive) -> float | None:
+    return drive.identity.counts_per_rev or None
+
+
+def _writer(
+    file: str | os.PathLike[str] | None,
+    drive: Drive,
+    plan: Plan,
+    name: str,
+    columns: Mapping[str, str],
+    overwrite: bool,
+    settings: Mapping[str, Any],
+) -> RecordWriter | None:
+    if file is None:
+        return None
+    identity = drive.identity
+    controller = {} if plan.controller is None else {"controller": plan.controller.to_dict()}
+    header = Header(
+        name=name,
+        Ts=identity.Ts,
+        columns={column: unit or "1" for column, unit in columns.items()},
+        n=len(plan.values),
+        counts_per_rev=_counts_per_rev(drive),
+        device={"kind": "drive", **asdict(identity)},
+        settings={
+            "mode": plan.mode,
+            "limits": _finite(drive.limits().values),
+            "watchdog_s": drive.watchdog,
+            **controller,
+            **settings,
+        },
+    )
+    return RecordWriter(Path(file), header, overwrite=overwrite)
+
+
+def _finite(limits: tuple[float, ...]) -> dict[str, float | None]:
+    names = ("volt", "speed_rpm", "acceleration", "current")
+    pairs = zip(names, limits, strict=True)
+    return {name: value if np.isfinite(value) else None for name, value in pairs}
+
+
+def _streamed(drive: Drive, plan: Plan, recorder: Recorder, writer: RecordWriter | None) -> Played:
+    """Stream, close the file whatever happens, and give what came."""
+    try:
+        outcome = drive.stream(plan, recorder)
+    except BaseException as error:
+        ended = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        _closed(recorder, ended, error)
+        if not isinstance(error, (KeyboardInterrupt, SewfastError)) or drive.outcome is None:
+            raise
+        raise Stopped(_played(recorder, writer, drive.outcome), error) from error
+    recorder.close(_word(outcome))
+    return _played(recorder, writer, outcome)
+
+
+def _closed(recorder: Recorder, ended: str, error: BaseException) -> None:
+    """Close the file; the error that is on its way says more than one of closing."""
+    try:
+        recorder.close(ended)
+    except SewfastError as second:
+        if second is not error:
+            error.__context__ = second
+
+
+def _word(outcome: Outcome) -> str:
+    """How the recording says that it ended."""
+    if outcome.reason == "finished":
+        return "complete"
+    return f"tripped: {outcome.reason}" if outcome.state == "tripped" else outcome.reason
+
+
+def _played(recorder: Recorder, writer: RecordWriter | None, outcome: Outcome) -> Played:
+    columns = dict(read_recording(writer.path).columns) if writer else recorder.columns()
+    n = outcome.taken if outcome.taken is not None else len(next(iter(columns.values())))
+    return Played({name: _padded(values, n) for name, values in columns.items()}, outcome)
+
+
+def _padded(values: FloatArray, n: int) -> FloatArray:
+    """NaN for samples at the end that the device took and the link lost."""
+    if len(values) >= n:
+        return values
+    padded = np.full(n, np.nan)
+    padded[: len(values)] = values
+    return padded
+
+
+def _not_finished(outcome: Outcome, n: int) -> str:
+    came = f"{outcome.received} of {n} samples came"
+    if outcome.state == "tripped":
+        return (
+            f"expected the run to finish, the device tripped: {outcome.reason}; its output is safe "
+            f"and {came}; find out why, then clear it (sewfast clear PORT)"
+        )
+    return f"expected the run to finish, the device ended it ({outcome.reason}); {came}"
