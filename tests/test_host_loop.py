@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import signal
+import threading
+import time
 import tty
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from link_device import ARM, DRIVE, START, STOP, ScriptedDevice
 from sewfast import Controller, Gains, _core
-from sewfast.errors import SettingError
+from sewfast.errors import Interrupted, LinkError, SettingError
+from sewfast.link import Drive, HostLoopRun, Jitter, at_period, connect, run_on_host
 
-CONTROLLER = Controller(
-    Gains.standard(0.004, 0.15, 0.0), Ts=0.01, u_min=-10.0, u_max=10.0, counts_per_rev=1572
-)
+pytest.importorskip("serial", reason="opens pseudo-terminals as serial ports")
+
+# the scripted device's motor moves u counts a sample: 38.2 u RPM
+CONTROLLER = Controller(Gains.standard(0.005, 0.1), Ts=0.01, u_min=-10.0, u_max=10.0)
 
 
 @pytest.fixture
@@ -30,6 +39,20 @@ def terminal() -> Iterator[tuple[int, int]]:
             os.close(descriptor)
 
 
+@pytest.fixture
+def device(tmp_path: Path) -> Iterator[ScriptedDevice]:
+    with ScriptedDevice(tmp_path) as served:
+        yield served
+
+
+@pytest.fixture
+def drive(device: ScriptedDevice) -> Iterator[Drive]:
+    connected = connect(device.url, watchdog=0.2)
+    connected.set_limits()
+    yield connected
+    connected.close()
+
+
 def _host_loop(port: int, **changed: Any) -> dict[str, Any]:
     settings: dict[str, Any] = {
         "tag": 1, "command": 0, "heartbeat": 0, "device_period": 1000, "ratio": 10,
@@ -40,12 +63,12 @@ def _host_loop(port: int, **changed: Any) -> dict[str, Any]:
 
 def test_a_device_that_is_not_there_is_an_outcome(terminal: tuple[int, int]) -> None:
     found = _host_loop(terminal[1])
-    assert found["outcome"] == {"name": "unanswered", "command": 0x05}
+    assert found["outcome"] == {"name": "unanswered", "command": ARM}
     assert not found["stopped"]
     assert len(found["times"]) == 0
     assert found["sequences"] == (2, 0)
     frames = os.read(terminal[0], 4096).split(b"\0")
-    assert len(frames) == 21, "ten times ARM, ten times STOP"
+    assert len(frames) == 111, "ten times ARM, a hundred times STOP"
 
 
 def test_a_port_that_vanishes_is_an_outcome(terminal: tuple[int, int]) -> None:
@@ -60,3 +83,192 @@ def test_refuses_what_cannot_run(terminal: tuple[int, int]) -> None:
         _host_loop(terminal[1], watchdog=5000)
     with pytest.raises(SettingError, match="an open port"):
         _host_loop(-1)
+
+
+def test_runs_the_reference_and_gives_the_session_back(
+    drive: Drive, device: ScriptedDevice
+) -> None:
+    r = np.full(60, 190.8)
+    run = run_on_host(drive, CONTROLLER, r, columns=["speed_true"], batch=11)
+    assert run.outcome == "completed"
+    assert run.is_complete
+    assert run.taken == 600
+    assert run.stop_confirmed
+    assert np.array_equal(run.samples["t"], np.arange(600) / 1000)
+    assert set(run.samples) == {"t", "counts", "u", "speed_true"}
+    assert run.sample_units["u"] == "V"
+    # what was said was applied, rounded to the channel's steps
+    said = run.u[np.isfinite(run.u)]
+    assert set(np.round(run.samples["u"], 3)) <= {0.0, *np.round(said, 3)}
+    assert len(run.jitter.late) + run.jitter.missed == 59
+    assert [kind for kind, _ in device.executed if kind in (ARM, START, STOP)] == [ARM, START, STOP]
+    assert sum(kind == DRIVE for _, kind in device.arrived) == len(said)
+    assert drive.status().state == "idle"
+    assert run_on_host(drive, CONTROLLER, r).outcome == "completed", "the session goes on"
+
+
+def test_a_trip_is_an_outcome_with_its_reason(drive: Drive, device: ScriptedDevice) -> None:
+    threading.Timer(0.15, lambda: device.do(lambda: device.trip(2, 3100.0))).start()
+    run = run_on_host(drive, CONTROLLER, np.full(400, 100.0))
+    assert run.outcome == "tripped"
+    assert "speed at 3100" in run.message
+    assert 0 < len(run.t) < 400
+    assert run.taken == len(run.samples["t"])
+
+
+def test_a_device_that_falls_silent_is_stopped(drive: Drive, device: ScriptedDevice) -> None:
+    def mute() -> None:
+        device.mangle = lambda kind, wire: [] if kind == 0xC0 else [wire]
+
+    threading.Timer(0.15, lambda: device.do(mute)).start()
+    run = run_on_host(drive, CONTROLLER, np.full(400, 100.0), watchdog=0.1)
+    assert run.outcome == "silent"
+    assert run.stop_confirmed
+    assert device.state == 1
+    [(first, count)] = run.gaps
+    assert first == len(run.samples["t"])
+    assert first + count == run.taken
+
+
+def test_lost_samples_are_gaps_and_the_loop_goes_on(drive: Drive, device: ScriptedDevice) -> None:
+    batches = iter(range(10_000))
+    device.mangle = lambda kind, wire: [] if kind == 0xC0 and next(batches) in (3, 4, 9) else [wire]
+    run = run_on_host(drive, CONTROLLER, np.full(40, 100.0))
+    assert run.outcome == "completed"
+    assert run.gaps == ((30, 20), (90, 10))
+    assert not run.is_complete
+    assert "20 from sample 30, 10 from sample 90" in str(run)
+    assert run.jitter.blind >= 2
+
+
+def test_a_port_that_vanishes_in_the_run_keeps_the_samples(
+    drive: Drive, device: ScriptedDevice
+) -> None:
+    threading.Timer(0.2, lambda: device.do(device.wire.unplug)).start()
+    run = run_on_host(drive, CONTROLLER, np.full(400, 100.0))
+    assert run.outcome == "port_lost"
+    assert len(run.samples["t"]) > 50
+    assert run.taken is None
+    assert "watchdog stops the motor" in run.message
+
+
+def test_a_reset_ends_the_run(drive: Drive, device: ScriptedDevice) -> None:
+    threading.Timer(0.2, lambda: device.do(device.reset)).start()
+    assert run_on_host(drive, CONTROLLER, np.full(400, 100.0)).outcome == "reset"
+
+
+def test_ctrl_c_stops_within_a_tenth_and_keeps_the_run(
+    drive: Drive, device: ScriptedDevice
+) -> None:
+    pressed: list[float] = []
+
+    def press() -> None:
+        pressed.append(time.monotonic())
+        signal.raise_signal(signal.SIGINT)
+
+    # a period of half a second: the loop must not wait for its deadline
+    slow = replace(CONTROLLER, Ts=0.5)
+    threading.Timer(0.7, press).start()
+    with pytest.raises(Interrupted) as caught:
+        run_on_host(drive, slow, np.full(40, 100.0))
+    [stopped] = [at for at, kind in device.arrived if kind == STOP]
+    assert stopped - pressed[0] < 0.1
+    run = caught.value.best
+    assert isinstance(run, HostLoopRun)
+    assert run.outcome == "interrupted"
+    assert len(run.samples["t"]) == run.taken
+
+
+def test_a_refusal_says_what_to_do(device: ScriptedDevice) -> None:
+    with contextlib.closing(connect(device.url)) as drive, pytest.raises(LinkError, match="limits"):
+        run_on_host(drive, CONTROLLER, np.full(10, 100.0))
+
+
+def test_refuses_before_anything_moves(drive: Drive, device: ScriptedDevice) -> None:
+    with pytest.raises(SettingError, match="at_period"):
+        run_on_host(drive, replace(CONTROLLER, Ts=0.001), np.full(10, 100.0))
+    with pytest.raises(SettingError, match="whole number"):
+        run_on_host(drive, replace(CONTROLLER, Ts=0.0105), np.full(10, 100.0))
+    volts = replace(CONTROLLER, gains=Gains.standard(0.005, 0.1, u_unit="A"))
+    with pytest.raises(SettingError, match="command is in V"):
+        run_on_host(drive, volts, np.full(10, 100.0))
+    assert ARM not in [kind for kind, _ in device.executed]
+
+
+def test_a_device_on_credit_is_refused(tmp_path: Path) -> None:
+    with (
+        ScriptedDevice(tmp_path, capabilities=0b101111) as device,
+        contextlib.closing(connect(device.url)) as drive,
+        pytest.raises(SettingError, match="without --fast"),
+    ):
+        run_on_host(drive, CONTROLLER, np.full(10, 100.0))
+
+
+def test_named_references_are_taken_at_the_loops_period(drive: Drive) -> None:
+    run = run_on_host(drive, replace(CONTROLLER, Ts=0.05), "trapezoid")
+    assert run.reference == "trapezoid"
+    assert len(run.r) == 30
+    assert run.r[0] == 0.0
+    assert run.r.max() == pytest.approx(3000.0)
+
+
+def test_a_wish_for_real_time_is_answered_either_way(drive: Drive) -> None:
+    run = run_on_host(drive, CONTROLLER, np.full(10, 0.0), real_time=True)
+    told = run.jitter.real_time
+    assert "SCHED_FIFO" in told or "refused" in told or "not offered" in told
+    assert "memory" in told
+    if hasattr(os, "sched_getscheduler"):
+        assert os.sched_getscheduler(0) == os.SCHED_OTHER, "given back"
+
+
+def test_a_controller_at_another_period_averages_over_the_same_time() -> None:
+    fast = Controller(Gains.per_sample(0.02, 0.0002, 0.5, Ts=0.001), filter_samples=40)
+    slow = at_period(fast, 0.01)
+    assert (slow.Ts, slow.filter_samples) == (0.01, 4)
+    assert slow.gains.to("standard") == fast.gains.to("standard")
+    assert "made for 0.001 s" in slow.notes
+    assert at_period(fast, 0.1).filter_samples == 1
+
+
+def _jitter(**changed: Any) -> Jitter:
+    values: dict[str, Any] = {
+        "late": np.array([0.0, 40.0, 60.0, 70.0, 2500.0]),
+        "age": np.array([np.nan, 3000.0, 4000.0, 5000.0, 2e7]), "period": 1e4, "missed": 2,
+        "blind": 1, "unsent": 0, "round_trip": 310.0, "device_late": 12, "real_time": "ordinary",
+    }  # fmt: skip
+    return Jitter(**values | changed)
+
+
+def test_the_histogram_holds_every_tick_once() -> None:
+    histogram = _jitter().histogram()
+    edges, late, age = histogram["edges_us"], histogram["late"], histogram["age"]
+    assert len(edges) == len(late) + 1
+    assert late.sum() == 5
+    assert age.sum() == 4
+    assert late[0] == 1, "below the first bin"
+    assert age[-1] == 1, "beyond the last one"
+    assert late[np.searchsorted(edges, 2500.0) - 1] == 1
+
+
+def test_percentiles_are_times_that_were_measured() -> None:
+    late = np.arange(1.0, 1001.0)
+    found = _jitter(late=late).percentiles()["late_us"]
+    assert found == {"median": 501.0, "p99": 991.0, "p999": 1000.0, "worst": 1000.0}
+
+
+def test_jitter_prints_and_serialises_even_without_ticks() -> None:
+    text = str(_jitter())
+    assert "missed deadlines 2, ticks without a new sample 1" in text
+    assert "2.5 ms" in text
+    assert "no bounds" in text
+    empty = _jitter(late=np.empty(0), age=np.empty(0), round_trip=None)
+    assert "0 us" not in str(empty).splitlines()[2]
+    told = json.loads(json.dumps(empty.to_dict(), allow_nan=False))
+    assert told["late_us"]["worst"] is None
+
+
+def test_jitter_draws_both_histograms(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    path = tmp_path / "jitter.png"
+    _jitter().plot(path)
+    assert path.read_bytes().startswith(b"\x89PNG")

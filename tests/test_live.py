@@ -319,6 +319,10 @@ def test_panels_put_the_reference_behind_the_speed() -> None:
         ({"u": "V", "counts": ""}, [["u"]]),
         ({"u": "V", "current": "A", "y": "rad/s"}, [["u"], ["current"]]),
         ({"t": "s", "u": "V", "r": "rad/s", "y": "rad/s"}, [["u"], ["y", "r"]]),
+        (
+            {"counts": "", "u": "V", "feedback": "RPM", "r": "RPM", "speed": "RPM"},
+            [["u"], ["speed", "r"]],
+        ),
         ({"counts": ""}, [["counts"]]),
         ({"u": "V", "y": "V"}, [["u", "y"]]),
     ],

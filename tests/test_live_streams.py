@@ -7,6 +7,7 @@ import os
 import re
 import socket
 import struct
+import subprocess
 import sys
 import threading
 import time
@@ -205,7 +206,9 @@ def test_foxglove_client_receives_samples_and_status() -> None:
 
     with (
         open_view("foxglove:0", f) as view,
-        connect(f"ws://127.0.0.1:{view.port}", subprotocols=["foxglove.sdk.v1"]) as client,
+        connect(
+            f"ws://127.0.0.1:{view.port}", subprotocols=["foxglove.sdk.v1"], close_timeout=1
+        ) as client,
     ):
         while len(topics) < 2:
             message = json.loads(client.recv(timeout=10))
@@ -274,6 +277,32 @@ def test_foxglove_client_that_never_reads_holds_nothing_up() -> None:
         began = time.monotonic()
     assert time.monotonic() - began < 5
     assert grown < 10e6
+
+
+HANGING = """
+import sys, time, numpy as np
+from sewfast.live import Feed, open_view
+feed = Feed({f"column_{k:02}_of_a_rather_wide_record": "V" for k in range(60)}, 0.001, None, "x")
+with open_view("foxglove:0", feed) as view:
+    print(view.port, flush=True)
+    sys.stdin.readline()
+    for first in range(0, 8000, 10):
+        feed.put(first, {name: np.random.normal(size=10) for name in feed.columns})
+        time.sleep(0.002)
+"""
+
+
+def test_program_ends_beside_a_foxglove_client_that_never_reads() -> None:
+    pytest.importorskip("foxglove", reason="needs the foxglove extra")
+    with subprocess.Popen(
+        [sys.executable, "-c", HANGING], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as program:
+        assert program.stdin is not None
+        assert program.stdout is not None
+        with subscribe(int(program.stdout.readline())):
+            program.stdin.write("\n")
+            program.stdin.flush()
+            assert program.wait(30) == 0
 
 
 def test_foxglove_port_that_is_taken_is_refused() -> None:

@@ -15,11 +15,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from recordings_made import SOAK, Made, header, make
 from sewfast.errors import DataError
 from sewfast.recordfile import RecordedFile, RecordWriter, read_recording
 from sewfast.recordfile.container import Assembler, Message, opening
+from sewfast.recordfile.curves import _groups
 from sewfast.recordfile.reader import decode_recording
 from sewfast.recordfile.topics import Topic
 
@@ -211,6 +214,61 @@ def test_an_account_that_does_not_fit_is_damage(account: dict[str, object]) -> N
     found = decode(forged.raw)
     assert len(found) == 2
     assert any(str(account["end"]) in d or str(account["received"]) in d for d in found.damage)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=8,
+)
+KEYS = st.sampled_from(
+    ["index", "t", "u", "kind", "detail", "elapsed", "outcome", "received", "end", "gaps", "name",
+     "Ts", "columns", "n", "counts_per_rev", "device", "settings", "started"]
+)  # fmt: skip
+
+
+@settings(max_examples=2000 if SOAK else 60, deadline=None)
+@given(
+    topics=st.lists(st.tuples(st.sampled_from(Topic), st.dictionaries(KEYS, JSON)), max_size=4),
+    change=st.dictionaries(KEYS, JSON, max_size=2),
+)
+def test_no_content_makes_the_reader_fail(
+    topics: list[tuple[Topic, dict[str, object]]], change: dict[str, object]
+) -> None:
+    """Whatever the messages hold: a recording that can be printed and exported, or a refusal."""
+    forged = Forged({"u": "V"})
+    forged.raw = opening()
+    first = {**json.loads(header(columns={"u": "V"}).encode()), **change}
+    for topic, content in [(Topic.HEADER, first), (Topic.SAMPLES, GOOD), *topics]:
+        forged.add(topic, json.dumps(content).encode())
+    try:
+        found = decode(forged.raw)
+    except DataError:
+        return
+    str(found).encode()
+    assert all(np.isfinite(c[c == c]).all() for c in found.columns.values())
+    assert sum(len(list(group)) for group in _groups(found)) >= 3
+
+
+@settings(max_examples=2000 if SOAK else 60, deadline=None)
+@given(st.binary(), st.binary(max_size=300))
+def test_no_bytes_make_the_reader_fail(made: Made, junk: bytes, tail: bytes) -> None:
+    with pytest.raises(DataError):
+        decode(junk)
+    whole = decode(made.raw + tail)
+    assert whole.received == 980
+    assert (whole.damage == ()) == (tail == b"")
+    at = len(made.raw) // 2
+    assert decode(made.raw[:at] + tail + made.raw[at:]).received >= 880
+
+
+def test_a_file_cannot_steer_the_terminal(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with RecordWriter(path, header(device={"name": "\x1b[2J\n"})) as writer:
+        writer.event("a\x07")
+    assert read_recording(path).header.device["name"] == "\x1b[2J\n"
+    assert "name: \\x1b[2J\\n" in str(read_recording(path))
+    assert "\x07" not in str(read_recording(path))
 
 
 def test_repeated_samples_are_left_out() -> None:

@@ -2,6 +2,8 @@
 
 from .clock import ClockBounds
 from .drive import Drive, connect
+from .host_loop import HostLoopRun, at_period, run_on_host
+from .jitter import Jitter
 from .plan import Layout, Outcome, Plan, Sink
 from .ports import Port, PortInfo, list_ports, open_port
 from .virtual import VirtualDevice
@@ -12,7 +14,9 @@ __all__ = [
     "ClockBounds",
     "Drive",
     "Event",
+    "HostLoopRun",
     "Identity",
+    "Jitter",
     "Layout",
     "Limits",
     "Outcome",
@@ -22,7 +26,9 @@ __all__ = [
     "Sink",
     "Status",
     "VirtualDevice",
+    "at_period",
     "connect",
     "list_ports",
     "open_port",
+    "run_on_host",
 ]

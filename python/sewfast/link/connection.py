@@ -5,7 +5,8 @@ from __future__ import annotations
 import secrets
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from .. import _core
@@ -37,6 +38,15 @@ class _Command:
     first_sent: float
     last_sent: float
     reply: Reply | None = None
+
+
+@dataclass
+class Loan:
+    """A port and its session in other hands: the descriptor and the last numbers used."""
+
+    descriptor: int
+    command: int
+    heartbeat: int
 
 
 class Connection:
@@ -272,6 +282,18 @@ class Connection:
                 self.port.write(frame)
             except LinkError as error:
                 self._failed = error
+
+    @contextmanager
+    def lent(self) -> Iterator[Loan]:
+        """The port and the session's numbers for someone else, who leaves those he reached."""
+        loan = Loan(self.port.fileno(), self._sequence, self._beats)
+        self._command = None
+        try:
+            yield loan
+        finally:
+            self._sequence, self._beats = loan.command, loan.heartbeat
+            # what the device has sent meanwhile is not missing
+            self.receiver = _core.LinkReceiver()
 
     # --- greeting and return --------------------------------------------------------------------
 

@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 import threading
 import time
+from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import Literal
 
 from ..control import Controller
 from ..errors import LinkError, SettingError
-from ..gains import real
+from ..gains import Gains, real
 from ..units import counts_per_unit
 from . import profile as profiles
 from . import wire
 from .clock import ClockBounds
-from .connection import Connection, DeviceReset
+from .connection import Connection, DeviceReset, Loan
 from .plan import Layout, Outcome, Plan, Sink, layout, require_capable
 from .ports import open_port
 from .run import Run
@@ -158,10 +159,7 @@ class Drive:
         SettingError
             Where sample time or units are not the device's.
         """
-        units = {c.name: c.unit for c in self.channels}
-        gains = controller.gains.to("standard")
-        _require_units(gains.u_unit, units.get("u", ""), "command")
-        _require_units(gains.y_unit, units.get("feedback", "RPM"), "output")
+        gains = self._fitting(controller)
         scale = counts_per_unit(self.identity.counts_per_rev, gains.y_unit)
         c = controller
         values = (
@@ -257,11 +255,6 @@ class Drive:
         self._require_idle()
         return {c.name: c.unit for c in self.layout(plan).channels}
 
-    @property
-    def watchdog(self) -> float:
-        """Time after which the device stops a motor whose host has fallen silent [s]."""
-        return self._link.watchdog
-
     # --- runs -------------------------------------------------------------------------------------
 
     def stream(self, plan: Plan, sink: Sink, *, cancel: threading.Event | None = None) -> Outcome:
@@ -314,6 +307,40 @@ class Drive:
         self.wait_for_rest()
         self.outcome = None
         return Run(self._link, plan, streamed, profile, sink)
+
+    def prepare_direct(self, plan: Plan, controller: Controller) -> Layout:
+        """Everything before a run whose commands `controller` decides elsewhere, up to rest.
+
+        Raises
+        ------
+        SettingError
+            Where the device does not take commands, or the controller is in other units.
+        LinkError
+            Where the device is not idle or its motor does not rest.
+        """
+        require_capable(plan, self.identity)
+        self._fitting(controller)
+        streamed = self.layout(plan)
+        self._require_idle()
+        self.wait_for_rest()
+        return streamed
+
+    def lent(self) -> AbstractContextManager[Loan]:
+        """The port and the session's numbers, for a loop that the interpreter has no part in."""
+        return self._link.lent()
+
+    @property
+    def watchdog(self) -> float:
+        """Time that the device goes on without a word from here [s]."""
+        return self._link.watchdog
+
+    def _fitting(self, controller: Controller) -> Gains:
+        """The controller's gains in standard form, which must be in the device's units."""
+        units = {c.name: c.unit for c in self.channels}
+        gains = controller.gains.to("standard")
+        _require_units(gains.u_unit, units.get("u", ""), "command")
+        _require_units(gains.y_unit, units.get("feedback", "RPM"), "output")
+        return gains
 
     def _profile_of(self, plan: Plan) -> profiles.Profile | None:
         if plan.mode == "direct":

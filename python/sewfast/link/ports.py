@@ -61,6 +61,16 @@ class Port(ABC):
         """
 
     @abstractmethod
+    def fileno(self) -> int:
+        """Its descriptor, for who reads and writes without the interpreter.
+
+        Raises
+        ------
+        LinkError
+            Where it is closed.
+        """
+
+    @abstractmethod
     def close(self) -> None:
         """Give it back; more than once does no harm, and nothing is raised."""
 
@@ -121,6 +131,9 @@ class SerialPort(Port):
         except FAILURES as error:
             raise explain(self.url, "write", error) from error
 
+    def fileno(self) -> int:
+        return int(_require(self._serial).fileno())
+
     def close(self) -> None:
         if self._serial is not None:
             # a port that has vanished cannot be given back
@@ -167,6 +180,9 @@ class SocketPort(Port):
                 connection.setblocking(False)
         except FAILURES as error:
             raise explain(self.url, "write", error) from error
+
+    def fileno(self) -> int:
+        return int(_require(self._socket).fileno())
 
     def close(self) -> None:
         if self._socket is not None:

@@ -81,6 +81,8 @@ class FoxgloveView:
                 _send(tail, drive, log)
             _send(tail, drive, log)
         finally:
+            # waits for a client that does not read, for as long as that stays connected: it must
+            # not be called from the thread that owns the link
             self._server.stop()
 
     def _channel(self, topic: str, name: str, schema: dict[str, Any]) -> Any:

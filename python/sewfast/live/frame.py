@@ -74,9 +74,15 @@ def panels(columns: Mapping[str, str]) -> list[Panel]:
 
 
 def _panel(drawn: Mapping[str, str], unit: str) -> Panel:
+    """The curves of one unit, a reference behind the others.
+
+    Beside the derived speed there is only its reference: what a device says of the same speed
+    would hide both.
+    """
     names = [name for name, of in drawn.items() if of == unit]
-    # a reference is drawn behind what follows it, and the derived speed is what follows
-    names.sort(key=lambda name: (name == "r", name not in ("u", SPEED)))
+    if SPEED in names:
+        names = [name for name in (SPEED, "r") if name in names]
+    names.sort(key=lambda name: (name == "r", name != "u"))
     return Panel(names[:4], unit)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from .topics import Topic, schema
@@ -79,6 +79,7 @@ class Assembler:
         self._catalogue = catalogue(columns, single=single)
         self._index = bytearray()
         self._counts = dict.fromkeys(Topic, 0)
+        self._first, self._last = 2**64 - 1, 0
 
     def chunk(self, messages: Sequence[Message], at: int, *, leading: bool = False) -> bytes:
         """A chunk of messages on one topic, and its index; `at` is where in the file it will stand.
@@ -92,6 +93,7 @@ class Assembler:
             places += _PLACE.pack(message.log_time, len(records))
             records += _record(MESSAGE, self._message(message))
         times = [message.log_time for message in messages]
+        self._first, self._last = min(self._first, *times), max(self._last, *times)
         size = len(records)
         head = CHUNK_HEAD.pack(
             CHUNK, CHUNK_HEAD.size - RECORD.size + size, min(times), max(times),
@@ -107,38 +109,37 @@ class Assembler:
         times = (message.log_time, message.publish_time)
         return MESSAGE_HEAD.pack(message.topic, sequence, *times) + message.data
 
-    def ending(self, at: int, data_crc: int) -> bytes:
-        """All that follows the last chunk; `at` is where it will stand."""
+    def ending(self, at: int, data_crc: int) -> Iterator[bytes]:
+        """All that follows the last chunk, in pieces; `at` is where it will stand."""
         end = _record(DATA_END, struct.pack("<I", data_crc))
-        start = at + len(end)
-        catalogue_of = {SCHEMA: b"", CHANNEL: b""}
-        for opcode, record in _records(self._catalogue):
-            catalogue_of[opcode] += record
-        groups = {**catalogue_of, STATISTICS: self._statistics(), CHUNK_INDEX: self._chunks()}
-        summary, offsets = b"", b""
-        for opcode, group in groups.items():
-            place = struct.pack("<BQQ", opcode, start + len(summary), len(group))
-            offsets += _record(SUMMARY_OFFSET, place)
-            summary += group
-        offset_start = start + len(summary)
-        footer = RECORD.pack(FOOTER, FOOTER_BODY.size) + struct.pack("<QQ", start, offset_start)
-        crc = zlib.crc32(summary + offsets + footer)
-        return end + summary + offsets + footer + struct.pack("<I", crc) + MAGIC
+        yield end
+        start = place = at + len(end)
+        offsets, crc = b"", 0
+        for opcode, group in self._groups():
+            begin = place
+            for piece in group:
+                yield piece
+                place += len(piece)
+                crc = zlib.crc32(piece, crc)
+            offsets += _record(SUMMARY_OFFSET, struct.pack("<BQQ", opcode, begin, place - begin))
+        footer = RECORD.pack(FOOTER, FOOTER_BODY.size) + struct.pack("<QQ", start, place)
+        yield offsets
+        yield footer + struct.pack("<I", zlib.crc32(offsets + footer, crc)) + MAGIC
+
+    def _groups(self) -> Iterator[tuple[int, Iterable[bytes]]]:
+        for kind in (SCHEMA, CHANNEL):
+            yield kind, [record for opcode, record in _records(self._catalogue) if opcode == kind]
+        yield STATISTICS, [self._statistics()]
+        entries = _ENTRY.iter_unpack(self._index)
+        yield CHUNK_INDEX, (_record(CHUNK_INDEX, _chunk_index(*entry)) for entry in entries)
 
     def _statistics(self) -> bytes:
-        entries = list(_ENTRY.iter_unpack(self._index))
-        first, last = min(e[0] for e in entries), max(e[1] for e in entries)
         counts = b"".join(struct.pack("<HQ", t, n) for t, n in self._counts.items() if n)
         body = struct.pack(
-            "<QHIIIIQQI", sum(self._counts.values()), len(Topic), len(Topic), 0, 0, len(entries),
-            first, last, len(counts),
+            "<QHIIIIQQI", sum(self._counts.values()), len(Topic), len(Topic), 0, 0,
+            len(self._index) // _ENTRY.size, self._first, self._last, len(counts),
         )  # fmt: skip
         return _record(STATISTICS, body + counts)
-
-    def _chunks(self) -> bytes:
-        return b"".join(
-            _record(CHUNK_INDEX, _chunk_index(*entry)) for entry in _ENTRY.iter_unpack(self._index)
-        )
 
 
 def _chunk_index(first: int, last: int, at: int, size: int, topic: int, index: int) -> bytes:

@@ -13,7 +13,7 @@ import numpy as np
 from . import samples
 from .container import Assembler, Message, opening
 from .reader import RecordedFile
-from .sink import Sink, replacing
+from .sink import Sink, batched, replacing
 from .topics import Topic
 
 CHUNK_SAMPLES = 500
@@ -37,7 +37,8 @@ def save_curves(path: str | os.PathLike[str], recording: RecordedFile) -> None:
             sink.append(opening())
             for count, group in enumerate(_groups(recording)):
                 sink.append(assembler.chunk(group, sink.size, leading=count == 0))
-            sink.append(assembler.ending(sink.size, sink.crc))
+            for piece in batched(assembler.ending(sink.size, sink.crc)):
+                sink.append(piece)
         finally:
             sink.close()
 

@@ -18,7 +18,7 @@ from ..errors import DataError
 from . import samples
 from .container import Assembler, Message, opening
 from .header import Header, bearable
-from .sink import Sink
+from .sink import Sink, batched
 from .topics import Topic
 
 MESSAGE_SAMPLES = 100
@@ -201,5 +201,6 @@ class Filing:
         }
         at = self._header.time_ns(self._first)
         self._append(Message(Topic.COMPLETENESS, at, at, samples.dumps(content)))
-        self._sink.append(self._assembler.ending(self._sink.size, self._sink.crc))
+        for piece in batched(self._assembler.ending(self._sink.size, self._sink.crc)):
+            self._sink.append(piece)
         self._sink.sync()

@@ -20,6 +20,10 @@ LARGEST_HEADER = 1 << 20
 """Bytes of the header as JSON."""
 MOST_MISSING = 50_000_000
 """Values that all gaps of a recording together may hold: a reader allocates them."""
+SHORTEST_TS, LONGEST_TS = 1e-9, 1e6
+"""Sample times [s]: the file counts nanoseconds."""
+LAST_NS = 2**64 - 1
+"""The last time that the file can state, in the year 2554."""
 _TAKEN = ("t", "index")
 _EMPTY: Mapping[str, Any] = MappingProxyType({})
 
@@ -77,6 +81,10 @@ class Header:
         if not isinstance(self.name, str):
             raise SettingError(f"name: expected text, received {self.name!r}")
         object.__setattr__(self, "Ts", _positive("Ts", self.Ts))
+        if not SHORTEST_TS <= self.Ts <= LONGEST_TS:
+            raise SettingError(
+                f"Ts: expected {SHORTEST_TS:g} to {LONGEST_TS:g} s, received {self.Ts:g}"
+            )
         object.__setattr__(self, "columns", _columns(self.columns))
         if self.n is not None:
             object.__setattr__(self, "n", _whole(self.n))
@@ -85,6 +93,7 @@ class Header:
             object.__setattr__(self, "counts_per_rev", value)
         object.__setattr__(self, "device", _plain("device", self.device))
         object.__setattr__(self, "settings", _plain("settings", self.settings))
+        plain("header", {"texts": [self.name, *self.columns, *self.columns.values()]})
         if len(self.encode()) > LARGEST_HEADER:
             raise SettingError(
                 f"expected a header of at most {LARGEST_HEADER} bytes, received "
@@ -99,7 +108,7 @@ class Header:
             at = datetime.fromisoformat(self.started.replace("Z", "+00:00"))
         except (AttributeError, TypeError, ValueError):
             at = None
-        if at is None or at.tzinfo is None or at.year < 1970:
+        if at is None or at.tzinfo is None or not 1970 < at.year < 2500:
             raise SettingError(
                 "started: expected a time such as 2026-01-31T12:00:00+00:00, with its offset from "
                 f"UTC; received {self.started!r}"
@@ -109,7 +118,7 @@ class Header:
 
     def time_ns(self, index: int) -> int:
         """When sample `index` was taken, in nanoseconds since 1970-01-01 UTC."""
-        return self.start_ns() + round(index * self.Ts * 1e9)
+        return min(self.start_ns() + round(index * self.Ts * 1e9), LAST_NS)
 
     def encode(self) -> bytes:
         """The header message: JSON with format and version."""
@@ -153,9 +162,13 @@ class Header:
 
 def _positive(what: str, value: object) -> float:
     number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-    if not number or not (math.isfinite(value) and value > 0):  # type: ignore[arg-type,operator]
-        raise SettingError(f"{what}: expected a positive number, received {value!r}")
-    return float(value)  # type: ignore[arg-type]
+    try:
+        found = float(value) if number else math.nan  # type: ignore[arg-type]
+    except OverflowError:
+        found = math.inf
+    if not (math.isfinite(found) and found > 0):
+        raise SettingError(f"{what}: expected a positive number, received {str(value)[:60]}")
+    return found
 
 
 def _whole(value: object) -> int:
@@ -197,7 +210,9 @@ def plain(what: str, content: Mapping[str, Any]) -> dict[str, Any]:
         Where a value is none of these.
     """
     try:
-        text = json.dumps(dict(content), allow_nan=False, default=_python)
+        text = json.dumps(dict(content), allow_nan=False, ensure_ascii=False, default=_python)
+        # half a surrogate pair could not be printed
+        text.encode()
     except (TypeError, ValueError, RecursionError) as e:
         raise SettingError(
             f"{what}: expected finite numbers, text, lists and dicts, received {e}; infinity "

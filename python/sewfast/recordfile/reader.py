@@ -104,10 +104,15 @@ class RecordedFile:
         lines += [f"  event     {_event(e)}" for e in self.events[:_SHOWN]]
         lines += _more(len(self.events), "events")
         lines += [f"  damage    {text}" for text in self.damage[:_SHOWN]]
-        return "\n".join(lines + _more(len(self.damage), "places of damage"))
+        return "\n".join(map(_printable, lines + _more(len(self.damage), "places of damage")))
 
 
 _SHOWN = 20
+
+
+def _printable(line: str) -> str:
+    """A file must not be able to steer the terminal that it is shown on."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
 def _described(label: str, content: Mapping[str, Any]) -> list[str]:

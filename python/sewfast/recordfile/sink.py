@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import secrets
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ..errors import DataError, SettingError
+
+_BATCH = 1 << 16
 
 
 class Sink:
@@ -77,6 +79,17 @@ class Sink:
     def close(self) -> None:
         with suppress(OSError):
             os.close(self._file)
+
+
+def batched(pieces: Iterable[bytes]) -> Iterator[bytes]:
+    """The same bytes in larger pieces, which cost fewer calls."""
+    batch = bytearray()
+    for piece in pieces:
+        batch += piece
+        if len(batch) >= _BATCH:
+            yield bytes(batch)
+            batch.clear()
+    yield bytes(batch)
 
 
 @contextmanager

@@ -2,12 +2,16 @@
 
 use sewfast_control::link::Body;
 
-/// How long a reply is waited for before the command is repeated \[us\].
-pub const PATIENCE: u64 = 100_000;
-/// How often a command is sent before it is given up.
-pub const TRIES: u32 = 10;
+use super::kind;
 
-/// One command and how often it has been sent.
+/// How long a reply is waited for before a command is repeated \[us\].
+const REPEAT: u64 = 100_000;
+/// The same for STOP, within any usual watchdog time.
+const STOP_REPEAT: u64 = 10_000;
+/// How long a command is repeated before it is given up \[us\].
+const PATIENCE: u64 = 1_000_000;
+
+/// One command and when it was sent.
 #[derive(Clone, Copy, Debug)]
 pub struct Request {
     /// The command.
@@ -17,7 +21,7 @@ pub struct Request {
     /// Its fields.
     pub body: Body,
     /// How often it has been sent.
-    pub sent: u32,
+    pub sent: u64,
     /// When it was last sent \[us\].
     pub at: u64,
 }
@@ -34,17 +38,25 @@ impl Request {
         }
     }
 
+    fn repeat(&self) -> u64 {
+        if self.kind == kind::STOP {
+            STOP_REPEAT
+        } else {
+            REPEAT
+        }
+    }
+
     /// When it is to be sent again, or given up \[us\].
     pub fn due(&self) -> u64 {
         if self.sent == 0 {
             0
         } else {
-            self.at.saturating_add(PATIENCE)
+            self.at.saturating_add(self.repeat())
         }
     }
 
     /// True once the last try has waited long enough.
     pub fn exhausted(&self, now: u64) -> bool {
-        self.sent >= TRIES && now >= self.due()
+        self.sent >= PATIENCE / self.repeat() && now >= self.due()
     }
 }

@@ -7,6 +7,8 @@ use sewfast_control::{Controller, Settings as Pid, Standard};
 use super::{HostLoop, Outcome, Settings, kind};
 use crate::samples::Channel;
 
+mod with_device;
+
 const PERIOD: u64 = 10_000;
 const TAG: u16 = 7;
 
@@ -252,7 +254,7 @@ fn arms_starts_drives_to_the_reference_stops_and_asks() {
         .collect();
     assert_eq!((kinds[0], kinds[1]), (kind::ARM, kind::START));
     assert_eq!(kinds[2..102], [kind::DRIVE; 100]);
-    assert_eq!(kinds[102..], [kind::STOP, kind::STATUS]);
+    assert_eq!(kinds[102..], [kind::KEEP, kind::STOP, kind::STATUS]);
     let commands = world
         .peer
         .said
@@ -345,7 +347,7 @@ fn keeps_the_command_without_a_new_sample_and_stops_when_blind() {
     assert_eq!(world.peer.count(kind::DRIVE), drives);
     assert_eq!(
         world.peer.count(kind::STOP),
-        10,
+        100,
         "STOP is repeated, then given up"
     );
 }
@@ -382,7 +384,7 @@ fn gives_up_a_device_that_never_answers() {
     assert_eq!(world.outcome(), Some(&Outcome::Unanswered(kind::ARM)));
     assert_eq!(
         (world.peer.count(kind::ARM), world.peer.count(kind::STOP)),
-        (10, 10)
+        (10, 100)
     );
     assert_eq!(world.now, 1_000_100 + 20 * 100_000);
 }

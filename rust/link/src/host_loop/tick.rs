@@ -50,6 +50,7 @@ pub(super) struct State {
     pub start: i64,
     pub deadline: u64,
     pub next: usize,
+    pub awaited: bool,
     pub newest: Option<i64>,
     pub used: Option<i64>,
     pub heard: u64,
@@ -92,6 +93,7 @@ impl HostLoop {
             start: 0,
             deadline: 0,
             next: 0,
+            awaited: false,
             newest: None,
             used: None,
             heard: 0,
@@ -226,9 +228,7 @@ impl State {
             return Some((header, self.request.body));
         }
         if self.phase == Phase::Starting && now >= self.keep_due() {
-            let mut body = Body::new();
-            body.u32(self.settings.watchdog);
-            return Some((self.heartbeat(kind::KEEP, now), body));
+            return Some(self.keep(now));
         }
         None
     }
@@ -258,8 +258,7 @@ impl State {
         self.next += missed.min(left);
         self.deadline = now - late % period + period;
         let Some(&r) = self.reference.get(self.next) else {
-            self.stop(Outcome::Completed);
-            return self.ask(now);
+            return self.await_end(now);
         };
         if now.saturating_sub(self.heard) > u64::from(self.settings.watchdog) {
             self.stop(Outcome::Silent);
@@ -270,6 +269,22 @@ impl State {
         let mut body = Body::new();
         body.u32(self.settings.watchdog).f32(u as f32);
         Some((self.heartbeat(kind::DRIVE, now), body))
+    }
+
+    /// The device's last sample comes up to a period after the host's last tick: one more period is its own to end the run.
+    fn await_end(&mut self, now: u64) -> Said {
+        if self.awaited {
+            self.stop(Outcome::Completed);
+            return self.ask(now);
+        }
+        self.awaited = true;
+        Some(self.keep(now))
+    }
+
+    fn keep(&mut self, now: u64) -> (Header, Body) {
+        let mut body = Body::new();
+        body.u32(self.settings.watchdog);
+        (self.heartbeat(kind::KEEP, now), body)
     }
 
     /// The command for this tick, from the speed over the newest period; without a new sample the last command stays.

@@ -1,0 +1,400 @@
+"""A controller on the host, for plants slow enough: `run_on_host`."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .. import _core, signals
+from ..control import Controller
+from ..errors import DataError, Interrupted, LinkError, SettingError
+from ..loop import SMOOTHING, reference_samples
+from ..units import counts_per_unit
+from . import wire
+from .drive import Drive
+from .jitter import Jitter
+from .plan import Layout, Plan
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+WATCHDOG_PERIODS = 4
+"""Periods that the device goes on without a command, unless its watchdog time is longer."""
+BATCH = 10
+"""Samples in a frame, or those of a period where these are fewer: the newest are never older."""
+PRIORITY = 50
+ORDINARY = "ordinary"
+
+_ENDS = {
+    "completed": "the whole reference was run",
+    "interrupted": "interrupted",
+    "ended": "the device ended the run early; see `sewfast doctor` for its state",
+    "silent": "no sample came within the watchdog time, so the motor was stopped; check the cable",
+    "reset": "the device was reset; its motor is without command: see to its supply",
+    "port_lost": "the port vanished, the device's watchdog stops the motor; check the cable",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class HostLoopRun:
+    """What a controller on the host did; entry k belongs to tick k, `t[k]` after the first.
+
+    Attributes
+    ----------
+    t, r : array, shape (N,)
+        Time [s] and reference [y] of each tick that was reached.
+    u : array, shape (N,)
+        Command after the controller's limits [u]; NaN where the tick was missed.
+    y, feedback : array, shape (N,)
+        Speed over the last period, from the counts, and the same after the feedback filter [y];
+        y is NaN where no new sample had come.
+    late, age : array, shape (N,)
+        Lateness of the tick and age of its newest sample [s]; NaN where there is none.
+    samples : mapping
+        Every sample of the device that came, (n,): `t` [s] from the start of the run, then its
+        channels.
+    sample_units : mapping
+        Their units.
+    gaps : tuple of (first, count)
+        Samples of the device that are missing.
+    taken : int or None
+        Samples that the device took; None where it could not be asked.
+    outcome : str
+        completed, tripped, ended, silent, reset, port_lost or interrupted.
+    message : str
+        What that means and what to do.
+    stop_confirmed : bool
+        Whether the device has answered STOP; where not, its watchdog stops the motor.
+    jitter : Jitter
+    controller : Controller
+    plant, reference : str
+        Their names.
+    """
+
+    t: FloatArray
+    r: FloatArray
+    u: FloatArray
+    y: FloatArray
+    feedback: FloatArray
+    late: FloatArray
+    age: FloatArray
+    samples: Mapping[str, FloatArray]
+    sample_units: Mapping[str, str]
+    gaps: tuple[tuple[int, int], ...]
+    taken: int | None
+    outcome: str
+    message: str
+    stop_confirmed: bool
+    jitter: Jitter
+    controller: Controller
+    plant: str
+    reference: str
+
+    @property
+    def Ts(self) -> float:
+        """Sample time of the loop [s]."""
+        return self.controller.Ts
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the whole reference was run and every sample that the device took has come."""
+        return (
+            self.outcome == "completed" and not self.gaps and self.taken == len(self.samples["t"])
+        )
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The unit of each column by name."""
+        u, y = self.controller.gains.u_unit, self.controller.gains.y_unit
+        return {"t": "s", "r": y, "u": u, "y": y, "feedback": y, "late": "s", "age": "s"}
+
+    def columns(self) -> dict[str, FloatArray]:
+        """t, r, u, y, feedback, late, age by name, for a file or a plot."""
+        return {name: getattr(self, name) for name in self.units}
+
+    def metrics(self) -> dict[str, float | None]:
+        """How well it tracked and what that took: `ClosedLoopRun.metrics` of the measured output.
+
+        Returns
+        -------
+        dict
+            None for what is not defined: nothing was run, or the reference is no step.
+        """
+        measured, run = np.isfinite(self.y), np.isfinite(self.u)
+        error = (self.r - self.y)[measured]
+        found: dict[str, float | None] = dict.fromkeys(("rmse", "max_abs"))
+        if len(error):
+            found = {"rmse": float(np.sqrt(np.mean(error**2))), "max_abs": float(abs(error).max())}
+        found |= self._step_metrics(measured)
+        effort = ("u_rms", "du_rms", "saturated")
+        if not run.any():
+            return found | dict.fromkeys(effort)
+        limits = {"u_min": self.controller.u_min, "u_max": self.controller.u_max}
+        return found | _core.effort(self.u[run], **limits)
+
+    def _step_metrics(self, measured: NDArray[np.bool_]) -> dict[str, float | None]:
+        names = ("rise_time_ms", "reference_rise_time_ms", "overshoot_percent")
+        if not measured.any():
+            return dict.fromkeys(names)
+        y = np.interp(self.t, self.t[measured], self.y[measured])
+        try:
+            found = _core.step_metrics(y, self.r, Ts=self.Ts, smoothing=SMOOTHING)
+        except DataError:
+            return dict.fromkeys(names)
+        return {name: None if math.isnan(value) else value for name, value in found.items()}
+
+    def __str__(self) -> str:
+        told, unit = self.metrics(), self.units
+        lines = [f"{self.reference} on {self.plant}, loop on the host: {self.outcome}"]
+        if self.outcome != "completed":
+            lines.append(f"  {self.message}")
+        if told["rmse"] is not None:
+            lines.append(
+                f"  error     {told['rmse']:.4g} {unit['y']} rms, {told['max_abs']:.4g} at most "
+                "(measured)"
+            )
+        of = "an unknown number" if self.taken is None else self.taken
+        gaps = ", ".join(f"{n} from sample {k}" for k, n in self.gaps[:5]) or "none"
+        more = f" and {len(self.gaps) - 5} more" if len(self.gaps) > 5 else ""
+        lines.append(f"  samples   {len(self.samples['t'])} of {of}; gaps: {gaps}{more}")
+        return "\n".join([*lines, str(self.jitter)])
+
+
+def run_on_host(
+    drive: Drive,
+    controller: Controller,
+    reference: str | ArrayLike,
+    *,
+    seed: int = 0,
+    name: str | None = None,
+    watchdog: float | None = None,
+    columns: Sequence[str] | None = None,
+    batch: int | None = None,
+    real_time: bool = False,
+    progress: Callable[[int, int, float], object] | None = None,
+) -> HostLoopRun:
+    """Run a controller on this computer against a drive, for plants slow enough.
+
+    The drive applies what it is told and watches over the motor; a thread without Python decides
+    each command from the newest counts. Its jitter and the link's delay are in the loop, and in the
+    result. Where the plant is fast, let the drive run the controller itself.
+
+    Parameters
+    ----------
+    drive : Drive
+        Idle, with limits set, in real time.
+    controller : Controller
+        Its sample time is the loop's: a whole number of the drive's, 2 or more; `at_period` makes
+        one of another.
+    reference : str or array, shape (N,)
+        Name of a reference (`sewfast.signals`) or its samples at the controller's sample time [y].
+    seed : int
+        Chooses a named random reference.
+    name : str, optional
+        Name of the reference in messages.
+    watchdog : float, optional
+        Time after which the drive stops without a command, and this computer without a sample
+        [s]; the drive's own, but at least four periods.
+    columns : sequence of str, optional
+        Channels to keep beside `counts` and `u`.
+    batch : int, optional
+        Samples in a frame; fewer are fresher and load the link more.
+    real_time : bool
+        Try real-time scheduling and locked memory; what became of it is in `jitter.real_time`.
+    progress : callable, optional
+        Called with ticks over, ticks in all and a number without meaning.
+
+    Returns
+    -------
+    HostLoopRun
+        However it ended: trips and lost links are outcomes.
+
+    Raises
+    ------
+    SettingError, DataError
+        Before anything moves, for what cannot run.
+    LinkError
+        Where the drive refuses to arm or to start, or does not answer.
+    Interrupted
+        On Ctrl-C, after STOP; `best` is the run up to there.
+    """
+    ratio = _ratio(drive, controller)
+    r = _reference(reference, controller, seed)
+    plan = Plan("direct", r, columns=columns, batch=batch or min(ratio, BATCH))
+    streamed = drive.prepare_direct(plan, controller)
+    wait = max(drive.watchdog, WATCHDOG_PERIODS * controller.Ts) if watchdog is None else watchdog
+    with drive.lent() as session, _scheduling(real_time) as scheduling:
+        found = _core.host_loop(
+            session.descriptor, controller.core(), r, tag=drive.identity.tag,
+            command=session.command, heartbeat=session.heartbeat,
+            device_period=drive.identity.period_us, ratio=ratio, watchdog=round(1e6 * wait),
+            batch=streamed.batch, mask=streamed.mask,
+            channels=[(c.encoding, c.steps_per_unit) for c in streamed.channels],
+            counts_per_unit=_scale(drive, controller), lock_memory=real_time, progress=progress,
+        )  # fmt: skip
+        session.command, session.heartbeat = found["sequences"]
+    _raise_where_it_never_ran(found["outcome"])
+    label = name or (reference if isinstance(reference, str) else "reference")
+    run = _run(found, drive, controller, r, streamed, scheduling, label)
+    if run.outcome == "interrupted":
+        raise Interrupted(run)
+    return run
+
+
+def at_period(controller: Controller, Ts: float) -> Controller:
+    """The same controller at a longer sample time, its feedback averaged over the same time.
+
+    The gains are kept in standard form. A loop that is stable at its own sample time need not be so
+    at a longer one: try it on a model first.
+
+    Parameters
+    ----------
+    Ts : float
+        Sample time [s].
+    """
+    samples = max(1, round(controller.filter_samples * controller.Ts / Ts))
+    note = f"made for {controller.Ts:g} s, run at {Ts:g} s"
+    notes = f"{controller.notes}; {note}" if controller.notes else note
+    gains = controller.gains.to("standard")
+    return replace(controller, gains=gains, Ts=Ts, filter_samples=samples, notes=notes)
+
+
+def _ratio(drive: Drive, controller: Controller) -> int:
+    """Samples of the drive in a period of the loop."""
+    if drive.identity.on_credit:
+        raise SettingError(
+            "expected a device in real time for a loop on the host, this one's time stands still "
+            "between grants; start it without --fast"
+        )
+    ratio = controller.Ts / drive.identity.Ts
+    whole = round(ratio)
+    if whole < 2 or abs(ratio - whole) > 1e-6 * whole:
+        raise SettingError(
+            "expected a controller at a whole number, 2 or more, of the device's "
+            f"{drive.identity.Ts:g} s, got {controller.Ts:g} s; convert it with at_period, or run "
+            "it on the device"
+        )
+    return whole
+
+
+def _reference(reference: str | ArrayLike, controller: Controller, seed: int) -> FloatArray:
+    """The reference at the loop's sample time; a named one is sampled from its own."""
+    step = round(controller.Ts / signals.TS)
+    named = isinstance(reference, str)
+    if not named or step <= 1 or not math.isclose(step * signals.TS, controller.Ts, rel_tol=1e-6):
+        return reference_samples(reference, controller, seed)
+    if controller.gains.y_unit.lower() != "rpm":
+        raise SettingError(
+            f"expected a controller in RPM for the reference {reference!r}, got "
+            f"{controller.gains.y_unit!r}; give the reference as samples"
+        )
+    assert isinstance(reference, str)
+    return np.ascontiguousarray(signals.reference(reference, seed)[::step])
+
+
+def _scale(drive: Drive, controller: Controller) -> float:
+    return counts_per_unit(drive.identity.counts_per_rev, controller.gains.y_unit)
+
+
+@contextmanager
+def _scheduling(wanted: bool) -> Iterator[list[str]]:
+    """Real-time scheduling, where wanted, of this thread and those it starts; what became of it."""
+    if not wanted:
+        yield [ORDINARY]
+        return
+    try:
+        before = os.sched_getscheduler(0), os.sched_getparam(0)
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except AttributeError:
+        yield [f"{ORDINARY} (real time is not offered on this system)"]
+        return
+    except OSError as refused:
+        yield [f"{ORDINARY} (real time refused: {refused.strerror}; see limits.conf, rtprio)"]
+        return
+    try:
+        yield [f"SCHED_FIFO {PRIORITY}"]
+    finally:
+        os.sched_setscheduler(0, *before)
+
+
+def _raise_where_it_never_ran(outcome: Mapping[str, Any]) -> None:
+    if outcome["name"] == "refused":
+        told = wire.refusal(outcome["command"], outcome["result"], outcome["detail"])
+        raise LinkError(told)
+    if outcome["name"] == "unanswered":
+        raise LinkError(
+            f"expected an answer to {wire.Kind(outcome['command']).name}, none came; check cable "
+            "and device, then connect again"
+        )
+
+
+def _run(
+    found: Mapping[str, Any], drive: Drive, controller: Controller, r: FloatArray,
+    streamed: Layout, scheduling: Sequence[str], label: str,
+) -> HostLoopRun:  # fmt: skip
+    ticks = found["ticks"]
+    number = ticks["number"].astype(np.intp)
+    reached = int(number[-1]) + 1 if len(number) else 0
+    at_ticks = {
+        k: _spread(ticks[k], number, reached) for k in ("u", "y", "feedback", "late", "age")
+    }
+    times = (found["times"] - found["start"]) / 1e6
+    samples = dict(zip(streamed.names, found["columns"], strict=True))
+    return HostLoopRun(
+        t=np.arange(reached, dtype=np.float64) * controller.Ts, r=r[:reached],
+        u=at_ticks["u"], y=at_ticks["y"], feedback=at_ticks["feedback"],
+        late=1e-6 * at_ticks["late"], age=1e-6 * at_ticks["age"],
+        samples={"t": times, **samples},
+        sample_units={"t": "s", **{c.name: c.unit for c in streamed.channels}},
+        gaps=_gaps(times, found["taken"], drive.identity.Ts), taken=found["taken"],
+        outcome=found["outcome"]["name"], message=_message(found["outcome"]),
+        stop_confirmed=found["stopped"], jitter=_jitter(found, controller, scheduling),
+        controller=controller, plant=drive.identity.name, reference=label,
+    )  # fmt: skip
+
+
+def _spread(values: FloatArray, number: NDArray[np.intp], reached: int) -> FloatArray:
+    """Values at the ticks that were run, NaN at those that were missed."""
+    spread = np.full(reached, np.nan)
+    spread[number] = values
+    return spread
+
+
+def _gaps(times: FloatArray, taken: int | None, Ts: float) -> tuple[tuple[int, int], ...]:
+    """First and count of the missing samples between those that came, and around them."""
+    numbers = np.rint(times / Ts).astype(np.int64)
+    end = taken if taken is not None else (int(numbers[-1]) + 1 if len(numbers) else 0)
+    edges = np.concatenate([[-1], numbers, [max(end, int(numbers[-1]) + 1 if len(numbers) else 0)]])
+    missing = np.diff(edges) - 1
+    return tuple((int(edges[k]) + 1, int(missing[k])) for k in np.flatnonzero(missing > 0))
+
+
+def _message(outcome: Mapping[str, Any]) -> str:
+    if outcome["name"] != "tripped":
+        detail = f" ({outcome['text']})" if "text" in outcome else ""
+        return _ENDS[outcome["name"]] + detail
+    reason = wire.name_of(wire.REASONS, outcome["reason"])
+    value = outcome["value"]
+    at = "" if math.isnan(value) or value == 0.0 else f" at {value:.5g}"
+    return f"the device tripped: {reason}{at}; find out why, then clear the trip"
+
+
+def _jitter(found: Mapping[str, Any], controller: Controller, scheduling: Sequence[str]) -> Jitter:
+    memory = found["memory"]
+    told = list(scheduling)
+    if memory is not None:
+        told.append("memory locked" if not memory else f"memory not locked ({memory})")
+    ticks = found["ticks"]
+    # the first tick is the start itself: nothing was waited for, nothing has been sampled
+    return Jitter(
+        late=ticks["late"][1:], age=ticks["age"][1:], period=1e6 * controller.Ts,
+        missed=found["missed"], blind=int(np.count_nonzero(ticks["fresh"][1:] == 0.0)),
+        unsent=found["unsent"], round_trip=found["round_trip"], device_late=found["device_late"],
+        real_time=", ".join(told),
+    )  # fmt: skip

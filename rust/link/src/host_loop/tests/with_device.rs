@@ -1,0 +1,254 @@
+//! The loop against the state machine of a real device and the virtual sewing machine, in computed time.
+
+use sewfast_control::link::{
+    Body, Device, Header, Identity, Limits, MAX_WIRE, Measurement, Reason, Source, State,
+};
+use sewfast_control::link::{Channel as Streamed, Encoding, capability, encode};
+use sewfast_control::{Controller, Settings as Pid, Standard};
+use sewfast_core::machine::{Machine, Parameters};
+
+use super::super::{HostLoop, Outcome, Settings};
+use crate::samples::Channel;
+
+const RATIO: u32 = 20;
+const TS: f64 = 0.02;
+const COUNTS_PER_UNIT: f64 = 1572.0 / 60.0;
+const OFFSET: u64 = 7_654_321;
+
+static CHANNELS: [Streamed; 2] = [
+    Streamed {
+        encoding: Encoding::Counts,
+        steps_per_unit: 1,
+        name: "counts",
+        unit: "1",
+        source: Source::Counts,
+    },
+    Streamed {
+        encoding: Encoding::Steps,
+        steps_per_unit: 1000,
+        name: "u",
+        unit: "V",
+        source: Source::Command,
+    },
+];
+
+fn controller() -> Controller<f64> {
+    let gains = Standard {
+        kp: 0.002,
+        ti: 0.25,
+        td: 0.0,
+    };
+    let settings = Pid {
+        u_min: 0.0,
+        u_max: 10.0,
+        tt: 0.0,
+        ..Pid::new(gains, TS)
+    };
+    Controller::new(settings, 1, 0.0).unwrap()
+}
+
+fn reference() -> Vec<f64> {
+    (0..100)
+        .map(|k| 1500.0 * (f64::from(k) / 40.0).min(1.0))
+        .collect()
+}
+
+/// The same loop without a link: measured and applied at once.
+fn simulated() -> Vec<f64> {
+    let (mut machine, mut controller) =
+        (Machine::new(Parameters::default()).unwrap(), controller());
+    let mut before = machine.counts();
+    let tick = |&r: &f64| {
+        let now = machine.counts();
+        let speed = (now - before) / (TS * COUNTS_PER_UNIT);
+        before = now;
+        let u = controller.step(r, speed);
+        (0..RATIO).for_each(|_| machine.advance(u));
+        speed
+    };
+    reference().iter().map(tick).collect()
+}
+
+/// A device, its machine, and a host whose clock differs by [`OFFSET`].
+struct Bench {
+    device: Device<8>,
+    machine: Machine,
+    now: u64,
+}
+
+impl Bench {
+    fn new() -> Self {
+        let device = Device::new(Identity {
+            boot_id: 3,
+            name: "bench",
+            firmware: "1",
+            period: 1000,
+            counts_per_rev: 1572.0,
+            capabilities: capability::DRIVE,
+            ceilings: Limits {
+                volt: 20.0,
+                speed: 5000.0,
+                acceleration: f32::INFINITY,
+                current: f32::INFINITY,
+            },
+            channels: &CHANNELS,
+        });
+        let mut bench = Self {
+            device: device.unwrap(),
+            machine: Machine::new(Parameters::default()).unwrap(),
+            now: OFFSET,
+        };
+        bench.pass(200);
+        let mut hello = Body::new();
+        hello.u8(1).u8(1).u32(99);
+        bench.say(0x01, 0, 0, &hello);
+        let mut limits = Body::new();
+        limits
+            .f32(20.0)
+            .f32(4000.0)
+            .f32(f32::INFINITY)
+            .f32(f32::INFINITY);
+        bench.say(0x04, 3, 1, &limits);
+        bench.pass(1);
+        bench
+    }
+
+    fn say(&mut self, kind: u8, tag: u16, sequence: u32, body: &Body) {
+        let header = Header {
+            kind,
+            tag,
+            sequence,
+            time: 0,
+        };
+        let mut wire = [0; MAX_WIRE];
+        let length = encode(&header, body.bytes().unwrap(), &mut wire).unwrap();
+        self.hear(&wire[..length]);
+    }
+
+    fn hear(&mut self, bytes: &[u8]) {
+        let time = self.now - OFFSET;
+        self.device.receive(time, bytes);
+        self.device.poll(time);
+    }
+
+    /// Lets milliseconds pass; what the device says meanwhile.
+    fn pass(&mut self, milliseconds: u32) -> Vec<u8> {
+        let mut said = Vec::new();
+        for _ in 0..milliseconds {
+            self.now += 1000;
+            let measurement = Measurement {
+                counts: self.machine.counts() as i32,
+                current: f32::NAN,
+                further: &[],
+            };
+            let output = self.device.sample(self.now - OFFSET, &measurement);
+            self.machine.advance(f64::from(output.u));
+            let mut chunk = [0; 512];
+            let length = self.device.transmit(&mut chunk);
+            said.extend_from_slice(&chunk[..length]);
+        }
+        said
+    }
+}
+
+fn host_loop() -> HostLoop {
+    let settings = Settings {
+        tag: 3,
+        command: 1,
+        heartbeat: 0,
+        device_period: 1000,
+        ratio: RATIO,
+        watchdog: 80_000,
+        batch: 5,
+        mask: 3,
+        counts_per_unit: COUNTS_PER_UNIT,
+    };
+    let channels =
+        [(0, 1), (1, 1000)].map(|(code, steps)| Channel::described(code, steps).unwrap());
+    HostLoop::new(settings, &channels, controller(), reference()).unwrap()
+}
+
+/// Serves the loop to its end; `disturb` is called before each millisecond.
+fn serve(bench: &mut Bench, looped: &mut HostLoop, mut disturb: impl FnMut(&mut Bench, u64)) {
+    for k in 0..20_000 {
+        disturb(bench, k);
+        let received = bench.pass(1);
+        let said = looped.tick(bench.now, &received).to_vec();
+        bench.hear(&said);
+        if looped.done() {
+            return;
+        }
+    }
+    panic!("the loop does not end");
+}
+
+#[test]
+fn tracks_as_the_simulated_loop_does() {
+    let (mut bench, mut looped) = (Bench::new(), host_loop());
+    serve(&mut bench, &mut looped, |_, _| {});
+    assert_eq!(looped.outcome(), Some(&Outcome::Completed));
+    assert_eq!(looped.history().times().len(), 2000);
+    assert_eq!((looped.ticks().run.len(), looped.ticks().missed), (100, 0));
+    let simulated = simulated();
+    let difference = looped
+        .ticks()
+        .run
+        .iter()
+        .zip(&simulated)
+        .map(|(tick, y)| tick.y - y);
+    let rms = (difference.map(|d| d * d).sum::<f64>() / 100.0).sqrt();
+    // Up to five samples of age at 37 RPM a tick, and what the machine's ripple makes of it.
+    assert!(rms < 5.0, "{rms} RPM");
+    assert!((looped.ticks().run[99].y - 1500.0).abs() < 40.0);
+}
+
+#[test]
+fn a_trip_of_the_device_ends_the_loop_with_its_reason() {
+    let (mut bench, mut looped) = (Bench::new(), host_loop());
+    serve(&mut bench, &mut looped, |bench, k| {
+        if k == 700 {
+            bench.device.trip(bench.now - OFFSET, Reason::StopInput);
+        }
+    });
+    assert!(matches!(
+        looped.outcome(),
+        Some(Outcome::Tripped { reason: 10, .. })
+    ));
+    assert_eq!(bench.device.state(), State::Tripped);
+    let taken = looped.status().map(|status| status.samples as usize);
+    assert_eq!(taken, Some(looped.history().times().len()));
+}
+
+#[test]
+fn a_stop_leaves_the_device_idle_and_its_samples_here() {
+    let (mut bench, mut looped) = (Bench::new(), host_loop());
+    for _ in 0..600 {
+        let received = bench.pass(1);
+        let said = looped.tick(bench.now, &received).to_vec();
+        bench.hear(&said);
+    }
+    looped.stop(Outcome::Interrupted);
+    serve(&mut bench, &mut looped, |_, _| {});
+    assert_eq!(bench.device.state(), State::Idle);
+    assert_eq!(looped.outcome(), Some(&Outcome::Interrupted));
+    let taken = looped.status().map(|status| status.samples as usize);
+    assert_eq!(taken, Some(looped.history().times().len()));
+}
+
+#[test]
+fn a_host_that_stops_calling_is_stopped_by_the_watchdog() {
+    let (mut bench, mut looped) = (Bench::new(), host_loop());
+    for _ in 0..600 {
+        let received = bench.pass(1);
+        let said = looped.tick(bench.now, &received).to_vec();
+        bench.hear(&said);
+    }
+    assert_eq!(bench.device.state(), State::Running);
+    let received = bench.pass(100);
+    assert_eq!(bench.device.state(), State::Tripped);
+    looped.tick(bench.now, &received);
+    assert!(matches!(
+        looped.outcome(),
+        Some(Outcome::Tripped { reason: 1, .. })
+    ));
+}
