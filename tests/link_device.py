@@ -17,6 +17,7 @@ import tty
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent / "golden"))
 
@@ -127,9 +128,13 @@ class ScriptedDevice(threading.Thread):
     bytes` sees every frame that goes out and says what is sent instead.
     """
 
-    def __init__(self, folder: Path, kind: str = "pty", **settings: object) -> None:
+    def __init__(
+        self, folder: Path | None, kind: str = "pty", clock: Any = time, **settings: object
+    ) -> None:
         super().__init__(daemon=True)
-        self.wire = Wire(kind, folder)
+        if folder is not None:
+            self.wire = Wire(kind, folder)
+        self._monotonic: Callable[[], float] = clock.monotonic
         self.boot = 0x0001BEEF
         self.channels = 5
         self.capacity = 512
@@ -147,7 +152,7 @@ class ScriptedDevice(threading.Thread):
         for name, value in settings.items():
             assert hasattr(self, name), name
             setattr(self, name, value)
-        self._began = time.monotonic()
+        self._began = self._monotonic()
         self._sequence = 0
         self._session = 0
         self._last: tuple[int, bytes] | None = None
@@ -191,24 +196,28 @@ class ScriptedDevice(threading.Thread):
                     todo, self._todo = self._todo, []
                 for action in todo:
                     action()
-                pending += self.wire.read(0.001)
-                *blocks, pending = pending.split(b"\0")
-                for frame in golden.frames(b"".join(b + b"\0" for b in blocks)):
-                    self._take(frame)
-                self._advance()
+                pending = self.hear(pending + self.wire.read(0.001))
+                self.advance()
         except BaseException as error:
             self.problem = error
+
+    def hear(self, data: bytes) -> bytes:
+        """Take the whole frames of `data`; what is left of it."""
+        *blocks, rest = data.split(b"\0")
+        for frame in golden.frames(b"".join(b + b"\0" for b in blocks)):
+            self._take(frame)
+        return rest
 
     # --- time -------------------------------------------------------------------------------------
 
     @property
     def now_us(self) -> int:
-        return int((time.monotonic() - self._began) * 1e6)
+        return int((self._monotonic() - self._began) * 1e6)
 
     def reset(self) -> None:
         """As after a loss of supply."""
         self.boot += 1
-        self._began, self._sequence, self._session, self._last = time.monotonic(), 0, 0, None
+        self._began, self._sequence, self._session, self._last = self._monotonic(), 0, 0, None
         self.limits, self.state, self.reason = (0.0,) * 4, IDLE, 0
         self.event(1)
 
@@ -217,8 +226,8 @@ class ScriptedDevice(threading.Thread):
         self.state, self.reason = TRIPPED, reason
         self.event(6, value)
 
-    def _advance(self) -> None:
-        if self.state in (ARMED, RUNNING) and time.monotonic() - self._fed > self._watchdog:
+    def advance(self) -> None:
+        if self.state in (ARMED, RUNNING) and self._monotonic() - self._fed > self._watchdog:
             if self.state == RUNNING:
                 self.trip(1)
             else:
@@ -270,7 +279,7 @@ class ScriptedDevice(threading.Thread):
 
     def _take(self, frame: tuple[int, int, int, int, bytes]) -> None:
         kind, tag, sequence, _, body = frame
-        self.arrived.append((time.monotonic(), kind))
+        self.arrived.append((self._monotonic(), kind))
         if self.intercept(frame):
             return
         if kind >= KEEP:
@@ -294,7 +303,7 @@ class ScriptedDevice(threading.Thread):
 
     def _heartbeat(self, kind: int, tag: int, body: bytes) -> None:
         if tag == self.boot & 0xFFFF:
-            self._fed = time.monotonic()
+            self._fed = self._monotonic()
             self.heartbeats += 1
             if kind == DRIVE:
                 self._drive = struct.unpack("<If", body)[1]
@@ -351,7 +360,7 @@ class ScriptedDevice(threading.Thread):
         if not any(self.limits):
             return b"\x0c" + bytes(4)
         self._watchdog = struct.unpack("<I", body)[0] * 1e-6
-        self._fed = time.monotonic()
+        self._fed = self._monotonic()
         self.state = ARMED
         return b"\0"
 
@@ -385,7 +394,7 @@ class ScriptedDevice(threading.Thread):
             "<BIQIHB", body
         )
         self._watchdog = watchdog * 1e-6
-        self._fed = time.monotonic()
+        self._fed = self._monotonic()
         self._drive = 0.0
         self.run_number += 1
         self._taken, self._rows = 0, []

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 MAX_DRIFT = 0.1
 """What any working oscillator keeps, a microcontroller's RC included."""
 
+RESOLUTION = 1.2e-6
+"""A device's time is in whole microseconds, of its own, and rounded down."""
+
 _Points = NDArray[np.float64]
 
 
@@ -65,7 +68,7 @@ class Clock:
         device = device_us * 1e-6
         if self._low and device < self._low[-1][0]:
             return
-        _extend(self._low, (device, sent), 1.0)
+        _extend(self._low, (device, sent - RESOLUTION), 1.0)
         _extend(self._high, (device, received), -1.0)
         self._exchanges += 1
 

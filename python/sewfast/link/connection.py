@@ -98,6 +98,9 @@ class Connection:
         self._bytes = 0
         self.identity = self._greet(patience)
         self._tag = self.identity.tag
+        if self._greeting is not None:
+            # what waited in the port may have been of another boot
+            self.newest = self._greeting.time_us
 
     # --- turns ----------------------------------------------------------------------------------
 
@@ -319,7 +322,10 @@ class Connection:
     def _nobody(self, patience: float) -> LinkError:
         heard = "nothing came"
         remedy = "check cable, supply and that the firmware speaks this protocol (docs/PROTOCOL.md)"
-        if self._bytes:
+        if self.receiver.counters["echoed"]:
+            heard = "only what was sent came back"
+            remedy = "see whether transmit and receive are joined, and what is connected"
+        elif self._bytes:
             heard = f"{self._bytes} bytes came that are no frames for this host"
             remedy = f"check the baud rate ({self.port.baud}) and what runs on the device"
         return LinkError(

@@ -95,6 +95,11 @@ class Run:
         mode = wire.MODES[self.plan.mode]
         body = wire.start(mode, link.watchdog_us, 0, self.length, layout.mask, layout.batch)
         self.run, start_us = wire.started(link.ask(Kind.START, body))
+        if abs(start_us - link.newest) >= 2**32:
+            raise LinkError(
+                f"expected a start at the device's present time of {link.newest} us, got "
+                f"{start_us} us; mend the firmware"
+            )
         self._heard = self._asked = time.monotonic()
         self.start_us = start_us
 
@@ -243,6 +248,9 @@ class Run:
             count, first = count - (self.next - first), self.next
             if count <= 0:
                 return
+        if first + count > self.length:
+            # no sample of this run, whatever the device says
+            return
         if first > self.next:
             self._gap(first - self.next)
         self._hand_over(first, count, columns)

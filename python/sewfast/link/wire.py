@@ -49,18 +49,6 @@ MODES = {"commands": 0, "controller": 1, "direct": 2}
 PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED = (1 << bit for bit in range(6))
 """Capabilities of a device."""
 
-FIELDS: dict[int, tuple[str, ...]] = {
-    Kind.HELLO: ("version from", "version to", "session"),
-    Kind.DESCRIBE: ("channel",),
-    Kind.LIMITS: ("volt", "speed", "acceleration", "current"),
-    Kind.ARM: ("watchdog",),
-    Kind.GAINS: (
-        "Kp", "Ti", "Td", "alpha", "beta", "N", "Tt", "u_min", "u_max", "slew", "filter_time",
-        "counts per unit", "filter_samples",
-    ),
-    Kind.START: ("mode", "watchdog", "at", "length", "mask", "batch"),
-}  # fmt: skip
-
 
 def name_of(names: Sequence[str], value: int) -> str:
     """The name of a value; one of a later firmware stays a number."""
@@ -220,6 +208,9 @@ class Reply:
             Where the device refused the command; the message says why and what to do.
         """
         if self.result:
+            # the names of the fields lie beside the messages, which need the kinds from here
+            from .refusals import refusal
+
             raise LinkError(refusal(self.kind, self.result, self.detail))
         return self.body
 
@@ -329,7 +320,7 @@ def watchdog(us: int) -> bytes:
 
 
 def credit(us: int, until: int) -> bytes:
-    return struct.pack("<IQ", us, until)
+    return struct.pack("<IQ", us, min(until, 2**64 - 1))
 
 
 def drive(us: int, u: float) -> bytes:
@@ -361,52 +352,6 @@ def body_size(encodings: Sequence[int], batch: int) -> int:
 def wire_size(body: int) -> int:
     """Bytes on the wire of a frame: header, CRC, stuffing and the closing zero."""
     return body + 21
-
-
-# --- refusals -----------------------------------------------------------------------------------
-
-
-def refusal(kind: int, result: int, detail: int) -> str:
-    """What a device's refusal means and what to do."""
-    name = Kind(kind).name if kind in Kind._value2member_map_ else f"command {kind:#04x}"
-    return f"expected the device to take {name}, it refused: {_refused(kind, result, detail)}"
-
-
-def _refused(kind: int, result: int, detail: int) -> str:
-    where = _field(kind, detail)
-    texts = {
-        1: "it does not know the command; update the firmware",
-        2: f"wrong length, {detail} bytes; update sewfast and the firmware to the same version",
-        3: f"{where} is outside its range; change it",
-        4: f"not while {name_of(STATES, detail)}; {_way_out(detail)}",
-        5: "it has been reset since; connect again, set the limits and start anew",
-        6: f"{where} is beyond a limit; lower it or raise the limit",
-        7: f"no room in its profile memory, {detail} values would fit; wait for it to play on",
-        8: f"it does not offer {where}; leave it out",
-        9: f"values out of order, it expects number {detail}; upload from there",
-        10: f"it speaks protocol version {detail}, sewfast {VERSION}; update the older one",
-        11: "the motor is moving; wait for rest",
-        12: "no limits were set since its boot; set them first",
-    }
-    return texts.get(result, f"result {result} (detail {detail}), which this sewfast does not know")
-
-
-def _field(kind: int, index: int) -> str:
-    if kind == Kind.UPLOAD:
-        return f"value {index}"
-    names = FIELDS.get(kind, ())
-    return names[index] if index < len(names) else f"field {index}"
-
-
-def _way_out(state: int) -> str:
-    remedies = {
-        0: "wait until it has measured well",
-        1: "arm it first",
-        2: "start or stop it first",
-        3: "stop it first",
-        4: "find out why, then clear the trip",
-    }
-    return remedies.get(state, "update sewfast")
 
 
 def _start(shape: struct.Struct, body: bytes, name: str) -> tuple[tuple[int, ...], bytes]:
