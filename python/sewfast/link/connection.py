@@ -22,6 +22,8 @@ STOP_REPEAT = 0.01
 """The same for STOP, within any usual watchdog time."""
 PATIENCE = 1.0
 """Time after which a command is given up [s]."""
+WATCHDOG = 0.05
+WATCHDOG_ON_CREDIT = 0.25
 RETRY = 0.05
 """Time between two attempts to open a port that vanished [s]."""
 SILENCE = 0.02
@@ -59,8 +61,8 @@ class Connection:
     ----------
     port : Port
         Open; the connection closes it.
-    watchdog : float
-        Time that the device goes on without a word from here [s].
+    watchdog : float or None
+        Time that the device goes on without a word from here [s]; None for the usual.
     patience : float
         How long to wait for the first answer [s]; many boards restart when their port opens.
     resume : float
@@ -72,11 +74,11 @@ class Connection:
         Where nothing answers, or what answers speaks otherwise.
     """
 
-    def __init__(self, port: Port, *, watchdog: float, patience: float, resume: float) -> None:
+    def __init__(
+        self, port: Port, *, watchdog: float | None, patience: float, resume: float
+    ) -> None:
         self.port = port
         self.receiver = _core.LinkReceiver()
-        self.watchdog = watchdog
-        self.watchdog_us = round(watchdog * 1e6)
         self.resume = resume
         self.session = secrets.randbelow(2**32 - 1) + 1
         self.clock = Clock()
@@ -98,6 +100,9 @@ class Connection:
         self._bytes = 0
         self.identity = self._greet(patience)
         self._tag = self.identity.tag
+        usual = WATCHDOG_ON_CREDIT if self.identity.on_credit else WATCHDOG
+        self.watchdog = usual if watchdog is None else watchdog
+        self.watchdog_us = round(self.watchdog * 1e6)
         if self._greeting is not None:
             # what waited in the port may have been of another boot
             self.newest = self._greeting.time_us

@@ -236,6 +236,11 @@ def _fits(encodings: Sequence[int], batch: int, identity: Identity, baud: float)
 
 
 def _too_much(plan: Plan, out: Sequence[Channel], identity: Identity, baud: float) -> SettingError:
+    if plan.batch is not None and _batch(plan, out, identity, math.inf) is None:
+        return SettingError(
+            f"expected a batch that fits a frame of {wire.MAX_BODY} bytes, got {plan.batch}; "
+            "leave it to sewfast (batch=None)"
+        )
     leave = f"leave out {', '.join(c.name for c in out)}" if out else "use a longer period"
     batch = "any batch" if plan.batch is None else f"batches of {plan.batch}"
     return SettingError(
