@@ -229,7 +229,8 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         };
         Refusal::unsupported(0).unless(self.can(needed))?;
         let count = values(table, upload.values, 1.0).count() as u32;
-        let anew = upload.offset == 0 && self.state != State::Running;
+        let committed = self.state == State::Running || self.run.planned.is_some();
+        let anew = upload.offset == 0 && !committed;
         let known = if anew {
             Refusal::room(CAPACITY as u32).unless(count as usize <= CAPACITY)?;
             0

@@ -1,5 +1,9 @@
 //! The device under its laws.
 
-#[allow(dead_code)]
+mod hostile;
+mod laws;
+mod limits;
+mod playback;
 mod rig;
 mod safety;
+mod words;

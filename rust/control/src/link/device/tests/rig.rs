@@ -297,7 +297,7 @@ impl Rig {
     pub fn sent(&mut self) -> Vec<(u64, i32, i16)> {
         self.listen();
         let batches = self.came.iter().filter(|came| came.header.kind == 0xC0);
-        batches.flat_map(|came| read(came)).collect()
+        batches.flat_map(read).collect()
     }
 }
 

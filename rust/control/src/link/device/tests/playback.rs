@@ -1,0 +1,217 @@
+//! What was uploaded is what the motor gets, and what it did is what the host hears.
+
+use super::rig::*;
+use crate::link::{Fields, Reason, State};
+use crate::{Controller, Settings, Standard};
+use proptest::prelude::*;
+use std::vec;
+use std::vec::Vec;
+
+proptest! {
+    /// In any pieces, overlapping, repeated, refused for room and sent again, while it plays.
+    #[test]
+    fn a_profile_plays_as_uploaded(
+        values in prop::collection::vec(-9_000i16..9_000, 1..300),
+        pieces in prop::collection::vec((1usize..=40, 0usize..60, any::<bool>(), 1usize..12), 1..200),
+        batch in 1u8..20,
+    ) {
+        let mut rig = Rig::armed();
+        let first = values.len().min(CAPACITY);
+        prop_assert_eq!(rig.upload(0, &values[..first]).0, 0);
+        let body = start(0, 0, values.len() as u32, 0b11, batch);
+        prop_assert_eq!(rig.command(0x0A, body.bytes().unwrap()).0, 0);
+        let (mut end, mut played, mut log) = (first, Vec::new(), Vec::new());
+        let mut pieces = pieces.into_iter().cycle();
+        while played.len() < values.len() {
+            let (count, back, repeated, play) = pieces.next().unwrap();
+            let from = end.saturating_sub(back);
+            let room = CAPACITY - (end - played.len());
+            let to = (end + count.min(room)).min(values.len());
+            let piece = &values[from..to];
+            let answer = rig.upload(from as u32, piece);
+            end = to;
+            let room = (CAPACITY - (end - played.len())) as u32;
+            let expected = [end as u32, room].map(u32::to_le_bytes).concat();
+            prop_assert_eq!(&answer, &(0, expected));
+            if repeated {
+                let body = upload(from as u32, piece);
+                prop_assert_eq!(rig.again(0x08, body.bytes().unwrap()), Some(answer));
+            }
+            for _ in 0..play.min(end - played.len()) {
+                rig.keep();
+                rig.counts += 7;
+                let output = rig.sample();
+                prop_assert!(output.enabled);
+                played.push((output.u * 1000.0).round() as i16);
+                log.push((rig.now, rig.counts, values[log.len()]));
+            }
+        }
+        prop_assert_eq!(&played, &values);
+        rig.keep();
+        prop_assert!(!rig.sample().enabled);
+        prop_assert_eq!(rig.device.state(), State::Idle);
+        prop_assert_eq!(rig.sent(), log);
+        prop_assert_eq!(rig.events().pop(), Some((4, 0)));
+    }
+
+    /// The device's controller is the crate's.
+    #[test]
+    fn the_pid_is_the_controller(
+        references in prop::collection::vec(0f32..3000.0, 1..60),
+        moves in prop::collection::vec(-60i32..90, 60),
+        filter in 1u8..20,
+        kp in 0.001f32..0.05, ti in 0.01f32..1.0, td in 0f32..0.01, tt in prop_oneof![Just(0f32), 0.01f32..1.0],
+    ) {
+        let per_unit = 25.0;
+        let values = [kp, ti, td, 0.4, 0.2, 10.0, tt, -20.0, 8.0, 2000.0, 0.002, per_unit];
+        let mut rig = Rig::armed();
+        prop_assert_eq!(rig.command(0x09, gains(values, filter).bytes().unwrap()).0, 0);
+        prop_assert_eq!(rig.references(0, &references[..references.len().min(50)]).0, 0);
+        if references.len() > 50 {
+            prop_assert_eq!(rig.references(50, &references[50..]).0, 0);
+        }
+        let body = start(1, 0, references.len() as u32, 0b01_1011, 4);
+        prop_assert_eq!(rig.command(0x0A, body.bytes().unwrap()).0, 0);
+        let settings = Settings {
+            alpha: 0.4, beta: 0.2, n: 10.0, tt, u_min: -10.0, u_max: 8.0, slew: 2000.0,
+            ..Settings::new(Standard { kp, ti, td }, 1e-3)
+        };
+        let mut controller = Controller::<f32>::new(settings, filter.into(), 0.002).unwrap();
+        let mut expected = Vec::new();
+        for (&reference, &count) in references.iter().zip(&moves) {
+            rig.counts += count;
+            rig.keep();
+            let u = controller.step(reference, count as f32 / (1e-3 * per_unit));
+            prop_assert_eq!(rig.sample(), crate::link::Output { u, enabled: true });
+            expected.push((reference.to_bits(), controller.filtered().to_bits()));
+        }
+        rig.watched(1);
+        rig.listen();
+        let mut heard = Vec::new();
+        for came in rig.came.iter().filter(|came| came.header.kind == 0xC0) {
+            let samples = (came.body.len() - 3) / 12;
+            let mut fields = Fields::new(&came.body[1 + 2 + 4 * samples..]);
+            let mut column = || (0..samples).map(|_| fields.u32().unwrap()).collect::<Vec<_>>();
+            let (r, y) = (column(), column());
+            heard.extend(r.into_iter().zip(y));
+        }
+        prop_assert_eq!(heard, expected);
+    }
+}
+
+#[test]
+fn a_profile_that_runs_dry_trips() {
+    let mut rig = Rig::armed();
+    rig.upload(0, &[1000; 5]);
+    rig.start(0, 0, 10);
+    for _ in 0..5 {
+        assert!(rig.sample().enabled);
+    }
+    assert!(!rig.sample().enabled);
+    assert_eq!(rig.device.reason(), Reason::Underrun);
+    assert_eq!(rig.sent().len(), 5);
+}
+
+#[test]
+fn a_run_starts_when_its_reply_says() {
+    for (ahead, periods) in [(0, 1), (1, 1), (1000, 1), (1001, 2), (7_500, 8)] {
+        let mut rig = Rig::armed();
+        rig.upload(0, &[1000; 5]);
+        let at = if ahead == 0 { 0 } else { rig.now + ahead };
+        let (result, body) = rig.start(0, at, 5);
+        let begins = rig.now + periods * PERIOD;
+        assert_eq!((result, &body[4..]), (0, &begins.to_le_bytes()[..]));
+        rig.watched(periods as usize + 5);
+        let times: Vec<u64> = rig.sent().iter().map(|sample| sample.0).collect();
+        let expected: Vec<u64> = (0..5).map(|k| begins + k * PERIOD).collect();
+        assert_eq!(times, expected);
+    }
+}
+
+#[test]
+fn jitter_does_not_move_the_samples_times() {
+    let mut rig = Rig::armed();
+    rig.upload(0, &[1000; 20]);
+    rig.start(0, 0, 20);
+    let begin = rig.now;
+    for k in 1..=20 {
+        rig.keep();
+        rig.sample_at(begin + k * PERIOD + 37 * (k % 5));
+    }
+    let times: Vec<u64> = rig.sent().iter().map(|sample| sample.0).collect();
+    assert_eq!(
+        times,
+        (1..=20).map(|k| begin + k * PERIOD).collect::<Vec<_>>()
+    );
+}
+
+#[test]
+fn a_profile_plays_twice() {
+    let mut rig = Rig::ready();
+    rig.upload(0, &[1000, 2000, 3000]);
+    for _ in 0..2 {
+        assert_eq!(rig.arm().0, 0);
+        assert_eq!(rig.start(0, 0, 3).0, 0);
+        let played: Vec<f32> = (0..4).map(|_| rig.sample().u).collect();
+        assert_eq!(played, [1.0, 2.0, 3.0, 0.0]);
+    }
+}
+
+#[test]
+fn uploads_are_taken_whole_or_not_at_all() {
+    let mut rig = Rig::ready();
+    let many = [0; CAPACITY + 1];
+    let fits = (CAPACITY as u32).to_le_bytes().to_vec();
+    assert_eq!(rig.upload(0, &many), (7, fits));
+    assert_eq!(rig.upload(1, &[1]), (9, vec![0; 4]));
+    assert_eq!(rig.upload(0, &[1, 2]).0, 0);
+    assert_eq!(rig.upload(3, &[1]), (9, vec![2, 0, 0, 0]));
+    assert_eq!(rig.references(2, &[1.0]), (9, vec![0; 4]));
+    assert_eq!(rig.upload(u32::MAX, &[1]), (9, vec![2, 0, 0, 0]));
+    assert_eq!(
+        rig.upload(1, &many[..CAPACITY]),
+        (7, (CAPACITY as u32 - 1).to_le_bytes().to_vec())
+    );
+    assert_eq!(
+        rig.command(0x08, &[0, 0, 0, 0, 0, 1]),
+        (2, vec![6, 0, 0, 0])
+    );
+    assert_eq!(rig.command(0x08, &[2, 0, 0, 0, 0]), (8, vec![0; 4]));
+}
+
+#[test]
+fn starts_that_make_no_sense_are_refused_by_field() {
+    let mut rig = Rig::armed();
+    rig.upload(0, &[1000; 5]);
+    let mut refused = |body: crate::link::Body| {
+        let (result, body) = rig.command(0x0A, body.bytes().unwrap());
+        (result, body[0])
+    };
+    assert_eq!(refused(start(3, 0, 5, 3, 10)), (3, 0));
+    assert_eq!(refused(start(1, 0, 5, 3, 10)), (3, 3));
+    assert_eq!(refused(start(0, 0, 0, 3, 10)), (3, 3));
+    assert_eq!(refused(start(0, 0, 5, 0x40, 10)), (3, 4));
+    assert_eq!(refused(start(0, 0, 5, 3, 58)), (3, 5));
+    assert_eq!(refused(start(0, 0, 5, 3, 0)), (3, 5));
+    let mut short = start(0, 0, 5, 3, 10).bytes().unwrap().to_vec();
+    short[1..5].copy_from_slice(&999u32.to_le_bytes());
+    assert_eq!(rig.command(0x0A, &short), (3, vec![1, 0, 0, 0]));
+    rig.references(0, &[1.0]);
+    let body = start(1, 0, 1, 3, 10);
+    let answer = rig.command(0x0A, body.bytes().unwrap());
+    assert_eq!(answer, (3, vec![0; 4]), "no gains");
+}
+
+#[test]
+fn the_batch_under_way_is_sent_when_the_run_ends() {
+    let mut rig = Rig::driving(3.0);
+    rig.watched(11);
+    rig.stop();
+    assert_eq!(rig.sent().len(), 13);
+    let mut rig = Rig::driving(3.0);
+    rig.samples(60);
+    assert_eq!(rig.device.reason(), Reason::Watchdog);
+    let sent = rig.sent();
+    assert!(sent.windows(2).all(|pair| pair[1].0 - pair[0].0 == PERIOD));
+    assert_eq!(sent.len(), 50);
+}
