@@ -167,7 +167,7 @@ impl Rig {
 
     /// A command with the next number.
     pub fn command(&mut self, kind: u8, body: &[u8]) -> Answer {
-        self.commands += 1;
+        self.commands = self.commands.wrapping_add(1);
         self.say(kind, self.tag, self.commands, body);
         self.answer(kind, self.commands).unwrap()
     }
