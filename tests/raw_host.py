@@ -38,6 +38,14 @@ class RawHost:
         self.frames: list[golden.Frame] = []
         self.tag = 0
         self.session = session
+        self.repeat = 0.5
+
+    def reopen(self, port: str) -> None:
+        """Go on with the session on a port that was away."""
+        self.close()
+        self._fd, self._socket = _opened(port)
+        self._rest = b""
+        self.command(HELLO, struct.pack("<BBI", 1, 1, self.session))
 
     def hello(self) -> bytes:
         body = struct.pack("<BBI", 1, 1, self.session)
@@ -93,7 +101,7 @@ class RawHost:
         deadline = time.monotonic() + PATIENCE
         while time.monotonic() < deadline:
             self.write(frame)
-            for reply in self._until(0.5, lambda f: f[0] == 0x80 | kind):
+            for reply in self._until(self.repeat, lambda f: f[0] == 0x80 | kind):
                 number, result = struct.unpack_from("<IB", reply[4])
                 if number == sequence:
                     return result, reply[4][5:]
@@ -115,11 +123,15 @@ class RawHost:
                 return found
         return []
 
+    def running(self) -> None:
+        """Wait until the run has begun."""
+        self.settle(RUNNING)
+
     def state(self) -> int:
         return self.command(STATUS)[0]
 
     def settle(self, state: int = IDLE) -> None:
-        """Wait until the device has booted."""
+        """Wait until the device is in a state."""
         while self.state() != state:
             pass
 
@@ -150,20 +162,52 @@ class RawHost:
     def keep(self, *, watchdog: int = WATCHDOG) -> None:
         self.send(KEEP, struct.pack("<I", watchdog))
 
+    def drive(self, u: float, *, watchdog: int = WATCHDOG) -> None:
+        self.send(DRIVE, struct.pack("<If", watchdog, u))
+
+    def turn(self, watchdog: int) -> None:
+        """From anywhere to a motor that turns at 2 V."""
+        self.hello()
+        if self.state() == TRIPPED:
+            self.command(CLEAR)
+        self.settle()
+        self.arm(watchdog=10_000_000)
+        self.start(0, mode=2, watchdog=10_000_000)
+        self.running()
+        self.drive(2.0, watchdog=watchdog)
+        # its reply says that the shorter time is in force
+        self.state()
+
     def credit(self, until: int, *, watchdog: int = WATCHDOG) -> None:
         self.send(CREDIT, struct.pack("<IQ", watchdog, until))
 
+    def fileno(self) -> int:
+        return self._fd
+
     def close(self) -> None:
+        if self._fd < 0:
+            return
         if self._socket is not None:
             self._socket.close()
         else:
             os.close(self._fd)
+        self._fd = -1
 
     def __enter__(self) -> RawHost:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def drive_forever(port: str) -> None:
+    """Turn the motor until killed, telling the device every 5 ms; says when it turns."""
+    with RawHost(port, session=os.getpid()) as host:
+        host.turn(WATCHDOG)
+        print("running", flush=True)
+        while True:
+            host.drive(2.0)
+            host.read(0.005)
 
 
 def _opened(port: str) -> tuple[int, socket.socket | None]:
@@ -187,3 +231,7 @@ def counts_and_u(frames: list[golden.Frame]) -> list[tuple[int, int, int]]:
         u = struct.unpack_from(f"<{n}h", body, 3 + 2 * n)
         rows += [(at + 1000 * k, c, v) for k, (c, v) in enumerate(zip(counts, u, strict=True))]
     return rows
+
+
+if __name__ == "__main__":
+    drive_forever(sys.argv[1])

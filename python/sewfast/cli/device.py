@@ -21,9 +21,11 @@ if TYPE_CHECKING:
 DEVICE = """\
 Serve the virtual sewing machine on a port, as a real drive would be there.
 
-The first line on standard output is `port NAME`; record, run and doctor take that name. Another
-such line follows where the port comes back under another name. Ctrl-C ends it.
-A pty is named by a symbolic link, which outlives a fault `unplug`. TCP takes one host at a time.
+The first line on standard output is `port NAME`; record, run and doctor take that name. Ctrl-C
+ends it.
+
+A pty is named by a symbolic link, which comes back with it after a fault `unplug`. TCP takes one
+host at a time.
 """
 
 EXAMPLES = """\
@@ -40,7 +42,7 @@ device boots anew), unplug (the port is gone, .3 s)
 """
 
 _LOOK = 0.05
-"""Time between two looks at signals and the port's name [s]."""
+"""Time between two looks at signals [s]."""
 
 
 def add(commands: Commands) -> None:
@@ -108,13 +110,9 @@ def device_command(args: argparse.Namespace) -> None:
 
 
 def _serve(device: VirtualDevice, *, as_json: bool) -> None:
-    port = None
-    while True:
-        if port != device.port:
-            port = device.port
-            _say(json.dumps({"port": port}) if as_json else f"port {port}")
-        if device.wait(_LOOK):
-            return
+    _say(json.dumps({"port": device.port}) if as_json else f"port {device.port}")
+    while not device.wait(_LOOK):
+        pass
 
 
 def _say_result(device: VirtualDevice, *, as_json: bool) -> None:

@@ -46,7 +46,8 @@ pub struct Serving<'a> {
     ends: Option<Instant>,
     room: usize,
     connected: bool,
-    met: bool,
+    /// A host has gone by itself, and none has come since.
+    left: bool,
     stalled: Option<Instant>,
     unplugged: Option<Instant>,
     statistics: Statistics,
@@ -92,7 +93,7 @@ impl<'a> Serving<'a> {
                 (false, None) => WAITING,
             },
             connected: false,
-            met: false,
+            left: false,
             stalled: None,
             unplugged: None,
             statistics: Statistics::default(),
@@ -116,11 +117,10 @@ impl<'a> Serving<'a> {
     }
 
     fn finished(&self) -> bool {
-        let left = self.once && self.met && !self.connected && self.unplugged.is_none();
         self.shared.stop.load(Ordering::Relaxed)
             || self.ends.is_some_and(|ends| Instant::now() >= ends)
             // the watchdog is given the time to end what was left running
-            || left && !self.rig.output().enabled
+            || self.once && self.left && !self.rig.output().enabled
     }
 
     /// Does what the owner of the server has asked for.
@@ -157,7 +157,7 @@ impl<'a> Serving<'a> {
             return;
         }
         self.connected = connected;
-        self.met |= connected;
+        self.left = !connected && self.unplugged.is_none();
         self.inbound.clear();
         self.outbound.clear();
         if connected {
