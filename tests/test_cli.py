@@ -64,6 +64,7 @@ COMMANDS = [
     "run",
     "report",
     "ports",
+    "doctor",
 ]
 
 

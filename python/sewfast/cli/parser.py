@@ -4,7 +4,18 @@ from __future__ import annotations
 
 import argparse
 
-from . import control, device, drive, experiment, files, identify, models, ports, recording
+from . import (
+    control,
+    device,
+    doctor,
+    drive,
+    experiment,
+    files,
+    identify,
+    models,
+    ports,
+    recording,
+)
 from .arguments import Commands, Help
 
 DESCRIPTION = """\
@@ -47,7 +58,19 @@ def build_parser() -> argparse.ArgumentParser:
     commands: Commands = parser.add_subparsers(
         title="commands", metavar="COMMAND", dest="name", required=True
     )
-    for group in (experiment, recording, files, identify, models, control, ports, drive, device):
+    groups = (
+        experiment,
+        recording,
+        files,
+        identify,
+        models,
+        control,
+        ports,
+        doctor,
+        drive,
+        device,
+    )
+    for group in groups:
         group.add(commands)
     return parser
 

@@ -1,6 +1,8 @@
 """The link to a real or virtual drive: ports, sessions, runs (docs/PROTOCOL.md)."""
 
 from .clock import ClockBounds
+from .diagnosis import Diagnosis, Finding
+from .doctor import examine
 from .drive import Drive, connect
 from .host_loop import HostLoopRun, at_period, run_on_host
 from .jitter import Jitter
@@ -12,8 +14,10 @@ from .wire import Channel, Event, Identity, Limits, Status
 __all__ = [
     "Channel",
     "ClockBounds",
+    "Diagnosis",
     "Drive",
     "Event",
+    "Finding",
     "HostLoopRun",
     "Identity",
     "Jitter",
@@ -28,6 +32,7 @@ __all__ = [
     "VirtualDevice",
     "at_period",
     "connect",
+    "examine",
     "list_ports",
     "open_port",
     "run_on_host",

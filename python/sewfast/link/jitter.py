@@ -134,7 +134,11 @@ class Jitter:
         ):
             axes.stairs(_counted(values), EDGES, label=name, fill=True, alpha=0.5, color=colour)
         axes.axvline(self.period, color="0.3", linestyle="--", label="period")
-        axes.set(xscale="log", yscale="log", xlabel="time [us]", ylabel="ticks", ylim=(0.5, None))
+        used = np.flatnonzero(_counted(self.late) + _counted(self.age))
+        ends = (EDGES[used[0]], EDGES[used[-1] + 1]) if len(used) else (1.0, 1.0)
+        span = (0.5 * min(ends[0], self.period), 2.0 * max(ends[1], self.period))
+        axes.set(xscale="log", yscale="log", xlim=span, ylim=(0.5, None))
+        axes.set(xlabel="time [us]", ylabel="ticks")
         axes.set_title(
             f"{len(self.late)} ticks of {_time(self.period)}, {self.missed} missed", fontsize=10
         )
