@@ -21,6 +21,7 @@ from . import wire
 from .drive import Drive
 from .jitter import Jitter
 from .plan import Layout, Plan
+from .refusals import refusal
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
@@ -325,7 +326,7 @@ def _scheduling(wanted: bool) -> Iterator[list[str]]:
 
 def _raise_where_it_never_ran(outcome: Mapping[str, Any]) -> None:
     if outcome["name"] == "refused":
-        told = wire.refusal(outcome["command"], outcome["result"], outcome["detail"])
+        told = refusal(outcome["command"], outcome["result"], outcome["detail"])
         raise LinkError(told)
     if outcome["name"] == "unanswered":
         raise LinkError(
