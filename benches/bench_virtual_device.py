@@ -1,4 +1,4 @@
-"""How many times faster than real time the virtual device runs through a pty, with a host in Python."""
+"""How many times faster than real time the virtual device runs through a pty."""
 
 from __future__ import annotations
 
