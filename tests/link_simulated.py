@@ -9,7 +9,8 @@ from types import SimpleNamespace
 import pytest
 
 from link_device import ScriptedDevice
-from sewfast.link import connection, drive, run
+from sewfast.errors import LinkError
+from sewfast.link import connection, drive, rest, run
 from sewfast.link.connection import Connection
 from sewfast.link.drive import Drive
 from sewfast.link.ports import Port
@@ -65,6 +66,9 @@ class SimulatedPort(Port):
         self._clock.now += 1e-5
         self._rest = self._device.hear(self._rest + data)
 
+    def fileno(self) -> int:
+        raise LinkError("it has no descriptor")
+
     def close(self) -> None:
         pass
 
@@ -74,7 +78,7 @@ def simulated(**settings: object) -> Iterator[tuple[ScriptedDevice, SimulatedPor
     """A device and its port, with the host's clock simulated as long as the block lasts."""
     clock = Clock()
     with pytest.MonkeyPatch.context() as patch:
-        for module in (connection, drive, run):
+        for module in (connection, drive, rest, run):
             patch.setattr(module, "time", clock)
         device = ScriptedDevice(None, clock=clock, **settings)
         device.wire = Ideal()  # type: ignore[assignment]

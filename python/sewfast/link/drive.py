@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from types import TracebackType
 from typing import Literal
 
@@ -19,13 +19,11 @@ from .clock import ClockBounds
 from .connection import Connection, DeviceReset, Loan
 from .plan import Layout, Outcome, Plan, Sink, layout, require_capable
 from .ports import open_port
+from .rest import await_measurement, wait_for_rest
 from .run import Run
 from .wire import Channel, Identity, Kind, Limits, Status
 
 PATIENCE = 3.0
-REST_US = 120_000
-"""Device's time without a count after which a motor is at rest; ARM wants 100 ms."""
-STEP_US = 20_000
 
 
 class Drive:
@@ -44,7 +42,7 @@ class Drive:
         self._channels = _describe(link)
         #: What became of the last run, also of one that ended in an exception.
         self.outcome: Outcome | None = None
-        self._await_measurement()
+        await_measurement(link)
 
     def __enter__(self) -> Drive:
         return self
@@ -193,19 +191,7 @@ class Drive:
         LinkError
             Where the motor still moves then.
         """
-        status = self.status()
-        since = began = status.time_us
-        deadline = time.monotonic() + timeout + (5.0 if self.identity.on_credit else 0.0)
-        while status.time_us - since < REST_US:
-            if status.time_us - began > timeout * 1e6 or time.monotonic() > deadline:
-                raise LinkError(
-                    f"expected the motor at rest within {timeout:g} s, it turns at "
-                    f"{status.speed_rpm:.0f} RPM; brake it or wait longer"
-                )
-            self._let_pass(STEP_US)
-            before, status = status, self.status()
-            if status.counts != before.counts:
-                since = status.time_us
+        wait_for_rest(self._link, timeout)
 
     def upload(
         self, values: object, *, what: Literal["commands", "references"] = "commands"
@@ -376,24 +362,8 @@ class Drive:
     def _settle(self) -> None:
         """Rest after a stop, where the device can say so."""
         if self.outcome is not None and self.outcome.state != "unknown":
-            try:
+            with suppress(LinkError):
                 self.wait_for_rest()
-            except LinkError:
-                return
-
-    def _let_pass(self, us: int) -> None:
-        if self.identity.on_credit:
-            self._link.grant(self._link.newest + us)
-            return
-        until = time.monotonic() + us * 1e-6
-        while (rest := until - time.monotonic()) > 0.0:
-            self._link.turn(rest)
-
-    def _await_measurement(self) -> None:
-        """Boot ends by itself after some good samples; one on credit needs time for them."""
-        deadline = time.monotonic() + 1.0
-        while self.status().state == "boot" and time.monotonic() < deadline:
-            self._let_pass(STEP_US)
 
 
 class _Nobody:

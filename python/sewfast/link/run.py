@@ -61,6 +61,7 @@ class Run:
         self._granted = 0
         self._beaten = self._heard = self._asked = 0.0
         self._outages = len(link.outages)
+        link.receiver.anomalies()
         self._counters = dict(link.receiver.counters)
         pause = 3.0 * layout.batch * self.period * 1e-6
         self._silence = 0.02 if self._on_credit else max(0.1, pause)
@@ -167,14 +168,14 @@ class Run:
 
     def _ask(self, now: float) -> None:
         """The next command where one is due: a piece of the profile, or STATUS."""
-        piece = None if self.profile is None else self.profile.piece(self._room())
-        if piece is not None:
-            self.link.begin(Kind.UPLOAD, piece)
-            return
         silent = now - max(self._heard, self._asked) >= self._silence
         if silent or (not self._on_credit and now - self._asked >= ASK):
             self._asked = now
             self.link.begin(Kind.STATUS)
+            return
+        piece = None if self.profile is None else self.profile.piece(self._room())
+        if piece is not None:
+            self.link.begin(Kind.UPLOAD, piece)
 
     def _room(self) -> int:
         """Values that fit: one has room once the one `capacity` before it has been played."""
@@ -184,6 +185,9 @@ class Run:
     def _answered(self, reply: Reply) -> None:
         if reply.kind == Kind.UPLOAD and self.profile is not None:
             self.profile.answered(reply)
+            if reply.result:
+                # the run has ended, or the device sees it otherwise: STATUS comes next
+                self._heard = self._asked = -math.inf
         elif reply.kind == Kind.STATUS:
             self._last = wire.status(reply)
             going = self._last.run == self.run and self._last.state in ("armed", "running")
