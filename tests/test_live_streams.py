@@ -264,7 +264,7 @@ def test_foxglove_client_that_never_reads_holds_nothing_up() -> None:
             f.put(first + 10 * k, wide)
             time.sleep(0.002)
 
-    with open_view("foxglove:0", f) as view, subscribe(view.port) as client:
+    with open_view("foxglove:0", f, own_process=False) as view, subscribe(view.port) as client:
         fill(0, 300)
         while b'"column_00_of' not in client.recv(4096):
             continue
@@ -322,14 +322,19 @@ def test_foxglove_without_its_package_is_refused(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, "foxglove", None)
     with (
         pytest.raises(SettingError, match=r'pip install "sewfast\[foxglove\]"'),
-        open_view("foxglove", feed()),
+        open_view("foxglove", feed(), own_process=False),
     ):
         pass
 
 
-def test_no_thread_is_left_behind() -> None:
-    f = feed()
-    with open_view("plotjuggler", f):
-        f.put(0, batch(0))
-        assert any(t.name == "live view" for t in threading.enumerate())
-    assert not any(t.name == "live view" for t in threading.enumerate())
+def test_nothing_is_left_behind() -> None:
+    before = set(os.listdir("/proc/self/fd")) if sys.platform.startswith("linux") else set()
+    for own_process in (True, False):
+        f = feed()
+        with open_view("plotjuggler", f, own_process=own_process):
+            f.put(0, batch(0))
+            alive = any(t.name == "live view" for t in threading.enumerate())
+            assert alive is not own_process
+        assert not any(t.name == "live view" for t in threading.enumerate())
+    if before:
+        assert len(os.listdir("/proc/self/fd")) <= len(before)

@@ -80,6 +80,10 @@ class Terminal:
             with self._lock:
                 self._stream.feed(chunk)
 
+    @property
+    def reading(self) -> bool:
+        return self._reader is not None and self._reader.is_alive()
+
     def finish(self) -> list[str]:
         """Lines of the screen once all was written, without the empty ones at the end."""
         os.close(self.theirs)
@@ -226,24 +230,24 @@ def test_encoding_without_braille(terminal: Terminal) -> None:
     assert b"\x1b[36m*" in terminal.output
 
 
-@pytest.mark.parametrize("anew", [True, False], ids=["opened anew", "shared"])
+@pytest.mark.parametrize("where", ["process", "thread", "shared"])
 def test_blocked_terminal_holds_nothing_up(
-    terminal: Terminal, monkeypatch: pytest.MonkeyPatch, anew: bool
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
-    """Nobody reads: puts go on, and the end comes."""
+    """Nobody reads: puts go on, and the end comes; also where it cannot be opened anew."""
     terminal.attach(reading=False)
     terminal.fill()
-    if not anew:
+    if where == "shared":
         monkeypatch.setattr(os, "ttyname", _no_name)
     f = feed(None)
-    began = time.monotonic()
-    with open_view("terminal", f):
+    with open_view("terminal", f, own_process=where == "process"):
         for k in range(30):
             for first in range(0, 1000, 10):
                 f.put(1000 * k + first, {"u": np.zeros(10), "counts": np.zeros(10)})
             f.say("x" * 1000)
             time.sleep(0.02)
         assert f.received == 30_000
+        began = time.monotonic()
     assert time.monotonic() - began < 10
     # what still waits for a shared terminal is let go
     terminal.hang_up()
@@ -262,7 +266,7 @@ def test_shared_terminal_is_drawn_on(terminal: Terminal, monkeypatch: pytest.Mon
     monkeypatch.setattr(os, "ttyname", _no_name)
     terminal.attach()
     f = feed()
-    with open_view("terminal", f):
+    with open_view("terminal", f, own_process=False):
         play(f, 0.3)
     lines = terminal.finish()
     assert lines[0] == "record sine"
@@ -311,6 +315,23 @@ def test_error_of_the_record_goes_through(terminal: Terminal) -> None:
     assert terminal.finish()[-1] == "gap of 50 samples at 1.000 s"
 
 
+@pytest.mark.parametrize("kind", ["auto", "terminal"])
+def test_view_that_does_not_start(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """Refused where it was asked for; else the record goes on with a line."""
+    terminal.attach()
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    f = feed()
+    asked = pytest.raises(SettingError, match="expected another process for the live view")
+    with asked if kind == "terminal" else contextlib.nullcontext(), open_view(kind, f) as view:
+        play(f, 0.1)
+        assert view is None
+    assert f.closed.is_set()
+    terminal.finish()
+    assert (b"the live view ended early" in terminal.output) == (kind == "auto")
+
+
 def test_failing_view_costs_a_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -319,7 +340,7 @@ def test_failing_view_costs_a_line(
 
     monkeypatch.setattr("sewfast.live.plotjuggler.PlotJugglerView._send", fail)
     f = feed()
-    with open_view("plotjuggler", f):
+    with open_view("plotjuggler", f, own_process=False):
         play(f, 0.1)
     assert f.received == 1950
     assert "the live view ended early: ValueError: broken" in capsys.readouterr().err
@@ -354,3 +375,22 @@ def test_ctrl_c_leaves_the_last_frame(terminal: Terminal) -> None:
     assert "all samples received" in lines[first - 2]
     assert b"\x1b[?" not in terminal.output
     assert lines[-1] == "KeyboardInterrupt"
+
+
+def test_view_ends_with_a_program_that_was_killed(terminal: Terminal) -> None:
+    terminal.read()
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM],
+        stderr=terminal.theirs,
+        env={**os.environ, "TERM": "xterm", "PYTHONUTF8": "1"},
+        cwd=ROOT,
+    )
+    deadline = time.monotonic() + 30
+    while terminal.output.count(b"\x1b[J") < 3 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    # the terminal ends once nobody holds it open: neither program nor view
+    lines = terminal.finish()
+    assert "all samples received" in lines[-1]
+    assert not terminal.reading

@@ -2,6 +2,7 @@
 
 from .feed import Feed
 from .kind import Kind
-from .view import View, open_view
+from .make import View
+from .view import open_view
 
 __all__ = ["Feed", "Kind", "View", "open_view"]

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, SettingError
+from .memory import Memory
 from .speed import speed_over_window
 
 FloatArray = NDArray[np.float64]
@@ -29,6 +34,12 @@ _LEAST, _MOST = 4096, 131_072
 
 _SPARE_S = 2.0
 """Kept beyond what a picture spans, for a view that comes late [s]."""
+
+
+_CLAIMED, _END, _RECEIVED, _GAPS = range(4)
+
+_LONGEST = 500
+"""Of a line of status; written at once, it is never written in part (POSIX, PIPE_BUF)."""
 
 
 class Feed:
@@ -59,10 +70,6 @@ class Feed:
     ----------
     columns : dict of str to str
         With the derived speed.
-    end : int
-        Number of the sample after the newest one.
-    received, gaps : int
-        Samples that came; jumps between batches.
     window : int
         Samples that a picture spans: all planned ones of a short record, else the last seconds.
     closed : threading.Event
@@ -97,13 +104,16 @@ class Feed:
         self._lag = max(1, round(speed_window / Ts))
         self.columns = _with_speed(columns, derived=self._derives)
         self._size, self.window = _extent(self.Ts, n)
-        self._rows = np.full((len(columns), self._size), np.nan)
-        # which sample a place of the ring holds: a gap costs nothing when it is put
-        self._holds = np.full(self._size, -1, dtype=np.int64)
-        self._claimed = 0
-        self.end = 0
-        self.received = 0
-        self.gaps = 0
+        self._memory = Memory.own(len(columns), self._size)
+        self._pipe: int | None = None
+        self.description: dict[str, Any] = {
+            "columns": dict(columns),
+            "Ts": self.Ts,
+            "n": None if n is None else int(n),
+            "title": title,
+            "counts_per_rev": None if counts_per_rev is None else float(counts_per_rev),
+            "speed_window": float(speed_window),
+        }
         self._said: deque[tuple[int, str]] = deque(maxlen=64)
         self._sayings = 0
         self.closed = threading.Event()
@@ -111,6 +121,45 @@ class Feed:
     @property
     def _derives(self) -> bool:
         return self._per_rev is not None and SPEED not in self._streamed
+
+    @classmethod
+    def attached(cls, file: int, description: Mapping[str, Any]) -> Feed:
+        """The feed of another process, from its memory and its `description`."""
+        feed = cls(**description)
+        feed._memory = Memory.mapped(file, len(feed._streamed), feed._size)
+        return feed
+
+    @contextmanager
+    def share(self, pipe: int) -> Iterator[int]:
+        """Memory that another process may map, as a file's descriptor.
+
+        Parameters
+        ----------
+        pipe : int
+            Takes the lines of status as JSON; not blocking.
+        """
+        file, self._memory = self._memory.shared()
+        self._pipe = pipe
+        try:
+            yield file
+        finally:
+            self._pipe = None
+            os.close(file)
+
+    @property
+    def end(self) -> int:
+        """Number of the sample after the newest one."""
+        return int(self._memory.counters[_END])
+
+    @property
+    def received(self) -> int:
+        """Samples that came."""
+        return int(self._memory.counters[_RECEIVED])
+
+    @property
+    def gaps(self) -> int:
+        """Jumps between batches."""
+        return int(self._memory.counters[_GAPS])
 
     @property
     def missing(self) -> int:
@@ -137,7 +186,9 @@ class Feed:
             return
         count = len(next(iter(columns.values())))
         end = first + count
-        self._claimed = max(self._claimed, end)
+        counters = self._memory.counters
+        before = counters[_END]
+        counters[_CLAIMED] = max(before, end)
         kept = min(count, self._size)
         start = end - kept
         place = start % self._size
@@ -145,9 +196,9 @@ class Feed:
         self._write(slice(place, place + head), start, count - kept, columns, count)
         if head < kept:
             self._write(slice(0, kept - head), start + head, count - kept + head, columns, count)
-        self.gaps += first > self.end
-        self.received += count
-        self.end = max(self.end, end)
+        counters[_GAPS] += first > before
+        counters[_RECEIVED] += count
+        counters[_END] = max(before, end)
 
     def _write(
         self,
@@ -158,24 +209,28 @@ class Feed:
         count: int,
     ) -> None:
         """Copy what follows the first `skip` samples of a batch into neighbouring places."""
-        width = places.stop - places.start
+        width, rows = places.stop - places.start, self._memory.rows
         for name, row in self._streamed.items():
             values = columns.get(name)
             if values is None:
-                self._rows[row, places] = np.nan
+                rows[row, places] = np.nan
             elif len(values) == count:
-                self._rows[row, places] = values[skip : skip + width]
+                rows[row, places] = values[skip : skip + width]
             else:
                 raise DataError(
                     f"expected every column of a batch to have {count} samples, received "
                     f"{len(values)} of {name}; put whole batches"
                 )
-        self._holds[places] = np.arange(first, first + width)
+        self._memory.holds[places] = np.arange(first, first + width)
 
     def say(self, text: str) -> None:
         """Add a line of status, such as "tripped: speed limit"; the newest are kept."""
         self._sayings += 1
         self._said.append((self._sayings, text))
+        if self._pipe is not None:
+            # a view that takes nothing more, or is gone, misses the line
+            with suppress(OSError):
+                os.write(self._pipe, json.dumps(text[:_LONGEST]).encode() + b"\n")
 
     def said(self, after: int = 0) -> list[tuple[int, str]]:
         """The lines whose number is above `after`, with their numbers, the oldest first."""
@@ -214,9 +269,9 @@ class Feed:
         """The rows of a range; what the writer overtook meanwhile is NaN."""
         wanted = np.arange(start, stop)
         places = wanted % self._size
-        rows = self._rows[:, places]
-        known = self._holds[places] == wanted
-        known &= wanted >= self._claimed - self._size
+        rows = self._memory.rows[:, places]
+        known = self._memory.holds[places] == wanted
+        known &= wanted >= self._memory.counters[_CLAIMED] - self._size
         rows[:, ~known] = np.nan
         return rows
 
