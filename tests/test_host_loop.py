@@ -18,9 +18,19 @@ import numpy as np
 import pytest
 
 from link_device import ARM, DRIVE, START, STOP, ScriptedDevice
-from sewfast import Controller, Gains, _core
+from sewfast import Controller, Gains, VirtualMachine, _core, read_table, write_table
+from sewfast.cli import main
 from sewfast.errors import Interrupted, LinkError, SettingError
-from sewfast.link import Drive, HostLoopRun, Jitter, at_period, connect, run_on_host
+from sewfast.link import (
+    Drive,
+    HostLoopRun,
+    Jitter,
+    VirtualDevice,
+    at_period,
+    connect,
+    run_on_host,
+)
+from sewfast.recordfile import read_recording
 
 pytest.importorskip("serial", reason="opens pseudo-terminals as serial ports")
 
@@ -272,3 +282,113 @@ def test_jitter_draws_both_histograms(tmp_path: Path) -> None:
     path = tmp_path / "jitter.png"
     _jitter().plot(path)
     assert path.read_bytes().startswith(b"\x89PNG")
+
+
+# --- on the virtual machine -----------------------------------------------------------------------
+
+SLOW = Controller(Gains.standard(0.002, 0.25), Ts=0.02, u_min=0.0, u_max=10.0)
+RAMP = np.interp(np.arange(0.0, 2.0, 0.02), [0.2, 1.2], [0.0, 1500.0])
+
+
+def _simulated() -> np.ndarray:
+    """The same loop without a link: measured and applied at once."""
+    machine, core, y = VirtualMachine(), SLOW.core(), []
+    before = machine.counts
+    for r in RAMP:
+        y.append((machine.counts - before) / (0.02 * machine.counts_per_rev / 60.0))
+        before = machine.counts
+        machine.run(np.full(20, core.step(r, y[-1])))
+    return np.array(y)
+
+
+@pytest.mark.parametrize("endpoint", ["pty", "tcp"])
+def test_tracks_as_the_loop_without_a_link(endpoint: Any) -> None:
+    with VirtualDevice(endpoint=endpoint) as device, connect(device.port, watchdog=1.0) as drive:
+        drive.set_limits()
+        run = run_on_host(drive, SLOW, RAMP)
+    assert run.outcome == "completed"
+    assert run.is_complete
+    measured = np.isfinite(run.y)
+    difference = (run.y - _simulated())[measured]
+    # a whole period of delay would be 30 RPM on the ramp
+    assert np.sqrt(np.mean(difference**2)) < 30.0
+    assert run.metrics()["rmse"] is not None
+
+
+def test_faults_are_gaps_and_nothing_is_lost_unnoticed(tmp_path: Path) -> None:
+    with (
+        VirtualDevice(faults="drop=.02,flip=.01", seed=4) as device,
+        connect(device.port, watchdog=1.0) as drive,
+    ):
+        drive.set_limits()
+        run = run_on_host(drive, SLOW, RAMP)
+    assert run.outcome == "completed"
+    assert run.gaps
+    assert run.taken == 2000
+    assert len(run.samples["t"]) + sum(n for _, n in run.gaps) == run.taken
+    run.save_samples(tmp_path / "run.csv")
+    table = read_table(tmp_path / "run.csv")
+    assert len(table["u"]) == run.taken
+    assert np.count_nonzero(np.isnan(table["u"])) == sum(n for _, n in run.gaps)
+    run.save_samples(tmp_path / "run.mcap")
+    recording = read_recording(tmp_path / "run.mcap")
+    assert np.array_equal(np.isnan(recording.columns["u"]), np.isnan(table["u"]))
+
+
+def test_the_watchdog_ends_a_host_that_stands_still(tmp_path: Path) -> None:
+    with VirtualDevice() as device, connect(device.port) as drive:
+        drive.set_limits()
+        threading.Timer(0.5, device.cause, ("stall", 0.3)).start()
+        run = run_on_host(drive, SLOW, RAMP, watchdog=0.1)
+        assert run.outcome in ("silent", "tripped")
+        assert drive.status().state != "running"
+
+
+@pytest.fixture
+def controller_file(tmp_path: Path) -> str:
+    SLOW.save(tmp_path / "controller.json")
+    write_table(tmp_path / "ramp.csv", {"t": 0.02 * np.arange(60), "r": RAMP[:60]})
+    return str(tmp_path / "controller.json")
+
+
+def test_the_command_runs_and_writes(
+    controller_file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["run", controller_file, "--reference", str(tmp_path / "ramp.csv"), "--host-loop"]
+    command += ["-o", str(tmp_path / "run.csv"), "--samples", str(tmp_path / "samples.mcap")]
+    command += ["--plot", str(tmp_path / "jitter.png"), "--json"]
+    with VirtualDevice() as device:
+        assert main([*command, "--on", device.port]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["outcome"] == "completed"
+    assert told["samples"] == told["taken"] == 1200
+    assert sum(told["jitter"]["histogram"]["late"]) == told["jitter"]["ticks"]
+    names = [header.split(" ")[0] for header in read_table(tmp_path / "run.csv").columns]
+    assert names == ["t", "r", "u", "y", "feedback", "late", "age"]
+    assert len(read_recording(tmp_path / "samples.mcap").columns["counts"]) == 1200
+    assert (tmp_path / "jitter.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_command_refuses_and_says_why(
+    controller_file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["run", controller_file, "--reference", "trapezoid", "--host-loop", "20"]
+    assert main([*command, "--on", "virtual"]) == 2
+    assert "--on PORT" in capsys.readouterr().err
+    with VirtualDevice(fast=True) as device:
+        assert main([*command, "--on", device.port]) == 2
+    assert "without --fast" in capsys.readouterr().err
+    assert main([*command[:-1], "-5", "--on", "socket://localhost:1"]) == 2
+    assert "up to 10000 ms" in capsys.readouterr().err
+
+
+def test_a_trip_exits_with_2_and_keeps_the_columns(
+    controller_file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["run", controller_file, "--reference", str(tmp_path / "ramp.csv"), "--host-loop"]
+    command += ["--limits", "volt=20,speed=300,acceleration=inf,current=inf"]
+    command += ["-o", str(tmp_path / "run.csv")]
+    with VirtualDevice() as device:
+        assert main([*command, "--on", device.port]) == 2
+    assert "tripped: speed" in capsys.readouterr().err
+    assert 20 < len(read_table(tmp_path / "run.csv")["t"]) < 60

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import DataError, Interrupted, SettingError
 from .arguments import RECORDINGS, TABLES, Commands, add_command, add_output, require_place
 from .drive import add_drive, is_port, opened, recording_place
+from .host_loop import add_host_loop, at_loops_period, run_host_loop
 from .output import print_json, print_rows, write_columns
 from .progress import Progress
 
@@ -53,6 +54,8 @@ examples:
   sewfast run controller.json --on virtual:7 --reference cycle.csv --json
   sewfast run controller.json --on /dev/ttyUSB0 --reference trapezoid -o measured.mcap \\
       --limits volt=10,speed=3500,acceleration=30000,current=15
+  sewfast run controller.json --on /dev/ttyUSB0 --reference cycle.csv -o measured.csv \\
+      --limits volt=10,speed=3500,acceleration=30000,current=15 --host-loop 20
 """
 
 
@@ -95,6 +98,7 @@ def add(commands: Commands) -> None:
         "CSV, .npz, .mat or Parquet, of a drive .mcap too; default: CSV to standard output",
     )  # fmt: skip
     add_drive(parser)
+    add_host_loop(parser)
 
 
 def tune_command(args: argparse.Namespace) -> int | None:
@@ -165,6 +169,9 @@ def run_command(args: argparse.Namespace) -> int | None:
     from ..control import load_controller
     from ..loop import run
 
+    if args.host_loop is not None:
+        controller = at_loops_period(args, load_controller(args.controller))
+        return run_host_loop(args, controller, _reference(args.reference, controller.Ts))
     require_place(args.out, RECORDINGS if is_port(args.on) else TABLES)
     controller = load_controller(args.controller)
     name = Path(args.reference).stem

@@ -28,6 +28,14 @@ class Progress:
         seconds = time.monotonic() - self._began
         self._draw(f"{self._title} [{bar}] {done}/{total}  best {best:.4g}  {seconds:.0f} s")
 
+    def count(self, done: int, total: int) -> None:
+        """Show work that has steps but no cost."""
+        if self._on:
+            filled = _WIDTH * done // max(total, 1)
+            bar = "=" * filled + " " * (_WIDTH - filled)
+            seconds = time.monotonic() - self._began
+            self._draw(f"{self._title} [{bar}] {done}/{total}  {seconds:.0f} s")
+
     def say(self, text: str) -> None:
         """Show a stage that has no steps to count."""
         if self._on:

@@ -4,7 +4,8 @@ from .clock import ClockBounds
 from .diagnosis import Diagnosis, Finding
 from .doctor import examine
 from .drive import Drive, connect
-from .host_loop import HostLoopRun, at_period, run_on_host
+from .host_loop import at_period, run_on_host
+from .host_run import HostLoopRun
 from .jitter import Jitter
 from .plan import Layout, Outcome, Plan, Sink
 from .ports import Port, PortInfo, list_ports, open_port
