@@ -38,16 +38,16 @@ def test_a_killed_recorder_leaves_what_it_wrote(tmp_path: Path, rate: str) -> No
     random = np.random.default_rng(len(rate))
     for trial in range(67 if SOAK else 5):
         path = tmp_path / f"{trial}.mcap"
-        moment = float(random.uniform(0.02, 0.7))
+        moment = float(random.uniform(0.02, 1.4 if rate == "slow" else 0.7))
         reported, killed = stopped_recorder(path, rate, moment, signal.SIGKILL)
         found = read_recording(path)
         assert_values(found)
         assert (found.gaps, found.outcome) == ((), "torn")
         older = max((n for n, at in reported if at < killed - 0.25), default=0)
         assert len(found) >= older - MESSAGE_SAMPLES
-        if rate == "slow":
-            # a message takes a quarter of a second here: two of them, and the machine's own delays
-            assert len(found) >= max((n for n, at in reported if at < killed - 0.6), default=0)
+        # what comes in a quarter of a second and a message of the slow recorder; counted, as a
+        # machine that is busy elsewhere slows all of it down
+        assert rate != "slow" or len(found) >= reported[-1][0] - 20
 
 
 def test_ctrl_c_costs_no_sample(tmp_path: Path) -> None:
