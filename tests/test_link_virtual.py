@@ -85,7 +85,8 @@ def test_real_time_is_kept_and_the_clock_is_known():
     sink = Kept()
     with VirtualDevice() as device:
         began = time.monotonic()
-        outcome = run(device, Plan("commands", excitation(1000)), sink, baud=921_600)
+        plan = Plan("commands", excitation(1000))
+        outcome = run(device, plan, sink, baud=921_600, watchdog=1.0)
         assert time.monotonic() - began >= 1.0
     assert outcome.is_complete
     assert outcome.clock is not None
@@ -184,7 +185,7 @@ def test_ctrl_c_leaves_a_motor_at_rest(fast):
         pressed.append(time.monotonic())
         os.kill(os.getpid(), signal.SIGINT)
 
-    with VirtualDevice(fast=fast) as device, connect(device.port, baud=921_600) as drive:
+    with VirtualDevice(fast=fast) as device, connect(device.port, watchdog=1.0) as drive:
         drive.set_limits(volt=20.0)
         timer = threading.Timer(0.1, press)
         sink = Kept(once(timer.start, at=200))

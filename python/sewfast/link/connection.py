@@ -39,6 +39,8 @@ class _Command:
     frame: bytes
     first_sent: float
     last_sent: float
+    since: float
+    """From when on its patience counts: anew after the port was away."""
     reply: Reply | None = None
 
 
@@ -191,7 +193,7 @@ class Connection:
         self._sequence = (self._sequence + 1) & 0xFFFFFFFF
         frame = self._frame(kind, self._sequence, body)
         now = time.monotonic()
-        self._command = _Command(kind, self._sequence, frame, now, now)
+        self._command = _Command(kind, self._sequence, frame, now, now, now)
         self._send(frame)
 
     def answer(self) -> Reply | None:
@@ -253,7 +255,7 @@ class Connection:
         pause = STOP_REPEAT if command.kind == Kind.STOP else REPEAT
         if command.reply is not None or now - command.last_sent < pause:
             return
-        if now - command.first_sent >= PATIENCE:
+        if now - command.since >= PATIENCE:
             self._command = None
             raise LinkError(
                 f"{self.port.url}: expected an answer to {Kind(command.kind).name}, none came "
@@ -351,7 +353,10 @@ class Connection:
                 "set the limits and start anew"
             )
             raise self._failed
-        self.outages.append(time.monotonic() - lost)
+        now = time.monotonic()
+        self.outages.append(now - lost)
+        if self._command is not None:
+            self._command.since = now
 
     def _return(self, lost: float, error: LinkError) -> Identity:
         while True:
@@ -360,8 +365,10 @@ class Connection:
                 return self._greet(REPEAT)
             except LinkError as failed:
                 if time.monotonic() - lost + RETRY > self.resume:
-                    message = f"{error}; it did not come back within {self.resume:g} s"
-                    raise LinkError(message) from failed
+                    raise LinkError(
+                        f"{error}; it did not come back within {self.resume:g} s: the device stops "
+                        f"its motor {self.watchdog:g} s after the last heartbeat"
+                    ) from failed
             time.sleep(RETRY)
 
     def close(self) -> None:

@@ -59,6 +59,7 @@ class Run:
         self._last: Status | None = None
         self._lead = round(CREDIT_SHARE * link.watchdog_us)
         self._granted = 0
+        self._driven = 0.0
         self._beaten = self._heard = self._asked = 0.0
         self._outages = len(link.outages)
         link.receiver.anomalies()
@@ -134,15 +135,19 @@ class Run:
         now = time.monotonic()
         if self._on_credit:
             self._grant(now)
-        elif now - self._beaten >= self.link.watchdog / 4.0:
+        elif now - self._beaten >= self.link.watchdog / 4.0 or self._changed():
             self._beaten = now
             self._beat()
 
     def _beat(self) -> None:
         if self.plan.mode == "direct":
-            self.link.drive(self._command())
+            self._driven = self._command()
+            self.link.drive(self._driven)
         else:
             self.link.keep()
+
+    def _changed(self) -> bool:
+        return self.plan.mode == "direct" and self._command() != self._driven
 
     def _command(self) -> float:
         """The command whose time has come, by the newest time heard of the device."""
@@ -316,6 +321,8 @@ class Run:
             Why; None where the run was cancelled.
         """
         self.link.each_turn = None
+        # a port that comes back while the motor may still turn is given the stop
+        self.link.resume = max(self.link.resume, self.link.watchdog)
         reason = "cancelled" if error is None else "failed"
         if isinstance(error, KeyboardInterrupt):
             reason = "interrupted"
