@@ -19,7 +19,7 @@ import pytest
 
 import raw_host as raw
 from cli import PROGRAM, environment, refused, sewfast
-from raw_host import RawHost, counts_and_u
+from raw_host import RawHost, counts_and_u, golden
 from sewfast import LinkError, SettingError, VirtualMachine
 from sewfast.link import VirtualDevice
 
@@ -338,6 +338,47 @@ def test_a_paced_port_carries_no_more_than_its_rate():
     # a command waits for the reply before it; each way may have saved a burst of 16 bytes meanwhile
     wire = (21 + size) + (21 + 5 + size) - 2 * 16
     assert passed * 1e-6 >= rounds * wire / (baud / 10)
+
+
+def test_115200_baud_carry_1_khz_with_40_percent_to_spare():
+    samples = 1500
+    with VirtualDevice(baud=round(115_200 / 1.4)) as device, RawHost(device.port) as host:
+        ready(host).start(samples, mode=2, watchdog=LONG)
+        host.frames.clear()
+        host.wait_for(raw.EVENT, raw.FINISHED)
+        batches = [f for f in host.frames if f[0] == raw.SAMPLES]
+        assert len(counts_and_u(host.frames)) == samples
+        assert len(batches) == samples // 10
+        assert max(len(golden.wire(*batch)) for batch in batches) <= 64
+        dropped = struct.unpack_from("<I", host.command(raw.STATUS), 45)[0]
+        assert dropped == 0
+
+
+@pytest.mark.parametrize("fast", [False, True])
+def test_hostile_bytes_leave_it_as_it_was(fast):
+    dice = random.Random(3)
+    with VirtualDevice(fast=fast, faults="flip=.1,drop=.1") as device:
+        with RawHost(device.port) as host:
+            host.hello()
+            for _ in range(200):
+                host.write(hostile(dice, host.tag))
+                host.read(0.0)
+        with RawHost(device.port, session=78) as host:
+            host.repeat = 0.02
+            host.write(b"\0")
+            host.hello()
+            assert host.state() in (raw.BOOT, raw.IDLE)
+            assert not [entry for entry in device.trace() if entry["event"] == "on"]
+
+
+def hostile(dice: random.Random, tag: int) -> bytes:
+    """Random bytes, whole frames of random content, and frames of which something is missing."""
+    frame = golden.wire(
+        dice.randrange(256), dice.choice((tag, dice.randrange(65536))), dice.randrange(2**32),
+        dice.randrange(2**64), dice.randbytes(dice.randrange(232)),
+    )  # fmt: skip
+    cut = dice.randrange(len(frame))
+    return dice.choice((frame, frame[:cut], frame[cut:], dice.randbytes(1000)))
 
 
 class TestLife:

@@ -318,6 +318,27 @@ mod tests {
     }
 
     #[test]
+    fn goes_wrong_alike_for_a_seed_and_a_traffic() {
+        let text =
+            "drop=.02,flip=.02,duplicate=.02,reorder=.02,delay=.02,stall=.01,reset=.01,unplug=.01";
+        let went = |seed, size| {
+            let (faults, start) = (Faults::parse(text).unwrap(), Instant::now());
+            let mut line = Line::new(Direction::ToHost, faults, seed, None, start);
+            let (mut log, mut events) = (FaultLog::default(), Vec::new());
+            let traffic: Vec<u8> = (0..3000).flat_map(frame).collect();
+            for piece in traffic.chunks(size) {
+                line.push(piece, start, &mut log, &mut events);
+            }
+            line.settle(start + Duration::from_secs(1), &mut log);
+            (line.arrived().to_vec(), log.counts(), events)
+        };
+        let first = went(1, 64);
+        assert_eq!(first, went(1, 7));
+        assert_ne!(first.0, went(2, 64).0);
+        assert!(first.1[0].iter().all(|&count| count > 5));
+    }
+
+    #[test]
     fn lets_an_overtaken_frame_go_where_nothing_follows() {
         let (mut line, mut log, now) = (line("reorder=1"), FaultLog::default(), Instant::now());
         push(&mut line, 5, now, &mut log);
