@@ -42,13 +42,17 @@ impl<T: Real> MovingAverage<T> {
     ///
     /// The sum is formed anew each time: a running sum would drift.
     pub fn step(&mut self, x: T) -> T {
-        let memory = &mut self.samples[..self.length];
+        // get, not an index: firmware is to hold no panic
+        let memory = self.samples.get_mut(..self.length).unwrap_or_default();
         if !self.started {
             memory.fill(x);
             self.started = true;
         }
-        memory[self.next] = x;
-        self.next = (self.next + 1) % self.length;
+        if let Some(oldest) = memory.get_mut(self.next) {
+            *oldest = x;
+        }
+        let next = self.next + 1;
+        self.next = if next < self.length { next } else { 0 };
         let sum = memory.iter().fold(T::ZERO, |sum, &x| sum + x);
         sum / T::from_count(self.length)
     }

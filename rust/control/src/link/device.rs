@@ -184,10 +184,26 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Device<CAPACITY, TRANSMIT> {
     /// # Errors
     /// The first field of the identity that is outside its range.
     pub fn new(identity: Identity) -> Result<Self, Refused> {
-        Ok(Self {
-            deframer: Deframer::new(),
-            core: Core::new(identity)?,
-        })
+        let mut device = Self::OFF;
+        device.boot(identity)?;
+        Ok(device)
+    }
+
+    /// A device before its boot, for a static place: it can do nothing, and its limits are 0.
+    pub const OFF: Self = Self {
+        deframer: Deframer::new(),
+        core: Core::OFF,
+    };
+
+    /// Boots in place, where [`new`](Self::new) would need the device's size on the stack; what was before is forgotten.
+    ///
+    /// # Errors
+    /// As for [`new`](Self::new); nothing is changed then.
+    pub fn boot(&mut self, identity: Identity) -> Result<(), Refused> {
+        identity.check()?;
+        *self = Self::OFF;
+        self.core.boot(identity);
+        Ok(())
     }
 
     /// Takes bytes that have come, in pieces of any length. Apply the output of [`poll`](Self::poll) afterwards.
@@ -305,38 +321,45 @@ struct Core<const CAPACITY: usize, const TRANSMIT: usize> {
 }
 
 impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
-    fn new(identity: Identity) -> Result<Self, Refused> {
-        identity.check()?;
-        let ts = (f64::from(identity.period) / 1e6) as f32;
-        let mut core = Self {
-            identity,
-            schema: identity.schema(),
-            period: NonZeroU64::new(identity.period.into()).unwrap_or(NonZeroU64::MIN),
-            ts,
-            transmit: Transmit::new(identity.tag()),
-            session: None,
-            credit: None,
-            watchdog: Watchdog::new(identity.period),
-            limits: None,
-            guard: Guard::new(identity.period, ts, identity.counts_per_rev),
-            gains: None,
-            profile: Profile::new(),
-            stream: Stream::new(identity.channels),
-            run: Run::NONE,
-            state: State::Boot,
-            reason: Reason::None,
-            output: Output::SAFE,
-            owed: false,
-            now: 0,
-            due: 0,
-            last_beat: 0,
-            good: 0,
-            armed: 0,
-            received: 0,
-            refused: 0,
-        };
-        core.event(Event::Boot, Reason::None, 0.0);
-        Ok(core)
+    const OFF: Self = Self {
+        identity: Identity::NONE,
+        schema: 0,
+        period: NonZeroU64::MIN,
+        ts: 1.0,
+        transmit: Transmit::new(),
+        session: None,
+        credit: None,
+        watchdog: Watchdog::new(1),
+        limits: None,
+        guard: Guard::new(1, 1.0, 1.0),
+        gains: None,
+        profile: Profile::new(),
+        stream: Stream::new(&[]),
+        run: Run::NONE,
+        state: State::Boot,
+        reason: Reason::None,
+        output: Output::SAFE,
+        owed: false,
+        now: 0,
+        due: 0,
+        last_beat: 0,
+        good: 0,
+        armed: 0,
+        received: 0,
+        refused: 0,
+    };
+
+    /// From off, with an identity that has been checked.
+    fn boot(&mut self, identity: Identity) {
+        self.identity = identity;
+        self.schema = identity.schema();
+        self.period = NonZeroU64::new(identity.period.into()).unwrap_or(NonZeroU64::MIN);
+        self.ts = (f64::from(identity.period) / 1e6) as f32;
+        self.transmit.boot(identity.tag());
+        self.watchdog = Watchdog::new(identity.period);
+        self.guard = Guard::new(identity.period, self.ts, identity.counts_per_rev);
+        self.stream = Stream::new(identity.channels);
+        self.event(Event::Boot, Reason::None, 0.0);
     }
 
     /// Lets time pass: the watchdog, and whether samples still come.

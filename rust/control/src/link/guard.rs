@@ -35,12 +35,12 @@ pub(super) struct Guard {
 }
 
 impl Guard {
-    pub(super) fn new(period: u32, ts: f32, counts_per_rev: f32) -> Self {
+    pub(super) const fn new(period: u32, ts: f32, counts_per_rev: f32) -> Self {
         Self {
             counts: [0; HISTORY],
             newest: 0,
             started: false,
-            period: period.into(),
+            period: period as u64,
             rpm: 60.0 / (WINDOW as f32 * ts * counts_per_rev),
             rate: 1.0 / (APART as f32 * ts),
             still: 0,

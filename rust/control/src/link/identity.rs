@@ -129,6 +129,18 @@ pub struct Identity {
 }
 
 impl Identity {
+    /// Of a device that is off.
+    pub(super) const NONE: Self = Self {
+        boot_id: 0,
+        name: "",
+        firmware: "",
+        period: 1,
+        counts_per_rev: 1.0,
+        capabilities: 0,
+        ceilings: Limits::NONE,
+        channels: &[],
+    };
+
     /// Whether the device has every capability in `bits`.
     pub fn can(&self, bits: u32) -> bool {
         self.capabilities & bits == bits

@@ -23,18 +23,23 @@ pub(super) enum Weight {
 }
 
 impl<const SIZE: usize> Transmit<SIZE> {
-    /// At boot; a zero goes first, as a frame may have been cut short by the reset.
-    pub(super) fn new(tag: u16) -> Self {
+    pub(super) const fn new() -> Self {
         const { assert!(SIZE >= 2 * MAX_WIRE, "room for a reply beside a batch") };
         Self {
             bytes: [0; SIZE],
             first: 0,
-            length: 1,
-            tag,
+            length: 0,
+            tag: 0,
             sequence: 0,
             dropped: 0,
             overflowed: false,
         }
+    }
+
+    /// Sets the tag of all frames; a zero goes first, as one may have been cut short by the reset.
+    pub(super) fn boot(&mut self, tag: u16) {
+        self.tag = tag;
+        self.append(&[0]);
     }
 
     /// Frames dropped since boot.
@@ -106,7 +111,7 @@ mod tests {
         fn loses_whole_frames_only(
             steps in prop::collection::vec((0usize..232, any::<bool>(), 0usize..600), 1..200),
         ) {
-            let mut transmit = Transmit::<1024>::new(7);
+            let mut transmit = Transmit::<1024>::new();
             let mut deframer = Deframer::new();
             let (mut accepted, mut came, mut dropped) = (Vec::new(), Vec::new(), 0);
             for (sequence, (length, stream, take)) in steps.into_iter().enumerate() {
@@ -132,7 +137,7 @@ mod tests {
 
     #[test]
     fn a_stream_leaves_room_for_a_reply() {
-        let mut transmit = Transmit::<1024>::new(0);
+        let mut transmit = Transmit::<1024>::new();
         while transmit.send(Weight::Stream, 0xC0, 0, &[0; 43]) {}
         assert!(transmit.send(Weight::Answer, 0x83, 0, &[0; 231]));
     }

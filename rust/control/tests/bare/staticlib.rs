@@ -5,6 +5,7 @@
 #![no_std]
 
 use core::panic::PanicInfo;
+use sewfast_control::link::{Device, Measurement};
 use sewfast_control::{Controller, Settings, Standard};
 
 #[panic_handler]
@@ -20,4 +21,18 @@ pub extern "C" fn one_step(r: f32, y: f32) -> f32 {
         Ok(mut controller) => controller.step(r, y),
         Err(_) => f32::NAN,
     }
+}
+
+/// A control period of a device, as firmware would call it.
+#[unsafe(no_mangle)]
+pub extern "C" fn one_period(device: &mut Device<64>, now: u64, counts: i32) -> f32 {
+    let measurement = Measurement {
+        counts,
+        current: f32::NAN,
+        further: &[],
+    };
+    let mut wire = [0; 64];
+    device.receive(now, &wire);
+    device.transmit(&mut wire);
+    device.sample(now, &measurement).u
 }
