@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV := $(CURDIR)/.venv
 BIN := $(VENV)/bin
 OUT ?= demo
+comma := ,
 
 # one interpreter and one target folder for every step, so that cargo compiles nothing twice
 export PYO3_PYTHON := $(BIN)/python
@@ -19,10 +20,10 @@ RUST := $(shell find rust -name '*.rs' -o -name 'Cargo.toml') Cargo.toml Cargo.l
 BUILT := $(VENV)/built.stamp
 REPORT := $(VENV)/report.stamp
 DEV := $(VENV)/dev.stamp
-MARKED := test lint rust-lint rust-test no-std python-lint types stubs python-test docs package
+MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo bench clean $(MARKED)
+.PHONY: help demo bench bench-device clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -30,7 +31,7 @@ help: ## this list
 demo: $(REPORT) ## the whole experiment on the virtual machine; the report goes to demo/report.html
 	$(BIN)/sewfast demo --out $(OUT)
 
-test: lint rust-test no-std docs package python-test ## every check; ends with pytest's summary
+test: lint rust-test no-std c-test docs package python-test ## every check; ends with pytest's summary
 
 lint: rust-lint python-lint types stubs ## formatting, clippy, ruff, mypy, stubs
 
@@ -60,6 +61,17 @@ ifeq ($(shell uname),Linux)
 	rustc --edition 2024 --crate-type cdylib -C panic=abort -C opt-level=s -C lto=fat -C embed-bitcode=yes -D warnings \
 	  --extern sewfast_control=target/release/libsewfast_control.rlib -C link-args='-nostdlib -lc -Wl,-z,defs' \
 	  --out-dir target/bare rust/control/tests/bare/no_panic.rs
+endif
+
+c-test: ## the C library and the example firmware, with board, motor and host in memory; nothing in it panics
+	cargo rustc --package sewfast-capi --profile firmware --crate-type staticlib --quiet
+	mkdir -p target/bare
+	$(CC) -std=c99 -Wall -Wextra -Werror -pedantic -O1 -I rust/capi/include -I examples/firmware \
+	  -o target/bare/device_test rust/capi/tests/device.c examples/firmware/firmware.c \
+	  target/firmware/libsewfast_capi.a -lm $(if $(filter Linux,$(shell uname)),-Wl$(comma)--gc-sections)
+	target/bare/device_test
+ifeq ($(shell uname),Linux)
+	! nm target/bare/device_test | grep panicking
 endif
 
 python-test: $(DEV) ## pytest, with every snippet of the documentation and every example

@@ -1,0 +1,139 @@
+//! [`Controller`] in storage of the caller.
+
+use crate::{place, tell};
+use core::ffi::c_void;
+use core::ptr::null_mut;
+use sewfast_control::{Controller, Settings, Standard};
+
+/// `sewfast_pid_settings`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct CSettings {
+    /// \[u/y\].
+    pub kp: f32,
+    /// \[s\].
+    pub ti: f32,
+    /// \[s\].
+    pub td: f32,
+    /// Share of the reference taken out of the proportional term.
+    pub alpha: f32,
+    /// Share of the reference taken out of the derivative term.
+    pub beta: f32,
+    /// The derivative's filter is `td/n`.
+    pub n: f32,
+    /// Anti-windup \[s\].
+    pub tt: f32,
+    /// \[u\].
+    pub u_min: f32,
+    /// \[u\].
+    pub u_max: f32,
+    /// \[u/s\].
+    pub slew: f32,
+    /// Sample time \[s\].
+    pub ts: f32,
+    /// Lag of the feedback \[s\].
+    pub filter_time: f32,
+    /// Moving average of the feedback.
+    pub filter_samples: u8,
+}
+
+/// The number of the setting, in the header's order and from 1; 0 is none.
+fn number(name: &str) -> i32 {
+    let names = [
+        "Kp",
+        "Ti",
+        "Td",
+        "alpha",
+        "beta",
+        "N",
+        "Tt",
+        "u_min",
+        "u_max",
+        "slew",
+        "Ts",
+        "filter_time",
+        "filter_samples",
+    ];
+    let found = (1..).zip(names).find(|(_, known)| *known == name);
+    found.map_or(-1, |(number, _)| number)
+}
+
+/// Bytes that a controller takes.
+#[unsafe(no_mangle)]
+pub extern "C" fn sewfast_pid_size() -> usize {
+    size_of::<Controller<f32>>()
+}
+
+/// A controller at rest in `storage`; null where it is refused.
+///
+/// # Safety
+/// `storage` is `size` bytes of memory that nothing else uses; `settings` is null or can be read; `refusal` is null or can be
+/// written to.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn sewfast_pid_init(
+    storage: *mut c_void,
+    size: usize,
+    settings: *const CSettings,
+    refusal: *mut i32,
+) -> *mut Controller<f32> {
+    // SAFETY: by contract.
+    let settings = unsafe { settings.as_ref() };
+    let made = match (place::<Controller<f32>>(storage, size), settings) {
+        (Some(place), Some(settings)) => {
+            settings.controller().map(|controller| {
+                // SAFETY: place is fit for a controller.
+                unsafe { place.write(controller) };
+                place
+            })
+        }
+        _ => Err(-1),
+    };
+    // SAFETY: by contract.
+    unsafe { tell(refusal, made.err().unwrap_or(0)) };
+    made.unwrap_or(null_mut())
+}
+
+impl CSettings {
+    fn controller(&self) -> Result<Controller<f32>, i32> {
+        let settings = Settings {
+            gains: Standard {
+                kp: self.kp,
+                ti: self.ti,
+                td: self.td,
+            },
+            alpha: self.alpha,
+            beta: self.beta,
+            n: self.n,
+            tt: self.tt,
+            u_min: self.u_min,
+            u_max: self.u_max,
+            slew: self.slew,
+            ts: self.ts,
+        };
+        let controller = Controller::new(settings, self.filter_samples.into(), self.filter_time);
+        controller.map_err(|refused| number(refused.name))
+    }
+}
+
+/// [`Controller::step`]; 0 where there is no controller.
+///
+/// # Safety
+/// `pid` is null or came from [`sewfast_pid_init`], used by one context at a time.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn sewfast_pid_step(pid: *mut Controller<f32>, r: f32, y: f32) -> f32 {
+    // SAFETY: by contract.
+    let pid = unsafe { pid.as_mut() };
+    pid.map_or(0.0, |pid| pid.step(r, y))
+}
+
+/// [`Controller::reset`].
+///
+/// # Safety
+/// As for [`sewfast_pid_step`].
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn sewfast_pid_reset(pid: *mut Controller<f32>) {
+    // SAFETY: by contract.
+    if let Some(pid) = unsafe { pid.as_mut() } {
+        pid.reset();
+    }
+}
