@@ -93,6 +93,9 @@ package: $(DEV) ## source archive -> wheel -> import in a clean environment
 bench: $(VENV)/bench.stamp ## end-to-end benchmarks beside their rivals
 	$(BIN)/python -m pytest benches --benchmark-enable --benchmark-only -o python_files='bench_*.py' -s
 
+bench-device: ## what a control period of the device costs on this machine
+	cargo run --release --quiet --package sewfast-control --example device_step
+
 clean: ## removes everything that was built; the virtual environment too
 	rm -rf target site demo dist $(VENV)
 	rm -f python/sewfast/_core*.so
