@@ -23,6 +23,8 @@ from sewfast.link import Drive, Plan, connect
 
 SOAK = bool(os.environ.get("SEWFAST_SOAK"))
 U = 3.0 * np.sin(np.arange(400) / 20.0)
+LONG = np.tile(U, 20)
+"""For what is to happen before the end, however busy the machine is."""
 
 
 class Kept:
@@ -309,9 +311,9 @@ def test_a_trip_is_an_outcome(device, drive):
             device.do(lambda: device.state == script.RUNNING and device.trip(3, 123.0))
 
     sink = Kept(trip)
-    outcome = drive.stream(Plan("commands", U), sink)
+    outcome = drive.stream(Plan("commands", LONG), sink)
     assert (outcome.state, outcome.reason) == ("tripped", "acceleration")
-    assert outcome.received == outcome.taken < len(U)
+    assert outcome.received == outcome.taken < len(LONG)
     (event,) = [e for e in sink.events if e[0] == "tripped"]
     assert event[1] == outcome.taken
     assert event[2]["value"] == 123.0
@@ -320,7 +322,7 @@ def test_a_trip_is_an_outcome(device, drive):
 def test_a_reset_ends_the_run_with_what_has_come(device, drive):
     sink = Kept(once(lambda: device.do(device.reset)))
     with pytest.raises(LinkError, match=r"it has been reset; .*set the limits"):
-        drive.stream(Plan("commands", U), sink)
+        drive.stream(Plan("commands", LONG), sink)
     assert drive.outcome is not None
     assert drive.outcome.reason == "failed"
     assert drive.outcome.received == len(sink.indexes()) >= 100
@@ -337,7 +339,7 @@ def test_a_dead_device_is_given_up_with_a_clear_error(device, drive, monkeypatch
         device.mangle = lambda kind, wire: []
 
     with pytest.raises(LinkError, match=r"an answer to STATUS, none came within 0\.1 s"):
-        drive.stream(Plan("commands", U), sink := Kept(die))
+        drive.stream(Plan("commands", LONG), sink := Kept(die))
     assert drive.outcome is not None
     assert drive.outcome.state == "unknown"
     assert sink.kinds[-1] == "stop_unconfirmed"
@@ -354,14 +356,14 @@ def test_an_error_of_the_sink_stops_the_motor_first(device, drive):
             raise OSError("disk full")
 
     with pytest.raises(OSError, match="disk full"):
-        drive.stream(Plan("commands", U), sink := Kept(full))
+        drive.stream(Plan("commands", LONG), sink := Kept(full))
     assert device.state == script.IDLE
     assert len(stops(device)) == 1
     outcome = drive.outcome
     assert outcome is not None
     assert outcome.reason == "failed"
     assert outcome.taken is not None
-    assert outcome.taken < len(U)
+    assert outcome.taken < len(LONG)
     listed = sum(count for _, count in outcome.gaps)
     assert outcome.received + listed == outcome.taken
     assert len(sink.indexes()) <= outcome.received
@@ -378,7 +380,7 @@ def test_ctrl_c_stops_the_motor_within_a_tenth_of_a_second(device, drive, where)
     timer = threading.Timer(0.05, press)
     sink = Kept(once(press if where == "in the sink" else timer.start))
     with pytest.raises(KeyboardInterrupt):
-        drive.stream(Plan("commands", np.tile(U, 20)), sink)
+        drive.stream(Plan("commands", LONG), sink)
     after = [kind for at, kind in device.arrived if at > pressed[0] and kind < script.KEEP]
     assert script.STOP in after[:2]
     if SOAK:
@@ -394,11 +396,11 @@ def test_ctrl_c_stops_the_motor_within_a_tenth_of_a_second(device, drive, where)
 def test_cancelling_stops_the_motor_and_is_no_error(device, drive):
     cancel = threading.Event()
     sink = Kept(lambda first: cancel.set() if first >= 100 else None)
-    outcome = drive.stream(Plan("commands", U), sink, cancel=cancel)
+    outcome = drive.stream(Plan("commands", LONG), sink, cancel=cancel)
     assert outcome.reason == "cancelled"
     assert outcome.is_complete
     assert outcome.taken is not None
-    assert 100 < outcome.taken < len(U)
+    assert 100 < outcome.taken < len(LONG)
     np.testing.assert_array_equal(sink.indexes(), np.arange(outcome.taken))
     assert len(stops(device)) == 1
 
@@ -408,7 +410,7 @@ def test_a_lost_stop_is_repeated(device, drive):
     device.intercept = lambda frame: frame[0] == script.STOP and next(swallowed, False)
     cancel = threading.Event()
     sink = Kept(lambda first: cancel.set())
-    assert drive.stream(Plan("commands", U), sink, cancel=cancel).reason == "cancelled"
+    assert drive.stream(Plan("commands", LONG), sink, cancel=cancel).reason == "cancelled"
     assert len(stops(device)) == 3
     assert device.state == script.IDLE
 
@@ -448,15 +450,15 @@ def test_a_run_goes_on_after_the_port_was_away(tmp_path, kind):
 
 
 def test_a_run_that_tripped_meanwhile_says_so(device):
-    with connect(device.url, watchdog=0.05) as drive:
+    with connect(device.url, watchdog=0.3) as drive:
         drive.set_limits(volt=10.0)
-        sink = Kept(once(lambda: device.do(lambda: replug(device, 0.3))))
+        sink = Kept(once(lambda: device.do(lambda: replug(device, 0.6))))
         with pytest.raises(LinkError, match=r"it had tripped: watchdog|device had tripped: watch"):
-            drive.stream(Plan("commands", np.tile(U, 2)), sink)
+            drive.stream(Plan("commands", LONG), sink)
         assert drive.outcome is not None
         assert drive.outcome.state == "tripped"
         assert drive.outcome.taken is not None
-        assert drive.outcome.taken < 800
+        assert drive.outcome.taken < len(LONG)
 
 
 def test_a_device_that_was_reset_meanwhile_says_so(device):
@@ -468,16 +470,16 @@ def test_a_device_that_was_reset_meanwhile_says_so(device):
         drive.set_limits(volt=10.0)
         sink = Kept(once(lambda: device.do(lose)))
         with pytest.raises(LinkError, match=r"came back, but the device has been reset"):
-            drive.stream(Plan("commands", U), sink)
+            drive.stream(Plan("commands", LONG), sink)
 
 
 def test_a_stop_still_reaches_a_device_whose_port_comes_back_late(device):
-    device.capacity = 8000
+    device.capacity = len(LONG)
     drive = connect(device.url, watchdog=5.0, resume=0.1)
     drive.set_limits(volt=10.0)
     sink = Kept(once(lambda: device.do(lambda: replug(device, 1.2))))
     with pytest.raises(LinkError, match=r"did not come back within 0\.1 s: the device stops its"):
-        drive.stream(Plan("commands", np.tile(U, 20)), sink)
+        drive.stream(Plan("commands", LONG), sink)
     assert device.state == script.IDLE
     assert drive.outcome is not None
     assert drive.outcome.state == "idle"
@@ -490,7 +492,7 @@ def test_a_port_that_stays_away(device):
     drive = connect(device.url, watchdog=0.3, resume=0.2)
     drive.set_limits(volt=10.0)
     with pytest.raises(LinkError, match=r"vanished .*did not come back within 0\.2 s"):
-        drive.stream(Plan("commands", U), sink)
+        drive.stream(Plan("commands", LONG), sink)
     drive.close()
     assert sink.kinds[-1] == "stop_unconfirmed"
     assert Path(device.url).exists() is False

@@ -168,11 +168,11 @@ def test_a_run_survives_a_replug_within_its_watchdog():
 
 
 def test_a_replug_beyond_the_watchdog_says_what_happened():
-    with VirtualDevice() as device, connect(device.port, baud=921_600) as drive:
+    with VirtualDevice() as device, connect(device.port, watchdog=0.3) as drive:
         drive.set_limits(volt=20.0)
-        sink = Kept(once(lambda: device.cause("unplug", 0.3), at=200))
+        sink = Kept(once(lambda: device.cause("unplug", 0.6), at=200))
         with pytest.raises(LinkError, match="had tripped: watchdog"):
-            drive.stream(Plan("commands", excitation(1500)), sink)
+            drive.stream(Plan("commands", excitation(5000)), sink)
         assert drive.outcome is not None
         assert drive.outcome.state == "tripped"
 
