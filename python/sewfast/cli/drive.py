@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import SettingError
+from ..errors import LinkError, SettingError
 from .arguments import Commands, add_command, add_view
 from .output import print_json
 
@@ -91,8 +91,24 @@ def opened(args: argparse.Namespace) -> Iterator[Drive]:
                 "expected --limits for a drive that is no virtual one, got none; say what motor "
                 "and machine stand: --limits volt=10,speed=3500,acceleration=30000,current=15"
             )
+        _require_untripped(args.on, drive)
         drive.set_limits(**(limits or {}))
         yield drive
+
+
+def _require_untripped(port: str, drive: Drive) -> None:
+    """Say why a drive does not take limits, rather than that it does not.
+
+    Raises
+    ------
+    LinkError
+    """
+    status = drive.status()
+    if status.state == "tripped":
+        raise LinkError(
+            f"{port}: expected a drive that is ready, it has tripped: {status.reason}; find out "
+            f"why, then `sewfast clear {port}`"
+        )
 
 
 def _limits(text: str) -> dict[str, float]:

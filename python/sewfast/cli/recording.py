@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,10 @@ if TYPE_CHECKING:
     from ..recording import Recording
 
 RECORD = """\
-Excite a machine with a named signal and record what its encoder says.
+Excite a machine with a signal and record what its encoder says.
+
+A signal is a named one (`sewfast signals`), made for the sewing machine, or a file with columns
+t [s], u [V] at the machine's sample time. --scale 0.2 makes any of them gentle.
 
 Columns: t [s], u [V], counts, y [RPM] (the speed estimated from the counts) and, of a virtual
 machine, speed_true [RPM], which no experiment could see; it is there for scores.
@@ -52,7 +56,11 @@ def add(commands: Commands) -> None:
         "--on", required=True, metavar="virtual[:SEED]|PORT", help="virtual machine, or drive"
     )
     parser.add_argument(
-        "--signal", required=True, metavar="NAME", help="an excitation; see `sewfast signals`"
+        "--signal", required=True, metavar="FILE|NAME",
+        help="an excitation; see `sewfast signals`",
+    )  # fmt: skip
+    parser.add_argument(
+        "--scale", type=float, default=1.0, metavar="X", help="factor on the signal (1)"
     )
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="seed of a random signal (0)"
@@ -66,20 +74,20 @@ def add(commands: Commands) -> None:
 
 
 def record_command(args: argparse.Namespace) -> int | None:
-    from ..signals import excitation
-
     require_place(args.out, RECORDINGS)
-    u = excitation(args.signal, args.seed)
+    u, Ts = _excitation(args)
     if not is_port(args.on):
-        _record_virtual(args, u)
+        _record_virtual(args, u, Ts)
         return None
     place = recording_place(args.out)
-    settings = {"signal": args.signal, "seed": args.seed}
     try:
         with opened(args) as drive:
             from ..recording import record
 
-            made = record(drive, u, name=args.signal, file=place, live=args.live, settings=settings)
+            _require_period(args, Ts, drive.identity.Ts)
+            made = record(
+                drive, u, name=_name(args), file=place, live=args.live, settings=_settings(args)
+            )
             name = drive.identity.name
     except Interrupted as e:
         print(f"interrupted; {len(e.best)} samples are in {place}", file=sys.stderr)
@@ -88,7 +96,52 @@ def record_command(args: argparse.Namespace) -> int | None:
     return None
 
 
-def _record_virtual(args: argparse.Namespace, u: FloatArray) -> None:
+def _name(args: argparse.Namespace) -> str:
+    return Path(args.signal).stem
+
+
+def _settings(args: argparse.Namespace) -> dict[str, Any]:
+    """What is needed to record it again."""
+    return {"signal": args.signal, "seed": args.seed, "scale": args.scale}
+
+
+def _excitation(args: argparse.Namespace) -> tuple[FloatArray, float]:
+    """The samples of the signal [V] and their sample time [s].
+
+    Raises
+    ------
+    SettingError, DataError
+        For a text that is neither a name nor a file, a file without u, or a factor that is no
+        number.
+    """
+    from ..readers import read
+    from ..signals import EXCITATIONS, TS, excitation
+
+    if not math.isfinite(args.scale):
+        raise SettingError(f"--scale: expected a number, got {args.scale}; 1 leaves it as it is")
+    named = args.signal.replace("-", "_").lower() in EXCITATIONS
+    if named or not Path(args.signal).exists():
+        return args.scale * excitation(args.signal, args.seed), TS
+    data = read(args.signal, inputs="u")
+    data.require_inputs()
+    return args.scale * data.experiments[0].u[:, 0], data.Ts
+
+
+def _require_period(args: argparse.Namespace, given: float, machine: float) -> None:
+    """A signal played at another rate would be another signal.
+
+    Raises
+    ------
+    SettingError
+    """
+    if abs(given - machine) > 0.01 * machine:
+        raise SettingError(
+            f"--signal {args.signal}: expected samples every {machine:g} s, the machine's, got one "
+            f"every {given:g} s; resample it into a file with columns t, u"
+        )
+
+
+def _record_virtual(args: argparse.Namespace, u: FloatArray, Ts: float) -> None:
     from ..machine import VirtualMachine
     from ..recording import record
 
@@ -98,7 +151,8 @@ def _record_virtual(args: argparse.Namespace, u: FloatArray) -> None:
             "neither; `sewfast ports` lists the serial ports"
         )
     machine = VirtualMachine.from_name(args.on)
-    _write(args, record(machine, u, name=args.signal), machine.name, None)
+    _require_period(args, Ts, machine.Ts)
+    _write(args, record(machine, u, name=_name(args)), machine.name, None)
 
 
 def _write(args: argparse.Namespace, made: Recording, machine: str, place: Path | None) -> None:
@@ -106,7 +160,7 @@ def _write(args: argparse.Namespace, made: Recording, machine: str, place: Path 
     from ..recording import UNITS
 
     summary, line = _told(made, machine)
-    summary |= {"signal": args.signal, "seed": args.seed}
+    summary |= _settings(args)
     if place is not None and args.out == place:
         if args.json:
             print_json({**summary, "file": str(place)})
@@ -115,7 +169,7 @@ def _write(args: argparse.Namespace, made: Recording, machine: str, place: Path 
         return
     write_columns(
         args.out, made.columns(), UNITS, summary, [line], as_json=args.json,
-        header=made.header(signal=args.signal, seed=args.seed),
+        header=made.header(**_settings(args)),
     )  # fmt: skip
 
 
