@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from .machine import VirtualMachine
     from .models import ARX, LinearOE, Model, NeuralOE, load_model
     from .readers import read, read_table
+    from .recording import Recording, record
     from .speed import speed_from_counts
     from .tuning import TuningResult, tune
     from .validation import Validation, validate
@@ -51,6 +52,7 @@ __all__ = [
     "Model",
     "ModelFileError",
     "NeuralOE",
+    "Recording",
     "SettingError",
     "SewfastError",
     "TuningResult",
@@ -64,6 +66,7 @@ __all__ = [
     "paper_controller",
     "read",
     "read_table",
+    "record",
     "run",
     "signals",
     "speed_from_counts",
@@ -84,6 +87,7 @@ _HOMES = {
     "machine": "VirtualMachine",
     "models": "ARX LinearOE Model NeuralOE load_model",
     "readers": "read read_table",
+    "recording": "Recording record",
     "speed": "speed_from_counts",
     "tuning": "TuningResult tune",
     "validation": "Validation validate",
