@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from cli import PROGRAM, environment
-from documents import Block, blocks
+from documents import Block, Command, blocks
+from sewfast.cli.parser import build_parser
+from terminal import Terminal
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
@@ -34,11 +33,12 @@ def test_page_runs(
         request.getfixturevalue("recordings")
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {"__name__": page.stem}
-    for block in blocks(page):
-        if block.language == "python":
-            _execute(block, page, names)
-        for command in block.commands if block.language == "console" else ():
-            _run(command, page)
+    with Terminal(page.name, monkeypatch.setenv) as terminal:
+        for block in blocks(page):
+            if block.language == "python":
+                _execute(block, page, names)
+            for command in block.commands if block.language == "console" else ():
+                terminal.run(command)
 
 
 def _execute(block: Block, page: Path, names: dict[str, object]) -> None:
@@ -46,15 +46,31 @@ def _execute(block: Block, page: Path, names: dict[str, object]) -> None:
     exec(compile("\n" * (block.line - 1) + block.text, str(page), "exec"), names)
 
 
-def _run(command: str, page: Path) -> None:
-    program, *arguments = shlex.split(os.path.expandvars(command))
-    assert program == "sewfast", f"{page}: only sewfast is run here, not {command!r}"
-    done = subprocess.run([*PROGRAM, *arguments], env=environment(), capture_output=True, text=True)
-    assert done.returncode == 0, f"{page}: {command}\n{done.stderr}"
+@pytest.mark.parametrize(
+    ("shown", "printed", "same"),
+    [
+        ("a b\n", "a  b", True),
+        ("a ... d\n", "a b\nc d\n", True),
+        ("...\nd\n", "a b\nd\n", True),
+        ("a\n", "a b", False),
+        ("a.b\n", "axb", False),
+        ("a ... d\n", "a b\nc d e\n", False),
+    ],
+)
+def test_what_is_shown_is_compared(shown: str, printed: str, same: bool) -> None:
+    assert Command("sewfast", shown).shows(printed) == same
+
+
+def test_every_command_is_on_its_page() -> None:
+    page = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
+    commands = re.findall(r"<!-- help (\w+) -->", page)
+    _, _, listed = build_parser().format_help().partition("COMMAND\n")
+    known = re.findall(r"^    (\w+) ", listed, re.MULTILINE)
+    assert sorted(commands) == sorted(known)
 
 
 def test_pages_have_snippets() -> None:
-    assert {p.stem for p in RUN} >= {"README", "tutorial", "cli", "real-data"}
+    assert {p.stem for p in RUN} >= {"README", "tutorial", "cli", "first-run", "real-data"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
