@@ -184,7 +184,7 @@ class ScriptedDevice(threading.Thread):
             raise self.problem
 
     def do(self, action: Callable[[], None]) -> None:
-        """Have the device's own thread do something."""
+        """Have the device do something, on its own thread where it has one."""
         with self._lock:
             self._todo.append(action)
 
@@ -192,14 +192,18 @@ class ScriptedDevice(threading.Thread):
         try:
             pending = b""
             while not self._done.is_set():
-                with self._lock:
-                    todo, self._todo = self._todo, []
-                for action in todo:
-                    action()
+                self.act()
                 pending = self.hear(pending + self.wire.read(0.001))
                 self.advance()
         except BaseException as error:
             self.problem = error
+
+    def act(self) -> None:
+        """Do what it was told to."""
+        with self._lock:
+            todo, self._todo = self._todo, []
+        for action in todo:
+            action()
 
     def hear(self, data: bytes) -> bytes:
         """Take the whole frames of `data`; what is left of it."""

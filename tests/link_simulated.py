@@ -55,6 +55,7 @@ class SimulatedPort(Port):
     def read(self, timeout: float) -> bytes:
         until = self._clock.now + timeout
         while True:
+            self._device.act()
             self._device.advance()
             data, self._device.wire.out = self._device.wire.out, b""
             if data or self._clock.now >= until:
@@ -85,9 +86,9 @@ def simulated(**settings: object) -> Iterator[tuple[ScriptedDevice, SimulatedPor
         yield device, SimulatedPort(device, clock)
 
 
-def linked(port: Port) -> Connection:
+def linked(port: Port, watchdog: float = 0.05) -> Connection:
     """A session with what is behind the port."""
-    return Connection(port, watchdog=0.05, patience=1.0, resume=0.5)
+    return Connection(port, watchdog=watchdog, patience=1.0, resume=0.5)
 
 
 def driven(port: Port) -> Drive:

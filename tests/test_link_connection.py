@@ -221,6 +221,13 @@ def test_a_reply_with_any_body_is_read_or_refused(kind, body):
         wire.status(reply)
 
 
+def test_what_single_precision_does_not_hold_is_infinite():
+    assert struct.unpack("<4f", wire.set_limits((1e300, -1e300, 1.5, np.inf)))[:3] == (
+        np.inf, -np.inf, 1.5,
+    )  # fmt: skip
+    assert struct.unpack("<If", wire.drive(5, -1e39)) == (5, -np.inf)
+
+
 @given(st.text(max_size=24))
 def test_a_name_cannot_write_to_the_terminal(name):
     body = bytes([0, 2]) + struct.pack("<I", 1)

@@ -17,6 +17,7 @@ import pytest
 
 import link_device as script
 from link_device import ScriptedDevice
+from link_simulated import SimulatedPort, driven, linked, simulated
 from sewfast import Controller, Gains
 from sewfast.errors import LinkError, SettingError
 from sewfast.link import Drive, Plan, connect
@@ -54,17 +55,29 @@ class Kept:
 
 
 @pytest.fixture
-def device(tmp_path) -> Iterator[ScriptedDevice]:
-    with ScriptedDevice(tmp_path) as served:
-        yield served
+def simulation() -> Iterator[tuple[ScriptedDevice, SimulatedPort]]:
+    with simulated() as found:
+        yield found
 
 
 @pytest.fixture
-def drive(device) -> Iterator[Drive]:
-    # a busy machine may forget this process for a while
-    with connect(device.url, watchdog=1.0) as connected:
+def device(simulation) -> ScriptedDevice:
+    """In simulated time."""
+    return simulation[0]
+
+
+@pytest.fixture
+def drive(simulation) -> Iterator[Drive]:
+    with Drive(linked(simulation[1])) as connected:
         connected.set_limits(volt=10.0, speed_rpm=4000.0)
         yield connected
+
+
+@pytest.fixture
+def served(tmp_path) -> Iterator[ScriptedDevice]:
+    """On a pty, in real time."""
+    with ScriptedDevice(tmp_path) as device:
+        yield device
 
 
 def stops(device: ScriptedDevice) -> list[float]:
@@ -105,14 +118,10 @@ def test_every_sample_of_a_run_arrives(tmp_path, kind):
     assert sink.kinds == ["started", "finished"]
 
 
-def test_a_profile_longer_than_the_memory_is_fed_while_it_runs(tmp_path):
-    with (
-        ScriptedDevice(tmp_path, capacity=130) as device,
-        connect(device.url, watchdog=1.0) as drive,
-    ):
-        drive.set_limits(volt=10.0)
+def test_a_profile_longer_than_the_memory_is_fed_while_it_runs():
+    with simulated(capacity=130) as (_, port):
         sink = Kept()
-        outcome = drive.stream(Plan("commands", U), sink)
+        outcome = driven(port).stream(Plan("commands", U), sink)
     assert outcome.is_complete
     np.testing.assert_allclose(sink.column("u"), U, atol=0.0005 + 1e-9)
 
@@ -165,13 +174,14 @@ def test_heartbeats_go_on_while_a_run_lasts_and_no_longer(device, drive):
 # --- what is refused ----------------------------------------------------------------------------
 
 
-def test_nothing_starts_without_limits(device):
-    with connect(device.url) as drive:
+def test_nothing_starts_without_limits(served):
+    with connect(served.url, watchdog=2.0) as drive:
         assert not drive.limits().are_set
-        with pytest.raises(SettingError, match=r"expected limits set .*drive\.set_limits"):
-            drive.stream(Plan("commands", U), Kept())
-    assert device.limits == (0.0,) * 4
-    assert not starts(device)
+        for mode in ("commands", "direct"):
+            with pytest.raises(SettingError, match=r"expected limits set .*drive\.set_limits"):
+                drive.stream(Plan(mode, U), Kept())
+    assert served.limits == (0.0,) * 4
+    assert not starts(served)
 
 
 def test_limits_left_out_keep_what_is_set_or_take_the_ceiling(drive):
@@ -187,6 +197,7 @@ def test_limits_left_out_keep_what_is_set_or_take_the_ceiling(drive):
     ("plan", "message"),
     [
         (Plan("commands", np.full(10, 10.01)), r"within \+-10 V, got 10\.01 at sample 0"),
+        (Plan("direct", np.full(10, -10.01)), r"within \+-10 V, got -10\.01 at sample 0"),
         (Plan("commands", U, columns=("torque",)), r"got torque; the device streams no others"),
         (
             Plan("controller", U, Controller(Gains.standard(1.0, 0.1), Ts=0.002)),
@@ -214,10 +225,10 @@ def test_what_cannot_be_run_is_refused_before_anything_moves(device, drive, plan
     assert not stops(device)
 
 
-def test_a_mode_that_the_device_does_not_offer(tmp_path):
+def test_a_mode_that_the_device_does_not_offer():
     with (
-        ScriptedDevice(tmp_path, capabilities=1) as device,
-        connect(device.url) as drive,
+        simulated(capabilities=1) as (_, port),
+        driven(port) as drive,
         pytest.raises(SettingError, match="mode 'direct', 'script' does not"),
     ):
         drive.stream(Plan("direct", U), Kept())
@@ -331,14 +342,13 @@ def test_a_reset_ends_the_run_with_what_has_come(device, drive):
         drive.status()
 
 
-def test_a_dead_device_is_given_up_with_a_clear_error(device, drive, monkeypatch):
-    monkeypatch.setattr("sewfast.link.connection.PATIENCE", 0.1)
+def test_a_dead_device_is_given_up_with_a_clear_error(device, drive):
 
     def die(first: int) -> None:
         device.intercept = lambda frame: True
         device.mangle = lambda kind, wire: []
 
-    with pytest.raises(LinkError, match=r"an answer to STATUS, none came within 0\.1 s"):
+    with pytest.raises(LinkError, match=r"an answer to STATUS, none came within 1 s"):
         drive.stream(Plan("commands", LONG), sink := Kept(die))
     assert drive.outcome is not None
     assert drive.outcome.state == "unknown"
@@ -370,27 +380,30 @@ def test_an_error_of_the_sink_stops_the_motor_first(device, drive):
 
 
 @pytest.mark.parametrize("where", ["in a wait", "in the sink"])
-def test_ctrl_c_stops_the_motor_within_a_tenth_of_a_second(device, drive, where):
-    pressed: list[float] = []
+def test_ctrl_c_stops_the_motor_within_a_tenth_of_a_second(served, where):
+    # a busy machine may forget this process for a while
+    with connect(served.url, watchdog=2.0) as drive:
+        drive.set_limits(volt=10.0)
+        pressed: list[float] = []
 
-    def press() -> None:
-        pressed.append(time.monotonic())
-        os.kill(os.getpid(), signal.SIGINT)
+        def press() -> None:
+            pressed.append(time.monotonic())
+            os.kill(os.getpid(), signal.SIGINT)
 
-    timer = threading.Timer(0.05, press)
-    sink = Kept(once(press if where == "in the sink" else timer.start))
-    with pytest.raises(KeyboardInterrupt):
-        drive.stream(Plan("commands", LONG), sink)
-    after = [kind for at, kind in device.arrived if at > pressed[0] and kind < script.KEEP]
-    assert script.STOP in after[:2]
-    if SOAK:
-        assert stops(device)[0] - pressed[0] < 0.1
-    assert device.state == script.IDLE
-    outcome = drive.outcome
-    assert outcome is not None
-    assert outcome.reason == "interrupted"
-    assert outcome.received + sum(n for _, n in outcome.gaps) == outcome.taken
-    assert sink.kinds[-1] == "stopped"
+        timer = threading.Timer(0.05, press)
+        sink = Kept(once(press if where == "in the sink" else timer.start))
+        with pytest.raises(KeyboardInterrupt):
+            drive.stream(Plan("commands", LONG), sink)
+        after = [kind for at, kind in served.arrived if at > pressed[0] and kind < script.KEEP]
+        assert script.STOP in after[:2]
+        if SOAK:
+            assert stops(served)[0] - pressed[0] < 0.1
+        assert served.state == script.IDLE
+        outcome = drive.outcome
+        assert outcome is not None
+        assert outcome.reason == "interrupted"
+        assert outcome.received + sum(n for _, n in outcome.gaps) == outcome.taken
+        assert sink.kinds[-1] == "stopped"
 
 
 def test_cancelling_stops_the_motor_and_is_no_error(device, drive):
@@ -415,12 +428,12 @@ def test_a_lost_stop_is_repeated(device, drive):
     assert device.state == script.IDLE
 
 
-def test_leaving_the_block_stops_the_motor(device):
-    with connect(device.url, watchdog=5.0) as drive:
+def test_leaving_the_block_stops_the_motor(served):
+    with connect(served.url, watchdog=5.0) as drive:
         drive.set_limits(volt=5.0)
         drive.arm()
         assert drive.status().state == "armed"
-    assert device.state == script.IDLE
+    assert served.state == script.IDLE
 
 
 # --- a port that comes and goes -----------------------------------------------------------------
@@ -449,11 +462,11 @@ def test_a_run_goes_on_after_the_port_was_away(tmp_path, kind):
     assert [k for k in sink.kinds if k in ("port_lost", "resumed")] == ["port_lost", "resumed"]
 
 
-def test_a_run_that_tripped_meanwhile_says_so(device):
-    with connect(device.url, watchdog=0.3) as drive:
+def test_a_run_that_tripped_meanwhile_says_so(served):
+    with connect(served.url, watchdog=0.3) as drive:
         drive.set_limits(volt=10.0)
-        sink = Kept(once(lambda: device.do(lambda: replug(device, 0.6))))
-        with pytest.raises(LinkError, match=r"it had tripped: watchdog|device had tripped: watch"):
+        sink = Kept(once(lambda: served.do(lambda: replug(served, 0.6))))
+        with pytest.raises(LinkError, match=r"the device had tripped: watchdog"):
             drive.stream(Plan("commands", LONG), sink)
         assert drive.outcome is not None
         assert drive.outcome.state == "tripped"
@@ -461,38 +474,38 @@ def test_a_run_that_tripped_meanwhile_says_so(device):
         assert drive.outcome.taken < len(LONG)
 
 
-def test_a_device_that_was_reset_meanwhile_says_so(device):
+def test_a_device_that_was_reset_meanwhile_says_so(served):
     def lose() -> None:
-        replug(device, 0.1)
-        device.reset()
+        replug(served, 0.1)
+        served.reset()
 
-    with connect(device.url, watchdog=2.0) as drive:
+    with connect(served.url, watchdog=2.0) as drive:
         drive.set_limits(volt=10.0)
-        sink = Kept(once(lambda: device.do(lose)))
+        sink = Kept(once(lambda: served.do(lose)))
         with pytest.raises(LinkError, match=r"came back, but the device has been reset"):
             drive.stream(Plan("commands", LONG), sink)
 
 
-def test_a_stop_still_reaches_a_device_whose_port_comes_back_late(device):
-    device.capacity = len(LONG)
-    drive = connect(device.url, watchdog=5.0, resume=0.1)
+def test_a_stop_still_reaches_a_device_whose_port_comes_back_late(served):
+    served.capacity = len(LONG)
+    drive = connect(served.url, watchdog=5.0, resume=0.1)
     drive.set_limits(volt=10.0)
-    sink = Kept(once(lambda: device.do(lambda: replug(device, 1.2))))
+    sink = Kept(once(lambda: served.do(lambda: replug(served, 1.2))))
     with pytest.raises(LinkError, match=r"did not come back within 0\.1 s: the device stops its"):
         drive.stream(Plan("commands", LONG), sink)
-    assert device.state == script.IDLE
+    assert served.state == script.IDLE
     assert drive.outcome is not None
     assert drive.outcome.state == "idle"
     assert drive.outcome.received + sum(n for _, n in drive.outcome.gaps) == drive.outcome.taken
     drive.close()
 
 
-def test_a_port_that_stays_away(device):
-    sink = Kept(once(lambda: device.do(lambda: replug(device, math.inf))))
-    drive = connect(device.url, watchdog=0.3, resume=0.2)
+def test_a_port_that_stays_away(served):
+    sink = Kept(once(lambda: served.do(lambda: replug(served, math.inf))))
+    drive = connect(served.url, watchdog=0.3, resume=0.2)
     drive.set_limits(volt=10.0)
     with pytest.raises(LinkError, match=r"vanished .*did not come back within 0\.2 s"):
         drive.stream(Plan("commands", LONG), sink)
     drive.close()
     assert sink.kinds[-1] == "stop_unconfirmed"
-    assert Path(device.url).exists() is False
+    assert Path(served.url).exists() is False

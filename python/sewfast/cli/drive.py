@@ -61,8 +61,9 @@ def add_drive(parser: argparse.ArgumentParser) -> None:
         "RPM/s, A]; it stops when it does more. inf: none. A virtual drive has limits by default",
     )  # fmt: skip
     group.add_argument(
-        "--watchdog", type=float, default=50.0, metavar="MS",
-        help="the drive stops when it has not heard from here for this long (50)",
+        "--watchdog", type=float, metavar="MS",
+        help="the drive stops when it has not heard from here for this long (50; 250 of its own "
+        "time where that runs by credit)",
     )  # fmt: skip
     add_view(group)
 
@@ -85,7 +86,8 @@ def opened(args: argparse.Namespace) -> Iterator[Drive]:
     from ..link import connect
 
     limits = _limits(args.limits) if args.limits else None
-    with connect(args.on, baud=args.baud, watchdog=args.watchdog * 1e-3) as drive:
+    watchdog = None if args.watchdog is None else args.watchdog * 1e-3
+    with connect(args.on, baud=args.baud, watchdog=watchdog) as drive:
         if limits is None and not drive.identity.is_computed:
             raise SettingError(
                 "expected --limits for a drive that is no virtual one, got none; say what motor "

@@ -11,10 +11,9 @@ from typing import Literal
 
 from ..control import Controller
 from ..errors import LinkError, SettingError
-from ..gains import Gains, real
-from ..units import counts_per_unit
+from ..gains import real
 from . import profile as profiles
-from . import wire
+from . import terms, wire
 from .clock import ClockBounds
 from .connection import Connection, DeviceReset, Loan
 from .plan import Layout, Outcome, Plan, Sink, layout, require_capable
@@ -39,7 +38,7 @@ class Drive:
 
     def __init__(self, link: Connection) -> None:
         self._link = link
-        self._channels = _describe(link)
+        self._channels = terms.channels(link)
         #: What became of the last run, also of one that ended in an exception.
         self.outcome: Outcome | None = None
         await_measurement(link)
@@ -142,7 +141,7 @@ class Drive:
             "volt": volt, "speed_rpm": speed_rpm, "acceleration": acceleration, "current": current
         }  # fmt: skip
         values = [
-            _limit(name, value, now, ceiling)
+            terms.limit(name, value, now, ceiling)
             for (name, value), now, ceiling in zip(
                 given.items(), present.values, present.ceilings, strict=True
             )
@@ -157,14 +156,8 @@ class Drive:
         SettingError
             Where sample time or units are not the device's.
         """
-        gains = self._fitting(controller)
-        scale = counts_per_unit(self.identity.counts_per_rev, gains.y_unit)
-        c = controller
-        values = (
-            gains.Kp, gains.Ti, gains.Td, c.alpha, c.beta, c.N, c.Tt, c.u_min, c.u_max, c.slew,
-            c.filter_time, scale,
-        )  # fmt: skip
-        self._link.ask(Kind.GAINS, wire.gains(values, c.filter_samples))
+        body = terms.gains(controller, self.channels, self.identity.counts_per_rev)
+        self._link.ask(Kind.GAINS, body)
 
     def arm(self) -> None:
         """Make it ready to start; its watchdog takes it back to idle when the host falls silent."""
@@ -305,7 +298,7 @@ class Drive:
             Where the device is not idle or its motor does not rest.
         """
         require_capable(plan, self.identity)
-        self._fitting(controller)
+        terms.fitting(controller, self.channels)
         streamed = self.layout(plan)
         self._require_idle()
         self.wait_for_rest()
@@ -320,18 +313,9 @@ class Drive:
         """Time that the device goes on without a word from here [s]."""
         return self._link.watchdog
 
-    def _fitting(self, controller: Controller) -> Gains:
-        """The controller's gains in standard form, which must be in the device's units."""
-        units = {c.name: c.unit for c in self.channels}
-        gains = controller.gains.to("standard")
-        _require_units(gains.u_unit, units.get("u", ""), "command")
-        _require_units(gains.y_unit, units.get("feedback", "RPM"), "output")
-        return gains
-
     def _profile_of(self, plan: Plan) -> profiles.Profile | None:
-        if plan.mode == "direct":
-            return None
-        return self._profile("references" if plan.mode == "controller" else "commands", plan)
+        profile = self._profile("references" if plan.mode == "controller" else "commands", plan)
+        return None if plan.mode == "direct" else profile
 
     def _profile(self, what: str, plan: Plan) -> profiles.Profile:
         limits = self.limits()
@@ -412,36 +396,3 @@ def connect(
     except BaseException:
         port.close()
         raise
-
-
-def _describe(link: Connection) -> tuple[Channel, ...]:
-    identity = link.identity
-    bodies = [link.ask(Kind.DESCRIBE, bytes([k])) for k in range(identity.channels)]
-    if wire.schema_hash(identity.version, identity.period_us, bodies) != identity.schema:
-        raise LinkError(
-            "expected channels that match the device's schema hash, got others; connect again, "
-            "or mend the firmware"
-        )
-    channels = tuple(map(wire.channel, bodies))
-    if (channels[0].encoding, channels[1].encoding) != (0, 1):
-        raise LinkError("expected channel 0 to be counts and 1 the command; mend the firmware")
-    return channels
-
-
-def _limit(name: str, value: float | None, present: float, ceiling: float) -> float:
-    if value is None:
-        return present if present else ceiling
-    if not 0.0 < real(name, value) <= ceiling * (1.0 + 1e-6):
-        raise SettingError(
-            f"expected {name} above 0 and at most {ceiling:g}, the device's ceiling, got {value}; "
-            "lower it"
-        )
-    return min(value, ceiling)
-
-
-def _require_units(given: str, device: str, what: str) -> None:
-    if given.lower() != device.lower():
-        raise SettingError(
-            f"expected a controller whose {what} is in {device}, as the device's, got {given}; "
-            "convert its gains"
-        )

@@ -82,8 +82,9 @@ def references(values: NDArray[np.float64], limits: Limits) -> Profile:
     SettingError
         Where one is beyond the speed limit.
     """
-    _require_within("references", values, limits.speed_rpm, "RPM")
-    return Profile(REFERENCES, np.clip(values, -limits.speed_rpm, limits.speed_rpm))
+    limit = min(limits.speed_rpm, wire.LARGEST)
+    _require_within("references", values, limit, "RPM")
+    return Profile(REFERENCES, np.clip(values, -limit, limit))
 
 
 def _require_within(name: str, values: NDArray[np.float64], limit: float, unit: str) -> None:

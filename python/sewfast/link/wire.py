@@ -14,6 +14,8 @@ from ..errors import LinkError
 
 VERSION = 1
 MAX_BODY = 231
+LARGEST = 3.4028234e38
+"""Of single precision."""
 
 
 class Kind(IntEnum):
@@ -324,11 +326,11 @@ def credit(us: int, until: int) -> bytes:
 
 
 def drive(us: int, u: float) -> bytes:
-    return struct.pack("<If", us, u)
+    return struct.pack("<If", us, _single(u))
 
 
 def set_limits(values: Sequence[float]) -> bytes:
-    return struct.pack("<4f", *values)
+    return struct.pack("<4f", *map(_single, values))
 
 
 def upload(table: int, offset: int, values: bytes) -> bytes:
@@ -336,11 +338,16 @@ def upload(table: int, offset: int, values: bytes) -> bytes:
 
 
 def gains(values: Sequence[float], filter_samples: int) -> bytes:
-    return _GAINS.pack(*values, filter_samples)
+    return _GAINS.pack(*map(_single, values), filter_samples)
 
 
 def start(mode: int, us: int, at: int, length: int, mask: int, batch: int) -> bytes:
     return _START.pack(mode, us, at, length, mask, batch)
+
+
+def _single(value: float) -> float:
+    """What single precision holds; beyond its range is infinite."""
+    return value if abs(value) <= LARGEST else math.copysign(math.inf, value)
 
 
 def body_size(encodings: Sequence[int], batch: int) -> int:

@@ -1,0 +1,91 @@
+"""Terms of host and device: its channels, limits within its ceilings, controllers in its units."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ..control import Controller
+from ..errors import LinkError, SettingError
+from ..gains import Gains, real
+from ..units import counts_per_unit
+from . import wire
+from .connection import Connection
+from .wire import Channel, Kind
+
+
+def channels(link: Connection) -> tuple[Channel, ...]:
+    """What the device can stream, as it describes it.
+
+    Raises
+    ------
+    LinkError
+        Where that is not what its schema hash stands for.
+    """
+    identity = link.identity
+    bodies = [link.ask(Kind.DESCRIBE, bytes([k])) for k in range(identity.channels)]
+    if wire.schema_hash(identity.version, identity.period_us, bodies) != identity.schema:
+        raise LinkError(
+            "expected channels that match the device's schema hash, got others; connect again, "
+            "or mend the firmware"
+        )
+    found = tuple(map(wire.channel, bodies))
+    if (found[0].encoding, found[1].encoding) != (0, 1):
+        raise LinkError("expected channel 0 to be counts and 1 the command; mend the firmware")
+    return found
+
+
+def limit(name: str, value: float | None, present: float, ceiling: float) -> float:
+    """The limit to set: the one asked for, the one in force, or the device's ceiling.
+
+    Raises
+    ------
+    SettingError
+        For a limit that is not above 0 or is above the ceiling.
+    """
+    if value is None:
+        return present if present else ceiling
+    if not 0.0 < real(name, value) <= ceiling * (1.0 + 1e-6):
+        raise SettingError(
+            f"expected {name} above 0 and at most {ceiling:g}, the device's ceiling, got {value}; "
+            "lower it"
+        )
+    return min(value, ceiling)
+
+
+def fitting(controller: Controller, streamed: Sequence[Channel]) -> Gains:
+    """The controller's gains in standard form.
+
+    Raises
+    ------
+    SettingError
+        Where they are not in the device's units.
+    """
+    units = {c.name: c.unit for c in streamed}
+    gains = controller.gains.to("standard")
+    _require_units(gains.u_unit, units.get("u", ""), "command")
+    _require_units(gains.y_unit, units.get("feedback", "RPM"), "output")
+    return gains
+
+
+def gains(controller: Controller, streamed: Sequence[Channel], counts_per_rev: float) -> bytes:
+    """Body of GAINS for a controller; the encoder is the device's own.
+
+    Raises
+    ------
+    SettingError
+        Where its gains are not in the device's units.
+    """
+    g, c = fitting(controller, streamed), controller
+    values = (
+        g.Kp, g.Ti, g.Td, c.alpha, c.beta, c.N, c.Tt, c.u_min, c.u_max, c.slew, c.filter_time,
+        counts_per_unit(counts_per_rev, g.y_unit),
+    )  # fmt: skip
+    return wire.gains(values, c.filter_samples)
+
+
+def _require_units(given: str, device: str, what: str) -> None:
+    if given.lower() != device.lower():
+        raise SettingError(
+            f"expected a controller whose {what} is in {device}, as the device's, got {given}; "
+            "convert its gains"
+        )
