@@ -70,6 +70,9 @@ c-test: ## the C library and the example firmware, with board, motor and host in
 	  -o target/bare/device_test rust/capi/tests/device.c examples/firmware/firmware.c \
 	  target/firmware/libsewfast_capi.a -lm $(if $(filter Linux,$(shell uname)),-Wl$(comma)--gc-sections)
 	target/bare/device_test
+	$(CC) -std=c99 -Wall -Wextra -Werror -pedantic -O1 -I rust/capi/include -I examples/firmware \
+	  -o target/bare/desk examples/firmware/desk.c examples/firmware/firmware.c \
+	  target/firmware/libsewfast_capi.a -lm $(if $(filter Linux,$(shell uname)),-Wl$(comma)--gc-sections)
 ifeq ($(shell uname),Linux)
 	! nm target/bare/device_test | grep panicking
 endif
