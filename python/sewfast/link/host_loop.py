@@ -28,8 +28,8 @@ FloatArray: TypeAlias = NDArray[np.float64]
 
 WATCHDOG_PERIODS = 4
 """Periods that the device goes on without a command, unless its watchdog time is longer."""
-BATCH = 10
-"""Samples in a frame, or those of a period where these are fewer: the newest are never older."""
+BATCHES = (10, 9, 8, 7, 6, 5)
+"""Samples in a frame; the first that divides a period, so that each tick finds them equally old."""
 PRIORITY = 50
 ORDINARY = "ordinary"
 
@@ -103,7 +103,7 @@ def run_on_host(
     """
     ratio = _ratio(drive, controller)
     r = _reference(reference, controller, seed)
-    plan = Plan("direct", r, columns=columns, batch=batch or min(ratio, BATCH))
+    plan = Plan("direct", r, columns=columns, batch=batch or _batch(ratio))
     streamed = drive.prepare_direct(plan, controller)
     wait = max(drive.watchdog, WATCHDOG_PERIODS * controller.Ts) if watchdog is None else watchdog
     with drive.lent() as session, _scheduling(real_time) as scheduling:
@@ -142,8 +142,18 @@ def at_period(controller: Controller, Ts: float) -> Controller:
     return replace(controller, gains=gains, Ts=Ts, filter_samples=samples, notes=notes)
 
 
+def _batch(ratio: int) -> int:
+    """Samples in a frame; fewer than five would load a serial line too much."""
+    return next((b for b in BATCHES if ratio % b == 0), min(ratio, BATCHES[0]))
+
+
 def _ratio(drive: Drive, controller: Controller) -> int:
     """Samples of the drive in a period of the loop."""
+    if os.name == "nt":
+        raise SettingError(
+            "expected Linux or macOS for a loop on the host, got Windows; run the controller on "
+            "the device"
+        )
     if drive.identity.on_credit:
         raise SettingError(
             "expected a device in real time for a loop on the host, this one's time stands still "
@@ -218,6 +228,9 @@ def _run(
     ticks = found["ticks"]
     number = ticks["number"].astype(np.intp)
     reached = int(number[-1]) + 1 if len(number) else 0
+    if found["outcome"]["name"] == "completed":
+        # the last ticks may be among those that were missed
+        reached = len(r)
     at_ticks = {
         k: _spread(ticks[k], number, reached) for k in ("u", "y", "feedback", "late", "age")
     }
@@ -268,10 +281,9 @@ def _jitter(found: Mapping[str, Any], controller: Controller, scheduling: Sequen
     if memory is not None:
         told.append("memory locked" if not memory else f"memory not locked ({memory})")
     ticks = found["ticks"]
-    # the first tick is the start itself: nothing was waited for, nothing has been sampled
     return Jitter(
-        late=ticks["late"][1:], age=ticks["age"][1:], period=1e6 * controller.Ts,
-        missed=found["missed"], blind=int(np.count_nonzero(ticks["fresh"][1:] == 0.0)),
+        late=ticks["late"], age=ticks["age"], period=1e6 * controller.Ts,
+        missed=found["missed"], blind=int(np.count_nonzero(ticks["fresh"] == 0.0)),
         unsent=found["unsent"], round_trip=found["round_trip"], device_late=found["device_late"],
         real_time=", ".join(told),
     )  # fmt: skip

@@ -32,7 +32,8 @@ class HostLoopRun:
     Attributes
     ----------
     t, r : array, shape (N,)
-        Time [s] and reference [y] of each tick that was reached.
+        Time [s] and reference [y] of each tick that was reached. The first tick comes shortly after
+        the first samples, so that each finds fresh ones; the drive is on with command 0 until then.
     u : array, shape (N,)
         Command after the controller's limits [u]; NaN where the tick was missed.
     y, feedback : array, shape (N,)

@@ -54,6 +54,9 @@ impl State {
         if newest == self.newest {
             return;
         }
+        if self.newest.is_none() && self.phase == Phase::Running && self.ticks.run.is_empty() {
+            self.set_grid(now, true);
+        }
         self.newest = newest;
         self.heard = now;
         if let Some(newest) = newest {
@@ -107,8 +110,8 @@ impl State {
         self.phase = Phase::Running;
         self.start = i64::try_from(start).unwrap_or(i64::MAX);
         self.history.keep(self.start, self.length() as usize);
-        self.deadline = now;
         self.heard = now;
+        self.set_grid(now, false);
         self.request.sent = 0;
     }
 

@@ -59,7 +59,7 @@ impl Settings {
             ts,
         )?;
         require(ticks > 0, "a reference of at least one sample", ticks)?;
-        let samples = ticks as u64 * u64::from(self.ratio);
+        let samples = (ticks as u64 + 2).saturating_mul(u64::from(self.ratio));
         require(
             samples <= u64::from(u32::MAX),
             "a run of at most 2^32 - 1 samples of the device",

@@ -16,6 +16,9 @@ use crate::anomalies::Counters;
 use crate::receiver::Receiver;
 use crate::samples::Channel;
 
+/// How long after the usual arrival of samples a tick comes \[us\]: what their delay may vary by.
+const MARGIN: u64 = 1000;
+
 /// What the loop is waiting for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Phase {
@@ -50,7 +53,6 @@ pub(super) struct State {
     pub start: i64,
     pub deadline: u64,
     pub next: usize,
-    pub awaited: bool,
     pub newest: Option<i64>,
     pub used: Option<i64>,
     pub heard: u64,
@@ -93,7 +95,6 @@ impl HostLoop {
             start: 0,
             deadline: 0,
             next: 0,
-            awaited: false,
             newest: None,
             used: None,
             heard: 0,
@@ -258,7 +259,8 @@ impl State {
         self.next += missed.min(left);
         self.deadline = now - late % period + period;
         let Some(&r) = self.reference.get(self.next) else {
-            return self.await_end(now);
+            self.stop(Outcome::Completed);
+            return self.ask(now);
         };
         if now.saturating_sub(self.heard) > u64::from(self.settings.watchdog) {
             self.stop(Outcome::Silent);
@@ -269,16 +271,6 @@ impl State {
         let mut body = Body::new();
         body.u32(self.settings.watchdog).f32(u as f32);
         Some((self.heartbeat(kind::DRIVE, now), body))
-    }
-
-    /// The device's last sample comes up to a period after the host's last tick: one more period is its own to end the run.
-    fn await_end(&mut self, now: u64) -> Said {
-        if self.awaited {
-            self.stop(Outcome::Completed);
-            return self.ask(now);
-        }
-        self.awaited = true;
-        Some(self.keep(now))
     }
 
     fn keep(&mut self, now: u64) -> (Header, Body) {
@@ -331,7 +323,17 @@ impl State {
         self.request = Request::new(kind, self.command, body);
     }
 
-    /// START of mode 2, at the next sample, for as long as the reference.
+    /// Sets the grid of deadlines shortly after the first samples, so that all ticks find fresh ones; without samples it begins
+    /// when half the watchdog time is over.
+    pub fn set_grid(&mut self, now: u64, sampled: bool) {
+        self.deadline = if sampled {
+            now + (self.settings.period() / 16).min(MARGIN)
+        } else {
+            now + u64::from(self.settings.watchdog / 2)
+        };
+    }
+
+    /// START of mode 2, at the next sample; the host stops it before it ends by itself.
     pub fn start_body(&self) -> Body {
         let s = &self.settings;
         let mut body = Body::new();
@@ -340,10 +342,11 @@ impl State {
         body
     }
 
-    /// Samples of the device in the whole run.
+    /// Most samples of the device in the run: the reference, the batch before its first tick, and a period for what is late.
     pub fn length(&self) -> u32 {
-        u32::try_from(self.reference.len() as u64 * u64::from(self.settings.ratio))
-            .unwrap_or(u32::MAX)
+        let periods = self.reference.len() as u64 + 1;
+        let samples = periods * u64::from(self.settings.ratio) + u64::from(self.settings.batch);
+        u32::try_from(samples).unwrap_or(u32::MAX)
     }
 
     fn heartbeat(&mut self, kind: u8, now: u64) -> Header {
