@@ -116,7 +116,7 @@ $(BUILT): $(RUST) pyproject.toml | $(VENV)/bin/python
 
 # sewfast itself is there already, so that pip only adds what its extras name
 $(REPORT): $(BUILT)
-	$(BIN)/pip install --quiet 'sewfast[report]'
+	$(BIN)/pip install --quiet 'sewfast[report,link]'
 	@touch $@
 
 $(DEV): $(BUILT)

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sewfast import identification, tuning
-from sewfast.control import load_controller
+from sewfast import identification, signals, tuning
+from sewfast.control import Controller, Gains, load_controller
 from sewfast.errors import DataError, SettingError
 from sewfast.experiment import STAGES, identified, loops, recordings, run_demo
+from sewfast.experiment.rig import rig
 from sewfast.machine import VirtualMachine
 from sewfast.models import load_model
 from sewfast.readers import read, read_table
@@ -98,7 +99,8 @@ def test_a_saved_model_scores_what_the_results_say(
 
 def test_the_saved_controller_gives_the_saved_run_again(demo: Path) -> None:
     controller = load_controller(demo / "controllers" / "tuned.json")
-    again = loops.run(controller, VirtualMachine(), "random", seed=3)
+    with rig(VirtualMachine()) as bench:
+        again = bench.run(controller, "random", seed=3)
     saved = read_table(demo / "runs" / "random_machine.npz")
     np.testing.assert_array_equal(again.u, saved["u"])
     np.testing.assert_array_equal(again.y, saved["y"])
@@ -198,7 +200,8 @@ def test_the_plant_of_eq_8_is_the_printed_one() -> None:
 
 
 def test_the_papers_gains_track_on_their_plant_and_chatter_on_the_machine() -> None:
-    runs = loops.paper_runs(VirtualMachine())
+    with rig(VirtualMachine()) as bench:
+        runs = loops.paper_runs(bench)
     numbers = loops.paper_numbers(runs)
     assert numbers["eq8"]["rise_time_ms"] == pytest.approx(186.0, abs=5.0)
     assert numbers["eq8"]["overshoot_percent"] < 5.0
@@ -215,12 +218,40 @@ def test_only_per_sample_gains_on_rpm_track_on_the_papers_plant() -> None:
 
 
 def test_the_closed_loop_recording_is_the_loop_itself() -> None:
-    machine = VirtualMachine()
-    fopdt = recordings.first_order(recordings.open_loop(machine, 0)["step"])
-    controller = recordings.coarse_controller(fopdt, machine)
-    recording = recordings.closed_loop(machine, controller)
-    loop = loops.run(controller, machine, "trapezoids")
+    with rig(VirtualMachine()) as bench:
+        step = bench.record(signals.excitation("step"), "step")
+        controller = recordings.coarse_controller(
+            recordings.first_order(step), Ts=bench.Ts, counts_per_rev=bench.counts_per_rev
+        )
+        recording = recordings.closed_loop(bench, controller)
+        loop = bench.run(controller, "trapezoids")
     np.testing.assert_array_equal(recording.speed_true, loop.y)
+
+
+def test_the_experiment_went_over_the_link(results: dict[str, Any]) -> None:
+    link = results["link"]
+    # six open-loop records, the closed loop twice, four references, the paper's gains
+    assert link["samples"] == 3000 + 4 * 20_000 + 15_000 + 2 * 9350 + 2 * 1500 + 2 * 20_000 + 10_000
+    assert link["missing"] == 0
+    assert link["port"] in ("pty", "tcp")
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_link_changes_no_measured_figure(seed: int) -> None:
+    """What the machine does behind the port is what it does in the same process."""
+    controller = load_coarse()
+    with rig(VirtualMachine()) as bench:
+        behind = bench.run(controller, "random", seed=seed)
+    direct = loops.run(controller, VirtualMachine(), "random", seed=seed)
+    assert np.sqrt(np.mean((behind.y - direct.y) ** 2)) < 2.0
+
+
+def load_coarse() -> Controller:
+    gains = Gains.standard(0.0175, 0.064, 0.0064)
+    return Controller(
+        gains, alpha=0.65, beta=0.4, N=10.0, u_min=-20.0, u_max=20.0, filter_samples=8,
+        counts_per_rev=1572.0,
+    )  # fmt: skip
 
 
 def test_the_record_scored_as_saturating_is_the_second_one() -> None:

@@ -16,6 +16,7 @@ from ..report.canvas import require
 from ..signals import excitation
 from ..tuning import TuningResult
 from . import folder, identified, loops, recordings
+from .rig import Rig, rig
 
 Progress: TypeAlias = Callable[[int, int, str], object]
 """Called with stages done, stages in all, and what comes now."""
@@ -68,6 +69,8 @@ def run_demo(
 ) -> dict[str, Any]:
     """Carry out the paper's experiment: excite, record, identify, validate, tune, run, report.
 
+    The machine is behind a port and is talked to as to hardware (docs/PROTOCOL.md).
+
     Parameters
     ----------
     out : path
@@ -100,22 +103,23 @@ def run_demo(
     target = Path(out)
     folder.prepare(target)
     try:
-        return _carry_out(target, plant, seed, _Clock(progress))
+        with rig(plant) as bench:
+            return _carry_out(target, bench, seed, _Clock(progress))
     except BaseException:
         folder.abandon(target)
         raise
 
 
-def _carry_out(target: Path, plant: VirtualMachine, seed: int, clock: _Clock) -> dict[str, Any]:
+def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, Any]:
     """The stages, one after the other; the folder is written at the end."""
     clock.enter("recording the machine")
-    recorded = recordings.open_loop(plant, seed)
+    recorded = recordings.open_loop(rig, seed)
     lo_hi = recorded["chirp_lo_hi"]
     speed = recordings.speed_numbers(lo_hi)
 
     clock.enter("paper's network")
     models = {"paper": identified.paper(recorded, seed)}
-    ideal = identified.ideal_cost(plant, seed)
+    ideal = identified.ideal_cost(rig.machine, seed)
 
     clock.enter("linear models")
     models["arx_raw"] = identified.arx_raw(recorded)
@@ -124,8 +128,8 @@ def _carry_out(target: Path, plant: VirtualMachine, seed: int, clock: _Clock) ->
 
     clock.enter("closed-loop recording")
     fopdt = recordings.first_order(recorded["step"])
-    coarse = recordings.coarse_controller(fopdt, plant)
-    recorded["closed_loop"] = recordings.closed_loop(plant, coarse)
+    coarse = recordings.coarse_controller(fopdt, Ts=rig.Ts, counts_per_rev=rig.counts_per_rev)
+    recorded["closed_loop"] = recordings.closed_loop(rig, coarse)
 
     clock.enter("default network")
     models["oe_all"] = identified.linear(recorded, "oe", identified.ALL_RECORDS)
@@ -138,8 +142,8 @@ def _carry_out(target: Path, plant: VirtualMachine, seed: int, clock: _Clock) ->
     tuning = loops.tuned(models["neural_oe"], coarse, seed)
 
     clock.enter("closed loops")
-    runs = loops.tuned_runs(tuning.controller, models["neural_oe"], plant, seed)
-    paper_runs = loops.paper_runs(plant)
+    runs = loops.tuned_runs(tuning.controller, models["neural_oe"], rig, seed)
+    paper_runs = loops.paper_runs(rig)
 
     clock.enter("writing")
     controllers = {"paper": paper_controller(), "coarse": coarse, "tuned": tuning.controller}
@@ -149,9 +153,10 @@ def _carry_out(target: Path, plant: VirtualMachine, seed: int, clock: _Clock) ->
     identification["paper"]["cost_ideal"] = ideal
     results = {
         "sewfast": __version__,
-        "machine": plant.name,
+        "machine": rig.drive.identity.name,
+        "link": rig.numbers(),
         "seed": seed,
-        "counts_per_rev": plant.counts_per_rev,
+        "counts_per_rev": rig.counts_per_rev,
         "speed": speed,
         "identification": identification,
         **_controller_numbers(fopdt, controllers, tuning),

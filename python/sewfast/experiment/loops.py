@@ -11,11 +11,11 @@ import numpy as np
 from .. import _core
 from ..control import Controller, Gains, paper_controller
 from ..errors import FitError
-from ..loop import ClosedLoopRun, Plant, run
-from ..machine import VirtualMachine
+from ..loop import ClosedLoopRun, run
 from ..models import LinearOE, Model
 from ..report.artefacts import PLANTS, REFERENCES
 from ..tuning import TuningResult, tune
+from .rig import Rig
 
 Runs = dict[tuple[str, str], ClosedLoopRun]
 
@@ -28,19 +28,18 @@ def tuned(model: Model, start: Controller, seed: int) -> TuningResult:
     return tune(model, start=start, seed=seed)
 
 
-def tuned_runs(controller: Controller, model: Model, machine: VirtualMachine, seed: int) -> Runs:
-    """Every reference on the model and on the machine."""
-    plants: dict[str, Plant] = {"model": model, "machine": machine}
-    return {(r, p): run(controller, plants[p], r, seed=seed) for r in REFERENCES for p in PLANTS}
+def tuned_runs(controller: Controller, model: Model, rig: Rig, seed: int) -> Runs:
+    """Every reference on the model and on the machine, which runs the controller itself."""
+    predicted = {(r, "model"): run(controller, model, r, seed=seed) for r in REFERENCES}
+    return predicted | {(r, "machine"): rig.run(controller, r, seed=seed) for r in REFERENCES}
 
 
-def paper_runs(machine: VirtualMachine) -> Runs:
+def paper_runs(rig: Rig) -> Runs:
     """The paper's gains on the plant of its Eq. 8, ideal feedback, and on the machine."""
     gains = paper_controller()
-    limited = VirtualMachine(parameters=machine.parameters | {"u_limit": PAPER_LIMIT})
     return {
         ("paper_gains", "eq8"): run(replace(gains, counts_per_rev=None), eq8(), "trapezoid"),
-        ("paper_gains", "machine"): run(gains, limited, "trapezoid"),
+        ("paper_gains", "machine"): rig.run(gains, "trapezoid", volt=PAPER_LIMIT),
     }
 
 

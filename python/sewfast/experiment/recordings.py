@@ -8,10 +8,9 @@ import numpy as np
 
 from .. import signals
 from ..control import Controller, Fopdt, fit_fopdt, table_1
-from ..loop import run
-from ..machine import VirtualMachine
-from ..recording import Recording, record
+from ..recording import Recording
 from ..speed import Method, floor_of_J
+from .rig import Rig
 
 EXCITATIONS = ("step", "chirp_lo_hi", "chirp_hi_lo", "random", "saturating", "saturating_2")
 FILTER_SAMPLES = 8
@@ -22,11 +21,9 @@ DERIVATIVE_FILTER = 10.0
 _METHODS: tuple[Method, ...] = ("difference", "savgol", "kalman")
 
 
-def open_loop(machine: VirtualMachine, seed: int) -> dict[str, Recording]:
-    """Every excitation on the machine, each from rest."""
-    return {
-        name: record(machine, signals.excitation(name, seed), name=name) for name in EXCITATIONS
-    }
+def open_loop(rig: Rig, seed: int) -> dict[str, Recording]:
+    """Every excitation on the drive, each from rest."""
+    return {name: rig.record(signals.excitation(name, seed), name) for name in EXCITATIONS}
 
 
 def first_order(step: Recording) -> Fopdt:
@@ -34,31 +31,30 @@ def first_order(step: Recording) -> Fopdt:
     return fit_fopdt(step.u, step.y, Ts=step.Ts)
 
 
-def coarse_controller(fopdt: Fopdt, machine: VirtualMachine) -> Controller:
+def coarse_controller(fopdt: Fopdt, *, Ts: float, counts_per_rev: float) -> Controller:
     """Gains by Table 1, nearest row; the delay of the feedback's filter counts as dead time."""
-    delayed = replace(fopdt, L=fopdt.L + (FILTER_SAMPLES - 1) / 2 * machine.Ts)
+    delayed = replace(fopdt, L=fopdt.L + (FILTER_SAMPLES - 1) / 2 * Ts)
     rule = table_1(delayed, outside="nearest")
     return Controller(
         gains=rule.gains,
-        Ts=machine.Ts,
+        Ts=Ts,
         alpha=rule.alpha,
         beta=rule.beta,
         N=DERIVATIVE_FILTER,
         u_min=-LIMIT,
         u_max=LIMIT,
         filter_samples=FILTER_SAMPLES,
-        counts_per_rev=machine.counts_per_rev,
+        counts_per_rev=counts_per_rev,
         notes="Table 1 on the recorded step response",
     )
 
 
-def closed_loop(machine: VirtualMachine, controller: Controller) -> Recording:
+def closed_loop(rig: Rig, controller: Controller) -> Recording:
     """A recording under the first gains, which follow trapezoids.
 
     The command is replayed: undisturbed, the machine does the same again and shows its counts.
     """
-    loop = run(controller, machine, "trapezoids")
-    return record(machine, loop.u, name="closed_loop")
+    return rig.record(rig.run(controller, "trapezoids").u, "closed_loop")
 
 
 def speed_numbers(recording: Recording) -> dict[str, dict[str, float]]:

@@ -50,6 +50,8 @@ def _context(artefacts: Artefacts) -> dict[str, Any]:
         "readings": readings_table(artefacts),
         "number": artefacts.number,
         "value": artefacts.value,
+        # results of before the link have none
+        "link": artefacts.results.get("link"),
     }
     # drawn last: where a number is missing nothing is drawn in vain
     with style():
