@@ -96,6 +96,13 @@ package: $(DEV) ## source archive -> wheel -> import in a clean environment
 bench: $(VENV)/bench.stamp ## end-to-end benchmarks beside their rivals
 	$(BIN)/python -m pytest benches --benchmark-enable --benchmark-only -o python_files='bench_*.py' -s
 
+SOAKED := tests/test_soak.py tests/test_watchdog.py tests/test_recordfile_kill.py tests/test_recordfile_damage.py \
+  tests/test_link_connection.py tests/test_link_drive.py tests/test_link_virtual.py
+
+soak: $(DEV) ## the link's figures at full count: hours of faults, kills, flips, hostile bytes (docs/RESULTS.md)
+	SEWFAST_SOAK=1 cargo test --package sewfast-control --package sewfast-link --release --quiet
+	SEWFAST_SOAK=1 $(BIN)/python -m pytest -s $(SOAKED)
+
 bench-device: ## what a control period of the device costs on this machine
 	cargo run --release --quiet --package sewfast-control --example device_step
 

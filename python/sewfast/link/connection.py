@@ -22,6 +22,8 @@ STOP_REPEAT = 0.01
 """The same for STOP, within any usual watchdog time."""
 PATIENCE = 1.0
 """Time after which a command is given up [s]."""
+ATTEMPTS = 10
+"""Times that a command is sent at least before it is given up."""
 WATCHDOG = 0.05
 WATCHDOG_ON_CREDIT = 0.25
 RETRY = 0.05
@@ -41,6 +43,7 @@ class _Command:
     last_sent: float
     since: float
     """From when on its patience counts: anew after the port was away."""
+    attempts: int = 1
     reply: Reply | None = None
 
 
@@ -255,12 +258,14 @@ class Connection:
         pause = STOP_REPEAT if command.kind == Kind.STOP else REPEAT
         if command.reply is not None or now - command.last_sent < pause:
             return
-        if now - command.since >= PATIENCE:
+        # a host that was not given the processor for a while has waited, but not asked
+        if now - command.since >= PATIENCE and command.attempts >= ATTEMPTS:
             self._command = None
             raise LinkError(
                 f"{self.port.url}: expected an answer to {Kind(command.kind).name}, none came "
                 f"within {PATIENCE:g} s; check cable and device, then connect again"
             )
+        command.attempts += 1
         command.last_sent = now
         self._send(command.frame)
 

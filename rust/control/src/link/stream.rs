@@ -146,7 +146,7 @@ impl Stream {
 }
 
 /// The nearest step, at an end where there is none; NaN is 0.
-fn to_steps(value: f32, steps_per_unit: u32) -> i16 {
+pub(super) fn to_steps(value: f32, steps_per_unit: u32) -> i16 {
     let steps = value * steps_per_unit as f32;
     (steps + 0.5f32.copysign(steps)) as i16
 }

@@ -3,6 +3,7 @@
 use super::{Core, Event, Measurement, Output, Reason, State, capability};
 use crate::link::guard::Trip;
 use crate::link::identity::{Limits, Source};
+use crate::link::stream::to_steps;
 
 /// Good samples in a row that end the boot.
 const GOOD: u8 = 10;
@@ -110,10 +111,23 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         if !wanted.is_finite() {
             return Err((Reason::Measurement, wanted));
         }
-        let u = wanted.max(-limits.volt).min(limits.volt);
+        let u = self.in_whole_steps(wanted.max(-limits.volt).min(limits.volt), limits.volt);
         self.guard.expect_motion(&limits, u)?;
-        let limited = self.run.controller.is_some() && u.abs() == limits.volt;
-        Ok((u, reference, u != wanted || limited))
+        let bound = limits.volt - 1.0 / self.identity.steps_per_volt();
+        let limited = self.run.controller.is_some() && u.abs() > bound;
+        Ok((u, reference, wanted.abs() > limits.volt || limited))
+    }
+
+    /// The command as it is recorded: what is applied is what the host gets to see.
+    fn in_whole_steps(&self, u: f32, limit: f32) -> f32 {
+        let per_volt = self.identity.steps_per_volt();
+        let steps = to_steps(u, per_volt as u32);
+        let value = f32::from(steps) / per_volt;
+        if value.abs() > limit {
+            f32::from(steps - steps.signum()) / per_volt
+        } else {
+            value
+        }
     }
 
     fn wanted(&mut self) -> Result<(f32, f32), Trip> {

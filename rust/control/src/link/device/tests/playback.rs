@@ -54,7 +54,7 @@ proptest! {
         prop_assert_eq!(rig.events().pop(), Some((4, 0)));
     }
 
-    /// The device's controller is the crate's.
+    /// The device's controller is the crate's, its command in whole steps.
     #[test]
     fn the_pid_is_the_controller(
         references in prop::collection::vec(0f32..3000.0, 1..60),
@@ -81,7 +81,8 @@ proptest! {
         for (&reference, &count) in references.iter().zip(&moves) {
             rig.counts += count;
             rig.keep();
-            let u = controller.step(reference, count as f32 / (1e-3 * per_unit));
+            let wanted = controller.step(reference, count as f32 / (1e-3 * per_unit));
+            let u = (wanted * 1000.0).round() / 1000.0;
             prop_assert_eq!(rig.sample(), crate::link::Output { u, enabled: true });
             expected.push((reference.to_bits(), controller.filtered().to_bits()));
         }
@@ -214,4 +215,19 @@ fn the_batch_under_way_is_sent_when_the_run_ends() {
     let sent = rig.sent();
     assert!(sent.windows(2).all(|pair| pair[1].0 - pair[0].0 == PERIOD));
     assert_eq!(sent.len(), 50);
+}
+
+#[test]
+fn what_is_applied_is_in_whole_steps_and_within_the_limit() {
+    let mut rig = Rig::ready();
+    assert_eq!(rig.limits(9.9996, 4000.0, 1e9, 20.0).0, 0);
+    rig.arm();
+    rig.start(2, 0, 0);
+    rig.sample();
+    rig.drive(1.23456);
+    assert_eq!(rig.sample().u, 1.235);
+    for (wanted, applied) in [(50.0, 9.999), (-50.0, -9.999), (-0.0004, 0.0)] {
+        rig.drive(wanted);
+        assert_eq!(rig.sample().u, applied);
+    }
 }
