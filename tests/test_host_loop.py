@@ -130,6 +130,21 @@ def test_runs_the_reference_and_gives_the_session_back(
     assert run_on_host(drive, CONTROLLER, r).outcome == "completed", "the session goes on"
 
 
+def test_an_error_of_progress_leaves_a_session_that_can_stop(
+    drive: Drive, device: ScriptedDevice
+) -> None:
+    def fail(done: int, total: int, best: float) -> None:
+        if done > 5:
+            raise RuntimeError("of progress")
+
+    with pytest.raises(RuntimeError, match="of progress"):
+        run_on_host(drive, CONTROLLER, np.full(400, 100.0), progress=fail)
+    # the loop's numbers are lost with it: a smaller one would be ignored as old
+    drive.stop()
+    assert [kind for kind, _ in device.executed][-1] == STOP
+    assert run_on_host(drive, CONTROLLER, np.full(20, 100.0)).outcome == "completed"
+
+
 def test_a_trip_is_an_outcome_with_its_reason(drive: Drive, device: ScriptedDevice) -> None:
     _at_tick(device, 5, lambda: device.trip(2, 3100.0))
     run = run_on_host(drive, CONTROLLER, np.full(400, 100.0))

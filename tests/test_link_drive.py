@@ -299,6 +299,24 @@ def test_each_gap_is_listed(device, drive, change):
     np.testing.assert_allclose(sink.column("u"), U[sink.indexes()], atol=0.0005 + 1e-9)
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+def test_a_gap_that_a_failing_sink_is_told_of_is_listed_once(device, drive, error):
+    class Failing(Kept):
+        def event(self, kind, index, **detail):
+            super().event(kind, index, **detail)
+            if kind == "gap" and self.kinds.count("gap") == 1:
+                raise error
+
+    device.mangle = every(7, lambda wire: [])
+    with pytest.raises(error):
+        drive.stream(Plan("commands", LONG), sink := Failing())
+    outcome = drive.outcome
+    listed = np.concatenate([first + np.arange(n) for first, n in outcome.gaps])
+    missing = np.setdiff1d(np.arange(outcome.taken), sink.indexes())
+    np.testing.assert_array_equal(listed, missing)
+    assert outcome.received == len(sink.indexes())
+
+
 def test_what_is_lost_at_the_end_is_a_gap_too(device, drive):
     device.mangle = lambda kind, wire: [] if kind in (0xC0, 0xC1) else [wire]
     outcome = drive.stream(Plan("commands", U[:100]), Kept())

@@ -108,6 +108,7 @@ def _show(args: argparse.Namespace, found: HostLoopRun) -> None:
     summary: dict[str, Any] = {
         "plant": found.plant, "reference": found.reference, "unit": found.units["y"],
         "n": len(found.t), "Ts": found.Ts, "outcome": found.outcome, "message": found.message,
+        "stop_confirmed": found.stop_confirmed,
         "samples": len(found.samples["t"]), "taken": found.taken, "gaps": found.gaps,
         **found.metrics(), "jitter": found.jitter.to_dict(),
     }  # fmt: skip

@@ -305,8 +305,14 @@ class Connection:
         self._command = None
         try:
             yield loan
+        except BaseException:
+            # numbers may have been used that were not left here: a STOP with one of those is old
+            loan.command += 2**16
+            loan.heartbeat += 2**24
+            raise
         finally:
-            self._sequence, self._beats = loan.command, loan.heartbeat
+            self._sequence = loan.command & 0xFFFFFFFF
+            self._beats = loan.heartbeat & 0xFFFFFFFF
             # what the device has sent meanwhile is not missing
             self.receiver = _core.LinkReceiver()
 

@@ -188,6 +188,10 @@ class HostLoopRun:
         lines = [f"{self.reference} on {self.plant}, loop on the host: {self.outcome}"]
         if self.outcome != "completed":
             lines.append(f"  {self.message}")
+        if not self.stop_confirmed and self.outcome != "reset":
+            lines.append(
+                "  STOP was not answered: the device's watchdog stops the motor; see that it stands"
+            )
         if told["rmse"] is not None:
             lines.append(
                 f"  error     {told['rmse']:.4g} {unit['y']} rms, {told['max_abs']:.4g} at most "

@@ -186,7 +186,8 @@ class SocketPort(Port):
 
     def close(self) -> None:
         if self._socket is not None:
-            self._socket.close()
+            with suppress(*FAILURES):
+                self._socket.close()
             self._socket = None
 
 

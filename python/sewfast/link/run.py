@@ -266,20 +266,24 @@ class Run:
 
     def _hand_over(self, first: int, count: int, columns: Columns) -> None:
         self.next = first + count
-        if self._sink_works:
-            try:
-                self.sink.samples(first, columns)
-            except BaseException as error:
-                # whether it has them is not known: listed as missing rather than unlisted
-                self.gaps.append((first, count))
-                self._sink_works = not isinstance(error, Exception)
-                raise
+        if not self._sink_works:
+            # they came, but nobody keeps them
+            self.gaps.append((first, count))
+            return
+        try:
+            self.sink.samples(first, columns)
+        except BaseException as error:
+            # whether it has them is not known: listed as missing rather than unlisted
+            self.gaps.append((first, count))
+            self._sink_works = not isinstance(error, Exception)
+            raise
         self.received += count
 
     def _gap(self, count: int) -> None:
-        self.gaps.append((self.next, count))
-        self._tell("gap", self.next, count=count)
-        self.next += count
+        # over before it is told: Ctrl-C in the sink must not have it listed again
+        first, self.next = self.next, self.next + count
+        self.gaps.append((first, count))
+        self._tell("gap", first, count=count)
 
     def _tell(self, kind: str, index: int, **detail: object) -> None:
         if self._sink_works:

@@ -165,7 +165,8 @@ sewfast_output sewfast_device_poll(sewfast_device *device, uint64_t now);
 /* At most `size` bytes to be sent are moved to `out`; how many. Take only what the port has room for. */
 size_t sewfast_device_transmit(sewfast_device *device, uint8_t *out, size_t size);
 
-/* The firmware's own reasons to stop: its stop input, a fault of the drive. Only the host's CLEAR, ARM, START lead on. */
+/* The firmware's own reasons to stop: its stop input, a fault of the drive. Only the host's CLEAR, ARM, START lead on. Call it each
+ * time round for as long as the reason stands, not at its edge only: CLEAR does not know of a stop input that is still pressed. */
 void sewfast_device_trip(sewfast_device *device, uint64_t now, int32_t reason);
 
 /* The transport knows that the host has gone (a closed socket, a USB port without terminal). */

@@ -134,8 +134,11 @@ impl State {
             self.outcome = None;
             self.finished();
         }
-        if self.outcome == Some(Outcome::Ended) && status.state == TRIPPED {
-            self.tripped(status.reason, f32::NAN);
+        // a trip whose event was lost; STOP leaves a tripped device tripped, so that the host may have taken it for the end
+        let ended = matches!(self.outcome, Some(Outcome::Ended | Outcome::Completed));
+        if ended && status.state == TRIPPED {
+            let (reason, value) = (status.reason, f32::NAN);
+            self.outcome = Some(Outcome::Tripped { reason, value });
         }
     }
 
