@@ -350,3 +350,50 @@ def test_refusals_are_documented(tmp_path: Path) -> None:
     text = sewfast(tmp_path, "--help").out
     for code in (cli.DONE, cli.FAULT, cli.REFUSED, cli.INTERRUPTED):
         assert f"  {code} " in text
+
+
+def test_a_reference_in_another_unit_of_speed(folder: Path) -> None:
+    columns = {"t": 0.001 * np.arange(400), "r": np.zeros(400)}
+    for unit, done in (("rad/s", 2), ("rpm", 0), ("", 0)):
+        api.write_table(folder / "r.csv", columns, units={"t": "s", "r": unit})
+        given = ("run", "c.json", "--on", "drive.json", "--reference", "r.csv", "-o", "out.csv")
+        assert ("expected r in RPM" in sewfast(folder, *given, done=done).err) == (done == 2)
+
+
+def test_interrupted_while_it_closes_a_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run.mcap"
+
+    def interrupted(args: object) -> None:
+        if write:
+            out.write_bytes(b"samples")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sewfast.cli.recording.record_command", interrupted)
+    given = ["record", "--on", "virtual", "--signal", "step", "-o", str(out)]
+    write = False
+    assert cli.main(given) == 130
+    assert "nothing was written" in capsys.readouterr().err
+    write = True
+    assert cli.main(given) == 130
+    assert f"what came is in {out}" in capsys.readouterr().err
+
+
+def test_interrupted_before_the_command_is_known(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "build_parser", interrupted)
+    assert cli.main(["record"]) == 130
+    assert "nothing was written" in capsys.readouterr().err
+
+
+def test_standard_output_that_is_closed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "stdout", None)
+    assert cli.main(["signals"]) == 0
+    assert capsys.readouterr().err == ""

@@ -236,6 +236,14 @@ def test_names_who_else_has_the_port_open(silent: str) -> None:
     assert other.pid in [number for number, _ in found.values["holders"]]
 
 
+def test_names_nobody_who_has_something_else_open() -> None:
+    with open(os.devnull, "wb"):
+        found = examine(os.devnull, echoes=10)["port"]
+    assert found.verdict == "fail"
+    assert "something else" in found.measured
+    assert "end " not in found.remedy
+
+
 def test_reads_the_latency_timer_where_there_is_one(tmp_path: Path) -> None:
     timer = tmp_path / "ttyUSB7" / "device" / "latency_timer"
     timer.parent.mkdir(parents=True)

@@ -255,7 +255,8 @@ def test_limits_given_are_enforced(device: VirtualDevice, tmp_path: Path) -> Non
         (("--limits", "volt=10"), "each of"),
         (("--limits", "volt=a,speed=1,acceleration=1,current=1"), "numbers"),
         (("--limits", "volt=1000,speed=1,acceleration=1,current=1"), "ceiling"),
-        (("--watchdog", "0"), "watchdog"),
+        (("--limits", "volt=-1,speed=1,acceleration=1,current=1"), "raise it"),
+        (("--watchdog", "0"), "expected 1 to 10000 ms, got 0"),
         (("--live", "radio"), "radio"),
     ],
 )

@@ -134,6 +134,12 @@ def test_a_path_that_is_not_there(tmp_path):
         open_port(str(tmp_path / "ttyUSB7"))
 
 
+@pytest.mark.parametrize("url", [None, 5, b"/dev/ttyUSB0"])
+def test_a_name_that_is_no_text(url):
+    with pytest.raises(SettingError, match="expected a port's name as text"):
+        open_port(url)
+
+
 @pytest.mark.parametrize("kind", ["file", "folder", "null"])
 def test_what_is_no_serial_port(tmp_path, kind):
     path = {"file": tmp_path / "file", "folder": tmp_path, "null": Path("/dev/null")}[kind]

@@ -178,3 +178,13 @@ def test_export_writes_what_other_programs_read(folder: Path, tmp_path: Path) ->
     message = refused(folder, "export", "holed.mcap", "-o", tmp_path / "run.xlsx")
     assert ".parquet" in message
     assert "no such file" in refused(folder, "show", "none.mcap")
+
+
+def test_export_leaves_the_recording_itself_alone(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "torn.mcap"
+    path.write_bytes((folder / "whole.mcap").read_bytes()[:-200])
+    (tmp_path / "link.mcap").symlink_to(path)
+    for same in ("torn.mcap", "./torn.mcap", "link.mcap"):
+        assert "expected another file than the recording" in refused(
+            tmp_path, "export", "torn.mcap", "-o", same
+        )

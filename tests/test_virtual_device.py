@@ -394,6 +394,19 @@ class TestLife:
         assert not device.running
         assert not list(tmp_path.iterdir())
 
+    def test_a_link_that_leads_somewhere_is_left_alone(self, tmp_path):
+        link = tmp_path / "drive"
+        with VirtualDevice(link=link):
+            target = link.readlink()
+            with pytest.raises(LinkError, match="expected a free name"):
+                VirtualDevice(link=link)
+            assert link.readlink() == target
+        mine = tmp_path / "mine"
+        mine.symlink_to(tmp_path)
+        with pytest.raises(LinkError, match="choose another name"):
+            VirtualDevice(link=mine)
+        assert mine.is_symlink()
+
     def test_an_exception_ends_it(self):
         with pytest.raises(ZeroDivisionError), VirtualDevice() as device:
             raise ZeroDivisionError

@@ -6,8 +6,10 @@ import argparse
 import errno
 import os
 import sys
+import time
 import traceback
 from collections.abc import Sequence
+from pathlib import Path
 
 from ..errors import SewfastError
 from .parser import build_parser
@@ -28,15 +30,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         0 done, 1 a fault in sewfast, 2 refused, 130 interrupted.
     """
-    args = build_parser().parse_args(argv)
+    try:
+        args = build_parser().parse_args(argv)
+    except KeyboardInterrupt:
+        return _say("sewfast: interrupted; nothing was written", INTERRUPTED)
+    began = time.time()
     try:
         code: int | None = args.command(args)
-        sys.stdout.flush()
+        if sys.stdout is not None:  # as it is where it was closed before the start
+            sys.stdout.flush()
         return code or DONE
     except SewfastError as e:
         return _say(f"sewfast {args.name}: {e}", REFUSED)
     except KeyboardInterrupt:
-        return _say(f"sewfast {args.name}: interrupted; nothing was written", INTERRUPTED)
+        return _say(f"sewfast {args.name}: {_interrupted(args, began)}", INTERRUPTED)
     except BrokenPipeError:
         # the reader of the pipe has seen enough; the interpreter must not flush into it again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -53,6 +60,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     except Exception as e:
         return _fault(args, e)
+
+
+def _interrupted(args: argparse.Namespace, began: float) -> str:
+    """What is left of a command that was interrupted again while it closed its recording."""
+    out = getattr(args, "out", None)
+    place = out.with_suffix(".mcap") if isinstance(out, Path) and out.name else None
+    try:
+        written = place is not None and place.stat().st_mtime >= began - 1.0
+    except OSError:
+        written = False
+    return (
+        f"interrupted; what came is in {place}" if written else "interrupted; nothing was written"
+    )
 
 
 def _fault(args: argparse.Namespace, e: Exception) -> int:

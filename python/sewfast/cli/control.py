@@ -108,7 +108,9 @@ def tune_command(args: argparse.Namespace) -> int | None:
     require_place(args.out, (".json",))
     model = load_model(args.model)
     counts = args.counts_per_rev or (model.counts[1] if model.counts else 1572.0)
-    references = [_reference(text, model.Ts) for text in args.reference or ()] or None
+    references = [
+        _reference(text, model.Ts, model.output_unit) for text in args.reference or ()
+    ] or None
     try:
         with Progress("tune") as progress:
             found = tune(
@@ -171,17 +173,17 @@ def run_command(args: argparse.Namespace) -> int | None:
 
     if args.host_loop is not None:
         controller = at_loops_period(args, load_controller(args.controller))
-        return run_host_loop(args, controller, _reference(args.reference, controller.Ts))
+        return run_host_loop(args, controller, _wanted(args, controller))
     require_place(args.out, RECORDINGS if is_port(args.on) else TABLES)
     controller = load_controller(args.controller)
     name = Path(args.reference).stem
     if not is_port(args.on):
         plant = _plant(args.on)
-        reference = _reference(args.reference, controller.Ts)
+        reference = _wanted(args, controller)
         _show_run(args, run(controller, plant, reference, name=name), None)
         return None
     place = recording_place(args.out)
-    reference = _reference(args.reference, controller.Ts)
+    reference = _wanted(args, controller)
     try:
         with opened(args) as drive:
             found = run(controller, drive, reference, name=name, file=place, live=args.live)
@@ -217,16 +219,22 @@ def _plant(text: str) -> Plant:
     return load_model(text)
 
 
-def _reference(text: str, Ts: float) -> str | FloatArray:
+def _wanted(args: argparse.Namespace, controller: Controller) -> str | FloatArray:
+    """The reference of a run."""
+    return _reference(args.reference, controller.Ts, controller.gains.y_unit)
+
+
+def _reference(text: str, Ts: float, unit: str) -> str | FloatArray:
     """The name of a reference, or the samples of a file with columns t, r.
 
     Raises
     ------
     SettingError, DataError
-        For a text that is neither, a file without r, or one at another sample time.
+        For a text that is neither, a file without r, one at another sample time or in another unit.
     """
     from ..readers import read
     from ..signals import REFERENCES
+    from ..units import REVOLUTIONS_PER_SECOND
 
     if text.replace("-", "_").lower() in REFERENCES:
         return text
@@ -240,5 +248,11 @@ def _reference(text: str, Ts: float) -> str | FloatArray:
     if abs(data.Ts - Ts) > 0.01 * Ts:
         raise DataError(
             f"{text}: sampled every {data.Ts:g} s, the loop every {Ts:g} s; resample the reference"
+        )
+    given = data.input_units[0]
+    speeds = {given.lower(), unit.lower()}
+    if len(speeds) > 1 and speeds <= REVOLUTIONS_PER_SECOND.keys():
+        raise DataError(
+            f"{text}: expected r in {unit}, the loop's unit, got {given}; convert the column"
         )
     return data.experiments[0].u[:, 0].copy()

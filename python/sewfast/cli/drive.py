@@ -87,6 +87,10 @@ def opened(args: argparse.Namespace) -> Iterator[Drive]:
 
     limits = _limits(args.limits) if args.limits else None
     watchdog = None if args.watchdog is None else args.watchdog * 1e-3
+    if watchdog is not None and not 0.001 <= watchdog <= 10.0:
+        raise SettingError(
+            f"--watchdog: expected 1 to 10000 ms, got {args.watchdog:g}; 50 suits most"
+        )
     with connect(args.on, baud=args.baud, watchdog=watchdog) as drive:
         if limits is None and not drive.identity.is_computed:
             raise SettingError(

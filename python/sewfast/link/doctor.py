@@ -10,6 +10,7 @@ from ..errors import LinkError, SettingError
 from . import system
 from .checkup import Metered, checkup
 from .diagnosis import Diagnosis, Finding
+from .failures import NO_PORT
 from .ports import list_ports, open_port
 
 ECHOES = 200
@@ -80,6 +81,8 @@ def _unopened(url: str, error: LinkError) -> Finding:
         remedy = system.permission_remedy(found, vid, pid)
         measured = f"{url} belongs to {found.owner} with mode {found.mode}; you may not open it"
         return Finding("port", "fail", measured, remedy, {"group": found.group})
+    if NO_PORT in str(error):
+        return finding  # who has /dev/null open is every program there is
     if held := system.holders(url):
         return _with(finding, f"end {_named(held)}, which has it open", holders=held)
     return finding

@@ -33,6 +33,9 @@ _BUSY_TEXT = (
     "close the other program (a serial monitor, ModemManager, another sewfast)",
 )
 
+NO_PORT = "expected a serial port, it is something else"
+"""In the message about a file, a folder or a device of another kind."""
+
 
 def explain(url: str, doing: Literal["open", "read", "write"], error: BaseException) -> LinkError:
     """The error as it is raised: expected, received, remedy."""

@@ -210,6 +210,11 @@ def open_port(url: str, baud: int = 115_200) -> Port:
     """
     if not isinstance(baud, int) or isinstance(baud, bool) or baud <= 0:
         raise SettingError(f"expected baud as a whole number above 0, got {baud!r}; try 115200")
+    if not isinstance(url, str):
+        raise SettingError(
+            f"expected a port's name as text, got {url!r}; as in '/dev/ttyUSB0' or "
+            "'socket://localhost:5000'"
+        )
     if url.startswith("socket://"):
         return SocketPort(url, baud)
     if "://" in url or not url or url.split(":")[0] == "virtual":

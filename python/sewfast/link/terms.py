@@ -47,7 +47,7 @@ def limit(name: str, value: float | None, present: float, ceiling: float) -> flo
     if not 0.0 < real(name, value) <= ceiling * (1.0 + 1e-6):
         raise SettingError(
             f"expected {name} above 0 and at most {ceiling:g}, the device's ceiling, got {value}; "
-            "lower it"
+            f"{'lower' if value > ceiling else 'raise'} it"
         )
     return min(value, ceiling)
 

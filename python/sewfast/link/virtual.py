@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any, Literal, TypeAlias
 
 from .._core import DeviceServer
-from ..errors import SettingError
+from ..errors import LinkError, SettingError
 from ..machine import VirtualMachine
 
 __all__ = ["VirtualDevice"]
@@ -64,7 +64,7 @@ class VirtualDevice:
     SettingError
         For a setting that cannot be used.
     LinkError
-        Where the port or a file cannot be had.
+        Where the port or a file cannot be had, or `link` names something that is there.
     """
 
     def __init__(
@@ -90,6 +90,8 @@ class VirtualDevice:
             _check_range("baud", baud, *_BAUD)
         if duration is not None and not 0.0 < duration < 1e9:
             raise SettingError(f"expected a duration above 0 s, got {duration!r}")
+        if pty and link is not None:
+            _require_free(Path(link))
         folder = tempfile.mkdtemp(prefix="sewfast-") if pty and link is None else None
         try:
             self._server = DeviceServer(
@@ -212,6 +214,21 @@ def _end(server: DeviceServer | None, folder: str | None) -> None:
 
 def _path(path: str | os.PathLike[str] | None) -> Path | None:
     return None if path is None else Path(path)
+
+
+def _require_free(link: Path) -> None:
+    """A link that leads nowhere was left over by a device that was killed, and may be replaced.
+
+    Raises
+    ------
+    LinkError
+        Where it leads somewhere: to the pty of another device, or to what somebody keeps there.
+    """
+    if link.is_symlink() and link.exists():
+        raise LinkError(
+            f"{link}: expected a free name, it is a link to {os.readlink(link)}, which exists; "
+            "choose another name, end the device that has this one, or remove the link"
+        )
 
 
 def _checked_endpoint(endpoint: str | None, link: object) -> str:

@@ -258,5 +258,7 @@ class Model(ABC):
         names = ", ".join(dict.fromkeys(d["name"] for d in t.get("data", [])))
         lines = [f"trained on {t.get('samples')} samples of {names}"]
         if t.get("termination"):
-            lines[0] += f"; {t.get('iterations')} iterations, {t['termination']}"
+            count = t.get("iterations")
+            steps = "" if count is None else f"{count} iterations, "
+            lines[0] += f"; {steps}{t['termination']}"
         return lines + [str(note) for note in t.get("notes", [])]

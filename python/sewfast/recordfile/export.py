@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from ..errors import SettingError
 from ..writers import write_table
 from .curves import save_curves
 from .reader import RecordedFile, read_recording
@@ -33,9 +34,15 @@ def export(path: str | os.PathLike[str], out: str | os.PathLike[str]) -> Recorde
     DataError
         Where the recording cannot be read or the other file not be written.
     SettingError
-        Where the extension is unknown or its package is not installed.
+        Where the extension is unknown or its package is not installed, or `out` is the recording
+        itself.
     """
     recording = read_recording(path)
+    if Path(out).exists() and Path(out).samefile(path):
+        raise SettingError(
+            f"{out}: expected another file than the recording, which cannot be had again, got the "
+            "same; choose another name"
+        )
     if Path(out).suffix.lower() == ".mcap":
         save_curves(out, recording)
     else:
