@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         SewfastError,
     )
     from .identification import identify
+    from .leastsquares import LeastSquaresResult, least_squares
     from .loop import ClosedLoopRun, run
     from .machine import VirtualMachine
     from .models import ARX, LinearOE, Model, NeuralOE, load_model
@@ -47,6 +48,7 @@ __all__ = [
     "FitError",
     "Gains",
     "Interrupted",
+    "LeastSquaresResult",
     "LinearOE",
     "LinkError",
     "Model",
@@ -61,6 +63,7 @@ __all__ = [
     "__version__",
     "fit_fopdt",
     "identify",
+    "least_squares",
     "load_controller",
     "load_model",
     "paper_controller",
@@ -83,6 +86,7 @@ _HOMES = {
     "dataset": "Dataset Experiment",
     "errors": "DataError FitError Interrupted LinkError ModelFileError SettingError SewfastError",
     "identification": "identify",
+    "leastsquares": "LeastSquaresResult least_squares",
     "loop": "ClosedLoopRun run",
     "machine": "VirtualMachine",
     "models": "ARX LinearOE Model NeuralOE load_model",

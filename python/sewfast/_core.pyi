@@ -226,6 +226,15 @@ def fit_neural_oe(
     depend on it. ``initial_state`` 'measured' starts each run after its first na samples.
     """
 
+# --- least_squares.rs --------------------------------------------------------------------------------------
+
+def least_squares_fit(
+    fun: Callable[[_F], _F], jac: Callable[[_F, _F], _F], x0: _F, first: _F, *,
+    lower: _F | None, upper: _F | None, x_scale: _F | None, ftol: float, xtol: float, gtol: float,
+    max_nfev: int, precision: float,
+) -> dict[str, Any]:
+    """``first`` is fun(x0); jac gets x and fun(x). Ctrl-C ends it as "interrupted", other exceptions pass."""
+
 # --- control.rs -------------------------------------------------------------------------------------------
 
 _Form: TypeAlias = Literal["standard", "parallel", "per_sample"]

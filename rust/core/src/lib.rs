@@ -7,11 +7,13 @@
 pub mod arx;
 pub mod closed_loop;
 pub mod data;
+mod descent;
 pub mod encoder;
 pub mod error;
 pub mod fopdt;
 mod gram;
 pub mod lagged;
+pub mod least_squares;
 pub mod linear;
 pub mod lm;
 pub mod machine;

@@ -5,6 +5,8 @@
 //! rejected trial, divided by 5 after an accepted one (Levenberg 1944, Marquardt 1963).
 
 use crate::Monitor;
+use crate::descent::{Method, Proposal, Verdict, descend};
+pub use crate::descent::{Outcome, Termination};
 
 /// What is minimised. `normal_equations` is only called at the parameters of the last successful `cost`, whose
 /// simulation it may reuse.
@@ -58,74 +60,6 @@ impl Default for Settings {
     }
 }
 
-/// How the iteration ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Termination {
-    /// The residual is orthogonal to every column of the Jacobian: a minimum.
-    SmallGradient,
-    /// The step no longer changes the parameters.
-    SmallStep,
-    /// The cost no longer falls.
-    SmallReduction,
-    /// The permitted iterations are used up.
-    MaxIterations,
-    /// No damping gave a lower cost.
-    Stalled,
-    /// The start itself has no finite cost.
-    NotFinite,
-    /// A stop was requested.
-    Interrupted,
-}
-
-impl Termination {
-    /// The name that files and Python carry.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::SmallGradient => "small_gradient",
-            Self::SmallStep => "small_step",
-            Self::SmallReduction => "small_reduction",
-            Self::MaxIterations => "max_iterations",
-            Self::Stalled => "stalled",
-            Self::NotFinite => "not_finite",
-            Self::Interrupted => "interrupted",
-        }
-    }
-
-    /// What a user can do about it.
-    pub fn remedy(self) -> &'static str {
-        match self {
-            Self::SmallGradient | Self::SmallStep | Self::SmallReduction => {
-                "converged; nothing to do"
-            }
-            Self::MaxIterations => {
-                "allow more iterations if the trace still falls; for a network this is the usual end"
-            }
-            Self::Stalled => {
-                "the best point found is kept; try more starts, a smaller model or better scaled data"
-            }
-            Self::NotFinite => {
-                "start from other parameters, scale the data, or use a stable linear model as start"
-            }
-            Self::Interrupted => "the best result so far is kept; run again to go on",
-        }
-    }
-}
-
-/// The best parameters found, and how.
-#[derive(Clone, Debug)]
-pub struct Outcome {
-    /// Best parameters.
-    pub theta: Vec<f64>,
-    /// Their cost.
-    pub cost: f64,
-    /// Jacobians taken.
-    pub iterations: usize,
-    /// How it ended.
-    pub termination: Termination,
-    /// Cost at the start and after each accepted step.
-    pub trace: Vec<f64>,
-}
-
 /// Slow iterations in a row that count as the end of progress.
 const PATIENCE: usize = 5;
 /// Rejected trials in a row that count as stalled: `mu` has then grown by more than 1e18.
@@ -139,109 +73,100 @@ pub fn minimize(
     start: Vec<f64>,
     settings: &Settings,
     monitor: &Monitor,
-    mut accepted: impl FnMut(&[f64], f64),
+    accepted: impl FnMut(&[f64], f64),
 ) -> Outcome {
-    let mut outcome = Outcome {
-        cost: f64::INFINITY,
-        theta: start,
-        iterations: 0,
-        termination: Termination::NotFinite,
-        trace: Vec::with_capacity(settings.max_iterations + 1),
-    };
-    match problem.cost(&outcome.theta) {
-        Some(cost) if cost.is_finite() => outcome.cost = cost,
-        _ => {
-            if monitor.stopped() {
-                outcome.termination = Termination::Interrupted;
-            }
-            return outcome;
-        }
-    }
-    outcome.trace.push(outcome.cost);
-    accepted(&outcome.theta, outcome.cost);
-    let mut system = System::new(problem.parameters());
-    outcome.termination = iterate(
+    let mut method = Marquardt {
+        system: System::new(problem.parameters()),
         problem,
-        &mut outcome,
-        &mut system,
         settings,
+        mu: settings.mu,
+        slow: 0,
+        rejections: 0,
+    };
+    descend(
+        &mut method,
+        start,
+        settings.max_iterations,
         monitor,
-        &mut accepted,
-    );
-    outcome
+        accepted,
+    )
 }
 
-fn iterate(
-    problem: &mut impl Problem,
-    outcome: &mut Outcome,
-    system: &mut System,
-    settings: &Settings,
-    monitor: &Monitor,
-    accepted: &mut impl FnMut(&[f64], f64),
-) -> Termination {
-    let (mut mu, mut slow) = (settings.mu, 0);
-    for _ in 0..settings.max_iterations {
-        problem.normal_equations(&outcome.theta, &mut system.jtj, &mut system.jte);
-        if monitor.stopped() {
-            return Termination::Interrupted;
-        }
-        outcome.iterations += 1;
-        monitor.advance(1);
-        if system.largest_cosine(outcome.cost) <= settings.gradient_tolerance {
-            return Termination::SmallGradient;
-        }
-        let before = outcome.cost;
-        if let Some(end) = improve(problem, outcome, system, settings, monitor, &mut mu) {
-            return end;
-        }
-        outcome.trace.push(outcome.cost);
-        monitor.report_cost(outcome.cost);
-        accepted(&outcome.theta, outcome.cost);
-        let gained = (before - outcome.cost) > settings.reduction_tolerance * before;
-        slow = if gained { 0 } else { slow + 1 };
-        if slow == PATIENCE {
-            return Termination::SmallReduction;
-        }
-    }
-    Termination::MaxIterations
+/// Normal equations whose damping follows success and failure by fixed factors.
+struct Marquardt<'a, P> {
+    problem: &'a mut P,
+    system: System,
+    settings: &'a Settings,
+    mu: f64,
+    /// Iterations in a row that gained nothing.
+    slow: usize,
+    /// Trials in a row that were rejected.
+    rejections: usize,
 }
 
-/// Raises the damping until a trial lowers the cost; says why where none does.
-fn improve(
-    problem: &mut impl Problem,
-    outcome: &mut Outcome,
-    system: &mut System,
-    settings: &Settings,
-    monitor: &Monitor,
-    mu: &mut f64,
-) -> Option<Termination> {
-    for _ in 0..MOST_REJECTIONS {
-        if monitor.stopped() {
-            return Some(Termination::Interrupted);
-        }
-        if system.solve(*mu, settings.damping) {
-            let size = length(&outcome.theta);
-            if length(&system.step) <= settings.step_tolerance * (size + settings.step_tolerance) {
-                return Some(Termination::SmallStep);
-            }
-            for ((trial, theta), step) in system
-                .trial
-                .iter_mut()
-                .zip(&outcome.theta)
-                .zip(&system.step)
-            {
-                *trial = theta + step;
-            }
-            if let Some(cost) = problem.cost(&system.trial).filter(|&c| c < outcome.cost) {
-                outcome.cost = cost;
-                outcome.theta.copy_from_slice(&system.trial);
-                *mu = (*mu / 5.0).max(LEAST_MU);
-                return None;
-            }
-        }
-        *mu *= 4.0;
+impl<P: Problem> Method for Marquardt<'_, P> {
+    fn parameters(&self) -> usize {
+        self.problem.parameters()
     }
-    Some(Termination::Stalled)
+
+    fn cost(&mut self, theta: &[f64]) -> Option<f64> {
+        self.problem.cost(theta)
+    }
+
+    fn linearise(&mut self, theta: &[f64]) -> bool {
+        let system = &mut self.system;
+        self.problem
+            .normal_equations(theta, &mut system.jtj, &mut system.jte);
+        self.rejections = 0;
+        true
+    }
+
+    fn finished(&mut self, outcome: &mut Outcome) -> Option<Termination> {
+        let cosine = self.system.largest_cosine(outcome.cost);
+        (cosine <= self.settings.gradient_tolerance).then_some(Termination::SmallGradient)
+    }
+
+    fn propose(&mut self, theta: &[f64], trial: &mut [f64]) -> Proposal {
+        if !self.system.solve(self.mu, self.settings.damping) {
+            return match self.reject() {
+                Verdict::End(end) => Proposal::End(end),
+                _ => Proposal::Again,
+            };
+        }
+        let tolerance = self.settings.step_tolerance;
+        if length(&self.system.step) <= tolerance * (length(theta) + tolerance) {
+            return Proposal::End(Termination::SmallStep);
+        }
+        for ((trial, theta), step) in trial.iter_mut().zip(theta).zip(&self.system.step) {
+            *trial = theta + step;
+        }
+        Proposal::Trial
+    }
+
+    fn judge(&mut self, before: f64, after: Option<f64>) -> Verdict {
+        if after.is_some_and(|cost| cost < before) {
+            self.mu = (self.mu / 5.0).max(LEAST_MU);
+            return Verdict::Accepted;
+        }
+        self.reject()
+    }
+
+    fn settled(&mut self, before: f64, after: f64) -> Option<Termination> {
+        let gained = (before - after) > self.settings.reduction_tolerance * before;
+        self.slow = if gained { 0 } else { self.slow + 1 };
+        (self.slow == PATIENCE).then_some(Termination::SmallReduction)
+    }
+}
+
+impl<P> Marquardt<'_, P> {
+    fn reject(&mut self) -> Verdict {
+        self.mu *= 4.0;
+        self.rejections += 1;
+        if self.rejections == MOST_REJECTIONS {
+            return Verdict::End(Termination::Stalled);
+        }
+        Verdict::Rejected
+    }
 }
 
 fn length(values: &[f64]) -> f64 {
@@ -255,7 +180,6 @@ struct System {
     jte: Vec<f64>,
     factor: Vec<f64>,
     step: Vec<f64>,
-    trial: Vec<f64>,
 }
 
 impl System {
@@ -266,7 +190,6 @@ impl System {
             jte: vec![0.0; size],
             factor: vec![0.0; size * size],
             step: vec![0.0; size],
-            trial: vec![0.0; size],
         }
     }
 

@@ -4,6 +4,7 @@ mod arrays;
 mod control;
 mod device;
 mod host_loop;
+mod least_squares;
 mod link;
 mod machine;
 mod models;
@@ -21,6 +22,7 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     speed::register(module)?;
     host_loop::register(module)?;
     models::register(module)?;
+    least_squares::register(module)?;
     control::register(module)?;
     link::register(module)?;
     device::register(module)
