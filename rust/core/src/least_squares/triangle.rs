@@ -217,8 +217,8 @@ mod tests {
             let (mut y, mut z) = ([0.0; 3], [0.0; 3]);
             triangle.times(&x, &mut y);
             triangle.solve(&mut y);
-            for j in 0..3 {
-                z[j] = (0..=j).map(|i| triangle.at(i, j) * x[i]).sum();
+            for (j, z) in z.iter_mut().enumerate() {
+                *z = (0..=j).map(|i| triangle.at(i, j) * x[i]).sum();
             }
             triangle.solve_transposed(&mut z);
             for j in 0..3 {
