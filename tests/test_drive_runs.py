@@ -280,7 +280,38 @@ def test_a_drive_needs_a_file_and_a_port_must_be_there(
     assert "sewfast device" in error
 
 
-def test_ctrl_c_on_the_command_line(tmp_path: Path) -> None:
+def test_limits_of_an_earlier_command_do_not_stay(device: VirtualDevice, tmp_path: Path) -> None:
+    arguments = ("record", "--on", device.port, "--signal", "step", "-o")
+    limits = "volt=8,speed=300,acceleration=inf,current=inf"
+    sewfast(tmp_path, *arguments, "a.mcap", "--limits", limits, done=2)
+    sewfast(tmp_path, "clear", device.port)
+    assert sewfast(tmp_path, *arguments, "b.mcap", "--json").json()["n"] == 3000
+
+
+def test_a_second_thread_is_refused(tmp_path: Path) -> None:
+    refusals: list[BaseException] = []
+    with VirtualDevice(fast=False) as device, connect(device.port, watchdog=1.0) as drive:
+        drive.set_limits()
+
+        def disturb() -> None:
+            for _ in range(5):
+                try:
+                    drive.status()
+                except SettingError as e:
+                    refusals.append(e)
+                time.sleep(0.05)
+
+        thread = threading.Timer(0.4, disturb)
+        thread.start()
+        found = record(drive, np.full(1500, 2.0))
+        thread.join()
+    assert len(found) == 1500
+    assert refusals
+    assert "one thread" in str(refusals[0])
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_on_the_command_line(tmp_path: Path, number: signal.Signals) -> None:
     with VirtualDevice(fast=False) as device:
         process = subprocess.Popen(
             [*PROGRAM, "record", "--on", device.port, "--signal", "chirp_lo_hi", "-o", "a.mcap",
@@ -292,7 +323,7 @@ def test_ctrl_c_on_the_command_line(tmp_path: Path) -> None:
             assert time.monotonic() < deadline
             time.sleep(0.05)
         time.sleep(0.5)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         _, err = process.communicate(timeout=30)
         assert [e["event"] for e in device.trace() if e["event"] in ("on", "off")][-1] == "off"
     assert process.returncode == 130

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import signal
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -98,8 +99,26 @@ def opened(args: argparse.Namespace) -> Iterator[Drive]:
                 "and machine stand: --limits volt=10,speed=3500,acceleration=30000,current=15"
             )
         _require_untripped(args.on, drive)
-        drive.set_limits(**(limits or {}))
-        yield drive
+        # limits that an earlier command has left must not stay in force unnoticed
+        drive.set_limits(**(limits or _ceilings(drive)))
+        with _ended_by_signals():
+            yield drive
+
+
+def _ceilings(drive: Drive) -> dict[str, float]:
+    return dict(zip(LIMITS.values(), drive.limits().ceilings, strict=True))
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """A run that is told to end, or whose terminal is closed, ends as by Ctrl-C: motor first."""
+    numbers = [getattr(signal, name, None) for name in ("SIGTERM", "SIGHUP")]
+    before = {n: signal.signal(n, signal.default_int_handler) for n in numbers if n is not None}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _require_untripped(port: str, drive: Drive) -> None:

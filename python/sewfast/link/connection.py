@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -10,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from .. import _core
-from ..errors import LinkError
+from ..errors import LinkError, SettingError
 from . import wire
 from .clock import Clock
 from .ports import Port
@@ -83,6 +84,7 @@ class Connection:
         self, port: Port, *, watchdog: float | None, patience: float, resume: float
     ) -> None:
         self.port = port
+        self._owner = threading.RLock()
         self.receiver = _core.LinkReceiver()
         self.resume = resume
         self.session = secrets.randbelow(2**32 - 1) + 1
@@ -206,6 +208,25 @@ class Connection:
         reply, self._command = self._command.reply, None
         return reply
 
+    @contextmanager
+    def owned(self) -> Iterator[None]:
+        """The connection for this thread alone; a second one is refused, not made to wait.
+
+        Raises
+        ------
+        SettingError
+            Where another thread uses it: their frames and replies would mix.
+        """
+        if not self._owner.acquire(blocking=False):
+            raise SettingError(
+                "expected one thread to use a drive, a second one came while it was in use; end a "
+                "run from elsewhere by the event that `stream` takes as cancel"
+            )
+        try:
+            yield
+        finally:
+            self._owner.release()
+
     def request(self, kind: Kind, body: bytes = b"") -> Reply:
         """Send a command and take turns until it is answered.
 
@@ -213,7 +234,13 @@ class Connection:
         ------
         LinkError
             Where no answer comes or the port fails; a refusal is a reply.
+        SettingError
+            Where another thread uses the connection.
         """
+        with self.owned():
+            return self._request(kind, body)
+
+    def _request(self, kind: Kind, body: bytes) -> Reply:
         while self.is_busy:
             self.turn()
             self.answer()
@@ -304,7 +331,8 @@ class Connection:
         loan = Loan(self.port.fileno(), self._sequence, self._beats)
         self._command = None
         try:
-            yield loan
+            with self.owned():
+                yield loan
         except BaseException:
             # numbers may have been used that were not left here: a STOP with one of those is old
             loan.command += 2**16

@@ -263,6 +263,10 @@ class Drive:
         LinkError
             Where port or device failed.
         """
+        with self._link.owned():
+            return self._stream(plan, sink, cancel)
+
+    def _stream(self, plan: Plan, sink: Sink, cancel: threading.Event | None) -> Outcome:
         run = self._prepare(plan, sink)
         try:
             run.upload()
