@@ -11,6 +11,8 @@ const WATCHDOG: core::ops::RangeInclusive<u32> = 1_000..=10_000_000;
 const MAX_ECHO: usize = 200;
 /// The kind of HELLO, which needs neither tag nor session.
 pub(super) const HELLO: u8 = 0x01;
+/// The kind of the command that is executed whatever its number.
+pub(super) const STOP: u8 = 0x06;
 
 /// Why a command was not done: result and detail of its reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -168,7 +170,7 @@ impl<'a> Command<'a> {
             0x03 => Some(Self::Status),
             0x04 => limits(&mut fields),
             0x05 => fields.u32().map(|watchdog| Self::Arm { watchdog }),
-            0x06 => Some(Self::Stop),
+            STOP => Some(Self::Stop),
             0x07 => Some(Self::Clear),
             0x08 => upload(&mut fields),
             0x09 => gains(&mut fields),

@@ -2,7 +2,7 @@
 
 use super::{Core, Event, Reason, Run, State, Weight};
 use crate::link::command::{
-    Beat, Command, Gains, HELLO, Heartbeat, Refusal, Start, Upload, check_watchdog,
+    Beat, Command, Gains, HELLO, Heartbeat, Refusal, STOP, Start, Upload, check_watchdog,
 };
 use crate::link::identity::{Limits, VERSION, capability};
 use crate::link::profile::Table;
@@ -39,6 +39,11 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             return self.send(Weight::Answer, reply.kind, &reply.body);
         }
         match Order::of(sequence, session.command) {
+            // whoever asks for it, and however late: a stop that was not wanted is the smaller harm
+            Order::Old if frame.header.kind == STOP => {
+                let reply = self.answer(frame);
+                self.send(Weight::Answer, reply.kind, &reply.body);
+            }
             Order::Old => {}
             Order::Repeated => {
                 if let Some(reply) = session.reply.clone() {

@@ -167,6 +167,9 @@ impl Bystander {
             let first = self.replies.get(&sequence);
             assert_eq!(replies.first(), first, "another reply to the same number");
             assert_eq!(self.rig.device.state(), state, "executed again");
+        } else if kind == 0x06 {
+            assert_eq!(replies.len(), 1, "STOP is answered whatever its number");
+            self.done(kind, body);
         } else {
             assert!(replies.is_empty() && self.rig.device.state() == state);
         }

@@ -381,3 +381,20 @@ fn a_device_that_is_not_sampled_is_safe() {
     assert_eq!(rig.device.sample(rig.now, &measurement), Output::SAFE);
     assert_eq!(rig.device.state(), State::Idle);
 }
+
+#[test]
+fn stop_is_executed_whatever_its_number() {
+    let mut rig = Rig::driving(3.0);
+    let tag = identity().boot_id as u16;
+    // of a host that was replaced and had counted further
+    rig.say(0x03, tag, 5000, &[]);
+    assert!(rig.sample().enabled);
+    rig.say(0x06, tag, 7, &[]);
+    assert_eq!(rig.device.poll(rig.now), Output::SAFE);
+    assert_eq!(rig.device.state(), State::Idle);
+    let last = rig.listen().pop().expect("an answer");
+    assert_eq!(
+        (last.header.kind, &last.body[..5]),
+        (0x86, &[7, 0, 0, 0, 0][..])
+    );
+}

@@ -154,7 +154,7 @@ fn the_same_number_gets_the_same_reply_and_is_not_executed_again() {
     assert_eq!(rig.device.armed_count(), count);
     let tag = rig.tag;
     rig.listen();
-    rig.say(0x06, tag, rig.commands - 1, &[]);
+    rig.say(0x03, tag, rig.commands - 1, &[]);
     assert!(rig.listen().is_empty());
     assert_eq!(rig.device.state(), State::Armed);
     // a number far ahead is taken, and those before it are old from then on
