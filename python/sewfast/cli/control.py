@@ -198,15 +198,10 @@ def _show_run(args: argparse.Namespace, found: ClosedLoopRun, place: Path | None
     """The columns and what they say; `place` already holds those of a drive."""
     summary: dict[str, Any] = {"plant": found.plant, "reference": found.reference}
     summary |= {"unit": found.units["y"], "n": len(found.t), "Ts": found.Ts, **found.metrics()}
-    lines = str(found).splitlines()
-    if place is not None and args.out == place:
-        summary["file"] = str(place)
-        if args.json:
-            print_json(summary)
-        else:
-            print("\n".join([*lines, f"written to {place}"]))
-        return
-    write_columns(args.out, found.columns(), found.units, summary, lines, as_json=args.json)
+    write_columns(
+        args.out, found.columns(), found.units, summary, str(found).splitlines(),
+        as_json=args.json, written=place,
+    )  # fmt: skip
 
 
 def _plant(text: str) -> Plant:

@@ -47,6 +47,7 @@ def write_columns(
     *,
     as_json: bool,
     header: Header | None = None,
+    written: Path | None = None,
 ) -> None:
     """Columns to `out` and what they say to standard output; without `out` the columns themselves.
 
@@ -61,9 +62,12 @@ def write_columns(
         The result as text.
     header : Header or None
         What an `.mcap` file says of itself.
+    written : Path or None
+        A file that holds the columns already: the recording of a drive.
     """
     if out is not None:
-        _write(out, columns, units, header)
+        if out != written:
+            _write(out, columns, units, header)
         summary, lines = {**summary, "file": str(out)}, [*lines, f"written to {out}"]
     if as_json:
         print_json(summary if out is not None else {**summary, "columns": _lists(columns)})

@@ -161,15 +161,9 @@ def _write(args: argparse.Namespace, made: Recording, machine: str, place: Path 
 
     summary, line = _told(made, machine)
     summary |= _settings(args)
-    if place is not None and args.out == place:
-        if args.json:
-            print_json({**summary, "file": str(place)})
-        else:
-            print(f"{line}\nwritten to {place}")
-        return
     write_columns(
         args.out, made.columns(), UNITS, summary, [line], as_json=args.json,
-        header=made.header(**_settings(args)),
+        header=made.header(**_settings(args)), written=place,
     )  # fmt: skip
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -89,17 +88,15 @@ def play(
     Raises
     ------
     Stopped
-        Where port, device, disk or Ctrl-C ended it; the motor has been stopped and the file closed.
-    LinkError
-        Where the device tripped; the message has the reason and names the file.
+        Where a trip, port, device, disk or Ctrl-C ended it; the motor has been stopped and the file
+        closed.
     SettingError, DataError
         Before anything moves.
     """
     columns = drive.columns(plan)
     n = len(plan.values)
     feed = Feed(columns, drive.identity.Ts, n, name, counts_per_rev=_counts_per_rev(drive))
-    with ExitStack() as open_things:
-        open_things.enter_context(open_view(live, feed))
+    with open_view(live, feed):
         writer = _writer(file, drive, plan, name, columns, overwrite, settings or {})
         recorder = Recorder(columns, n, writer=writer, feed=feed)
         played = _streamed(drive, plan, recorder, writer)
