@@ -73,14 +73,14 @@ def checkup(port: Metered, echoes: int) -> Iterator[Finding]:
     link = Connection(port, watchdog=0.05, patience=PATIENCE, resume=0.0)
     drive = Drive(link)
     yield _identity(drive)
-    before, sent = drive.status(), port.frames
+    # counted up to the first copy of each STATUS, as the device does: its repeats are none's loss
+    sent, before = port.frames, drive.status()
     yield _state(before)
     yield _limits(drive)
     times = _echo(drive, echoes)
     yield _round_trip(times)
     yield _throughput(times, drive, port)
-    # what the device counts of a command stands in the reply to the next
-    after, sent = drive.status(), port.frames - sent
+    sent, after = port.frames - sent, drive.status()
     yield _loss(link, before, after, sent, 2 * echoes)
     yield _clock(drive)
     yield _counters(after, before, drive)
