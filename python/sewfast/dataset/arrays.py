@@ -1,0 +1,68 @@
+"""What a caller hands over -> read-only columns of float64."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import DataError
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+
+def as_float(values: ArrayLike, what: str) -> FloatArray:
+    """Read-only C-contiguous float64; a copy unless the array already is exactly that."""
+    if isinstance(values, np.ma.MaskedArray):
+        values = np.ma.filled(values.astype(np.float64), np.nan)
+    array = np.asarray(values)
+    if array.dtype.kind not in "biuf":
+        raise DataError(
+            f"{what}: expected real numbers, received dtype {array.dtype}; convert it to float64"
+        )
+    if array.dtype != np.float64 or array.flags.writeable or not array.flags.c_contiguous:
+        array = np.array(array, dtype=np.float64, order="C")
+        array.flags.writeable = False
+    return array
+
+
+def as_column(values: ArrayLike, what: str, n: int | None = None) -> FloatArray:
+    array = as_float(values, what)
+    if array.ndim != 1:
+        raise DataError(
+            f"{what}: expected shape (N,), received {array.shape}; nothing is transposed or "
+            "flattened by guess, pass one column"
+        )
+    if n is not None and len(array) != n:
+        raise DataError(
+            f"{what}: expected {n} samples, as many as the output, received {len(array)}; "
+            "cut both to the same range"
+        )
+    return array
+
+
+def as_inputs(values: ArrayLike, n: int) -> FloatArray:
+    """(N, nu), where a single input may come as (N,)."""
+    array = as_float(values, "u")
+    if array.ndim == 1:
+        array = array.reshape(-1, 1)
+    if array.ndim != 2 or array.shape[0] != n or array.shape[1] == 0:
+        raise DataError(
+            f"u: expected shape ({n},) or ({n}, n_inputs), time first, as long as y; received "
+            f"{np.shape(values)}; nothing is transposed by guess"
+        )
+    return array
+
+
+def range_of(column: FloatArray) -> tuple[float, float]:
+    known = column[~np.isnan(column)]
+    return (float(known.min()), float(known.max())) if len(known) else (math.nan, math.nan)
+
+
+def texts(value: str | Sequence[str] | None, default: tuple[str, ...]) -> tuple[str, ...]:
+    if value is None:
+        return default
+    return (value,) if isinstance(value, str) else tuple(value)

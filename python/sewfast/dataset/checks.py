@@ -1,0 +1,85 @@
+"""What a data set must fulfil before it is used."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import DataError
+from .arrays import FloatArray
+from .units import require_same_units
+
+if TYPE_CHECKING:
+    from .dataset import Dataset
+
+
+def require_dataset(data: object, what: str) -> None:
+    """A `Dataset`, or a `DataError` that says how to make one."""
+    from .dataset import Dataset
+
+    if not isinstance(data, Dataset):
+        raise DataError(
+            f"{what}: expected a Dataset, received {type(data).__name__}; make one with "
+            "sewfast.read or Dataset.from_arrays"
+        )
+
+
+def require_alike(data: Dataset, other: Dataset) -> None:
+    """Raise `DataError` where two data sets cannot be one: inputs, units, sample time (1 %)."""
+    if data.n_inputs != other.n_inputs:
+        raise DataError(
+            f"expected {data.n_inputs} inputs, as in {data.source}, received {other.n_inputs} "
+            f"in {other.source}"
+        )
+    require_same_units(data, other)
+    if abs(data.Ts - other.Ts) > 0.01 * data.Ts:
+        raise DataError(
+            f"expected one sample time: {data.Ts} s in {data.source}, received {other.Ts} s in "
+            f"{other.source}; resample one of them"
+        )
+
+
+def require_inputs(data: Dataset) -> None:
+    """Raise `DataError` that names the first input value that is not finite."""
+    for e in data.experiments:
+        for name, column in zip(data.input_names, e.u.T, strict=True):
+            require_finite(column, f"{e.name}, input {name!r}", e.start)
+
+
+def require_complete(data: Dataset) -> None:
+    """Raise `DataError` that names the first input or output value that is not finite."""
+    require_inputs(data)
+    for e in data.experiments:
+        require_finite(e.y, f"{e.name}, output {data.output_name!r}", e.start)
+
+
+def require_excited(data: Dataset) -> None:
+    """Raise `DataError` where an input or the output never moves: nothing to identify from."""
+    for i, name in enumerate(data.input_names):
+        if all(np.min(e.u[:, i]) == np.max(e.u[:, i]) for e in data.experiments):
+            raise DataError(
+                f"{data.source}: input {name!r} is constant at "
+                f"{data.experiments[0].u[0, i]:g}; expected an input that moves; "
+                "record with an excitation (`sewfast signals`)"
+            )
+    if all(np.min(e.y) == np.max(e.y) for e in data.experiments):
+        raise DataError(
+            f"{data.source}: output {data.output_name!r} is constant at "
+            f"{data.experiments[0].y[0]:g}; expected an output that follows the input; check "
+            "the column and the sensor"
+        )
+
+
+def require_finite(column: FloatArray, what: str, start: int) -> None:
+    bad = ~np.isfinite(column)
+    if not bad.any():
+        return
+    if bad.all():
+        raise DataError(f"{what}: every value is NaN or infinite; expected a measured column")
+    k = int(np.argmax(bad))
+    raise DataError(
+        f"{what}: expected finite values, received {column[k]} at sample {start + k} (0-based; "
+        f"{int(bad.sum())} such in {len(column)} samples); repair it, choose a range without it, "
+        "or take the pieces between: Dataset.split_at_gaps (--split-at-gaps)"
+    )

@@ -1,0 +1,199 @@
+"""`Dataset`: inputs and one output at a fixed sample time, in one or several experiments."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import DataError, SettingError
+from . import checks, pieces
+from .arrays import range_of, texts
+from .experiment import Experiment
+from .units import labelled
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Dataset:
+    """Recordings of one plant: the same columns, units and sample time in every experiment.
+
+    Immutable. Values may hold NaN; `identify` and `validate` name the sample that they cannot use.
+
+    Parameters
+    ----------
+    experiments : tuple of Experiment
+    Ts : float
+        Sample time [s].
+    input_names, output_name
+        Column names.
+    input_units, output_unit
+        Units as text, empty where unknown.
+    counts : tuple (column, counts_per_rev) or None
+        Set where the output is a speed [RPM] computed from an encoder's counts.
+    notes : tuple of str
+        What was left out when the data set was made.
+
+    Raises
+    ------
+    DataError
+        Where experiments, names and units disagree in number, or Ts is not a positive number.
+    """
+
+    experiments: tuple[Experiment, ...]
+    Ts: float
+    input_names: tuple[str, ...] = ("u",)
+    output_name: str = "y"
+    input_units: tuple[str, ...] = ("",)
+    output_unit: str = ""
+    counts: tuple[str, float] | None = None
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.experiments:
+            raise DataError("expected at least one experiment, received none")
+        if isinstance(self.Ts, bool) or not (math.isfinite(self.Ts) and self.Ts > 0):
+            raise DataError(f"Ts: expected a positive sample time in seconds, received {self.Ts}")
+        widths = sorted({e.u.shape[1] for e in self.experiments})
+        if len(widths) > 1:
+            raise DataError(
+                f"expected the same inputs in every experiment, received {widths} inputs"
+            )
+        if not len(self.input_names) == len(self.input_units) == widths[0]:
+            raise DataError(
+                f"expected {widths[0]} input names and units, one per column of u, received names "
+                f"{list(self.input_names)} and units {list(self.input_units)}"
+            )
+        if len(set(self.input_names)) < len(self.input_names):
+            raise DataError(f"expected different input names, received {list(self.input_names)}")
+
+    @classmethod
+    def from_arrays(
+        cls,
+        u: ArrayLike,
+        y: ArrayLike | None,
+        Ts: float,
+        *,
+        input_names: str | Sequence[str] | None = None,
+        output_name: str = "y",
+        input_units: str | Sequence[str] | None = None,
+        output_unit: str = "",
+        name: str = "array",
+        channels: Mapping[str, ArrayLike] | None = None,
+    ) -> Dataset:
+        """One experiment from arrays, which are copied.
+
+        Parameters
+        ----------
+        u : array_like, shape (N,) or (N, n_inputs)
+        y : array_like, shape (N,), or None
+            None where nothing was measured: enough to simulate from rest.
+        Ts : float
+            Sample time [s].
+
+        Raises
+        ------
+        DataError
+            As for `Experiment` and `Dataset`.
+        """
+        y = np.full(np.shape(u)[:1], np.nan) if y is None else y
+        experiment = Experiment(u, y, channels or {}, name)  # type: ignore[arg-type]
+        width = experiment.u.shape[1]
+        default = ("u",) if width == 1 else tuple(f"u{i + 1}" for i in range(width))
+        return cls(
+            (experiment,),
+            float(Ts),
+            texts(input_names, default),
+            output_name,
+            texts(input_units, ("",) * width),
+            output_unit,
+        )
+
+    @staticmethod
+    def concat(datasets: Iterable[Dataset]) -> Dataset:
+        """All experiments of several data sets as one data set; names are taken from the first.
+
+        Raises
+        ------
+        DataError
+            Where there is none, or sample times (1 %), numbers of inputs or units differ.
+        """
+        parts = tuple(datasets)
+        if not parts:
+            raise DataError("concat: expected at least one data set, received none")
+        first = parts[0]
+        for other in parts[1:]:
+            checks.require_alike(first, other)
+        return replace(
+            first,
+            experiments=tuple(e for part in parts for e in part.experiments),
+            notes=tuple(note for part in parts for note in part.notes),
+        )
+
+    @property
+    def n_inputs(self) -> int:
+        return len(self.input_names)
+
+    @property
+    def source(self) -> str:
+        """Names of the experiments, for messages."""
+        return ", ".join(dict.fromkeys(e.name for e in self.experiments))
+
+    @property
+    def input_range(self) -> tuple[tuple[float, float], ...]:
+        """Smallest and largest value of each input over all experiments."""
+        u = np.concatenate([e.u for e in self.experiments])
+        return tuple(map(range_of, u.T))
+
+    @property
+    def output_range(self) -> tuple[float, float]:
+        """Smallest and largest measured output over all experiments; NaN where there is none."""
+        return range_of(np.concatenate([e.y for e in self.experiments]))
+
+    def __len__(self) -> int:
+        """Samples in all experiments together."""
+        return sum(len(e) for e in self.experiments)
+
+    # without this, Python would iterate over `self[0]`, `self[1]`, ...
+    __iter__ = None
+
+    def __getitem__(self, key: slice) -> Dataset:
+        """`data[a:b]`: that range of every experiment, cut where it leaves the experiment."""
+        if not isinstance(key, slice) or key.step not in (None, 1):
+            raise SettingError(
+                f"expected a range such as data[0:400], received data[{key!r}]; single experiments "
+                "are in data.experiments"
+            )
+        pieces = (e.cut(*key.indices(len(e))[:2]) for e in self.experiments)
+        return replace(self, experiments=tuple(pieces))
+
+    slice = pieces.take
+    split = pieces.split
+    split_at_gaps = pieces.split_at_gaps
+
+    require_inputs = checks.require_inputs
+    require_complete = checks.require_complete
+    require_excited = checks.require_excited
+
+    def __repr__(self) -> str:
+        inputs = ", ".join(map(labelled, self.input_names, self.input_units))
+        return (
+            f"Dataset({len(self.experiments)} experiment(s), {len(self)} samples, "
+            f"Ts={self.Ts:g} s, {inputs} -> {labelled(self.output_name, self.output_unit)})"
+        )
+
+    def __str__(self) -> str:
+        lines = [f"Data set: {len(self)} samples at Ts = {self.Ts:g} s"]
+        for name, unit, (low, high) in zip(
+            self.input_names, self.input_units, self.input_range, strict=True
+        ):
+            lines.append(f"  input   {labelled(name, unit)}: {low:g} to {high:g}")
+        low, high = self.output_range
+        lines.append(
+            f"  output  {labelled(self.output_name, self.output_unit)}: {low:g} to {high:g}"
+        )
+        lines += [f"  {e.name} [{e.range_text}]" for e in self.experiments]
+        lines += [f"  note    {note}" for note in self.notes]
+        return "\n".join(lines)

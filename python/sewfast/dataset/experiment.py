@@ -1,0 +1,92 @@
+"""`Experiment`: one uninterrupted recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError
+from .arrays import FloatArray, as_column, as_inputs
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Experiment:
+    """One uninterrupted recording.
+
+    Parameters
+    ----------
+    u : array, shape (N, n_inputs) or (N,)
+        Inputs; `u[k]` is held from sample k to k + 1.
+    y : array, shape (N,)
+        Output, measured before `u[k]` acts. NaN marks samples that were not measured.
+    channels : mapping of name to array of shape (N,)
+        Further columns for plots and scores (the true speed of a virtual machine, say).
+    name : str
+        Where it comes from, for messages.
+    start : int
+        Index of its first sample in the recording that it was cut from.
+
+    Raises
+    ------
+    DataError
+        Where shapes disagree, nothing is left, or the values are not real numbers.
+    """
+
+    u: FloatArray
+    y: FloatArray
+    channels: Mapping[str, FloatArray] = field(default_factory=dict)
+    name: str = "array"
+    start: int = 0
+
+    def __post_init__(self) -> None:
+        y = as_column(self.y, "y")
+        if len(y) == 0:
+            raise DataError(f"{self.name}: expected at least 1 sample, received none")
+        channels = {key: as_column(v, key, len(y)) for key, v in self.channels.items()}
+        object.__setattr__(self, "y", y)
+        object.__setattr__(self, "u", as_inputs(self.u, len(y)))
+        object.__setattr__(self, "channels", MappingProxyType(channels))
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+    def __repr__(self) -> str:
+        return f"Experiment({self.name!r}, {self.range_text}, {self.u.shape[1]} input(s))"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # a mappingproxy cannot be pickled
+        return Experiment, (self.u, self.y, dict(self.channels), self.name, self.start)
+
+    @property
+    def range_text(self) -> str:
+        """Its place in the recording, as `A:B`."""
+        return f"{self.start}:{self.start + len(self)}"
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Where inputs and output are finite, shape (N,)."""
+        known: NDArray[np.bool_] = np.isfinite(self.u).all(axis=1) & np.isfinite(self.y)
+        return known
+
+    def cut(self, start: int, stop: int) -> Experiment:
+        """Samples `start` to `stop`, end excluded, as views.
+
+        Raises
+        ------
+        DataError
+            Where the range leaves the experiment or is empty.
+        """
+        if not 0 <= start < stop <= len(self):
+            raise DataError(
+                f"{self.name}: expected a range inside 0:{len(self)} with at least one sample, "
+                f"received {start}:{stop}"
+            )
+        channels = {key: v[start:stop] for key, v in self.channels.items()}
+        return Experiment(
+            self.u[start:stop], self.y[start:stop], channels, self.name, self.start + start
+        )
