@@ -20,7 +20,7 @@ SAMPLES, EVENT, BEAT = 0xC0, 0xC1, 0xC2
 BOOT, IDLE, ARMED, RUNNING, TRIPPED = range(5)
 FINISHED, TRIP_EVENT = 4, 6
 WATCHDOG = 50_000
-PATIENCE = 20.0
+PATIENCE = 60.0
 """Long enough for any machine; reached only where something is wrong [s]."""
 
 

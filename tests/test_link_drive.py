@@ -104,7 +104,7 @@ def starts(device: ScriptedDevice) -> list[bytes]:
 
 @pytest.mark.parametrize("kind", ["pty", "tcp"])
 def test_every_sample_of_a_run_arrives(tmp_path, kind):
-    with ScriptedDevice(tmp_path, kind) as device, connect(device.url, watchdog=1.0) as drive:
+    with ScriptedDevice(tmp_path, kind) as device, connect(device.url, watchdog=5.0) as drive:
         drive.set_limits(volt=10.0)
         sink = Kept()
         outcome = drive.stream(Plan("commands", U), sink)
@@ -400,7 +400,7 @@ def test_an_error_of_the_sink_stops_the_motor_first(device, drive):
 @pytest.mark.parametrize("where", ["in a wait", "in the sink"])
 def test_ctrl_c_stops_the_motor_within_a_tenth_of_a_second(served, where):
     # a busy machine may forget this process for a while
-    with connect(served.url, watchdog=2.0) as drive:
+    with connect(served.url, watchdog=5.0) as drive:
         drive.set_limits(volt=10.0)
         pressed: list[float] = []
 
@@ -468,7 +468,7 @@ def replug(device: ScriptedDevice, away: float) -> None:
 def test_a_run_goes_on_after_the_port_was_away(tmp_path, kind):
     with (
         ScriptedDevice(tmp_path, kind) as device,
-        connect(device.url, watchdog=2.0) as drive,
+        connect(device.url, watchdog=10.0, resume=10.0) as drive,
     ):
         drive.set_limits(volt=10.0)
         sink = Kept(once(lambda: device.do(lambda: replug(device, 0.15))))
@@ -481,9 +481,10 @@ def test_a_run_goes_on_after_the_port_was_away(tmp_path, kind):
 
 
 def test_a_run_that_tripped_meanwhile_says_so(served):
-    with connect(served.url, watchdog=0.3) as drive:
+    served.capacity = len(LONG)
+    with connect(served.url, watchdog=1.0, resume=10.0) as drive:
         drive.set_limits(volt=10.0)
-        sink = Kept(once(lambda: served.do(lambda: replug(served, 0.6))))
+        sink = Kept(once(lambda: served.do(lambda: replug(served, 1.5))))
         with pytest.raises(LinkError, match=r"the device had tripped: watchdog"):
             drive.stream(Plan("commands", LONG), sink)
         assert drive.outcome is not None
@@ -497,7 +498,7 @@ def test_a_device_that_was_reset_meanwhile_says_so(served):
         replug(served, 0.1)
         served.reset()
 
-    with connect(served.url, watchdog=2.0) as drive:
+    with connect(served.url, watchdog=10.0, resume=10.0) as drive:
         drive.set_limits(volt=10.0)
         sink = Kept(once(lambda: served.do(lose)))
         with pytest.raises(LinkError, match=r"came back, but the device has been reset"):
@@ -520,7 +521,7 @@ def test_a_stop_still_reaches_a_device_whose_port_comes_back_late(served):
 
 def test_a_port_that_stays_away(served):
     sink = Kept(once(lambda: served.do(lambda: replug(served, math.inf))))
-    drive = connect(served.url, watchdog=0.3, resume=0.2)
+    drive = connect(served.url, watchdog=1.0, resume=0.2)
     drive.set_limits(volt=10.0)
     with pytest.raises(LinkError, match=r"vanished .*did not come back within 0\.2 s"):
         drive.stream(Plan("commands", LONG), sink)

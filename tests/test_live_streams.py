@@ -122,7 +122,7 @@ def receiver() -> Iterator[socket.socket]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as made:
         made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         made.bind(("127.0.0.1", 0))
-        made.settimeout(10)
+        made.settimeout(60)
         yield made
 
 
@@ -175,7 +175,7 @@ def subscribe(port: int) -> socket.socket:
     client = socket.socket()
     # before connecting, so that the window is small from the start
     client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    client.settimeout(10)
+    client.settimeout(60)
     client.connect(("127.0.0.1", port))
     client.sendall(
         b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -211,7 +211,7 @@ def test_foxglove_client_receives_samples_and_status() -> None:
         ) as client,
     ):
         while len(topics) < 2:
-            message = json.loads(client.recv(timeout=10))
+            message = json.loads(client.recv(timeout=60))
             topics |= {c["topic"]: c for c in message.get("channels", ())}
         client.send(
             json.dumps(
@@ -227,7 +227,7 @@ def test_foxglove_client_receives_samples_and_status() -> None:
         writer = threading.Thread(target=put)
         writer.start()
         while len(samples) < 200 or not texts:
-            message = client.recv(timeout=10)
+            message = client.recv(timeout=60)
             _, subscription, stamp = struct.unpack_from("<BIQ", message)
             (samples if subscription == 1 else texts).append((stamp, strict(message[13:])))
             if len(samples) == 1:
@@ -275,7 +275,7 @@ def test_foxglove_client_that_never_reads_holds_nothing_up() -> None:
         grown = resident() - before
         assert f.received == 10_000
         began = time.monotonic()
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - began < 30
     assert grown < 10e6
 
 
@@ -302,7 +302,7 @@ def test_program_ends_beside_a_foxglove_client_that_never_reads() -> None:
         with subscribe(int(program.stdout.readline())):
             program.stdin.write("\n")
             program.stdin.flush()
-            assert program.wait(30) == 0
+            assert program.wait(120) == 0
 
 
 def test_foxglove_port_that_is_taken_is_refused() -> None:

@@ -10,7 +10,7 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import pytest
 
 import raw_host as raw
 from cli import PROGRAM, environment, refused, sewfast
+from moments import until
 from raw_host import RawHost, counts_and_u, golden
 from sewfast import LinkError, SettingError, VirtualMachine
 from sewfast.link import VirtualDevice
@@ -34,15 +35,6 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-termina
 def device(request: pytest.FixtureRequest) -> Iterator[VirtualDevice]:
     with VirtualDevice(endpoint=request.param) as served:
         yield served
-
-
-def until(condition: Callable[[], Any]) -> Any:
-    """What a condition gives as soon as it is true."""
-    deadline = time.monotonic() + raw.PATIENCE
-    while not (found := condition()):
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    return found
 
 
 def event(device: VirtualDevice, name: str) -> dict[str, Any]:
@@ -70,14 +62,14 @@ class TestRun:
             names = [row[7 : 7 + row[6]].decode() for row in names]
             assert names == ["counts", "u", "current", "r", "feedback", "speed_true"]
             host.settle()
-            host.arm()
+            host.arm(watchdog=LONG)
             assert host.upload([3000] * 100) == (100, 8092)
-            host.keep()
+            host.keep(watchdog=LONG)
             assert host.upload([3000] * 100, 100) == (200, 7992)
-            start = host.start(200)
+            start = host.start(200, watchdog=LONG)
             ended = []
             while not ended:
-                host.keep()
+                host.keep(watchdog=LONG)
                 ended = [f for f in host.read(0.005) if f[0] == raw.EVENT and f[4][0] in (4, 6)]
             assert ended[0][4][:3] == bytes([raw.FINISHED, raw.IDLE, 0])
             rows = counts_and_u(host.frames)
@@ -346,6 +338,9 @@ def test_115200_baud_carry_1_khz_with_40_percent_to_spare():
         ready(host).start(samples, mode=2, watchdog=LONG)
         host.frames.clear()
         host.wait_for(raw.EVENT, raw.FINISHED)
+        if device.statistics["latest_us"] > 150_000:
+            # what falls due at once then fills the memory for frames, which holds .32 s of them
+            pytest.skip("the computer held the device up for longer than it can make up for")
         batches = [f for f in host.frames if f[0] == raw.SAMPLES]
         assert len(counts_and_u(host.frames)) == samples
         assert len(batches) == samples // 10

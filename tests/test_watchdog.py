@@ -20,6 +20,7 @@ import pytest
 
 import raw_host as raw
 from cli import environment
+from moments import until
 from raw_host import RawHost
 from sewfast.link import VirtualDevice
 
@@ -42,11 +43,8 @@ def changes(device: VirtualDevice, after: int) -> list[dict[str, Any]]:
 
 
 def switched_off(device: VirtualDevice, after: int) -> dict[str, Any]:
-    deadline = time.monotonic() + raw.PATIENCE
-    while not (found := [e for e in changes(device, after) if e["event"] == "off"]):
-        assert time.monotonic() < deadline, "the output stayed on"
-        time.sleep(0.005)
-    return found[0]
+    found = until(lambda: [e for e in changes(device, after) if e["event"] == "off"])
+    return dict(found[0])
 
 
 def unplugged(device: VirtualDevice, watchdog: int) -> None:
@@ -118,10 +116,7 @@ def test_the_output_is_safe_within_the_stated_time(
 
 def back_again(device: VirtualDevice) -> None:
     """The port is there again; whoever comes finds the device tripped, not running."""
-    deadline = time.monotonic() + raw.PATIENCE
-    while not Path(device.port).exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
+    until(lambda: Path(device.port).exists())
     with RawHost(device.port, session=1) as host:
         host.hello()
         assert host.state() == raw.TRIPPED
