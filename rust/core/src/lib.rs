@@ -12,6 +12,7 @@ pub mod encoder;
 pub mod error;
 pub mod fopdt;
 mod gram;
+mod guard;
 pub mod lagged;
 pub mod least_squares;
 pub mod linear;
@@ -25,6 +26,7 @@ pub mod random;
 pub mod rules;
 pub mod signals;
 pub mod speed;
+mod starts;
 pub mod tune;
 
 pub use data::Record;

@@ -1,9 +1,5 @@
 //! Training in free run: many starts in parallel, each by Levenberg-Marquardt, chosen by free run.
 
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::thread;
-
 use super::network::{Network, Shape};
 use super::problem::{Experiment, FreeRun};
 use super::referee::Referee;
@@ -13,7 +9,7 @@ use crate::lagged::Lagged;
 use crate::linear::LinearModel;
 use crate::lm::{self, Damping, Outcome, Termination};
 use crate::random::Random;
-use crate::{Error, Monitor, Record, Result, arx};
+use crate::{Error, Monitor, Record, Result, arx, starts};
 
 /// Where a free run starts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -118,7 +114,9 @@ pub fn fit(
 ) -> Result<NeuralFit> {
     let training = Training::new(records, validation, settings, monitor)?;
     monitor.set_total((settings.starts * settings.max_iterations) as u64);
-    let results = training.run_all();
+    let results = starts::run_all(settings.starts, settings.threads, monitor, |start| {
+        training.run(start)
+    });
     training.chosen(results)
 }
 
@@ -192,37 +190,6 @@ impl<'a> Training<'a> {
             scaling,
             linear: bypass,
         })
-    }
-
-    /// The starts' results in their order, whatever the number of threads.
-    fn run_all(&self) -> Vec<Option<Trained>> {
-        let starts = self.settings.starts;
-        let available = || thread::available_parallelism().map_or(1, usize::from);
-        let threads = match self.settings.threads {
-            0 => available(),
-            threads => threads,
-        };
-        let (next, results) = (AtomicUsize::new(0), Mutex::new(Vec::with_capacity(starts)));
-        let work = || {
-            loop {
-                let start = next.fetch_add(1, Ordering::Relaxed);
-                if start >= starts || self.monitor.stopped() {
-                    return;
-                }
-                let trained = self.run(start);
-                let mut results = results.lock().unwrap_or_else(|e| e.into_inner());
-                results.push((start, trained));
-            }
-        };
-        thread::scope(|scope| {
-            for _ in 1..threads.min(starts) {
-                scope.spawn(work);
-            }
-            work();
-        });
-        let mut results = results.into_inner().unwrap_or_else(|e| e.into_inner());
-        results.sort_by_key(|(start, _)| *start);
-        results.into_iter().map(|(_, trained)| trained).collect()
     }
 
     /// Trains one start, drawn again while it is dead.
@@ -322,14 +289,8 @@ impl<'a> Training<'a> {
     fn chosen(&self, results: Vec<Option<Trained>>) -> Result<NeuralFit> {
         let score = |t: &Option<Trained>| t.as_ref().map_or(f64::INFINITY, Trained::score);
         let start_costs: Vec<f64> = results.iter().map(score).collect();
-        let mut order: Vec<usize> = (0..results.len())
-            .filter(|&i| start_costs[i].is_finite())
-            .collect();
-        let sound = |i: usize| results[i].as_ref().is_some_and(|t| t.sound);
-        order.sort_by(|&i, &j| {
-            sound(j)
-                .cmp(&sound(i))
-                .then(start_costs[i].total_cmp(&start_costs[j]))
+        let order = starts::ranked(&start_costs, |i| {
+            results[i].as_ref().is_some_and(|t| t.sound)
         });
         let models = order
             .iter()
