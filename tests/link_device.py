@@ -145,7 +145,7 @@ class ScriptedDevice(threading.Thread):
         self.mangle: Callable[[int, bytes], list[bytes]] = lambda kind, wire: [wire]
         self.executed: list[tuple[int, bytes]] = []
         self.arrived: list[tuple[float, int]] = []
-        self.heartbeats = 0
+        self.heartbeats = self.foreign = 0
         self.limits = (0.0,) * 4
         self.state, self.reason, self.run_number = IDLE, 0, 0
         self.problem: BaseException | None = None
@@ -282,18 +282,21 @@ class ScriptedDevice(threading.Thread):
     # --- commands ---------------------------------------------------------------------------------
 
     def _take(self, frame: tuple[int, int, int, int, bytes]) -> None:
-        kind, tag, sequence, _, body = frame
+        kind, tag, sequence, told, body = frame
         self.arrived.append((self._monotonic(), kind))
         if self.intercept(frame):
             return
-        if kind >= KEEP:
-            self._heartbeat(kind, tag, body)
-        elif kind == HELLO:
+        own = told >> 32 == self._session
+        if kind == HELLO:
             self._hello(body)
-        elif not self._session:
-            return
+        elif not self._session or not (own or kind == STOP):
+            self.foreign += 1
+        elif kind >= KEEP:
+            self._heartbeat(kind, tag, body)
         elif tag != self.boot & 0xFFFF:
             self._reply(kind, sequence, b"\5" + struct.pack("<I", tag))
+        elif not own:
+            self._reply(kind, sequence, self._execute(kind, body))
         elif self._last is None or sequence > self._last[0]:
             self.executed.append((kind, body))
             answer = self._execute(kind, body)
@@ -313,17 +316,17 @@ class ScriptedDevice(threading.Thread):
                 self._drive = struct.unpack("<If", body)[1]
 
     def _hello(self, body: bytes) -> None:
-        session = struct.unpack("<BBI", body)[2]
+        session: int = struct.unpack("<BBI", body)[2]
         if session != self._session:
-            self._session, self._last = session, None
+            self._session, self._last, self.limits = session, None, (0.0,) * 4
             if self.state == RUNNING:
                 self.trip(7)
-        schema = zlib.crc32(struct.pack("<BI", 1, PERIOD) + b"".join(CHANNELS[: self.channels]))
+        schema = zlib.crc32(struct.pack("<BI", 2, PERIOD) + b"".join(CHANNELS[: self.channels]))
         head = struct.pack(
-            "<BIIBBIIIf", 1, self.boot, self.schema or schema, self.state, self.channels, PERIOD,
+            "<BIIBBIIIf", 2, self.boot, self.schema or schema, self.state, self.channels, PERIOD,
             self.capabilities, self.capacity, 1572.0,
         )  # fmt: skip
-        answer = b"\0" + head + text("script") + text("1.0")
+        answer = b"\0" + head + text("script") + text("1.0") + struct.pack("<I", session)
         if self.hello_result != b"\0":
             answer = self.hello_result
         self._reply(HELLO, 0, answer)
@@ -355,9 +358,9 @@ class ScriptedDevice(threading.Thread):
 
     def _status(self) -> bytes:
         return struct.pack(
-            "<BBBHIQIIIfiIIIII", self.state, self.reason, self._mode, self._mask, self.run_number,
+            "<BBBHIQIIIfiIIIIII", self.state, self.reason, self._mode, self._mask, self.run_number,
             self._at, self._taken, self._length, len(self._profile), 0.0, self._counts, 0, 0, 0, 0,
-            self._session,
+            self._session, self.foreign,
         )  # fmt: skip
 
     def _arm(self, body: bytes) -> bytes:

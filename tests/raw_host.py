@@ -45,10 +45,10 @@ class RawHost:
         self.close()
         self._fd, self._socket = _opened(port)
         self._rest = b""
-        self.command(HELLO, struct.pack("<BBI", 1, 1, self.session))
+        self.command(HELLO, struct.pack("<BBI", 2, 2, self.session))
 
     def hello(self) -> bytes:
-        body = struct.pack("<BBI", 1, 1, self.session)
+        body = struct.pack("<BBI", 2, 2, self.session)
         reply = self.command(HELLO, body)
         self.boot = struct.unpack_from("<I", reply, 1)[0]
         self.tag = self.boot & 0xFFFF
@@ -60,8 +60,9 @@ class RawHost:
         if kind != HELLO:
             self._count[beat] += 1
         sequence = 0 if kind == HELLO else self._count[beat]
-        tag = 0 if kind == HELLO else self.tag
-        return sequence, golden.wire(kind, tag, sequence, time.monotonic_ns() // 1000, body)
+        tag, session = (0, 0) if kind == HELLO else (self.tag, self.session)
+        told = golden.host_time(session, time.monotonic_ns() // 1000)
+        return sequence, golden.wire(kind, tag, sequence, told, body)
 
     def send(self, kind: int, body: bytes = b"") -> int:
         sequence, frame = self.frame(kind, body)

@@ -33,7 +33,7 @@ def test_a_device_is_known_by_its_greeting():
     with simulated() as (_, port):
         drive = driven(port)
         identity = drive.identity
-        assert (identity.name, identity.firmware, identity.version) == ("script", "1.0", 1)
+        assert (identity.name, identity.firmware, identity.version) == ("script", "1.0", 2)
         assert (identity.boot, identity.tag) == (0x1BEEF, 0xBEEF)
         assert (identity.period_us, identity.Ts, identity.capacity) == (1000, 0.001, 512)
         assert identity.counts_per_rev == 1572.0
@@ -47,6 +47,30 @@ def test_a_device_is_known_by_its_greeting():
 def test_sessions_differ():
     with simulated() as (_, port):
         assert len({linked(port).session for _ in range(20)}) == 20
+
+
+def test_a_greeting_to_another_host_is_not_taken():
+    with simulated() as (device, port):
+        kept = []
+        device.mangle = lambda kind, wire: kept.append(wire) or [wire]
+        before = linked(port)
+        device.reset()
+        device.mangle = lambda kind, wire: [wire]
+        device.wire.out = b"".join(kept)
+        link = linked(port)
+        assert link.identity.session == link.session != before.session
+        assert link.identity.boot == device.boot != before.identity.boot
+
+
+def test_frames_carry_the_session_and_the_clock():
+    with simulated() as (device, port):
+        hello = commands(device, script.HELLO)
+        link = linked(port)
+        said = commands(device, script.ECHO)
+        port._clock.now = 5000.0
+        link.ask(Kind.ECHO, b"data")
+        assert said[0][3] == link.session << 32 | 5_000_000_000 % 2**32
+        assert hello[0][3] >> 32 == 0
 
 
 def test_greeting_sets_and_moves_nothing():
@@ -88,7 +112,7 @@ def test_a_device_that_boots_slowly_is_waited_for():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"hello_result": b"\x0a\x02\0\0\0"}, r"protocol version 2, sewfast 1; update the older"),
+        ({"hello_result": b"\x0a\x03\0\0\0"}, r"protocol version 3, sewfast 2; update the older"),
         ({"schema": 0x12345678}, r"match the device's schema hash"),
         ({"channels": 1}, r"2 to 16 channels"),
     ],
@@ -174,11 +198,11 @@ def test_a_stop_is_repeated_sooner():
 
 def test_the_status_is_read_field_by_field():
     body = struct.pack(
-        "<BBBHIQIIIfiIIIII", 4, 2, 1, 0x15, 7, 123_000, 50, 60, 55, -3.5, -9, 1, 2, 3, 44, 99
+        "<BBBHIQIIIfiIIIIII", 4, 2, 1, 0x15, 7, 123_000, 50, 60, 55, -3.5, -9, 1, 2, 3, 44, 99, 6
     )
     found = wire.status(wire.Reply(3, 0, 0, body, 200_000))
     assert found == wire.Status(
-        "tripped", "speed", 1, 0x15, 7, 123_000, 50, 60, 55, -3.5, -9, 1, 2, 3, 44, 99, 200_000
+        "tripped", "speed", 1, 0x15, 7, 123_000, 50, 60, 55, -3.5, -9, 1, 2, 3, 44, 99, 200_000, 6
     )
 
 

@@ -55,7 +55,7 @@ class TestRun:
         with RawHost(device.port) as host:
             reply = host.hello()
             name = reply[28 : 28 + reply[27]].decode()
-            assert (reply[0], reply[10], name) == (1, 6, "virtual")
+            assert (reply[0], reply[10], name) == (2, 6, "virtual")
             capabilities, capacity = struct.unpack_from("<II", reply, 15)
             assert (capabilities, capacity) == (0b11_0111, 8192)
             names = [host.command(raw.DESCRIBE, bytes([k])) for k in range(6)]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 _HEAD = struct.Struct("<BHIQ")
 HELLO, LIMITS, ARM, UPLOAD, START, ECHO, CREDIT = 0x01, 0x04, 0x05, 0x08, 0x0A, 0x0B, 0x22
-SAMPLES, FINISHED = 0xC0, 4
+SAMPLES, FINISHED, SESSION = 0xC0, 4, 12345
 WATCHDOG_US, LEAD_US, PER_FRAME = 250_000, 200_000, 113
 
 
@@ -43,7 +43,7 @@ class Host:
         self.batches: list[tuple[int, bytes]] = []
         self.replies: dict[int, bytes] = {}
         self.finished = False
-        self._send(HELLO, 0, struct.pack("<BBI", 1, 1, 12345))
+        self._send(HELLO, 0, struct.pack("<BBI", 2, 2, SESSION))
         while 0 not in self.replies:
             self.hear()
         _, boot = struct.unpack_from("<BI", self.replies[0])
@@ -51,7 +51,7 @@ class Host:
         self.tag = boot & 0xFFFF
 
     def _send(self, kind: int, sequence: int, body: bytes) -> None:
-        frame = _HEAD.pack(kind, self.tag, sequence, 0) + body
+        frame = _HEAD.pack(kind, self.tag, sequence, SESSION << 32) + body
         self.port.write(_stuffed(frame + struct.pack("<I", zlib.crc32(frame))))
 
     def begin(self, kind: int, body: bytes) -> int:

@@ -345,7 +345,7 @@ class LinkReceiver:
 # --- host_loop.rs -----------------------------------------------------------------------------------------
 
 def host_loop(
-    port: int, controller: Controller, reference: _F, *, tag: int, command: int, heartbeat: int, device_period: int,
+    port: int, controller: Controller, reference: _F, *, tag: int, session: int, command: int, heartbeat: int, device_period: int,
     ratio: int, watchdog: int, batch: int, mask: int, channels: Sequence[tuple[int, int]], counts_per_unit: float,
     lock_memory: bool = False, progress: _Progress = None,
 ) -> dict[str, Any]:

@@ -32,6 +32,11 @@ def frame(kind: int, tag: int, sequence: int, time: int, body: bytes) -> bytes:
     return content + struct.pack("<I", zlib.crc32(content))
 
 
+def host_time(session: int, us: int) -> int:
+    """The time field of a host's frame: u32 of its clock, which wraps, then u32 session."""
+    return int.from_bytes(struct.pack("<II", us & 0xFFFFFFFF, session), "little")
+
+
 def wire(kind: int, tag: int, sequence: int, time: int, body: bytes) -> bytes:
     """The frame as it is sent, with its closing zero."""
     return stuffed(frame(kind, tag, sequence, time, body)) + b"\0"
@@ -106,18 +111,22 @@ def samples() -> list[dict[str, Any]]:
 def catalogue() -> list[tuple[str, Frame]]:
     """Frames that reach every edge of the layout."""
     dice = random.Random(7)
-    boot, hello = 0xBEEF, struct.pack("<BBI", 1, 1, 0x12345678)
+    boot, hello = 0xBEEF, struct.pack("<BBI", 2, 2, 0x12345678)
+
+    def at(us: int) -> int:
+        return host_time(0x12345678, us)
+
     described = [
         ("empty body", (0x06, boot, 1, 0, b"")),
         ("all zero", (0, 0, 0, 0, bytes(4))),
         ("all ones", (0xFF, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFFFFFFFFFF, b"\xff" * 4)),
         ("HELLO", (0x01, 0, 0, 1_000_000, hello)),
-        ("DESCRIBE", (0x02, boot, 2, 1_010_000, b"\x01")),
-        ("ARM for 50 ms", (0x05, boot, 3, 1_020_000, struct.pack("<I", 50_000))),
-        ("KEEP for 50 ms", (0x20, boot, 4, 1_030_000, struct.pack("<I", 50_000))),
-        ("DRIVE at 1.5", (0x21, boot, 5, 1_040_000, struct.pack("<If", 50_000, 1.5))),
-        ("CREDIT", (0x22, boot, 6, 1_050_000, struct.pack("<IQ", 50_000, 2**40))),
-        ("ECHO of 200 bytes", (0x0B, boot, 7, 1_060_000, bytes(range(200)))),
+        ("DESCRIBE", (0x02, boot, 2, at(1_010_000), b"\x01")),
+        ("ARM for 50 ms", (0x05, boot, 3, at(1_020_000), struct.pack("<I", 50_000))),
+        ("KEEP for 50 ms", (0x20, boot, 4, at(1_030_000), struct.pack("<I", 50_000))),
+        ("DRIVE at 1.5", (0x21, boot, 5, at(1_040_000), struct.pack("<If", 50_000, 1.5))),
+        ("CREDIT", (0x22, boot, 6, at(1_050_000), struct.pack("<IQ", 50_000, 2**40))),
+        ("ECHO of 200 bytes", (0x0B, boot, 7, at(2**32 + 1_060_000), bytes(range(200)))),
         (
             "the longest without a zero",
             (0x0B, 0x0101, 0x01010101, 2**64 // 255, b"\x01" * MAX_BODY),

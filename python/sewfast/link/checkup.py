@@ -136,7 +136,7 @@ def _limits(drive: Drive) -> Finding:
     names = ("volt", "speed_rpm", "acceleration", "current")
     values = dict(zip(names, (v if math.isfinite(v) else None for v in limits.values), strict=True))
     if not limits.are_set:
-        return Finding("limits", "ok", "none set since its boot: it will not arm before they are")
+        return Finding("limits", "ok", "none set in this session: it will not arm before they are")
     volt, speed, acceleration, current = limits.values
     told = f"{volt:g} V, {speed:g} RPM, {acceleration:g} RPM/s, {current:g} A"
     return Finding("limits", "ok", told, values=values)

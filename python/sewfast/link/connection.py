@@ -50,9 +50,10 @@ class _Command:
 
 @dataclass
 class Loan:
-    """A port and its session in other hands: the descriptor and the last numbers used."""
+    """A port and its session in other hands: the descriptor, the session, the last numbers used."""
 
     descriptor: int
+    session: int
     command: int
     heartbeat: int
 
@@ -176,7 +177,8 @@ class Connection:
 
     def _answered(self, sequence: int, reply: Reply, received: float) -> None:
         if reply.kind == Kind.HELLO:
-            self._greeting = reply
+            if reply.result or wire.identity(reply.body).session == self.session:
+                self._greeting = reply
             return
         command = self._command
         if command is None or sequence != command.sequence or reply.kind != command.kind:
@@ -315,8 +317,8 @@ class Connection:
         self._send(self._frame(kind, self._beats, body))
 
     def _frame(self, kind: Kind, sequence: int, body: bytes) -> bytes:
-        now_us = time.monotonic_ns() // 1000
-        return _core.link_frame(kind, self._tag or 0, sequence, now_us, body)
+        told = wire.host_time(self.session, time.monotonic_ns() // 1000)
+        return _core.link_frame(kind, self._tag or 0, sequence, told, body)
 
     def _send(self, frame: bytes) -> None:
         if self._failed is None:
@@ -328,7 +330,7 @@ class Connection:
     @contextmanager
     def lent(self) -> Iterator[Loan]:
         """The port and the session's numbers for someone else, who leaves those he reached."""
-        loan = Loan(self.port.fileno(), self._sequence, self._beats)
+        loan = Loan(self.port.fileno(), self.session, self._sequence, self._beats)
         self._command = None
         try:
             with self.owned():

@@ -123,7 +123,7 @@ class Drive:
         acceleration: float | None = None,
         current: float | None = None,
     ) -> Limits:
-        """Set limits that the device enforces at every sample; it forgets them when it is reset.
+        """Set limits that the device enforces at every sample, in this session and until a reset.
 
         Parameters
         ----------
@@ -325,7 +325,7 @@ class Drive:
         limits = self.limits()
         if not limits.are_set:
             raise SettingError(
-                "expected limits set on the device, it has none since its boot; set them to what "
+                "expected limits set on the device, it has none in this session; set them to what "
                 "motor and machine stand: drive.set_limits(volt=..., speed_rpm=..., ...)"
             )
         if what == "references":

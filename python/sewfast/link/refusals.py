@@ -37,7 +37,7 @@ def _refused(kind: int, result: int, detail: int) -> str:
         9: f"values out of order, it expects number {detail}; upload from there",
         10: f"it speaks protocol version {detail}, sewfast {wire.VERSION}; update the older one",
         11: "the motor is moving; wait for rest",
-        12: "no limits were set since its boot; set them first",
+        12: "no limits were set in this session; set them first",
     }
     return texts.get(result, f"result {result} (detail {detail}), which this sewfast does not know")
 

@@ -12,7 +12,7 @@ from zlib import crc32
 
 from ..errors import LinkError
 
-VERSION = 1
+VERSION = 2
 MAX_BODY = 231
 LARGEST = 3.4028234e38
 """Of single precision."""
@@ -84,6 +84,8 @@ class Identity:
         Values that its profile memory holds.
     counts_per_rev : float
         Counts of its encoder in one turn.
+    session : int
+        Whose HELLO it has answered.
     """
 
     name: str
@@ -97,6 +99,7 @@ class Identity:
     capabilities: int
     capacity: int
     counts_per_rev: float
+    session: int = 0
 
     @property
     def Ts(self) -> float:
@@ -135,7 +138,8 @@ class Status:
     """What the device says of itself; the run is the present or the last one.
 
     `taken` of `length` samples are behind it; the profile ends at `end`. `received`, `refused` and
-    `dropped` count frames, `late_us` is the latest control period [us].
+    `dropped` count frames, `late_us` is the latest control period [us]; `foreign` counts frames of
+    other sessions.
     """
 
     state: str
@@ -155,6 +159,7 @@ class Status:
     late_us: int
     session: int
     time_us: int
+    foreign: int = 0
 
 
 @dataclass(frozen=True)
@@ -174,7 +179,7 @@ class Limits:
 
     @property
     def are_set(self) -> bool:
-        """Whether the device has been given limits since its boot."""
+        """Whether the device has been given limits in this session."""
         return any(self.values)
 
 
@@ -219,8 +224,9 @@ class Reply:
 
 _REPLY = struct.Struct("<IB")
 _HELLO = struct.Struct("<BIIBBIIIf")
+_SESSION = struct.Struct("<I")
 _CHANNEL = struct.Struct("<BBI")
-_STATUS = struct.Struct("<BBBHIQIIIfiIIIII")
+_STATUS = struct.Struct("<BBBHIQIIIfiIIIIII")
 _LIMITS = struct.Struct("<8f")
 _EVENT = struct.Struct("<BBBIIf")
 _START = struct.Struct("<BIQIHB")
@@ -247,6 +253,7 @@ def identity(body: bytes) -> Identity:
     version, boot, schema, state, channels, period, capabilities, capacity, counts = values
     name, rest = _text(rest, "HELLO")
     firmware, rest = _text(rest, "HELLO")
+    (session,), _ = _start(_SESSION, rest, "HELLO")
     if not 2 <= channels <= 16 or period == 0 or not (math.isfinite(counts) and counts >= 0):
         raise LinkError(
             "expected a device with 2 to 16 channels, a control period and counts per turn, got "
@@ -254,7 +261,7 @@ def identity(body: bytes) -> Identity:
         )
     return Identity(
         name, firmware, version, boot, schema, name_of(STATES, state), channels, period,
-        capabilities, capacity, counts,
+        capabilities, capacity, counts, session,
     )  # fmt: skip
 
 
@@ -271,6 +278,11 @@ def channel(body: bytes) -> Channel:
     return Channel(number, encoding, steps, name, unit)
 
 
+def host_time(session: int, us: int) -> int:
+    """What stands for the time in a host's frames: its session above its clock, which wraps."""
+    return session << 32 | us & 0xFFFFFFFF
+
+
 def schema_hash(version: int, period_us: int, descriptions: Sequence[bytes]) -> int:
     """CRC-32 of version, period and the bodies of all DESCRIBE replies in order."""
     return crc32(b"".join([struct.pack("<BI", version, period_us), *descriptions]))
@@ -280,7 +292,8 @@ def status(answer: Reply) -> Status:
     """The reply to STATUS."""
     values: Any = _start(_STATUS, answer.checked(), "STATUS")[0]
     names = (name_of(STATES, values[0]), name_of(REASONS, values[1]))
-    return Status(*names, *values[2:], time_us=answer.time_us)  # type: ignore[misc]
+    told = (*values[2:-1], answer.time_us, values[-1])
+    return Status(*names, *told)
 
 
 def limits(body: bytes) -> Limits:

@@ -147,11 +147,13 @@ size_t board_write(const uint8_t *bytes, size_t count) {
 /* ---- host ---- */
 
 static const uint16_t TAG = 0x0042;
+static const uint32_t SESSION = 9;
 static uint32_t commands, beats;
 
 static void say(uint8_t kind, const uint8_t *body, size_t length) {
     uint32_t sequence = kind == 1 ? 0 : kind < 0x20 ? ++commands : ++beats;
-    to_device_count += encode(to_device + to_device_count, kind, kind == 1 ? 0 : TAG, sequence, now, body, length);
+    uint64_t told = kind == 1 ? now : (uint64_t)SESSION << 32 | (uint32_t)now;
+    to_device_count += encode(to_device + to_device_count, kind, kind == 1 ? 0 : TAG, sequence, told, body, length);
 }
 
 static void steps(int periods) {
@@ -181,9 +183,9 @@ static void drive(float u) {
 /* ---- tests ---- */
 
 static void codec_is_that_of_the_golden_vectors(void) {
-    static const uint8_t hello[] = {1, 1, 0x78, 0x56, 0x34, 0x12};
+    static const uint8_t hello[] = {2, 2, 0x78, 0x56, 0x34, 0x12};
     static const uint8_t golden[] = {0x02, 0x01, 0x01, 0x01, 0x01, 0x01, 0x01, 0x04, 0x40, 0x42, 0x0f, 0x01, 0x01, 0x01, 0x01,
-                                     0x0b, 0x01, 0x01, 0x78, 0x56, 0x34, 0x12, 0xae, 0xa8, 0x37, 0x48, 0x00};
+                                     0x0b, 0x02, 0x02, 0x78, 0x56, 0x34, 0x12, 0xd0, 0xa0, 0x03, 0x89, 0x00};
     uint8_t wire[256];
     CHECK(encode(wire, 1, 0, 0, 1000000, hello, 6) == sizeof golden);
     CHECK(memcmp(wire, golden, sizeof golden) == 0);
@@ -224,7 +226,7 @@ static void storage_is_checked(void) {
 }
 
 static void host_is_heard(void) {
-    static const uint8_t hello[] = {1, 1, 9, 0, 0, 0};
+    static const uint8_t hello[] = {2, 2, 9, 0, 0, 0};
     uint8_t limits[16];
     CHECK(firmware_init(0x10042));
     steps(150);

@@ -85,7 +85,7 @@ impl Host {
             kind,
             tag,
             sequence,
-            time: self.now,
+            time: Header::host_time(if kind == 0x01 { 0 } else { 1 }, self.now),
         };
         let mut wire = [0; MAX_WIRE];
         let length = encode(&header, body.bytes().expect("a body"), &mut wire).expect("a frame");
@@ -111,7 +111,7 @@ impl Host {
     fn run(mode: u8) -> Self {
         let mut host = Self::new();
         (0..150).for_each(|_| host.period(0));
-        host.say(0x01, Body::new().u8(1).u8(1).u32(1));
+        host.say(0x01, Body::new().u8(2).u8(2).u32(1));
         host.say(
             0x04,
             Body::new()

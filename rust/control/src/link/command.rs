@@ -7,6 +7,8 @@ use crate::{Controller, Refused, Settings, Standard};
 
 /// Shortest and longest time of a watchdog \[us\].
 const WATCHDOG: core::ops::RangeInclusive<u32> = 1_000..=10_000_000;
+/// Counts in a period that no counter of 32 bits exceeds.
+const MOST_COUNTS: f32 = 2_147_483_648.0;
 /// The longest body of ECHO.
 const MAX_ECHO: usize = 200;
 /// The kind of HELLO, which needs neither tag nor session.
@@ -107,7 +109,9 @@ impl Gains {
         let free = self.controller(f32::INFINITY, ts);
         free.map_err(|refused| Refusal::value(field(refused)))?;
         let unit = self.counts_per_unit * ts;
-        Refusal::value(11).unless(unit > 0.0 && unit.is_finite())?;
+        // a feedback that is not finite would leave the controller blind
+        let holds = unit > 0.0 && unit.is_finite() && (MOST_COUNTS / unit).is_finite();
+        Refusal::value(11).unless(holds)?;
         let clipped = self.controller(volt, ts);
         clipped.map_err(|refused| Refusal::limit(field(refused)))?;
         Ok(())

@@ -27,11 +27,33 @@ pub struct Header {
     pub tag: u16,
     /// The sender's count.
     pub sequence: u32,
-    /// The sender's time in microseconds.
+    /// The device's time in microseconds; a host's [`host_time`](Self::host_time).
     pub time: u64,
 }
 
 impl Header {
+    /// What stands for the time in a host's frames: its own clock in microseconds, which wraps, and above that its session.
+    ///
+    /// ```
+    /// use sewfast_control::link::Header;
+    ///
+    /// let time = Header::host_time(7, 0x5_0000_0003);
+    /// assert_eq!(time, 0x7_0000_0003);
+    /// assert_eq!(Header { time, ..Header::default() }.session(), 7);
+    /// ```
+    #[must_use]
+    #[inline]
+    pub const fn host_time(session: u32, clock: u64) -> u64 {
+        (session as u64) << 32 | clock & 0xFFFF_FFFF
+    }
+
+    /// The session in a host's frame.
+    #[must_use]
+    #[inline]
+    pub const fn session(&self) -> u32 {
+        (self.time >> 32) as u32
+    }
+
     #[inline]
     fn bytes(&self) -> [u8; HEADER] {
         let mut bytes = [self.kind; HEADER];

@@ -5,9 +5,12 @@ use super::crc::Crc;
 use crate::Refused;
 
 /// The version of the protocol that is spoken here.
-pub const VERSION: u8 = 1;
+pub const VERSION: u8 = 2;
 /// As many channels as the mask of START has bits.
 pub const MAX_CHANNELS: usize = 16;
+
+/// Far fewer counts in a turn would make a speed infinite, and infinite times 0 counts is a speed that no limit trips on.
+const COUNTS_PER_REV: core::ops::RangeInclusive<f32> = 1.0..=1e9;
 
 /// Bits of [`Identity::capabilities`].
 pub mod capability {
@@ -118,7 +121,7 @@ pub struct Identity {
     pub firmware: &'static str,
     /// Control period \[us\].
     pub period: u32,
-    /// Counts per turn of the motor.
+    /// Counts per turn of the motor, 1 to 1e9.
     pub counts_per_rev: f32,
     /// Bits of [`capability`].
     pub capabilities: u32,
@@ -166,8 +169,8 @@ impl Identity {
         let holds = (10..=1_000_000).contains(&period);
         unless(holds, "period", "10 us to 1 s", period.into())?;
         let counts = self.counts_per_rev;
-        let holds = counts > 0.0 && counts.is_finite();
-        let expected = "a finite number above 0";
+        let holds = COUNTS_PER_REV.contains(&counts);
+        let expected = "1 to 1e9";
         unless(holds, "counts_per_rev", expected, counts.into())?;
         self.check_ceilings()?;
         self.check_channels()

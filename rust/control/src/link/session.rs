@@ -1,6 +1,6 @@
 //! A host's session: what it has said already, what it was answered last.
 
-use super::Body;
+use super::{Body, Frame};
 
 /// Where a number stands to the last one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -39,16 +39,28 @@ pub(super) struct Session {
     pub(super) heartbeat: u32,
     /// To the last command.
     pub(super) reply: Option<Reply>,
+    /// Frames of other sessions since boot.
+    pub(super) foreign: u32,
 }
 
 impl Session {
-    pub(super) const fn new(number: u32) -> Self {
+    pub(super) const fn new(number: u32, foreign: u32) -> Self {
         Self {
             number,
             command: 0,
             heartbeat: 0,
             reply: None,
+            foreign,
         }
+    }
+
+    /// Whether a frame is of this session; others are counted.
+    pub(super) fn says(&mut self, frame: &Frame<'_>) -> bool {
+        let own = frame.header.session() == self.number;
+        if !own {
+            self.foreign = self.foreign.wrapping_add(1);
+        }
+        own
     }
 }
 

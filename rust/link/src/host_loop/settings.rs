@@ -12,6 +12,8 @@ const SHORTEST_WATCHDOG: u32 = 1_000;
 pub struct Settings {
     /// Low 16 bits of the device's boot id.
     pub tag: u16,
+    /// The session's number.
+    pub session: u32,
     /// Sequence of the session's last command.
     pub command: u32,
     /// Sequence of the session's last heartbeat.
@@ -113,6 +115,7 @@ mod tests {
     fn settings() -> Settings {
         Settings {
             tag: 1,
+            session: 5,
             command: 0,
             heartbeat: 0,
             device_period: 1000,

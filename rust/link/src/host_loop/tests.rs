@@ -11,6 +11,7 @@ mod with_device;
 
 const PERIOD: u64 = 10_000;
 const TAG: u16 = 7;
+const SESSION: u32 = 0x8000_0009;
 
 /// A motor `dx/dt = (400 u - x) / .1 s` \[counts/s\] behind a device that does as it is told.
 struct Peer {
@@ -69,6 +70,7 @@ impl Peer {
         let mut deframer = std::mem::take(&mut self.deframer);
         while let Some(frame) = deframer.next(&mut bytes) {
             let frame = frame.expect("the loop sends whole frames");
+            assert_eq!(frame.header.session(), SESSION);
             self.said.push((frame.header, frame.body.to_vec()));
             if !self.deaf {
                 self.obey(&frame.header, frame.body);
@@ -185,6 +187,7 @@ fn host_loop(ticks: usize) -> HostLoop {
     };
     let settings = Settings {
         tag: TAG,
+        session: SESSION,
         command: 3,
         heartbeat: 8,
         device_period: 1000,

@@ -360,7 +360,7 @@ impl State {
             kind,
             tag: self.settings.tag,
             sequence,
-            time,
+            time: Header::host_time(self.settings.session, time),
         }
     }
 }

@@ -95,6 +95,8 @@ pub struct Trace {
     entries: Vec<Entry>,
     file: Option<LineWriter<File>>,
     deframer: Deframer,
+    /// Of the last HELLO.
+    session: u32,
     heartbeat: Option<Heartbeat>,
     enabled: bool,
     /// Why the file ended early.
@@ -113,6 +115,7 @@ impl Trace {
             entries: Vec::new(),
             file: file.map(LineWriter::new),
             deframer: Deframer::new(),
+            session: 0,
             heartbeat: None,
             enabled: false,
             broken: None,
@@ -129,10 +132,13 @@ impl Trace {
         let seconds = self.seconds(now);
         while let Some(frame) = self.deframer.next(&mut bytes) {
             let Ok(frame) = frame else { continue };
-            if frame.header.tag != boot_id as u16 {
+            let mut body = Fields::new(frame.body);
+            if frame.header.kind == 0x01 {
+                self.session = body.take(2).and_then(|_| body.u32()).unwrap_or(0);
+            }
+            if frame.header.tag != boot_id as u16 || frame.header.session() != self.session {
                 continue;
             }
-            let mut body = Fields::new(frame.body);
             let watchdog_us = match frame.header.kind {
                 0x05 | 0x20..=0x22 => body.u32(),
                 0x0A => body.u8().and_then(|_| body.u32()),

@@ -34,16 +34,21 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         let Some(session) = &mut self.session else {
             return;
         };
+        let (own, stop) = (session.says(frame), frame.header.kind == STOP);
+        if !own && !stop {
+            return;
+        }
         if tag != self.identity.tag() {
             let reply = reply(frame, &Err(Refusal::tag(tag)), &Body::new());
             return self.send(Weight::Answer, reply.kind, &reply.body);
         }
-        match Order::of(sequence, session.command) {
-            // whoever asks for it, and however late: a stop that was not wanted is the smaller harm
-            Order::Old if frame.header.kind == STOP => {
-                let reply = self.answer(frame);
-                self.send(Weight::Answer, reply.kind, &reply.body);
-            }
+        let order = Order::of(sequence, session.command);
+        // whoever asks for it, and however late: a stop that was not wanted is the smaller harm
+        if stop && (!own || order == Order::Old) {
+            let reply = self.answer(frame);
+            return self.send(Weight::Answer, reply.kind, &reply.body);
+        }
+        match order {
             Order::Old => {}
             Order::Repeated => {
                 if let Some(reply) = session.reply.clone() {
@@ -75,6 +80,9 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         let Some(session) = &mut self.session else {
             return;
         };
+        if !session.says(frame) {
+            return;
+        }
         let sequence = frame.header.sequence;
         let in_order = Order::of(sequence, session.heartbeat) == Order::New;
         if frame.header.tag != self.identity.tag() || !in_order {
@@ -128,6 +136,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
 
     fn hello(&mut self, from: u8, to: u8, number: u32, body: &mut Body) -> Done {
         Refusal::version(VERSION).unless((from..=to).contains(&VERSION))?;
+        Refusal::value(2).unless(number != 0)?;
         if self.session.as_ref().map(|session| session.number) != Some(number) {
             self.change_host(number);
         }
@@ -141,19 +150,21 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         body.u32(self.identity.capabilities).u32(CAPACITY as u32);
         body.f32(self.identity.counts_per_rev);
         body.text(self.identity.name, 24);
-        body.text(self.identity.firmware, 16);
+        body.text(self.identity.firmware, 16).u32(number);
         Ok(())
     }
 
-    /// Nothing that another host has said moves a motor.
+    /// Nothing that another host has said moves a motor, and his limits are not this one's.
     fn change_host(&mut self, number: u32) {
         match self.state {
             State::Running => self.trip(Reason::HostChanged, 0.0),
             State::Armed => self.stop(Reason::HostChanged),
             _ => {}
         }
-        self.session = Some(Session::new(number));
+        let foreign = self.foreign();
+        self.session = Some(Session::new(number, foreign));
         self.credit = None;
+        self.limits = None;
         self.gains = None;
         self.profile.clear(Table::Commands);
     }
@@ -169,6 +180,12 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         body.u32(self.received).u32(self.refused);
         body.u32(self.transmit.dropped()).u32(run.latest);
         body.u32(self.session.as_ref().map_or(0, |session| session.number));
+        body.u32(self.foreign());
+    }
+
+    /// Frames of other sessions since boot.
+    fn foreign(&self) -> u32 {
+        self.session.as_ref().map_or(0, |session| session.foreign)
     }
 
     fn set_limits(&mut self, limits: Limits, body: &mut Body) -> Done {
@@ -272,6 +289,8 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
 
     fn set_gains(&mut self, gains: Gains) -> Done {
         self.allow(&[State::Idle, State::Armed])?;
+        // what a start was checked with does not change behind its back
+        Refusal::state(self.state).unless(self.run.planned.is_none())?;
         Refusal::unsupported(0).unless(self.can(capability::PID))?;
         gains.check(self.bounds().volt, self.ts)?;
         self.gains = Some(gains);

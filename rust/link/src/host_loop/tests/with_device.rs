@@ -100,7 +100,7 @@ impl Bench {
         };
         bench.pass(200);
         let mut hello = Body::new();
-        hello.u8(1).u8(1).u32(99);
+        hello.u8(2).u8(2).u32(99);
         bench.say(0x01, 0, 0, &hello);
         let mut limits = Body::new();
         limits
@@ -118,7 +118,7 @@ impl Bench {
             kind,
             tag,
             sequence,
-            time: 0,
+            time: Header::host_time(99, self.now),
         };
         let mut wire = [0; MAX_WIRE];
         let length = encode(&header, body.bytes().unwrap(), &mut wire).unwrap();
@@ -154,6 +154,7 @@ impl Bench {
 fn host_loop() -> HostLoop {
     let settings = Settings {
         tag: 3,
+        session: 99,
         command: 1,
         heartbeat: 0,
         device_period: 1000,

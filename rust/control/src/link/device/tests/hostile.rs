@@ -37,7 +37,7 @@ fn number(dice: &mut Dice, out: &mut Vec<u8>) {
 fn body(dice: &mut Dice, kind: u8, now: u64) -> Vec<u8> {
     let watchdog = (1000 + dice.below(100_000) as u32).to_le_bytes();
     let mut body = match kind {
-        0x01 => [&[1, 1], &(dice.below(2) as u32).to_le_bytes()[..]].concat(),
+        0x01 => [&[2, 2], &(1 + dice.below(2) as u32).to_le_bytes()[..]].concat(),
         0x02 => std::vec![dice.below(7) as u8],
         0x04 => [10f32, 4000.0, f32::INFINITY, 20.0]
             .map(f32::to_le_bytes)
@@ -130,7 +130,15 @@ fn bytes(dice: &mut Dice, rig: &mut Rig) -> Vec<u8> {
         rig.tag
     };
     let body = body(dice, kind, rig.now);
+    let session = rig.session;
+    if dice.below(64) == 0 {
+        rig.session = dice.next() as u32;
+    }
     let mut wire = rig.wire(kind, tag, sequence, &body);
+    rig.session = session;
+    if kind == 0x01 && body.len() == 6 {
+        rig.session = u32::from_le_bytes([body[2], body[3], body[4], body[5]]);
+    }
     match dice.below(32) {
         0 => {
             let at = dice.below(wire.len());
@@ -175,9 +183,10 @@ fn no_bytes_break_the_device() {
             whole += 1;
         }
         if dice.below(400) == 0 {
-            let session = (dice.next() as u32).to_le_bytes();
+            rig.session = dice.next() as u32;
+            let session = rig.session.to_le_bytes();
             rig.put(&[0]);
-            rig.say(0x01, 0, 0, &[&[1, 1], &session[..]].concat());
+            rig.say(0x01, 0, 0, &[&[2, 2], &session[..]].concat());
             (rig.commands, rig.beats) = (0, 0);
         }
     }

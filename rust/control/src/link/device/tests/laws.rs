@@ -35,14 +35,18 @@ enum Act {
     Reset,
 }
 
+/// A frame as a line keeps it: kind, tag, session, sequence, body.
+type Said = (u8, u16, u32, u32, Vec<u8>);
+
 /// What a bystander knows who sees the line and the motor but not the device.
 struct Bystander {
     rig: Rig,
     boot: u32,
-    line: Vec<(u8, u16, u32, Vec<u8>)>,
+    line: Vec<Said>,
     last_command: u32,
     last_beat: u32,
-    session: bool,
+    /// In force; 0 where there is none.
+    session: u32,
     limited: bool,
     /// Until when a word of the host covers motion.
     covered: u64,
@@ -70,7 +74,7 @@ impl Bystander {
             line: Vec::new(),
             last_command: 0,
             last_beat: 0,
-            session: false,
+            session: 0,
             limited: false,
             covered: 0,
             clear: false,
@@ -85,15 +89,15 @@ impl Bystander {
     /// Settles and opens a session with limits.
     fn settle(&mut self) {
         self.sample(150);
-        self.hello(SESSION);
-        let limits = [VOLT, 4000.0, INF, 20.0].map(f32::to_le_bytes).concat();
-        self.say(0x04, limits, Fate::Arrives);
+        self.hello(self.rig.session.max(SESSION));
+        self.say(0x04, command(0x04, 0, 0), Fate::Arrives);
     }
 
     fn hello(&mut self, session: u32) {
-        let mut body = vec![1, 1];
+        let mut body = vec![2, 2];
         body.extend(session.to_le_bytes());
-        self.deliver(0x01, 0, 0, &body);
+        self.rig.session = session;
+        self.deliver((0x01, 0, session, 0, body));
     }
 
     fn say(&mut self, kind: u8, body: Vec<u8>, fate: Fate) {
@@ -103,12 +107,12 @@ impl Bystander {
             &mut self.rig.beats
         };
         *counter += 1;
-        let frame = (kind, self.rig.tag, *counter, body);
+        let counter = *counter;
+        let wire = self.rig.wire(kind, self.rig.tag, counter, &body);
+        let frame = (kind, self.rig.tag, self.rig.session, counter, body);
         self.line.push(frame.clone());
-        let (kind, tag, sequence, body) = frame;
-        let wire = self.rig.wire(kind, tag, sequence, &body);
         match fate {
-            Fate::Arrives => self.deliver(kind, tag, sequence, &body),
+            Fate::Arrives => self.deliver(frame),
             Fate::Lost => {}
             Fate::Damaged(bit) => {
                 let mut wire = wire;
@@ -122,32 +126,37 @@ impl Bystander {
                 self.rig.put(&[0]);
             }
             Fate::Twice => {
-                self.deliver(kind, tag, sequence, &body);
-                self.deliver(kind, tag, sequence, &body);
+                self.deliver(frame.clone());
+                self.deliver(frame);
             }
         }
         self.look();
     }
 
     /// A frame reaches the device whole; what it must mean.
-    fn deliver(&mut self, kind: u8, tag: u16, sequence: u32, body: &[u8]) {
-        let state = self.rig.device.state();
+    fn deliver(&mut self, (kind, tag, session, sequence, body): Said) {
+        let (state, body) = (self.rig.device.state(), &body[..]);
+        let present = core::mem::replace(&mut self.rig.session, session);
         self.rig.say(kind, tag, sequence, body);
+        self.rig.session = present;
         let replies = self.replies(kind, sequence);
-        let whole = tag == self.rig.tag && self.session;
         if kind == 0x01 {
-            let new = !self.session || body[2..] != SESSION.to_le_bytes();
-            self.session = true;
+            let new = self.session != session;
+            self.session = session;
             if new {
-                // a line keeps order: what an earlier host said comes before this
-                self.line.clear();
                 (self.last_command, self.last_beat) = (0, 0);
                 (self.rig.commands, self.rig.beats) = (0, 0);
                 self.replies.clear();
+                self.limited = false;
             }
             assert!(state != State::Running || !new || self.rig.device.state() == State::Tripped);
-        } else if !whole {
+        } else if self.session == 0 || tag != self.rig.tag {
             assert_eq!(self.rig.device.state(), state);
+        } else if session != self.session && kind == 0x06 {
+            assert_eq!(replies.len(), 1, "STOP is answered whatever its session");
+            self.done(kind, body);
+        } else if session != self.session {
+            assert!(replies.is_empty() && self.rig.device.state() == state);
         } else if kind >= 0x20 {
             if sequence > self.last_beat {
                 self.last_beat = sequence;
@@ -271,7 +280,7 @@ impl Bystander {
                 self.say(0x21, body, fate);
             }
             Act::BringUp(mode) => {
-                for kind in [0x07, 0x09, 0x08, 0x05, 0x0A] {
+                for kind in [0x07, 0x04, 0x09, 0x08, 0x05, 0x0A] {
                     self.say(
                         kind,
                         command(kind, mode.into(), self.rig.now),
@@ -288,8 +297,8 @@ impl Bystander {
             Act::Silence(count) => self.sample(count),
             Act::Replay(index) => {
                 let index = index as usize % self.line.len().max(1);
-                if let Some((kind, tag, sequence, body)) = self.line.get(index).cloned() {
-                    self.deliver(kind, tag, sequence, &body);
+                if let Some(frame) = self.line.get(index).cloned() {
+                    self.deliver(frame);
                     self.look();
                 }
             }
@@ -305,27 +314,27 @@ impl Bystander {
                 assert_eq!(self.rig.device.state(), State::Tripped);
             }
             Act::NewHost => {
-                self.hello(SESSION + 1);
-                self.hello(SESSION);
+                self.hello(self.session + 1);
                 self.look();
+                self.say(0x04, command(0x04, 0, 0), Fate::Arrives);
             }
             Act::Reset => self.reset(),
         }
     }
 
-    /// The line remembers, the device does not.
+    /// The line remembers, the device does not; the host goes on with its session.
     fn reset(&mut self) {
-        let line = core::mem::take(&mut self.line);
+        let (line, session) = (core::mem::take(&mut self.line), self.session);
         *self = Self::new(self.boot + 1);
         self.line = line;
         self.sample(150);
-        for (kind, tag, sequence, body) in self.line.clone() {
-            self.deliver(kind, tag, sequence, &body);
+        for frame in self.line.clone() {
+            self.deliver(frame);
         }
         self.look();
-        self.hello(SESSION);
-        for (kind, tag, sequence, body) in self.line.clone() {
-            self.deliver(kind, tag, sequence, &body);
+        self.hello(session);
+        for frame in self.line.clone() {
+            self.deliver(frame);
         }
         assert!(!self.limited);
         self.settle();
@@ -335,6 +344,7 @@ impl Bystander {
 /// A body of a command that could be right.
 fn command(kind: u8, value: u32, now: u64) -> Vec<u8> {
     let body = match kind {
+        0x04 => return [VOLT, 4000.0, INF, 20.0].map(f32::to_le_bytes).concat(),
         0x05 => return (10_000 + value % 40_000).to_le_bytes().to_vec(),
         0x08 => upload(0, &[2000; 50]),
         0x09 => gains(

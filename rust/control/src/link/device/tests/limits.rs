@@ -166,6 +166,37 @@ fn profiles_beyond_the_limits_do_not_start() {
 }
 
 #[test]
+fn gains_do_not_change_behind_a_planned_start() {
+    let good = [
+        0.02, 0.25, 0.004, 0.4, 0.2, INF, 0.0, -20.0, 20.0, INF, 0.0, 25.0,
+    ];
+    let body = gains(good, 8);
+    let mut rig = Rig::armed();
+    assert_eq!(rig.command(0x09, body.bytes().unwrap()).0, 0);
+    assert_eq!(rig.references(0, &[100.0; 5]).0, 0);
+    let at = rig.now + 20_000;
+    assert_eq!(rig.start(1, at, 5).0, 0);
+    let refused = rig.command(0x09, body.bytes().unwrap());
+    assert_eq!(refused, (4, detail(State::Armed as u8)));
+    rig.watched(21);
+    assert_eq!(rig.device.state(), State::Running);
+}
+
+#[test]
+fn limits_are_of_the_session_that_set_them() {
+    let mut rig = Rig::ready();
+    rig.hello(77);
+    let (_, same) = rig.limits(0.0, 0.0, 0.0, 0.0);
+    assert_eq!(same[..4], 10f32.to_le_bytes());
+    rig.new_session(78);
+    let (result, anew) = rig.limits(0.0, 0.0, 0.0, 0.0);
+    assert_eq!((result, &anew[..16]), (0, &[0; 16][..]));
+    assert_eq!(rig.arm(), (12, detail(0)));
+    assert_eq!(rig.limits(5.0, 4000.0, INF, 20.0).0, 0);
+    assert_eq!(rig.arm().0, 0);
+}
+
+#[test]
 fn gains_that_make_no_sense_are_refused_by_field() {
     let good = [
         0.02, 0.25, 0.004, 0.4, 0.2, INF, 0.0, -20.0, 20.0, INF, 0.0, 25.0,
@@ -185,7 +216,7 @@ fn gains_that_make_no_sense_are_refused_by_field() {
     }
     assert_eq!((set(12, 0.0, 0), set(12, 0.0, 65)), ((3, 12), (3, 12)));
     assert_eq!((set(1, 0.0, 1), set(11, 0.0, 1)), ((3, 1), (3, 11)));
-    assert_eq!(set(11, INF, 1), (3, 11));
+    assert_eq!((set(11, INF, 1), set(11, 1e-35, 1)), ((3, 11), (3, 11)));
     // the limits of the controller are on one side of those of the device
     assert_eq!(set(7, 11.0, 1), (6, 8));
 }
@@ -213,13 +244,13 @@ fn a_device_refuses_to_be_what_it_cannot_be() {
         "name"
     );
     assert_eq!(name(Identity { period: 0, ..sound }), "period");
-    assert_eq!(
-        name(Identity {
-            counts_per_rev: f32::NAN,
+    for counts_per_rev in [f32::NAN, 0.0, -1500.0, f32::MIN_POSITIVE, 0.9, 2e9, INF] {
+        let bad = Identity {
+            counts_per_rev,
             ..sound
-        }),
-        "counts_per_rev"
-    );
+        };
+        assert_eq!(name(bad), "counts_per_rev", "{counts_per_rev}");
+    }
     for bad in [0.0, -1.0, f32::NAN, INF, 33.0] {
         assert_eq!(name(volt(bad)), "volt", "{bad}");
     }

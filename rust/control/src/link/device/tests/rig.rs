@@ -70,6 +70,7 @@ pub struct Rig {
     pub current: f32,
     pub further: [f32; 1],
     pub tag: u16,
+    pub session: u32,
     pub commands: u32,
     pub beats: u32,
     pub came: Vec<Came>,
@@ -89,6 +90,7 @@ impl Rig {
             current: 0.0,
             further: [0.0],
             tag: identity.boot_id as u16,
+            session: 0,
             commands: 0,
             beats: 0,
             came: Vec::new(),
@@ -111,12 +113,14 @@ impl Rig {
         rig
     }
 
+    /// A frame of the session, whose number HELLO does not carry in its header.
     pub fn wire(&self, kind: u8, tag: u16, sequence: u32, body: &[u8]) -> Vec<u8> {
+        let session = if kind == 0x01 { 0 } else { self.session };
         let header = Header {
             kind,
             tag,
             sequence,
-            time: 0,
+            time: Header::host_time(session, self.now),
         };
         let mut wire = [0; MAX_WIRE];
         let length = encode(&header, body, &mut wire).unwrap();
@@ -181,6 +185,7 @@ impl Rig {
     pub fn hello(&mut self, session: u32) -> Answer {
         let mut body = Body::new();
         body.u8(1).u8(3).u32(session);
+        self.session = session;
         self.say(0x01, 0, 0, body.bytes().unwrap());
         self.answer(0x01, 0).unwrap()
     }

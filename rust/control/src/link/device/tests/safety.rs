@@ -140,6 +140,7 @@ fn a_new_host_starts_nothing_that_the_old_one_left() {
     let mut rig = Rig::ready();
     rig.upload(0, &[1000; 5]);
     rig.new_session(78);
+    rig.limits(10.0, 4000.0, INF, 20.0);
     assert_eq!(rig.arm().0, 0);
     assert_eq!(rig.start(0, 0, 5), (3, std::vec![3, 0, 0, 0]));
 }
@@ -265,7 +266,7 @@ fn jitter_is_borne_and_reported() {
         assert!(rig.sample_at(rig.now).enabled, "{jitter}");
     }
     let (_, status) = rig.command(0x03, &[]);
-    let latest = &status[status.len() - 8..status.len() - 4];
+    let latest = &status[status.len() - 12..status.len() - 8];
     assert_eq!(latest, 900u32.to_le_bytes());
 }
 
@@ -397,4 +398,80 @@ fn stop_is_executed_whatever_its_number() {
         (last.header.kind, &last.body[..5]),
         (0x86, &[7, 0, 0, 0, 0][..])
     );
+}
+
+/// Two hosts: the second drives, and the line still holds what the first has said, with far higher numbers.
+fn replaced(u: f32) -> Rig {
+    let mut rig = Rig::ready();
+    rig.new_session(78);
+    assert_eq!(rig.limits(10.0, 4000.0, INF, 20.0).0, 0);
+    assert_eq!((rig.arm().0, rig.start(2, 0, 0).0), (0, 0));
+    rig.sample();
+    rig.drive(u);
+    assert_eq!(rig.sample().u, u);
+    rig
+}
+
+/// A frame of the first one arrives.
+fn stale(rig: &mut Rig, kind: u8, sequence: u32, body: &[u8]) {
+    let (session, tag) = (core::mem::replace(&mut rig.session, 77), rig.tag);
+    rig.say(kind, tag, sequence, body);
+    rig.session = session;
+}
+
+#[test]
+fn a_replaced_host_neither_drives_nor_feeds() {
+    let mut rig = replaced(3.0);
+    let until = rig.now + 48_000;
+    while rig.now < until {
+        let drive = [50_000u32.to_le_bytes(), 9f32.to_le_bytes()].concat();
+        let number = 1_000_000 + rig.now as u32;
+        stale(&mut rig, 0x21, number, &drive);
+        stale(&mut rig, 0x20, number + 1, &drive[..4]);
+        assert_eq!(rig.sample().u, 3.0);
+    }
+    // only the last word of the second host counts
+    rig.sample();
+    tripped(&mut rig, Reason::Watchdog);
+    let (_, status) = rig.command(0x03, &[]);
+    assert_eq!(status[status.len() - 4..], (2 * 48u32).to_le_bytes());
+}
+
+#[test]
+fn the_new_host_is_heard_after_high_numbers_of_the_old_one() {
+    let mut rig = replaced(3.0);
+    for k in 0..200 {
+        stale(&mut rig, 0x20, 5_000_000 + k, &50_000u32.to_le_bytes());
+        stale(&mut rig, 0x03, 5_000_000 + k, &[]);
+        // unknown, and with another tag: not even a refusal, and no trip
+        stale(&mut rig, 0x1F, 6_000_000 + k, &[]);
+        rig.tag ^= 1;
+        stale(&mut rig, 0x03, 7_000_000 + k, &[]);
+        rig.tag ^= 1;
+        assert!(rig.listen().iter().all(|came| came.header.kind >= 0xC0));
+        rig.drive(4.0);
+        assert_eq!(rig.sample().u, 4.0);
+    }
+    assert_eq!(rig.stop().0, 0);
+}
+
+#[test]
+fn stop_of_either_host_is_executed_and_uses_no_number_of_the_other() {
+    let mut rig = replaced(3.0);
+    let last = rig.commands;
+    for number in [1, last, 9_000_000] {
+        stale(&mut rig, 0x06, number, &[]);
+        assert_eq!(rig.device.poll(rig.now), Output::SAFE);
+        let reply = rig.listen().pop().expect("an answer");
+        assert_eq!((reply.header.kind, reply.body[4]), (0x86, 0));
+        assert_eq!(reply.body[..4], number.to_le_bytes());
+        assert_eq!(rig.device.state(), State::Idle);
+        rig.samples(150);
+        assert_eq!((rig.arm().0, rig.start(2, 0, 0).0), (0, 0));
+        rig.sample();
+        rig.drive(3.0);
+        assert!(rig.sample().enabled);
+    }
+    assert_eq!(rig.stop().0, 0);
+    assert_eq!(rig.device.state(), State::Idle);
 }

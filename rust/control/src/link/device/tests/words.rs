@@ -24,7 +24,7 @@ fn hello_tells_the_identity() {
     let mut fields = Fields::new(&body);
     assert_eq!(
         (result, fields.u8(), fields.u32()),
-        (0, Some(1), Some(0x1_2345))
+        (0, Some(2), Some(0x1_2345))
     );
     // zlib.crc32 of the same fields, packed by Python
     assert_eq!(fields.u32(), Some(SCHEMA));
@@ -35,21 +35,23 @@ fn hello_tells_the_identity() {
         (fields.text(24), fields.text(16)),
         (Some("rig"), Some("test"))
     );
-    assert_eq!(fields.end(), Some(()));
+    assert_eq!((fields.u32(), fields.end()), (Some(9), Some(())));
 }
 
-const SCHEMA: u32 = 0x7E79_CC15;
+const SCHEMA: u32 = 0x8CD8_E9B9;
 
 #[test]
 fn hello_needs_a_common_version() {
     let mut rig = Rig::new();
-    for (from, to) in [(0, 0), (2, 9), (3, 1)] {
-        rig.say(0x01, 0, 0, &[from, to, 0, 0, 0, 0]);
+    for (from, to) in [(0, 0), (1, 1), (3, 9), (3, 1)] {
+        rig.say(0x01, 0, 0, &[from, to, 1, 0, 0, 0]);
         let reply = rig.listen().pop().unwrap();
-        assert_eq!(reply.body, [0, 0, 0, 0, 10, 1, 0, 0, 0]);
+        assert_eq!(reply.body, [0, 0, 0, 0, 10, 2, 0, 0, 0]);
     }
     rig.say(0x01, 0, 0, &[1]);
     assert_eq!(rig.listen().pop().unwrap().body[4..], [2, 1, 0, 0, 0]);
+    // session 0 is none
+    assert_eq!(rig.hello(0), (3, vec![2, 0, 0, 0]));
 }
 
 #[test]
@@ -100,7 +102,7 @@ fn status_tells_the_run() {
         (Some(10), Some(1), Some(0))
     );
     assert_eq!((fields.u32(), fields.u32()), (Some(0), Some(77)));
-    assert_eq!(fields.end(), Some(()));
+    assert_eq!((fields.u32(), fields.end()), (Some(0), Some(())));
 }
 
 #[test]
