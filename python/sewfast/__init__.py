@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         SettingError,
         SewfastError,
     )
+    from .evidence import ReportCard, check
     from .identification import identify
     from .leastsquares import LeastSquaresResult, least_squares
     from .loop import ClosedLoopRun, run
@@ -55,12 +56,14 @@ __all__ = [
     "ModelFileError",
     "NeuralOE",
     "Recording",
+    "ReportCard",
     "SettingError",
     "SewfastError",
     "TuningResult",
     "Validation",
     "VirtualMachine",
     "__version__",
+    "check",
     "fit_fopdt",
     "identify",
     "least_squares",
@@ -85,6 +88,7 @@ _HOMES = {
     "control": "Controller Gains fit_fopdt load_controller paper_controller table_1",
     "dataset": "Dataset Experiment",
     "errors": "DataError FitError Interrupted LinkError ModelFileError SettingError SewfastError",
+    "evidence": "ReportCard check",
     "identification": "identify",
     "leastsquares": "LeastSquaresResult least_squares",
     "loop": "ClosedLoopRun run",

@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias
 from . import recipes
 from .dataset import Dataset, require_dataset
 from .errors import DataError, SettingError
+from .evidence import remembered
 from .models import Model
 from .models.base import INIT
 from .recipes import Progress, Task
@@ -104,7 +105,7 @@ def identify(
     task = Task(data, validation, na, nb, nk, hidden, starts, seed, iterations, threads, progress)
     _require_settings(task)
     _require_data(task, kind)
-    return _RECIPES[kind](task)
+    return remembered(_RECIPES[kind](task), data)
 
 
 def _preset(preset: str, kind: str, orders: tuple[int, ...]) -> str:

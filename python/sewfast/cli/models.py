@@ -73,13 +73,13 @@ def _add_model_and_data(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("model", metavar="MODEL.json", help="model file that identify wrote")
     parser.add_argument("data", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
     parser.add_argument(
-        "--init", type=_whole, default=20, metavar="N",
+        "--init", type=whole, default=20, metavar="N",
         help="first samples, which set the initial state and are not scored (20); 0: from rest",
     )  # fmt: skip
     add_columns(parser, from_model=True)
 
 
-def _whole(text: str) -> int:
+def whole(text: str) -> int:
     try:
         value = int(text)
     except ValueError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from . import (
+    check,
     control,
     device,
     doctor,
@@ -64,6 +65,7 @@ def build_parser() -> argparse.ArgumentParser:
         files,
         identify,
         models,
+        check,
         control,
         ports,
         doctor,

@@ -22,6 +22,7 @@ from ..dataset import (
 from ..errors import DataError, SettingError
 
 if TYPE_CHECKING:
+    from ..evidence import Bands, ReportCard
     from ..validation import Validation
 
 FORMAT = "sewfast.model"
@@ -170,6 +171,20 @@ class Model(ABC):
         from ..validation import validate
 
         return validate(self, data, init=init, against=against)
+
+    def check(
+        self, data: Dataset, training: Dataset | None = None, *, init: int = INIT
+    ) -> ReportCard:
+        """Whether the model can be trusted on these data; see `sewfast.evidence.check`."""
+        from ..evidence import check
+
+        return check(self, data, training=training, init=init)
+
+    def bands(self, data: Dataset, level: float = 0.95, *, init: int = INIT) -> Bands:
+        """Where measured samples are to be expected; see `sewfast.evidence.bands`."""
+        from ..evidence import bands
+
+        return bands(self, data, level, init=init)
 
     def initial_state(self, experiment: Experiment, init: int) -> FloatArray:
         """Past outputs y(-1), y(-2), .. of an experiment, from its first `init` samples."""

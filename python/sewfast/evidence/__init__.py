@@ -1,0 +1,31 @@
+"""Evidence that a model can be trusted: tests, covariance, bands, region, linearisation."""
+
+from .bands import Bands, bands
+from .card import Line, ReportCard
+from .checking import check, remembered, training_evidence
+from .correlations import ResidualTest
+from .operating import OperatingPoint, OperatingRange, operating_range
+from .parameters import Parameters, estimate
+from .region import Region, training_region
+from .residual_tests import residual_tests
+from .residuals import Residuals
+
+__all__ = [
+    "Bands",
+    "Line",
+    "OperatingPoint",
+    "OperatingRange",
+    "Parameters",
+    "Region",
+    "ReportCard",
+    "ResidualTest",
+    "Residuals",
+    "bands",
+    "check",
+    "estimate",
+    "operating_range",
+    "remembered",
+    "residual_tests",
+    "training_evidence",
+    "training_region",
+]

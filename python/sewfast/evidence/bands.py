@@ -1,0 +1,307 @@
+"""Simulation bands: where a measured sample is to be expected about a free run.
+
+The half width at sample k is a quantile of e/s times s(k), s(k)^2 = sigma^2 + |Psi(k) F|^2: the
+spread of the residual and what the parameters' uncertainty adds to it (delta method, P = FF' the
+sandwich covariance, so the residual's colour counts). Ensembles put the spread of their members in
+place of the second part. The quantiles are those of residuals that the model was not fitted to:
+every tenth of the training data is left out in turn, to first order (Cook and Weisberg 1982), so
+that neither normality nor a perfect model is assumed (normalised jackknife+ and conformal bands:
+Barber et al. 2021, Lei et al. 2018).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..dataset import Dataset, FloatArray
+from ..errors import SettingError
+from ..models.base import INIT, Model
+from .distributions import normal_quantile
+from .parameters import Information, estimate
+from .residuals import Residuals
+
+LEVEL = 0.95
+BLOCKS = 10
+_TAILS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.35, 0.5)
+_KEPT_VARIANCE = 0.999
+_LARGEST_GROWTH = 3.0
+"""A residual is not trusted to grow further when its block is left out: first order ends there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """How far measured samples lie from a model's free run.
+
+    Attributes
+    ----------
+    spread : float
+        Standard deviation of the residual [output unit].
+    factor : array, shape (p, r)
+        F with FF' the part of the parameters' covariance that matters; r = 0 for an ensemble.
+    probabilities, quantiles : array, shape (q,)
+        Of e/s.
+    samples : int
+    """
+
+    spread: float
+    factor: FloatArray
+    probabilities: FloatArray
+    quantiles: FloatArray
+    samples: int
+
+    def quantile(self, probability: float) -> float:
+        """Quantile of e/s, between the stored ones on the scale of a normal variable."""
+        at = [-normal_quantile(float(p)) for p in self.probabilities]
+        return float(np.interp(-normal_quantile(probability), at, self.quantiles))
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {
+            "spread": self.spread,
+            "factor": [[float(f"{v:.6e}") for v in row] for row in self.factor],
+            "probabilities": self.probabilities.tolist(),
+            "quantiles": self.quantiles.tolist(),
+            "samples": self.samples,
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Uncertainty:
+        """What `to_json` gave.
+
+        Raises
+        ------
+        ValueError
+            Where the values are of another form.
+        """
+        try:
+            factor = np.array(values["factor"], dtype=np.float64)
+            p, q = (np.array(values[k], dtype=np.float64) for k in ("probabilities", "quantiles"))
+            spread, samples = float(values["spread"]), int(values["samples"])
+        except (KeyError, TypeError, ValueError) as e:
+            raise ValueError(f"expected spread, factor, probabilities and quantiles: {e}") from e
+        factor = factor.reshape(len(factor), -1) if factor.size else np.zeros((0, 0))
+        sound = p.ndim == 1 and p.shape == q.shape and len(p) > 1 and bool(np.all(np.diff(p) > 0))
+        if not (sound and p[0] > 0 and p[-1] < 1 and np.all(np.diff(q) >= 0) and spread >= 0):
+            raise ValueError("expected rising probabilities and quantiles of one length")
+        return cls(spread, factor, p, q, samples)
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """Bands about the free run of every experiment, and what lay inside.
+
+    Attributes
+    ----------
+    level : float
+        Share of measured samples that the band is made for.
+    lower, simulated, upper : tuple of array, shape (N,)
+    inside : tuple of float
+        Measured share of each experiment's samples after the initial ones; NaN where none is
+        measured.
+    coverage : float
+        Of all experiments together.
+    n : int
+        Samples measured.
+    """
+
+    level: float
+    lower: tuple[FloatArray, ...]
+    simulated: tuple[FloatArray, ...]
+    upper: tuple[FloatArray, ...]
+    inside: tuple[float, ...]
+    coverage: float
+    n: int
+
+    def to_json(self) -> dict[str, Any]:
+        """The shares as JSON values; the series are not among them."""
+        return {
+            "level": self.level,
+            "coverage": _number(self.coverage),
+            "experiments": [_number(v) for v in self.inside],
+            "n": self.n,
+        }
+
+
+def bands(
+    model: Model,
+    data: Dataset,
+    level: float = LEVEL,
+    *,
+    init: int = INIT,
+    training: Dataset | None = None,
+) -> Bands:
+    """Bands about a free run.
+
+    Parameters
+    ----------
+    model : Model
+    data : Dataset
+        Outputs after the first `init` samples may be NaN; those measured are counted.
+    level : float
+        Share of measured samples to expect inside, .5 to .999.
+    init : int
+        As for `simulate`.
+    training : Dataset or None
+        What the model was identified from; None takes what `identify` stored with it.
+
+    Raises
+    ------
+    SettingError
+        For a level out of range, or a model that knows nothing of its uncertainty.
+    DataError, FitError
+        As for `simulate`.
+    """
+    if not 0.5 <= level <= 0.999:
+        raise SettingError(f"level: expected a share from 0.5 to 0.999, received {level!r}")
+    known = uncertainty(model, training) if training is not None else stored_uncertainty(model)
+    if known is None:
+        raise SettingError(
+            "bands: expected a model that stores its uncertainty, received one without; "
+            "identify it "
+            "again, or give its training data (training=...)"
+        )
+    residuals = Residuals.of(model, data, init, "free run")
+    return bands_of(model, data, residuals, known, level)
+
+
+def bands_of(
+    model: Model, data: Dataset, residuals: Residuals, known: Uncertainty, level: float
+) -> Bands:
+    """Bands about free runs that have been computed."""
+    tail = 0.5 * (1.0 - level)
+    low, high = known.quantile(tail), known.quantile(1.0 - tail)
+    spreads = _spreads(model, data, residuals, known)
+    lower = tuple(r.yhat + low * s for r, s in zip(residuals.runs, spreads, strict=True))
+    upper = tuple(r.yhat + high * s for r, s in zip(residuals.runs, spreads, strict=True))
+    hits = [
+        ((r.y >= a) & (r.y <= b))[r.counts]
+        for r, a, b in zip(residuals.runs, lower, upper, strict=True)
+    ]
+    n = sum(map(len, hits))
+    return Bands(
+        level,
+        lower,
+        tuple(r.yhat for r in residuals.runs),
+        upper,
+        tuple(float(h.mean()) if len(h) else math.nan for h in hits),
+        float(np.concatenate(hits).mean()) if n else math.nan,
+        n,
+    )
+
+
+def uncertainty(model: Model, data: Dataset, init: int = INIT) -> Uncertainty:
+    """From the data that a model was identified from."""
+    residuals = Residuals.of(model, data, init, "free run")
+    if getattr(model, "members", ()):
+        factor = np.zeros((0, 0))
+        errors = [r.error for r in residuals.runs]
+    else:
+        factor = _factor(model, residuals)
+        errors = _left_out(model, residuals)
+    power = sum(
+        float(np.sum(np.square(e[r.counts]))) for e, r in zip(errors, residuals.runs, strict=True)
+    )
+    spread = math.sqrt(power / residuals.n)
+    empty = Uncertainty(spread, factor, np.zeros(0), np.zeros(0), residuals.n)
+    spreads = _spreads(model, data, residuals, empty)
+    scores = np.concatenate(
+        [
+            (e / np.where(s > 0, s, 1.0))[r.counts]
+            for e, s, r in zip(errors, spreads, residuals.runs, strict=True)
+        ]
+    )
+    probabilities = np.array([*_TAILS, *(1.0 - t for t in _TAILS[-2::-1])])
+    return Uncertainty(
+        spread, factor, probabilities, np.quantile(scores, probabilities), residuals.n
+    )
+
+
+def stored_uncertainty(model: Model) -> Uncertainty | None:
+    """What the model stores; None where there is nothing that can be read."""
+    values = model.training.get("uncertainty")
+    if not isinstance(values, Mapping):
+        return None
+    try:
+        return Uncertainty.from_json(values)
+    except ValueError:
+        return None
+
+
+def _factor(model: Model, residuals: Residuals) -> FloatArray:
+    """F with FF' about P, by the directions that move the free run most."""
+    found = estimate(model, residuals)
+    if found is None:
+        return np.zeros((0, 0))
+    gram = np.sum([r.sensitivity.T @ r.sensitivity for r in residuals.runs], axis=0)
+    sizes, vectors = np.linalg.eigh(found.covariance)
+    root = vectors * np.sqrt(np.maximum(sizes, 0.0))
+    # directions of P^(1/2), sorted by the variance that they give the free run
+    moved, turn = np.linalg.eigh(root.T @ gram @ root)
+    order = np.argsort(moved)[::-1]
+    share = np.cumsum(moved[order]) / max(moved.sum(), 1e-300)
+    kept = order[: int(np.searchsorted(share, _KEPT_VARIANCE)) + 1]
+    factor: FloatArray = root @ turn[:, kept]
+    return factor
+
+
+def _left_out(model: Model, residuals: Residuals) -> list[FloatArray]:
+    """Residuals of every block with the parameters that the other blocks alone would give.
+
+    To first order e_b + Psi_b (H - H_b + L)^-1 Psi_b' e_b.
+    """
+    errors = [r.error for r in residuals.runs]
+    if residuals.width == 0:
+        return errors
+    information = Information.of(model, residuals)
+    found = [e.copy() for e in errors]
+    for run, e, out in zip(residuals.runs, errors, found, strict=True):
+        for a, b in _blocks(len(e), residuals.n):
+            psi = run.sensitivity[a:b]
+            inverse = information.inverse(less=psi.T @ psi)
+            change = psi @ (inverse @ (psi.T @ e[a:b]))
+            out[a:b] = e[a:b] + _bounded(change, e[a:b])
+    return found
+
+
+def _blocks(length: int, total: int) -> list[tuple[int, int]]:
+    """Blocks of one run, so that all runs together have about `BLOCKS`."""
+    count = max(1, round(BLOCKS * length / max(total, 1)))
+    if count == 1 and length >= total:
+        count = 2
+    edges = np.linspace(0, length, count + 1).astype(int)
+    return [(int(a), int(b)) for a, b in itertools.pairwise(edges)]
+
+
+def _bounded(change: FloatArray, e: FloatArray) -> FloatArray:
+    largest = _LARGEST_GROWTH * float(np.linalg.norm(e))
+    size = float(np.linalg.norm(change))
+    return change if size <= largest else change * (largest / size)
+
+
+def _spreads(
+    model: Model, data: Dataset, residuals: Residuals, known: Uncertainty
+) -> Sequence[FloatArray]:
+    """s(k) of every experiment."""
+    members = getattr(model, "members", ())
+    if members:
+        runs = [m.simulate(data, init=residuals.init) for m in members]
+        return [
+            np.sqrt(known.spread**2 + np.var(np.stack(same), axis=0))
+            for same in zip(*runs, strict=True)
+        ]
+    factor = known.factor
+    if factor.size == 0 or factor.shape[0] != residuals.width:
+        return [np.full(len(r.y), known.spread) for r in residuals.runs]
+    return [
+        np.sqrt(known.spread**2 + np.square(r.psi @ factor).sum(axis=1)) for r in residuals.runs
+    ]
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,210 @@
+"""`check`: a model on data -> its report card."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from ..dataset import Dataset, FloatArray, require_dataset
+from ..errors import FitError, SewfastError
+from ..models.base import INIT, Model
+from ..validation import Scores
+from . import questions
+from .bands import LEVEL, Bands, bands_of, stored_uncertainty, uncertainty
+from .card import Line, ReportCard
+from .criteria import Criteria
+from .operating import OperatingRange, operating_range
+from .parameters import Parameters, estimate
+from .region import Region, points, stored_region, training_region
+from .residual_tests import LAGS, residual_tests
+from .residuals import Residuals, representative
+from .scores import horizon_scores
+
+_FORGOTTEN = 0.05
+
+
+def check(
+    model: Model,
+    data: Dataset,
+    *,
+    training: Dataset | None = None,
+    init: int = INIT,
+    level: float = LEVEL,
+) -> ReportCard:
+    """What is known of a model's trustworthiness on these data.
+
+    Parameters
+    ----------
+    model : Model
+    data : Dataset
+        Best not the training data. Outputs after the first `init` samples may be NaN.
+    training : Dataset or None
+        What the model was identified from: adds information criteria and the comparison of errors,
+        and replaces what `identify` stored with the model (bands, region).
+    init : int
+        Samples of each experiment that set the initial state and are not judged.
+    level : float
+        Of the bands.
+
+    Returns
+    -------
+    ReportCard
+
+    Raises
+    ------
+    DataError
+        Where the data do not fit the model or leave nothing to judge.
+    FitError
+        Where the model runs away on these inputs.
+    """
+    require_dataset(data, "data")
+    if training is not None:
+        require_dataset(training, "training")
+    free = Residuals.of(model, data, init, "free run")
+    tested = free if model.kind != "arx" or _has_gaps(data) else Residuals.of(model, data, init)
+    scores = horizon_scores(model, data, free)
+    unit = free.unit
+    on_training = training is data or (training is None and is_training_data(model, data))
+    lines = questions.accuracy(scores, unit)
+    if training is not None and training is not data:
+        lines.append(
+            questions.generalisation(
+                scores.pooled["free run"], _training_scores(model, training, init)
+            )
+        )
+    lines.append(questions.bias(free))
+    tests = residual_tests(tested, memory(model, data, init))
+    lines += [questions.correlation(t) for t in tests]
+    found = _parameters(model, data, training, on_training, init)
+    lines += found[2]
+    covered = _bands(model, data, free, training, level)
+    if covered is not None:
+        lines.append(questions.coverage(covered))
+    distances = _distances(model, data, training, init)
+    outside = math.nan
+    if distances:
+        judged = np.concatenate([d[init:] for d in distances])
+        outside = float(np.mean(judged > 1.0))
+        lines.append(questions.region(outside, float(judged.max())))
+    operating = _operating(model)
+    if operating is not None:
+        lines += questions.operation(operating)
+    return ReportCard(
+        tuple(lines), model.title, _named(data), on_training, scores, tests, covered, operating,
+        found[0], found[1], outside, tuple(distances), free.runs, data.Ts, data.output_name, unit,
+    )  # fmt: skip
+
+
+def is_training_data(model: Model, data: Dataset) -> bool:
+    """Whether names, ranges and lengths are those that the model was identified from."""
+    known = model.training.get("data")
+    mine = [{"name": e.name, "range": e.range_text, "samples": len(e)} for e in data.experiments]
+    return known == mine
+
+
+def memory(model: Model, data: Dataset, init: int = INIT) -> int:
+    """Samples after which a model has forgotten all but a twentieth of its initial state."""
+    single = representative(model)
+    e = max(data.experiments, key=len)
+    state = single.initial_state(e, init)
+    size = np.abs(state).max(initial=0.0)
+    try:
+        one = single.core.simulate(e.u, state)
+        other = single.core.simulate(e.u, state + 1e-3 * max(size, 1.0))
+    except (FitError, ValueError):
+        return LAGS
+    gap = np.abs(other - one)
+    kept = np.flatnonzero(gap > _FORGOTTEN * gap.max(initial=0.0))
+    return int(kept[-1]) + 1 if len(kept) else LAGS
+
+
+def remembered(model: Model, data: Dataset) -> Model:
+    """The model with what `training_evidence` finds in its `training`."""
+    return replace(model, training={**model.training, **training_evidence(model, data)})
+
+
+def training_evidence(model: Model, data: Dataset) -> dict[str, object]:
+    """What a model should store of its training data: `region` and `uncertainty`, JSON values.
+
+    Parameters
+    ----------
+    model : Model
+    data : Dataset
+        What it was identified from.
+
+    Returns
+    -------
+    dict
+        For `model.training`; without a part that these data do not give.
+    """
+    found: dict[str, object] = {}
+    try:
+        found["region"] = training_region(model, data)
+        found["uncertainty"] = uncertainty(model, data).to_json()
+    except (SewfastError, np.linalg.LinAlgError):
+        return found
+    return found
+
+
+def _has_gaps(data: Dataset) -> bool:
+    return not all(np.isfinite(e.y).all() for e in data.experiments)
+
+
+def _named(data: Dataset) -> str:
+    return ", ".join(f"{e.name} [{e.range_text}]" for e in data.experiments)
+
+
+def _training_scores(model: Model, training: Dataset, init: int) -> Scores:
+    return horizon_scores(
+        model, training, Residuals.of(model, training, init, "free run"), ()
+    ).pooled["free run"]
+
+
+def _parameters(
+    model: Model, data: Dataset, training: Dataset | None, on_training: bool, init: int
+) -> tuple[Parameters | None, Criteria | None, list[Line]]:
+    """Parameters and criteria from the training data where they are known, else from the data."""
+    if getattr(model, "members", ()):
+        return None, None, []
+    source = training if training is not None else data
+    residuals = Residuals.of(model, source, init)
+    found = estimate(model, residuals)
+    if found is None:
+        return None, None, []
+    lines = questions.parameters(found, residuals.n)
+    if training is None and not on_training:
+        return found, None, lines
+    squares = questions.residuals_power(residuals) * residuals.n
+    criteria = Criteria.of(squares, residuals.n, found.effective)
+    return found, criteria, [*lines, questions.information(criteria, residuals.unit)]
+
+
+def _bands(
+    model: Model, data: Dataset, free: Residuals, training: Dataset | None, level: float
+) -> Bands | None:
+    known = stored_uncertainty(model) if training is None else uncertainty(model, training)
+    if known is None:
+        return None
+    return bands_of(model, data, free, known, level)
+
+
+def _distances(
+    model: Model, data: Dataset, training: Dataset | None, init: int
+) -> list[FloatArray]:
+    known = stored_region(model)
+    if training is not None:
+        known = Region.from_json(training_region(model, training))
+    if known is None:
+        return []
+    where = points(model, data, init)
+    if where[0].shape[1] != len(known.mean):
+        return []
+    return [known.distance(p) / max(known.radius, 1e-300) for p in where]
+
+
+def _operating(model: Model) -> OperatingRange | None:
+    if not model.training.get("input_range"):
+        return None
+    return operating_range(model)

@@ -1,0 +1,285 @@
+"""Linearisation over the operating range: equilibria, poles, gains, frequency responses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..dataset import FloatArray
+from ..errors import DataError, SettingError
+from ..models.base import Model
+from .linearised import Linearised, linearise
+
+POINTS = 9
+FREQUENCIES = 120
+
+
+@dataclass(frozen=True, eq=False)
+class OperatingPoint:
+    """A linear model about one constant input.
+
+    Attributes
+    ----------
+    u : array, shape (nu,)
+    y : float
+        Steady output.
+    A, B, C, D : array, shapes (n, n), (n, nu), (1, n), (1, nu)
+        Small signals in the data's units; the inputs act `delay` samples later.
+    delay : int
+    settled : bool
+        Whether this is an equilibrium; where it is not, the linear model holds at the last state
+        of a long run (an integrator's drifts).
+    saturated : bool
+        Whether the output is on a limit: nothing passes through there.
+    Ts : float
+        Sample time [s].
+    """
+
+    u: FloatArray
+    y: float
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    delay: int
+    settled: bool
+    saturated: bool
+    Ts: float
+
+    @property
+    def poles(self) -> NDArray[np.complex128]:
+        """In the z plane, the slowest first; those of the delay (at 0) are left out."""
+        found = np.linalg.eigvals(self.A).astype(np.complex128)
+        return found[np.argsort(-np.abs(found), kind="stable")]
+
+    @property
+    def is_stable(self) -> bool:
+        return bool(np.all(np.abs(self.poles) < 1.0))
+
+    @property
+    def dc_gain(self) -> FloatArray:
+        """Steady output over steady input, shape (nu,); infinite for an integrator."""
+        matrix = np.eye(len(self.A)) - self.A
+        if len(matrix) and np.linalg.cond(matrix) > 1e10:
+            return np.full(self.B.shape[1], np.inf)
+        gain: FloatArray = (self.C @ np.linalg.solve(matrix, self.B) + self.D)[0]
+        return gain
+
+    @property
+    def time_constants(self) -> FloatArray:
+        """-Ts/ln|pole| [s], the slowest first; infinite where a pole does not decay."""
+        size = np.abs(self.poles)
+        size = np.clip(size, 1e-300, None)
+        return np.where(size < 1.0, -self.Ts / np.log(np.minimum(size, 1.0 - 1e-16)), np.inf)
+
+    def response(self, hertz: FloatArray) -> NDArray[np.complex128]:
+        """Frequency response, shape (len(hertz), nu)."""
+        z = np.exp(2j * np.pi * np.asarray(hertz, dtype=np.float64) * self.Ts)
+        eye = np.eye(len(self.A))
+        inner = np.linalg.solve(
+            z[:, None, None] * eye - self.A, np.broadcast_to(self.B, (len(z), *self.B.shape))
+        )
+        found: NDArray[np.complex128] = ((self.C @ inner)[:, 0] + self.D) * z[
+            :, None
+        ] ** -self.delay
+        return found
+
+    def bandwidth(self, i: int = 0) -> float:
+        """Where the gain of input i first falls to 1/sqrt 2 of the steady one [Hz]; NaN if "
+        "never."""
+        steady = abs(self.dc_gain[i])
+        if not 0.0 < steady < math.inf:
+            return math.nan
+        hertz = np.geomspace(1e-5, 0.5, 2000) / self.Ts
+        below = np.flatnonzero(np.abs(self.response(hertz)[:, i]) < steady / math.sqrt(2.0))
+        if len(below) == 0:
+            return math.nan
+        if below[0] == 0:
+            return float(hertz[0])
+        pair = hertz[below[0] - 1 : below[0] + 1]
+        sizes = np.abs(self.response(pair)[:, i]) * math.sqrt(2.0) / steady
+        share = math.log(sizes[0]) / math.log(sizes[0] / sizes[1])
+        return float(pair[0] * (pair[1] / pair[0]) ** share)
+
+    def to_control(self) -> Any:
+        """As a `control.StateSpace` with its delay.
+
+        Raises
+        ------
+        SettingError
+            Where python-control is not installed.
+        """
+        try:
+            import control
+        except ImportError as e:
+            raise SettingError(
+                "to_control needs python-control, which is not installed: pip install control"
+            ) from e
+        A, B, C, D = self.delayed()
+        return control.ss(A, B, C, D, self.Ts)
+
+    def delayed(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """A, B, C, D with the delay as states of their own."""
+        A, B, C, D = self.A, self.B, self.C, self.D
+        for _ in range(self.delay):
+            n, m = B.shape
+            A = np.block([[A, B], [np.zeros((m, n + m))]])
+            C = np.hstack([C, D])
+            B = np.vstack([np.zeros((n, m)), np.eye(m)])
+            D = np.zeros_like(D)
+        return A, B, C, D
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values; what is not finite becomes None."""
+        return {
+            "u": self.u.tolist(),
+            "y": self.y,
+            "poles": [[p.real, p.imag] for p in self.poles.tolist()],
+            "time_constants_s": _finite(self.time_constants),
+            "dc_gain": _finite(self.dc_gain),
+            "bandwidth_hz": _finite([self.bandwidth(i) for i in range(len(self.u))]),
+            "settled": self.settled,
+            "saturated": self.saturated,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class OperatingRange:
+    """Operating points over the range of the training inputs.
+
+    Attributes
+    ----------
+    points : tuple of OperatingPoint
+        Every input over its range while the others are at their middles, input by input.
+    varied : tuple of int
+        Which input is varied at each point.
+    members : tuple of tuple of OperatingPoint
+        The same of every member of an ensemble; `points` are then those of the first.
+    """
+
+    points: tuple[OperatingPoint, ...]
+    varied: tuple[int, ...]
+    members: tuple[tuple[OperatingPoint, ...], ...]
+    input_names: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_name: str
+    output_unit: str
+    Ts: float
+
+    @property
+    def frequencies(self) -> FloatArray:
+        """For the Bode plot [Hz]: from well below the slowest corner to half the sample rate."""
+        slowest = [
+            max((t for t in p.time_constants if math.isfinite(t)), default=self.Ts)
+            for p in self.points
+        ]
+        low = 0.05 / (2.0 * math.pi * max(*slowest, self.Ts))
+        return np.geomspace(min(low, 0.05 / self.Ts), 0.5 / self.Ts, FREQUENCIES)
+
+    def __str__(self) -> str:
+        header = [*self.input_names, self.output_name, "gain", "slowest [s]", "bandwidth [Hz]", ""]
+        rows = [_row(p, i) for p, i in zip(self.points, self.varied, strict=True)]
+        widths = [max(len(r[j]) for r in [header, *rows]) for j in range(len(header))]
+        return "\n".join(
+            "  ".join(c.rjust(w) for c, w in zip(r, widths, strict=True)).rstrip()
+            for r in [header, *rows]
+        )
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """The points as JSON values."""
+        return [{"varied": i, **p.to_json()} for p, i in zip(self.points, self.varied, strict=True)]
+
+
+def operating_range(
+    model: Model, inputs: Sequence[FloatArray] | None = None, points: int = POINTS
+) -> OperatingRange:
+    """Linearise a model over the range of its training inputs.
+
+    Parameters
+    ----------
+    model : Model
+    inputs : sequence of array, shape (nu,), or None
+        Operating points; None spreads `points` over each input's range in the training data.
+    points : int
+
+    Raises
+    ------
+    DataError
+        Where the model does not store the range of its training inputs and none are given.
+    """
+    grid, varied = _grid(model, points) if inputs is None else _given(model, inputs)
+    members = tuple(getattr(model, "members", ())) or (model,)
+    found = tuple(tuple(_points(m, grid)) for m in members)
+    return OperatingRange(
+        found[0], varied, found if len(found) > 1 else (), model.input_names, model.input_units,
+        model.output_name, model.output_unit, model.Ts,
+    )  # fmt: skip
+
+
+def _grid(model: Model, points: int) -> tuple[list[FloatArray], tuple[int, ...]]:
+    ranges = model.training.get("input_range")
+    if not ranges:
+        raise DataError(
+            "operating range: expected a model that stores the range of its training inputs, "
+            "received one without; give the operating points (inputs=...)"
+        )
+    limits = np.array(ranges, dtype=np.float64)
+    middle = limits.mean(axis=1)
+    grid, varied = [], []
+    for i, (low, high) in enumerate(limits):
+        for value in np.linspace(low, high, points):
+            u = middle.copy()
+            u[i] = value
+            grid.append(u)
+            varied.append(i)
+    return grid, tuple(varied)
+
+
+def _given(model: Model, inputs: Sequence[FloatArray]) -> tuple[list[FloatArray], tuple[int, ...]]:
+    grid = [np.atleast_1d(np.asarray(u, dtype=np.float64)) for u in inputs]
+    for u in grid:
+        if u.shape != (len(model.input_names),) or not np.isfinite(u).all():
+            raise DataError(
+                f"inputs: expected finite arrays of shape ({len(model.input_names)},), "
+                f"received {u!r}"
+            )
+    return grid, (0,) * len(grid)
+
+
+def _points(model: Model, grid: Sequence[FloatArray]) -> list[OperatingPoint]:
+    found, state = [], None
+    for u in grid:
+        small: Linearised = linearise(model.core, u, state)
+        state = small.state
+        found.append(
+            OperatingPoint(
+                u,
+                small.y,
+                small.A,
+                small.B,
+                small.C,
+                small.D,
+                small.delay,
+                small.settled,
+                small.saturated,
+                model.Ts,
+            )
+        )
+    return found
+
+
+def _row(p: OperatingPoint, i: int) -> list[str]:
+    note = "" if p.settled else "no equilibrium"
+    note = "saturated" if p.saturated else note
+    note = note if p.is_stable else "unstable"
+    numbers = [p.dc_gain[i], float(p.time_constants.max(initial=0.0)), p.bandwidth(i)]
+    return [*(f"{v:.4g}" for v in [*p.u, p.y, *numbers]), note]
+
+
+def _finite(values: Sequence[float] | FloatArray) -> list[float | None]:
+    return [float(v) if math.isfinite(v) else None for v in values]

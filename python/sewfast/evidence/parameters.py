@@ -1,0 +1,172 @@
+"""Parameters: their covariance in sandwich form, conditioning, and how many of them count."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..dataset import FloatArray
+from ..models.base import Model
+from .noise import Noise
+from .residuals import Residuals, representative
+
+DETERMINED = 1e-10
+"""Share of the largest information from which a direction counts; double precision ends there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters:
+    """What the data say of the parameters.
+
+    Attributes
+    ----------
+    values : array, shape (p,)
+    covariance : array, shape (p, p)
+        (H + L)^-1 Psi'R Psi (H + L)^-1 with H = Psi'Psi, L the weight decay, R the residual's
+        covariance matrix, coloured (Ljung 1999, eq. 9.42; Newey and West 1987); undetermined
+        directions count as held.
+    effective : float
+        trace (H + L)^-1 H: parameters that the data and not the weight decay determine.
+    condition : float
+        Of the sensitivity with columns of unit length; infinity where a direction has no effect.
+    undetermined : int
+        Directions that the data say nothing about.
+    names : tuple of str
+    """
+
+    values: FloatArray
+    covariance: FloatArray
+    effective: float
+    condition: float
+    undetermined: int
+    names: tuple[str, ...]
+
+    @property
+    def standard_errors(self) -> FloatArray:
+        """Square roots of the variances, shape (p,)."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    def loose(self, share: float = 1.0) -> list[str]:
+        """Names of the parameters whose standard error exceeds that share of their size."""
+        bound = share * np.abs(self.values)
+        return [n for n, s, b in zip(self.names, self.standard_errors, bound, strict=True) if s > b]
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """The normal matrix of a residual, with its inverse over what is determined.
+
+    Attributes
+    ----------
+    gram, penalty : array, shape (p, p) and (p,)
+        Psi'Psi and the weight decay's diagonal.
+    """
+
+    gram: FloatArray
+    penalty: FloatArray
+
+    @classmethod
+    def of(cls, model: Model, residuals: Residuals) -> Information:
+        gram = np.sum([r.sensitivity.T @ r.sensitivity for r in residuals.runs], axis=0)
+        return cls(gram, penalty(model, residuals))
+
+    @property
+    def scale(self) -> FloatArray:
+        """Square roots of the diagonal, 1 where it is 0."""
+        diagonal = np.sqrt(np.diag(self.gram) + self.penalty)
+        return np.where(diagonal > 0.0, diagonal, 1.0)
+
+    def inverse(self, less: FloatArray | None = None) -> FloatArray:
+        """(gram - less + penalty)^+ over the determined directions."""
+        matrix = self.gram + np.diag(self.penalty)
+        if less is not None:
+            matrix = matrix - less
+        outer = np.outer(self.scale, self.scale)
+        sizes, vectors = np.linalg.eigh(matrix / outer)
+        kept = sizes > DETERMINED * max(sizes[-1], DETERMINED) if len(sizes) else sizes > 0
+        vectors = vectors[:, kept]
+        found: FloatArray = (vectors / sizes[kept]) @ vectors.T / outer
+        return found
+
+    def conditioning(self) -> tuple[float, int]:
+        """Condition number of the sensitivity, and the directions without information."""
+        diagonal = np.sqrt(np.diag(self.gram))
+        scale = np.where(diagonal > 0.0, diagonal, 1.0)
+        sizes = np.linalg.eigvalsh(self.gram / np.outer(scale, scale))
+        if len(sizes) == 0 or sizes[-1] <= 0.0:
+            return np.inf, len(sizes)
+        lost = int(np.sum(sizes <= DETERMINED * sizes[-1]))
+        condition = np.sqrt(sizes[-1] / sizes[0]) if lost == 0 else np.inf
+        return float(condition), lost
+
+
+def estimate(model: Model, residuals: Residuals) -> Parameters | None:
+    """What the data say of a model's parameters; None where the model has no sensitivities."""
+    if residuals.width == 0:
+        return None
+    information = Information.of(model, residuals)
+    inverse = information.inverse()
+    effective = float(np.trace(inverse @ information.gram))
+    noise = residuals.noise(spent=effective)
+    covariance = inverse @ _meat(residuals, noise) @ inverse
+    values, names = _values(representative(model), residuals)
+    condition, lost = information.conditioning()
+    return Parameters(values, covariance, effective, condition, lost, names)
+
+
+def penalty(model: Model, residuals: Residuals) -> FloatArray:
+    """The weight decay as a diagonal beside Psi'Psi, in the data's units; zero where there is none.
+
+    The training cost is 1/(2N) sum (e/y_scale)^2 + decay/2 |w|^2 (docs/CONVENTIONS.md).
+    """
+    single = representative(model)
+    decay = single.training.get("weight_decay", 0.0)
+    decay = decay if isinstance(decay, float) and np.isfinite(decay) else 0.0
+    weights = np.zeros(residuals.width)
+    if decay > 0.0 and single.kind in _DECAYED:
+        share, y_scale = _DECAYED[single.kind](single)
+        if len(share) == residuals.width:
+            n = single.training.get("samples_fitted", residuals.n)
+            weights = decay * float(n) * y_scale**2 * share
+    return weights
+
+
+def _network_decay(model: Model) -> tuple[FloatArray, float]:
+    s = model.core.settings
+    regressors = s["na"] + s["nb"] * s["n_inputs"]
+    hidden = s["hidden"]
+    parts = [np.ones(hidden * regressors), np.full(hidden, 0.1), np.ones(hidden)]
+    rest = len(model.core.theta) - sum(map(len, parts))
+    return np.concatenate([*parts, np.zeros(rest)]), float(s["y_scale"])
+
+
+_DECAYED = {"neural_oe": _network_decay}
+
+
+def _meat(residuals: Residuals, noise: Noise) -> FloatArray:
+    """Psi'R Psi over all experiments."""
+    total = np.zeros((residuals.width, residuals.width))
+    for run in residuals.runs:
+        shaped = noise.shaped(run.sensitivity)
+        total += shaped.T @ shaped
+    return total
+
+
+def _values(model: Model, residuals: Residuals) -> tuple[FloatArray, tuple[str, ...]]:
+    core = model.core
+    if hasattr(core, "theta"):
+        theta = np.asarray(core.theta, dtype=np.float64)
+        return theta, tuple(f"theta[{i}]" for i in range(len(theta)))
+    values = np.concatenate([core.a, core.b.ravel(), [core.offset]])
+    a = [f"a{i + 1}" for i in range(core.na)]
+    width = core.b.shape[1]
+    b = [f"b{i + 1}" for i in range(width)]
+    if len(core.b) > 1:
+        b = [f"b{i + 1} of {name}" for name in residuals.input_names for i in range(width)]
+    names = (*a, *b, "offset")
+    if residuals.horizon == "one step":
+        # regressors are past outputs themselves, a_i their negative factors
+        values = np.concatenate([-core.a, core.b.ravel(), [core.offset]])
+        names = tuple(f"-{n}" if n in a else n for n in names)
+    return values[: residuals.width], names[: residuals.width]

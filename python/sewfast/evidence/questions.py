@@ -1,0 +1,329 @@
+"""The questions of the report card: from evidence to lines with limits and verdicts.
+
+The limits are stated in docs/report-card.md.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..dataset import FloatArray
+from ..validation import Scores
+from .bands import Bands
+from .card import Line, Verdict
+from .correlations import LEVEL, ResidualTest
+from .criteria import Criteria
+from .operating import OperatingRange
+from .parameters import Parameters
+from .residuals import Residuals
+from .scores import HorizonScores, fit_text
+
+SMALL = 0.05
+"""Share of the residual's power below which a detected dependence is a warning, not a failure."""
+GOOD_FIT, POOR_FIT = 70.0, 30.0
+COVERAGE = (0.88, 0.99)
+LEAST_COVERAGE = 0.8
+OUTSIDE, FAR_OUTSIDE = 0.02, 0.2
+CONDITION = 1e8
+SAMPLES_PER_PARAMETER = 10.0
+GROWTH, LARGE_GROWTH = 1.5, 3.0
+
+_FOUND = {
+    "autocorrelation": (
+        "the noise model is too simple: predictions one step ahead waste what past errors "
+        "say; raise "
+        "na and nb, or take model oe, which makes no promise about the noise"
+    ),
+    "input": (
+        "the input still explains part of the residual: dynamics or delay are missing; raise the "
+        "orders (na, nb, nx), check nk, or allow a nonlinear model"
+    ),
+    "squared_input": (
+        "the square of the input explains part of the residual: an even nonlinearity is missing; "
+        "allow a network, or more hidden units"
+    ),
+    "squares": (
+        "the residual is larger where the input is: a nonlinearity is missing there, or the noise "
+        "grows with the amplitude"
+    ),
+    "product": (
+        "residual and input multiply: noise acts inside a nonlinear loop, or the gain drifts "
+        "over the "
+        "record; compare records from different times"
+    ),
+    "feedback": (
+        "the input answers to past residuals: the data were recorded in closed loop, where past "
+        "inputs carry noise; a correlation with past inputs then does not condemn the model"
+    ),
+}
+_PASSED = {
+    "autocorrelation": "the residual is white: nothing of it can be predicted from its own past",
+    "input": "nothing of the input is left in the residual: the linear dynamics are complete",
+    "squared_input": "no even nonlinearity is left in the residual",
+    "squares": "the residual is as large for small inputs as for large ones",
+    "product": "residual and input do not multiply",
+    "feedback": "the input does not answer to the residual: recorded in open loop",
+}
+
+
+def accuracy(scores: HorizonScores, unit: str) -> list[Line]:
+    """Free run, judged, and the steps ahead, told."""
+    free = scores.pooled["free run"]
+    fit = free.fit_percent
+    verdict: Verdict = "ok" if fit >= GOOD_FIT else "warn" if fit >= POOR_FIT else "fail"
+    meaning = {
+        "ok": "the model alone, from the inputs, follows the output: what tuning and "
+        "simulation need",
+        "warn": "the model follows the output loosely; look where the error is large (the "
+        "plot), and "
+        "whether the data hold what drives the plant",
+        "fail": "the model alone is hardly better than the mean of the output; do not tune on it: "
+        "check columns, delay and orders, or record with a larger excitation",
+    }[verdict]
+    if not math.isfinite(fit):
+        verdict, meaning = (
+            "info",
+            "the output is constant here: only the error's size says something",
+        )
+    found = [
+        Line(
+            "free run", free.rmse, fit_text(free, unit), f"fit >= {GOOD_FIT:g} %", verdict, meaning
+        )
+    ]
+    for name, s in scores.pooled.items():
+        if name != "free run":
+            text = "put right by measured outputs so often, nearly any model looks good"
+            found.append(Line(f"{name} ahead", s.rmse, fit_text(s, unit), "", "info", text))
+    return found + _worst(scores, unit)
+
+
+def _worst(scores: HorizonScores, unit: str) -> list[Line]:
+    single = [
+        (s.rmse, n) for s, n in zip(scores.experiments["free run"], scores.names, strict=True) if s
+    ]
+    if len(single) < 2:
+        return []
+    rmse, name = max(single)
+    text = f"the experiment with the largest error is {name}; to_json() lists every one"
+    return [Line("worst experiment", rmse, f"{rmse:.4g} {unit}".rstrip(), "", "info", text)]
+
+
+def generalisation(here: Scores, training: Scores) -> Line:
+    """Free-run error on new data against that on the training data."""
+    ratio = here.rmse / training.rmse if training.rmse > 0.0 else math.inf
+    verdict: Verdict = "ok" if ratio <= GROWTH else "warn" if ratio <= LARGE_GROWTH else "fail"
+    meaning = {
+        "ok": "the error is about as large as on the training data",
+        "warn": "the error is larger than on the training data: these data hold something "
+        "new, or the "
+        "model has learnt noise; compare with a smaller model",
+        "fail": "the error is several times that on the training data: do not use the model here; "
+        "train on data like these as well",
+    }[verdict]
+    return Line("error over training", ratio, f"{ratio:.3g}", f"<= {GROWTH:g}", verdict, meaning)
+
+
+_NO_OFFSET: tuple[Verdict, str] = "ok", "no offset between model and data"
+_OFFSET: tuple[Verdict, str] = (
+    "warn",
+    "the model is off by a constant here; a sensor's or an amplifier's zero may have moved",
+)
+
+
+def bias(residuals: Residuals) -> Line:
+    """Mean residual, beside what the initial state explains, against what chance lets it vary."""
+    ones, mean = residuals.constants, residuals.mean
+    noise = residuals.noise()
+    length = max(float(sum(one @ one for one in ones)), 1e-300)
+    error = math.sqrt(sum(float(np.square(noise.shaped(o[:, None])).sum()) for o in ones)) / length
+    shown = f"{mean:.3g} +- {2.58 * error:.2g} {residuals.unit}".rstrip()
+    share = mean**2 / max(residuals_power(residuals), 1e-300)
+    if abs(mean) <= 2.58 * error:
+        verdict, text = _NO_OFFSET
+    elif share < SMALL:
+        verdict, text = "ok", "a small offset, which matters little beside the rest of the residual"
+    else:
+        verdict, text = _OFFSET
+    return Line("mean residual", mean, shown, "99 % about 0", verdict, text)
+
+
+def residuals_power(residuals: Residuals) -> float:
+    """Mean square of the residuals."""
+    return sum(float(r.error @ r.error) for r in residuals.runs) / residuals.n
+
+
+def correlation(t: ResidualTest) -> Line:
+    """The verdict of one residual test."""
+    limit = f"p >= {LEVEL:g}"
+    if not math.isfinite(t.p_value):
+        text = (
+            "nothing to test: the residual or the input does not move, or there are too few samples"
+        )
+        return Line(t.title, math.nan, "not tested", limit if t.judges else "", "info", text)
+    shown = f"p = {_probability(t.p_value)}"
+    if not t.judges:
+        text = _PASSED[t.name] if t.passed else _INFORMS.get(t.name, _FOUND[t.name])
+        return Line(t.title, t.p_value, shown, "", "info", text)
+    if t.passed:
+        return Line(t.title, t.p_value, shown, limit, "ok", _PASSED[t.name])
+    share = f"{100 * t.explained:.2g} % of the residual's power: "
+    if t.explained < SMALL:
+        return Line(
+            t.title, t.p_value, shown, limit, "warn",
+            f"significant but small, {share}{_FOUND[t.name]}",
+        )  # fmt: skip
+    return Line(t.title, t.p_value, shown, limit, "fail", share + _FOUND[t.name])
+
+
+_INFORMS = {
+    "autocorrelation": (
+        "the residual is coloured, which an output-error model allows: disturbances and noise have "
+        "their own dynamics"
+    )
+}
+
+
+def _probability(p: float) -> str:
+    return "< 1e-12" if p < 1e-12 else f"{p:.2g}"
+
+
+def parameters(p: Parameters, n: int) -> list[Line]:
+    """Conditioning, undetermined directions, samples per parameter."""
+    ratio = n / max(p.effective, 1e-12)
+    enough = ratio >= SAMPLES_PER_PARAMETER
+    size = Line(
+        "samples per parameter", ratio,
+        f"{n} / {p.effective:.1f} effective of {len(p.values)}",
+        f">= {SAMPLES_PER_PARAMETER:g}", "ok" if enough else "warn",
+        "enough data for a model of this size"
+        if enough
+        else "too few samples for a model of this size: it learns noise; record longer or take a "
+        "smaller model",
+    )  # fmt: skip
+    sound = p.condition <= CONDITION
+    if sound:
+        text = "the data tell the parameters apart"
+    elif p.undetermined:
+        text = (
+            f"{p.undetermined} direction(s) in parameter space change nothing in these data; "
+            "the output "
+            "is as good, but single parameters mean nothing: take a smaller model to read them"
+        )
+    else:
+        text = "nearly the same output comes from other parameters; do not read single parameters"
+    shown = f"{p.condition:.2g}" if math.isfinite(p.condition) else "infinite"
+    return [
+        size,
+        Line(
+            "conditioning",
+            p.condition,
+            shown,
+            f"<= {CONDITION:.0e}",
+            "ok" if sound else "info",
+            text,
+        ),
+        _looseness(p),
+    ]
+
+
+def _looseness(p: Parameters) -> Line:
+    loose = p.loose()
+    shown = f"{len(loose)} of {len(p.values)}"
+    named = ", ".join(loose[:5]) + (", .." if len(loose) > 5 else "")
+    text = "every parameter is larger than its standard error" if not loose else (
+        f"standard error larger than the value: {named}; a zero would do as well"
+    )  # fmt: skip
+    return Line("parameters not told from 0", float(len(loose)), shown, "", "info", text)
+
+
+def information(c: Criteria, unit: str) -> Line:
+    """The criteria, to compare models of the same data."""
+    shown = f"AIC {c.aic:.6g}, BIC {c.bic:.6g}"
+    squared = f"{unit}²" if unit else ""
+    text = (
+        f"to compare models of the same data, the smaller the better; AICc {c.aicc:.6g}, "
+        f"FPE {c.fpe:.4g} {squared}".rstrip()
+        + f", {c.parameters:.1f} effective parameters"
+    )
+    return Line("information criteria", c.aic, shown, "", "info", text)
+
+
+def coverage(b: Bands) -> Line:
+    """Measured coverage of the bands; its limits are the issue of honesty, not of accuracy."""
+    low, high = COVERAGE
+    value = b.coverage
+    limit = f"{100 * low:.0f} to {100 * high:.0f} %"
+    name = f"inside {100 * b.level:g} % bands"
+    if not math.isfinite(value):
+        return Line(name, value, "not measured", limit, "info", "no output was measured here")
+    if b.level != 0.95:
+        low, high, limit = b.level - 0.07, min(1.0, b.level + 0.04), ""
+    verdict: Verdict = (
+        "ok" if low <= value <= high else "fail" if value < LEAST_COVERAGE else "warn"
+    )
+    text = "the bands tell the truth about the error to expect"
+    if value < low:
+        text = (
+            "fewer samples lie inside than promised: noise or operating range differ from the "
+            "training "
+            "data; do not rely on the bands here"
+        )
+    elif value > high:
+        text = "more samples lie inside than promised: the bands are wider than need be here"
+    return Line(name, value, f"{100 * value:.1f} %", limit, verdict, text)
+
+
+def region(outside: float, farthest: float) -> Line:
+    """Share of samples unlike any in the training data."""
+    verdict: Verdict = "ok" if outside <= OUTSIDE else "warn" if outside <= FAR_OUTSIDE else "fail"
+    meaning = {
+        "ok": "the model is used where it has been trained",
+        "warn": "some samples are unlike any in the training data: the model extrapolates there",
+        "fail": "the model is used where it has never been: record such operation and "
+        "identify again",
+    }[verdict]
+    if verdict != "ok":
+        meaning += f" (farthest: {farthest:.3g} times the region's radius)"
+    limit = f"<= {100 * OUTSIDE:g} %"
+    return Line(
+        "outside training region", outside, f"{100 * outside:.2f} %", limit, verdict, meaning
+    )
+
+
+def operation(found: OperatingRange) -> list[Line]:
+    """Stability, gain and bandwidth over the operating range."""
+    wild = [p for p in found.points if not p.is_stable]
+    integrating = [p for p in wild if np.abs(p.poles).max(initial=0.0) < 1.0 + 1e-9]
+    largest = max(float(np.abs(p.poles).max(initial=0.0)) for p in found.points)
+    verdict: Verdict = "ok" if not wild else "info" if len(integrating) == len(wild) else "fail"
+    text = {
+        "ok": "every operating point is stable",
+        "info": "the model integrates its input",
+        "fail": f"{len(wild) - len(integrating)} of {len(found.points)} operating points are "
+        "unstable: a "
+        "loop tuned there is tuned on a plant that does not exist; train on data from there",
+    }[verdict]
+    lines = [Line("largest pole", largest, f"{largest:.6g}", "< 1", verdict, text)]
+    for i, name in enumerate(found.input_names):
+        here = [p for p, j in zip(found.points, found.varied, strict=True) if j == i]
+        lines.append(_spread_line(f"gain from {name}", np.array([p.dc_gain[i] for p in here]), ""))
+        widths = np.array([p.bandwidth(i) for p in here])
+        lines.append(_spread_line(f"bandwidth from {name}", widths, "Hz"))
+    return lines
+
+
+def _spread_line(name: str, values: FloatArray, unit: str) -> Line:
+    known = values[np.isfinite(values)]
+    if len(known) == 0:
+        return Line(name, math.nan, "none", "", "info", "not defined over the operating range")
+    low, high = float(known.min()), float(known.max())
+    shown = f"{low:.4g} to {high:.4g} {unit}".rstrip()
+    same = high - low <= 0.1 * max(abs(low), abs(high))
+    text = (
+        "nearly the same over the operating range: one set of gains will do"
+        if same
+        else "varies over the operating range: check the loop at both ends, or schedule gains"
+    )
+    return Line(name, high - low, shown, "", "info", text)
