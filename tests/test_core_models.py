@@ -306,7 +306,7 @@ def test_unusable_records_are_refused() -> None:
     with pytest.raises(DataError, match="more than"):
         _fit([(u[:20], y[:20])], [])
     with pytest.raises(DataError, match="finite"):
-        _fit([(u, np.where(np.arange(300) == 7, np.nan, y))], [])
+        _fit([(u, np.where(np.arange(300) == 7, np.inf, y))], [])
     with pytest.raises(DataError, match="inputs in every experiment"):
         _fit([(u, y)], [(np.hstack([u, u]), y)])
 

@@ -165,7 +165,7 @@ class LinearFit:
     def trace(self) -> _F: ...
     @property
     def initial_states(self) -> _F:
-        """Past outputs of each experiment, newest first, (n_experiments, na)."""
+        """Past outputs before the first measured sample of each experiment, newest first, (n_experiments, na)."""
 
 @final
 class NeuralFit:
@@ -204,9 +204,11 @@ class NeuralFit:
         """The model forgets its initial state and stands inputs a quarter larger; else no start did."""
     @property
     def initial_states(self) -> _F:
-        """Past outputs of each training experiment, newest first, (n_experiments, na)."""
+        """Past outputs before the first simulated sample of each training experiment, newest first, (n_experiments, na)."""
 
-def fit_arx(experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool) -> LinearModel: ...
+def fit_arx(experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool) -> LinearModel:
+    """In every fit an output that is NaN has no weight; inputs are finite."""
+
 def fit_oe(
     experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool = True,
     max_iterations: int = 100, progress: _Progress = None,

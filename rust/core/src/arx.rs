@@ -42,7 +42,7 @@ pub fn fit(
     let rows = usable(records, &lags);
     if rows < columns {
         return Err(Error::data(format!(
-            "expected at least {columns} samples with a whole regressor, got {rows}; record longer or lower na and nb"
+            "expected at least {columns} samples with a whole regressor (output and {na} outputs before it measured), got {rows}; record longer, lower na and nb, or use output error, which needs no neighbouring measurements"
         )));
     }
     let (gram, moment) = normal_equations(records, &lags, columns);
@@ -86,7 +86,8 @@ pub(crate) fn check(records: &[Record], na: usize, nb: usize, nk: usize) -> Resu
             .flat_map(|r| r.u.iter().skip(j).step_by(channels));
         changes(values, &format!("input {j}"))?;
     }
-    changes(records.iter().flat_map(|r| r.y), "the output")?;
+    let measured = records.iter().flat_map(|r| r.y).filter(|y| !y.is_nan());
+    changes(measured, "the output")?;
     Lags::new(na, nb, nk, channels)
 }
 
@@ -102,17 +103,22 @@ fn changes<'a>(mut values: impl Iterator<Item = &'a f64>, name: &str) -> Result<
 }
 
 fn usable(records: &[Record], lags: &Lags) -> usize {
-    records
-        .iter()
-        .map(|r| r.len().saturating_sub(lags.first_whole()))
-        .sum()
+    let whole = |r: &Record| whole_rows(r, lags).count();
+    records.iter().map(whole).sum()
 }
 
-/// Calls `each(row, y)` for every sample whose regressor lies inside its record; a last column is 1.
+/// Samples whose regressor lies inside the record and which, like the outputs in it, were measured.
+fn whole_rows<'r>(record: &'r Record<'r>, lags: &Lags) -> impl Iterator<Item = usize> + 'r {
+    let (na, complete) = (lags.na, record.unmeasured == 0);
+    (lags.first_whole()..record.len())
+        .filter(move |&k| complete || record.y[k - na..=k].iter().all(|y| !y.is_nan()))
+}
+
+/// Calls `each(row, y)` for every sample with a whole regressor; a last column is 1.
 fn each_row(records: &[Record], lags: &Lags, columns: usize, mut each: impl FnMut(&[f64], f64)) {
     let mut row = vec![1.0; columns];
     for record in records {
-        for k in lags.first_whole()..record.len() {
+        for k in whole_rows(record, lags) {
             for (i, past) in row[..lags.na].iter_mut().enumerate() {
                 *past = record.y[k - 1 - i];
             }
@@ -241,6 +247,30 @@ mod tests {
         let y = truth.simulate(&u, 1, &[490e3, 490e3]).unwrap();
         let model = fit(&[Record::new(&u, 1, &y).unwrap()], 2, 2, 1, false).unwrap();
         assert!(worst(model.a(), truth.a()) < 1e-4, "{:?}", model.a());
+    }
+
+    #[test]
+    fn leaves_out_rows_that_were_not_measured() {
+        let truth = LinearModel::new(vec![-1.5, 0.7], vec![0.5, 0.3], 1, 1, 0.4).unwrap();
+        let u = noise(400, 1);
+        let clean = truth.simulate(&u, 1, &[3.0, 1.0]).unwrap();
+        let mut random = Random::new(7);
+        let mut y = clean.clone();
+        y.iter_mut()
+            .filter(|_| random.between(0.0, 1.0) < 0.3)
+            .for_each(|y| *y = f64::NAN);
+        y[..30].fill(f64::NAN);
+        let record = Record::with_gaps(&u, 1, &y).unwrap();
+        let model = fit(&[record], 2, 2, 1, true).unwrap();
+        assert!(worst(model.a(), truth.a()) < 1e-10 && worst(model.b(), truth.b()) < 1e-10);
+        let every_other: Vec<f64> = clean
+            .iter()
+            .enumerate()
+            .map(|(k, &y)| if k % 2 == 0 { y } else { f64::NAN })
+            .collect();
+        let record = Record::with_gaps(&u, 1, &every_other).unwrap();
+        let message = fit(&[record], 2, 2, 1, true).unwrap_err().message;
+        assert!(message.contains("output error"), "{message}");
     }
 
     #[test]

@@ -2,7 +2,8 @@
 
 use crate::{Error, Result};
 
-/// One experiment: inputs row by row (time first, `channels` values per sample) and the measured output.
+/// One experiment: inputs row by row (time first, `channels` values per sample) and the measured output, NaN where it was
+/// not measured.
 #[derive(Clone, Copy, Debug)]
 pub struct Record<'a> {
     /// Inputs, `y.len() * channels` values.
@@ -11,6 +12,8 @@ pub struct Record<'a> {
     pub channels: usize,
     /// Measured output, one value per sample.
     pub y: &'a [f64],
+    /// Samples whose output was not measured.
+    pub unmeasured: usize,
 }
 
 impl<'a> Record<'a> {
@@ -19,6 +22,21 @@ impl<'a> Record<'a> {
     /// # Errors
     /// `ErrorKind::Data` for lengths that do not match or values that are not finite.
     pub fn new(u: &'a [f64], channels: usize, y: &'a [f64]) -> Result<Self> {
+        let record = Self::with_gaps(u, channels, y)?;
+        match y.iter().position(|v| v.is_nan()) {
+            None => Ok(record),
+            Some(k) => Err(Error::data(format!(
+                "expected finite values in y, got NaN at sample {k}; cut or repair that part of the recording"
+            ))),
+        }
+    }
+
+    /// A record whose output may be NaN: such a sample has no weight, a simulation runs through it.
+    ///
+    /// # Errors
+    /// `ErrorKind::Data` for lengths that do not match, inputs that are not finite, infinite outputs, or outputs of which
+    /// none was measured.
+    pub fn with_gaps(u: &'a [f64], channels: usize, y: &'a [f64]) -> Result<Self> {
         if channels == 0 || u.len() != y.len() * channels {
             return Err(Error::data(format!(
                 "expected {} x {channels} inputs for {} outputs, got {} values; give u and y the same number of samples",
@@ -27,16 +45,41 @@ impl<'a> Record<'a> {
                 u.len()
             )));
         }
-        for (name, values) in [("u", u), ("y", y)] {
-            if let Some(k) = values.iter().position(|v| !v.is_finite()) {
-                return Err(Error::data(format!(
-                    "expected finite values in {name}, got {} at sample {}; cut or repair that part of the recording",
-                    values[k],
-                    if name == "u" { k / channels } else { k }
-                )));
-            }
+        if let Some(i) = u.iter().position(|v| !v.is_finite()) {
+            return Err(Error::data(format!(
+                "expected finite values in u, got {} at sample {}; a simulation needs every input: cut the recording there, or fill what is missing",
+                u[i],
+                i / channels
+            )));
         }
-        Ok(Self { u, channels, y })
+        if let Some(k) = y.iter().position(|v| v.is_infinite()) {
+            return Err(Error::data(format!(
+                "expected finite values in y, or NaN where it was not measured, got {} at sample {k}; set it to NaN",
+                y[k]
+            )));
+        }
+        let unmeasured = y.iter().filter(|v| v.is_nan()).count();
+        if unmeasured > 0 && unmeasured == y.len() {
+            return Err(Error::data(
+                "expected a measured output, got NaN throughout; leave that experiment out",
+            ));
+        }
+        Ok(Self {
+            u,
+            channels,
+            y,
+            unmeasured,
+        })
+    }
+
+    /// Number of samples whose output was measured.
+    pub fn measured(&self) -> usize {
+        self.y.len() - self.unmeasured
+    }
+
+    /// The first sample whose output was measured; 0 for an empty record.
+    pub fn first_measured(&self) -> usize {
+        self.y.iter().position(|y| !y.is_nan()).unwrap_or(0)
     }
 
     /// Number of samples.
@@ -56,6 +99,15 @@ impl<'a> Record<'a> {
     }
 }
 
+/// Number of leading samples that hold `count` measured outputs; none where there are not as many.
+pub(crate) fn window(y: &[f64], count: usize) -> Option<usize> {
+    let mut measured = y.iter().enumerate().filter(|(_, y)| !y.is_nan());
+    match count {
+        0 => Some(0),
+        _ => measured.nth(count - 1).map(|(k, _)| k + 1),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -68,6 +120,22 @@ mod tests {
             .unwrap_err()
             .message;
         assert!(message.contains("sample 1"), "{message}");
+    }
+
+    #[test]
+    fn takes_gaps_in_the_output_where_they_are_allowed() {
+        let (nan, u) = (f64::NAN, [1.0, 2.0, 3.0, 4.0]);
+        let y = [nan, 5.0, nan, 6.0];
+        assert!(Record::new(&u, 1, &y).is_err());
+        let record = Record::with_gaps(&u, 1, &y).unwrap();
+        assert_eq!((record.measured(), record.first_measured()), (2, 1));
+        assert_eq!(
+            [0, 1, 2, 3].map(|count| window(&y, count)),
+            [Some(0), Some(2), Some(4), None]
+        );
+        assert!(Record::with_gaps(&u, 1, &[nan; 4]).is_err());
+        assert!(Record::with_gaps(&u, 1, &[1.0, f64::INFINITY, 0.0, 0.0]).is_err());
+        assert!(Record::with_gaps(&[1.0, nan, 0.0, 0.0], 1, &y).is_err());
     }
 
     #[test]

@@ -129,7 +129,8 @@ pub trait Lagged {
 
     /// The output `horizon` steps ahead: measured outputs up to sample `k - horizon`, the model's own after it.
     ///
-    /// The first samples, for which fewer outputs are known, start from `y_past`.
+    /// The first samples, for which fewer outputs are known, start from `y_past`. In the place of an output that was not
+    /// measured (NaN) stands the model's one-step prediction of it.
     ///
     /// # Errors
     /// `ErrorKind::Data` for wrong shapes, `ErrorKind::Setting` for a horizon of 0, `ErrorKind::Fit` as in free run.
@@ -149,6 +150,8 @@ pub trait Lagged {
                 "expected a horizon of 1 step or more, got 0; 1 is one-step prediction",
             ));
         }
+        let filled = self.filled(u, y, y_past);
+        let y = filled.as_deref().unwrap_or(y);
         let mut phi = vec![0.0; lags.regressors()];
         let ahead = |k: usize| {
             let start = (k + 1).saturating_sub(horizon);
@@ -170,31 +173,56 @@ pub trait Lagged {
         finite((0..samples).map(ahead).collect())
     }
 
+    /// `y` with the one-step prediction in the place of what was not measured; none where everything was.
+    fn filled(&self, u: &[f64], y: &[f64], y_past: &[f64]) -> Option<Vec<f64>> {
+        if !y.iter().any(|v| v.is_nan()) {
+            return None;
+        }
+        let lags = self.lags();
+        let mut phi = vec![0.0; lags.regressors()];
+        phi[..lags.na].copy_from_slice(y_past);
+        let next = |(k, &measured): (usize, &f64)| {
+            let known = if measured.is_nan() {
+                lags.write_inputs(u, k, &mut phi[lags.na..]);
+                self.output(&phi)
+            } else {
+                measured
+            };
+            push_past(&mut phi[..lags.na], known);
+            known
+        };
+        Some(y.iter().enumerate().map(next).collect())
+    }
+
     /// The past outputs with which the free run comes nearest to `y`, by regularised least squares.
+    ///
+    /// Outputs that are NaN have no weight.
     ///
     /// Damped Gauss-Newton steps on `sum e^2 + rho |y_past - level|^2` from several starts; `level` is the mean of
     /// the first outputs. `rho` is first 1e-2, then the ratio of the residual's to the output's variance where that is
     /// smaller: a noisy or short record cannot give a wild state, a clean one gives the exact state.
     ///
     /// # Errors
-    /// `ErrorKind::Data` for wrong shapes or no samples, `ErrorKind::Fit` where every start leaves the finite numbers.
+    /// `ErrorKind::Data` for wrong shapes or no measured samples, `ErrorKind::Fit` where every start leaves the finite
+    /// numbers.
     fn estimate_initial_state(&self, u: &[f64], channels: usize, y: &[f64]) -> Result<Vec<f64>> {
         let lags = self.lags();
         let samples = lags.check(u, channels, &vec![0.0; lags.na])?;
         check_measured(y, samples)?;
-        if samples == 0 {
+        let known: Vec<f64> = y.iter().copied().filter(|v| !v.is_nan()).collect();
+        if known.is_empty() {
             return Err(Error::data(
-                "expected samples to estimate the initial state from, got none; give 20 or so",
+                "expected measured outputs to estimate the initial state from, got none; give 20 or so",
             ));
         }
-        let first = &y[..samples.min(lags.na.max(3))];
+        let first = &known[..known.len().min(lags.na.max(3))];
         let level = first.iter().sum::<f64>() / first.len() as f64;
         let mut search = StateSearch::new(self, lags, u, y, level);
-        let starts = [level, y[0], 0.0];
+        let starts = [level, known[0], 0.0];
         let run = |search: &mut StateSearch<Self>, start: f64| search.descend(vec![start; lags.na]);
         let mut best = best_of(starts.iter().filter_map(|&s| run(&mut search, s)))?;
         for _ in 0..RELAXATIONS {
-            if samples <= 2 * lags.na || !search.relax(&best.1, level) {
+            if known.len() <= 2 * lags.na || !search.relax(&best.1, level, &known) {
                 break;
             }
             best = search.descend(best.1.clone()).unwrap_or(best);
@@ -216,9 +244,9 @@ fn check_measured(y: &[f64], samples: usize) -> Result<()> {
             y.len()
         )));
     }
-    if y.iter().any(|v| !v.is_finite()) {
+    if y.iter().any(|v| v.is_infinite()) {
         return Err(Error::data(
-            "expected finite measured outputs, got NaN or infinity; cut or repair that part",
+            "expected finite outputs, or NaN where none was measured, got infinity; set it to NaN",
         ));
     }
     Ok(())
@@ -292,21 +320,27 @@ impl<'a, M: Lagged + ?Sized> StateSearch<'a, M> {
         for (k, &measured) in self.y.iter().enumerate() {
             self.lags.write_inputs(self.u, k, &mut self.phi[n..]);
             let y = self.model.output_and_slope(&self.phi, &mut self.slope);
-            cost += (measured - y) * (measured - y);
-            self.add_row(measured - y);
+            let error = if measured.is_nan() {
+                None
+            } else {
+                Some(measured - y)
+            };
+            cost += error.map_or(0.0, |e| e * e);
+            self.add_row(error);
             push_past(&mut self.phi[..n], y);
         }
         cost
     }
 
-    /// Sensitivity row of this sample (rule of the chain over the past rows), into the normal equations.
-    fn add_row(&mut self, error: f64) {
+    /// Sensitivity row of this sample (rule of the chain over the past rows), into the normal equations where it was
+    /// measured.
+    fn add_row(&mut self, error: Option<f64>) {
         let n = self.lags.na;
         let (row, past) = self.rows.split_at_mut(n);
         for j in 0..n {
             row[j] = (0..n).map(|m| self.slope[m] * past[m * n + j]).sum();
         }
-        for i in 0..n {
+        for (i, error) in (0..n).zip(error.iter().cycle()) {
             self.gradient[i] += row[i] * error;
             for j in 0..n {
                 self.normal[i * n + j] += row[i] * row[j];
@@ -349,16 +383,11 @@ impl<'a, M: Lagged + ?Sized> StateSearch<'a, M> {
     }
 
     /// Lowers the prior's weight to what the residual says; false where it is low enough already.
-    fn relax(&mut self, state: &[f64], level: f64) -> bool {
-        let (prior, samples) = (self.rho, self.y.len());
+    fn relax(&mut self, state: &[f64], level: f64, known: &[f64]) -> bool {
+        let (prior, samples) = (self.rho, known.len());
         self.rho = 0.0;
         let residual = self.evaluate(state) / (samples - self.lags.na) as f64;
-        let spread = self
-            .y
-            .iter()
-            .map(|y| (y - level) * (y - level))
-            .sum::<f64>()
-            / samples as f64;
+        let spread = known.iter().map(|y| (y - level) * (y - level)).sum::<f64>() / samples as f64;
         self.rho = (residual / spread.max(f64::MIN_POSITIVE)).clamp(1e-9, prior);
         self.rho < prior
     }

@@ -204,6 +204,46 @@ mod tests {
     }
 
     #[test]
+    fn predicts_with_its_own_predictions_where_nothing_was_measured() {
+        let model = second_order();
+        let u: Vec<f64> = (0..60).map(|k| (k as f64 * 0.9).cos()).collect();
+        let past = [0.2, 0.1];
+        let free = model.simulate(&u, 2, &past).unwrap();
+        let none = model.predict(&u, 2, &[f64::NAN; 30], &past, 1).unwrap();
+        assert_eq!(none, free);
+        let mut y: Vec<f64> = (0..30).map(|k| (k as f64 * 1.7).sin()).collect();
+        let whole = model.predict(&u, 2, &y, &past, 1).unwrap();
+        y[11] = f64::NAN;
+        let one = model.predict(&u, 2, &y, &past, 1).unwrap();
+        assert_eq!(one[..12], whole[..12]);
+        let phi = [whole[11], y[10], u[20], u[18], u[21], u[19]];
+        assert_eq!(one[12], model.output(&phi));
+        let two = model.predict(&u, 2, &y, &past, 2).unwrap();
+        assert_eq!(two[12], model.output(&phi));
+        assert!(
+            model
+                .predict(&u, 2, &[f64::INFINITY; 30], &past, 1)
+                .is_err()
+        );
+    }
+
+    #[test]
+    fn finds_the_state_behind_a_gap_and_refuses_to_without_any_output() {
+        let model = second_order();
+        let u: Vec<f64> = (0..60).map(|k| (k as f64 * 1.3).sin()).collect();
+        let mut y = model.simulate(&u, 2, &[2.0, -1.0]).unwrap();
+        y[..4].fill(f64::NAN);
+        y[10..15].fill(f64::NAN);
+        let state = model.estimate_initial_state(&u, 2, &y).unwrap();
+        assert!(
+            (state[0] - 2.0).abs() < 1e-4 && (state[1] + 1.0).abs() < 1e-4,
+            "{state:?}"
+        );
+        y.fill(f64::NAN);
+        assert!(model.estimate_initial_state(&u, 2, &y).is_err());
+    }
+
+    #[test]
     fn gives_no_wild_state_for_a_short_noisy_record() {
         let model = LinearModel::new(vec![-1.87, 0.8705], vec![0.1228, 0.1224], 1, 1, 0.0).unwrap();
         let y = [1000.0, 1038.0, 962.0];

@@ -57,7 +57,7 @@ pub type Experiments<'py> = Vec<(PyReadonlyArray2<'py, f64>, PyReadonlyArray1<'p
 pub fn records<'a>(py: Python<'_>, experiments: &'a Experiments<'_>) -> PyResult<Vec<Record<'a>>> {
     let record = |(u, y): &'a (PyReadonlyArray2<'_, f64>, PyReadonlyArray1<'_, f64>)| {
         let (u, channels) = rows(u, "u")?;
-        Record::new(u, channels, slice(y, "y")?).map_err(|e| raise(py, e))
+        Record::with_gaps(u, channels, slice(y, "y")?).map_err(|e| raise(py, e))
     };
     experiments.iter().map(record).collect()
 }

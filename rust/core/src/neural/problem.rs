@@ -17,6 +17,7 @@ const LOOK: usize = 4096;
 #[derive(Clone, Debug)]
 pub(super) struct Experiment {
     pub u: Vec<f64>,
+    /// NaN where it was not measured.
     pub y: Vec<f64>,
     /// First simulated sample.
     pub first: usize,
@@ -29,11 +30,8 @@ impl Experiment {
         let y: Vec<f64> = record.y.iter().map(|&y| scaling.output(y)).collect();
         let (first, state) = match kind {
             InitialState::Zero => (0, vec![scaling.output(0.0); na]),
-            InitialState::Measured => (na, y[..na].iter().rev().copied().collect()),
-            InitialState::Estimated => (
-                0,
-                vec![y[..y.len().min(5)].iter().sum::<f64>() / y.len().min(5) as f64; na],
-            ),
+            InitialState::Measured => after_measured(&y, na),
+            InitialState::Estimated => (record.first_measured(), vec![first_level(&y); na]),
         };
         Self {
             u: scaling.inputs(record.u),
@@ -47,6 +45,26 @@ impl Experiment {
     pub fn samples(&self) -> usize {
         self.y.len() - self.first
     }
+
+    /// Simulated samples whose output was measured.
+    pub fn measured(&self) -> usize {
+        self.y[self.first..].iter().filter(|y| !y.is_nan()).count()
+    }
+}
+
+/// The first sample behind `na` measured ones and those, newest first; the end where there is none.
+fn after_measured(y: &[f64], na: usize) -> (usize, Vec<f64>) {
+    let mut pasts = y.windows(na).enumerate();
+    match pasts.find(|(_, past)| past.iter().all(|y| !y.is_nan())) {
+        Some((k, past)) => (k + na, past.iter().rev().copied().collect()),
+        None => (y.len(), vec![0.0; na]),
+    }
+}
+
+/// Mean of the first five measured outputs.
+fn first_level(y: &[f64]) -> f64 {
+    let first = || y.iter().filter(|y| !y.is_nan()).take(5);
+    first().sum::<f64>() / first().count() as f64
 }
 
 /// Parameters: theta, then, where they are estimated, the past outputs of each experiment.
@@ -56,6 +74,7 @@ pub(super) struct FreeRun<'a> {
     network: Network,
     estimated: bool,
     decay: f64,
+    /// Measured samples.
     samples: f64,
     /// Outputs and hidden outputs of the last simulation, experiment by experiment.
     runs: Vec<Vec<f64>>,
@@ -79,7 +98,7 @@ impl<'a> FreeRun<'a> {
             monitor,
             estimated,
             decay,
-            samples: experiments.iter().map(Experiment::samples).sum::<usize>() as f64,
+            samples: experiments.iter().map(Experiment::measured).sum::<usize>() as f64,
             runs: experiments.iter().map(|e| vec![0.0; e.samples()]).collect(),
             hidden: experiments
                 .iter()
@@ -131,7 +150,7 @@ impl<'a> FreeRun<'a> {
             .flatten()
             .filter(|&&y| self.network.is_clipped(y))
             .count();
-        clipped as f64 / self.samples
+        clipped as f64 / self.runs.iter().map(Vec::len).sum::<usize>() as f64
     }
 
     fn state<'t>(&'t self, theta: &'t [f64], experiment: usize) -> &'t [f64] {
@@ -163,7 +182,9 @@ impl<'a> FreeRun<'a> {
                 .forward(|c| phi[c], |block, values| h[block] = *values);
             push_past(&mut phi[..lags.na], y);
             *out = y;
-            sum += (data.y[k] - y) * (data.y[k] - y);
+            if !data.y[k].is_nan() {
+                sum += (data.y[k] - y) * (data.y[k] - y);
+            }
             // NaN is no number below the bound either.
             let sound = y.abs() < DIVERGED;
             if !sound || (i % LOOK == 0 && self.monitor.stopped()) {

@@ -3,6 +3,7 @@
 use super::network::Network;
 use super::problem::Experiment;
 use super::train::{InitialState, Training};
+use crate::data::window;
 use crate::lagged::{Lagged, STATE_SAMPLES, push_past};
 
 /// Keeps the best iterate of a start: on the validation data, else on the training data.
@@ -40,14 +41,16 @@ impl<'t> Referee<'t> {
         if cost.is_nan() { f64::INFINITY } else { cost }
     }
 
-    /// Sum of squared errors and the number of samples it is taken over.
+    /// Sum of squared errors and the number of measured samples it is taken over.
     fn score(&self, experiment: &Experiment) -> (f64, usize) {
         let lags = self.network.shape.lags;
         let estimated = self.training.settings.initial_state == InitialState::Estimated;
-        let skipped = if estimated {
-            STATE_SAMPLES.min(experiment.y.len() / 2)
+        let half = (experiment.measured() / 2).max(1);
+        let (first, skipped) = if estimated {
+            let known = window(&experiment.y, STATE_SAMPLES.min(half));
+            (0, known.unwrap_or(experiment.y.len()))
         } else {
-            experiment.first
+            (experiment.first, experiment.first)
         };
         let mut phi = vec![0.0; lags.regressors()];
         let state = match estimated {
@@ -62,15 +65,18 @@ impl<'t> Referee<'t> {
             return (f64::INFINITY, 1);
         };
         phi[..lags.na].copy_from_slice(&state);
-        let mut sum = 0.0;
-        for k in experiment.first..experiment.y.len() {
+        let (mut sum, mut count) = (0.0, 0);
+        for k in first..experiment.y.len() {
             lags.write_inputs(&experiment.u, k, &mut phi[lags.na..]);
             let y = self.network.output(&phi);
             push_past(&mut phi[..lags.na], y);
-            if k >= skipped {
-                sum += (experiment.y[k] - y) * (experiment.y[k] - y);
+            if k >= skipped && !experiment.y[k].is_nan() {
+                (sum, count) = (
+                    sum + (experiment.y[k] - y) * (experiment.y[k] - y),
+                    count + 1,
+                );
             }
         }
-        (sum, experiment.y.len() - skipped)
+        (sum, count)
     }
 }

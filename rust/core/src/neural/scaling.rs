@@ -16,7 +16,7 @@ pub struct Scaling {
 }
 
 impl Scaling {
-    /// Means and standard deviations over all records.
+    /// Means and standard deviations over all records, of the output where it was measured.
     pub fn of(records: &[Record]) -> Self {
         let channels = records[0].channels;
         let input = |j: usize| {
@@ -27,7 +27,8 @@ impl Scaling {
             )
         };
         let (u_mean, u_scale) = (0..channels).map(input).unzip();
-        let (y_mean, y_scale) = moments(records.iter().flat_map(|r| r.y));
+        let measured = records.iter().flat_map(|r| r.y).filter(|y| !y.is_nan());
+        let (y_mean, y_scale) = moments(measured);
         Self {
             u_mean,
             u_scale,

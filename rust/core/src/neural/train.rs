@@ -173,9 +173,15 @@ impl<'a> Training<'a> {
             .transpose()?;
         let scaled = |r: &Record| Experiment::new(r, &scaling, lags.na, settings.initial_state);
         let mut experiments: Vec<Experiment> = records.iter().map(scaled).collect();
+        let validation: Vec<Experiment> = validation.iter().map(scaled).collect();
+        check_starts(&experiments, &validation, lags.na)?;
         if let (Some(linear), InitialState::Estimated) = (linear, settings.initial_state) {
             for (experiment, record) in experiments.iter_mut().zip(records) {
-                let state = linear.estimate_initial_state(record.u, record.channels, record.y)?;
+                // the run begins at the first measured sample, which may lie behind a gap
+                let first = experiment.first;
+                let u = &record.u[first * record.channels..];
+                let state =
+                    linear.estimate_initial_state(u, record.channels, &record.y[first..])?;
                 experiment.state = state.iter().map(|&y| scaling.output(y)).collect();
             }
         }
@@ -185,7 +191,7 @@ impl<'a> Training<'a> {
             shape,
             limits: limits(&experiments, settings.saturate),
             constant_cost: constant_cost(&experiments),
-            validation: validation.iter().map(scaled).collect(),
+            validation,
             experiments,
             scaling,
             linear: bypass,
@@ -359,7 +365,8 @@ fn limits(experiments: &[Experiment], widened: Option<f64>) -> (f64, f64) {
 
 /// J of the best constant output.
 fn constant_cost(experiments: &[Experiment]) -> f64 {
-    let outputs = || experiments.iter().flat_map(|e| &e.y[e.first..]);
+    let simulated = || experiments.iter().flat_map(|e| &e.y[e.first..]);
+    let outputs = || simulated().filter(|y| !y.is_nan());
     let count = outputs().count() as f64;
     let mean = outputs().sum::<f64>() / count;
     0.5 * outputs().map(|y| (y - mean) * (y - mean)).sum::<f64>() / count
@@ -403,15 +410,29 @@ fn check_records(records: &[Record], validation: &[Record], shape: Shape) -> Res
         }
     }
     let (samples, parameters) = (
-        records.iter().map(Record::len).sum::<usize>(),
+        records.iter().map(Record::measured).sum::<usize>(),
         shape.parameters(),
     );
     if samples <= parameters {
         return Err(Error::data(format!(
-            "expected more than {parameters} samples for as many parameters, got {samples}; record longer or use fewer hidden units"
+            "expected more than {parameters} samples for as many parameters, got {samples} measured; record longer or use fewer hidden units"
         )));
     }
     Ok(())
+}
+
+/// Refuses experiments in which no sample is left to simulate to.
+fn check_starts(experiments: &[Experiment], validation: &[Experiment], na: usize) -> Result<()> {
+    match experiments
+        .iter()
+        .chain(validation)
+        .find(|e| e.measured() == 0)
+    {
+        None => Ok(()),
+        Some(_) => Err(Error::data(format!(
+            "expected {na} measured outputs in a row and one after them, got none in an experiment; start at rest or estimate the initial state, or leave that experiment out"
+        ))),
+    }
 }
 
 fn no_start() -> Error {

@@ -18,7 +18,8 @@ pub(super) fn output_layer(network: &Network, experiments: &[Experiment]) -> Opt
     let (mut left, mut right) = (vec![0.0; n * n], vec![0.0; n]);
     let (mut phi, mut row) = (vec![0.0; lags.regressors()], vec![1.0; n]);
     for experiment in experiments {
-        for k in lags.na..experiment.y.len() {
+        let measured = |k: &usize| experiment.y[k - lags.na..=*k].iter().all(|y| !y.is_nan());
+        for k in (lags.na..experiment.y.len()).filter(measured) {
             let past = experiment.y[k - lags.na..k].iter().rev();
             phi.iter_mut().zip(past).for_each(|(phi, y)| *phi = *y);
             lags.write_inputs(&experiment.u, k, &mut phi[lags.na..]);

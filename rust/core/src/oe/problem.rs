@@ -17,7 +17,11 @@ pub(super) struct OutputError<'a> {
     records: &'a [Record<'a>],
     monitor: &'a Monitor,
     offset: bool,
+    /// Measured samples.
     samples: f64,
+    /// Where each free run begins: at the first measured sample, for a state before a gap would leave no trace.
+    firsts: Vec<usize>,
+    /// Free runs from there on.
     runs: Vec<Vec<f64>>,
     gram: Gram,
     phi: Vec<f64>,
@@ -30,12 +34,12 @@ impl<'a> OutputError<'a> {
         offset: bool,
         monitor: &'a Monitor,
     ) -> Result<Self> {
-        let samples: usize = records.iter().map(Record::len).sum();
+        let samples: usize = records.iter().map(Record::measured).sum();
         let shared = lags.regressors() + usize::from(offset);
         let parameters = shared + lags.na * records.len();
         if samples <= parameters {
             return Err(Error::data(format!(
-                "expected more than {parameters} samples for as many parameters and initial states, got {samples}; record longer or lower na and nb"
+                "expected more than {parameters} samples for as many parameters and initial states, got {samples} measured; record longer or lower na and nb"
             )));
         }
         Ok(Self {
@@ -44,7 +48,11 @@ impl<'a> OutputError<'a> {
             monitor,
             offset,
             samples: samples as f64,
-            runs: records.iter().map(|r| vec![0.0; r.len()]).collect(),
+            firsts: records.iter().map(Record::first_measured).collect(),
+            runs: records
+                .iter()
+                .map(|r| vec![0.0; r.len() - r.first_measured()])
+                .collect(),
             gram: Gram::new(shared + lags.na + 1, lags.na),
             phi: vec![0.0; lags.regressors()],
         })
@@ -102,15 +110,18 @@ impl<'a> OutputError<'a> {
         let state = &theta[self.shared() + experiment * lags.na..][..lags.na];
         self.phi[..lags.na].copy_from_slice(state);
         let mut sum = 0.0;
-        for k in 0..record.len() {
+        let samples = self.firsts[experiment]..record.len();
+        for (k, out) in samples.zip(&mut self.runs[experiment]) {
             if k % LOOK == 0 && self.monitor.stopped() {
                 return None;
             }
             lags.write_inputs(record.u, k, &mut self.phi[lags.na..]);
             let y = model.output(&self.phi);
             push_past(&mut self.phi[..lags.na], y);
-            self.runs[experiment][k] = y;
-            sum += (record.y[k] - y) * (record.y[k] - y);
+            *out = y;
+            if !record.y[k].is_nan() {
+                sum += (record.y[k] - y) * (record.y[k] - y);
+            }
         }
         Some(sum)
     }
@@ -128,7 +139,7 @@ impl<'a> OutputError<'a> {
         for i in 0..na {
             self.gram.past_mut(i + 1)[shared + i] = 1.0;
         }
-        for (k, &y) in run.iter().enumerate() {
+        for (k, &y) in (self.firsts[experiment]..).zip(run) {
             if k % LOOK == 0 && self.monitor.stopped() {
                 return;
             }

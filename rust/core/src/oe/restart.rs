@@ -1,6 +1,7 @@
 //! How well a linear model runs on from a state that a few samples gave it.
 
 use crate::Record;
+use crate::data::window;
 use crate::lagged::{Lagged, STATE_SAMPLES};
 use crate::linear::LinearModel;
 
@@ -38,7 +39,7 @@ pub(super) fn restart_error(model: &LinearModel, records: &[Record]) -> f64 {
     }
 }
 
-/// Sum of squared errors and number of samples behind those that set the state.
+/// Sum of squared errors and number of measured samples behind those that set the state.
 fn segment_error(
     model: &LinearModel,
     record: &Record,
@@ -48,11 +49,14 @@ fn segment_error(
     let channels = record.channels;
     let u = &record.u[start * channels..(start + length) * channels];
     let y = &record.y[start..start + length];
-    let init = STATE_SAMPLES.min(length.div_ceil(SHORTEST));
+    let Some(init) = window(y, STATE_SAMPLES.min(length.div_ceil(SHORTEST))) else {
+        return Some((0.0, 0));
+    };
     let state = model
         .estimate_initial_state(&u[..init * channels], channels, &y[..init])
         .ok()?;
     let run = model.simulate(u, channels, &state).ok()?;
-    let errors = y.iter().zip(&run).skip(init).map(|(y, r)| (y - r).powi(2));
-    Some((errors.sum(), length - init))
+    let scored = y.iter().zip(&run).skip(init).filter(|(y, _)| !y.is_nan());
+    let count = scored.clone().count();
+    Some((scored.map(|(y, r)| (y - r).powi(2)).sum(), count))
 }
