@@ -1,14 +1,14 @@
 """Evidence that a model can be trusted: tests, covariance, bands, region, linearisation."""
 
-from .bands import Bands, bands
 from .card import Line, ReportCard
 from .checking import check, remembered, training_evidence
 from .correlations import ResidualTest
 from .operating import OperatingPoint, OperatingRange, operating_range
 from .parameters import Parameters, estimate
+from .portmanteau import residual_tests
 from .region import Region, training_region
-from .residual_tests import residual_tests
 from .residuals import Residuals
+from .simulation_bands import Bands, bands
 
 __all__ = [
     "Bands",

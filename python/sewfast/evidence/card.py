@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 if TYPE_CHECKING:
     from ..dataset import FloatArray
-    from .bands import Bands
     from .correlations import ResidualTest
     from .criteria import Criteria
     from .operating import OperatingRange
     from .parameters import Parameters
     from .residuals import Run
     from .scores import HorizonScores
+    from .simulation_bands import Bands
 
 Verdict: TypeAlias = Literal["ok", "warn", "fail", "info"]
 FORMAT = "sewfast.report_card"

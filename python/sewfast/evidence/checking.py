@@ -12,15 +12,15 @@ from ..errors import FitError, SewfastError
 from ..models.base import INIT, Model
 from ..validation import Scores
 from . import questions
-from .bands import LEVEL, Bands, bands_of, stored_uncertainty, uncertainty
 from .card import Line, ReportCard
 from .criteria import Criteria
 from .operating import OperatingRange, operating_range
 from .parameters import Parameters, estimate
-from .region import Region, points, stored_region, training_region
-from .residual_tests import LAGS, residual_tests
+from .portmanteau import LAGS, residual_tests
+from .region import distances, training_region
 from .residuals import Residuals, representative
 from .scores import horizon_scores
+from .simulation_bands import LEVEL, Bands, bands_of, stored_uncertainty, uncertainty
 
 _FORGOTTEN = 0.05
 
@@ -79,13 +79,13 @@ def check(
     lines += [questions.correlation(t) for t in tests]
     found = _parameters(model, data, training, on_training, init)
     lines += found[2]
-    covered = _bands(model, data, free, training, level)
+    far = distances(model, data, training, init)
+    covered = _bands(model, data, free, training, level, far)
     if covered is not None:
         lines.append(questions.coverage(covered))
-    distances = _distances(model, data, training, init)
     outside = math.nan
-    if distances:
-        judged = np.concatenate([d[init:] for d in distances])
+    if far:
+        judged = np.concatenate([d[init:] for d in far])
         outside = float(np.mean(judged > 1.0))
         lines.append(questions.region(outside, float(judged.max())))
     operating = _operating(model)
@@ -93,7 +93,7 @@ def check(
         lines += questions.operation(operating)
     return ReportCard(
         tuple(lines), model.title, _named(data), on_training, scores, tests, covered, operating,
-        found[0], found[1], outside, tuple(distances), free.runs, data.Ts, data.output_name, unit,
+        found[0], found[1], outside, tuple(far), free.runs, data.Ts, data.output_name, unit,
     )  # fmt: skip
 
 
@@ -182,26 +182,17 @@ def _parameters(
 
 
 def _bands(
-    model: Model, data: Dataset, free: Residuals, training: Dataset | None, level: float
+    model: Model,
+    data: Dataset,
+    free: Residuals,
+    training: Dataset | None,
+    level: float,
+    far: list[FloatArray],
 ) -> Bands | None:
     known = stored_uncertainty(model) if training is None else uncertainty(model, training)
     if known is None:
         return None
-    return bands_of(model, data, free, known, level)
-
-
-def _distances(
-    model: Model, data: Dataset, training: Dataset | None, init: int
-) -> list[FloatArray]:
-    known = stored_region(model)
-    if training is not None:
-        known = Region.from_json(training_region(model, training))
-    if known is None:
-        return []
-    where = points(model, data, init)
-    if where[0].shape[1] != len(known.mean):
-        return []
-    return [known.distance(p) / max(known.radius, 1e-300) for p in where]
+    return bands_of(model, data, free, known, level, far)
 
 
 def _operating(model: Model) -> OperatingRange | None:

@@ -87,13 +87,16 @@ class Sums:
     reference : array, shape (n,)
         Variances that the values would have without any correction.
     explained : float
+    room : float
+        Samples less the parameters that were estimated on them.
     """
 
     values: FloatArray
     covariance: FloatArray
     scales: FloatArray
     reference: FloatArray
-    explained: float = 0.0
+    explained: float
+    room: float
 
     @classmethod
     def of(
@@ -127,7 +130,8 @@ class Sums:
         reference = squares * noise.variance
         scales = np.sqrt(np.maximum(squares * power, 1e-300))
         explained = _explained(values, gram, covariance, squares, power)
-        return cls(values, covariance, scales, reference, explained)
+        room = sum(int(np.count_nonzero(e)) for e in target) - directions[0].shape[1]
+        return cls(values, covariance, scales, reference, explained, float(room))
 
 
 def verdict(
@@ -142,6 +146,7 @@ def verdict(
     shape = (len(series), len(lags))
     spread = np.sqrt(np.maximum(np.diag(sums.covariance), 0.0))
     statistic, freedom = quadratic(sums.values, sums.covariance, sums.reference)
+    statistic = _likelihood_ratio(statistic, freedom, sums.room)
     return ResidualTest(
         name,
         title,
@@ -156,6 +161,17 @@ def verdict(
         sums.explained,
         judges,
     )
+
+
+def _likelihood_ratio(statistic: float, freedom: int, room: float) -> float:
+    """Nearer to chi-square than the quadratic form, whose variance holds the effect that is tested.
+
+    -(n - (m + 2)/2) ln(1 - S/n), Bartlett's correction for a regression with m regressors.
+    """
+    share = statistic / max(room, 1.0)
+    if share >= 1.0:
+        return float(np.inf)
+    return float(-max(room - 0.5 * freedom - 1.0, 1.0) * np.log1p(-share))
 
 
 def quadratic(

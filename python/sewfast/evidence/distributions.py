@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from statistics import NormalDist
 
 _TINY = 1e-300
@@ -67,6 +68,7 @@ def _away(value: float) -> float:
     return value if abs(value) > _TINY else _TINY
 
 
+@cache
 def chi2_quantile(tail: float, freedom: int) -> float:
     """The value that a chi-square variable exceeds with probability `tail`.
 

@@ -86,7 +86,7 @@ def save(card: ReportCard, folder: str | os.PathLike[str]) -> list[Path]:
 def residual_figure(card: ReportCard) -> Figure:
     """Every residual test: correlations over lags, their 99 % limits, the verdict."""
     rows = (len(card.tests) + 1) // 2
-    figure, axes = _panels(rows, 2, 2.15 * rows)
+    figure, axes = _panels(rows, 2, 2.3 * rows)
     for ax, t in zip(axes.ravel(), card.tests, strict=False):
         lags = t.lags * card.Ts * 1e3
         for i, name in enumerate(t.series):
@@ -101,7 +101,7 @@ def residual_figure(card: ReportCard) -> Figure:
         ax.axhline(0.0, color="#555555", lw=0.7)
         judged = "" if t.judges else ", informs"
         word = "passed" if t.passed else "detected"
-        ax.set_title(f"{t.title}: {word} (p = {t.p_value:.2g}{judged})", fontsize=8.5)
+        ax.set_title(f"{t.title}\n{word}, p = {t.p_value:.2g}{judged}", fontsize=8.5)
         ax.set_ylabel("correlation")
         reach = 1.15 * max(float(np.abs(t.correlations).max()), float(limit.max()), 1e-12)
         ax.set_ylim(-reach, reach)
@@ -152,7 +152,11 @@ def bode_figure(card: ReportCard) -> Figure:
         here = [k for k, j in enumerate(o.varied) if j == i]
         shown = here[:: max(1, (len(here) - 1) // 4)]
         for n, k in enumerate(shown):
-            look = {"color": _shade(n, len(shown)), "lw": 1.3, "ls": _STYLES[n % len(_STYLES)]}
+            look = {
+                "color": _shade(n, len(shown)),
+                "lw": 4.2 - 0.7 * n,
+                "ls": _STYLES[n % len(_STYLES)],
+            }
             g = o.points[k].response(hertz)[:, i]
             value = labelled(f"{o.points[k].u[i]:.3g}", o.input_units[i])
             label = f"{o.input_names[i]} = {value}".replace("[", "").replace("]", "")
@@ -203,7 +207,7 @@ def pole_figure(card: ReportCard) -> Figure:
         (steady, "steady output", lambda p: p.y, labelled(o.output_name, o.output_unit)),
         (gain, "steady gain", lambda p: float(p.dc_gain[0]),
          f"gain [{o.output_unit or '1'}/{o.input_units[0] or '1'}]"),
-        (slow, "slowest time constant", lambda p: float(p.time_constants.max(initial=np.nan)),
+        (slow, "slowest time constant", lambda p: float(p.time_constants.max(initial=0.0)),
          "time constant [s]"),
     )  # fmt: skip
     for ax, title, value, unit in rows:

@@ -69,6 +69,22 @@ class Noise:
         found: FloatArray = np.fft.irfft(self.spectrum(size), size)[:lags]
         return found
 
+    def whole(self, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Where w(k) follows from values that are all known, shape (N,)."""
+        p = len(self.ar)
+        found: NDArray[np.bool_] = np.convolve(known, np.ones(p + 1))[: len(known)] > p + 0.5
+        return found
+
+    def whitened(self, columns: FloatArray) -> FloatArray:
+        """w(k) of every column (N, m), with zeros before the first sample."""
+        n = len(columns)
+        size = fast_length(n + len(self.ar))
+        gain = np.fft.rfft(np.concatenate([[1.0], -self.ar]), size)
+        found = np.empty_like(columns)
+        for j in range(columns.shape[1]):
+            found[:, j] = np.fft.irfft(gain * np.fft.rfft(columns[:, j], size), size)[:n]
+        return found
+
     def shaped(self, columns: FloatArray) -> FloatArray:
         """Columns V with V'V = Z'RZ, R the covariance matrix of the noise.
 

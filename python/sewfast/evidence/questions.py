@@ -11,7 +11,6 @@ import numpy as np
 
 from ..dataset import FloatArray
 from ..validation import Scores
-from .bands import Bands
 from .card import Line, Verdict
 from .correlations import LEVEL, ResidualTest
 from .criteria import Criteria
@@ -19,6 +18,7 @@ from .operating import OperatingRange
 from .parameters import Parameters
 from .residuals import Residuals
 from .scores import HorizonScores, fit_text
+from .simulation_bands import Bands
 
 SMALL = 0.05
 """Share of the residual's power below which a detected dependence is a warning, not a failure."""

@@ -115,6 +115,25 @@ def stored_region(model: Model) -> Region | None:
         return None
 
 
+def distances(
+    model: Model, data: Dataset, training: Dataset | None = None, init: int = INIT
+) -> list[FloatArray]:
+    """Distance from the nearest known point over the radius, one array (N,) per experiment.
+
+    From the region stored with the model, or that of the training data where they are given; none
+    where there is neither.
+    """
+    known = stored_region(model)
+    if training is not None:
+        known = Region.from_json(training_region(model, training))
+    if known is None:
+        return []
+    where = points(model, data, init)
+    if where[0].shape[1] != len(known.mean):
+        return []
+    return [known.distance(p) / max(known.radius, 1e-300) for p in where]
+
+
 def points(model: Model, data: Dataset, init: int = INIT) -> list[FloatArray]:
     """Where the model is at every sample in free run, one array (N, d0) per experiment.
 

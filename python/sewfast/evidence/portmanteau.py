@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from typing import TypeAlias
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..dataset import FloatArray
 from .correlations import ResidualTest, Sums, independent_directions, verdict
-from .noise import Noise, fast_length
+from .noise import Noise
 from .residuals import Residuals, Run
 
 LAGS = 25
@@ -87,6 +87,8 @@ class _Setting:
     errors: _Columns
     noise: Noise
     directions: _Columns
+    white: _Columns
+    known: list[NDArray[np.bool_]]
     memory: int
 
     @classmethod
@@ -95,7 +97,10 @@ class _Setting:
             [np.column_stack([r.sensitivity, r.counts]) for r in residuals.runs]
         )
         noise = residuals.noise(spent=directions[0].shape[1])
-        return cls(residuals, residuals.errors, noise, directions, memory)
+        errors = residuals.errors
+        known = [noise.whole(r.counts) for r in residuals.runs]
+        white = _innovations(errors, directions, known, noise)
+        return cls(residuals, errors, noise, directions, white, known, memory)
 
     @property
     def runs(self) -> tuple[Run, ...]:
@@ -104,11 +109,6 @@ class _Setting:
     @property
     def names(self) -> tuple[str, ...]:
         return self.residuals.input_names
-
-    @property
-    def constant(self) -> _Columns:
-        """The direction of a mean alone."""
-        return [r.counts[:, None] / np.sqrt(self.residuals.n) for r in self.runs]
 
     def lags(self, series: int = 1) -> _Lags:
         """As many as the record's length and the number of series allow."""
@@ -127,6 +127,24 @@ class _Setting:
         columns = [of(r.u) for r in self.runs]
         mean = np.concatenate(columns).mean(axis=0)
         return [c - mean for c in columns]
+
+
+def _innovations(
+    errors: _Columns, directions: _Columns, known: list[NDArray[np.bool_]], noise: Noise
+) -> _Columns:
+    """Whitened residuals, less what better parameters would take of them.
+
+    A change of the parameters too small to see in the residual can be large beside its innovation.
+    """
+    white = [
+        np.where(k, noise.whitened(e[:, None])[:, 0], 0.0)
+        for e, k in zip(errors, known, strict=True)
+    ]
+    basis = independent_directions(
+        [noise.whitened(d) * k[:, None] for d, k in zip(directions, known, strict=True)]
+    )
+    taken = np.sum([d.T @ w for d, w in zip(basis, white, strict=True)], axis=0)
+    return [w - d @ taken for d, w in zip(basis, white, strict=True)]
 
 
 def _products(u: FloatArray) -> FloatArray:
@@ -152,7 +170,9 @@ def _autocorrelation(s: _Setting) -> ResidualTest:
     white = Noise(np.zeros(0), s.noise.variance, s.noise.variance)
     past = s.spread(lagged, [e[:, None] for e in s.errors], lags)
     # the sensitivities of a free run hold no noise: only a mean is to be taken out
-    sums = Sums.of(past, s.errors, white, s.directions if judges else s.constant)
+    sums = Sums.of(
+        past, s.errors, white, s.directions if judges else _constant([r.counts for r in s.runs])
+    )
     title = "residual with its own past"
     return verdict("autocorrelation", title, lags, ("e",), sums, judges)
 
@@ -176,13 +196,13 @@ def _squared_input(s: _Setting) -> ResidualTest:
 def _squares(s: _Setting) -> ResidualTest:
     names = _product_names(s.names)
     lags = s.lags(len(names))
-    past = s.spread(lagged, _squares_about_mean(s), lags)
-    power = [
-        np.where(r.counts, e**2 - s.noise.variance, 0.0)
-        for e, r in zip(s.errors, s.runs, strict=True)
-    ]
-    noise = s.residuals.noise(power)
-    sums = Sums.of(past, power, noise, s.constant)
+    squares = _squares_about_mean(s)
+    past = [lagged(q, lags, known) for q, known in zip(squares, s.known, strict=True)]
+    bound = 3.0 * np.sqrt(s.noise.innovation)
+    # a single outlier's square would outweigh all the rest
+    power = _about_mean([np.minimum(np.abs(w), bound) ** 2 for w in s.white], s.known)
+    noise = Noise.fit(list(zip(power, s.known, strict=True)))
+    sums = Sums.of(past, power, noise, _constant(s.known))
     title = "squared residual with squares of past inputs"
     return verdict("squares", title, lags, names, sums, True)
 
@@ -200,52 +220,29 @@ def _squares_about_mean(s: _Setting) -> _Columns:
 
 
 def _product(s: _Setting) -> ResidualTest:
+    """For white w, w(k) and w(k-1-a) u(k-1-a) have the covariance sum u(k-1-a)^2 w(k)^2 "
+    "w(k-1-a)^2 alone."""
     lags = s.lags(len(s.names))
     inputs = s.centred(lambda u: u)
-    width, m = len(s.names), len(lags)
-    values, squares = np.zeros((width, m)), np.zeros((width, m))
-    covariance = np.zeros((width * m, width * m))
-    for u, e in zip(inputs, s.errors, strict=True):
-        for i, ahead in enumerate(lags[lags + 1 < len(e)] + 1):
-            pairs = e[:-ahead] * e[ahead:]
-            values[:, i] += u[:-ahead].T @ pairs
-            squares[:, i] += np.square(u[:-ahead]).T @ np.square(pairs)
-        covariance += _product_covariance(u, s.noise, lags)
-    power = np.sqrt(len(s.runs) * s.residuals.n * np.maximum(squares, 1e-300))
-    sums = Sums(values.ravel(), covariance, power.ravel(), np.diag(covariance).copy())
+    past = [
+        lagged(w[:, None] * u, lags + 1, known)
+        for w, u, known in zip(s.white, inputs, s.known, strict=True)
+    ]
+    power = sum(float(w @ w) for w in s.white)
+    variance = power / max(sum(int(k.sum()) for k in s.known), 1)
+    white = Noise(np.zeros(0), variance, variance)
+    sums = Sums.of(past, s.white, white, _constant(s.known))
     title = "residual with past residual times input"
     return verdict("product", title, lags, s.names, sums, True)
 
 
-def _product_covariance(u: FloatArray, noise: Noise, lags: _Lags) -> FloatArray:
-    """Covariance of sum_k u(k) e(k) e(k+1+a) over lags a, for normal e (Isserlis).
-
-    sum_h G_u(h) [R(h) R(h + b - a) + R(h + 1 + b) R(h - 1 - a)], G_u(h) = sum_k u(k) u(k+h).
-    """
-    n, width = u.shape
-    top = int(lags[-1]) + 1
-    reach = min(n - 1, 2000)
-    r = noise.autocovariance(reach + 2 * top + 2, n)
-    h = np.arange(-reach, reach + 1)
-    first = r[np.abs(h)]
-    found = np.empty((width, len(lags), width, len(lags)))
-    for i in range(width):
-        for j in range(width):
-            g = _cross(u[:, i], u[:, j], reach)
-            for a, lag in enumerate(lags):
-                shift = lags[:, None] - lag
-                same = first * r[np.abs(h + shift)]
-                turned = r[np.abs(h + 1 + lags[:, None])] * r[np.abs(h - 1 - lag)]
-                found[i, a, j] = (same + turned) @ g
-    size = width * len(lags)
-    matrix = found.reshape(size, size)
-    symmetric: FloatArray = 0.5 * (matrix + matrix.T)
-    return symmetric
+def _about_mean(series: _Columns, known: Sequence[NDArray[np.bool_]]) -> _Columns:
+    n = max(sum(int(k.sum()) for k in known), 1)
+    mean = sum(float(x[k].sum()) for x, k in zip(series, known, strict=True)) / n
+    return [np.where(k, x - mean, 0.0) for x, k in zip(series, known, strict=True)]
 
 
-def _cross(x: FloatArray, z: FloatArray, reach: int) -> FloatArray:
-    """sum_k x(k) z(k + h) for h = -reach .. reach."""
-    size = fast_length(len(x) + reach + 1)
-    product = np.conj(np.fft.rfft(x, size)) * np.fft.rfft(z, size)
-    circular = np.fft.irfft(product, size)
-    return np.concatenate([circular[-reach:] if reach else circular[:0], circular[: reach + 1]])
+def _constant(known: Sequence[NDArray[np.bool_]]) -> _Columns:
+    """The direction of a mean."""
+    n = max(sum(int(k.sum()) for k in known), 1)
+    return [k[:, None] / np.sqrt(n) for k in known]

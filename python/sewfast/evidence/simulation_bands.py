@@ -2,11 +2,11 @@
 
 The half width at sample k is a quantile of e/s times s(k), s(k)^2 = sigma^2 + |Psi(k) F|^2: the
 spread of the residual and what the parameters' uncertainty adds to it (delta method, P = FF' the
-sandwich covariance, so the residual's colour counts). Ensembles put the spread of their members in
+sandwich covariance, so the residual's colour counts). An ensemble puts the spread of its members in
 place of the second part. The quantiles are those of residuals that the model was not fitted to:
-every tenth of the training data is left out in turn, to first order (Cook and Weisberg 1982), so
-that neither normality nor a perfect model is assumed (normalised jackknife+ and conformal bands:
-Barber et al. 2021, Lei et al. 2018).
+every fifth of the training data is left out in turn, to first order (Cook and Weisberg 1982), so
+that neither normality nor a perfect model is assumed (CV+ and normalised conformal bands: Barber et
+al. 2021, Lei et al. 2018). Outside the training region s grows in proportion to the distance.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ from ..errors import SettingError
 from ..models.base import INIT, Model
 from .distributions import normal_quantile
 from .parameters import Information, estimate
+from .region import distances
 from .residuals import Residuals
 
 LEVEL = 0.95
-BLOCKS = 10
+BLOCKS = 5
 _TAILS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.35, 0.5)
 _KEPT_VARIANCE = 0.999
 _LARGEST_GROWTH = 3.0
@@ -167,16 +168,23 @@ def bands(
             "again, or give its training data (training=...)"
         )
     residuals = Residuals.of(model, data, init, "free run")
-    return bands_of(model, data, residuals, known, level)
+    return bands_of(model, data, residuals, known, level, distances(model, data, training, init))
 
 
 def bands_of(
-    model: Model, data: Dataset, residuals: Residuals, known: Uncertainty, level: float
+    model: Model,
+    data: Dataset,
+    residuals: Residuals,
+    known: Uncertainty,
+    level: float,
+    distances: Sequence[FloatArray] = (),
 ) -> Bands:
-    """Bands about free runs that have been computed."""
+    """Bands about free runs that have been computed, with their distances from the region."""
     tail = 0.5 * (1.0 - level)
     low, high = known.quantile(tail), known.quantile(1.0 - tail)
     spreads = _spreads(model, data, residuals, known)
+    if distances:
+        spreads = [s * np.maximum(1.0, d) for s, d in zip(spreads, distances, strict=True)]
     lower = tuple(r.yhat + low * s for r, s in zip(residuals.runs, spreads, strict=True))
     upper = tuple(r.yhat + high * s for r, s in zip(residuals.runs, spreads, strict=True))
     hits = [
@@ -198,12 +206,8 @@ def bands_of(
 def uncertainty(model: Model, data: Dataset, init: int = INIT) -> Uncertainty:
     """From the data that a model was identified from."""
     residuals = Residuals.of(model, data, init, "free run")
-    if getattr(model, "members", ()):
-        factor = np.zeros((0, 0))
-        errors = [r.error for r in residuals.runs]
-    else:
-        factor = _factor(model, residuals)
-        errors = _left_out(model, residuals)
+    factor = np.zeros((0, 0)) if getattr(model, "members", ()) else _factor(model, residuals)
+    errors = _left_out(model, residuals)
     power = sum(
         float(np.sum(np.square(e[r.counts]))) for e, r in zip(errors, residuals.runs, strict=True)
     )
