@@ -169,23 +169,34 @@ def test_the_summary_shows_the_network_beside_both_linear_models(page: str) -> N
     assert all(value in summary for value in (">6.00", ">18.0", ">20.0"))
 
 
-def test_an_undefined_number_is_no_success(folder: Path) -> None:
+@pytest.fixture(scope="module")
+def changed(original: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Another folder: a number that is not defined, one that is no other's, text that is markup."""
+    folder = Path(shutil.copytree(original, tmp_path_factory.mktemp("changed") / "demo"))
     document = json.loads((folder / "results.json").read_text())
     document["control"]["trapezoid"]["machine"]["rise_time_ms"] = None
+    document["control"]["chirp_hi_lo"]["model_vs_machine_rmse_rpm"] = 7.77
+    document["machine"] = "<script>alert(1)</script>"
     (folder / "results.json").write_text(json.dumps(document))
-    verdicts = [g.verdict for g in goals(load(folder))]
+    report(folder)
+    return folder
+
+
+def test_an_undefined_number_is_no_success(changed: Path) -> None:
+    verdicts = [g.verdict for g in goals(load(changed))]
     assert verdicts.count("undefined") == 1
-    assert "✗" not in report(folder).read_text(encoding="utf-8").split("<body>")[1]
+    assert "✗" not in (changed / "report.html").read_text(encoding="utf-8").split("<body>")[1]
 
 
-def test_numbers_of_the_results_stand_on_the_page(folder: Path) -> None:
-    change(folder, "control.chirp_hi_lo.model_vs_machine_rmse_rpm", 7.77)
-    assert "7.77\N{NO-BREAK SPACE}RPM" in report(folder).read_text(encoding="utf-8")
+def test_numbers_of_the_results_stand_on_the_page(changed: Path) -> None:
+    page = (changed / "report.html").read_text(encoding="utf-8")
+    assert "7.77\N{NO-BREAK SPACE}RPM" in page
 
 
-def test_text_from_the_results_cannot_become_markup(folder: Path) -> None:
-    change(folder, "machine", "<script>alert(1)</script>")
-    assert "<script" not in report(folder).read_text(encoding="utf-8")
+def test_text_from_the_results_cannot_become_markup(changed: Path) -> None:
+    page = (changed / "report.html").read_text(encoding="utf-8")
+    assert "alert(1)" in page
+    assert "<script" not in page
 
 
 def _remove(path: str) -> Callable[[Path], object]:
