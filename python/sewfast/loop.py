@@ -134,6 +134,7 @@ def run(
     name: str | None = None,
     file: str | os.PathLike[str] | None = None,
     live: str | Kind = "none",
+    overwrite: bool = False,
 ) -> ClosedLoopRun:
     """Run a controller on a model, on a virtual machine or on a drive, from rest.
 
@@ -157,6 +158,8 @@ def run(
         Of a drive: MCAP recording to write while it runs.
     live : str
         Of a drive: see `sewfast.live.open_view`.
+    overwrite : bool
+        Whether `file` may replace a recording of a drive, which cannot be had again.
 
     Returns
     -------
@@ -181,7 +184,7 @@ def run(
     r = reference_samples(reference, controller, seed)
     title = name or (reference if isinstance(reference, str) else "reference")
     if not isinstance(on, (Model, VirtualMachine)):
-        return _run_on(_require_drive(on), controller, r, title, file, live)
+        return _run_on(_require_drive(on), controller, r, title, file, live, overwrite)
     check_fits(controller, on)
     record = _core.closed_loop(
         on.core, controller.core(), r, counts_per_unit=controller.counts_per_unit
@@ -214,6 +217,7 @@ def _run_on(
     name: str,
     file: str | os.PathLike[str] | None,
     live: str | Kind,
+    overwrite: bool,
 ) -> ClosedLoopRun:
     from .link.plan import Plan
     from .link.play import Played, Stopped, play
@@ -223,9 +227,9 @@ def _run_on(
 
     plan = Plan("controller", r, controller)
     try:
-        return made(play(drive, plan, name=name, file=file, live=live))
+        return made(play(drive, plan, name=name, file=file, live=live, overwrite=overwrite))
     except Stopped as stopped:
-        raise stopped.as_error(made, file) from stopped.cause
+        raise stopped.as_error(made) from stopped.cause
 
 
 def _of_drive(

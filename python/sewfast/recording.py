@@ -15,6 +15,7 @@ from .dataset import Dataset
 from .errors import DataError
 from .machine import VirtualMachine
 from .recordfile import Header, save_columns
+from .recordfile.keeping import require_replaceable
 from .speed import Method, speed_from_counts, speed_or_nan
 from .writers import write_table
 
@@ -103,14 +104,22 @@ class Recording:
             settings,
         )
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write the columns as CSV, `.npz`, `.mat`, Parquet or MCAP, whole or not at all.
+
+        Parameters
+        ----------
+        path : path
+            A file that exists is replaced in one step, save a recording of a drive.
+        overwrite : bool
+            Whether that may be replaced as well.
 
         Raises
         ------
         DataError, SettingError
             As for `sewfast.writers.write_table`.
         """
+        require_replaceable(path, overwrite=overwrite)
         if Path(path).suffix.lower() == ".mcap":
             columns = self.columns()
             del columns["t"]
@@ -131,6 +140,7 @@ def record(
     file: str | os.PathLike[str] | None = None,
     live: str | Kind = "none",
     settings: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
 ) -> Recording:
     """Excite a machine from rest and record it.
 
@@ -146,11 +156,15 @@ def record(
     method : "kalman", "savgol" or "difference"
         How the speed is estimated from the counts.
     file : path, optional
-        MCAP recording to write: of a drive while it runs, so that nothing is lost.
+        Of a drive an MCAP recording, written while it runs, so that nothing is lost; of a virtual
+        machine any format.
     live : str
         Of a drive: see `sewfast.live.open_view`.
     settings : mapping, optional
         What else the file says of the recording.
+    overwrite : bool
+        Whether `file` may replace a recording of a drive, which cannot be had again; one of a
+        virtual machine is replaced anyway.
 
     Returns
     -------
@@ -162,6 +176,8 @@ def record(
     ------
     DataError
         Where `u` is not one-dimensional and finite, or too short for a speed.
+    SettingError
+        Where `file` has an unknown ending or is a recording that is kept, before anything moves.
     LinkError
         Where the port or the drive failed or tripped; the motor is stopped, `recording` holds what
         came.
@@ -174,7 +190,9 @@ def record(
             f"expected an excitation of shape (N,), received {command.shape}; pass one column"
         )
     if not isinstance(machine, VirtualMachine):
-        return _record_on(machine, command, name, method, file, live, settings)
+        return _record_on(machine, command, name, method, file, live, settings, overwrite)
+    if file is not None:
+        require_replaceable(file, overwrite=overwrite)
     machine.reset()
     run = machine.run(command)
     y = speed_from_counts(run.counts, machine.Ts, machine.counts_per_rev, method=method)
@@ -182,7 +200,7 @@ def record(
         command, run.counts, y, run.speed_rpm, machine.Ts, machine.counts_per_rev, name
     )
     if file is not None:
-        made.save(file)
+        made.save(file, overwrite=overwrite)
     return made
 
 
@@ -194,6 +212,7 @@ def _record_on(
     file: str | os.PathLike[str] | None,
     live: str | Kind,
     settings: Mapping[str, Any] | None,
+    overwrite: bool,
 ) -> Recording:
     from .link.plan import Plan
     from .link.play import Played, Stopped, play
@@ -203,9 +222,14 @@ def _record_on(
 
     try:
         plan = Plan("commands", command)
-        return recording(play(drive, plan, name=name, file=file, live=live, settings=settings))
+        return recording(
+            play(
+                drive, plan, name=name, file=file, live=live, settings=settings,
+                overwrite=overwrite,
+            )
+        )  # fmt: skip
     except Stopped as stopped:
-        raise stopped.as_error(recording, file) from stopped.cause
+        raise stopped.as_error(recording) from stopped.cause
 
 
 def _of_drive(

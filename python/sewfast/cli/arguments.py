@@ -106,6 +106,14 @@ def add_output(
     parser.add_argument("-o", dest="out", metavar=metavar, type=Path, required=required, help=help)
 
 
+def add_overwrite(parser: argparse._ActionsContainer) -> None:
+    """Whether what cannot be had again may be written over."""
+    parser.add_argument(
+        "--overwrite", action="store_true",
+        help="replace even what a drive did, which cannot be had again",
+    )  # fmt: skip
+
+
 def require_place(path: Path | None, suffixes: tuple[str, ...]) -> None:
     """Refuse an output file that could not be written, before the work is done.
 

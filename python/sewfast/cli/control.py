@@ -8,8 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import DataError, Interrupted, SettingError
-from .arguments import RECORDINGS, TABLES, Commands, add_command, add_output, require_place
-from .drive import add_drive, is_port, opened, recording_place
+from .arguments import (
+    RECORDINGS,
+    TABLES,
+    Commands,
+    add_command,
+    add_output,
+    add_overwrite,
+    require_place,
+)
+from .drive import add_drive, is_port, opened, recording_place, say_interrupted
 from .host_loop import add_host_loop, at_loops_period, run_host_loop
 from .output import print_json, print_rows, write_columns
 from .progress import Progress
@@ -97,6 +105,7 @@ def add(commands: Commands) -> None:
         parser, "OUT",
         "CSV, .npz, .mat or Parquet, of a drive .mcap too; default: CSV to standard output",
     )  # fmt: skip
+    add_overwrite(parser)
     add_drive(parser)
     add_host_loop(parser)
 
@@ -182,14 +191,16 @@ def run_command(args: argparse.Namespace) -> int | None:
         reference = _wanted(args, controller)
         _show_run(args, run(controller, plant, reference, name=name), None)
         return None
-    place = recording_place(args.out)
+    place = recording_place(args.out, overwrite=args.overwrite)
     reference = _wanted(args, controller)
     try:
         with opened(args) as drive:
-            found = run(controller, drive, reference, name=name, file=place, live=args.live)
+            found = run(
+                controller, drive, reference, name=name, file=place, live=args.live,
+                overwrite=args.overwrite,
+            )  # fmt: skip
     except Interrupted as e:
-        print(f"interrupted; {len(e.best.t)} samples are in {place}", file=sys.stderr)
-        return 130
+        return say_interrupted(len(e.best.t), place)
     _show_run(args, found, place)
     return None
 

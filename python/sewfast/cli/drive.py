@@ -6,6 +6,7 @@ import argparse
 import re
 import signal
 import stat
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -157,19 +158,34 @@ def _limits(text: str) -> dict[str, float]:
         raise SettingError(f"--limits: expected numbers, got {text!r}") from None
 
 
-def recording_place(out: Path | None) -> Path:
+def recording_place(out: Path | None, *, overwrite: bool) -> Path:
     """Where the recording of a drive goes: the output itself, or `.mcap` beside it.
 
     Raises
     ------
     SettingError
-        Without an output: what a drive did cannot be had again.
+        Without an output, what a drive did cannot be had again; nor can what another one has done,
+        which is kept.
     """
+    from ..recordfile.keeping import require_free, require_replaceable
+
     if out is None:
         raise SettingError(
             "expected -o FILE for what is recorded on a drive, got none; as in -o run.mcap"
         )
-    return out.with_suffix(".mcap")
+    place = out.with_suffix(".mcap")
+    require_replaceable(place, overwrite=overwrite)
+    if not place.exists():
+        # a table beside its recording was made from it; this one is all there is
+        require_free([out], overwrite=overwrite)
+    return place
+
+
+def say_interrupted(count: int, place: Path) -> int:
+    """What a run has left that Ctrl-C ended; the exit code."""
+    left = f"{count} samples are in {place}" if count else "nothing had been recorded"
+    print(f"interrupted; {left}", file=sys.stderr)
+    return 130
 
 
 def stop_command(args: argparse.Namespace) -> None:

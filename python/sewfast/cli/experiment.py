@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from .arguments import Commands, add_command
+from .arguments import Commands, add_command, add_overwrite
 from .output import print_json, print_rows
 from .progress import Progress
 
@@ -37,6 +37,7 @@ def add(commands: Commands) -> None:
         "--seed", type=int, default=0, metavar="N",
         help="seed of the random signals and of every search (0)",
     )  # fmt: skip
+    add_overwrite(parser)
     parser = add_command(
         commands, "report", report_command,
         summary="the page of an experiment", text=REPORT,
@@ -50,8 +51,9 @@ def demo_command(args: argparse.Namespace) -> None:
 
     with Progress("demo") as progress:
         results = run_demo(
-            args.out, args.seed, progress=lambda done, total, stage: progress.say(stage)
-        )
+            args.out, args.seed, overwrite=args.overwrite,
+            progress=lambda done, total, stage: progress.say(stage),
+        )  # fmt: skip
     page = args.out / "report.html"
     if args.json:
         print_json({"report": str(page), "results": results})

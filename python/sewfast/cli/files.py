@@ -5,7 +5,14 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from .arguments import RECORDINGS, Commands, add_command, add_output, require_place
+from .arguments import (
+    RECORDINGS,
+    Commands,
+    add_command,
+    add_output,
+    add_overwrite,
+    require_place,
+)
 from .output import print_json
 
 if TYPE_CHECKING:
@@ -37,6 +44,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument("recording", metavar="RECORDING.mcap", help="recording")
     add_output(parser, "OUT", "CSV, .npz, .mat, Parquet or .mcap", required=True)
+    add_overwrite(parser)
 
 
 def show_command(args: argparse.Namespace) -> None:
@@ -53,7 +61,7 @@ def export_command(args: argparse.Namespace) -> None:
     from ..recordfile import export
 
     require_place(args.out, RECORDINGS)
-    found = export(args.recording, args.out)
+    found = export(args.recording, args.out, overwrite=args.overwrite)
     if args.json:
         print_json({**_content(found), "file": str(args.out)})
     else:

@@ -54,6 +54,7 @@ def at_loops_period(args: argparse.Namespace, controller: Controller) -> Control
         For what cannot be, before anything moves.
     """
     from ..link import at_period
+    from ..recordfile.keeping import require_free
 
     if not is_port(args.on):
         raise SettingError(
@@ -63,6 +64,7 @@ def at_loops_period(args: argparse.Namespace, controller: Controller) -> Control
     require_place(args.out, TABLES)
     require_place(args.samples, RECORDINGS)
     require_place(args.plot, PICTURES)
+    require_free([args.out, args.samples, args.plot], overwrite=args.overwrite)
     if not args.host_loop:
         return controller
     if not 0.0 < args.host_loop <= 10_000.0:
@@ -114,7 +116,7 @@ def _show(args: argparse.Namespace, found: HostLoopRun) -> None:
     }  # fmt: skip
     lines = str(found).splitlines()
     if args.samples is not None:
-        found.save_samples(args.samples)
+        found.save_samples(args.samples, overwrite=args.overwrite)
         lines.append(f"samples written to {args.samples}")
     if args.plot is not None:
         found.jitter.plot(args.plot)

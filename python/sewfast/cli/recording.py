@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import Interrupted, SettingError
-from .arguments import RECORDINGS, Commands, add_command, add_output, require_place
-from .drive import add_drive, is_port, opened, recording_place
+from .arguments import (
+    RECORDINGS,
+    Commands,
+    add_command,
+    add_output,
+    add_overwrite,
+    require_place,
+)
+from .drive import add_drive, is_port, opened, recording_place, say_interrupted
 from .output import print_json, print_rows, write_columns
 
 if TYPE_CHECKING:
@@ -66,6 +72,7 @@ def add(commands: Commands) -> None:
         "--seed", type=int, default=0, metavar="N", help="seed of a random signal (0)"
     )
     add_output(parser, "OUT", "CSV, .npz, .mat, Parquet or .mcap; default: CSV to standard output")
+    add_overwrite(parser)
     add_drive(parser)
     add_command(
         commands, "signals", signals_command,
@@ -79,19 +86,19 @@ def record_command(args: argparse.Namespace) -> int | None:
     if not is_port(args.on):
         _record_virtual(args, u, Ts)
         return None
-    place = recording_place(args.out)
+    place = recording_place(args.out, overwrite=args.overwrite)
     try:
         with opened(args) as drive:
             from ..recording import record
 
             _require_period(args, Ts, drive.identity.Ts)
             made = record(
-                drive, u, name=_name(args), file=place, live=args.live, settings=_settings(args)
-            )
+                drive, u, name=_name(args), file=place, live=args.live,
+                settings=_settings(args), overwrite=args.overwrite,
+            )  # fmt: skip
             name = drive.identity.name
     except Interrupted as e:
-        print(f"interrupted; {len(e.best)} samples are in {place}", file=sys.stderr)
-        return 130
+        return say_interrupted(len(e.best), place)
     _write(args, made, name, place)
     return None
 
@@ -143,6 +150,7 @@ def _require_period(args: argparse.Namespace, given: float, machine: float) -> N
 
 def _record_virtual(args: argparse.Namespace, u: FloatArray, Ts: float) -> None:
     from ..machine import VirtualMachine
+    from ..recordfile.keeping import require_replaceable
     from ..recording import record
 
     if not args.on.startswith("virtual"):
@@ -150,6 +158,8 @@ def _record_virtual(args: argparse.Namespace, u: FloatArray, Ts: float) -> None:
             f"--on {args.on}: expected virtual[:SEED], a serial port or socket://HOST:PORT, got "
             "neither; `sewfast ports` lists the serial ports"
         )
+    if args.out is not None:
+        require_replaceable(args.out, overwrite=args.overwrite)
     machine = VirtualMachine.from_name(args.on)
     _require_period(args, Ts, machine.Ts)
     _write(args, record(machine, u, name=_name(args)), machine.name, None)

@@ -65,6 +65,7 @@ def run_demo(
     seed: int = 0,
     *,
     machine: str = "virtual",
+    overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Carry out the paper's experiment: excite, record, identify, validate, tune, run, report.
@@ -80,6 +81,8 @@ def run_demo(
         Of the random signals, of the networks' starts and of the search for gains.
     machine : str
         `virtual`, or `virtual:SEED` for another machine of the type.
+    overwrite : bool
+        Whether files of these names may be replaced that no experiment has left.
     progress : callable(done, total, stage), optional
         Called as each stage begins, and at the end.
 
@@ -91,7 +94,8 @@ def run_demo(
     Raises
     ------
     SettingError
-        For an unknown machine, a seed that is none, or where the report's packages are missing.
+        For an unknown machine, a seed that is none, a folder with files of somebody else's, or
+        where the report's packages are missing.
     DataError
         Where the folder cannot be made.
     Interrupted
@@ -101,6 +105,7 @@ def run_demo(
     plant = VirtualMachine.from_name(machine)
     excitation("random", seed)  # refuses a seed that is none before the folder is made
     target = Path(out)
+    folder.require_own(target, overwrite=overwrite)
     folder.prepare(target)
     try:
         with rig(plant) as bench:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 from .. import jsonfile
 from ..control import Controller
-from ..errors import DataError
+from ..errors import DataError, SettingError
 from ..loop import ClosedLoopRun
 from ..models import Model
 from ..recording import Recording
@@ -17,6 +18,34 @@ from ..report.artefacts import FORMAT, VERSION, prediction_file, recording_file,
 from ..writers import write_table
 
 _FOLDERS = ("recordings", "models", "controllers", "predictions", "runs")
+
+
+def require_own(folder: Path, *, overwrite: bool) -> None:
+    """Refuse a folder whose files would be lost and are of no experiment, which can be repeated.
+
+    Raises
+    ------
+    SettingError
+    """
+    if overwrite or _is_result(folder):
+        return
+    for name in (*_FOLDERS, "results.json", "report.html"):
+        place = folder / name
+        if place.is_file() or (place.is_dir() and any(place.iterdir())):
+            raise SettingError(
+                f"{place}: expected a folder of an earlier experiment or one without such files, "
+                "there are some and no results.json; choose another folder, or overwrite them "
+                "(--overwrite)"
+            )
+
+
+def _is_result(folder: Path) -> bool:
+    try:
+        found = json.loads((folder / "results.json").read_bytes())
+    except (OSError, ValueError):
+        return False
+    # of any version: what an older one has left is replaced as well
+    return isinstance(found, dict) and found.get("format") == FORMAT
 
 
 def prepare(folder: Path) -> None:

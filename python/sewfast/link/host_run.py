@@ -17,6 +17,7 @@ from ..control import Controller
 from ..errors import DataError
 from ..loop import SMOOTHING
 from ..recordfile import Header, RecordWriter
+from ..recordfile.keeping import require_replaceable
 from ..recordfile.sink import replacing
 from ..writers import write_table
 from .jitter import Jitter
@@ -140,16 +141,24 @@ class HostLoopRun:
             return dict.fromkeys(names)
         return {name: None if math.isnan(value) else value for name, value in found.items()}
 
-    def save_samples(self, path: str | os.PathLike[str]) -> None:
+    def save_samples(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write every sample of the device as CSV, `.npz`, `.mat`, Parquet or MCAP.
 
         Missing samples are NaN; in MCAP they are gaps. The file appears whole or not at all.
+
+        Parameters
+        ----------
+        path : path
+            A file that exists is replaced in one step, save a recording of a drive.
+        overwrite : bool
+            Whether that may be replaced as well.
 
         Raises
         ------
         DataError, SettingError
             As for `sewfast.writers.write_table`.
         """
+        require_replaceable(path, overwrite=overwrite)
         if Path(path).suffix.lower() == ".mcap":
             self._save_mcap(Path(path))
             return
@@ -177,7 +186,8 @@ class HostLoopRun:
                 if len(part):
                     columns = {name: self.samples[name][part] for name in names}
                     writer.samples(int(numbers[part[0]]), columns)
-            writer.close("complete" if self.outcome == "completed" else self.outcome)
+            ended = "complete" if self.outcome == "completed" else self.outcome
+            writer.close(ended, taken=self.taken)
 
     def _numbers(self) -> NDArray[np.intp]:
         """The samples' numbers in the run."""

@@ -14,6 +14,7 @@ from ..dataset import FloatArray
 from ..errors import Interrupted, LinkError, SewfastError
 from ..live import Feed, Kind, open_view
 from ..recordfile import Header, RecordWriter, read_recording
+from ..recordfile.keeping import require_ending, require_replaceable
 from .drive import Drive
 from .plan import Outcome, Plan
 from .recorder import Recorder
@@ -30,10 +31,13 @@ class Played:
         planned number after a whole run.
     outcome : Outcome
         How it ended.
+    file : Path or None
+        The recording that was written, where the run had begun.
     """
 
     columns: dict[str, FloatArray]
     outcome: Outcome
+    file: Path | None
 
 
 class Stopped(Exception):
@@ -44,13 +48,12 @@ class Stopped(Exception):
         self.played = played
         self.cause = cause
 
-    def as_error(
-        self, made: Callable[[Played], Any], file: str | os.PathLike[str] | None
-    ) -> BaseException:
+    def as_error(self, made: Callable[[Played], Any]) -> BaseException:
         """`Interrupted` after Ctrl-C, else the cause; both carry what `made` makes of the run."""
         result = made(self.played)
         if isinstance(self.cause, KeyboardInterrupt):
             return Interrupted(result)
+        file = self.played.file
         kept = f"; what came is in {file}" if file is not None else ""
         error = LinkError(f"{self.cause}{kept}") if kept else self.cause
         if isinstance(error, LinkError):
@@ -65,7 +68,7 @@ def play(
     name: str,
     file: str | os.PathLike[str] | None = None,
     live: str | Kind = "none",
-    overwrite: bool = True,
+    overwrite: bool = False,
     settings: Mapping[str, Any] | None = None,
 ) -> Played:
     """Run a plan and keep its samples.
@@ -77,11 +80,13 @@ def play(
     name : str
         Of the excitation or reference.
     file : path, optional
-        An MCAP recording, written as the samples come; without it they are in memory only.
+        An MCAP recording, written as the samples come; without it they are in memory only. It is
+        made when the device has accepted the start: a run that is refused leaves no file, and one
+        that is there as it was.
     live : str or Kind
         See `sewfast.live.open_view`.
     overwrite : bool
-        Whether an existing file may be replaced.
+        Whether a recording of a drive may be replaced; one of a virtual machine may.
     settings : mapping, optional
         What else the file says of the run.
 
@@ -93,11 +98,13 @@ def play(
     SettingError, DataError
         Before anything moves.
     """
+    if file is not None:
+        require_replaceable(require_ending(file), overwrite=overwrite)
     columns = drive.columns(plan)
     n = len(plan.values)
     feed = Feed(columns, drive.identity.Ts, n, name, counts_per_rev=_counts_per_rev(drive))
     with open_view(live, feed):
-        writer = _writer(file, drive, plan, name, columns, overwrite, settings or {})
+        writer = _writer(file, drive, plan, name, columns, settings or {})
         recorder = Recorder(columns, n, writer=writer, feed=feed)
         played = _streamed(drive, plan, recorder, writer)
     if played.outcome.reason != "finished":
@@ -115,7 +122,6 @@ def _writer(
     plan: Plan,
     name: str,
     columns: Mapping[str, str],
-    overwrite: bool,
     settings: Mapping[str, Any],
 ) -> RecordWriter | None:
     if file is None:
@@ -137,7 +143,9 @@ def _writer(
             **settings,
         },
     )
-    return RecordWriter(Path(file), header, overwrite=overwrite)
+    place = Path(file)
+    # that it may be replaced where it exists has been asked
+    return RecordWriter(place, header, overwrite=place.exists(), lazy=True)
 
 
 def _finite(limits: tuple[float, ...]) -> dict[str, float | None]:
@@ -148,22 +156,24 @@ def _finite(limits: tuple[float, ...]) -> dict[str, float | None]:
 
 def _streamed(drive: Drive, plan: Plan, recorder: Recorder, writer: RecordWriter | None) -> Played:
     """Stream, close the file whatever happens, and give what came."""
+    # of this run, not of one before it
+    drive.outcome = None
     try:
         outcome = drive.stream(plan, recorder)
     except BaseException as error:
         ended = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-        _closed(recorder, ended, error)
+        _closed(recorder, ended, drive.outcome, error)
         if not isinstance(error, (KeyboardInterrupt, SewfastError)) or drive.outcome is None:
             raise
         raise Stopped(_played(recorder, writer, drive.outcome), error) from error
-    recorder.close(_word(outcome))
+    recorder.close(_word(outcome), outcome.taken)
     return _played(recorder, writer, outcome)
 
 
-def _closed(recorder: Recorder, ended: str, error: BaseException) -> None:
+def _closed(recorder: Recorder, ended: str, outcome: Outcome | None, error: BaseException) -> None:
     """Close the file; the error that is on its way says more than one of closing."""
     try:
-        recorder.close(ended)
+        recorder.close(ended, None if outcome is None else outcome.taken)
     except SewfastError as second:
         if second is not error:
             error.__context__ = second
@@ -177,9 +187,10 @@ def _word(outcome: Outcome) -> str:
 
 
 def _played(recorder: Recorder, writer: RecordWriter | None, outcome: Outcome) -> Played:
-    columns = dict(read_recording(writer.path).columns) if writer else recorder.columns()
+    file = writer.path if writer is not None and writer.is_made else None
+    columns = recorder.columns() if file is None else dict(read_recording(file).columns)
     n = outcome.taken if outcome.taken is not None else len(next(iter(columns.values())))
-    return Played({name: _padded(values, n) for name, values in columns.items()}, outcome)
+    return Played({name: _padded(values, n) for name, values in columns.items()}, outcome, file)
 
 
 def _padded(values: FloatArray, n: int) -> FloatArray:

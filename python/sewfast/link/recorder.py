@@ -14,6 +14,9 @@ from ..recordfile import RecordWriter
 
 FloatArray = NDArray[np.float64]
 
+_OF_A_RUN = ("started", "gap")
+"""Events that say that the device has accepted a start."""
+
 
 class Recorder:
     """The sink of `Drive.stream`.
@@ -25,7 +28,8 @@ class Recorder:
     n : int
         Samples of the run.
     writer : RecordWriter, optional
-        The file. The samples are then not kept in memory.
+        The file, a lazy one: it gets nothing before the run has begun. The samples are then not
+        kept in memory.
     feed : Feed, optional
         Of a live view.
     """
@@ -38,10 +42,13 @@ class Recorder:
         writer: RecordWriter | None = None,
         feed: Feed | None = None,
     ) -> None:
-        self._kept = None if writer else {name: np.full(n, np.nan) for name in columns}
+        size = 0 if writer else n
+        self._kept = {name: np.full(size, np.nan) for name in columns}
         self._file = writer
         self._feed = feed
         self._end = 0
+        self._begun = False
+        self._early: list[tuple[str, int | None, dict[str, Any]]] = []
 
     def samples(self, first: int, columns: Mapping[str, FloatArray]) -> None:
         """A batch that came; called by the thread that owns the link.
@@ -51,9 +58,10 @@ class Recorder:
         DataError
             Where the file takes no more.
         """
+        self._begin()
         if self._file is not None:
             self._file.samples(first, columns)
-        if self._kept is not None:
+        else:
             stop = first + len(next(iter(columns.values())))
             for name, kept in self._kept.items():
                 kept[first:stop] = columns[name]
@@ -63,18 +71,39 @@ class Recorder:
 
     def event(self, kind: str, index: int | None = None, **detail: Any) -> None:
         """Something that happened on the way; see `samples`."""
-        if self._file is not None:
-            self._file.event(kind, index, **{k: _finite(v) for k, v in detail.items()})
+        if kind in _OF_A_RUN:
+            self._begin()
+        if self._begun:
+            self._write_down(kind, index, detail)
+        else:
+            self._early.append((kind, index, detail))
         if self._feed is not None:
             self._feed.say(describe(kind, index, detail))
 
+    def _begin(self) -> None:
+        """The run is there: what happened on the way to it belongs to its recording."""
+        if not self._begun:
+            self._begun = True
+            for event in self._early:
+                self._write_down(*event)
+
+    def _write_down(self, kind: str, index: int | None, detail: Mapping[str, Any]) -> None:
+        if self._file is not None:
+            self._file.event(kind, index, **{k: _finite(v) for k, v in detail.items()})
+
     def columns(self) -> dict[str, FloatArray]:
         """What came, sample 0 to the last one, NaN in gaps; where there is no file."""
-        kept = self._kept or {}
-        return {name: values[: self._end] for name, values in kept.items()}
+        return {name: values[: self._end] for name, values in self._kept.items()}
 
-    def close(self, outcome: str) -> None:
+    def close(self, outcome: str, taken: int | None) -> None:
         """Write what waits and close the file.
+
+        Parameters
+        ----------
+        outcome : str
+            How it ended.
+        taken : int or None
+            Samples that the device took, where that is known.
 
         Raises
         ------
@@ -82,7 +111,7 @@ class Recorder:
             Where the file could not be written to its end.
         """
         if self._file is not None:
-            self._file.close(outcome)
+            self._file.close(outcome, taken=taken)
 
 
 def _finite(value: Any) -> Any:

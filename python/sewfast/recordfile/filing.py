@@ -14,11 +14,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from ..errors import DataError
+from ..errors import DataError, SewfastError
 from . import samples
 from .container import Assembler, Message, opening
 from .header import Header, bearable
-from .sink import Sink, batched
+from .sink import Sink, batched, require_writable
 from .topics import Topic
 
 MESSAGE_SAMPLES = 100
@@ -44,9 +44,10 @@ class Event(NamedTuple):
 
 
 class End(NamedTuple):
-    """The recording ends, and how."""
+    """The recording ends, how, and which sample would have come next."""
 
     outcome: str
+    due: int
 
 
 Item: TypeAlias = Block | Event | End
@@ -55,10 +56,11 @@ Item: TypeAlias = Block | Event | End
 class Filing:
     """Owner of the file. Only `put`, `finish`, `failure` and `refusal` are for other threads."""
 
-    def __init__(self, path: Path, header: Header, *, overwrite: bool) -> None:
+    def __init__(self, path: Path, header: Header, *, overwrite: bool, lazy: bool) -> None:
         self.failure: Exception | None = None
+        self._path, self._overwrite = path, overwrite
         self._header = header
-        self._sink = Sink(path, overwrite=overwrite)
+        self._opened: Sink | None = None
         self._assembler = Assembler(header.columns)
         self._pending: dict[str, list[Any]] = {name: [] for name in header.columns}
         self._first = 0
@@ -68,7 +70,10 @@ class Filing:
         self._gaps: list[tuple[int, int]] = []
         self._gap_count = 0
         self._items: queue.SimpleQueue[Item] = queue.SimpleQueue()
-        self._write_header()
+        if lazy:
+            require_writable(path, overwrite=overwrite)
+        else:
+            self._open()
         self._thread = threading.Thread(target=self._run, name="sewfast-recording", daemon=True)
         self._thread.start()
 
@@ -84,14 +89,30 @@ class Filing:
         """Wait until the end that was put is in the file."""
         self._thread.join()
 
-    def refusal(self, error: Exception) -> DataError:
+    @property
+    def is_made(self) -> bool:
+        """Whether there is a file; certain once it is finished."""
+        return self._opened is not None
+
+    def refusal(self, error: Exception) -> SewfastError:
         """What to say to callers when the file could not be written."""
+        if isinstance(error, SewfastError):
+            return error
         reason = getattr(error, "strerror", None) or repr(error)
         return DataError(
-            f"{self._sink.path}: expected room for the recording, received {reason!r}; the "
+            f"{self._path}: expected room for the recording, received {reason!r}; the "
             f"file is whole up to sample {self._first} (end excluded, {self._sink.size} bytes); "
             "free some space and record again"
         )
+
+    @property
+    def _sink(self) -> Sink:
+        assert self._opened is not None, "the file is made before anything is written"
+        return self._opened
+
+    def _open(self) -> None:
+        self._opened = Sink(self._path, overwrite=self._overwrite)
+        self._write_header()
 
     def _write_header(self) -> None:
         """Twice: a recording cannot be read without it, and one copy may be damaged."""
@@ -112,13 +133,17 @@ class Filing:
     def _run(self) -> None:
         try:
             while not isinstance(item := self._next_item(), End):
+                if not self.is_made:
+                    self._open()
                 self._take(item)
-            self._finish(item.outcome)
+            if self.is_made:
+                self._finish(item)
         except Exception as e:
             # whatever it is, callers must learn of it
             self.failure = e
         finally:
-            self._sink.close()
+            if self.is_made:
+                self._sink.close()
 
     def _next_item(self) -> Item:
         while self._waiting:
@@ -184,10 +209,10 @@ class Filing:
     def _append(self, message: Message, *, leading: bool = False) -> None:
         self._sink.append(self._assembler.chunk([message], self._sink.size, leading=leading))
 
-    def _finish(self, outcome: str) -> None:
+    def _finish(self, end: End) -> None:
         self._write_pending()
-        planned = self._header.n
-        due = self._first if planned is None or outcome != "complete" else planned
+        planned, outcome = self._header.n, end.outcome
+        due = end.due if planned is None or outcome != "complete" else planned
         if due > self._first and bearable(due - self._received, len(self._header.columns)):
             # what was planned and never came is a gap as well
             self._skip_to(due)

@@ -16,7 +16,7 @@ from ..errors import DataError
 from ..runs import runs
 from . import walk
 from .container import MAGIC, Message
-from .header import MOST_MISSING, Header, bearable, plain
+from .header import LARGEST_HEADER, MOST_MISSING, Header, bearable, plain
 from .samples import EXACT, Block, decode, parse
 from .topics import Topic
 
@@ -147,11 +147,30 @@ def read_recording(path: str | os.PathLike[str]) -> RecordedFile:
         Where the file cannot be read, is no MCAP file, or none of the two copies of its header
         message is whole.
     """
-    path = Path(path)
+    path = _named(path)
     return decode_recording(path, _bytes(path))
 
 
-def _bytes(path: Path) -> bytes:
+def read_header(path: str | os.PathLike[str]) -> Header:
+    """Read what a recording says of itself, without its samples.
+
+    Raises
+    ------
+    DataError
+        As `read_recording`.
+    """
+    path = _named(path)
+    # both copies of the header message stand in the first bytes
+    return decode_recording(path, _bytes(path, 3 * LARGEST_HEADER)).header
+
+
+def _named(path: object) -> Path:
+    if isinstance(path, (str, os.PathLike)):
+        return Path(path)
+    raise DataError(f"expected a recording's name, got {path!r}; as in 'run.mcap'")
+
+
+def _bytes(path: Path, most: int = -1) -> bytes:
     if path.is_dir():
         raise DataError(f"{path}: expected a file, received a folder")
     try:
@@ -161,7 +180,8 @@ def _bytes(path: Path) -> bytes:
                 f"{path}: expected a recording of at most {LARGEST_FILE >> 30} GiB, received "
                 f"{size} bytes; record in parts"
             )
-        return path.read_bytes()
+        with path.open("rb") as file:
+            return file.read(most)
     except FileNotFoundError as e:
         raise DataError(f"{path}: no such file; check the name and the folder") from e
     except (OSError, ValueError) as e:

@@ -14,6 +14,49 @@ from ..errors import DataError, SettingError
 _BATCH = 1 << 16
 
 
+def require_writable(path: Path, *, overwrite: bool) -> None:
+    """Refuse what `Sink` would refuse, and leave everything as it is.
+
+    Raises
+    ------
+    SettingError, DataError
+        As `Sink`.
+    """
+    if path.exists() and not path.is_dir():
+        if not overwrite:
+            raise _exists(path)
+        _try(path, path, os.O_WRONLY)
+        return
+    if path.is_dir():
+        raise _folder(path)
+    probe = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    _try(path, probe, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+    probe.unlink(missing_ok=True)
+
+
+def _try(path: Path, opened: Path, flags: int) -> None:
+    try:
+        os.close(os.open(opened, flags, 0o666))
+    except OSError as e:
+        raise _unwritable(path, e) from e
+
+
+def _exists(path: Path) -> SettingError:
+    return SettingError(
+        f"{path}: the file exists and is kept; choose another name, or overwrite=True (--overwrite)"
+    )
+
+
+def _folder(path: Path) -> DataError:
+    return DataError(f"{path}: expected a file to write, received a folder")
+
+
+def _unwritable(path: Path, error: OSError) -> DataError:
+    return DataError(
+        f"{path}: cannot be written ({error.strerror}); choose a folder that exists and is writable"
+    )
+
+
 class Sink:
     """An open file; a piece that cannot be written as a whole is taken back.
 
@@ -40,17 +83,9 @@ class Sink:
             # without O_EXCL two writers could meet in one file
             self._file = os.open(path, flags | (os.O_TRUNC if overwrite else os.O_EXCL), 0o666)
         except FileExistsError as e:
-            if path.is_dir():
-                raise DataError(f"{path}: expected a file to write, received a folder") from e
-            raise SettingError(
-                f"{path}: the file exists and is kept; choose another name, or overwrite=True "
-                "(--overwrite)"
-            ) from e
+            raise (_folder(path) if path.is_dir() else _exists(path)) from e
         except OSError as e:
-            raise DataError(
-                f"{path}: cannot be written ({e.strerror}); choose a folder that exists and is "
-                "writable"
-            ) from e
+            raise _unwritable(path, e) from e
 
     def append(self, piece: bytes) -> None:
         """Hand a piece to the operating system: from then on `kill -9` cannot take it away.
@@ -102,7 +137,7 @@ def replacing(target: Path) -> Iterator[Path]:
         Where the file cannot be written.
     """
     if target.is_dir():
-        raise DataError(f"{target}: expected a file to write, received a folder")
+        raise _folder(target)
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
     try:
         yield temporary

@@ -34,6 +34,9 @@ class RecordWriter:
     header : Header
     overwrite : bool
         Whether an existing file may be replaced.
+    lazy : bool
+        Make the file with the first sample or event; without any, there is none, and one that
+        exists is left as it is. That it could be made is found out here all the same.
 
     Raises
     ------
@@ -62,11 +65,16 @@ class RecordWriter:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], header: Header, *, overwrite: bool = False
+        self,
+        path: str | os.PathLike[str],
+        header: Header,
+        *,
+        overwrite: bool = False,
+        lazy: bool = False,
     ) -> None:
         self.path = Path(path)
         self.header = header
-        self._filing = Filing(self.path, header, overwrite=overwrite)
+        self._filing = Filing(self.path, header, overwrite=overwrite, lazy=lazy)
         self._opened = time.monotonic()
         self._next = 0
         self._received = 0
@@ -94,6 +102,11 @@ class RecordWriter:
     def received(self) -> int:
         """Samples given so far."""
         return self._received
+
+    @property
+    def is_made(self) -> bool:
+        """Whether there is a file, as soon as the recording is closed."""
+        return self._filing.is_made
 
     def samples(self, first: int, columns: Mapping[str, ArrayLike]) -> None:
         """Append consecutive samples.
@@ -175,13 +188,16 @@ class RecordWriter:
         since = self.header.start_ns() + round(elapsed * 1e9)
         self._filing.put(Event(content, since if index is None else self.header.time_ns(index)))
 
-    def close(self, outcome: str = "complete") -> None:
+    def close(self, outcome: str = "complete", *, taken: int | None = None) -> None:
         """Write what waits, the completeness record and the index; a closed file stays closed.
 
         Parameters
         ----------
         outcome : str
             "complete", "interrupted", "failed", "tripped" or another word that says how it ended.
+        taken : int or None
+            Samples that the device took, where it said so: the last ones that did not come are a
+            gap. A complete recording has the planned number.
 
         Raises
         ------
@@ -189,7 +205,7 @@ class RecordWriter:
             Where that could not be written; the samples before it are whole.
         """
         if not self._closed:
-            self._filing.put(End(str(outcome)))
+            self._filing.put(End(str(outcome), taken or 0))
             self._closed = True
         try:
             self._filing.finish()
