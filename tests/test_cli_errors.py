@@ -58,14 +58,24 @@ def spoiled(name: str, at: int | slice, value: float) -> dict[str, np.ndarray]:
     ("columns", "expected"),
     [
         (spoiled("y", slice(None), np.nan), ["'y'", "NaN"]),
-        (spoiled("y", 7, np.nan), ["'y'", "sample 7"]),
+        (spoiled("u", 7, np.nan), ["'u'", "sample 7", "--split-at-gaps"]),
+        (spoiled("y", 7, np.inf), ["'y'", "sample 7"]),
         (spoiled("u", 7, np.inf), ["'u'", "7"]),
         (spoiled("u", slice(None), 2.0), ["'u'", "constant"]),
         (spoiled("y", slice(None), 2.0), ["'y'", "constant"]),
         (spoiled("t", 9, 0.0), ["'t'", "increasing", "line 11"]),
         (spoiled("t", 9, 0.0095), ["'t'", "even steps", "1 %"]),
     ],
-    ids=["all-nan", "nan", "inf", "constant-input", "constant-output", "backwards", "uneven"],
+    ids=[
+        "all-nan",
+        "nan",
+        "inf-output",
+        "inf",
+        "constant-input",
+        "constant-output",
+        "backwards",
+        "uneven",
+    ],
 )
 def test_unusable_columns(
     folder: Path, columns: dict[str, np.ndarray], expected: list[str]
@@ -197,7 +207,7 @@ def test_nothing_left_to_score(folder: Path, options: tuple[object, ...]) -> Non
 
 
 def test_simulation_without_the_samples_that_start_it(folder: Path) -> None:
-    spoil(folder, **spoiled("y", 7, np.nan))
+    spoil(folder, **spoiled("y", slice(7, None), np.nan))
     assert "--init" in refused(folder, "simulate", "drive.json", "run.csv")
 
 

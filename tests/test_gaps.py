@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sewfast import _core
-from sewfast.dataset import FloatArray
+from sewfast import _core, identify
+from sewfast.dataset import Dataset, FloatArray
 from sewfast.errors import DataError, FitError
 
 A, B, OFFSET = (-1.6, 0.66), (0.05, 0.03), 0.1
@@ -151,3 +151,55 @@ def test_prediction_runs_on_over_what_was_not_measured() -> None:
     np.testing.assert_array_equal(
         model.predict(u, np.full_like(y, np.nan), state, 1), model.simulate(u, state)
     )
+
+
+# --- through the public interface ---------------------------------------------------------------
+
+
+def data_of(y: FloatArray, u: FloatArray) -> Dataset:
+    return Dataset.from_arrays(u, y, 0.01, name="run")
+
+
+@pytest.mark.parametrize("kind", ["arx", "oe", "neural_oe", "auto"])
+def test_what_stood_in_a_gap_changes_nothing(kind: Any) -> None:
+    """Garbage that is masked gives the same bits as NaN from the beginning."""
+    u, y = recording(0)
+    where = np.isnan(masked(y, "random")) | np.isnan(masked(y, "long gaps"))
+    garbage = np.where(where, 1e9 * np.sin(np.arange(len(y))), y)
+    texts = [
+        str(identify(data, model=kind, iterations=5, starts=1).parameters())
+        for data in (data_of(garbage, u).mask(where), data_of(np.where(where, np.nan, y), u))
+    ]
+    assert texts[0] == texts[1]
+
+
+@pytest.mark.parametrize("kind", ["random", "long gaps", "first samples"])
+def test_identify_takes_gaps(kind: str) -> None:
+    u, y = recording(0)
+    z = masked(y, kind)
+    model = identify(data_of(z, u), model="auto", iterations=20, starts=1)
+    assert model.training["unmeasured"] == np.isnan(z).sum()
+    found = model.validate(data_of(z, u))
+    assert found.simulation.rmse == pytest.approx(0.01, rel=0.15)
+    assert found.n + found.unmeasured + found.experiments[0].init == len(z)
+    clean = model.validate(data_of(y, u))
+    assert clean.simulation.rmse == pytest.approx(0.01, rel=0.15)
+    assert np.isfinite(model.predict(data_of(z, u), 3)[0]).all()
+
+
+def test_a_gap_in_the_input_names_its_remedies() -> None:
+    u, y = recording(0)
+    u[400:410] = np.nan
+    data = data_of(y, u)
+    with pytest.raises(DataError, match=r"sample 400.*split_at_gaps.*fill_inputs\(\"hold\"\)"):
+        identify(data)
+    held = data.fill_inputs("hold")
+    assert "10 missing values of input 'u' in 1 gaps" in str(held)
+    assert (held.experiments[0].u[400:410] == u[399]).all()
+    assert np.isnan(data.experiments[0].u[400:410]).all()
+    assert identify(held, model="arx")
+    pieces = data.mask("100:120").split_at_gaps(of="inputs")
+    assert [e.range_text for e in pieces.experiments] == ["0:400", "410:1500"]
+    assert data.fill_inputs(longest=9).experiments[0].unmeasured == 0
+    with pytest.raises(DataError, match="nothing to hold"):
+        data[400:].fill_inputs()

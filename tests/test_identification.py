@@ -206,7 +206,9 @@ def test_unusable_data_are_refused(kind: Any) -> None:
         (u, np.zeros(n), "output 'y' is constant"),
         (np.full(n, np.nan), y, "every value is NaN"),
         (u, np.full(n, np.nan), "every value is NaN"),
-        (u, np.where(np.arange(n) == 250, np.nan, y), "sample 250"),
+        (u, np.where(np.arange(n) == 250, np.inf, y), "sample 250"),
+        (np.where(np.arange(n) == 250, np.nan, u), y, "sample 250.*fill_inputs"),
+        (u, np.where(np.arange(n) > 9, np.nan, y), r"more than 22 samples, received 10 \(290 more"),
         (u[:15], y[:15], "more than 22 samples"),
     ]
     for bad_u, bad_y, words in cases:

@@ -123,9 +123,10 @@ def test_the_initial_samples_must_be_there(model: Model) -> None:
     with pytest.raises(SettingError, match="init"):
         model.simulate(data, init=-1)
     y = data.experiments[0].y.copy()
-    y[15] = np.nan
-    with pytest.raises(DataError, match="first 20 outputs, but sample 15"):
+    y[5:16] = np.nan
+    with pytest.raises(DataError, match=r"at least init = 20 samples.*received 19 \(11 more"):
         model.simulate(Dataset.from_arrays(np.ones(30), y, 0.01))
+    assert len(model.simulate(Dataset.from_arrays(np.ones(30), y, 0.01), init=19)[0]) == 30
     with pytest.raises(SettingError, match="horizon"):
         model.predict(data, 0)
 

@@ -99,6 +99,25 @@ def test_nothing_to_score_is_refused() -> None:
         validate(MODEL, linear_data(20))
     data = linear_data(100)
     y = data.experiments[0].y.copy()
-    y[50] = np.nan
+    y[50] = np.inf
     with pytest.raises(DataError, match="sample 50"):
         validate(MODEL, Dataset.from_arrays(data.experiments[0].u, y, 0.01))
+    y[20:] = np.nan
+    with pytest.raises(DataError, match=r"received 20 \(80 more not measured\)"):
+        validate(MODEL, Dataset.from_arrays(data.experiments[0].u, y, 0.01))
+
+
+def test_samples_that_were_not_measured_are_counted_and_not_scored() -> None:
+    data = linear_data(200)
+    y = data.experiments[0].y.copy()
+    y[:5] = y[100:130] = np.nan
+    holed = Dataset.from_arrays(data.experiments[0].u, y, 0.01)
+    found = validate(MODEL, holed)
+    (e,) = found.experiments
+    assert (found.n, found.unmeasured, e.init) == (145, 30, 25)
+    assert "145 samples scored, 30 not measured" in str(found)
+    assert found.to_json()["unmeasured"] == found.to_json()["experiments"][0]["unmeasured"] == 30
+    known = ~np.isnan(y)
+    known[:25] = False
+    rmse = np.sqrt(np.mean((y - e.simulated)[known] ** 2))
+    assert found.simulation.rmse == pytest.approx(rmse, rel=1e-12)

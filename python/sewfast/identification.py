@@ -48,7 +48,7 @@ def identify(
     Parameters
     ----------
     data : Dataset
-        Training data, complete.
+        Training data: inputs complete; outputs that are NaN were not measured and have no weight.
     model : {"auto", "arx", "oe", "neural_oe"}
         `arx`: least squares of the one-step error. `oe`: linear output error. `neural_oe`: the
         network, trained in free run from the linear output-error model. `auto`: `oe` or
@@ -82,7 +82,7 @@ def identify(
     Raises
     ------
     DataError
-        Where data hold NaN, never move, or are too short for the orders.
+        Where an input is NaN, data never move, or are too short for the orders.
     SettingError
         Where a setting is out of its range or contradicts another.
     FitError
@@ -137,24 +137,24 @@ def _require_settings(task: Task) -> None:
 
 def _require_data(task: Task, kind: str) -> None:
     require_dataset(task.data, "data")
-    task.data.require_complete()
+    task.data.require_measured()
     task.data.require_excited()
     _require_enough(task, kind)
     if kind == "paper" and task.data.n_inputs != 1:
         raise DataError(f"preset 'paper' has one input, the data have {task.data.n_inputs}")
     if task.validation is not None:
         require_dataset(task.validation, "validation")
-        task.validation.require_complete()
+        task.validation.require_measured()
         Dataset.concat([task.data, task.validation])
         _require_longer(task.validation, INIT)
 
 
 def _require_longer(data: Dataset, least: int) -> None:
     for e in data.experiments:
-        if len(e) <= least:
+        if len(e) - e.unmeasured <= least:
             raise DataError(
                 f"{e.name} [{e.range_text}]: expected more than {least} samples, received "
-                f"{len(e)}; record longer, lower the orders, or leave this experiment out"
+                f"{e.counted}; record longer, lower the orders, or leave this experiment out"
             )
 
 
@@ -166,7 +166,7 @@ def _require_enough(task: Task, kind: str) -> None:
     parameters = regressors + 1
     if kind in ("neural_oe", "paper"):
         parameters += task.hidden * (regressors + 2)
-    usable = sum(len(e) - lag for e in task.data.experiments)
+    usable = sum(len(e) - e.unmeasured - lag for e in task.data.experiments)
     if usable < 2 * parameters:
         raise DataError(
             f"{task.data.source}: expected at least {2 * parameters} samples for {parameters} "

@@ -69,7 +69,7 @@ def arx(task: Task) -> Model:
         ]
     )
     return _told(
-        model, {"cost": float(np.mean(one_step**2) / 2), "cost_unit": "output unit squared"}
+        model, {"cost": float(np.nanmean(one_step**2) / 2), "cost_unit": "output unit squared"}
     )
 
 
@@ -215,11 +215,19 @@ def _with_blocks_held_out(task: Task) -> Task:
         held += [e.cut(edges[i], edges[i + 1]) for i in HELD_OUT]
         starts, stops = (0, *(i + 1 for i in HELD_OUT)), (*HELD_OUT, BLOCKS)
         kept += [e.cut(edges[i], edges[j]) for i, j in zip(starts, stops, strict=True)]
+    kept, held = _with_enough_measured(kept), _with_enough_measured(held)
+    if not kept or not held:
+        return task
     return replace(
         task,
         data=replace(task.data, experiments=tuple(kept)),
         validation=replace(task.data, experiments=tuple(held)),
     )
+
+
+def _with_enough_measured(pieces: list[Experiment]) -> list[Experiment]:
+    """The pieces that a long gap in the output has left something of."""
+    return [e for e in pieces if len(e) - e.unmeasured > LEAST_BLOCK]
 
 
 _NOTHING_HELD_OUT: Story = {
@@ -306,6 +314,7 @@ def _model(
     common = {
         "data": _sources(data),
         "samples": len(data),
+        "unmeasured": sum(e.unmeasured for e in data.experiments),
         "input_range": [list(r) for r in data.input_range],
         "output_range": list(data.output_range),
         "settings": {"max_iterations": task.iterations},

@@ -43,12 +43,15 @@ class Scores:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ExperimentErrors:
-    """Series and scores of one experiment; the first `init` samples are not scored.
+    """Series and scores of one experiment; its first `init` samples are not scored.
 
     Attributes
     ----------
+    init : int
+        Samples before the scored ones: those with the measured outputs that set the state.
     y, simulated, one_step : array, shape (N,)
-        What is scored against, the free run and the one-step prediction [output unit].
+        What is scored against, the free run and the one-step prediction [output unit]. NaN in y
+        is not scored.
     """
 
     name: str
@@ -68,9 +71,20 @@ class ExperimentErrors:
         """One-step error, shape (N,)."""
         return self.y - self.one_step
 
+    @property
+    def unmeasured(self) -> int:
+        """Samples after the initial ones that are not scored, because y is NaN there."""
+        return int(np.isnan(self.y[self.init :]).sum())
+
+    @property
+    def n(self) -> int:
+        """Samples scored."""
+        return len(self.y) - self.init - self.unmeasured
+
     def scored(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """y, free run and one-step prediction after the initial samples."""
-        return self.y[self.init :], self.simulated[self.init :], self.one_step[self.init :]
+        """y, free run and one-step prediction at the samples that are scored."""
+        known = np.flatnonzero(~np.isnan(self.y[self.init :])) + self.init
+        return self.y[known], self.simulated[known], self.one_step[known]
 
     @property
     def simulation_scores(self) -> Scores:
@@ -96,7 +110,9 @@ class Validation:
     n : int
         Samples scored.
     init : int
-        Samples before those in each experiment; they set the initial state. 0: from rest.
+        Measured outputs before those in each experiment; they set the initial state. 0: from rest.
+    unmeasured : int
+        Samples after those that are not scored, because their output was not measured.
     unit : str
         Of the errors.
     notes : tuple of str
@@ -113,6 +129,10 @@ class Validation:
     against: str
     notes: tuple[str, ...] = ()
 
+    @property
+    def unmeasured(self) -> int:
+        return sum(e.unmeasured for e in self.experiments)
+
     def to_json(self) -> dict[str, Any]:
         """Scores as JSON values."""
         return {
@@ -120,13 +140,15 @@ class Validation:
             "one_step": self.one_step.to_json(),
             "n": self.n,
             "init": self.init,
+            "unmeasured": self.unmeasured,
             "unit": self.unit,
             "against": self.against,
             "experiments": [
                 {
                     "name": e.name,
                     "range": e.range_text,
-                    "n": len(e.y) - e.init,
+                    "n": e.n,
+                    "unmeasured": e.unmeasured,
                     "simulation": e.simulation_scores.to_json(),
                     "one_step": e.one_step_scores.to_json(),
                 }
@@ -140,12 +162,13 @@ class Validation:
         return f"Validation(free run: rmse={s.rmse:.4g}, fit={s.fit_percent:.2f} %, n={self.n})"
 
     def __str__(self) -> str:
+        missing = f", {self.unmeasured} not measured" if self.unmeasured else ""
         state = f"initial state from the first {self.init} samples" if self.init else "from rest"
         unit = f" [{self.unit}]" if self.unit else ""
         data = ", ".join(f"{e.name} [{e.range_text}]" for e in self.experiments)
         lines = [
             f"{self.model} against {self.against}{unit} on {data}",
-            f"{self.n} samples scored, {state}",
+            f"{self.n} samples scored{missing}, {state}",
             f"{'':18}{'rmse' + unit:>16}{'fit [%]':>10}{'largest' + unit:>16}",
             _row("free run", self.simulation),
             _row("one step ahead", self.one_step),
@@ -169,10 +192,10 @@ def validate(
     ----------
     model : Model
     data : Dataset
-        Complete inputs and outputs.
+        Complete inputs. Samples whose output is NaN are not scored, and counted in `unmeasured`.
     init : int
-        The first `init` samples of each experiment set the initial state and are not scored; 0
-        starts from rest and scores every sample.
+        The first `init` measured outputs of each experiment set the initial state; what comes up
+        to the last of them is not scored. 0 starts from rest and scores every sample.
     against : str or None
         Name of a channel to score against instead of the measured output (a virtual machine's
         true speed).
@@ -180,18 +203,19 @@ def validate(
     Raises
     ------
     DataError
-        Where data do not fit the model, hold NaN, or leave nothing to score.
+        Where data do not fit the model, an input is NaN, or nothing is left to score.
     FitError
         Where the model is unstable on this input.
     """
     require_dataset(data, "data")
     require_init(init)
-    data.require_complete()
+    data.require_measured()
     for e in data.experiments:
-        if len(e) <= init:
+        if len(e) - e.unmeasured <= init:
             raise DataError(
-                f"{e.name}: expected more than init = {init} samples, received {len(e)}: "
-                "nothing is left to score; lower init (--init) or give a longer range"
+                f"{e.name}: expected more than init = {init} samples, received "
+                f"{e.counted}: nothing is left to score; lower init (--init) or give a "
+                "longer range"
             )
     series = zip(
         data.experiments,
@@ -200,7 +224,14 @@ def validate(
         strict=True,
     )
     found = tuple(
-        ExperimentErrors(e.name, e.range_text, init, _target(e, against), simulated, one_step)
+        ExperimentErrors(
+            e.name,
+            e.range_text,
+            e.initial_samples(init),
+            _target(e, against, init),
+            simulated,
+            one_step,
+        )
         for e, simulated, one_step in series
     )
     y, simulated, one_step = (
@@ -219,7 +250,7 @@ def validate(
     )
 
 
-def _target(experiment: Experiment, against: str | None) -> FloatArray:
+def _target(experiment: Experiment, against: str | None, init: int) -> FloatArray:
     if against is None:
         return experiment.y
     if against not in experiment.channels:
@@ -227,7 +258,10 @@ def _target(experiment: Experiment, against: str | None) -> FloatArray:
             f"{experiment.name}: no channel {against!r}; available: "
             f"{', '.join(experiment.channels) or 'none'}"
         )
-    return experiment.channels[against]
+    target = experiment.channels[against]
+    if np.isnan(target[experiment.initial_samples(init) :]).all():
+        raise DataError(f"{experiment.name}: channel {against!r} is NaN at every scored sample")
+    return target
 
 
 def _beyond_training(model: Model, data: Dataset) -> list[str]:

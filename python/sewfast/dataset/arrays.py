@@ -29,6 +29,13 @@ def as_float(values: ArrayLike, what: str) -> FloatArray:
     return array
 
 
+def frozen(array: FloatArray) -> FloatArray:
+    """A new array that nobody writes to, so that it needs no copy."""
+    array = np.ascontiguousarray(array)
+    array.flags.writeable = False
+    return array
+
+
 def as_column(values: ArrayLike, what: str, n: int | None = None) -> FloatArray:
     array = as_float(values, what)
     if array.ndim != 1:

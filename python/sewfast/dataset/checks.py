@@ -7,11 +7,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import DataError
-from .arrays import FloatArray
+from .arrays import FloatArray, range_of
 from .units import require_same_units
 
 if TYPE_CHECKING:
     from .dataset import Dataset
+
+
+INPUT_REMEDY = (
+    "a simulation needs every input: choose a range without it, take the pieces between, "
+    "Dataset.split_at_gaps (--split-at-gaps), or say what the input was: "
+    'Dataset.fill_inputs("hold") assumes that it stayed as it was last known (--hold-inputs)'
+)
+OUTPUT_REMEDY = (
+    "repair it, choose a range without it, or take the pieces between: "
+    "Dataset.split_at_gaps (--split-at-gaps)"
+)
 
 
 def require_dataset(data: object, what: str) -> None:
@@ -44,14 +55,43 @@ def require_inputs(data: Dataset) -> None:
     """Raise `DataError` that names the first input value that is not finite."""
     for e in data.experiments:
         for name, column in zip(data.input_names, e.u.T, strict=True):
-            require_finite(column, f"{e.name}, input {name!r}", e.start)
+            require_finite(column, f"{e.name}, input {name!r}", e.start, INPUT_REMEDY)
+
+
+def require_measured(data: Dataset, least: int = 1) -> None:
+    """Raise `DataError` unless every input is known and enough outputs were measured.
+
+    An output that is NaN was not measured and is no error; an infinite one is.
+
+    Parameters
+    ----------
+    least : int
+        Measured outputs that every experiment must have.
+    """
+    require_inputs(data)
+    for e in data.experiments:
+        what = f"{e.name} [{e.range_text}], output {data.output_name!r}"
+        if np.isinf(e.y).any():
+            k = int(np.argmax(np.isinf(e.y)))
+            raise DataError(
+                f"{what}: expected finite values, or NaN where it was not measured, received "
+                f"{e.y[k]} at sample {e.start + k} (0-based); set it to NaN: Dataset.mask"
+            )
+        measured = len(e) - e.unmeasured
+        if measured == 0 < least:
+            raise DataError(f"{what}: every value is NaN; expected a measured column")
+        if measured < least:
+            raise DataError(
+                f"{what}: expected at least {least} samples, received {e.counted}; "
+                "leave this experiment out, or record again"
+            )
 
 
 def require_complete(data: Dataset) -> None:
     """Raise `DataError` that names the first input or output value that is not finite."""
     require_inputs(data)
     for e in data.experiments:
-        require_finite(e.y, f"{e.name}, output {data.output_name!r}", e.start)
+        require_finite(e.y, f"{e.name}, output {data.output_name!r}", e.start, OUTPUT_REMEDY)
 
 
 def require_excited(data: Dataset) -> None:
@@ -63,15 +103,16 @@ def require_excited(data: Dataset) -> None:
                 f"{data.experiments[0].u[0, i]:g}; expected an input that moves; "
                 "record with an excitation (`sewfast signals`)"
             )
-    if all(np.min(e.y) == np.max(e.y) for e in data.experiments):
+    ranges = [range_of(e.y) for e in data.experiments]
+    if not any(low < high for low, high in ranges):
         raise DataError(
-            f"{data.source}: output {data.output_name!r} is constant at "
-            f"{data.experiments[0].y[0]:g}; expected an output that follows the input; check "
-            "the column and the sensor"
+            f"{data.source}: output {data.output_name!r} is constant at {ranges[0][0]:g}; expected "
+            "an output that follows the input; check the column and the sensor"
         )
 
 
-def require_finite(column: FloatArray, what: str, start: int) -> None:
+def require_finite(column: FloatArray, what: str, start: int, remedy: str) -> None:
+    """Raise `DataError` that names the first value that is not finite."""
     bad = ~np.isfinite(column)
     if not bad.any():
         return
@@ -80,6 +121,5 @@ def require_finite(column: FloatArray, what: str, start: int) -> None:
     k = int(np.argmax(bad))
     raise DataError(
         f"{what}: expected finite values, received {column[k]} at sample {start + k} (0-based; "
-        f"{int(bad.sum())} such in {len(column)} samples); repair it, choose a range without it, "
-        "or take the pieces between: Dataset.split_at_gaps (--split-at-gaps)"
+        f"{int(bad.sum())} such in {len(column)} samples); {remedy}"
     )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import DataError, SettingError
-from . import checks, pieces
+from . import checks, gaps, pieces
 from .arrays import range_of, texts
 from .experiment import Experiment
 from .units import labelled
@@ -20,7 +20,8 @@ from .units import labelled
 class Dataset:
     """Recordings of one plant: the same columns, units and sample time in every experiment.
 
-    Immutable. Values may hold NaN; `identify` and `validate` name the sample that they cannot use.
+    Immutable. An output may be NaN, which means that it was not measured: models run through it and
+    it has no weight. An input that is NaN is refused where a model needs it, with its sample.
 
     Parameters
     ----------
@@ -173,7 +174,11 @@ class Dataset:
     split = pieces.split
     split_at_gaps = pieces.split_at_gaps
 
+    mask = gaps.mask
+    fill_inputs = gaps.fill_inputs
+
     require_inputs = checks.require_inputs
+    require_measured = checks.require_measured
     require_complete = checks.require_complete
     require_excited = checks.require_excited
 

@@ -70,8 +70,44 @@ class Experiment:
     @property
     def measured(self) -> NDArray[np.bool_]:
         """Where inputs and output are finite, shape (N,)."""
-        known: NDArray[np.bool_] = np.isfinite(self.u).all(axis=1) & np.isfinite(self.y)
+        known: NDArray[np.bool_] = np.isfinite(self.y)
+        return known & self.known_inputs
+
+    @property
+    def known_inputs(self) -> NDArray[np.bool_]:
+        """Where every input is finite, shape (N,)."""
+        known: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(self.u), axis=1)
         return known
+
+    @property
+    def counted(self) -> str:
+        """How many samples were measured, for messages: `97`, or `97 (3 more not measured)`."""
+        missing = self.unmeasured
+        return f"{len(self) - missing}" + (f" ({missing} more not measured)" if missing else "")
+
+    @property
+    def unmeasured(self) -> int:
+        """Samples whose output is NaN."""
+        return int(np.isnan(self.y).sum())
+
+    def initial_samples(self, init: int) -> int:
+        """How many of its first samples hold `init` measured outputs; `init` where none is missing.
+
+        Raises
+        ------
+        DataError
+            Where fewer than `init` were measured.
+        """
+        known = np.flatnonzero(~np.isnan(self.y[:init]))
+        if len(known) < init:
+            known = np.flatnonzero(~np.isnan(self.y))
+        if len(known) < init:
+            raise DataError(
+                f"{self.name}: expected at least init = {init} samples to start from, received "
+                f"{self.counted}; lower init (--init), 0 to start from rest, or give a "
+                "longer range"
+            )
+        return int(known[init - 1]) + 1 if init else 0
 
     def cut(self, start: int, stop: int) -> Experiment:
         """Samples `start` to `stop`, end excluded, as views.

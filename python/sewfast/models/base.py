@@ -112,10 +112,10 @@ class Model(ABC):
         Parameters
         ----------
         data : Dataset
-            Outputs after the first `init` samples are not looked at and may be NaN.
+            Inputs are complete; outputs may be NaN, and are not looked at after the initial ones.
         init : int
-            The past outputs are estimated by least squares from this many samples; 0 starts from
-            rest.
+            The initial state is estimated by least squares from this many measured outputs, the
+            first ones; 0 starts from rest.
 
         Returns
         -------
@@ -139,7 +139,8 @@ class Model(ABC):
         Parameters
         ----------
         data : Dataset
-            Complete inputs and outputs.
+            Inputs are complete. In the place of an output that was not measured (NaN) stands the
+            model's own prediction of it.
         horizon : int
             1 is one-step prediction.
         init : int
@@ -158,7 +159,7 @@ class Model(ABC):
         if horizon < 1:
             raise SettingError(f"horizon: expected 1 step or more, received {horizon}")
         self._require_match(data)
-        data.require_complete()
+        data.require_measured(0)
         return [
             self.core.predict(e.u, e.y, self.initial_state(e, init), horizon)
             for e in data.experiments
@@ -187,24 +188,17 @@ class Model(ABC):
         return bands(self, data, level, init=init)
 
     def initial_state(self, experiment: Experiment, init: int) -> FloatArray:
-        """Past outputs y(-1), y(-2), .. of an experiment, from its first `init` samples."""
+        """Past outputs y(-1), y(-2), .. of an experiment, from its first `init` measured outputs.
+
+        Where some of its first outputs are missing, more samples are looked at.
+        """
         require_init(init)
         if init == 0:
             return np.zeros(self.core.na)
-        if init > len(experiment):
-            raise DataError(
-                f"{experiment.name}: expected at least init = {init} samples, received "
-                f"{len(experiment)}; lower init (--init) or give a longer range"
-            )
-        y = experiment.y[:init]
-        if not np.isfinite(y).all():
-            k = experiment.start + int(np.argmin(np.isfinite(y)))
-            raise DataError(
-                f"{experiment.name}: the initial state needs the first {init} outputs, but sample "
-                f"{k} (0-based) is not finite; lower init (--init), 0 to start from rest, or take "
-                "the pieces between gaps: Dataset.split_at_gaps (--split-at-gaps)"
-            )
-        past: FloatArray = self.core.estimate_initial_state(experiment.u[:init], y)
+        first = experiment.initial_samples(init)
+        past: FloatArray = self.core.estimate_initial_state(
+            experiment.u[:first], experiment.y[:first]
+        )
         return past
 
     def _require_match(self, data: Dataset) -> None:
