@@ -120,9 +120,13 @@ class LinearModel:
         """Real and imaginary parts, (na, 2)."""
     def dc_gain(self) -> _F:
         """Steady gain from each input, (n_inputs,)."""
+    def rest_state(self) -> _F:
+        """Zeros, (na,): past outputs of a drive at rest."""
     def simulate(self, u: _F, y_past: _F) -> _F: ...
     def predict(self, u: _F, y: _F, y_past: _F, horizon: int) -> _F: ...
     def estimate_initial_state(self, u: _F, y: _F) -> _F: ...
+    def jacobian(self, u: _F, y_past: _F) -> tuple[_F, _F]:
+        """Free run (N,) and its sensitivities (N, n_theta + na): [a, b input by input, offset], then y_past."""
 
 @final
 class NeuralOE:
@@ -140,6 +144,8 @@ class NeuralOE:
         """Every constructor argument but theta."""
     @property
     def na(self) -> int: ...
+    def rest_state(self) -> _F:
+        """Zeros, (na,): past outputs of a drive at rest."""
     def simulate(self, u: _F, y_past: _F) -> _F: ...
     def predict(self, u: _F, y: _F, y_past: _F, horizon: int) -> _F: ...
     def estimate_initial_state(self, u: _F, y: _F) -> _F: ...
@@ -166,6 +172,15 @@ class LinearFit:
     @property
     def initial_states(self) -> _F:
         """Past outputs before the first measured sample of each experiment, newest first, (n_experiments, na)."""
+    @property
+    def covariance(self) -> _F:
+        """Of [a, b input by input, offset] for white measurement noise, (n_theta, n_theta).
+
+        Zero for an offset that was not estimated; inf where the data do not fix the parameters.
+        """
+    @property
+    def standard_errors(self) -> _F:
+        """Square roots of its diagonal, (n_theta,)."""
 
 @final
 class NeuralFit:
@@ -208,6 +223,12 @@ class NeuralFit:
 
 def fit_arx(experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool) -> LinearModel:
     """In every fit an output that is NaN has no weight; inputs are finite."""
+
+def fit_iv(
+    experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool = True,
+    max_iterations: int = 50, progress: _Progress = None,
+) -> LinearFit:
+    """Refined instrumental variables (SRIV); "small_step" is the only success."""
 
 def fit_oe(
     experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool = True,

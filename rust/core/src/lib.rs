@@ -1,6 +1,6 @@
 //! Identification, simulation and tuning of motor drives, without Python.
 //!
-//! A recording becomes a model ([`arx`], [`oe`], [`neural`]), a model and demands become a controller
+//! A recording becomes a model ([`arx`], [`iv`], [`oe`], [`neural`]), a model and demands become a controller
 //! ([`fopdt`], [`rules`], [`tune`]), and [`closed_loop`] runs that controller on a model or on the
 //! [`machine`]. Times are in seconds; outputs and inputs carry the caller's units.
 
@@ -13,9 +13,11 @@ pub mod error;
 pub mod fopdt;
 mod gram;
 mod guard;
+pub mod iv;
 pub mod lagged;
 pub mod least_squares;
 pub mod linear;
+pub mod linear_fit;
 pub mod lm;
 pub mod machine;
 pub mod metrics;

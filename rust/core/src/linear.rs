@@ -2,7 +2,7 @@
 
 use nalgebra::{Complex, DMatrix};
 
-use crate::lagged::{Lagged, Lags};
+use crate::lagged::{Lagged, Lags, push_past};
 use crate::{Error, Result};
 
 /// `y(k) = -sum_i a[i] y(k-1-i) + sum_j sum_i b[j nb + i] u_j(k-nk-i) + offset`, in the data's units.
@@ -58,6 +58,52 @@ impl LinearModel {
     /// What the output moves by per sample without any input.
     pub fn offset(&self) -> f64 {
         self.offset
+    }
+
+    /// Number of parameters: a, b of every input, offset.
+    pub fn parameters(&self) -> usize {
+        self.lags.regressors() + 1
+    }
+
+    /// Free run in the data's units, and its derivatives row by row: by [a, b input by input, offset], then by the past
+    /// outputs.
+    ///
+    /// `d y(k) = d f - sum_i a_i d y(k-i)`, where `d f/d a_i = -y(k-i)`, `d f/d b_ji = u_j(k-nk-i+1)`, `d f/d offset = 1`.
+    ///
+    /// # Errors
+    /// As [`Lagged::simulate`].
+    pub fn jacobian(
+        &self,
+        u: &[f64],
+        channels: usize,
+        y_past: &[f64],
+    ) -> Result<(Vec<f64>, Vec<f64>)> {
+        let run = self.simulate(u, channels, y_past)?;
+        let (na, n_phi) = (self.lags.na, self.lags.regressors());
+        let columns = n_phi + 1 + na;
+        // the rows of the past outputs themselves come first, the oldest one on top
+        let mut rows = vec![0.0; (na + run.len()) * columns];
+        for i in 0..na {
+            rows[(na - 1 - i) * columns + n_phi + 1 + i] = 1.0;
+        }
+        let mut past = y_past.to_vec();
+        for (k, &y) in run.iter().enumerate() {
+            let (before, rest) = rows.split_at_mut((na + k) * columns);
+            let row = &mut rest[..columns];
+            for (value, y) in row.iter_mut().zip(&past) {
+                *value = -y;
+            }
+            self.lags.write_inputs(u, k, &mut row[na..n_phi]);
+            row[n_phi] = 1.0;
+            for (a, old) in self.a.iter().zip(before.rchunks_exact(columns)) {
+                for (value, old) in row.iter_mut().zip(old) {
+                    *value -= a * old;
+                }
+            }
+            push_past(&mut past, y);
+        }
+        rows.drain(..na * columns);
+        Ok((run, rows))
     }
 
     /// The poles: roots of `z^na + a_1 z^(na-1) + .. + a_na`; NaN where they overflow.
@@ -133,6 +179,23 @@ pub(crate) fn polynomial(roots: &[Complex<f64>]) -> Vec<f64> {
     coefficients[1..].iter().map(|c| c.re).collect()
 }
 
+/// The denominator with every root inside the unit circle: those outside are mirrored at it.
+pub(crate) fn stabilised(a: &[f64]) -> Vec<f64> {
+    if is_stable(a, 1e-6) {
+        return a.to_vec();
+    }
+    let inside = |p: Complex<f64>| {
+        let radius = p.norm();
+        let wanted = if radius > 1.0 { 1.0 / radius } else { radius };
+        if radius > 0.0 {
+            p * (wanted.min(0.999) / radius)
+        } else {
+            p
+        }
+    };
+    polynomial(&poles(a).into_iter().map(inside).collect::<Vec<_>>())
+}
+
 /// True where every root lies inside the unit circle: all reflection coefficients below `1 - margin` (Schur and Cohn).
 pub(crate) fn is_stable(a: &[f64], margin: f64) -> bool {
     let mut a = a.to_vec();
@@ -173,6 +236,29 @@ mod tests {
         assert!((y[5] - expected).abs() < 1e-14);
         let first = 1.5 * 0.3 + 0.7 * 0.4 + 0.8 * input(0, 0) - 0.1 * input(0, 1) + 0.05;
         assert!((y[0] - first).abs() < 1e-14);
+    }
+
+    #[test]
+    fn sensitivities_agree_with_differences() {
+        let model = second_order();
+        let u: Vec<f64> = (0..60).map(|k| (k as f64 * 0.9).cos()).collect();
+        let past = [0.3, -0.4];
+        let (run, rows) = model.jacobian(&u, 2, &past).unwrap();
+        assert_eq!(run, model.simulate(&u, 2, &past).unwrap());
+        let moved = |i: usize, by: f64| {
+            let mut theta = [model.a(), model.b(), &[model.offset()], &past[..]].concat();
+            theta[i] += by;
+            let b = theta[2..6].to_vec();
+            let other = LinearModel::new(theta[..2].to_vec(), b, 2, 2, theta[6]).unwrap();
+            other.simulate(&u, 2, &theta[7..]).unwrap()
+        };
+        for i in 0..9 {
+            let (ahead, behind) = (moved(i, 1e-5), moved(i, -1e-5));
+            for k in 0..run.len() {
+                let difference = (ahead[k] - behind[k]) / 2e-5;
+                assert!((rows[k * 9 + i] - difference).abs() < 1e-7, "{i} {k}");
+            }
+        }
     }
 
     #[test]

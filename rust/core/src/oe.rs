@@ -7,7 +7,7 @@ mod starts;
 use problem::OutputError;
 use restart::restart_error;
 
-use crate::linear::LinearModel;
+use crate::linear_fit::LinearFit;
 use crate::lm::{self, Outcome, Settings, Termination};
 use crate::{Error, Monitor, Record, Result, arx};
 
@@ -19,23 +19,6 @@ const RESTARTED: usize = 40;
 const ABOUT_AS_WELL: f64 = 1.05;
 /// Iterations after which the refined candidates are compared and the best one goes on alone.
 const HEAT: usize = 30;
-
-/// A fitted linear model with the story of its fit.
-#[derive(Clone, Debug)]
-pub struct LinearFit {
-    /// The model.
-    pub model: LinearModel,
-    /// `1/(2N) sum e^2` in free run, in the output's unit squared.
-    pub cost: f64,
-    /// Iterations over all refined starts.
-    pub iterations: usize,
-    /// How the best one ended.
-    pub termination: Termination,
-    /// Cost of the best one at its start and after each accepted step.
-    pub trace: Vec<f64>,
-    /// Past outputs per experiment, newest first, as estimated with the model.
-    pub initial_states: Vec<Vec<f64>>,
-}
 
 /// Fits `LinearModel` in free run over all experiments, with an initial state per experiment.
 ///
@@ -101,6 +84,7 @@ pub fn fit(
         termination: best.termination,
         trace: best.trace,
         initial_states: problem.initial_states(&best.theta),
+        covariance: problem.covariance(&best.theta, best.cost),
     })
 }
 
@@ -194,6 +178,7 @@ fn no_model() -> Error {
 mod tests {
     use super::*;
     use crate::lagged::Lagged;
+    use crate::linear::LinearModel;
     use crate::machine::{Machine, Parameters};
     use crate::random::Random;
 

@@ -3,7 +3,7 @@
 pub mod linear;
 pub mod neural;
 
-use numpy::{PyReadonlyArray1, PyReadonlyArray2};
+use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use sewfast_core::Result;
 use sewfast_core::lagged::Lagged;
@@ -15,6 +15,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     neural::register(module)
 }
 
+type RunAndJacobian<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);
 type Rows<'py> = PyReadonlyArray2<'py, f64>;
 type Values<'py> = PyReadonlyArray1<'py, f64>;
 

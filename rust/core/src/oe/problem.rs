@@ -1,8 +1,11 @@
 //! The free run of a linear model as a least-squares problem.
 
+use nalgebra::DMatrix;
+
 use crate::gram::Gram;
 use crate::lagged::{Lagged, Lags, push_past};
 use crate::linear::{LinearModel, is_stable};
+use crate::linear_fit::{covariance_rows, spread, without_nuisance};
 use crate::lm::{Problem, cholesky, substitute};
 use crate::{Error, Monitor, Record, Result};
 
@@ -103,6 +106,22 @@ impl<'a> OutputError<'a> {
         substitute(&normal, linear, &mut jte[na..]);
         theta[na..].copy_from_slice(&jte[na..]);
         Some((self.cost(&theta)?, theta))
+    }
+
+    /// Covariance of the shared parameters for white noise, row by row, with a row for the offset in any case.
+    pub fn covariance(&mut self, theta: &[f64], cost: f64) -> Vec<f64> {
+        let n = self.parameters();
+        let (mut jtj, mut jte) = (vec![0.0; n * n], vec![0.0; n]);
+        let is_valid = self.cost(theta).is_some();
+        self.normal_equations(theta, &mut jtj, &mut jte);
+        let information = DMatrix::from_fn(n, n, |i, j| jtj[i.max(j) * n + i.min(j)]);
+        // jtj is a mean over the samples, the cost half of one
+        let variance = 2.0 * cost / (self.samples - n as f64);
+        let shared = self.shared();
+        let found = without_nuisance(&information, shared)
+            .filter(|_| is_valid)
+            .and_then(|i| spread(&i, variance));
+        covariance_rows(found.as_ref(), self.lags.regressors() + 1)
     }
 
     fn simulate(&mut self, theta: &[f64], model: &LinearModel, experiment: usize) -> Option<f64> {

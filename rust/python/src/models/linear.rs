@@ -3,9 +3,9 @@
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use sewfast_core::lagged::Lagged;
-use sewfast_core::{arx, linear, oe};
+use sewfast_core::{arx, iv, linear, linear_fit, oe};
 
-use super::{Rows, Values};
+use super::{Rows, RunAndJacobian, Values};
 use crate::arrays::{Experiments, array1, array2, raise, records, rows, slice};
 use crate::watch::watched;
 
@@ -13,6 +13,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<LinearModel>()?;
     module.add_class::<LinearFit>()?;
     module.add_function(wrap_pyfunction!(fit_arx, module)?)?;
+    module.add_function(wrap_pyfunction!(fit_iv, module)?)?;
     module.add_function(wrap_pyfunction!(fit_oe, module)?)
 }
 
@@ -78,6 +79,10 @@ impl LinearModel {
         array1(py, self.inner.dc_gain())
     }
 
+    fn rest_state<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array1(py, vec![0.0; self.inner.lags().na])
+    }
+
     fn simulate<'py>(
         &self,
         py: Python<'py>,
@@ -107,12 +112,24 @@ impl LinearModel {
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
         Ok(array1(py, super::initial_state(py, &self.inner, &u, &y)?))
     }
+
+    fn jacobian<'py>(
+        &self,
+        py: Python<'py>,
+        u: Rows<'py>,
+        y_past: Values<'py>,
+    ) -> PyResult<RunAndJacobian<'py>> {
+        let ((u, channels), y_past) = (rows(&u, "u")?, slice(&y_past, "y_past")?);
+        let (run, jacobian) = super::released(py, || self.inner.jacobian(u, channels, y_past))?;
+        let columns = self.inner.parameters() + self.inner.lags().na;
+        Ok((array1(py, run), array2(py, jacobian, columns)?))
+    }
 }
 
 /// A fitted linear model with the story of its fit.
 #[pyclass(frozen, module = "sewfast._core")]
 pub struct LinearFit {
-    inner: oe::LinearFit,
+    inner: linear_fit::LinearFit,
 }
 
 #[pymethods]
@@ -154,6 +171,17 @@ impl LinearFit {
         let states = self.inner.initial_states.concat();
         array2(py, states, self.inner.model.lags().na)
     }
+
+    #[getter]
+    fn covariance<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let rows = self.inner.covariance.clone();
+        array2(py, rows, self.inner.model.parameters())
+    }
+
+    #[getter]
+    fn standard_errors<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array1(py, self.inner.standard_errors())
+    }
 }
 
 #[pyfunction]
@@ -187,6 +215,26 @@ fn fit_oe(
     let records = records(py, &experiments)?;
     let inner = watched(py, progress.as_ref(), |monitor| {
         oe::fit(&records, na, nb, nk, offset, max_iterations, monitor)
+    })?;
+    Ok(LinearFit { inner })
+}
+
+#[pyfunction]
+#[pyo3(signature = (experiments, *, na, nb, nk, offset = true, max_iterations = 50, progress = None))]
+#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+fn fit_iv(
+    py: Python<'_>,
+    experiments: Experiments<'_>,
+    na: usize,
+    nb: usize,
+    nk: usize,
+    offset: bool,
+    max_iterations: usize,
+    progress: Option<Bound<'_, PyAny>>,
+) -> PyResult<LinearFit> {
+    let records = records(py, &experiments)?;
+    let inner = watched(py, progress.as_ref(), |monitor| {
+        iv::fit(&records, na, nb, nk, offset, max_iterations, monitor)
     })?;
     Ok(LinearFit { inner })
 }

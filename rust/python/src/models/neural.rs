@@ -8,7 +8,7 @@ use sewfast_core::neural::{self, InitialState, Scaling, Settings, Shape};
 use sewfast_core::{Error, Result};
 
 use super::linear::LinearModel;
-use super::{Rows, Values};
+use super::{Rows, RunAndJacobian, Values};
 use crate::arrays::{Experiments, array1, array2, raise, records, rows, slice};
 use crate::watch::watched;
 
@@ -17,8 +17,6 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<NeuralFit>()?;
     module.add_function(wrap_pyfunction!(fit_neural_oe, module)?)
 }
-
-type RunAndJacobian<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);
 
 /// Network output-error model.
 #[pyclass(frozen, module = "sewfast._core")]
@@ -94,6 +92,10 @@ impl NeuralOE {
     #[getter]
     fn na(&self) -> usize {
         self.inner.lags().na
+    }
+
+    fn rest_state<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array1(py, vec![0.0; self.inner.lags().na])
     }
 
     fn simulate<'py>(
