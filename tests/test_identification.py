@@ -12,7 +12,7 @@ from plants import OFFSET, A, B, bent_data, linear_data
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError, Interrupted, SettingError
 from sewfast.identification import identify
-from sewfast.models import ARX, LinearOE, NeuralOE
+from sewfast.models import ARX, IV, LinearOE, NeuralOE
 from sewfast.readers import read
 from sewfast.validation import validate
 
@@ -24,11 +24,11 @@ QUICK: dict[str, Any] = {"iterations": 20, "starts": 2, "hidden": 4}
 # --- recovery ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["arx", "oe"])
+@pytest.mark.parametrize("kind", ["arx", "iv", "oe"])
 @pytest.mark.parametrize("inputs", [1, 2])
 def test_linear_models_recover_a_linear_plant(kind: Any, inputs: int) -> None:
     model = identify(linear_data(inputs=inputs), model=kind)
-    assert isinstance(model, (ARX, LinearOE))
+    assert isinstance(model, (ARX, IV, LinearOE))
     np.testing.assert_allclose(model.core.a, A, rtol=1e-6)
     np.testing.assert_allclose(model.core.b, np.vstack([B, 2 * B])[:inputs], rtol=1e-6)
     assert model.core.offset == pytest.approx(OFFSET, rel=1e-6)
@@ -173,8 +173,8 @@ def test_an_interruption_hands_over_the_best_model(kind: Any) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"model": "narx"}, "auto, arx, oe or neural-oe, received 'narx'"),
-        ({"model": "paper"}, "auto, arx, oe or neural-oe"),
+        ({"model": "narx"}, "auto, arx, iv, oe or neural-oe, received 'narx'"),
+        ({"model": "paper"}, "auto, arx, iv, oe or neural-oe"),
         ({"preset": "other"}, "'paper' or none"),
         ({"preset": "paper", "model": "arx"}, "neural-oe"),
         ({"preset": "paper", "na": 3}, "na = 2"),

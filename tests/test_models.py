@@ -16,7 +16,7 @@ from sewfast import _core
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError, FitError, ModelFileError, SettingError, SewfastError
 from sewfast.identification import identify
-from sewfast.models import ARX, LinearOE, Model, NeuralOE, load_model
+from sewfast.models import ARX, IV, LinearOE, Model, NeuralOE, load_model
 
 NAMES = (0.01, ("u",), "speed", ("V",), "RPM")
 
@@ -47,6 +47,7 @@ def network(**options: Any) -> NeuralOE:
 
 CATALOGUE = {
     "arx": exact,
+    "iv": lambda **o: IV(_core.LinearModel(A, B, 1, OFFSET), *NAMES, **o),
     "oe": lambda **o: LinearOE(_core.LinearModel(A, B, 1, OFFSET), *NAMES, **o),
     "neural_oe": network,
 }
@@ -98,7 +99,7 @@ def test_one_step_prediction_takes_measured_outputs(model: Model) -> None:
     far = model.predict(data, 1000, init=5)[0]
     np.testing.assert_allclose(far, model.simulate(data, init=5)[0], rtol=1e-12, atol=1e-12)
     assert not np.allclose(model.predict(data, 1, init=5)[0], far) or isinstance(
-        model, (ARX, LinearOE)
+        model, (ARX, IV, LinearOE)
     )
 
 
@@ -189,7 +190,7 @@ def test_counts_are_remembered(tmp_path: Path) -> None:
 
 
 DAMAGE: list[tuple[str, tuple[str | int, ...], Any, str]] = [
-    ("arx", ("kind",), "narx", "one of arx, oe, neural_oe"),
+    ("arx", ("kind",), "narx", "one of arx, iv, oe, neural_oe"),
     ("arx", ("kind",), None, "'kind'"),
     ("arx", ("version",), 2, "version"),
     ("arx", ("format",), "other", "format"),

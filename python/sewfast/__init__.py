@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from .leastsquares import LeastSquaresResult, least_squares
     from .loop import ClosedLoopRun, run
     from .machine import VirtualMachine
-    from .models import ARX, LinearOE, Model, NeuralOE, load_model
+    from .models import ARX, IV, LinearOE, Model, NeuralOE, load_model
     from .readers import read, read_table
     from .recording import Recording, record
     from .speed import speed_from_counts
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ARX",
+    "IV",
     "ClosedLoopRun",
     "Controller",
     "DataError",
@@ -93,7 +94,7 @@ _HOMES = {
     "leastsquares": "LeastSquaresResult least_squares",
     "loop": "ClosedLoopRun run",
     "machine": "VirtualMachine",
-    "models": "ARX LinearOE Model NeuralOE load_model",
+    "models": "ARX IV LinearOE Model NeuralOE load_model",
     "readers": "read read_table",
     "recording": "Recording record",
     "speed": "speed_from_counts",

@@ -14,11 +14,12 @@ from .models import Model
 from .models.base import INIT
 from .recipes import Progress, Task
 
-Kind: TypeAlias = Literal["auto", "arx", "oe", "neural_oe", "neural-oe"]
+Kind: TypeAlias = Literal["auto", "arx", "iv", "oe", "neural_oe", "neural-oe"]
 
 _RECIPES: dict[str, Callable[[Task], Model]] = {
     "auto": recipes.auto,
     "arx": recipes.arx,
+    "iv": recipes.iv,
     "oe": recipes.oe,
     "neural_oe": recipes.neural_oe,
     "paper": recipes.paper,
@@ -49,8 +50,9 @@ def identify(
     ----------
     data : Dataset
         Training data: inputs complete; outputs that are NaN were not measured and have no weight.
-    model : {"auto", "arx", "oe", "neural_oe"}
-        `arx`: least squares of the one-step error. `oe`: linear output error. `neural_oe`: the
+    model : {"auto", "arx", "iv", "oe", "neural_oe"}
+        `arx`: least squares of the one-step error. `iv`: refined instrumental variables, which
+        measurement noise does not bias. `oe`: linear output error. `neural_oe`: the
         network, trained in free run from the linear output-error model. `auto`: `oe` or
         `neural_oe`, whichever has the smaller free-run error on data not trained on.
     preset : "paper" or None
@@ -97,7 +99,7 @@ def identify(
     """
     kind = str(model).replace("-", "_")
     if kind not in _RECIPES or kind == "paper":
-        raise SettingError(f"model: expected auto, arx, oe or neural-oe, received {model!r}")
+        raise SettingError(f"model: expected auto, arx, iv, oe or neural-oe, received {model!r}")
     if preset is not None:
         kind = _preset(preset, kind, (na, nb, nk, hidden))
     starts = _STARTS.get(kind, _USUAL_STARTS) if starts is None else starts

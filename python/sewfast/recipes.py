@@ -13,12 +13,13 @@ import numpy as np
 from . import _core
 from .dataset import Dataset, Experiment, FloatArray
 from .errors import FitError, Interrupted
-from .models import ARX, LinearOE, Model, NeuralOE
+from .models import ARX, IV, LinearOE, Model, NeuralOE
 from .models.base import INIT
 from .validation import validate
 
 Progress: TypeAlias = Callable[[int, int, float], object]
 Story: TypeAlias = dict[str, Any]
+_Class: TypeAlias = type[ARX] | type[IV] | type[LinearOE] | type[NeuralOE]
 
 BLOCKS = 8
 HELD_OUT = (2, 5)
@@ -71,6 +72,25 @@ def arx(task: Task) -> Model:
     return _told(
         model, {"cost": float(np.nanmean(one_step**2) / 2), "cost_unit": "output unit squared"}
     )
+
+
+def iv(task: Task) -> Model:
+    """Refined instrumental variables."""
+    began = time.perf_counter()
+    fit = _core.fit_iv(
+        _arrays(task.data),
+        na=task.na,
+        nb=task.nb,
+        nk=task.nk,
+        max_iterations=task.iterations,
+        progress=task.progress,
+    )
+    settled = fit.termination == "small_step"
+    note = f"instrumental variables did not settle ({fit.termination}); consider model oe"
+    model = _linear_model(task, fit, began, {} if settled else {"notes": [note]}, IV)
+    if fit.termination == "interrupted":
+        raise Interrupted(model)
+    return model
 
 
 def oe(task: Task) -> Model:
@@ -277,10 +297,23 @@ def _free_run_rmse(model: Model, data: Dataset) -> float:
 
 
 def _linear_model(
-    task: Task, fit: _core.LinearFit, began: float, extra: Story | None = None
+    task: Task,
+    fit: _core.LinearFit,
+    began: float,
+    extra: Story | None = None,
+    cls: type[IV] | type[LinearOE] = LinearOE,
 ) -> Model:
-    story = {"initial_state": "estimated", "cost_unit": "output unit squared"}
-    return _model(LinearOE, fit.model, task, began, _fit_story(fit) | story | (extra or {}))
+    story: Story = {"initial_state": "estimated", "cost_unit": "output unit squared"}
+    story |= {"standard_errors": _standard_errors(fit)}
+    return _model(cls, fit.model, task, began, _fit_story(fit) | story | (extra or {}))
+
+
+def _standard_errors(fit: _core.LinearFit) -> Story:
+    """Of the coefficients, for white measurement noise; None where the data do not fix them."""
+    errors = [e if math.isfinite(e) else None for e in fit.standard_errors.tolist()]
+    (na, (inputs, nb)) = (fit.model.na, fit.model.b.shape)
+    b = [errors[na + j * nb :][:nb] for j in range(inputs)]
+    return {"a": errors[:na], "b": b, "offset": errors[-1]}
 
 
 def _network_model(
@@ -304,7 +337,7 @@ def _fit_story(fit: _core.LinearFit | _core.NeuralFit) -> Story:
 
 
 def _model(
-    cls: type[ARX] | type[LinearOE] | type[NeuralOE],
+    cls: _Class,
     core: Any,
     task: Task,
     began: float,
@@ -323,7 +356,7 @@ def _model(
     return _told(_bare(cls, core, task), common | story)
 
 
-def _bare(cls: type[ARX] | type[LinearOE] | type[NeuralOE], core: Any, task: Task) -> Model:
+def _bare(cls: _Class, core: Any, task: Task) -> Model:
     d = task.data
     return cls(core, d.Ts, d.input_names, d.output_name, d.input_units, d.output_unit, d.counts)
 

@@ -80,9 +80,10 @@ def add(commands: Commands) -> None:
 
 def _add_model(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--model", choices=("auto", "arx", "oe", "neural-oe"), default="auto",
-        help="arx: least squares one step ahead; oe: linear output error; neural-oe: network "
-        "output error; auto (default): oe or neural-oe, whichever does better",
+        "--model", choices=("auto", "arx", "iv", "oe", "neural-oe"), default="auto",
+        help="arx: least squares one step ahead; iv: refined instrumental variables; oe: linear "
+        "output error; neural-oe: network output error; auto (default): oe or neural-oe, whichever "
+        "does better",
     )  # fmt: skip
     parser.add_argument(
         "--preset", choices=("paper",),

@@ -2,7 +2,7 @@
 
 from .base import Model
 from .files import load_model
-from .linear import ARX, LinearOE
+from .linear import ARX, IV, LinearOE
 from .neural import NeuralOE
 
-__all__ = ["ARX", "LinearOE", "Model", "NeuralOE", "load_model"]
+__all__ = ["ARX", "IV", "LinearOE", "Model", "NeuralOE", "load_model"]

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 from .. import jsonfile
 from ..errors import ModelFileError, SewfastError
 from .base import FORMAT, VERSION, Model
 from .fields import Fields
-from .linear import ARX, LinearOE
+from .linear import ARX, IV, LinearOE
 from .neural import NeuralOE
 
-_KINDS: dict[str, type[ARX] | type[LinearOE] | type[NeuralOE]] = {
-    c.kind: c for c in (ARX, LinearOE, NeuralOE)
-}
+_Kind: TypeAlias = type[ARX] | type[IV] | type[LinearOE] | type[NeuralOE]
+_KINDS: dict[str, _Kind] = {c.kind: c for c in (ARX, IV, LinearOE, NeuralOE)}
 _FIELDS = ("version", "kind", "Ts", "inputs", "output", "counts", "parameters", "training")
 
 
@@ -53,7 +52,7 @@ def _read(fields: Fields) -> Model:
     return _model(fields, _KINDS[kind])
 
 
-def _model(fields: Fields, cls: type[ARX] | type[LinearOE] | type[NeuralOE]) -> Model:
+def _model(fields: Fields, cls: _Kind) -> Model:
     inputs, output = fields.objects("inputs"), fields.object("output")
     if not inputs:
         raise fields.refuse("inputs", "at least one input", [])
@@ -84,7 +83,7 @@ def _training(training: Fields, inputs: int) -> Mapping[str, Any]:
     return known
 
 
-def _core(parameters: Fields, cls: type[ARX] | type[LinearOE] | type[NeuralOE]) -> object:
+def _core(parameters: Fields, cls: _Kind) -> object:
     try:
         return cls.core_from(parameters)
     except ModelFileError:

@@ -1,17 +1,36 @@
-"""Linear difference equations with offset: ARX, and the linear output-error model."""
+"""Linear difference equations with offset: ARX, instrumental variables, linear output error."""
 
 from __future__ import annotations
 
 import cmath
 import math
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from .. import _core
-from ..dataset import labelled
+from ..dataset import FloatArray, labelled
+from ..errors import SettingError
 from .base import Model
+from .continuous import ContinuousModel, continuous
+from .conversion import (
+    StateSpace,
+    difference_equation,
+    from_state_space,
+    in_descending_powers,
+    observer_form,
+    offset_at,
+    transfer_function,
+)
 from .fields import Fields
+from .toolboxes import (
+    control_state_space,
+    control_transfer_function,
+    polynomials_of,
+    scipy_system,
+)
 
 
 class LinearDifference(Model):
@@ -51,6 +70,200 @@ class LinearDifference(Model):
         a = _polynomial(np.concatenate([[1.0], self.core.a]), 0)
         return f"G(z) = ({b}) / ({a})"
 
+    # --- other forms ------------------------------------------------------------------------------
+
+    def to_tf(self) -> tuple[FloatArray, FloatArray]:
+        """Transfer function of deviations, as coefficients of z^0, z^-1, z^-2, ..
+
+        Returns
+        -------
+        num : array, shape (n_inputs, nk + nb)
+            One row per input; the delay is `nk` leading zeros.
+        den : array, shape (na + 1,)
+            `[1, a_1, .., a_na]`, common to all inputs.
+        """
+        return transfer_function(self.core)
+
+    def to_ss(self) -> StateSpace:
+        """State space of deviations in observer form: `A, B, C, D = model.to_ss()`.
+
+        Returns
+        -------
+        StateSpace
+            x(k+1) = A x(k) + B u(k), y(k) = C x(k) + D u(k), of order n = max(na, nk + nb - 1);
+            shapes (n, n), (n, n_inputs), (1, n), (1, n_inputs). `x_i(k)` is what inputs and
+            outputs up to sample k - 1 contribute to y(k+i-1); the delay is among these states.
+        """
+        return observer_form(self.core)
+
+    def to_control(self, form: str = "tf") -> Any:
+        """`control.TransferFunction` (`form` "tf") or `control.StateSpace` ("ss"), dt = Ts, named.
+
+        Raises
+        ------
+        SettingError
+            Where python-control is not installed, or for another form.
+        """
+        inputs, output = list(self.input_names), self.output_name
+        if form == "ss":
+            return control_state_space(self.to_ss(), self.Ts, inputs, output)
+        if form != "tf":
+            raise SettingError(f"form: expected 'tf' or 'ss', received {form!r}")
+        return control_transfer_function(*in_descending_powers(self.core), self.Ts, inputs, output)
+
+    def to_scipy(self) -> Any:
+        """`scipy.signal.dlti` with dt = Ts: a transfer function, for several inputs a state space.
+
+        Raises
+        ------
+        SettingError
+            Where scipy is not installed.
+        """
+        return scipy_system(*in_descending_powers(self.core), self.to_ss(), self.Ts)
+
+    def to_continuous(self) -> ContinuousModel:
+        """The differential equation that becomes this model under a zero-order hold.
+
+        Raises
+        ------
+        SettingError
+            Where there is none: a pole on the negative real axis or at 0, or nb > na.
+        """
+        return continuous(self.core, self.Ts, self.input_names, self.output_name)
+
+    def frequency_response(self, omega: ArrayLike) -> NDArray[np.complex128]:
+        """G(exp(i omega Ts)), shape (n_inputs, len(omega)), for omega in rad/s."""
+        num, den = self.to_tf()
+        z = np.exp(-1j * self.Ts * np.atleast_1d(np.asarray(omega, dtype=np.float64)))
+        powers = z ** np.arange(max(num.shape[1], len(den)))[:, None]
+        response: NDArray[np.complex128] = num @ powers[: num.shape[1]] / (den @ powers[: len(den)])
+        return response
+
+    def steady_output(self, u0: ArrayLike) -> float:
+        """The output at which the model rests under constant inputs: with `u0` a steady point.
+
+        Raises
+        ------
+        SettingError
+            Where `u0` has not one value per input, or a pole at 1 leaves nothing to rest at.
+        """
+        at_rest = 1.0 + float(self.core.a.sum())
+        if at_rest == 0.0:
+            raise SettingError("expected no pole at 1, received one; an integrator has no level")
+        return (self.core.offset - offset_at(self.core, u0, 0.0)) / at_rest
+
+    @classmethod
+    def from_tf(
+        cls,
+        num: ArrayLike,
+        den: ArrayLike,
+        Ts: float,
+        *,
+        offset: float = 0.0,
+        operating_point: tuple[ArrayLike, float] | None = None,
+        input_names: Sequence[str] | None = None,
+        output_name: str = "y",
+        input_units: Sequence[str] | None = None,
+        output_unit: str = "",
+    ) -> Any:
+        """A model from a transfer function in powers of z^-1, as `to_tf` gives it.
+
+        Parameters
+        ----------
+        num : array_like, shape (m,) or (n_inputs, m)
+            Leading zeros that all rows share are the delay `nk`.
+        den : array_like, shape (na + 1,)
+        Ts : float
+            Sample time [s].
+        offset : float
+            What a transfer function does not hold: `model.core.offset` of the model it came from.
+        operating_point : (u0, y0) or None
+            Instead of `offset`: the inputs and the output, in the data's units, from which the
+            transfer function's deviations count. The model then rests at y0 under u0.
+        input_names, output_name, input_units, output_unit
+            As in the data set; by default `u` or `u1, u2, ..` and `y`, without units.
+
+        Returns
+        -------
+        Model
+            Of the class it is called on.
+
+        Raises
+        ------
+        SettingError
+            Where shapes or values are impossible, or both `offset` and `operating_point` are given.
+        """
+        core = difference_equation(num, den, offset)
+        if operating_point is not None:
+            if offset != 0.0:
+                raise SettingError("expected offset or operating_point, received both")
+            at = offset_at(core, *operating_point)
+            core = _core.LinearModel(core.a, core.b, core.nk, at)
+        width = len(core.b)
+        numbered = tuple(f"u{i + 1}" for i in range(width)) if width > 1 else ("u",)
+        names = numbered if input_names is None else tuple(input_names)
+        units = ("",) * width if input_units is None else tuple(input_units)
+        if not len(names) == len(units) == width:
+            raise SettingError(
+                f"expected {width} input names and units, received {list(names)}, {list(units)}"
+            )
+        if not (np.isfinite(Ts) and Ts > 0.0):
+            raise SettingError(f"Ts: expected a positive sample time in seconds, received {Ts}")
+        return cls(core, float(Ts), names, output_name, units, output_unit)
+
+    @classmethod
+    def from_ss(
+        cls, A: ArrayLike, B: ArrayLike, C: ArrayLike, D: ArrayLike, Ts: float, **options: Any
+    ) -> Any:
+        """A model from a state space with one output; options as in `from_tf`.
+
+        From observer form, as `to_ss` gives it, nothing is lost but the last bit of `b` where
+        nk = 0; else na is the order n and rounding errors are those of an eigenvalue problem.
+
+        Raises
+        ------
+        SettingError
+            As `from_tf`.
+        """
+        return cls.from_tf(*from_state_space(A, B, C, D), Ts, **options)
+
+    @classmethod
+    def from_control(cls, system: Any, Ts: float | None = None, **options: Any) -> Any:
+        """A model from a discrete-time python-control system with one output.
+
+        Parameters
+        ----------
+        system : control.TransferFunction or control.StateSpace
+            Its names are taken over. Different denominators are multiplied out.
+        Ts : float or None
+            Sample time [s] where `system.dt` is True.
+        **options
+            As in `from_tf`.
+
+        Raises
+        ------
+        SettingError
+            For continuous time or several outputs, and as `from_tf`.
+        """
+        num, den, dt = polynomials_of(system, Ts)
+        names = {
+            "input_names": getattr(system, "input_labels", None),
+            "output_name": next(iter(getattr(system, "output_labels", None) or ["y"])),
+        }
+        return cls.from_tf(num, den, dt, **names | options)
+
+    @classmethod
+    def from_scipy(cls, system: Any, Ts: float | None = None, **options: Any) -> Any:
+        """A model from a `scipy.signal.dlti` with one output; arguments as in `from_control`.
+
+        Raises
+        ------
+        SettingError
+            As `from_control`.
+        """
+        num, den, dt = polynomials_of(system, Ts)
+        return cls.from_tf(num, den, dt, **options)
+
     def describe(self) -> list[str]:
         lines = []
         for i, (name, unit) in enumerate(zip(self.input_names, self.input_units, strict=True)):
@@ -66,6 +279,13 @@ class ARX(LinearDifference):
 
     kind: ClassVar[str] = "arx"
     title: ClassVar[str] = "ARX by least squares"
+
+
+class IV(LinearDifference):
+    """Refined instrumental variables, SRIV (Young 2011, section 6.4): no bias by output noise."""
+
+    kind: ClassVar[str] = "iv"
+    title: ClassVar[str] = "Refined instrumental variables"
 
 
 class LinearOE(LinearDifference):
