@@ -14,7 +14,7 @@ const DECAYED: f64 = 1e-30;
 pub(super) struct Run {
     /// The model's outputs.
     pub output: Vec<f64>,
-    /// Past outputs, newest first.
+    /// Past outputs before the first measured sample, newest first.
     pub state: Vec<f64>,
     /// Sum of squared errors at the measured samples.
     pub error: f64,
@@ -109,9 +109,15 @@ pub(super) fn best_run(model: &LinearModel, record: &Record, responses: &[f64]) 
     let squares = errors.filter(|e| !e.is_nan()).map(|e| e * e);
     let (measured, error) = squares.fold((0, 0.0), |(n, sum), e| (n + 1, sum + e));
     error.is_finite().then(|| Run {
+        state: before(record.first_measured(), &output, state.as_slice()),
         output,
-        state: state.as_slice().to_vec(),
         error,
         measured,
     })
+}
+
+/// Past outputs before sample `k` of a run that began at `state`.
+fn before(k: usize, output: &[f64], state: &[f64]) -> Vec<f64> {
+    let past = output[..k].iter().rev().chain(state);
+    past.take(state.len()).copied().collect()
 }

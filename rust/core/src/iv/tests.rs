@@ -44,6 +44,22 @@ fn recovers_a_clean_system_from_experiments_in_any_state() {
 }
 
 #[test]
+fn runs_through_gaps() {
+    let truth = LinearModel::new(vec![-1.5, 0.7], vec![0.5, 0.3], 1, 1, 0.4).unwrap();
+    let u = noise(800, 1);
+    let clean = truth.simulate(&u, 1, &[3.0, 1.0]).unwrap();
+    let mut y = clean.clone();
+    let mut random = Random::new(7);
+    y.iter_mut()
+        .filter(|_| random.between(0.0, 1.0) < 0.1)
+        .for_each(|y| *y = f64::NAN);
+    y[..30].fill(f64::NAN);
+    let fit = fitted(&[Record::with_gaps(&u, 1, &y).unwrap()], truth.lags());
+    assert!(worst(fit.model.a(), truth.a()) < 1e-7, "{:?}", fit.model);
+    assert!(worst(&fit.initial_states[0], &[clean[29], clean[28]]) < 1e-5);
+}
+
+#[test]
 fn is_not_biased_by_noise_that_ruins_least_squares() {
     // 490 / ((.252 s + 1)(.0074 s + 1)) sampled at 1 ms, with the noise of a counted encoder.
     let a = vec![-1.86963746, 0.87013806];
