@@ -60,7 +60,6 @@ def test_run_pyserial(benchmark: Any) -> None:
         device = VirtualDevice(fast=True)
         devices.append(device)
         host = pyserial_link.Host(device.port)
-        host.grant(100_000)
         host.set_limits()
         return (host,), {}
 

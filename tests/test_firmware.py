@@ -92,3 +92,16 @@ def test_a_host_that_dies_is_watched(port: str) -> None:
         status = drive.status()
     assert (status.state, status.reason) == ("tripped", "watchdog")
     assert 0 < status.taken < 20_000
+
+
+def test_two_boots_have_two_boot_ids() -> None:
+    if not DESK.exists():
+        pytest.skip("needs the firmware on its desk board: make c-test")
+    boots = set()
+    for _ in range(3):
+        with subprocess.Popen([DESK], stdout=subprocess.PIPE, text=True) as desk:
+            assert desk.stdout is not None
+            with connect(desk.stdout.readline().removeprefix("port ").strip()) as drive:
+                boots.add(drive.identity.boot)
+            desk.terminate()
+    assert len(boots) == 3

@@ -340,3 +340,18 @@ def test_the_command_lists_ports(tmp_path):
     assert isinstance(found, list)
     assert all(set(p) >= {"path", "vid", "pid", "can_open"} for p in found)
     assert sewfast(tmp_path, "ports").out
+
+
+def test_a_socket_is_opened_again_within_the_time_given(monkeypatch):
+    waits = []
+
+    def refuse(address, timeout):
+        waits.append(timeout)
+        raise TimeoutError("timed out")
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = open_port(f"socket://127.0.0.1:{server.getsockname()[1]}")
+        monkeypatch.setattr(socket, "create_connection", refuse)
+        with pytest.raises(LinkError):
+            port.reopen(0.3)
+    assert waits == [0.3]

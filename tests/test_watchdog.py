@@ -27,6 +27,10 @@ from sewfast.link import VirtualDevice
 TRIALS = 200 if os.environ.get("SEWFAST_SOAK") == "1" else 3
 PERIOD = 1000
 """The control period [us], by which the output may be late."""
+SET_BACK = 1_000_000
+"""Lateness of the server at which it sets its clock back [us]."""
+ROUNDING = 3
+"""Three times are cut to whole microseconds."""
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals")
 
@@ -96,7 +100,7 @@ def test_the_output_is_safe_within_the_stated_time(
     device: VirtualDevice, end: Callable[[VirtualDevice, int], None]
 ) -> None:
     random = np.random.default_rng(1)
-    late, wall = [], []
+    late, wall, server = [], [], []
     for _ in range(TRIALS):
         before = len(device.trace())
         end(device, int(random.integers(20_000, 60_000)))
@@ -105,6 +109,9 @@ def test_the_output_is_safe_within_the_stated_time(
         wall.append(off["seconds"] - off["heartbeat_seconds"] - off["watchdog_us"] * 1e-6)
         assert off["state"] == raw.TRIPPED
         assert late[-1] <= PERIOD
+        server.append(off["late_us"])
+        if server[-1] < SET_BACK:
+            assert wall[-1] <= (PERIOD + server[-1] + ROUNDING) * 1e-6
         back_again(device)
         assert [e["event"] for e in changes(device, before)] == ["on", "off"]
     print(
@@ -112,6 +119,14 @@ def test_the_output_is_safe_within_the_stated_time(
         f"device's clock, {max(wall) * 1e6:.0f} us by the computer's "
         f"(median {np.median(wall) * 1e6:.0f})"
     )
+    late_trials = [k for k in range(TRIALS) if server[k] > PERIOD]
+    if late_trials:
+        print(
+            f"in {len(late_trials)} of them the server got no processor in time, by up to "
+            f"{max(server)} us, so that its clock says nothing of these; without them "
+            f"{max((wall[k] for k in range(TRIALS) if k not in late_trials), default=0) * 1e6:.0f} "
+            "us at most by the computer's"
+        )
 
 
 def back_again(device: VirtualDevice) -> None:

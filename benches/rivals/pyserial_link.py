@@ -16,9 +16,11 @@ import serial
 from numpy.typing import NDArray
 
 _HEAD = struct.Struct("<BHIQ")
-HELLO, LIMITS, ARM, UPLOAD, START, ECHO, CREDIT = 0x01, 0x04, 0x05, 0x08, 0x0A, 0x0B, 0x22
+HELLO, STATUS, LIMITS, ARM, UPLOAD, START, ECHO = 0x01, 0x03, 0x04, 0x05, 0x08, 0x0A, 0x0B
+CREDIT = 0x22
 SAMPLES, FINISHED, SESSION = 0xC0, 4, 12345
 WATCHDOG_US, LEAD_US, PER_FRAME = 250_000, 200_000, 113
+SETTLED_US = 150_000
 
 
 def _stuffed(data: bytes) -> bytes:
@@ -139,6 +141,10 @@ class Host:
         return self.ask(ECHO, data)
 
     def set_limits(self) -> None:
+        """Once the device has booted and seen its motor stand, for which it needs time."""
+        while self.newest < SETTLED_US:
+            self.grant(SETTLED_US)
+            self.ask(STATUS, b"")
         self.ask(LIMITS, struct.pack("<4f", 20.0, *[float("inf")] * 3))
 
     def close(self) -> None:

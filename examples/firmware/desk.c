@@ -82,6 +82,19 @@ size_t board_write(const uint8_t *bytes, size_t count) {
     return taken > 0 ? (size_t)taken : 0;
 }
 
+/* Without memory that outlives the program, entropy: the same low 16 bits as at the boot before come once in 65536 boots. A drive has a
+ * counter in non-volatile memory instead, which never gives them. */
+static uint32_t boot_id(void) {
+    uint32_t id = (uint32_t)time(NULL) * 2654435761u ^ (uint32_t)getpid();
+    FILE *source = fopen("/dev/urandom", "rb");
+    if (source != NULL) {
+        uint32_t drawn;
+        if (fread(&drawn, sizeof drawn, 1, source) == 1) id = drawn;
+        fclose(source);
+    }
+    return id;
+}
+
 static bool open_port(void) {
     struct termios raw;
     port = posix_openpt(O_RDWR | O_NOCTTY);
@@ -94,7 +107,7 @@ static bool open_port(void) {
 }
 
 int main(void) {
-    if (!open_port() || !firmware_init((uint32_t)time(NULL))) {
+    if (!open_port() || !firmware_init(boot_id())) {
         fprintf(stderr, "desk: no pseudo-terminal, or the identity is refused\n");
         return 1;
     }

@@ -11,7 +11,7 @@ from . import wire
 from .connection import Connection
 from .diagnosis import Finding, Verdict
 from .drive import PATIENCE, Drive
-from .ports import Port
+from .ports import CONNECT_TIMEOUT, Port
 
 SHORT, LONG = 0, 200
 """Bytes of the two kinds of echoes; the difference of their times is what the bytes cost."""
@@ -55,8 +55,8 @@ class Metered(Port):
     def close(self) -> None:
         self._port.close()
 
-    def reopen(self) -> None:
-        self._port.reopen()
+    def reopen(self, timeout: float = CONNECT_TIMEOUT) -> None:
+        self._port.reopen(timeout)
 
 
 # --- the device -----------------------------------------------------------------------------------

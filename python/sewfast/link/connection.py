@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import threading
 import time
@@ -93,6 +94,8 @@ class Connection:
         self.events: deque[Event] = deque(maxlen=256)
         #: Greatest time of the device that any of its frames told [us].
         self.newest = 0
+        #: When any of its frames came last.
+        self.heard = -math.inf
         #: Called at the end of each turn; a run takes its samples there and sends heartbeats.
         self.each_turn: Callable[[], None] | None = None
         #: Whether a vanished port is to be opened again.
@@ -165,6 +168,7 @@ class Connection:
         return True
 
     def _take(self, kind: int, device_us: int, body: bytes, received: float) -> None:
+        self.heard = received
         self.newest = max(self.newest, device_us)
         if kind == wire.EVENT:
             event = wire.event(device_us, body)
@@ -177,7 +181,7 @@ class Connection:
 
     def _answered(self, sequence: int, reply: Reply, received: float) -> None:
         if reply.kind == Kind.HELLO:
-            if reply.result or wire.identity(reply.body).session == self.session:
+            if wire.greets(reply, self.session):
                 self._greeting = reply
             return
         command = self._command
@@ -402,7 +406,7 @@ class Connection:
     def _return(self, lost: float, error: LinkError) -> Identity:
         while True:
             try:
-                self.port.reopen()
+                self.port.reopen(max(RETRY, lost + self.resume - time.monotonic()))
                 return self._greet(REPEAT)
             except LinkError as failed:
                 if time.monotonic() - lost + RETRY > self.resume:

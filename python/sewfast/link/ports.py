@@ -35,6 +35,7 @@ class Port(ABC):
     def __init__(self, url: str, baud: int) -> None:
         self.url = url
         self.baud = baud
+        self._patience = CONNECT_TIMEOUT
         self._open()
 
     @abstractmethod
@@ -74,8 +75,13 @@ class Port(ABC):
     def close(self) -> None:
         """Give it back; more than once does no harm, and nothing is raised."""
 
-    def reopen(self) -> None:
+    def reopen(self, timeout: float = CONNECT_TIMEOUT) -> None:
         """Close it and open the same again.
+
+        Parameters
+        ----------
+        timeout : float
+            Longest wait for the other side of a socket [s], for each of its addresses.
 
         Raises
         ------
@@ -83,6 +89,7 @@ class Port(ABC):
             Where it is not there (yet).
         """
         self.close()
+        self._patience = timeout
         self._open()
 
     def _write(self, descriptor: int, data: bytes) -> None:
@@ -150,7 +157,7 @@ class SocketPort(Port):
     def _open(self) -> None:
         address = _address(self.url)
         try:
-            self._socket = socket.create_connection(address, CONNECT_TIMEOUT)
+            self._socket = socket.create_connection(address, self._patience)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._socket.setblocking(False)
         except FAILURES as error:

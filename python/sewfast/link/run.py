@@ -24,6 +24,8 @@ CREDIT_SHARE = 0.8
 """Share of the watchdog time that a device on credit may run ahead."""
 AGAIN = 0.002
 """Time after which credit that brought nothing is granted again [s]."""
+ARMED_SILENCE = 0.25
+"""Time within which an armed device says something: every .2 s [s]."""
 _ENDS = ("finished", "stopped", "tripped")
 
 
@@ -65,6 +67,7 @@ class Run:
         link.receiver.anomalies()
         self._counters = dict(link.receiver.counters)
         pause = 3.0 * layout.batch * self.period * 1e-6
+        self._deaf_after = max(link.watchdog, pause)
         self._silence = 0.02 if self._on_credit else max(0.1, pause)
 
     @property
@@ -126,7 +129,10 @@ class Run:
     def _wait(self) -> float:
         if self._on_credit:
             return AGAIN
-        rest = self._beaten + self.link.watchdog / 4.0 - time.monotonic()
+        now = time.monotonic()
+        if self._is_deaf(now):
+            return SILENCE
+        rest = self._beaten + self.link.watchdog / 4.0 - now
         return min(max(rest, 0.0), SILENCE)
 
     def _each_turn(self) -> None:
@@ -135,9 +141,18 @@ class Run:
         now = time.monotonic()
         if self._on_credit:
             self._grant(now)
+        elif self._is_deaf(now):
+            return
         elif now - self._beaten >= self.link.watchdog / 4.0 or self._changed():
             self._beaten = now
             self._beat()
+
+    def _is_deaf(self, now: float) -> bool:
+        """Whether the device may do anything unheard: then its watchdog is to stop the motor."""
+        after = self._deaf_after
+        if self.start_us is None:
+            after = max(after, ARMED_SILENCE)
+        return now - self.link.heard > after
 
     def _beat(self) -> None:
         if self.plan.mode == "direct":
@@ -238,7 +253,7 @@ class Run:
         if not n:
             return
         first, last = int(times[0]), int(times[-1])
-        self._heard = time.monotonic()
+        self._heard = self.link.heard = time.monotonic()
         self.link.newest = max(self.link.newest, last)
         named = dict(zip(self.layout.names, columns, strict=True))
         if last - first == (n - 1) * self.period:
@@ -324,18 +339,20 @@ class Run:
         error : BaseException or None
             Why; None where the run was cancelled.
         """
-        self.link.each_turn = None
+        link, resume = self.link, self.link.resume
+        link.each_turn = None
         # a port that comes back while the motor may still turn is given the stop
-        self.link.resume = max(self.link.resume, self.link.watchdog)
+        link.resume = max(resume, link.watchdog)
         reason = "cancelled" if error is None else "failed"
         if isinstance(error, KeyboardInterrupt):
             reason = "interrupted"
         try:
-            self.link.stop()
+            link.stop()
             return self._save(reason)
         except LinkError as failed:
             return self._unconfirmed(reason, failed)
         finally:
+            link.resume = resume
             self._leave()
 
     def _save(self, reason: str) -> Outcome:

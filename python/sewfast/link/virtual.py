@@ -184,7 +184,8 @@ class VirtualDevice:
         Each entry has ``event`` (on, off, connected, gone, stalled, unplugged, plugged, reset),
         ``device_us``, ``seconds`` (since the server began), ``state``, and of the last intact
         heartbeat before it ``heartbeat_us``, ``heartbeat_seconds`` and ``watchdog_us``, None where
-        none had come since the boot.
+        none had come since the boot. ``late_us`` is how late the server itself was at most since
+        that heartbeat, for want of a processor: the device's clock is the server's and hides it.
         """
         return self._server.trace()
 

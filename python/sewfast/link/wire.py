@@ -265,6 +265,11 @@ def identity(body: bytes) -> Identity:
     )  # fmt: skip
 
 
+def greets(reply: Reply, session: int) -> bool:
+    """Whether a reply to HELLO is to that of `session`, not to another host's before."""
+    return reply.result != 0 or reply.body.endswith(_SESSION.pack(session))
+
+
 def channel(body: bytes) -> Channel:
     """The reply to DESCRIBE."""
     (number, encoding, steps), rest = _start(_CHANNEL, body, "DESCRIBE")

@@ -38,6 +38,7 @@ fn entry<'py>(py: Python<'py>, entry: &Entry) -> PyResult<Bound<'py, PyDict>> {
     dict.set_item("device_us", entry.device_us)?;
     dict.set_item("seconds", entry.seconds)?;
     dict.set_item("state", entry.state)?;
+    dict.set_item("late_us", entry.late_us)?;
     let heartbeat = entry.heartbeat;
     dict.set_item("heartbeat_us", heartbeat.map(|h| h.device_us))?;
     dict.set_item("heartbeat_seconds", heartbeat.map(|h| h.seconds))?;

@@ -35,6 +35,9 @@ impl State {
         if frame.header.tag != self.settings.tag {
             return self.reset();
         }
+        if self.phase == Phase::Starting {
+            self.heard = now;
+        }
         let mut fields = Fields::new(frame.body);
         // A frame too short for its kind says nothing.
         let _ = match frame.header.kind {
@@ -87,6 +90,7 @@ impl State {
         match self.phase {
             Phase::Arming => {
                 self.phase = Phase::Starting;
+                self.heard = now;
                 self.request(kind::START, self.start_body());
             }
             Phase::Starting => {

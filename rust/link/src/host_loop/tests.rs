@@ -428,6 +428,22 @@ fn says_what_was_refused() {
 }
 
 #[test]
+fn a_start_that_is_answered_by_nothing_is_not_fed_for_long() {
+    let mut world = World::new(100);
+    while world.peer.count(kind::START) == 0 {
+        world.serve(world.now + 100);
+        world.peer.mute = world.peer.count(kind::ARM) == 1;
+    }
+    let muted = world.now;
+    world.serve(u64::MAX);
+    assert_eq!(world.outcome(), Some(&Outcome::Unanswered(kind::START)));
+    let keeps = world.peer.said.iter().filter(|(h, _)| h.kind == kind::KEEP);
+    let after = keeps.map(|(header, _)| (header.time & 0xFFFF_FFFF) - muted);
+    let after: Vec<u64> = after.collect();
+    assert!(after.len() > 10 && after.iter().all(|&after| after <= 250_000));
+}
+
+#[test]
 fn a_device_that_has_reset_ends_the_loop_at_once() {
     let mut world = World::new(100);
     world.serve(1_200_000);

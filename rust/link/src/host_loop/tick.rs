@@ -19,6 +19,9 @@ use crate::samples::Channel;
 /// How long after the usual arrival of samples a tick comes \[us\]: what their delay may vary by.
 const MARGIN: u64 = 1000;
 
+/// Within this an armed device says something, every 200 ms \[us\].
+const ARMED_SILENCE: u64 = 250_000;
+
 /// What the loop is waiting for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Phase {
@@ -241,10 +244,16 @@ impl State {
         }
     }
 
-    /// When an armed device needs the next heartbeat.
+    /// When an armed device needs the next heartbeat; never once it has long not been heard, so that its watchdog ends what it
+    /// may be doing.
     fn keep_due(&self) -> u64 {
-        self.fed
-            .saturating_add(u64::from(self.settings.watchdog / 4))
+        let due = self.fed + u64::from(self.settings.watchdog / 4);
+        let deaf_after = ARMED_SILENCE.max(self.settings.watchdog.into());
+        if due > self.heard + deaf_after {
+            u64::MAX
+        } else {
+            due
+        }
     }
 
     /// A tick, where its deadline has come: measure, control, command.

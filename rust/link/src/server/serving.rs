@@ -51,6 +51,8 @@ pub struct Serving<'a> {
     stalled: Option<Instant>,
     unplugged: Option<Instant>,
     statistics: Statistics,
+    /// How late this turn is, by the first sample that it finds due [us].
+    behind: u64,
 }
 
 impl<'a> Serving<'a> {
@@ -97,6 +99,7 @@ impl<'a> Serving<'a> {
             stalled: None,
             unplugged: None,
             statistics: Statistics::default(),
+            behind: 0,
         }
     }
 
@@ -203,10 +206,12 @@ impl<'a> Serving<'a> {
         let boot_id = self.rig.boot_id();
         let mut length = 0;
         for frame in each_frame(self.inbound.arrived()).take(frames) {
-            self.trace.observe(frame, boot_id, time, Instant::now());
+            self.trace
+                .observe(frame, boot_id, time, self.behind, Instant::now());
             self.rig.receive(time, frame);
             let output = self.rig.output();
-            self.trace.output(output.enabled, time, self.rig.state());
+            self.trace
+                .output(output.enabled, time, &self.clock, self.rig.state());
             length += frame.len();
         }
         self.inbound.consume(length);
@@ -222,12 +227,15 @@ impl<'a> Serving<'a> {
     fn keep_time(&mut self) {
         let now = Instant::now();
         self.log.time = self.clock.read(now);
+        self.behind = 0;
         if self.credit().is_some() {
             self.clock.stand(self.log.time.min(self.rig.next()));
             return;
         }
         self.clock.run(now);
         let time = self.clock.read(now);
+        self.behind = time.saturating_sub(self.rig.next());
+        self.trace.late(self.behind);
         if time > self.rig.next() + HOPELESS {
             self.clock.set(self.rig.next(), now);
             self.statistics.set_back += 1;
@@ -261,8 +269,12 @@ impl<'a> Serving<'a> {
         let due = self.rig.next();
         self.rig.sample();
         self.statistics.samples += 1;
-        self.trace
-            .output(self.rig.output().enabled, due, self.rig.state());
+        self.trace.output(
+            self.rig.output().enabled,
+            due,
+            &self.clock,
+            self.rig.state(),
+        );
         self.collect();
     }
 
@@ -343,8 +355,9 @@ impl<'a> Serving<'a> {
     }
 
     fn reset(&mut self) {
+        let time = self.clock.read(Instant::now());
         self.trace
-            .output(false, self.clock.read(Instant::now()), self.rig.state());
+            .output(false, time, &self.clock, self.rig.state());
         self.trace.rebooted();
         self.rig.reboot();
         self.clock.set(0, Instant::now());
@@ -353,7 +366,8 @@ impl<'a> Serving<'a> {
 
     fn note(&mut self, happening: Happening) {
         let time = self.clock.read(Instant::now());
-        self.trace.note(happening, time, self.rig.state());
+        self.trace
+            .note(happening, time, &self.clock, self.rig.state());
     }
 
     fn report(&mut self) {

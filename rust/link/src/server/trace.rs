@@ -7,6 +7,8 @@ use std::time::Instant;
 
 use sewfast_control::link::{Deframer, Fields, State};
 
+use super::clock::Clock;
+
 /// What happened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Happening {
@@ -68,6 +70,9 @@ pub struct Entry {
     pub state: u8,
     /// The heartbeat before it.
     pub heartbeat: Option<Heartbeat>,
+    /// How late the server was at most since that heartbeat, by the samples that it had to catch up with, and at this entry: the
+    /// device's clock does not tell, as it is the server that keeps it [us].
+    pub late_us: u64,
 }
 
 impl Entry {
@@ -79,11 +84,12 @@ impl Entry {
             )
         });
         format!(
-            "{{\"event\":\"{}\",\"device_us\":{},\"seconds\":{:.6},\"state\":{}{heartbeat}}}",
+            "{{\"event\":\"{}\",\"device_us\":{},\"seconds\":{:.6},\"state\":{},\"late_us\":{}{heartbeat}}}",
             self.happening.name(),
             self.device_us,
             self.seconds,
             self.state,
+            self.late_us,
         )
     }
 }
@@ -98,6 +104,8 @@ pub struct Trace {
     /// Of the last HELLO.
     session: u32,
     heartbeat: Option<Heartbeat>,
+    /// Since that heartbeat.
+    late_us: u64,
     enabled: bool,
     /// Why the file ended early.
     pub broken: Option<String>,
@@ -117,6 +125,7 @@ impl Trace {
             deframer: Deframer::new(),
             session: 0,
             heartbeat: None,
+            late_us: 0,
             enabled: false,
             broken: None,
         })
@@ -127,8 +136,21 @@ impl Trace {
         self.entries.drain(..)
     }
 
-    /// Looks at bytes that reach the device of boot id `boot_id` at `device_us`.
-    pub fn observe(&mut self, mut bytes: &[u8], boot_id: u32, device_us: u64, now: Instant) {
+    /// The server is late by this much.
+    #[inline]
+    pub fn late(&mut self, late_us: u64) {
+        self.late_us = self.late_us.max(late_us);
+    }
+
+    /// Looks at bytes that reach the device of boot id `boot_id` at `device_us`, and came at any time within the `late_us` before.
+    pub fn observe(
+        &mut self,
+        mut bytes: &[u8],
+        boot_id: u32,
+        device_us: u64,
+        late_us: u64,
+        now: Instant,
+    ) {
         let seconds = self.seconds(now);
         while let Some(frame) = self.deframer.next(&mut bytes) {
             let Ok(frame) = frame else { continue };
@@ -150,13 +172,14 @@ impl Trace {
                     seconds,
                     watchdog_us,
                 });
+                self.late_us = late_us;
             }
         }
     }
 
     /// Notes a change of the output.
     #[inline]
-    pub fn output(&mut self, enabled: bool, device_us: u64, state: State) {
+    pub fn output(&mut self, enabled: bool, device_us: u64, clock: &Clock, state: State) {
         if enabled != self.enabled {
             self.enabled = enabled;
             let change = if enabled {
@@ -164,18 +187,21 @@ impl Trace {
             } else {
                 Happening::Off
             };
-            self.note(change, device_us, state);
+            self.note(change, device_us, clock, state);
         }
     }
 
-    /// Notes anything.
-    pub fn note(&mut self, happening: Happening, device_us: u64, state: State) {
+    /// Notes anything, at `device_us`, which `clock` may have left behind.
+    pub fn note(&mut self, happening: Happening, device_us: u64, clock: &Clock, state: State) {
+        let now = Instant::now();
+        self.late(clock.read(now).saturating_sub(device_us));
         let entry = Entry {
             happening,
             device_us,
-            seconds: self.seconds(Instant::now()),
+            seconds: self.seconds(now),
             state: state as u8,
             heartbeat: self.heartbeat,
+            late_us: self.late_us,
         };
         self.entries.push(entry);
         if let Some(file) = &mut self.file
@@ -189,6 +215,7 @@ impl Trace {
     /// Forgets the heartbeats of the boot before.
     pub fn rebooted(&mut self) {
         self.heartbeat = None;
+        self.late_us = 0;
         self.enabled = false;
     }
 
