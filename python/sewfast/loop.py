@@ -181,6 +181,7 @@ def run(
     Interrupted
         On Ctrl-C, of a drive; the motor is stopped, `best` is the run up to there.
     """
+    require_controller(controller, on, "run(controller, plant, reference)")
     r = reference_samples(reference, controller, seed)
     title = name or (reference if isinstance(reference, str) else "reference")
     if not isinstance(on, (Model, VirtualMachine)):
@@ -196,6 +197,23 @@ def run(
         controller=controller,
         plant=plant_name(on),
         reference=title,
+    )
+
+
+def require_controller(controller: Any, plant: Any, call: str) -> None:
+    """Refuse what is no controller, such as the plant in its place.
+
+    Raises
+    ------
+    SettingError
+    """
+    if isinstance(controller, Controller):
+        return
+    swapped = isinstance(plant, Controller)
+    raise SettingError(
+        f"expected a Controller, got {type(controller).__name__}"
+        + (" and the Controller in another place" if swapped else "")
+        + f"; the order is {call}"
     )
 
 

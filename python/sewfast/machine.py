@@ -87,7 +87,7 @@ class VirtualMachine:
         SettingError
             For any other name.
         """
-        match = _NAME.fullmatch(name)
+        match = _NAME.fullmatch(name) if isinstance(name, str) else None
         if match is None:
             raise SettingError(
                 f"expected 'virtual' or 'virtual:SEED' with a whole number, got {name!r}; "

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .dataset import Dataset
-from .errors import DataError
+from .errors import DataError, SettingError
 from .machine import VirtualMachine
 from .recordfile import Header, save_columns
 from .recordfile.keeping import require_replaceable
@@ -184,7 +184,18 @@ def record(
     Interrupted
         On Ctrl-C, of a drive; the motor is stopped, `best` is the recording up to there.
     """
-    command = np.array(u, dtype=np.float64)
+    if not isinstance(machine, VirtualMachine) and not hasattr(machine, "stream"):
+        raise SettingError(
+            f"expected a VirtualMachine or a Drive to record, got {type(machine).__name__}; the "
+            "machine comes first: record(machine, u)"
+        )
+    try:
+        command = np.array(u, dtype=np.float64)
+    except (TypeError, ValueError) as e:
+        raise DataError(
+            f"expected an excitation as numbers, got {str(u)[:60]!r}; a named one is "
+            "sewfast.signals.excitation('step')"
+        ) from e
     if command.ndim != 1:
         raise DataError(
             f"expected an excitation of shape (N,), received {command.shape}; pass one column"

@@ -64,7 +64,7 @@ def add_drive(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--watchdog", type=float, metavar="MS",
-        help="the drive stops when it has not heard from here for this long (50; 250 of its own "
+        help="the drive stops when it has not heard from here for this long (100; 250 of its own "
         "time where that runs by credit)",
     )  # fmt: skip
     add_view(group)
@@ -91,7 +91,7 @@ def opened(args: argparse.Namespace) -> Iterator[Drive]:
     watchdog = None if args.watchdog is None else args.watchdog * 1e-3
     if watchdog is not None and not 0.001 <= watchdog <= 10.0:
         raise SettingError(
-            f"--watchdog: expected 1 to 10000 ms, got {args.watchdog:g}; 50 suits most"
+            f"--watchdog: expected 1 to 10000 ms, got {args.watchdog:g}; 100 suits most"
         )
     with connect(args.on, baud=args.baud, watchdog=watchdog) as drive:
         if limits is None and not drive.identity.is_computed:

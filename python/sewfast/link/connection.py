@@ -26,7 +26,7 @@ PATIENCE = 1.0
 """Time after which a command is given up [s]."""
 ATTEMPTS = 10
 """Times that a command is sent at least before it is given up."""
-WATCHDOG = 0.05
+WATCHDOG = 0.1
 WATCHDOG_ON_CREDIT = 0.25
 RETRY = 0.05
 """Time between two attempts to open a port that vanished [s]."""

@@ -74,6 +74,8 @@ def _unopened(url: str, error: LinkError) -> Finding:
     if url.startswith("socket://"):
         return finding
     if not os.path.exists(url):
+        if "socket://" in finding.remedy:
+            return finding  # an address, whatever ports there are
         others = ", ".join(p.path for p in list_ports()) or "none"
         return _with(finding, f"{finding.remedy}; ports there are: {others}", others=others)
     if os.name != "nt" and not (found := system.access(url)).allowed:

@@ -373,7 +373,7 @@ def connect(
         Bits per second of a serial port.
     watchdog : float or None
         Time after which the device stops a motor whose host has fallen silent, .001 to 10 s. None
-        for .05 s, and .25 s of a computed time on credit, which runs ahead by most of it.
+        for .1 s, and .25 s of a computed time on credit, which runs ahead by most of it.
     resume : float
         How long a run waits for a port that vanished [s]; the motor turns on only as long as
         `watchdog` allows.
@@ -391,7 +391,7 @@ def connect(
         For a setting outside its range.
     """
     if watchdog is not None and not 0.001 <= real("watchdog", watchdog) <= 10.0:
-        raise SettingError(f"expected a watchdog of .001 to 10 s, got {watchdog}; .05 suits most")
+        raise SettingError(f"expected a watchdog of .001 to 10 s, got {watchdog}; .1 suits most")
     if not 0.0 <= real("resume", resume) < math.inf:
         raise SettingError(f"expected resume of 0 s or more, got {resume}; 1 suits most")
     port = open_port(url, baud)

@@ -54,6 +54,8 @@ def _opening(url: str, number: int | None, error: BaseException) -> tuple[str, s
         return _BUSY_TEXT
     if number in _MISSING:
         remedy = "plug the cable in and see `sewfast ports`"
+        if re.fullmatch(r"[^/\\]+:\d+", url):
+            remedy = f"an address is written socket://{url}"
         return "a serial port of this name", "there is none", remedy
     if number in _DENIED:
         return "a port that you may open", "permission was denied", _permission(url)

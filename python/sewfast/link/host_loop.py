@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from .. import _core, signals
 from ..control import Controller
 from ..errors import Interrupted, LinkError, SettingError
-from ..loop import reference_samples
+from ..loop import reference_samples, require_controller
 from ..units import counts_per_unit
 from . import wire
 from .drive import Drive
@@ -101,6 +101,12 @@ def run_on_host(
     Interrupted
         On Ctrl-C, after STOP; `best` is the run up to there.
     """
+    call = "run_on_host(drive, controller, reference)"
+    require_controller(controller, drive, call)
+    if not isinstance(drive, Drive):
+        raise SettingError(
+            f"expected a Drive to run on, got {type(drive).__name__}; connect to one, then {call}"
+        )
     ratio = _ratio(drive, controller)
     r = _reference(reference, controller, seed)
     plan = Plan("direct", r, columns=columns, batch=batch or _batch(ratio))

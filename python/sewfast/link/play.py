@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..dataset import FloatArray
-from ..errors import Interrupted, LinkError, SewfastError
+from ..errors import Interrupted, LinkError, SettingError, SewfastError
 from ..live import Feed, Kind, open_view
 from ..recordfile import Header, RecordWriter, read_recording
 from ..recordfile.keeping import require_ending, require_replaceable
@@ -100,6 +100,8 @@ def play(
     """
     if file is not None:
         require_replaceable(require_ending(file), overwrite=overwrite)
+    if settings is not None and not isinstance(settings, Mapping):
+        raise SettingError(f"expected settings as a mapping, got {settings!r}")
     columns = drive.columns(plan)
     n = len(plan.values)
     feed = Feed(columns, drive.identity.Ts, n, name, counts_per_rev=_counts_per_rev(drive))
@@ -108,7 +110,7 @@ def play(
         recorder = Recorder(columns, n, writer=writer, feed=feed)
         played = _streamed(drive, plan, recorder, writer)
     if played.outcome.reason != "finished":
-        raise Stopped(played, LinkError(_not_finished(played.outcome, n)))
+        raise Stopped(played, LinkError(_not_finished(played.outcome, n, drive)))
     return played
 
 
@@ -179,6 +181,26 @@ def _closed(recorder: Recorder, ended: str, outcome: Outcome | None, error: Base
             error.__context__ = second
 
 
+_MORE_TIME = (
+    ". A busy computer needs more time: --watchdog 250 (watchdog=0.25), where the machine stands it"
+)
+_LIMITED = {"speed": (1, "RPM"), "acceleration": (2, "RPM/s"), "current": (3, "A")}
+"""Trips with a limit of their own: its place among the limits, its unit."""
+
+
+def _why(reason: str, drive: Drive) -> str:
+    """The reason of a trip, with what was in force."""
+    if reason == "watchdog":
+        return f"{reason}, it had heard nothing for {drive.watchdog * 1e3:g} ms"
+    if reason not in _LIMITED:
+        return reason
+    place, unit = _LIMITED[reason]
+    try:
+        return f"{reason}, the limit is {drive.limits().values[place]:g} {unit}"
+    except LinkError:
+        return reason
+
+
 def _word(outcome: Outcome) -> str:
     """How the recording says that it ended."""
     if outcome.reason == "finished":
@@ -202,11 +224,12 @@ def _padded(values: FloatArray, n: int) -> FloatArray:
     return padded
 
 
-def _not_finished(outcome: Outcome, n: int) -> str:
+def _not_finished(outcome: Outcome, n: int, drive: Drive) -> str:
     came = f"{outcome.received} of {n} samples came"
     if outcome.state == "tripped":
         return (
-            f"expected the run to finish, the device tripped: {outcome.reason}; its output is safe "
-            f"and {came}; find out why, then clear it (sewfast clear PORT)"
+            f"expected the run to finish, the device tripped: {_why(outcome.reason, drive)}; its "
+            f"output is safe and {came}; find out why, then clear it (sewfast clear PORT)"
+            + (_MORE_TIME if outcome.reason == "watchdog" else "")
         )
     return f"expected the run to finish, the device ended it ({outcome.reason}); {came}"

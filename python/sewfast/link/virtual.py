@@ -13,6 +13,7 @@ from typing import Any, Literal, TypeAlias
 
 from .._core import DeviceServer
 from ..errors import LinkError, SettingError
+from ..gains import real
 from ..machine import VirtualMachine
 
 __all__ = ["VirtualDevice"]
@@ -88,8 +89,13 @@ class VirtualDevice:
         _check_range("seed", seed, 0, _LARGEST_SEED)
         if baud is not None:
             _check_range("baud", baud, *_BAUD)
-        if duration is not None and not 0.0 < duration < 1e9:
+        if duration is not None and not 0.0 < real("duration", duration) < 1e9:
             raise SettingError(f"expected a duration above 0 s, got {duration!r}")
+        _require_switches(fast=fast, once=once)
+        if not isinstance(address, str):
+            raise SettingError(f"expected HOST:PORT as address, got {address!r}; port 0 is any")
+        for name, place in (("link", link), ("fault_log", fault_log), ("trace", trace)):
+            _require_place(name, place)
         if pty and link is not None:
             _require_free(Path(link))
         folder = tempfile.mkdtemp(prefix="sewfast-") if pty and link is None else None
@@ -126,7 +132,7 @@ class VirtualDevice:
 
     def wait(self, timeout: float) -> bool:
         """Wait for the end of serving, at most for `timeout` seconds; whether it has come."""
-        return self._server.wait(timeout)
+        return self._server.wait(real("timeout", timeout))
 
     def stop(self) -> None:
         """End serving and remove the port; a second time does nothing.
@@ -153,7 +159,9 @@ class VirtualDevice:
         SettingError
             For an unknown kind or an unusable time.
         """
-        if seconds is not None and not 0.0 < seconds <= 60.0:
+        if not isinstance(fault, str):
+            raise SettingError(f"expected a fault by its name, got {fault!r}; as in 'unplug'")
+        if seconds is not None and not 0.0 < real("seconds", seconds) <= 60.0:
             raise SettingError(f"expected a time above 0 and at most 60 s, got {seconds!r}")
         self._server.cause(fault, seconds)
 
@@ -217,6 +225,33 @@ def _path(path: str | os.PathLike[str] | None) -> Path | None:
     return None if path is None else Path(path)
 
 
+def _require_switches(**values: object) -> None:
+    for name, value in values.items():
+        if not isinstance(value, bool):
+            raise SettingError(f"expected True or False as {name}, got {value!r}")
+
+
+def _require_place(name: str, place: object) -> None:
+    """Refuse a file that could not be made, before anything is.
+
+    Raises
+    ------
+    SettingError
+        For what is no file's name.
+    LinkError
+        For a folder that is not there.
+    """
+    if place is None:
+        return
+    if not isinstance(place, (str, os.PathLike)) or not os.fspath(place):
+        raise SettingError(f"expected a file's name as {name}, got {place!r}")
+    if not Path(place).parent.is_dir():
+        raise LinkError(
+            f"{os.fspath(place)}: expected a folder that exists for {name}, there is no "
+            f"{Path(place).parent}; create it, or name another one"
+        )
+
+
 def _require_free(link: Path) -> None:
     """A link that leads nowhere was left over by a device that was killed, and may be replaced.
 
@@ -250,6 +285,11 @@ def _check_range(name: str, value: int, low: int, high: int) -> None:
 def _faults_text(faults: Faults) -> str:
     if isinstance(faults, str):
         return faults
+    if not isinstance(faults, Mapping):
+        raise SettingError(
+            f"expected faults as text or as a mapping, got {faults!r}; as in 'drop=.001' or "
+            "{'drop': 0.001}"
+        )
     items = []
     for kind, value in faults.items():
         rate, *seconds = value if isinstance(value, tuple) else (value,)

@@ -42,6 +42,8 @@ class Kind:
         SettingError
             For a text that names no view, or a port outside 1 to 65535 (Foxglove: 0 to 65535).
         """
+        if not isinstance(text, str):
+            raise _refusal(text)
         name, _, rest = text.partition(":")
         if text in ("auto", "terminal", "none"):
             return cls(text)

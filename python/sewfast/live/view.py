@@ -70,7 +70,7 @@ def open_view(kind: str | Kind, feed: Feed, *, own_process: bool = True) -> Iter
         On entry: for another kind, `terminal` where standard error is none, a host without an
         address, a port that is taken, a missing package, a view that does not start.
     """
-    asked = Kind.parse(kind) if isinstance(kind, str) else kind
+    asked = kind if isinstance(kind, Kind) else Kind.parse(kind)
     chosen = settled(asked)
     with contextlib.ExitStack() as open_things:
         open_things.callback(feed.close)

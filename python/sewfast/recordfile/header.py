@@ -136,6 +136,9 @@ class Header:
         }
         return json.dumps(content, allow_nan=False).encode()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Header.from_json, (json.loads(self.encode()),)
+
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Header:
         """From the header message.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -78,6 +78,13 @@ class RecordedFile:
         t = np.round(np.arange(len(self)) * self.header.Ts, 9)
         return {"t": t, **self.columns}
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        columns = {name: np.array(values) for name, values in self.columns.items()}
+        events = [dict(event) for event in self.events]
+        return _made, (
+            self.path, self.header, columns, self.gaps, events, self.outcome, self.damage,
+        )  # fmt: skip
+
     def __repr__(self) -> str:
         return f"RecordedFile({self.path.name!r}, {self.summary})"
 
@@ -101,6 +108,8 @@ class RecordedFile:
         )
         lines += [f"  gap       samples {a}:{a + n}" for a, n in self.gaps[:_SHOWN]]
         lines += _more(len(self.gaps), "gaps")
+        if self.header.n is not None and len(self) < self.header.n:
+            lines.append(f"  not there samples {len(self)}:{self.header.n}, planned")
         lines += [f"  event     {_event(e)}" for e in self.events[:_SHOWN]]
         lines += _more(len(self.events), "events")
         lines += [f"  damage    {text}" for text in self.damage[:_SHOWN]]
@@ -123,9 +132,29 @@ def _more(count: int, what: str) -> list[str]:
     return [f"  ... {count - _SHOWN} more {what}"] if count > _SHOWN else []
 
 
+def _made(
+    path: Path,
+    header: Header,
+    columns: Mapping[str, FloatArray],
+    gaps: tuple[tuple[int, int], ...],
+    events: Sequence[Mapping[str, Any]],
+    outcome: str,
+    damage: tuple[str, ...],
+) -> RecordedFile:
+    """What was read, immutable."""
+    for column in columns.values():
+        column.flags.writeable = False
+    frozen = tuple(MappingProxyType(dict(event)) for event in events)
+    return RecordedFile(path, header, MappingProxyType(columns), gaps, frozen, outcome, damage)
+
+
 def _event(event: Mapping[str, Any]) -> str:
     at = "" if event["index"] is None else f" at sample {event['index']}"
-    detail = ", ".join(f"{key} {value}" for key, value in event["detail"].items())
+    told = dict(event["detail"])
+    if told.get("reason") == "none":
+        # a device says so of every event; only with a reason does the value mean something
+        told = {key: value for key, value in told.items() if key not in ("reason", "value")}
+    detail = ", ".join(f"{key} {value}" for key, value in told.items())
     return f"{event['kind']}{at}" + (f": {detail}" if detail else "")
 
 
@@ -282,17 +311,9 @@ class _Contents:
             there[block.numbers] = True
             for column, values in zip(columns.values(), block.columns, strict=True):
                 column[block.numbers] = values
-        for column in columns.values():
-            column.flags.writeable = False
-        return RecordedFile(
-            path,
-            header,
-            MappingProxyType(columns),
-            runs(~there),
-            tuple(self.events),
-            "torn" if self.completeness is None else self.completeness["outcome"],
-            tuple(self.damage),
-        )
+        outcome = "torn" if self.completeness is None else self.completeness["outcome"]
+        gaps, damage = runs(~there), tuple(self.damage)
+        return _made(path, header, columns, gaps, self.events, outcome, damage)
 
     def _end(self, width: int) -> int:
         """Samples that there should be, by the file's own account where it has one."""
