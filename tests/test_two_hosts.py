@@ -6,12 +6,15 @@ import os
 import struct
 import time
 from collections.abc import Iterator
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
 import raw_host as raw
 from raw_host import RawHost
-from sewfast.link import VirtualDevice
+from sewfast.link import VirtualDevice, wire
+from sewfast.link.checkup import _counters
 
 OLD, NEW = 11, 12
 AHEAD = 1_000_000
@@ -103,3 +106,12 @@ def test_limits_of_one_host_are_not_those_of_the_next(device: VirtualDevice) -> 
         assert struct.unpack("<4f", host.command(raw.LIMITS, bytes(16))[:16]) == (0.0,) * 4
         result, _ = host.ask(raw.ARM, struct.pack("<I", 50_000))
         assert result == 12
+
+
+def test_the_doctor_names_another_host_that_talks_meanwhile() -> None:
+    drive = SimpleNamespace(identity=SimpleNamespace(period_us=1000))
+    empty = wire.Status("idle", "none", 0, 0, 0, 0, 0, 0, 0, 0.0, 0, 0, 0, 0, 0, NEW, 0)
+    earlier, now = (replace(empty, foreign=n) for n in (5, 6))
+    assert _counters(earlier, earlier, drive).verdict == "ok"  # type: ignore[arg-type]
+    found = _counters(now, earlier, drive)  # type: ignore[arg-type]
+    assert (found.verdict, "another host" in found.remedy) == ("warn", True)

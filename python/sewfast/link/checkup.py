@@ -256,7 +256,7 @@ def _counters(after: wire.Status, before: wire.Status, drive: Drive) -> Finding:
     """What the device has counted since its boot."""
     values = {
         "received": after.received, "refused": after.refused, "dropped": after.dropped,
-        "late_us": after.late_us,
+        "late_us": after.late_us, "foreign": after.foreign,
     }  # fmt: skip
     told = (
         f"since boot: {after.received} frames received, {after.refused} refused, {after.dropped} "
@@ -267,6 +267,8 @@ def _counters(after: wire.Status, before: wire.Status, drive: Drive) -> Finding:
         remedies.append("frames were dropped: the link was too slow or the host did not read")
     if 2 * after.late_us >= drive.identity.period_us:
         remedies.append("control periods come late: shorten what else the firmware does")
+    if after.foreign != before.foreign:
+        remedies.append("frames of another host came meanwhile: let one program use the line")
     verdict: Verdict = "warn" if remedies else "ok"
     return Finding("counters", verdict, told, "; ".join(remedies), values)
 

@@ -77,7 +77,7 @@ typedef struct sewfast_identity {
     const char *name;     /* UTF-8, at most 24 bytes */
     const char *firmware; /* UTF-8, at most 16 bytes */
     uint32_t period;      /* us, 10 to 1,000,000 */
-    float counts_per_rev;
+    float counts_per_rev; /* 1 to 1e9 */
     uint32_t capabilities;
     sewfast_limits ceilings;         /* what no host can go beyond */
     const sewfast_channel *channels; /* [0]: counts of the counter; [1]: steps of the command */

@@ -215,6 +215,10 @@ static void storage_is_checked(void) {
     identity.period = 0;
     CHECK(sewfast_device_init(&place, SEWFAST_DEVICE_SIZE, &identity, &refusal) == NULL && refusal == SEWFAST_REFUSED_PERIOD);
     identity.period = 1000;
+    identity.counts_per_rev = 1e-30f; /* a speed would be infinite */
+    CHECK(sewfast_device_init(&place, SEWFAST_DEVICE_SIZE, &identity, &refusal) == NULL);
+    CHECK(refusal == SEWFAST_REFUSED_COUNTS_PER_REV);
+    identity.counts_per_rev = 1572.0f;
     identity.ceilings.volt = 40;
     CHECK(sewfast_device_init(&place, SEWFAST_DEVICE_SIZE, &identity, &refusal) == NULL);
     CHECK(refusal == SEWFAST_REFUSED_CEILINGS);

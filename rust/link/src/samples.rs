@@ -35,7 +35,7 @@ impl Channel {
             2 => Encoding::Number,
             _ => {
                 return Err(Error::setting(format!(
-                    "expected an encoding of protocol version 1, 0 to 2, got {encoding}; the device may need a newer sewfast"
+                    "expected an encoding of 0 to 2, got {encoding}; the device may need a newer sewfast"
                 )));
             }
         };
