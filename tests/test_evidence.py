@@ -92,7 +92,8 @@ def test_a_good_model_passes_and_the_card_says_so() -> None:
     card = linear_model().check(data)
     assert card.verdict == "ok"
     assert {t.name for t in card.tests} == {
-        "autocorrelation", "input", "squared_input", "squares", "product", "feedback",
+        "autocorrelation", "input", "squared_input", "cubed_input", "output", "squares", "product",
+        "feedback",
     }  # fmt: skip
     assert "verdict: ok" in str(card)
     assert json.loads(json.dumps(card.to_json(), allow_nan=False))["verdict"] == "ok"

@@ -33,7 +33,10 @@ class Noise:
 
     @classmethod
     def fit(
-        cls, series: Sequence[tuple[FloatArray, NDArray[np.bool_]]], spent: float = 0.0
+        cls,
+        series: Sequence[tuple[FloatArray, NDArray[np.bool_]]],
+        spent: float = 0.0,
+        sparing: bool = False,
     ) -> Noise:
         """Least squares, the order by Akaike's criterion.
 
@@ -43,6 +46,8 @@ class Noise:
             One pair per experiment.
         spent : float
             Parameters that were estimated on these samples: they take as many degrees of freedom.
+        sparing : bool
+            By Schwarz's criterion, for a series that is white unless much speaks against it.
         """
         n = sum(int(known.sum()) for _, known in series)
         squares = sum(float(e[known] @ e[known]) for e, known in series)
@@ -50,7 +55,7 @@ class Noise:
         order = _largest_order(series)
         if order == 0 or squares <= 0.0:
             return cls(np.zeros(0), squares / free, squares / free)
-        ar, ratio = _autoregression(_gram(series, order))
+        ar, ratio = _autoregression(_gram(series, order), np.log(n) if sparing else 2.0)
         return cls(ar, squares / free * ratio, squares / free)
 
     @property
@@ -133,7 +138,7 @@ def _gram(series: Sequence[tuple[FloatArray, NDArray[np.bool_]]], order: int) ->
     return total
 
 
-def _autoregression(gram: FloatArray) -> tuple[FloatArray, float]:
+def _autoregression(gram: FloatArray, price: float) -> tuple[FloatArray, float]:
     """Coefficients of the best order, and the innovation's share of the variance."""
     sums, n = gram[:-1], gram[-1, 0]
     best, found, ratio = np.inf, np.zeros(0), 1.0
@@ -142,7 +147,7 @@ def _autoregression(gram: FloatArray) -> tuple[FloatArray, float]:
     for p in range(len(sums)):
         ar = _solve(sums[1 : p + 1, 1 : p + 1], sums[1 : p + 1, 0])
         left = (sums[0, 0] - ar @ sums[1 : p + 1, 0]) / sums[0, 0]
-        criterion = n * np.log(max(left, 1e-14)) + 2.0 * p
+        criterion = n * np.log(max(left, 1e-14)) + price * p
         if criterion < best:
             best, found, ratio = criterion, ar, max(left, 1e-14) * n / max(n - p, 1.0)
     return found, float(min(ratio, 1.0))

@@ -37,7 +37,8 @@ def residual_tests(residuals: Residuals, memory: int = LAGS) -> tuple[ResidualTe
     -------
     tuple of ResidualTest
         `autocorrelation` of e (judges one-step residuals only); `input`: e(k) with u(k - lag);
-        `squared_input`: e with u^2; `squares`: e^2 with u^2; `product`: e(k) with
+        `squared_input`, `cubed_input`: e with u^2, u^3; `output`: e with powers of the computed
+        output (Ramsey 1969); `squares`: e^2 with u^2; `product`: e(k) with
         e(k - 1 - lag) u(k - 1 - lag); `feedback`: u(k) with e(k - lag). None where there are fewer
         than 50 samples, or nothing but rounding is left.
 
@@ -49,10 +50,7 @@ def residual_tests(residuals: Residuals, memory: int = LAGS) -> tuple[ResidualTe
     if residuals.is_nothing or residuals.n < LEAST_SAMPLES:
         return ()
     setting = _Setting.of(residuals, memory)
-    return tuple(
-        test(setting)
-        for test in (_autocorrelation, _input, _squared_input, _squares, _product, _feedback)
-    )
+    return tuple(test(setting) for test in _TESTS)
 
 
 def lags_over(memory: int, samples: int, count: int = LAGS) -> _Lags:
@@ -124,9 +122,7 @@ class _Setting:
 
     def centred(self, of: Callable[[FloatArray], FloatArray]) -> _Columns:
         """Columns made of the inputs, about their common means."""
-        columns = [of(r.u) for r in self.runs]
-        mean = np.concatenate(columns).mean(axis=0)
-        return [c - mean for c in columns]
+        return _about_mean_of_columns([of(r.u) for r in self.runs])
 
 
 def _innovations(
@@ -193,6 +189,35 @@ def _squared_input(s: _Setting) -> ResidualTest:
     return verdict("squared_input", title, lags, names, sums, True)
 
 
+def _cubed_input(s: _Setting) -> ResidualTest:
+    """Saturation and dead zone are odd: squares do not see them."""
+    names = tuple(f"{name}³" for name in s.names)
+    lags = s.lags(len(names))
+    mean = np.concatenate([r.u for r in s.runs]).mean(axis=0)
+    past = s.spread(lagged, s.centred(lambda u: (u - mean) ** 3), lags)
+    sums = Sums.of(past, s.errors, s.noise, s.directions)
+    title = "residual with cubes of past inputs"
+    return verdict("cubed_input", title, lags, names, sums, True)
+
+
+def _output(s: _Setting) -> ResidualTest:
+    """Ramsey's test: powers of what the model computes, which hold the input's whole past."""
+    lags = s.lags(2)
+    values = np.concatenate([r.yhat for r in s.runs])
+    mean, spread = values.mean(), max(float(values.std()), 1e-300)
+    scaled = [(r.yhat - mean) / spread for r in s.runs]
+    powers = _about_mean_of_columns([np.column_stack([y**2, y**3]) for y in scaled])
+    past = s.spread(lagged, powers, lags)
+    sums = Sums.of(past, s.errors, s.noise, s.directions)
+    title = "residual with powers of the computed output"
+    return verdict("output", title, lags, ("ŷ²", "ŷ³"), sums, True)
+
+
+def _about_mean_of_columns(columns: _Columns) -> _Columns:
+    mean = np.concatenate(columns).mean(axis=0)
+    return [c - mean for c in columns]
+
+
 def _squares(s: _Setting) -> ResidualTest:
     names = _product_names(s.names)
     lags = s.lags(len(names))
@@ -201,7 +226,7 @@ def _squares(s: _Setting) -> ResidualTest:
     bound = 3.0 * np.sqrt(s.noise.innovation)
     # a single outlier's square would outweigh all the rest
     power = _about_mean([np.minimum(np.abs(w), bound) ** 2 for w in s.white], s.known)
-    noise = Noise.fit(list(zip(power, s.known, strict=True)))
+    noise = Noise.fit(list(zip(power, s.known, strict=True)), sparing=True)
     sums = Sums.of(past, power, noise, _constant(s.known))
     title = "squared residual with squares of past inputs"
     return verdict("squares", title, lags, names, sums, True)
@@ -246,3 +271,15 @@ def _constant(known: Sequence[NDArray[np.bool_]]) -> _Columns:
     """The direction of a mean."""
     n = max(sum(int(k.sum()) for k in known), 1)
     return [k[:, None] / np.sqrt(n) for k in known]
+
+
+_TESTS = (
+    _autocorrelation,
+    _input,
+    _squared_input,
+    _cubed_input,
+    _output,
+    _squares,
+    _product,
+    _feedback,
+)

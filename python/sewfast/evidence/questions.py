@@ -44,6 +44,14 @@ _FOUND = {
         "the square of the input explains part of the residual: an even nonlinearity is missing; "
         "allow a network, or more hidden units"
     ),
+    "cubed_input": (
+        "the cube of the input explains part of the residual: an odd nonlinearity (saturation, "
+        "dead zone, friction) is missing; allow a network, or more hidden units"
+    ),
+    "output": (
+        "powers of the computed output explain part of the residual: a nonlinearity of the plant "
+        "or the sensor is missing; allow a network, more states or more hidden units"
+    ),
     "squares": (
         "the residual is larger where the input is: a nonlinearity is missing there, or the noise "
         "grows with the amplitude"
@@ -62,6 +70,8 @@ _PASSED = {
     "autocorrelation": "the residual is white: nothing of it can be predicted from its own past",
     "input": "nothing of the input is left in the residual: the linear dynamics are complete",
     "squared_input": "no even nonlinearity is left in the residual",
+    "cubed_input": "no odd nonlinearity of the input is left in the residual",
+    "output": "no function of the computed output is left in the residual",
     "squares": "the residual is as large for small inputs as for large ones",
     "product": "residual and input do not multiply",
     "feedback": "the input does not answer to the residual: recorded in open loop",
