@@ -111,6 +111,7 @@ def test_a_missing_nonlinearity_is_detected() -> None:
     found = {t.name: t for t in card.tests}
     assert found["squared_input"].p_value < 1e-6
     assert card.line(found["squared_input"].title).verdict == "fail"
+    assert found["squared_input"].explained > 0.3
     assert found["input"].p_value > 1e-6
 
 
@@ -182,7 +183,7 @@ def test_larger_inputs_leave_the_training_region() -> None:
     large = Dataset.from_arrays(3.0 * e.u, e.y, 0.01, input_units="V", output_unit="RPM")
     card = network().check(large)
     assert card.outside > 0.2
-    assert card.line("outside training region").verdict == "fail"
+    assert card.line("outside training region").verdict == "warn"
 
 
 def test_operating_points_are_the_equilibria_and_slopes_of_the_simulation() -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from ..dataset import Dataset, FloatArray, require_dataset
+from ..dataset import Dataset, require_dataset
 from ..errors import FitError, SewfastError
 from ..models.base import INIT, Model
 from ..validation import Scores
@@ -17,7 +18,7 @@ from .criteria import Criteria
 from .operating import OperatingRange, operating_range
 from .parameters import Parameters, estimate
 from .portmanteau import LAGS, residual_tests
-from .region import distances, training_region
+from .region import Place, placed, training_region
 from .residuals import Residuals, representative
 from .scores import horizon_scores
 from .simulation_bands import LEVEL, Bands, bands_of, stored_uncertainty, uncertainty
@@ -79,8 +80,9 @@ def check(
     lines += [questions.correlation(t) for t in tests]
     found = _parameters(model, data, training, on_training, init)
     lines += found[2]
-    far = distances(model, data, training, init)
-    covered = _bands(model, data, free, training, level, far)
+    place = placed(model, data, training, init)
+    far = place.distances if place is not None else []
+    covered = _bands(model, data, free, training, level, place)
     if covered is not None:
         lines.append(questions.coverage(covered))
     outside = math.nan
@@ -125,7 +127,7 @@ def remembered(model: Model, data: Dataset) -> Model:
     return replace(model, training={**model.training, **training_evidence(model, data)})
 
 
-def training_evidence(model: Model, data: Dataset) -> dict[str, object]:
+def training_evidence(model: Model, data: Dataset) -> dict[str, Any]:
     """What a model should store of its training data: `region` and `uncertainty`, JSON values.
 
     Parameters
@@ -139,7 +141,7 @@ def training_evidence(model: Model, data: Dataset) -> dict[str, object]:
     dict
         For `model.training`; without a part that these data do not give.
     """
-    found: dict[str, object] = {}
+    found: dict[str, Any] = {}
     try:
         found["region"] = training_region(model, data)
         found["uncertainty"] = uncertainty(model, data).to_json()
@@ -187,12 +189,12 @@ def _bands(
     free: Residuals,
     training: Dataset | None,
     level: float,
-    far: list[FloatArray],
+    place: Place | None,
 ) -> Bands | None:
     known = stored_uncertainty(model) if training is None else uncertainty(model, training)
     if known is None:
         return None
-    return bands_of(model, data, free, known, level, far)
+    return bands_of(model, data, free, known, level, place)
 
 
 def _operating(model: Model) -> OperatingRange | None:

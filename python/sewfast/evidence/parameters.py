@@ -77,14 +77,14 @@ class Information:
         diagonal = np.sqrt(np.diag(self.gram) + self.penalty)
         return np.where(diagonal > 0.0, diagonal, 1.0)
 
-    def inverse(self, less: FloatArray | None = None) -> FloatArray:
+    def inverse(self, less: FloatArray | None = None, determined: float = DETERMINED) -> FloatArray:
         """(gram - less + penalty)^+ over the determined directions."""
         matrix = self.gram + np.diag(self.penalty)
         if less is not None:
             matrix = matrix - less
         outer = np.outer(self.scale, self.scale)
         sizes, vectors = np.linalg.eigh(matrix / outer)
-        kept = sizes > DETERMINED * max(sizes[-1], DETERMINED) if len(sizes) else sizes > 0
+        kept = sizes > determined * max(sizes[-1], DETERMINED) if len(sizes) else sizes > 0
         vectors = vectors[:, kept]
         found: FloatArray = (vectors / sizes[kept]) @ vectors.T / outer
         return found

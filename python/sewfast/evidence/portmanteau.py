@@ -235,7 +235,10 @@ def _squares(s: _Setting) -> ResidualTest:
 def _feedback(s: _Setting) -> ResidualTest:
     lags = s.lags(len(s.names)) + 1
     ahead = s.spread(leading, s.centred(lambda u: u), lags)
-    sums = Sums.of(ahead, s.errors, s.noise, s.directions)
+    past = s.spread(lagged, s.centred(lambda u: u), lags - 1)
+    known = [np.hstack(pair) for pair in zip(s.directions, past, strict=True)]
+    # what the past input says of the coming one is no answer to the residual
+    sums = Sums.of(ahead, s.errors, s.noise, independent_directions(known))
     return verdict("feedback", "inputs with past residuals", lags, s.names, sums, False)
 
 

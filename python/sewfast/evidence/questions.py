@@ -20,8 +20,8 @@ from .residuals import Residuals
 from .scores import HorizonScores, fit_text
 from .simulation_bands import Bands
 
-SMALL = 0.05
-"""Share of the residual's power below which a detected dependence is a warning, not a failure."""
+SMALL = 0.1
+"""Part of the rms error that a detected dependence must be worth for a failure, not a warning."""
 GOOD_FIT, POOR_FIT = 70.0, 30.0
 COVERAGE = (0.88, 0.99)
 LEAST_COVERAGE = 0.8
@@ -62,8 +62,9 @@ _FOUND = {
         "record; compare records from different times"
     ),
     "feedback": (
-        "the input answers to past residuals: the data were recorded in closed loop, where past "
-        "inputs carry noise; a correlation with past inputs then does not condemn the model"
+        "the input follows past residuals: either the data come from a closed loop, where "
+        "past inputs "
+        "carry noise and their correlation does not condemn the model, or dynamics are missing"
     ),
 }
 _PASSED = {
@@ -152,7 +153,7 @@ def bias(residuals: Residuals) -> Line:
     share = mean**2 / max(residuals_power(residuals), 1e-300)
     if abs(mean) <= 2.58 * error:
         verdict, text = _NO_OFFSET
-    elif share < SMALL:
+    elif share < SMALL**2:
         verdict, text = "ok", "a small offset, which matters little beside the rest of the residual"
     else:
         verdict, text = _OFFSET
@@ -178,13 +179,11 @@ def correlation(t: ResidualTest) -> Line:
         return Line(t.title, t.p_value, shown, "", "info", text)
     if t.passed:
         return Line(t.title, t.p_value, shown, limit, "ok", _PASSED[t.name])
-    share = f"{100 * t.explained:.2g} % of the residual's power: "
-    if t.explained < SMALL:
-        return Line(
-            t.title, t.p_value, shown, limit, "warn",
-            f"significant but small, {share}{_FOUND[t.name]}",
-        )  # fmt: skip
-    return Line(t.title, t.p_value, shown, limit, "fail", share + _FOUND[t.name])
+    gain = 1.0 - math.sqrt(1.0 - t.explained)
+    text = f"{_FOUND[t.name]} (worth {100 * gain:.2g} % of the error)"
+    if gain < SMALL:
+        return Line(t.title, t.p_value, shown, limit, "warn", f"detected, but small: {text}")
+    return Line(t.title, t.p_value, shown, limit, "fail", text)
 
 
 _INFORMS = {
@@ -287,13 +286,13 @@ def coverage(b: Bands) -> Line:
 
 def region(outside: float, farthest: float) -> Line:
     """Share of samples unlike any in the training data."""
-    verdict: Verdict = "ok" if outside <= OUTSIDE else "warn" if outside <= FAR_OUTSIDE else "fail"
+    verdict: Verdict = "ok" if outside <= OUTSIDE else "warn"
     meaning = {
         "ok": "the model is used where it has been trained",
         "warn": "some samples are unlike any in the training data: the model extrapolates there",
-        "fail": "the model is used where it has never been: record such operation and "
-        "identify again",
-    }[verdict]
+        "far": "the model is used where it has not been trained: trust what was measured here, not "
+        "what it computes elsewhere; record such operation and identify again",
+    }["far" if outside > FAR_OUTSIDE else verdict]
     if verdict != "ok":
         meaning += f" (farthest: {farthest:.3g} times the region's radius)"
     limit = f"<= {100 * OUTSIDE:g} %"

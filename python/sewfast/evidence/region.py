@@ -8,7 +8,7 @@ record. A point farther than that from every centre is outside: no training samp
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,6 +21,11 @@ from .residuals import representative
 CENTRES = 200
 LARGEST_DIMENSION = 8
 _SMALLEST_VARIANCE = 1e-8
+_LEAST_SPREAD = 0.1
+"""Deviations smaller than a tenth of a variable's own spread are no new region.
+
+Between one sample and the next of a fast record there is less; any new rate would be far away.
+"""
 _MOST_POINTS = 20_000
 _BLOCK = 4096
 _TENTHS = 10
@@ -56,15 +61,16 @@ class Region:
 
     def distance(self, points: FloatArray) -> FloatArray:
         """Whitened distance of points (N, d0) to the nearest centre, shape (N,)."""
+        return np.concatenate([np.sqrt(d.min(axis=1)) for d in self._squares(points)])
+
+    def _squares(self, points: FloatArray) -> Iterator[FloatArray]:
+        """Squared distances (n, c) of a block of points after the other to all centres."""
         white = (points - self.mean) @ self.turn
-        found = np.empty(len(white))
-        squares = np.square(self.centres).sum(axis=1)
+        centres = np.square(self.centres).sum(axis=1)
         for a in range(0, len(white), _BLOCK):
             part = white[a : a + _BLOCK]
-            cross = squares - 2.0 * part @ self.centres.T
-            found[a : a + _BLOCK] = np.square(part).sum(axis=1) + cross.min(axis=1)
-        distance: FloatArray = np.sqrt(np.maximum(found, 0.0))
-        return distance
+            cross = centres - 2.0 * part @ self.centres.T
+            yield np.maximum(np.square(part).sum(axis=1)[:, None] + cross, 0.0)
 
     def to_json(self) -> dict[str, Any]:
         """As JSON values with the digits that matter."""
@@ -115,23 +121,40 @@ def stored_region(model: Model) -> Region | None:
         return None
 
 
-def distances(
-    model: Model, data: Dataset, training: Dataset | None = None, init: int = INIT
-) -> list[FloatArray]:
-    """Distance from the nearest known point over the radius, one array (N,) per experiment.
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where a free run goes, seen from the training region.
 
-    From the region stored with the model, or that of the training data where they are given; none
-    where there is neither.
+    Attributes
+    ----------
+    points : arrays, shape (N, d0), one per experiment
+    distances : arrays, shape (N,)
+        To the nearest known point, over the region's radius.
+    """
+
+    region: Region
+    points: list[FloatArray]
+
+    @property
+    def distances(self) -> list[FloatArray]:
+        radius = max(self.region.radius, 1e-300)
+        return [self.region.distance(p) / radius for p in self.points]
+
+
+def placed(
+    model: Model, data: Dataset, training: Dataset | None = None, init: int = INIT
+) -> Place | None:
+    """In the region stored with the model, or that of the training data where they are given.
+
+    None where there is neither.
     """
     known = stored_region(model)
     if training is not None:
         known = Region.from_json(training_region(model, training))
     if known is None:
-        return []
+        return None
     where = points(model, data, init)
-    if where[0].shape[1] != len(known.mean):
-        return []
-    return [known.distance(p) / max(known.radius, 1e-300) for p in where]
+    return Place(known, where) if where[0].shape[1] == len(known.mean) else None
 
 
 def points(model: Model, data: Dataset, init: int = INIT) -> list[FloatArray]:
@@ -170,7 +193,8 @@ def _whitening(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     scaled = (points - mean) / scale
     sizes, vectors = np.linalg.eigh(scaled.T @ scaled / len(points))
     kept = np.flatnonzero(sizes > _SMALLEST_VARIANCE * max(sizes[-1], 1e-300))[-LARGEST_DIMENSION:]
-    return mean, (vectors[:, kept] / np.sqrt(sizes[kept])) / scale[:, None]
+    spread = np.sqrt(np.maximum(sizes[kept], _LEAST_SPREAD**2))
+    return mean, (vectors[:, kept] / spread) / scale[:, None]
 
 
 def _spread_out(points: FloatArray) -> FloatArray:
