@@ -10,6 +10,7 @@ import pytest
 import sewfast as api
 from cli import refused, sewfast
 from recordings_made import header
+from sewfast.cli import main
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError, SettingError
 from sewfast.machine import VirtualMachine
@@ -188,3 +189,30 @@ def test_export_leaves_the_recording_itself_alone(folder: Path, tmp_path: Path) 
         assert "expected another file than the recording" in refused(
             tmp_path, "export", "torn.mcap", "-o", same
         )
+
+
+def test_tune_takes_the_volt_limit_of_a_recording(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = header(5, columns={"u": "V"}, settings={"limits": {"volt": 7.5, "current": None}})
+    with RecordWriter(tmp_path / "drive.mcap", made) as writer:
+        writer.samples(0, {"u": np.ones(5)})
+    given = {}
+
+    def tune(model: object, references: object, **settings: object) -> None:
+        given.update(settings)
+        raise SettingError("far enough")
+
+    monkeypatch.setattr("sewfast.tuning.tune", tune)
+    model = tmp_path / "model.json"
+    data = api.read(folder / "whole.mcap", inputs="u", output="y")
+    api.identify(data, model="arx").save(model)
+    out = str(tmp_path / "c.json")
+    command = ["tune", str(model), "-o", out, "--limits-of"]
+    assert main([*command, str(tmp_path / "drive.mcap"), "--u-min", "0"]) == 2
+    assert (given["u_min"], given["u_max"]) == (0.0, 7.5)
+    assert main(["tune", str(model), "-o", out]) == 2
+    assert (given["u_min"], given["u_max"]) == (-20.0, 20.0)
+    given.clear()
+    assert main([*command, str(folder / "whole.mcap")]) == 2
+    assert not given

@@ -77,12 +77,12 @@ def add(commands: Commands) -> None:
         "--reference", action="append", metavar="FILE|NAME",
         help="what to track; may repeat (trapezoid, trapezoids, random)",
     )  # fmt: skip
+    parser.add_argument("--u-min", type=float, metavar="V", help="least command (-20)")
+    parser.add_argument("--u-max", type=float, metavar="V", help="largest command (20)")
     parser.add_argument(
-        "--u-min", type=float, default=-20.0, metavar="V", help="least command (-20)"
-    )
-    parser.add_argument(
-        "--u-max", type=float, default=20.0, metavar="V", help="largest command (20)"
-    )
+        "--limits-of", metavar="RECORDING.mcap",
+        help="take the volt limit that a drive had in a recording, both ways, for those not given",
+    )  # fmt: skip
     parser.add_argument(
         "--counts-per-rev", type=float, metavar="N",
         help="encoder in the loop; default: the model's own, else 1572 where the output is a speed",
@@ -117,6 +117,7 @@ def tune_command(args: argparse.Namespace) -> int | None:
     require_place(args.out, (".json",))
     model = load_model(args.model)
     counts = args.counts_per_rev or (model.counts[1] if model.counts else 1572.0)
+    u_min, u_max = _command_limits(args)
     references = [
         _reference(text, model.Ts, model.output_unit) for text in args.reference or ()
     ] or None
@@ -125,8 +126,8 @@ def tune_command(args: argparse.Namespace) -> int | None:
             found = tune(
                 model,
                 references,
-                u_min=args.u_min,
-                u_max=args.u_max,
+                u_min=u_min,
+                u_max=u_max,
                 counts_per_rev=counts,
                 filter_samples=args.filter,
                 progress=progress,
@@ -138,6 +139,34 @@ def tune_command(args: argparse.Namespace) -> int | None:
     found.controller.save(args.out)
     _show_tuned(args, found)
     return None
+
+
+def _command_limits(args: argparse.Namespace) -> tuple[float, float]:
+    """Least and largest command [V]: as given, else of a recording, else those of +-20 V.
+
+    Raises
+    ------
+    SettingError, DataError
+        For a recording without a volt limit, or one that cannot be read.
+    """
+    volt = 20.0 if args.limits_of is None else _volt_limit(args.limits_of)
+    return (
+        -volt if args.u_min is None else args.u_min,
+        volt if args.u_max is None else args.u_max,
+    )
+
+
+def _volt_limit(path: str) -> float:
+    from ..recordfile.reader import read_header
+
+    limits = read_header(path).settings.get("limits")
+    volt = limits.get("volt") if isinstance(limits, dict) else None
+    if not isinstance(volt, (int, float)) or isinstance(volt, bool) or volt <= 0.0:
+        raise SettingError(
+            f"--limits-of {path}: expected a recording of a drive with a volt limit, it states "
+            "none; give --u-min and --u-max"
+        )
+    return float(volt)
 
 
 def _show_tuned(args: argparse.Namespace, found: TuningResult) -> None:
