@@ -332,6 +332,7 @@ def test_ctrl_c_keeps_the_best_controller(folder: Path) -> None:
 
 def _interrupted(folder: Path, *arguments: str) -> str:
     """Start a command, press Ctrl-C once the compiled work is under way; its messages."""
+    start_up = _start_up(folder)
     process = subprocess.Popen(
         [*PROGRAM, *arguments],
         cwd=folder,
@@ -340,7 +341,7 @@ def _interrupted(folder: Path, *arguments: str) -> str:
         text=True,
     )
     try:
-        _wait_until_busy(process)
+        _wait_until_busy(process, start_up)
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=120)
     finally:
@@ -350,13 +351,19 @@ def _interrupted(folder: Path, *arguments: str) -> str:
     return err
 
 
-BUSY = 2.5
-"""Seconds of the processor, far more than start-up takes, that say that the work is under way."""
+def _start_up(folder: Path) -> float:
+    """What a short command takes of the processor [s]."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    sewfast(folder, "validate", "drive.json", "run.csv")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return float(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
 
 
-def _wait_until_busy(process: subprocess.Popen[str]) -> None:
+def _wait_until_busy(process: subprocess.Popen[str], start_up: float) -> None:
+    """Wait until it has had far more of the processor than start-up takes."""
     began = time.monotonic()
-    while _used(process, began) < BUSY:
+    while _used(process, began) < 2.0 * start_up + 0.5:
         time.sleep(0.1)
         assert process.poll() is None, process.communicate()
 
