@@ -16,7 +16,7 @@ from sewfast import _core
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError, FitError, ModelFileError, SettingError, SewfastError
 from sewfast.identification import identify
-from sewfast.models import ARX, IV, LinearOE, Model, NeuralOE, load_model
+from sewfast.models import ARX, IV, LinearOE, Model, NeuralOE, NeuralSS, load_model
 
 NAMES = (0.01, ("u",), "speed", ("V",), "RPM")
 
@@ -45,11 +45,35 @@ def network(**options: Any) -> NeuralOE:
     return NeuralOE(core, *NAMES, **options)
 
 
+def state_space(**options: Any) -> NeuralSS:
+    core = _core.NeuralSS(
+        nx=2,
+        nk=1,
+        n_inputs=1,
+        n_outputs=1,
+        hidden=3,
+        integrator=False,
+        output="saturation",
+        output_parameters=np.array([-3.0, 3.0, 0.1]),
+        theta=np.random.default_rng(1).uniform(-0.3, 0.3, 31),
+        u_mean=np.array([0.1]),
+        u_scale=np.array([3.0]),
+        y_mean=np.array([5.0]),
+        y_scale=np.array([20.0]),
+        state_mean=np.zeros(2),
+        state_covariance=np.eye(2),
+        residual_variance=np.array([0.01]),
+        process_noise=1e-3,
+    )
+    return NeuralSS(core, *NAMES, **options)
+
+
 CATALOGUE = {
     "arx": exact,
     "iv": lambda **o: IV(_core.LinearModel(A, B, 1, OFFSET), *NAMES, **o),
     "oe": lambda **o: LinearOE(_core.LinearModel(A, B, 1, OFFSET), *NAMES, **o),
     "neural_oe": network,
+    "neural_ss": state_space,
 }
 
 
@@ -153,7 +177,7 @@ def test_linear_models_show_poles_gain_and_transfer_function() -> None:
 
 def test_every_model_names_its_columns_orders_and_notes(model: Model) -> None:
     assert "u [V] -> speed [RPM]" in str(model)
-    assert "na=2, nb=2, nk=1" in repr(model)
+    assert ("nx=2" if isinstance(model, NeuralSS) else "na=2, nb=2") + ", nk=1" in repr(model)
     assert "a note" in str(model)
     assert model.columns == {
         "inputs": ("u",),
@@ -190,7 +214,7 @@ def test_counts_are_remembered(tmp_path: Path) -> None:
 
 
 DAMAGE: list[tuple[str, tuple[str | int, ...], Any, str]] = [
-    ("arx", ("kind",), "narx", "one of arx, iv, oe, neural_oe"),
+    ("arx", ("kind",), "narx", "one of arx, iv, oe, neural_oe, neural_ss"),
     ("arx", ("kind",), None, "'kind'"),
     ("arx", ("version",), 2, "version"),
     ("arx", ("format",), "other", "format"),
@@ -222,6 +246,19 @@ DAMAGE: list[tuple[str, tuple[str | int, ...], Any, str]] = [
     ("neural_oe", ("parameters", "bypass"), 1, "'parameters.bypass': expected true or false"),
     ("neural_oe", ("parameters", "output_low"), 9.0, "parameters"),
     ("neural_oe", ("parameters", "n_inputs"), 2, "parameters|inputs"),
+    ("neural_ss", ("parameters", "theta"), [0.0], "parameters"),
+    ("neural_ss", ("parameters", "hidden"), 999_999, "parameters"),
+    ("neural_ss", ("parameters", "nx"), 0, "parameters"),
+    ("neural_ss", ("parameters", "n_outputs"), 2, "'parameters.n_outputs': expected 1"),
+    ("neural_ss", ("parameters", "output"), "relu", "'parameters.output': expected one of"),
+    ("neural_ss", ("parameters", "output_parameters"), [1.0, 0.0, 0.1], "parameters"),
+    ("neural_ss", ("parameters", "integrator"), True, "integrator"),
+    ("neural_ss", ("parameters", "integrator"), 1, "'parameters.integrator': expected true"),
+    ("neural_ss", ("parameters", "state_covariance"), [[1.0, 0.0]], "parameters"),
+    ("neural_ss", ("parameters", "state_covariance"), [[-1.0, 0.0], [0.0, 1.0]], "parameters"),
+    ("neural_ss", ("parameters", "residual_variance"), [0.0], "parameters"),
+    ("neural_ss", ("parameters", "process_noise"), -1.0, "parameters"),
+    ("neural_ss", ("parameters", "y_mean"), 5.0, "'parameters.y_mean': expected a list"),
 ]
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from .leastsquares import LeastSquaresResult, least_squares
     from .loop import ClosedLoopRun, run
     from .machine import VirtualMachine
-    from .models import ARX, IV, LinearOE, Model, NeuralOE, load_model
+    from .models import ARX, IV, LinearOE, Model, NeuralOE, NeuralSS, load_model
     from .readers import read, read_table
     from .recording import Recording, record
     from .speed import speed_from_counts
@@ -56,6 +56,7 @@ __all__ = [
     "Model",
     "ModelFileError",
     "NeuralOE",
+    "NeuralSS",
     "Recording",
     "ReportCard",
     "SettingError",
@@ -94,7 +95,7 @@ _HOMES = {
     "leastsquares": "LeastSquaresResult least_squares",
     "loop": "ClosedLoopRun run",
     "machine": "VirtualMachine",
-    "models": "ARX IV LinearOE Model NeuralOE load_model",
+    "models": "ARX IV LinearOE Model NeuralOE NeuralSS load_model",
     "readers": "read read_table",
     "recording": "Recording record",
     "speed": "speed_from_counts",

@@ -153,6 +153,41 @@ class NeuralOE:
         """Free run (N,) in the data's units and its sensitivities (N, n_theta + na): theta, then y_past."""
 
 @final
+class NeuralSS:
+    """Neural state-space model (docs/CONVENTIONS.md); theta = [A, B, E, Wx, Wu, bh, C, D, c, G], row by row.
+
+    States are in scaled units. With one output, runs are (N,) and rows (N, n); with ny outputs (N, ny) and (N, ny, n).
+    """
+
+    def __new__(
+        cls, *, nx: int, nk: int, n_inputs: int, n_outputs: int, hidden: int, integrator: bool,
+        output: Literal["linear", "saturation", "abs"], output_parameters: _F, theta: _F, u_mean: _F,
+        u_scale: _F, y_mean: _F, y_scale: _F, state_mean: _F, state_covariance: _F, residual_variance: _F,
+        process_noise: float,
+    ) -> NeuralSS:
+        """``output_parameters``: (), (low, high, w) or (w,), in scaled units; ``state_covariance`` (nx, nx)."""
+    @property
+    def theta(self) -> _F: ...
+    @property
+    def settings(self) -> dict[str, object]:
+        """Every constructor argument but theta."""
+    @property
+    def nx(self) -> int: ...
+    @property
+    def nk(self) -> int: ...
+    def rest_state(self) -> _F:
+        """State that minimises |x+ - x|^2 + |y|^2 at input zero, (nx,)."""
+    def simulate(self, u: _F, state: _F) -> _F: ...
+    def states(self, u: _F, state: _F) -> _F:
+        """States of the free run, (N, nx)."""
+    def predict(self, u: _F, y: _F, state: _F, horizon: int) -> _F:
+        """Extended Kalman filter up to sample k - horizon, then free run; NaN in y is not used."""
+    def estimate_initial_state(self, u: _F, y: _F) -> _F:
+        """Maximum a posteriori, (nx,); NaN in y does not count."""
+    def jacobian(self, u: _F, state: _F) -> tuple[_F, _F]:
+        """Free run and its sensitivities in the data's units: theta, then the state."""
+
+@final
 class LinearFit:
     """A fitted linear model with the story of its fit."""
 
@@ -230,6 +265,51 @@ def fit_iv(
 ) -> LinearFit:
     """Refined instrumental variables (SRIV); "small_step" is the only success."""
 
+@final
+class NeuralSSFit:
+    """A trained state-space model with the story of its training."""
+
+    @property
+    def model(self) -> NeuralSS: ...
+    @property
+    def cost(self) -> float:
+        """J = 1/(2N) sum e^2 in scaled units, free run, on the training data's known outputs."""
+    @property
+    def validation_cost(self) -> float | None: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def termination(self) -> str: ...
+    @property
+    def remedy(self) -> str:
+        """What to do about the termination."""
+    @property
+    def trace(self) -> _F: ...
+    @property
+    def start(self) -> int:
+        """Which of these starts was chosen, counted from 0."""
+    @property
+    def start_costs(self) -> _F:
+        """J that each start was judged by: on validation data, else on training data; inf: failed."""
+    @property
+    def discarded(self) -> int:
+        """Dead starts that were drawn again."""
+    @property
+    def models(self) -> list[NeuralSS]:
+        """Models of all starts with a finite cost, sound ones first, then by cost: an ensemble."""
+    @property
+    def start_models(self) -> list[NeuralSS | None]:
+        """The model of each start, in the order of the starts; None: failed, or not begun before Ctrl-C."""
+    @property
+    def sounds(self) -> list[bool]:
+        """Whether each start's model forgets its initial state and stands inputs a quarter larger."""
+    @property
+    def sound(self) -> bool:
+        """The same of the chosen model; else no start's does."""
+    @property
+    def initial_states(self) -> _F:
+        """State of each training experiment, (n_experiments, nx)."""
+
 def fit_oe(
     experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool = True,
     max_iterations: int = 100, progress: _Progress = None,
@@ -247,6 +327,20 @@ def fit_neural_oe(
     weights and no bypass. ``saturate`` widens the training output's range by that fraction (half at each end) and
     clips the output there, without slope outside; None leaves it linear. ``threads = 0`` takes all; the bits do not
     depend on it. ``initial_state`` 'measured' starts each run after its first na samples.
+    """
+
+def fit_neural_ss(
+    experiments: _Experiments, validation: _Experiments, *, nx: int, nk: int, hidden: int,
+    linear: LinearModel | None, output: Literal["linear", "saturation", "abs"], output_parameters: _F,
+    integrator: bool, weight_decay: float, hidden_scale: float, max_iterations: int, starts: int,
+    first_start: int, seed: int, threads: int, progress: _Progress = None,
+) -> NeuralSSFit:
+    """Train in free run; each start is stopped and judged on ``validation``, without it on the training data.
+
+    y is (N,) or (N, ny); NaN in it has no weight. Scaled units are means and standard deviations of the training data;
+    with output 'abs' y_mean is 0 and y_scale the root mean square. ``linear`` has na = nx, nb <= nx + 1 and the same nk;
+    without it a start begins with random states. Start i of the seed is ``first_start + i`` here: starts spread over
+    several calls, or over threads (0 takes all), have the same bits.
     """
 
 # --- least_squares.rs --------------------------------------------------------------------------------------
@@ -280,7 +374,7 @@ class Controller:
     def filtered(self) -> float:
         """The feedback after its filter, at the last step."""
 
-_Plant: TypeAlias = Machine | LinearModel | NeuralOE
+_Plant: TypeAlias = Machine | LinearModel | NeuralOE | NeuralSS
 
 def closed_loop(
     plant: _Plant, controller: Controller, reference: _F, *, counts_per_unit: float,

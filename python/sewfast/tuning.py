@@ -255,7 +255,7 @@ def _step_fit(model: Model, u_max: float) -> Fopdt:
             u = np.zeros(samples)
             u[samples // 20 :] = share * u_max
             try:
-                y = model.core.simulate(u[:, None], np.zeros(model.core.na))
+                y = model.core.simulate(u[:, None], model.core.rest_state())
                 return fit_fopdt(u, y, Ts=model.Ts)
             except (DataError, FitError) as error:
                 reason = error

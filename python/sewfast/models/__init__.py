@@ -1,8 +1,9 @@
-"""Identified models: linear ones and the network, with their files."""
+"""Identified models: linear ones and networks, with their files."""
 
 from .base import Model
 from .files import load_model
 from .linear import ARX, IV, LinearOE
 from .neural import NeuralOE
+from .neural_ss import NeuralSS
 
-__all__ = ["ARX", "IV", "LinearOE", "Model", "NeuralOE", "load_model"]
+__all__ = ["ARX", "IV", "LinearOE", "Model", "NeuralOE", "NeuralSS", "load_model"]

@@ -41,13 +41,13 @@ def require_init(init: int) -> None:
 class Core(Protocol):
     """What the compiled models share."""
 
-    @property
-    def na(self) -> int: ...
-    def simulate(self, u: FloatArray, y_past: FloatArray) -> FloatArray: ...
+    def rest_state(self) -> FloatArray: ...
+    def simulate(self, u: FloatArray, state: FloatArray) -> FloatArray: ...
     def predict(
-        self, u: FloatArray, y: FloatArray, y_past: FloatArray, horizon: int
+        self, u: FloatArray, y: FloatArray, state: FloatArray, horizon: int
     ) -> FloatArray: ...
     def estimate_initial_state(self, u: FloatArray, y: FloatArray) -> FloatArray: ...
+    def jacobian(self, u: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]: ...
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -114,8 +114,8 @@ class Model(ABC):
         data : Dataset
             Inputs are complete; outputs may be NaN, and are not looked at after the initial ones.
         init : int
-            The initial state is estimated by least squares from this many measured outputs, the
-            first ones; 0 starts from rest.
+            The initial state is estimated from this many measured outputs, the first ones; 0 starts
+            from rest.
 
         Returns
         -------
@@ -188,18 +188,20 @@ class Model(ABC):
         return bands(self, data, level, init=init)
 
     def initial_state(self, experiment: Experiment, init: int) -> FloatArray:
-        """Past outputs y(-1), y(-2), .. of an experiment, from its first `init` measured outputs.
+        """What a run over an experiment starts from, by its first `init` measured outputs.
 
-        Where some of its first outputs are missing, more samples are looked at.
+        Past outputs y(-1), y(-2), .. of a lagged model, the states of a state-space model. Where
+        some of the first outputs are missing, more samples are looked at.
         """
         require_init(init)
         if init == 0:
-            return np.zeros(self.core.na)
+            rest: FloatArray = self.core.rest_state()
+            return rest
         first = experiment.initial_samples(init)
-        past: FloatArray = self.core.estimate_initial_state(
+        state: FloatArray = self.core.estimate_initial_state(
             experiment.u[:first], experiment.y[:first]
         )
-        return past
+        return state
 
     def _require_match(self, data: Dataset) -> None:
         require_dataset(data, "data")

@@ -12,9 +12,10 @@ from .base import FORMAT, VERSION, Model
 from .fields import Fields
 from .linear import ARX, IV, LinearOE
 from .neural import NeuralOE
+from .neural_ss import NeuralSS
 
-_Kind: TypeAlias = type[ARX] | type[IV] | type[LinearOE] | type[NeuralOE]
-_KINDS: dict[str, _Kind] = {c.kind: c for c in (ARX, IV, LinearOE, NeuralOE)}
+_Kind: TypeAlias = type[ARX] | type[IV] | type[LinearOE] | type[NeuralOE] | type[NeuralSS]
+_KINDS: dict[str, _Kind] = {c.kind: c for c in (ARX, IV, LinearOE, NeuralOE, NeuralSS)}
 _FIELDS = ("version", "kind", "Ts", "inputs", "output", "counts", "parameters", "training")
 
 

@@ -2,7 +2,7 @@
 
 mod plants;
 
-pub use plants::{LaggedPlant, Varied};
+pub use plants::{LaggedPlant, StatePlant, Varied};
 
 use sewfast_control::{Controller, Refused};
 

@@ -3,17 +3,22 @@
 //! Rows are collected 64 at a time and then folded into the lower tiles of `X'X`: a rank-1 update per sample would
 //! stream the whole matrix through the caches for every row.
 
+use crate::simd::{self, Eight, Kernel, LANES};
+
 /// Rows per block: with 64 parameters a block is 32 kB and stays in the first-level cache.
 const BLOCK: usize = 64;
-/// Edge of a tile; its 16 sums stay in registers.
-const TILE: usize = 4;
 
 /// `X'X` over rows that may depend linearly on the rows before them.
 #[derive(Debug)]
 pub(crate) struct Gram {
+    /// Groups of eight columns that are summed.
+    groups: usize,
+    /// Numbers from one row to the next.
     width: usize,
     memory: usize,
     filled: usize,
+    /// Where the first row begins: on a cache line.
+    base: usize,
     rows: Vec<f64>,
     sums: Vec<f64>,
     /// Rows of the block that take part in the recursion alone.
@@ -23,12 +28,20 @@ pub(crate) struct Gram {
 impl Gram {
     /// Room for rows of at least `columns` values, each of which sees `memory` rows before it.
     pub fn new(columns: usize, memory: usize) -> Self {
-        let width = columns.next_multiple_of(TILE);
+        let groups = columns.div_ceil(LANES);
+        // An odd number of cache lines: rows apart by a power of two would share the same few places of a cache.
+        let width = (groups | 1) * LANES;
+        let rows = vec![0.0; (memory + BLOCK) * width + LANES];
         Self {
+            groups,
             width,
             memory,
             filled: 0,
-            rows: vec![0.0; (memory + BLOCK) * width],
+            base: rows
+                .as_ptr()
+                .align_offset(LANES * size_of::<f64>())
+                .min(LANES),
+            rows,
             sums: vec![0.0; width * width],
             weightless: Vec::with_capacity(BLOCK),
         }
@@ -42,9 +55,14 @@ impl Gram {
         self.weightless.clear();
     }
 
+    /// Numbers from one row to the next: the columns, and some more.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
     /// The row `back` rows before the next one, 1 being the last.
     pub fn past_mut(&mut self, back: usize) -> &mut [f64] {
-        let start = (self.memory + self.filled - back) * self.width;
+        let start = self.base + (self.memory + self.filled - back) * self.width;
         &mut self.rows[start..start + self.width]
     }
 
@@ -53,7 +71,8 @@ impl Gram {
     /// and not of the sum: a sample that was not measured.
     pub fn push(&mut self, gains: &[f64], last: usize, value: f64, write: impl FnOnce(&mut [f64])) {
         let width = self.width;
-        let (past, rest) = self.rows.split_at_mut((self.memory + self.filled) * width);
+        let next = self.base + (self.memory + self.filled) * width;
+        let (past, rest) = self.rows.split_at_mut(next);
         let row = &mut rest[..width];
         write(row);
         for (gain, old) in gains.iter().zip(past.rchunks_exact(width)) {
@@ -71,48 +90,110 @@ impl Gram {
         }
     }
 
+    /// Room for `count` rows, at most 64, that come with old values; [`Gram::keep`] appends them.
+    #[inline(always)]
+    pub fn room(&mut self, count: usize) -> &mut [f64] {
+        if self.filled + count > BLOCK {
+            self.fold();
+        }
+        let start = self.base + (self.memory + self.filled) * self.width;
+        &mut self.rows[start..start + count * self.width]
+    }
+
+    /// Appends the rows that were written into [`Gram::room`].
+    #[inline(always)]
+    pub fn keep(&mut self, count: usize) {
+        self.filled += count;
+    }
+
     /// `X'X` row by row, `width` values each; only its lower triangle is valid. The width comes second.
     pub fn finish(&mut self) -> (&[f64], usize) {
         self.fold();
         (&self.sums, self.width)
     }
 
+    #[inline(never)]
     fn fold(&mut self) {
-        let (width, start) = (self.width, self.memory * self.width);
+        let width = self.width;
+        let start = self.base + self.memory * width;
         let end = start + self.filled * width;
         // The rows that the next block sees are saved before those without weight are emptied.
-        self.rows.copy_within(end - start..end, 0);
+        let kept = end - self.memory * width;
+        self.rows.copy_within(kept..end, self.base);
         for i in self.weightless.drain(..) {
             self.rows[start + i * width..][..width].fill(0.0);
         }
-        let block = &self.rows[start..end];
-        for i in (0..width).step_by(TILE) {
-            for j in (0..=i).step_by(TILE) {
-                let tile = tile(block, width, i, j);
-                for (a, sums) in tile.iter().enumerate() {
-                    let at = (i + a) * width + j;
-                    for (total, sum) in self.sums[at..at + TILE].iter_mut().zip(sums) {
-                        *total += sum;
-                    }
-                }
-            }
-        }
+        simd::run(Fold {
+            block: &self.rows[start..end],
+            width,
+            groups: self.groups,
+            sums: &mut self.sums,
+        });
         self.filled = 0;
     }
 }
 
-fn tile(block: &[f64], width: usize, i: usize, j: usize) -> [[f64; TILE]; TILE] {
-    let mut sums = [[0.0; TILE]; TILE];
-    for row in block.chunks_exact(width) {
-        let left: &[f64; TILE] = row[i..i + TILE].try_into().unwrap_or(&[0.0; TILE]);
-        let right: &[f64; TILE] = row[j..j + TILE].try_into().unwrap_or(&[0.0; TILE]);
-        for (sums, left) in sums.iter_mut().zip(left) {
-            for (sum, right) in sums.iter_mut().zip(right) {
-                *sum += left * right;
+/// Adds a block's outer products to the sums.
+struct Fold<'a> {
+    block: &'a [f64],
+    width: usize,
+    groups: usize,
+    sums: &'a mut [f64],
+}
+
+impl Kernel for Fold<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<V: Eight>(mut self) {
+        match V::TILE {
+            (8, _) => self.panels::<V, 8>(),
+            (4, _) => self.panels::<V, 4>(),
+            _ => self.panels::<V, 2>(),
+        }
+    }
+}
+
+impl Fold<'_> {
+    /// Panels of columns, which stay in the first-level cache while the rows of `X'` pass by.
+    #[inline(always)]
+    fn panels<V: Eight, const ROWS: usize>(&mut self) {
+        let (_, wide) = V::TILE;
+        for first in (0..self.groups).step_by(wide) {
+            for i in (first * LANES..self.groups * LANES).step_by(ROWS) {
+                // As far as the diagonal.
+                match (i / LANES + 1 - first).min(wide) {
+                    1 => self.tile::<V, ROWS, 1>(i, first * LANES),
+                    2 => self.tile::<V, ROWS, 2>(i, first * LANES),
+                    _ => self.tile::<V, ROWS, 3>(i, first * LANES),
+                }
             }
         }
     }
-    sums
+
+    /// `ROWS` times `GROUPS` groups of sums, which stay in registers.
+    #[inline(always)]
+    fn tile<V: Eight, const ROWS: usize, const GROUPS: usize>(&mut self, i: usize, j: usize) {
+        let mut sums = [[V::splat(0.0); GROUPS]; ROWS];
+        for row in self.block.chunks_exact(self.width) {
+            let right = &row[j..j + GROUPS * LANES];
+            let right: [V; GROUPS] = std::array::from_fn(|g| V::first(&right[g * LANES..]));
+            let left = &row[i..i + ROWS];
+            for (sums, left) in sums.iter_mut().zip(left) {
+                let left = V::splat(*left);
+                for (sum, right) in sums.iter_mut().zip(right) {
+                    *sum = sum.add_product(left, right);
+                }
+            }
+        }
+        for (r, sums) in sums.iter().enumerate() {
+            let totals = &mut self.sums[(i + r) * self.width + j..][..GROUPS * LANES];
+            for (g, sum) in sums.iter().enumerate() {
+                let total = &mut totals[g * LANES..];
+                V::first(total).add(*sum).write(total);
+            }
+        }
+    }
 }
 
 #[cfg(test)]

@@ -259,7 +259,8 @@ pub fn push_past(past: &mut [f64], y: f64) {
     past[0] = y;
 }
 
-fn finite(run: Vec<f64>) -> Result<Vec<f64>> {
+/// The run, where all of it is finite.
+pub(crate) fn finite(run: Vec<f64>) -> Result<Vec<f64>> {
     match run.iter().position(|y| !y.is_finite()) {
         None => Ok(run),
         Some(k) => Err(Error::fit(format!(

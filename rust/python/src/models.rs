@@ -2,6 +2,7 @@
 
 pub mod linear;
 pub mod neural;
+pub mod neural_ss;
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
@@ -12,7 +13,8 @@ use crate::arrays::{raise, rows, slice};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     linear::register(module)?;
-    neural::register(module)
+    neural::register(module)?;
+    neural_ss::register(module)
 }
 
 type RunAndJacobian<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);

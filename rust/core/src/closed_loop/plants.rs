@@ -3,6 +3,7 @@
 use super::Plant;
 use crate::encoder::Encoder;
 use crate::lagged::Lagged;
+use crate::neural_ss::{NeuralSS, Shape, Stepper};
 use crate::{Error, Result};
 
 /// A lagged model as a plant: its regressor is kept from sample to sample.
@@ -83,6 +84,63 @@ impl<M: Lagged> Plant for LaggedPlant<'_, M> {
 fn push(newest_first: &mut [f64], value: f64) {
     newest_first.rotate_right(1);
     newest_first[0] = value;
+}
+
+/// A state-space model as a plant.
+#[derive(Clone, Debug)]
+pub struct StatePlant {
+    stepper: Stepper,
+    position: f64,
+    ts: f64,
+}
+
+impl StatePlant {
+    /// `model` at rest, after inputs of zero. `ts` \[s\] is the sample time it was identified at.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for a model with several inputs or outputs or without delay, or an unusable sample time.
+    pub fn new(model: &NeuralSS, ts: f64) -> Result<Self> {
+        let Shape {
+            inputs, outputs, ..
+        } = model.shape();
+        if inputs != 1 || outputs != 1 {
+            return Err(Error::setting(format!(
+                "expected a model with one input and one output to close a loop around, got {inputs} and {outputs}; identify it from the command alone"
+            )));
+        }
+        if !(ts > 0.0 && ts.is_finite()) {
+            return Err(Error::setting(format!(
+                "expected a sample time above 0, got {ts}"
+            )));
+        }
+        Ok(Self {
+            stepper: Stepper::new(model)?,
+            position: 0.0,
+            ts,
+        })
+    }
+}
+
+impl Plant for StatePlant {
+    fn reset(&mut self) {
+        self.stepper.reset();
+        self.position = 0.0;
+    }
+
+    fn output(&self) -> f64 {
+        self.stepper.output(0)
+    }
+
+    fn position(&self) -> f64 {
+        self.position
+    }
+
+    fn advance(&mut self, u: f64) {
+        let before = self.output();
+        self.stepper.advance(&[u]);
+        // Between samples the output runs straight, so an encoder sees the mean of both ends.
+        self.position += self.ts * (before + self.output()) / 2.0;
+    }
 }
 
 /// Longest extra delay of a [`Varied`] plant, in samples.

@@ -1,20 +1,22 @@
-//! Whatever Python calls a plant: a linear model, a network, a virtual machine.
+//! Whatever Python calls a plant: a linear model, a network, a state-space model, a virtual machine.
 
 use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
-use sewfast_core::closed_loop::{LaggedPlant, Plant};
+use sewfast_core::closed_loop::{LaggedPlant, Plant, StatePlant};
 use sewfast_core::encoder::Encoder;
 use sewfast_core::machine::{self, SAMPLE_TIME};
-use sewfast_core::{Error, Result, linear, neural};
+use sewfast_core::{Error, Result, linear, neural, neural_ss};
 
 use crate::machine::Machine;
 use crate::models::linear::LinearModel;
 use crate::models::neural::NeuralOE;
+use crate::models::neural_ss::NeuralSS;
 
 /// A copy of the Python object's value, which work on other threads may use.
 pub enum Model {
     Linear(linear::LinearModel),
     Neural(neural::NeuralOE),
+    States(neural_ss::NeuralSS),
     Machine(Box<machine::Machine>),
 }
 
@@ -26,11 +28,14 @@ impl Model {
         if let Ok(model) = object.cast::<NeuralOE>() {
             return Ok(Self::Neural(model.get().inner.clone()));
         }
+        if let Ok(model) = object.cast::<NeuralSS>() {
+            return Ok(Self::States(model.get().inner.clone()));
+        }
         if let Ok(machine) = object.cast::<Machine>() {
             return Ok(Self::Machine(Box::new(machine.try_borrow()?.core.clone())));
         }
         Err(PyTypeError::new_err(format!(
-            "expected a LinearModel, a NeuralOE or a Machine, got {}",
+            "expected a LinearModel, a NeuralOE, a NeuralSS or a Machine, got {}",
             object.get_type().name()?
         )))
     }
@@ -40,6 +45,7 @@ impl Model {
         match self {
             Self::Linear(model) => Ok(AnyPlant::Linear(LaggedPlant::new(model, ts)?)),
             Self::Neural(model) => Ok(AnyPlant::Neural(LaggedPlant::new(model, ts)?)),
+            Self::States(model) => Ok(AnyPlant::States(Box::new(StatePlant::new(model, ts)?))),
             Self::Machine(_) if (ts / SAMPLE_TIME - 1.0).abs() > 1e-9 => {
                 Err(Error::setting(format!(
                     "expected a controller with the machine's sample time of {SAMPLE_TIME} s, got {ts} s; convert its gains"
@@ -55,6 +61,7 @@ impl Model {
 pub enum AnyPlant<'a> {
     Linear(LaggedPlant<'a, linear::LinearModel>),
     Neural(LaggedPlant<'a, neural::NeuralOE>),
+    States(Box<StatePlant>),
     Machine(Box<machine::Machine>),
 }
 
@@ -63,6 +70,7 @@ macro_rules! each {
         match $plant {
             AnyPlant::Linear($inner) => $call,
             AnyPlant::Neural($inner) => $call,
+            AnyPlant::States($inner) => $call,
             AnyPlant::Machine($inner) => $call,
         }
     };
@@ -89,6 +97,7 @@ impl Plant for AnyPlant<'_> {
         match self {
             AnyPlant::Linear(plant) => plant.encoder(),
             AnyPlant::Neural(plant) => plant.encoder(),
+            AnyPlant::States(plant) => plant.encoder(),
             AnyPlant::Machine(plant) => Plant::encoder(plant.as_ref()),
         }
     }

@@ -1,0 +1,432 @@
+//! The neural state-space model: linear state equations beside one hidden layer (M. Schoukens, arXiv 2103.14516).
+
+mod draw;
+mod guard;
+mod kalman;
+mod network;
+mod output;
+mod problem;
+mod realisation;
+mod referee;
+mod scaling;
+mod sensitivities;
+mod shape;
+mod state;
+mod tanh;
+mod train;
+
+pub use output::OutputFunction;
+pub use scaling::Scaling;
+pub use shape::Shape;
+pub use state::Statistics;
+pub use train::{NeuralSSFit, Recording, Settings, fit};
+
+use kalman::Filter;
+use network::{Network, Scratch};
+use problem::{FreeRun, Trajectory};
+use sensitivities::{Columns, Recursion, Rows, Sensitivities};
+
+use crate::lagged::finite;
+use crate::{Error, Monitor, Result, simd};
+
+/// `x+ = A x + B v + E h`, `y = f(C x + D v + c + G h)` with `h = tanh(Wx x + Wu v + bh)`, in scaled units
+/// (docs/CONVENTIONS.md).
+#[derive(Clone, Debug)]
+pub struct NeuralSS {
+    theta: Vec<f64>,
+    scaling: Scaling,
+    statistics: Statistics,
+    network: Network,
+}
+
+impl NeuralSS {
+    /// A model from its parameters.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for a wrong number of parameters or scales, values that are not finite, or an integrator
+    /// whose held parameters have other values.
+    pub fn new(
+        shape: Shape,
+        output: OutputFunction,
+        theta: Vec<f64>,
+        scaling: Scaling,
+        statistics: Statistics,
+    ) -> Result<Self> {
+        let shape = shape.checked()?;
+        if theta.len() != shape.parameters() {
+            return Err(Error::setting(format!(
+                "expected {} parameters for this shape, got {}; theta is A, B, E, Wx, Wu, bh, C, D, c, G, each row by row",
+                shape.parameters(),
+                theta.len()
+            )));
+        }
+        if theta.iter().any(|v| !v.is_finite()) {
+            return Err(Error::setting(
+                "expected finite parameters, got NaN or infinity; train the model again",
+            ));
+        }
+        if let Some((i, value)) = shape
+            .held()
+            .into_iter()
+            .find(|&(i, value)| theta[i] != value)
+        {
+            return Err(Error::setting(format!(
+                "expected {value} for theta[{i}], which the integrator holds, got {}; set it so or leave the integrator out",
+                theta[i]
+            )));
+        }
+        scaling.check(shape.inputs, shape.outputs)?;
+        statistics.check(shape)?;
+        let network = Network::new(shape, output, &theta);
+        Ok(Self {
+            theta,
+            scaling,
+            statistics,
+            network,
+        })
+    }
+
+    /// Parameters, in the order of docs/CONVENTIONS.md.
+    pub fn theta(&self) -> &[f64] {
+        &self.theta
+    }
+
+    /// Sizes.
+    pub fn shape(&self) -> Shape {
+        self.network.shape
+    }
+
+    /// The output function.
+    pub fn output(&self) -> OutputFunction {
+        self.network.output
+    }
+
+    /// Scaling of inputs and outputs.
+    pub fn scaling(&self) -> &Scaling {
+        &self.scaling
+    }
+
+    /// What training knows of states and residuals.
+    pub fn statistics(&self) -> &Statistics {
+        &self.statistics
+    }
+
+    /// The state at which the model rests at input zero, in scaled units: least `|x+ - x|^2 + |y|^2`.
+    pub fn rest_state(&self) -> Vec<f64> {
+        let Shape {
+            inputs, outputs, ..
+        } = self.shape();
+        let v: Vec<f64> = (0..inputs).map(|j| self.scaling.input(j, 0.0)).collect();
+        let zero: Vec<f64> = (0..outputs).map(|p| self.scaling.output(p, 0.0)).collect();
+        state::rest(&self.network, &self.statistics, &v, &zero)
+    }
+
+    /// Free run in the data's units, time first.
+    ///
+    /// # Errors
+    /// `ErrorKind::Data` for wrong shapes or values, `ErrorKind::Fit` for a run that leaves the finite numbers.
+    pub fn simulate(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<Vec<f64>> {
+        let run = self.run(u, channels, state)?;
+        finite(self.restored(&run.sums))
+    }
+
+    /// The states of the free run, time first, in scaled units.
+    ///
+    /// # Errors
+    /// As [`NeuralSS::simulate`].
+    pub fn states(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<Vec<f64>> {
+        finite(self.run(u, channels, state)?.states)
+    }
+
+    /// Free run in the data's units, and its derivatives row by row, output by output: by theta, then by the state.
+    ///
+    /// # Errors
+    /// As [`NeuralSS::simulate`].
+    pub fn jacobian(
+        &self,
+        u: &[f64],
+        channels: usize,
+        state: &[f64],
+    ) -> Result<(Vec<f64>, Vec<f64>)> {
+        let shape = self.shape();
+        let trajectory = self.run(u, channels, state)?;
+        let run = finite(self.restored(&trajectory.sums))?;
+        let columns = Columns::new(shape);
+        let states = (0..shape.nx).map(|j| columns.state + j);
+        let mut dense = Dense {
+            columns: columns.of_theta().into_iter().chain(states).collect(),
+            row: vec![0.0; columns.room * shape.outputs],
+            room: columns.room,
+            rows: Vec::with_capacity(run.len() * (self.theta.len() + shape.nx)),
+            scales: &self.scaling.y_scale,
+        };
+        let known = vec![0.0; run.len()];
+        simd::run(Recursion {
+            network: &self.network,
+            run: &trajectory,
+            v: &self.scaling.delayed_inputs(u, shape.nk),
+            y: &known,
+            buffers: &mut Sensitivities::new(shape),
+            rows: &mut dense,
+            monitor: &Monitor::default(),
+        });
+        Ok((run, dense.rows))
+    }
+
+    /// The output `horizon` steps ahead: an extended Kalman filter follows the measured outputs up to sample
+    /// `k - horizon`, from there the model runs free. Outputs that are NaN are not used.
+    ///
+    /// # Errors
+    /// `ErrorKind::Data` for wrong shapes, `ErrorKind::Setting` for a horizon of 0, `ErrorKind::Fit` as in free run.
+    pub fn predict(
+        &self,
+        u: &[f64],
+        channels: usize,
+        y: &[f64],
+        state: &[f64],
+        horizon: usize,
+    ) -> Result<Vec<f64>> {
+        let shape = self.shape();
+        let samples = self.check(u, channels, state)?;
+        self.check_measured(y, samples)?;
+        if horizon == 0 {
+            return Err(Error::setting(
+                "expected a horizon of 1 step or more, got 0; 1 is one-step prediction",
+            ));
+        }
+        // the first samples, for which too few outputs are known, run free from the state
+        let first = horizon.min(samples);
+        let mut run = self.simulate(&u[..first * channels], channels, state)?;
+        let v = self.scaling.delayed_inputs(u, shape.nk);
+        let mut filtered = Vec::with_capacity(samples * shape.nx);
+        simd::run(Filter {
+            network: &self.network,
+            prior: &self.statistics,
+            process: self.statistics.process_noise,
+            state,
+            v: &v,
+            y: &self.scaling.outputs(y),
+            each: |_: usize, _: &[f64], x: &[f64]| filtered.extend_from_slice(x),
+        });
+        let mut trajectory = Trajectory::new(&self.network, horizon + 1);
+        let mut scratch = Scratch::new(shape);
+        for k in first..samples {
+            let state = &filtered[(k - horizon) * shape.nx..][..shape.nx];
+            self.free(
+                &v[(k - horizon) * channels..(k + 1) * channels],
+                state,
+                &mut trajectory,
+                &mut scratch,
+            )?;
+            run.extend(self.restored(&trajectory.sums[horizon * shape.outputs..]));
+        }
+        finite(run)
+    }
+
+    /// The state at the first sample that is likeliest after these samples (docs/CONVENTIONS.md), in scaled units.
+    /// Outputs that are NaN do not count.
+    ///
+    /// # Errors
+    /// `ErrorKind::Data` for wrong shapes or no samples, `ErrorKind::Fit` where every start leaves the finite numbers.
+    pub fn estimate_initial_state(
+        &self,
+        u: &[f64],
+        channels: usize,
+        y: &[f64],
+    ) -> Result<Vec<f64>> {
+        let samples = self.check(u, channels, &vec![0.0; self.shape().nx])?;
+        self.check_measured(y, samples)?;
+        if samples == 0 {
+            return Err(Error::data(
+                "expected samples to estimate the initial state from, got none; give 20 or so",
+            ));
+        }
+        let v = self.scaling.delayed_inputs(u, self.shape().nk);
+        let y = self.scaling.outputs(y);
+        let rest = [self.rest_state()];
+        state::estimate(&self.network, &self.statistics, &v, &y, &rest).ok_or_else(|| {
+            Error::fit("expected an initial state with a finite free run, found none; the model is unstable on this record")
+        })
+    }
+
+    fn run(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<Trajectory> {
+        let samples = self.check(u, channels, state)?;
+        let mut run = Trajectory::new(&self.network, samples);
+        let v = self.scaling.delayed_inputs(u, self.shape().nk);
+        self.free(&v, state, &mut run, &mut Scratch::new(self.shape()))?;
+        Ok(run)
+    }
+
+    fn free(
+        &self,
+        v: &[f64],
+        state: &[f64],
+        run: &mut Trajectory,
+        scratch: &mut Scratch,
+    ) -> Result<()> {
+        let free = FreeRun {
+            network: &self.network,
+            v,
+            state,
+            run,
+            scratch,
+            bound: f64::MAX,
+            monitor: &Monitor::default(),
+        };
+        simd::run(free).ok_or_else(|| {
+            Error::fit("expected a finite simulation, got states beyond all bounds; the model is unstable on this input: identify it again with other orders or more data")
+        })
+    }
+
+    fn restored(&self, sums: &[f64]) -> Vec<f64> {
+        let (count, output) = (self.shape().outputs, self.network.output);
+        let restored = |(i, s): (usize, &f64)| self.scaling.restored(i % count, output.value(*s));
+        sums.iter().enumerate().map(restored).collect()
+    }
+
+    /// Number of samples in `u`, after all shapes have been checked.
+    fn check(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<usize> {
+        let shape = self.shape();
+        if channels != shape.inputs {
+            return Err(Error::data(format!(
+                "expected u of shape (N, {}), got (N, {channels}); give the inputs the model was made with, time first",
+                shape.inputs
+            )));
+        }
+        if state.len() != shape.nx {
+            return Err(Error::data(format!(
+                "expected {} states, got {}; use rest_state or estimate_initial_state",
+                shape.nx,
+                state.len()
+            )));
+        }
+        if u.iter().chain(state).any(|v| !v.is_finite()) {
+            return Err(Error::data(
+                "expected finite inputs and states, got NaN or infinity; cut or repair that part of the recording",
+            ));
+        }
+        Ok(u.len() / channels)
+    }
+
+    fn check_measured(&self, y: &[f64], samples: usize) -> Result<()> {
+        let outputs = self.shape().outputs;
+        if y.len() != samples * outputs {
+            return Err(Error::data(format!(
+                "expected {samples} x {outputs} measured outputs, one row per input sample, got {} values; give u and y the same number of samples",
+                y.len()
+            )));
+        }
+        if y.iter().any(|v| v.is_infinite()) {
+            return Err(Error::data(
+                "expected measured outputs that are finite, or NaN where not known, got infinity; cut or repair that part",
+            ));
+        }
+        Ok(())
+    }
+}
+
+/// Rows in the data's units, in the order of theta.
+struct Dense<'a> {
+    columns: Vec<usize>,
+    row: Vec<f64>,
+    room: usize,
+    rows: Vec<f64>,
+    scales: &'a [f64],
+}
+
+impl Rows for Dense<'_> {
+    fn width(&self) -> usize {
+        self.room
+    }
+
+    fn room(&mut self, count: usize) -> &mut [f64] {
+        &mut self.row[..count * self.room]
+    }
+
+    fn keep(&mut self, count: usize) {
+        let rows = self.row.chunks_exact(self.room).take(count);
+        for (row, scale) in rows.zip(self.scales) {
+            self.rows
+                .extend(self.columns.iter().map(|&c| row[c] * scale));
+        }
+    }
+}
+
+/// The model from sample to sample, for a loop that is closed around it.
+#[derive(Clone, Debug)]
+pub struct Stepper {
+    network: Network,
+    scaling: Scaling,
+    rest: Vec<f64>,
+    scratch: Scratch,
+    /// Inputs that are still to act, the oldest at `oldest`: nk rows.
+    waiting: Vec<f64>,
+    oldest: usize,
+}
+
+impl Stepper {
+    /// `model` at rest.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for a model without delay.
+    pub fn new(model: &NeuralSS) -> Result<Self> {
+        let shape = model.shape();
+        if shape.nk == 0 {
+            return Err(Error::setting(
+                "expected a model with a delay nk of 1 or more, got 0: the command is decided after the output is \
+                 measured; identify it again with nk = 1",
+            ));
+        }
+        let mut stepper = Self {
+            network: model.network.clone(),
+            scaling: model.scaling.clone(),
+            rest: model.rest_state(),
+            scratch: Scratch::new(shape),
+            waiting: vec![0.0; shape.nk * shape.inputs],
+            oldest: 0,
+        };
+        stepper.reset();
+        Ok(stepper)
+    }
+
+    /// Back to rest, with inputs of zero before.
+    pub fn reset(&mut self) {
+        let inputs = self.network.shape.inputs;
+        for (i, waiting) in self.waiting.iter_mut().enumerate() {
+            *waiting = self.scaling.input(i % inputs, 0.0);
+        }
+        self.oldest = 0;
+        self.scratch.next.copy_from_slice(&self.rest);
+        self.advance_state();
+    }
+
+    /// Output `p` at this sample, in the data's unit.
+    pub fn output(&self, p: usize) -> f64 {
+        let scaled = self.network.output.value(self.scratch.sums[p]);
+        self.scaling.restored(p, scaled)
+    }
+
+    /// Holds the inputs for one sample time, which brings the next sample.
+    pub fn advance(&mut self, u: &[f64]) {
+        let inputs = self.network.shape.inputs;
+        let place = &mut self.waiting[self.oldest * inputs..][..inputs];
+        for (j, (waiting, u)) in place.iter_mut().zip(u).enumerate() {
+            *waiting = self.scaling.input(j, *u);
+        }
+        self.oldest = (self.oldest + 1) % self.network.shape.nk;
+        self.advance_state();
+    }
+
+    fn advance_state(&mut self) {
+        let inputs = self.network.shape.inputs;
+        let v = &self.waiting[self.oldest * inputs..][..inputs];
+        simd::run(state::Next {
+            network: &self.network,
+            scratch: &mut self.scratch,
+            v,
+        });
+    }
+}
+
+#[cfg(test)]
+mod tests;

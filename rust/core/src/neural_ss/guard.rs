@@ -1,0 +1,73 @@
+//! The runs by which a model is guarded: from states beside the training's, and over larger inputs.
+
+use super::network::{Network, Scratch};
+use super::problem::{Experiment, FreeRun, Trajectory};
+use super::shape::Shape;
+use super::state::Statistics;
+use crate::guard::{Guard, enlarged};
+use crate::{Monitor, simd};
+
+/// Where a run that is to forget its state is started, in standard deviations of the training states.
+const BESIDE: f64 = 3.0;
+
+/// True where the free run forgets its initial state, unless that is integrated, and answers somewhat larger inputs
+/// with outputs of like size.
+pub(super) fn is_sound(
+    network: &Network,
+    experiments: &[Experiment],
+    runs: &[Trajectory],
+    states: &[Vec<f64>],
+    statistics: &Statistics,
+) -> bool {
+    let Shape {
+        nx,
+        inputs,
+        outputs,
+        integrator,
+        ..
+    } = network.shape;
+    let measured = |p: usize| {
+        experiments
+            .iter()
+            .flat_map(move |e| e.y.iter().skip(p).step_by(outputs))
+    };
+    let guards: Vec<Guard> = (0..outputs).map(|p| Guard::of(measured(p))).collect();
+    let beside = |sign: f64| -> Vec<f64> {
+        let deviation = |i: usize| statistics.state_covariance[i * (nx + 1)].sqrt();
+        (0..nx)
+            .map(|i| statistics.state_mean[i] + sign * BESIDE * deviation(i))
+            .collect()
+    };
+    experiments
+        .iter()
+        .zip(runs)
+        .zip(states)
+        .all(|((experiment, usual), state)| {
+            let of = |p: usize, run: &Trajectory| -> Vec<f64> {
+                let sums = run.sums.iter().skip(p).step_by(outputs);
+                sums.map(|s| network.output.value(*s)).collect()
+            };
+            let forgets = |sign: f64| {
+                run(network, &experiment.v, &beside(sign)).is_some_and(|other| {
+                    (0..outputs).all(|p| guards[p].meet(&of(p, usual), &of(p, &other)))
+                })
+            };
+            let larger = run(network, &enlarged(&experiment.v, inputs), state);
+            larger.is_some_and(|larger| (0..outputs).all(|p| guards[p].holds(&of(p, &larger))))
+                && (integrator || (forgets(1.0) && forgets(-1.0)))
+        })
+}
+
+fn run(network: &Network, v: &[f64], state: &[f64]) -> Option<Trajectory> {
+    let mut run = Trajectory::new(network, v.len() / network.shape.inputs);
+    simd::run(FreeRun {
+        network,
+        v,
+        state,
+        run: &mut run,
+        scratch: &mut Scratch::new(network.shape),
+        bound: f64::MAX,
+        monitor: &Monitor::default(),
+    })?;
+    Some(run)
+}

@@ -1,0 +1,219 @@
+//! The extended Kalman filter: states that follow the measured outputs (Anderson and Moore 1979, section 8.2).
+
+use super::network::{Network, Scratch};
+use super::problem::Experiment;
+use super::shape::Shape;
+use super::state::{Statistics, step_with_slopes};
+use crate::Monitor;
+use crate::simd::{self, Eight, Kernel};
+
+/// Powers of ten that the process noise is chosen from.
+const EXPONENTS: std::ops::RangeInclusive<i32> = -8..=2;
+/// Where the search begins.
+const FIRST_EXPONENT: i32 = -3;
+/// Samples that it looks at: more do not move a power of ten.
+const MOST_SAMPLES: usize = 20_000;
+
+/// A filter over one record, as a kernel. `each(k, s, x)` sees the sums predicted for sample `k` before its outputs
+/// count, and the state after they did.
+pub(super) struct Filter<'a, F> {
+    pub network: &'a Network,
+    pub prior: &'a Statistics,
+    /// Process noise, relative to the prior's covariance.
+    pub process: f64,
+    pub state: &'a [f64],
+    pub v: &'a [f64],
+    /// Measured outputs; those that are NaN are not used.
+    pub y: &'a [f64],
+    pub each: F,
+}
+
+impl<F: FnMut(usize, &[f64], &[f64])> Kernel for Filter<'_, F> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<V: Eight>(self) {
+        let Self {
+            network,
+            prior,
+            process,
+            state,
+            v,
+            y,
+            mut each,
+        } = self;
+        let Shape {
+            nx,
+            inputs,
+            outputs,
+            ..
+        } = network.shape;
+        let noise: Vec<f64> = prior.state_covariance.iter().map(|c| process * c).collect();
+        let mut memory = Memory {
+            covariance: noise.clone(),
+            x: state.to_vec(),
+            room: vec![0.0; nx * nx],
+            row: vec![0.0; nx],
+            gain: vec![0.0; nx],
+        };
+        let (mut scratch, mut predicted) = (Scratch::new(network.shape), vec![0.0; outputs]);
+        for (k, (v, y)) in v
+            .chunks_exact(inputs)
+            .zip(y.chunks_exact(outputs))
+            .enumerate()
+        {
+            scratch.next.copy_from_slice(&memory.x);
+            step_with_slopes::<V>(network, &mut scratch, v);
+            predicted.copy_from_slice(&scratch.sums);
+            for (p, y) in y.iter().enumerate().filter(|(_, y)| !y.is_nan()) {
+                memory.measure(
+                    network,
+                    &scratch,
+                    p,
+                    *y,
+                    prior.residual_variance[p],
+                    state_before(&scratch, nx),
+                );
+            }
+            each(k, &predicted, &memory.x);
+            scratch.next.copy_from_slice(&memory.x);
+            step_with_slopes::<V>(network, &mut scratch, v);
+            memory.advance(&scratch, &noise);
+        }
+    }
+}
+
+/// The state that the last step began at.
+fn state_before(scratch: &Scratch, nx: usize) -> &[f64] {
+    &scratch.arguments[..nx]
+}
+
+struct Memory {
+    x: Vec<f64>,
+    covariance: Vec<f64>,
+    room: Vec<f64>,
+    row: Vec<f64>,
+    gain: Vec<f64>,
+}
+
+impl Memory {
+    /// One output counts: the outputs' noises are independent, so that one may come after the other.
+    fn measure(
+        &mut self,
+        network: &Network,
+        scratch: &Scratch,
+        p: usize,
+        y: f64,
+        noise: f64,
+        before: &[f64],
+    ) {
+        let nx = self.x.len();
+        let (value, steepness) = network.output.value_and_slope(scratch.sums[p]);
+        for (j, row) in self.row.iter_mut().enumerate() {
+            *row = steepness * scratch.slope((nx + p) * nx + j);
+        }
+        for (i, gain) in self.gain.iter_mut().enumerate() {
+            *gain = (0..nx)
+                .map(|j| self.covariance[i * nx + j] * self.row[j])
+                .sum();
+        }
+        let spread = noise
+            + self
+                .row
+                .iter()
+                .zip(&self.gain)
+                .map(|(r, g)| r * g)
+                .sum::<f64>();
+        let moved: f64 = (0..nx).map(|j| self.row[j] * (self.x[j] - before[j])).sum();
+        let innovation = (y - value - moved) / spread;
+        for i in 0..nx {
+            self.x[i] += self.gain[i] * innovation;
+            for j in 0..nx {
+                self.covariance[i * nx + j] -= self.gain[i] * self.gain[j] / spread;
+            }
+        }
+    }
+
+    /// `x+ = f(x)`, `P+ = F P F' + Q`.
+    fn advance(&mut self, scratch: &Scratch, noise: &[f64]) {
+        let nx = self.x.len();
+        self.x.copy_from_slice(&scratch.next);
+        for q in 0..nx {
+            for j in 0..nx {
+                self.room[q * nx + j] = (0..nx)
+                    .map(|i| scratch.slope(q * nx + i) * self.covariance[i * nx + j])
+                    .sum();
+            }
+        }
+        for q in 0..nx {
+            for r in 0..=q {
+                let sum: f64 = (0..nx)
+                    .map(|j| self.room[q * nx + j] * scratch.slope(r * nx + j))
+                    .sum();
+                self.covariance[q * nx + r] = sum + noise[q * nx + r];
+                self.covariance[r * nx + q] = self.covariance[q * nx + r];
+            }
+        }
+    }
+}
+
+/// The power of ten with the least one-step error on these experiments, by descent from one to the next.
+pub(super) fn process_noise(
+    network: &Network,
+    prior: &Statistics,
+    experiments: &[Experiment],
+    states: &[Vec<f64>],
+    monitor: &Monitor,
+) -> f64 {
+    let error = |exponent: i32| match EXPONENTS.contains(&exponent) && !monitor.stopped() {
+        true => one_step_error(network, prior, experiments, states, 10f64.powi(exponent)),
+        false => f64::INFINITY,
+    };
+    let (mut at, mut least) = (FIRST_EXPONENT, error(FIRST_EXPONENT));
+    for direction in [-1, 1] {
+        loop {
+            let next = error(at + direction);
+            if next.is_nan() || next >= least {
+                break;
+            }
+            (at, least) = (at + direction, next);
+        }
+    }
+    10f64.powi(at)
+}
+
+/// Sum of squared one-step errors, in the measure of the outputs' residuals.
+fn one_step_error(
+    network: &Network,
+    prior: &Statistics,
+    experiments: &[Experiment],
+    states: &[Vec<f64>],
+    process: f64,
+) -> f64 {
+    let Shape {
+        inputs, outputs, ..
+    } = network.shape;
+    let (mut left, mut sum) = (MOST_SAMPLES, 0.0);
+    for (experiment, state) in experiments.iter().zip(states) {
+        let samples = left.min(experiment.y.len() / outputs);
+        left -= samples;
+        let y = &experiment.y[..samples * outputs];
+        simd::run(Filter {
+            network,
+            prior,
+            process,
+            state,
+            v: &experiment.v[..samples * inputs],
+            y,
+            each: |k: usize, s: &[f64], _: &[f64]| {
+                for (p, s) in s.iter().enumerate() {
+                    let error = y[k * outputs + p] - network.output.value(*s);
+                    if !y[k * outputs + p].is_nan() {
+                        sum += error * error / prior.residual_variance[p];
+                    }
+                }
+            },
+        });
+    }
+    if sum.is_finite() { sum } else { f64::INFINITY }
+}

@@ -1,0 +1,174 @@
+//! Which iterate of a start is kept: the best on the validation data, else the best on the training data.
+
+use std::cell::RefCell;
+
+use super::network::{Network, Scratch};
+use super::problem::{Experiment, FreeRun, Trajectory};
+use super::shape::Shape;
+use super::state::{self, Statistics};
+use crate::lagged::STATE_SAMPLES;
+use crate::{Monitor, simd};
+
+/// Residual variances below this part of the output's count as this much: the arithmetic has an end.
+const LEAST_VARIANCE: f64 = 1e-12;
+
+/// The iterate that is kept.
+pub(super) struct Best {
+    score: f64,
+    pub validation_cost: Option<f64>,
+    pub theta: Vec<f64>,
+    pub cost: f64,
+}
+
+/// Keeps the best iterate of a start.
+pub(super) struct Referee<'a> {
+    network: Network,
+    experiments: &'a [Experiment],
+    runs: &'a RefCell<Vec<Trajectory>>,
+    validation: &'a [Experiment],
+    monitor: &'a Monitor,
+    /// The last iterate's initial states of the validation experiments.
+    states: Vec<Option<Vec<f64>>>,
+    own: Vec<Trajectory>,
+    scratch: Scratch,
+    pub best: Option<Best>,
+}
+
+impl<'a> Referee<'a> {
+    pub fn new(
+        network: Network,
+        experiments: &'a [Experiment],
+        runs: &'a RefCell<Vec<Trajectory>>,
+        validation: &'a [Experiment],
+        monitor: &'a Monitor,
+    ) -> Self {
+        let outputs = network.shape.outputs;
+        let own = validation
+            .iter()
+            .map(|e| Trajectory::new(&network, e.y.len() / outputs));
+        Self {
+            own: own.collect(),
+            scratch: Scratch::new(network.shape),
+            states: vec![None; validation.len()],
+            network,
+            experiments,
+            runs,
+            validation,
+            monitor,
+            best: None,
+        }
+    }
+
+    /// Looks at an accepted iterate, whose training run is stored; `error` is its cost without weight decay.
+    pub fn judge(&mut self, all: &[f64], cost: f64, error: f64) {
+        self.network.load(&all[..self.network.shape.parameters()]);
+        let validation_cost = (!self.validation.is_empty()).then(|| self.validation_cost());
+        let score = validation_cost.unwrap_or(cost);
+        if self.best.as_ref().is_none_or(|best| score < best.score) {
+            self.best = Some(Best {
+                score,
+                validation_cost,
+                theta: all.to_vec(),
+                cost: error,
+            });
+        }
+    }
+
+    /// J over all validation experiments, after the samples that their states are estimated from; infinite where one
+    /// diverges.
+    fn validation_cost(&mut self) -> f64 {
+        let statistics = statistics(&self.network, self.experiments, &self.runs.borrow());
+        let (mut sum, mut samples) = (0.0, 0);
+        for i in 0..self.validation.len() {
+            let Some((squares, known)) = self.score(i, &statistics) else {
+                return f64::INFINITY;
+            };
+            (sum, samples) = (sum + squares, samples + known);
+        }
+        let cost = 0.5 * sum / samples as f64;
+        if cost.is_nan() { f64::INFINITY } else { cost }
+    }
+
+    /// Sum of squared errors and the number of outputs it is taken over.
+    fn score(&mut self, i: usize, statistics: &Statistics) -> Option<(f64, usize)> {
+        let Shape {
+            inputs, outputs, ..
+        } = self.network.shape;
+        let Experiment { v, y } = &self.validation[i];
+        let skipped = STATE_SAMPLES.min(y.len() / outputs / 2);
+        let (first_v, first_y) = (&v[..skipped * inputs], &y[..skipped * outputs]);
+        let state = match self.states[i].take() {
+            Some(last) => {
+                let starts = [last, statistics.state_mean.clone()];
+                state::update(&self.network, statistics, first_v, first_y, &starts)
+            }
+            None => state::estimate(&self.network, statistics, first_v, first_y, &[]),
+        };
+        let state = state?;
+        let run = &mut self.own[i];
+        let free = FreeRun {
+            network: &self.network,
+            v,
+            state: &state,
+            run,
+            scratch: &mut self.scratch,
+            bound: f64::MAX,
+            monitor: self.monitor,
+        };
+        self.states[i] = Some(state.clone());
+        simd::run(free)?;
+        let pairs = run.sums.iter().zip(y).skip(skipped * outputs);
+        let errors = pairs
+            .filter(|(_, y)| !y.is_nan())
+            .map(|(s, y)| y - self.network.output.value(*s));
+        Some(errors.fold((0.0, 0), |(sum, known), e| (sum + e * e, known + 1)))
+    }
+}
+
+/// What the runs over the training data say of states and residuals.
+pub(super) fn statistics(
+    network: &Network,
+    experiments: &[Experiment],
+    runs: &[Trajectory],
+) -> Statistics {
+    let Shape { nx, outputs, .. } = network.shape;
+    let states = || runs.iter().flat_map(|run| run.states.chunks_exact(nx));
+    let count = states().count() as f64;
+    let mut mean = vec![0.0; nx];
+    for x in states() {
+        mean.iter_mut()
+            .zip(x)
+            .for_each(|(mean, x)| *mean += x / count);
+    }
+    let mut covariance = vec![0.0; nx * nx];
+    for x in states() {
+        for i in 0..nx {
+            for j in 0..=i {
+                covariance[i * nx + j] += (x[i] - mean[i]) * (x[j] - mean[j]) / count;
+            }
+        }
+    }
+    (0..nx).for_each(|i| (0..i).for_each(|j| covariance[j * nx + i] = covariance[i * nx + j]));
+    let variance = |p: usize| {
+        let pairs = runs
+            .iter()
+            .zip(experiments)
+            .flat_map(|(run, e)| run.sums.iter().zip(&e.y).skip(p).step_by(outputs));
+        let errors = pairs
+            .filter(|(_, y)| !y.is_nan())
+            .map(|(s, y)| y - network.output.value(*s));
+        let (sum, known) = errors.fold((0.0, 0.0), |(sum, n), e| (sum + e * e, n + 1.0));
+        let variance: f64 = sum / f64::max(known, 1.0);
+        if variance.is_finite() {
+            variance.max(LEAST_VARIANCE)
+        } else {
+            1.0
+        }
+    };
+    Statistics {
+        state_mean: mean,
+        residual_variance: (0..outputs).map(variance).collect(),
+        state_covariance: covariance,
+        process_noise: 0.0,
+    }
+}

@@ -1,0 +1,403 @@
+//! Exact derivatives of the free run by the forward recursion, eight columns at a time.
+//!
+//! With `X = dx/d(theta, x0)`: `X(k+1) = (dx+/dx) X(k) + dx+/dtheta` and `dy(k) = f'(s) ((ds/dx) X(k) + ds/dtheta)`,
+//! all at the states and hidden outputs that the simulation left behind.
+
+use super::network::{Network, Scratch};
+use super::problem::Trajectory;
+use super::shape::Shape;
+use crate::Monitor;
+use crate::gram::Gram;
+use crate::simd::{Eight, Group, Kernel, LANES};
+
+/// Samples between two looks at the monitor.
+const LOOK: usize = 512;
+
+/// Where the parameters' columns stand in a row: for each state, each input and the bias, then for each row of E, then
+/// for each row of G, all hidden units; then `[A B]` row by row, the initial state, `[C D c]` row by row, the error.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Columns {
+    shape: Shape,
+    /// First column of G.
+    direct: usize,
+    /// First column of `[A B]`.
+    linear: usize,
+    /// First column of the initial state.
+    pub state: usize,
+    /// First column of `[C D c]`.
+    sums: usize,
+    /// Column of the error.
+    pub error: usize,
+    /// Numbers that a row must have room for: some are written beyond its end.
+    pub room: usize,
+}
+
+impl Columns {
+    pub fn new(shape: Shape) -> Self {
+        let (nx, ny, width) = (shape.nx, shape.outputs, shape.arguments());
+        let direct = (width + 1 + nx) * shape.hidden;
+        let linear = direct + ny * shape.hidden;
+        let state = linear + nx * width;
+        let sums = state + nx;
+        let error = sums + ny * (width + 1);
+        let room = (error + 1).max(linear + (nx * width + nx).next_multiple_of(LANES));
+        Self {
+            shape,
+            direct,
+            linear,
+            state,
+            sums,
+            error,
+            room,
+        }
+    }
+
+    /// For each entry of theta its column.
+    pub fn of_theta(&self) -> Vec<usize> {
+        let Shape {
+            nx,
+            inputs: nu,
+            outputs: ny,
+            hidden,
+            ..
+        } = self.shape;
+        let width = nx + nu;
+        let mut columns = Vec::with_capacity(self.shape.parameters());
+        columns.extend((0..nx).flat_map(|q| (0..nx).map(move |j| self.linear + q * width + j)));
+        columns
+            .extend((0..nx).flat_map(|q| (0..nu).map(move |j| self.linear + q * width + nx + j)));
+        columns.extend((0..nx * hidden).map(|i| (width + 1) * hidden + i));
+        columns.extend((0..hidden).flat_map(|i| (0..nx).map(move |j| j * hidden + i)));
+        columns.extend((0..hidden).flat_map(|i| (0..nu).map(move |j| (nx + j) * hidden + i)));
+        columns.extend((0..hidden).map(|i| width * hidden + i));
+        columns.extend((0..ny).flat_map(|p| (0..nx).map(move |j| self.sums + p * (width + 1) + j)));
+        columns.extend(
+            (0..ny).flat_map(|p| (0..nu).map(move |j| self.sums + p * (width + 1) + nx + j)),
+        );
+        columns.extend((0..ny).map(|p| self.sums + p * (width + 1) + width));
+        columns.extend((0..ny * hidden).map(|i| self.direct + i));
+        columns
+    }
+}
+
+/// What takes the rows.
+pub(super) trait Rows {
+    /// Numbers from one row to the next.
+    fn width(&self) -> usize;
+    /// Room for `count` rows.
+    fn room(&mut self, count: usize) -> &mut [f64];
+    /// The rows have been written.
+    fn keep(&mut self, count: usize);
+}
+
+impl Rows for Gram {
+    #[inline(always)]
+    fn width(&self) -> usize {
+        Gram::width(self)
+    }
+
+    #[inline(always)]
+    fn room(&mut self, count: usize) -> &mut [f64] {
+        Gram::room(self, count)
+    }
+
+    #[inline(always)]
+    fn keep(&mut self, count: usize) {
+        Gram::keep(self, count);
+    }
+}
+
+/// The recursion with its buffers.
+#[derive(Clone, Debug)]
+pub(super) struct Sensitivities {
+    columns: Columns,
+    /// `X` in groups of columns: for each group the rows of all states.
+    states: Vec<Group>,
+    /// `dx+/d[A B x0]`, in groups as `states`.
+    linear: Vec<Group>,
+    /// `[E; G] diag(1 - h^2)`.
+    weighted: Vec<Group>,
+    scratch: Scratch,
+    /// Outputs of a sample that are known: which, slope of the output function, error.
+    known: Vec<(usize, f64, f64)>,
+}
+
+impl Sensitivities {
+    pub fn new(shape: Shape) -> Self {
+        let (nx, groups) = (shape.nx, shape.hidden.div_ceil(LANES));
+        let small = (nx * shape.arguments() + nx).div_ceil(LANES);
+        let hidden = (shape.arguments() + 1 + nx) * groups;
+        Self {
+            columns: Columns::new(shape),
+            states: vec![Group::ZERO; (hidden + small) * nx],
+            linear: vec![Group::ZERO; small * nx],
+            weighted: vec![Group::ZERO; (nx + shape.outputs) * groups],
+            scratch: Scratch::new(shape),
+            known: Vec::with_capacity(shape.outputs),
+        }
+    }
+
+    /// Before the first sample the states depend on nothing but themselves.
+    fn reset(&mut self) {
+        let Shape { nx, .. } = self.columns.shape;
+        let first = self.states.len() - self.linear.len();
+        self.states.fill(Group::ZERO);
+        for q in 0..nx {
+            let column = self.columns.state - self.columns.linear + q;
+            self.states[first + column / LANES * nx + q].0[column % LANES] = 1.0;
+        }
+    }
+}
+
+/// The recursion over one run, as a kernel. A stop request ends it early.
+pub(super) struct Recursion<'a, R> {
+    pub network: &'a Network,
+    pub run: &'a Trajectory,
+    pub v: &'a [f64],
+    /// Measured outputs; an output that is NaN has no row.
+    pub y: &'a [f64],
+    pub buffers: &'a mut Sensitivities,
+    pub rows: &'a mut R,
+    pub monitor: &'a Monitor,
+}
+
+impl<R: Rows> Kernel for Recursion<'_, R> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<V: Eight>(self) {
+        match self.network.shape.nx {
+            1 => self.samples::<V, 1>(),
+            2 => self.samples::<V, 2>(),
+            3 => self.samples::<V, 3>(),
+            4 => self.samples::<V, 4>(),
+            _ => self.samples::<V, 0>(),
+        }
+    }
+}
+
+impl<R: Rows> Recursion<'_, R> {
+    /// `NX` states, so that their loops are unrolled; 0 stands for any number.
+    #[inline(always)]
+    fn samples<V: Eight, const NX: usize>(self) {
+        let Self {
+            network,
+            run,
+            v,
+            y,
+            buffers,
+            rows,
+            monitor,
+        } = self;
+        let Shape {
+            nx,
+            inputs,
+            outputs,
+            ..
+        } = network.shape;
+        buffers.reset();
+        let hidden = run.hidden.chunks_exact(network.groups());
+        let samples = run
+            .states
+            .chunks_exact(nx)
+            .zip(v.chunks_exact(inputs))
+            .zip(hidden);
+        let sums = run.sums.chunks_exact(outputs).zip(y.chunks_exact(outputs));
+        for (k, (((x, v), h), (s, y))) in samples.zip(sums).enumerate() {
+            if k % LOOK == 0 && monitor.stopped() {
+                return;
+            }
+            buffers.scratch.set(x, v);
+            buffers.prepare::<V>(network, h, s, y);
+            let count = buffers.known.len();
+            let width = rows.width();
+            buffers.advance::<V, NX>(network, h, rows.room(count), width);
+            rows.keep(count);
+        }
+    }
+}
+
+impl Sensitivities {
+    /// All that the columns have in common.
+    #[inline(always)]
+    fn prepare<V: Eight>(&mut self, network: &Network, h: &[Group], s: &[f64], y: &[f64]) {
+        let Scratch {
+            arguments,
+            rises,
+            slopes,
+            ..
+        } = &mut self.scratch;
+        let (nx, width) = (network.shape.nx, network.shape.arguments());
+        self.known.clear();
+        for (p, (s, y)) in s.iter().zip(y).enumerate() {
+            let (value, slope) = network.output.value_and_slope(*s);
+            if !y.is_nan() {
+                self.known.push((p, slope, y - value));
+            }
+        }
+        network.slopes::<V>(h, rises, slopes);
+        for (weighted, weights) in self
+            .weighted
+            .chunks_exact_mut(rises.len())
+            .zip(network.second.chunks_exact(rises.len()))
+        {
+            for ((weighted, weight), rise) in weighted.iter_mut().zip(weights).zip(&*rises) {
+                V::load(&weight.0)
+                    .mul(V::load(&rise.0))
+                    .store(&mut weighted.0);
+            }
+        }
+        for q in 0..nx {
+            for (c, value) in arguments[..width].iter().enumerate() {
+                let column = q * width + c;
+                self.linear[column / LANES * nx + q].0[column % LANES] = *value;
+            }
+        }
+    }
+
+    /// Writes the sample's rows and takes `X` to the next sample.
+    #[inline(always)]
+    fn advance<V: Eight, const NX: usize>(
+        &mut self,
+        network: &Network,
+        h: &[Group],
+        rows: &mut [f64],
+        stride: usize,
+    ) {
+        let nx = if NX == 0 { network.shape.nx } else { NX };
+        let (groups, hidden) = (h.len(), network.shape.hidden);
+        let width = network.shape.arguments();
+        let (of_states, of_outputs) = self.weighted.split_at(nx * groups);
+        let slopes = Slopes {
+            scratch: &self.scratch,
+            known: &self.known,
+            nx,
+        };
+        let mut states = self.states.chunks_exact_mut(nx);
+        for (c, argument) in self.scratch.arguments.iter().enumerate() {
+            let argument = V::splat(*argument);
+            for g in 0..groups {
+                let Some(x) = states.next() else { return };
+                let place = (c * hidden + g * LANES, stride);
+                slopes.advance::<V, NX>(
+                    x,
+                    rows,
+                    place,
+                    |p| argument.mul(V::load(&of_outputs[p * groups + g].0)),
+                    |q| argument.mul(V::load(&of_states[q * groups + g].0)),
+                );
+            }
+        }
+        for row in 0..nx {
+            for (g, h) in h.iter().enumerate() {
+                let Some(x) = states.next() else { return };
+                let start = (width + 1 + row) * hidden + g * LANES;
+                let place = (start, stride);
+                let own = |q: usize| {
+                    if q == row {
+                        V::load(&h.0)
+                    } else {
+                        V::splat(0.0)
+                    }
+                };
+                slopes.advance::<V, NX>(x, rows, place, |_| V::splat(0.0), own);
+            }
+        }
+        slopes.write_direct::<V>(h, rows, stride, self.columns.direct, hidden);
+        for (i, linear) in self.linear.chunks_exact(nx).enumerate() {
+            let Some(x) = states.next() else { return };
+            let start = self.columns.linear + i * LANES;
+            let place = (start, stride);
+            slopes.advance::<V, NX>(x, rows, place, |_| V::splat(0.0), |q| V::load(&linear[q].0));
+        }
+        slopes.write_sums(rows, stride, &self.columns);
+    }
+}
+
+/// The slopes of one sample.
+struct Slopes<'a> {
+    scratch: &'a Scratch,
+    known: &'a [(usize, f64, f64)],
+    nx: usize,
+}
+
+impl Slopes<'_> {
+    /// One group of columns: its part of the rows, from `start` on, and `X` one step on. `direct(p)` and `next(q)` are `ds/dtheta` and
+    /// `dx+/dtheta`.
+    #[inline(always)]
+    fn advance<V: Eight, const NX: usize>(
+        &self,
+        x: &mut [Group],
+        rows: &mut [f64],
+        (start, stride): (usize, usize),
+        direct: impl Fn(usize) -> V,
+        next: impl Fn(usize) -> V,
+    ) {
+        let nx = if NX == 0 { self.nx } else { NX };
+        let slope = |i: usize| V::splat(self.scratch.slope(i));
+        for (row, &(p, steepness, _)) in self.known.iter().enumerate() {
+            let first = (nx + p) * nx;
+            let sum = x.iter().enumerate().fold(direct(p), |sum, (j, x)| {
+                sum.add_product(slope(first + j), V::load(&x.0))
+            });
+            sum.mul(V::splat(steepness))
+                .write(&mut rows[start + row * stride..]);
+        }
+        if NX == 0 {
+            let mut moved = [Group::ZERO; 64];
+            for (q, moved) in moved[..nx].iter_mut().enumerate() {
+                let sum = x.iter().enumerate().fold(next(q), |sum, (j, x)| {
+                    sum.add_product(slope(q * nx + j), V::load(&x.0))
+                });
+                sum.store(&mut moved.0);
+            }
+            x.copy_from_slice(&moved[..nx]);
+            return;
+        }
+        let old: [V; NX] = std::array::from_fn(|j| V::load(&x[j].0));
+        for (q, x) in x.iter_mut().enumerate() {
+            let sum = old.iter().enumerate().fold(next(q), |sum, (j, old)| {
+                sum.add_product(slope(q * NX + j), *old)
+            });
+            sum.store(&mut x.0);
+        }
+    }
+
+    /// The columns of G.
+    #[inline(always)]
+    fn write_direct<V: Eight>(
+        &self,
+        h: &[Group],
+        rows: &mut [f64],
+        stride: usize,
+        first: usize,
+        hidden: usize,
+    ) {
+        let outputs = self.scratch.sums.len();
+        for (row, &(own, steepness, _)) in rows.chunks_exact_mut(stride).zip(self.known) {
+            for p in 0..outputs {
+                for (g, h) in h.iter().enumerate() {
+                    let factor = if p == own { steepness } else { 0.0 };
+                    let place = &mut row[first + p * hidden + g * LANES..];
+                    V::load(&h.0).mul(V::splat(factor)).write(place);
+                }
+            }
+        }
+    }
+
+    /// The columns of `[C D c]` and the error.
+    #[inline(always)]
+    fn write_sums(&self, rows: &mut [f64], stride: usize, columns: &Columns) {
+        let arguments = &self.scratch.arguments;
+        for (row, &(own, steepness, error)) in rows.chunks_exact_mut(stride).zip(self.known) {
+            let sums = row[columns.sums..columns.error].chunks_exact_mut(arguments.len());
+            for (p, sums) in sums.enumerate() {
+                let factor = if p == own { steepness } else { 0.0 };
+                for (sum, argument) in sums.iter_mut().zip(arguments) {
+                    *sum = factor * argument;
+                }
+            }
+            row[columns.error] = error;
+        }
+    }
+}

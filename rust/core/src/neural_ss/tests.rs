@@ -1,0 +1,286 @@
+use super::*;
+use crate::random::Random;
+use proptest::prelude::*;
+
+fn random_model(seed: u64, shape: Shape, output: OutputFunction) -> NeuralSS {
+    let mut random = Random::new(seed);
+    let parts = shape.parts();
+    let mut theta: Vec<f64> = (0..shape.parameters())
+        .map(|_| random.between(-0.5, 0.5))
+        .collect();
+    // rows of A and E so small that no state can grow
+    for range in [parts.a, parts.e] {
+        let width = range.len() / shape.nx;
+        theta[range].iter_mut().for_each(|t| *t /= width as f64);
+    }
+    for (i, value) in shape.held() {
+        theta[i] = value;
+    }
+    let ramp = |n: usize, first: f64| (0..n).map(|i| first + 0.3 * i as f64).collect::<Vec<_>>();
+    let scaling = Scaling {
+        u_mean: ramp(shape.inputs, 0.1),
+        u_scale: ramp(shape.inputs, 2.0),
+        y_mean: ramp(shape.outputs, 3.0),
+        y_scale: ramp(shape.outputs, 20.0),
+    };
+    let unit = (0..shape.nx * shape.nx).map(|i| f64::from(u8::from(i % (shape.nx + 1) == 0)));
+    let statistics = Statistics {
+        state_mean: vec![0.0; shape.nx],
+        state_covariance: unit.collect(),
+        residual_variance: vec![1e-6; shape.outputs],
+        process_noise: 1e-3,
+    };
+    NeuralSS::new(shape, output, theta, scaling, statistics).unwrap()
+}
+
+fn moved(model: &NeuralSS, i: usize, by: f64) -> NeuralSS {
+    let mut moved = model.clone();
+    moved.theta[i] += by;
+    moved.network.load(&moved.theta);
+    moved
+}
+
+fn noise(count: usize, seed: u64) -> Vec<f64> {
+    let mut random = Random::new(seed);
+    (0..count).map(|_| random.normal()).collect()
+}
+
+fn shapes() -> impl Strategy<Value = Shape> {
+    let integrator = any::<bool>();
+    (
+        1usize..7,
+        0usize..3,
+        1usize..4,
+        1usize..3,
+        1usize..19,
+        integrator,
+    )
+        .prop_map(|(nx, nk, inputs, outputs, hidden, integrator)| Shape {
+            nx,
+            nk,
+            inputs,
+            outputs,
+            hidden,
+            integrator,
+        })
+}
+
+fn functions() -> impl Strategy<Value = OutputFunction> {
+    prop_oneof![
+        Just(OutputFunction::Linear),
+        Just(OutputFunction::Saturation {
+            low: -0.6,
+            high: 0.7,
+            width: 0.2
+        }),
+        Just(OutputFunction::Abs { width: 0.3 }),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(60))]
+    #[test]
+    fn sensitivities_agree_with_differences(seed in any::<u64>(), shape in shapes(), output in functions()) {
+        let model = random_model(seed, shape, output);
+        let u = noise(40 * shape.inputs, seed ^ 1);
+        let state = noise(shape.nx, seed ^ 2);
+        let (run, rows) = model.jacobian(&u, shape.inputs, &state).unwrap();
+        let columns = shape.parameters() + shape.nx;
+        for i in 0..columns {
+            let at = |by: f64| match i.checked_sub(shape.parameters()) {
+                None => moved(&model, i, by).simulate(&u, shape.inputs, &state).unwrap(),
+                Some(j) => {
+                    let mut state = state.clone();
+                    state[j] += by;
+                    model.simulate(&u, shape.inputs, &state).unwrap()
+                }
+            };
+            let (ahead, behind) = (at(1e-5), at(-1e-5));
+            for k in 0..run.len() {
+                let difference = (ahead[k] - behind[k]) / 2e-5;
+                let row = rows[k * columns + i];
+                prop_assert!((row - difference).abs() < 1e-5 * (20.0 + difference.abs()), "{i} {k}: {row} {difference}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_clean_record_gives_its_state_back(seed in any::<u64>(), hidden in 1usize..10) {
+        let shape = Shape { nx: 2, nk: 1, inputs: 1, outputs: 1, hidden, integrator: false };
+        let model = random_model(seed, shape, OutputFunction::Linear);
+        let u = noise(60, seed ^ 1);
+        let y = model.simulate(&u, 1, &[0.5, -0.8]).unwrap();
+        let state = model.estimate_initial_state(&u, 1, &y).unwrap();
+        let again = model.simulate(&u, 1, &state).unwrap();
+        let worst = y.iter().zip(&again).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        prop_assert!(worst < 1e-2 * model.scaling().y_scale[0], "{worst}");
+    }
+}
+
+const SMALL: Shape = Shape {
+    nx: 2,
+    nk: 1,
+    inputs: 1,
+    outputs: 1,
+    hidden: 3,
+    integrator: false,
+};
+
+#[test]
+fn a_long_horizon_runs_free_and_a_short_one_follows_the_outputs() {
+    let mut model = random_model(4, SMALL, OutputFunction::Linear);
+    model.theta[..4].copy_from_slice(&[0.97, 0.1, 0.0, 0.95]);
+    model.network.load(&model.theta);
+    let u = noise(200, 5);
+    let y = model.simulate(&u, 1, &[0.3, 0.2]).unwrap();
+    let wrong = [3.0, -3.0];
+    let free = model.simulate(&u, 1, &wrong).unwrap();
+    assert_eq!(model.predict(&u, 1, &y, &wrong, 200).unwrap(), free);
+    let error = |run: &[f64]| run.iter().zip(&y).map(|(a, b)| (a - b).abs()).sum::<f64>();
+    let one = error(&model.predict(&u, 1, &y, &wrong, 1).unwrap());
+    assert!(2.0 * one < error(&free), "{one} {}", error(&free));
+    assert!(model.predict(&u, 1, &y, &wrong, 0).is_err());
+}
+
+#[test]
+fn rests_where_nothing_moves() {
+    let shape = Shape { inputs: 2, ..SMALL };
+    let mut model = random_model(6, shape, OutputFunction::Linear);
+    model.scaling.u_mean = vec![0.0; 2];
+    model.scaling.y_mean = vec![0.0];
+    for range in [shape.parts().bh, shape.parts().constant] {
+        model.theta[range].fill(0.0);
+    }
+    model.network.load(&model.theta);
+    assert!(
+        model.rest_state().iter().all(|x| x.abs() < 1e-6),
+        "{:?}",
+        model.rest_state()
+    );
+}
+
+#[test]
+fn steps_as_it_simulates() {
+    for nk in [1, 3] {
+        let model = random_model(7, Shape { nk, ..SMALL }, OutputFunction::Linear);
+        let mut stepper = Stepper::new(&model).unwrap();
+        let mut u = vec![0.0; 3];
+        u.extend(noise(50, 8));
+        let run = model.simulate(&u, 1, &model.rest_state()).unwrap();
+        for (u, y) in u.iter().zip(&run) {
+            assert!((stepper.output(0) - y).abs() < 1e-12);
+            stepper.advance(&[*u]);
+        }
+    }
+    let model = random_model(7, Shape { nk: 0, ..SMALL }, OutputFunction::Linear);
+    assert!(Stepper::new(&model).is_err());
+}
+
+#[test]
+fn refuses_what_is_no_model() {
+    let model = random_model(9, SMALL, OutputFunction::Linear);
+    let with = |theta: Vec<f64>, statistics: Statistics, shape: Shape| {
+        NeuralSS::new(
+            shape,
+            OutputFunction::Linear,
+            theta,
+            model.scaling.clone(),
+            statistics,
+        )
+    };
+    let good = || (model.theta.clone(), model.statistics.clone());
+    assert!(with(good().0, good().1, SMALL).is_ok());
+    assert!(with(vec![0.0], good().1, SMALL).is_err());
+    assert!(with(good().0, good().1, Shape { nx: 0, ..SMALL }).is_err());
+    assert!(
+        with(
+            good().0,
+            good().1,
+            Shape {
+                integrator: true,
+                ..SMALL
+            }
+        )
+        .is_err()
+    );
+    let mut statistics = good().1;
+    statistics.residual_variance[0] = 0.0;
+    assert!(with(good().0, statistics, SMALL).is_err());
+    assert!(model.simulate(&[0.0; 4], 2, &[0.0; 2]).is_err());
+    assert!(model.simulate(&[0.0; 4], 1, &[0.0; 3]).is_err());
+    assert!(model.simulate(&[f64::NAN; 4], 1, &[0.0; 2]).is_err());
+    assert!(model.estimate_initial_state(&[], 1, &[]).is_err());
+}
+
+fn settings(shape: Shape) -> Settings {
+    Settings {
+        nx: shape.nx,
+        nk: shape.nk,
+        hidden: shape.hidden,
+        linear: None,
+        output: OutputFunction::Linear,
+        integrator: shape.integrator,
+        weight_decay: 0.0,
+        hidden_scale: 1.0,
+        max_iterations: 60,
+        starts: 3,
+        first_start: 0,
+        seed: 1,
+        threads: 1,
+    }
+}
+
+#[test]
+fn recovers_a_model_of_its_own_class_and_gaps_do_not_matter() {
+    let truth = random_model(11, SMALL, OutputFunction::Linear);
+    let (u, other) = (noise(1200, 12), noise(400, 13));
+    let mut y = truth.simulate(&u, 1, &[0.2, 0.1]).unwrap();
+    y[100..140].fill(f64::NAN);
+    let recording = Recording::new(&u, 1, &y, 1).unwrap();
+    let fit = fit(&[recording], &[], &settings(SMALL), &Monitor::default()).unwrap();
+    let expected = truth.simulate(&other, 1, &[0.0, 0.0]).unwrap();
+    let state = fit
+        .model
+        .estimate_initial_state(&other[..50], 1, &expected[..50])
+        .unwrap();
+    let found = fit.model.simulate(&other, 1, &state).unwrap();
+    let error: f64 = found
+        .iter()
+        .zip(&expected)
+        .skip(50)
+        .map(|(a, b)| (a - b).powi(2))
+        .sum();
+    let mean = expected.iter().sum::<f64>() / expected.len() as f64;
+    let spread: f64 = expected.iter().map(|y| (y - mean).powi(2)).sum();
+    assert!(error < 1e-4 * spread, "{}", error / spread);
+    assert!(fit.sound && fit.trace.windows(2).all(|w| w[1] <= w[0]));
+}
+
+#[test]
+fn the_threads_and_the_split_of_the_starts_do_not_matter() {
+    let truth = random_model(21, SMALL, OutputFunction::Linear);
+    let u = noise(300, 22);
+    let y = truth.simulate(&u, 1, &[0.2, 0.1]).unwrap();
+    let recording = [Recording::new(&u, 1, &y, 1).unwrap()];
+    let fit =
+        |settings: &Settings| super::fit(&recording, &[], settings, &Monitor::default()).unwrap();
+    let base = Settings {
+        max_iterations: 10,
+        ..settings(SMALL)
+    };
+    let one = fit(&base);
+    let many = fit(&Settings {
+        threads: 3,
+        ..base.clone()
+    });
+    let last = fit(&Settings {
+        starts: 1,
+        first_start: 2,
+        ..base.clone()
+    });
+    let theta = |model: &Option<NeuralSS>| model.as_ref().unwrap().theta().to_vec();
+    for i in 0..3 {
+        assert_eq!(theta(&one.start_models[i]), theta(&many.start_models[i]));
+    }
+    assert_eq!(theta(&last.start_models[0]), theta(&one.start_models[2]));
+}

@@ -1,0 +1,567 @@
+//! Training in free run: many starts in parallel, each by Levenberg-Marquardt, chosen by free run.
+
+use std::cell::RefCell;
+
+use super::network::Network;
+use super::output::OutputFunction;
+use super::problem::{self, Experiment, Trajectory};
+use super::realisation::Realisation;
+use super::referee::{Referee, statistics};
+use super::scaling::{Scaling, moments};
+use super::shape::Shape;
+use super::state::{self, Statistics};
+use super::{NeuralSS, draw, guard, kalman};
+use crate::linear::LinearModel;
+use crate::lm::{self, Damping, Outcome, Problem, Termination};
+use crate::random::Random;
+use crate::{Error, Monitor, Result, starts};
+
+/// One experiment as it was measured; outputs that are not known are NaN.
+#[derive(Clone, Copy, Debug)]
+pub struct Recording<'a> {
+    /// Inputs, time first.
+    pub u: &'a [f64],
+    /// Number of inputs.
+    pub inputs: usize,
+    /// Outputs, time first.
+    pub y: &'a [f64],
+    /// Number of outputs.
+    pub outputs: usize,
+}
+
+impl<'a> Recording<'a> {
+    /// A recording whose shape and values have been checked.
+    ///
+    /// # Errors
+    /// `ErrorKind::Data` for lengths that do not match, inputs that are not finite, outputs that are infinite.
+    pub fn new(u: &'a [f64], inputs: usize, y: &'a [f64], outputs: usize) -> Result<Self> {
+        if inputs == 0 || outputs == 0 || u.len() / inputs != y.len() / outputs {
+            return Err(Error::data(format!(
+                "expected u of shape (N, nu) and y of shape (N, ny) with the same N, got {} values for {inputs} inputs and {} for {outputs} outputs; give u and y the same number of samples",
+                u.len(),
+                y.len()
+            )));
+        }
+        if let Some(i) = u.iter().position(|v| !v.is_finite()) {
+            return Err(Error::data(format!(
+                "expected finite values in u, got {} at sample {}; cut or repair that part of the recording",
+                u[i],
+                i / inputs
+            )));
+        }
+        if let Some(i) = y.iter().position(|v| v.is_infinite()) {
+            return Err(Error::data(format!(
+                "expected finite values in y, or NaN where it is not known, got {} at sample {}; cut or mask that part of the recording",
+                y[i],
+                i / outputs
+            )));
+        }
+        Ok(Self {
+            u,
+            inputs,
+            y,
+            outputs,
+        })
+    }
+
+    fn samples(&self) -> usize {
+        self.u.len() / self.inputs
+    }
+}
+
+/// What to train, and how.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Number of states.
+    pub nx: usize,
+    /// Delay in samples.
+    pub nk: usize,
+    /// Hidden units.
+    pub hidden: usize,
+    /// Where the starts begin, a model of order nx; without it they begin at random states.
+    pub linear: Option<LinearModel>,
+    /// Output function, its parameters in scaled units.
+    pub output: OutputFunction,
+    /// Whether the last state is the sum of a function of the others.
+    pub integrator: bool,
+    /// Weight of `1/2 (|E|^2 + |Wx|^2 + |Wu|^2 + |G|^2 + .1 |bh|^2)` beside J; 1e-8 or less on much data.
+    pub weight_decay: f64,
+    /// Standard deviation of a hidden unit's argument at the start, beside its bias: .3 to 1.
+    pub hidden_scale: f64,
+    /// Iterations of each start.
+    pub max_iterations: usize,
+    /// Number of starts.
+    pub starts: usize,
+    /// Number of the first start: starts may be spread over several calls.
+    pub first_start: usize,
+    /// Seed of the starts; start `i` draws from stream `i`.
+    pub seed: u64,
+    /// Threads; 0 takes as many as the machine has. The result does not depend on it.
+    pub threads: usize,
+}
+
+/// A trained model with the story of its training.
+#[derive(Clone, Debug)]
+pub struct NeuralSSFit {
+    /// The chosen model.
+    pub model: NeuralSS,
+    /// `J = 1/(2N) sum e^2` in scaled units, free run, on the training data, without weight decay.
+    pub cost: f64,
+    /// The same on the validation data, where there are any.
+    pub validation_cost: Option<f64>,
+    /// Iterations of the chosen start.
+    pub iterations: usize,
+    /// How the chosen start ended.
+    pub termination: Termination,
+    /// J of the chosen start, at its beginning and after each accepted step.
+    pub trace: Vec<f64>,
+    /// Which start was chosen, counted from `first_start`.
+    pub start: usize,
+    /// What each start was judged by: J on the validation data, else on the training data; infinite for a failed one.
+    pub start_costs: Vec<f64>,
+    /// Starts that were dead and drawn again.
+    pub discarded: usize,
+    /// Whether the chosen model passed the guard; false only where no start passed.
+    pub sound: bool,
+    /// Models of all starts with a finite cost, those that passed the guard first, each part best first.
+    pub models: Vec<NeuralSS>,
+    /// The model of each start, in the order of the starts.
+    pub start_models: Vec<Option<NeuralSS>>,
+    /// Whether each start's model passed the guard.
+    pub sounds: Vec<bool>,
+    /// Initial state of each training experiment, in scaled units.
+    pub initial_states: Vec<Vec<f64>>,
+}
+
+/// First damping.
+const FIRST_MU: f64 = 1e-2;
+/// Relative reduction of the cost that counts as none.
+const NO_REDUCTION: f64 = 1e-7;
+/// Draws of one start before it is given up.
+const MOST_DRAWS: usize = 50;
+/// Trainings of one start before it is given up: only those that ended dead are repeated.
+const MOST_TRAININGS: usize = 3;
+/// A training that ends above this share of a constant output's J has learnt nothing.
+const DEAD_COST: f64 = 0.9;
+/// Samples of an experiment that its state is first estimated from.
+const STATE_SAMPLES: usize = 2_000;
+/// Share of the output's variance that a linear model is taken to miss while it is.
+const LINEAR_RESIDUAL: f64 = 0.1;
+
+/// Trains `settings.starts` models in free run and chooses by validation J, without validation data by training J.
+///
+/// With validation data each start keeps its best iterate on them. A start is dead where its free run diverges or ends
+/// no better than a constant output; it is drawn again from its own stream, and counted in `discarded`. A start whose
+/// model does not forget its initial state, or runs away on somewhat larger inputs, is chosen only where all do.
+///
+/// # Errors
+/// `ErrorKind::Data` and `ErrorKind::Setting` for what cannot be trained; `ErrorKind::Fit` where every start failed.
+pub fn fit(
+    recordings: &[Recording],
+    validation: &[Recording],
+    settings: &Settings,
+    monitor: &Monitor,
+) -> Result<NeuralSSFit> {
+    let task = Task::new(recordings, validation, settings, monitor)?;
+    monitor.set_total((settings.starts * settings.max_iterations) as u64);
+    let results = starts::run_all(settings.starts, settings.threads, monitor, |start| {
+        task.run(settings.first_start + start)
+    });
+    task.chosen(results)
+}
+
+/// All that the starts share.
+struct Task<'a> {
+    settings: &'a Settings,
+    monitor: &'a Monitor,
+    shape: Shape,
+    scaling: Scaling,
+    experiments: Vec<Experiment>,
+    validation: Vec<Experiment>,
+    linear: Option<Realisation>,
+    constant_cost: f64,
+}
+
+/// One trained start.
+struct Trained {
+    model: NeuralSS,
+    states: Vec<Vec<f64>>,
+    cost: f64,
+    validation_cost: Option<f64>,
+    outcome: Outcome,
+    trace: Vec<f64>,
+    discarded: usize,
+    sound: bool,
+}
+
+impl Trained {
+    fn score(&self) -> f64 {
+        let score = self.validation_cost.unwrap_or(self.cost);
+        if score.is_nan() { f64::INFINITY } else { score }
+    }
+}
+
+impl<'a> Task<'a> {
+    fn new(
+        recordings: &[Recording],
+        validation: &[Recording],
+        settings: &'a Settings,
+        monitor: &'a Monitor,
+    ) -> Result<Self> {
+        let first = recordings
+            .first()
+            .ok_or_else(|| Error::data("expected one experiment or more, got none"))?;
+        let shape = Shape {
+            nx: settings.nx,
+            nk: settings.nk,
+            inputs: first.inputs,
+            outputs: first.outputs,
+            hidden: settings.hidden,
+            integrator: settings.integrator,
+        }
+        .checked()?;
+        check(settings)?;
+        check_recordings(recordings, validation, shape)?;
+        let scaling = scaling(recordings, settings.output)?;
+        let scaled = |r: &Recording| Experiment {
+            v: scaling.delayed_inputs(r.u, shape.nk),
+            y: scaling.outputs(r.y),
+        };
+        let experiments: Vec<Experiment> = recordings.iter().map(scaled).collect();
+        let linear = settings.linear.as_ref();
+        Ok(Self {
+            settings,
+            monitor,
+            shape,
+            constant_cost: constant_cost(&experiments, shape),
+            validation: validation.iter().map(scaled).collect(),
+            linear: linear
+                .map(|l| Realisation::of(l, shape, &scaling, &experiments))
+                .transpose()?,
+            experiments,
+            scaling,
+        })
+    }
+
+    /// Trains one start, drawn again while it is dead.
+    fn run(&self, start: usize) -> Option<Trained> {
+        let mut random = Random::stream(self.settings.seed, start as u64);
+        let mut discarded = 0;
+        for training in 0..MOST_TRAININGS {
+            let network = Network::new(
+                self.shape,
+                self.settings.output,
+                &vec![0.0; self.shape.parameters()],
+            );
+            let runs = self
+                .experiments
+                .iter()
+                .map(|e| Trajectory::new(&network, e.y.len() / self.shape.outputs));
+            let runs = RefCell::new(runs.collect());
+            let decay = self.settings.weight_decay;
+            let mut problem =
+                problem::Training::new(&self.experiments, network, decay, &runs, self.monitor);
+            let (theta, dead) = self.drawn(&mut problem, &mut random)?;
+            discarded += dead;
+            let mut trained = self.train(&mut problem, theta, &runs)?;
+            trained.discarded = discarded;
+            let learnt = trained.cost < DEAD_COST * self.constant_cost;
+            if learnt || training + 1 == MOST_TRAININGS || self.monitor.stopped() {
+                return Some(trained);
+            }
+            discarded += 1;
+        }
+        None
+    }
+
+    /// Parameters with a free run to learn from, and how many draws had none.
+    fn drawn(
+        &self,
+        problem: &mut problem::Training,
+        random: &mut Random,
+    ) -> Option<(Vec<f64>, usize)> {
+        for dead in 0..MOST_DRAWS {
+            let theta = match &self.linear {
+                Some(linear) => Some(self.begun(linear, random)),
+                None => draw::small(self.shape, &self.experiments, random)
+                    .map(|linear| self.begun(&linear, random)),
+            };
+            if let Some(theta) = theta.filter(|theta| problem.cost(theta).is_some()) {
+                return Some((theta, dead));
+            }
+            if self.monitor.stopped() {
+                return None;
+            }
+        }
+        None
+    }
+
+    /// A hidden layer beside the linear equations, and the states at which those come nearest to the experiments.
+    fn begun(&self, linear: &Realisation, random: &mut Random) -> Vec<f64> {
+        let Shape {
+            nx,
+            inputs,
+            outputs,
+            ..
+        } = self.shape;
+        let network = Network::new(self.shape, self.settings.output, &linear.theta(self.shape));
+        let unit = (0..nx * nx).map(|i| f64::from(u8::from(i % (nx + 1) == 0)));
+        let prior = Statistics {
+            state_mean: vec![0.0; nx],
+            state_covariance: unit.collect(),
+            residual_variance: vec![LINEAR_RESIDUAL; outputs],
+            process_noise: 0.0,
+        };
+        let mut theta = draw::beside(linear, self.shape, self.settings.hidden_scale, random);
+        for Experiment { v, y } in &self.experiments {
+            let samples = STATE_SAMPLES.min(y.len() / outputs);
+            let (v, y) = (&v[..samples * inputs], &y[..samples * outputs]);
+            let state = state::update(
+                &network,
+                &prior,
+                v,
+                y,
+                std::slice::from_ref(&prior.state_mean),
+            );
+            theta.extend(state.unwrap_or_else(|| prior.state_mean.clone()));
+        }
+        theta
+    }
+
+    fn train(
+        &self,
+        problem: &mut problem::Training,
+        theta: Vec<f64>,
+        runs: &RefCell<Vec<Trajectory>>,
+    ) -> Option<Trained> {
+        let settings = lm::Settings {
+            max_iterations: self.settings.max_iterations,
+            damping: Damping::Identity,
+            mu: FIRST_MU,
+            reduction_tolerance: NO_REDUCTION,
+            ..lm::Settings::default()
+        };
+        let mut referee = Referee::new(
+            problem.network.clone(),
+            &self.experiments,
+            runs,
+            &self.validation,
+            self.monitor,
+        );
+        let mut costs = Vec::with_capacity(settings.max_iterations.min(1000) + 1);
+        let decay = problem.decay.clone();
+        let outcome = lm::minimize(problem, theta, &settings, self.monitor, |theta, cost| {
+            let error = cost - decay.penalty(theta);
+            costs.push(error);
+            referee.judge(theta, cost, error);
+        });
+        let spare = self.settings.max_iterations - outcome.iterations;
+        self.monitor.advance(spare as u64);
+        let best = referee.best.take()?;
+        self.finished(problem, best.theta, runs)
+            .map(|(model, states, sound)| Trained {
+                cost: best.cost,
+                model,
+                states,
+                validation_cost: best.validation_cost,
+                outcome,
+                trace: costs,
+                discarded: 0,
+                sound,
+            })
+    }
+
+    /// The model with all that its training run says, its initial states and the guard's verdict.
+    fn finished(
+        &self,
+        problem: &mut problem::Training,
+        theta: Vec<f64>,
+        runs: &RefCell<Vec<Trajectory>>,
+    ) -> Option<(NeuralSS, Vec<Vec<f64>>, bool)> {
+        let own = self.shape.parameters();
+        let states: Vec<Vec<f64>> = theta[own..]
+            .chunks_exact(self.shape.nx)
+            .map(<[f64]>::to_vec)
+            .collect();
+        let network = Network::new(self.shape, self.settings.output, &theta[..own]);
+        problem.rerun(&theta)?;
+        let runs = runs.borrow();
+        let mut statistics = statistics(&network, &self.experiments, &runs);
+        statistics.process_noise = kalman::process_noise(
+            &network,
+            &statistics,
+            &self.experiments,
+            &states,
+            self.monitor,
+        );
+        let sound = guard::is_sound(&network, &self.experiments, &runs, &states, &statistics);
+        let model = NeuralSS::new(
+            self.shape,
+            self.settings.output,
+            theta[..own].to_vec(),
+            self.scaling.clone(),
+            statistics,
+        );
+        model.ok().map(|model| (model, states, sound))
+    }
+
+    fn chosen(&self, mut results: Vec<Option<Trained>>) -> Result<NeuralSSFit> {
+        results.resize_with(self.settings.starts, || None);
+        let score = |t: &Option<Trained>| t.as_ref().map_or(f64::INFINITY, Trained::score);
+        let start_costs: Vec<f64> = results.iter().map(score).collect();
+        let is_sound = |t: &Option<Trained>| t.as_ref().is_some_and(|t| t.sound);
+        let sounds: Vec<bool> = results.iter().map(is_sound).collect();
+        let order = starts::ranked(&start_costs, |i| sounds[i]);
+        let model = |t: &Option<Trained>| t.as_ref().map(|t| t.model.clone());
+        let start_models: Vec<_> = results.iter().map(model).collect();
+        let models = order
+            .iter()
+            .filter_map(|&i| start_models[i].clone())
+            .collect();
+        let discarded = results.iter().flatten().map(|t| t.discarded).sum();
+        let start = *order.first().ok_or_else(no_start)?;
+        let best = results.swap_remove(start).ok_or_else(no_start)?;
+        let stopped = self.monitor.stopped();
+        Ok(NeuralSSFit {
+            model: best.model,
+            cost: best.cost,
+            validation_cost: best.validation_cost,
+            iterations: best.outcome.iterations,
+            termination: if stopped {
+                Termination::Interrupted
+            } else {
+                best.outcome.termination
+            },
+            trace: best.trace,
+            start,
+            start_costs,
+            discarded,
+            sound: best.sound,
+            models,
+            start_models,
+            sounds,
+            initial_states: best.states,
+        })
+    }
+}
+
+/// Means and standard deviations of the known values. An output function without sign counts from 0.
+fn scaling(recordings: &[Recording], output: OutputFunction) -> Result<Scaling> {
+    let (inputs, outputs) = (recordings[0].inputs, recordings[0].outputs);
+    let input = |j: usize| {
+        moments(
+            recordings
+                .iter()
+                .flat_map(move |r| r.u.iter().skip(j).step_by(inputs).copied()),
+        )
+    };
+    let measured = |p: usize| {
+        moments(
+            recordings
+                .iter()
+                .flat_map(move |r| r.y.iter().skip(p).step_by(outputs).copied()),
+        )
+    };
+    let from_zero = |(mean, deviation): (f64, f64)| match output {
+        OutputFunction::Abs { .. } => (0.0, mean.hypot(deviation)),
+        _ => (mean, deviation),
+    };
+    let (u_mean, u_scale): (Vec<f64>, Vec<f64>) = (0..inputs).map(input).unzip();
+    let (y_mean, y_scale): (Vec<f64>, Vec<f64>) =
+        (0..outputs).map(|p| from_zero(measured(p))).unzip();
+    for (name, scales) in [("input", &u_scale), ("output", &y_scale)] {
+        // NaN, of an output that is never known, does not change either
+        if let Some(j) = scales.iter().position(|s| !(s.is_finite() && *s > 0.0)) {
+            return Err(Error::data(format!(
+                "expected {name} {j} (0-based) to change, got a constant or no known value; leave it out or excite the drive"
+            )));
+        }
+    }
+    Ok(Scaling {
+        u_mean,
+        u_scale,
+        y_mean,
+        y_scale,
+    })
+}
+
+/// J of the best constant outputs.
+fn constant_cost(experiments: &[Experiment], shape: Shape) -> f64 {
+    let (mut sum, mut samples) = (0.0, 0.0);
+    for p in 0..shape.outputs {
+        let known = experiments
+            .iter()
+            .flat_map(|e| e.y.iter().skip(p).step_by(shape.outputs))
+            .filter(|y| !y.is_nan());
+        let count = known.clone().count() as f64;
+        sum += count * moments(known.copied()).1.powi(2);
+        samples += count;
+    }
+    0.5 * sum / samples
+}
+
+fn check(settings: &Settings) -> Result<()> {
+    for (name, value) in [
+        ("max_iterations", settings.max_iterations),
+        ("starts", settings.starts),
+    ] {
+        if value == 0 || value > 1_000_000 {
+            return Err(Error::setting(format!(
+                "expected {name} from 1 to 1,000,000, got {value}; 100 iterations and 8 starts are usual"
+            )));
+        }
+    }
+    let decays = settings.weight_decay >= 0.0 && settings.weight_decay.is_finite();
+    if !decays {
+        return Err(Error::setting(format!(
+            "expected a weight decay of 0 or more, got {}; 1e-3 is usual on few data, 1e-8 on many",
+            settings.weight_decay
+        )));
+    }
+    let spreads = settings.hidden_scale > 0.0 && settings.hidden_scale.is_finite();
+    if !spreads {
+        return Err(Error::setting(format!(
+            "expected a hidden scale above 0, got {}; .3 to 1 is usual",
+            settings.hidden_scale
+        )));
+    }
+    Ok(())
+}
+
+fn check_recordings(
+    recordings: &[Recording],
+    validation: &[Recording],
+    shape: Shape,
+) -> Result<()> {
+    for recording in recordings.iter().chain(validation) {
+        let alike = recording.inputs == shape.inputs && recording.outputs == shape.outputs;
+        if !alike || recording.samples() < 2 || recording.y.iter().all(|y| y.is_nan()) {
+            return Err(Error::data(format!(
+                "expected 2 or more samples of {} inputs and {} outputs, some of them known, in every experiment, got {} samples of {} and {}; leave that experiment out",
+                shape.inputs,
+                shape.outputs,
+                recording.samples(),
+                recording.inputs,
+                recording.outputs
+            )));
+        }
+    }
+    let known = recordings
+        .iter()
+        .flat_map(|r| r.y)
+        .filter(|y| !y.is_nan())
+        .count();
+    let parameters = shape.parameters() + recordings.len() * shape.nx;
+    if known <= parameters {
+        return Err(Error::data(format!(
+            "expected more than {parameters} known outputs for as many parameters, got {known}; record longer or use fewer hidden units"
+        )));
+    }
+    Ok(())
+}
+
+fn no_start() -> Error {
+    Error::fit(
+        "expected a start with a finite free run on training and validation data, found none; give more starts, a linear model to start from, or a smaller network",
+    )
+}

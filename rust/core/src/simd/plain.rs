@@ -1,0 +1,87 @@
+//! Eight numbers as the baseline of any processor has them.
+
+use super::{Eight, LANES};
+
+#[derive(Clone, Copy)]
+pub(super) struct Plain([f64; LANES]);
+
+impl Plain {
+    #[inline(always)]
+    fn with(self, other: Self, f: impl Fn(f64, f64) -> f64) -> Self {
+        Self(std::array::from_fn(|i| f(self.0[i], other.0[i])))
+    }
+}
+
+impl Eight for Plain {
+    const TILE: (usize, usize) = (2, 1);
+
+    #[inline(always)]
+    fn load(values: &[f64; LANES]) -> Self {
+        Self(*values)
+    }
+
+    #[inline(always)]
+    fn store(self, values: &mut [f64; LANES]) {
+        *values = self.0;
+    }
+
+    #[inline(always)]
+    fn splat(value: f64) -> Self {
+        Self([value; LANES])
+    }
+
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        self.with(other, |a, b| a + b)
+    }
+
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        self.with(other, |a, b| a - b)
+    }
+
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        self.with(other, |a, b| a * b)
+    }
+
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        self.with(other, |a, b| a / b)
+    }
+
+    #[inline(always)]
+    fn add_product(self, a: Self, b: Self) -> Self {
+        // 64-bit ARM has it in its baseline; elsewhere it would be a call.
+        if cfg!(target_arch = "aarch64") {
+            return Self(std::array::from_fn(|i| a.0[i].mul_add(b.0[i], self.0[i])));
+        }
+        self.add(a.mul(b))
+    }
+
+    #[inline(always)]
+    fn sum(self) -> f64 {
+        let v = self.0;
+        ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7]))
+    }
+
+    #[inline(always)]
+    fn size_up_to(self, limit: f64) -> Self {
+        // A comparison rather than `min`, which would turn NaN into a number.
+        Self(
+            self.0
+                .map(|v| if v.abs() > limit { limit } else { v.abs() }),
+        )
+    }
+
+    #[inline(always)]
+    fn power_of_two(self) -> Self {
+        let power = |v: f64| f64::from_bits((v.to_bits() << 52).wrapping_add(1023 << 52));
+        Self(self.0.map(power))
+    }
+
+    #[inline(always)]
+    fn with_sign(self, sign: Self) -> Self {
+        self.with(sign, f64::copysign)
+    }
+}

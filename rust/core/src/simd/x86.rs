@@ -1,0 +1,248 @@
+//! Eight numbers in one AVX-512 register, or in two of AVX2.
+//!
+//! The intrinsics are only reached through [`wide`] and [`half`], whose callers have asked the processor.
+
+use std::arch::x86_64::*;
+
+use super::{Eight, Kernel, LANES};
+
+/// Runs a kernel in AVX-512 registers.
+#[target_feature(enable = "avx512f,avx2,fma")]
+pub(super) fn wide<K: Kernel>(kernel: K) -> K::Output {
+    kernel.run::<Wide>()
+}
+
+/// Runs a kernel in AVX2 registers.
+#[target_feature(enable = "avx2,fma")]
+pub(super) fn half<K: Kernel>(kernel: K) -> K::Output {
+    kernel.run::<Halves>()
+}
+
+#[derive(Clone, Copy)]
+pub(super) struct Wide(__m512d);
+
+impl Eight for Wide {
+    const TILE: (usize, usize) = (8, 3);
+
+    #[inline(always)]
+    fn load(values: &[f64; LANES]) -> Self {
+        // SAFETY: eight readable numbers; only run where the processor has AVX-512.
+        unsafe { Self(_mm512_loadu_pd(values.as_ptr())) }
+    }
+
+    #[inline(always)]
+    fn store(self, values: &mut [f64; LANES]) {
+        // SAFETY: room for eight numbers; only run where the processor has AVX-512.
+        unsafe { _mm512_storeu_pd(values.as_mut_ptr(), self.0) }
+    }
+
+    #[inline(always)]
+    fn splat(value: f64) -> Self {
+        // SAFETY: only run where the processor has AVX-512, here and below.
+        unsafe { Self(_mm512_set1_pd(value)) }
+    }
+
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_add_pd(self.0, other.0)) }
+    }
+
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_sub_pd(self.0, other.0)) }
+    }
+
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_mul_pd(self.0, other.0)) }
+    }
+
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_div_pd(self.0, other.0)) }
+    }
+
+    #[inline(always)]
+    fn add_product(self, a: Self, b: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_fmadd_pd(a.0, b.0, self.0)) }
+    }
+
+    #[inline(always)]
+    fn sum(self) -> f64 {
+        // SAFETY: as `splat`.
+        unsafe {
+            let low = _mm512_castpd512_pd256(self.0);
+            sum(_mm256_add_pd(low, _mm512_extractf64x4_pd::<1>(self.0)))
+        }
+    }
+
+    #[inline(always)]
+    fn size_up_to(self, limit: f64) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            let (size, limit) = (_mm512_abs_pd(self.0), _mm512_set1_pd(limit));
+            let larger = _mm512_cmp_pd_mask::<_CMP_GT_OQ>(size, limit);
+            Self(_mm512_mask_blend_pd(larger, size, limit))
+        }
+    }
+
+    #[inline(always)]
+    fn power_of_two(self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            let exponent = _mm512_slli_epi64::<52>(_mm512_castpd_si512(self.0));
+            let one = _mm512_castpd_si512(_mm512_set1_pd(1.0));
+            Self(_mm512_castsi512_pd(_mm512_add_epi64(exponent, one)))
+        }
+    }
+
+    #[inline(always)]
+    fn with_sign(self, sign: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            let bit = _mm512_castpd_si512(_mm512_set1_pd(-0.0));
+            let sign = _mm512_and_si512(bit, _mm512_castpd_si512(sign.0));
+            let size = _mm512_andnot_si512(bit, _mm512_castpd_si512(self.0));
+            Self(_mm512_castsi512_pd(_mm512_or_si512(size, sign)))
+        }
+    }
+}
+
+#[derive(Clone, Copy)]
+pub(super) struct Halves(__m256d, __m256d);
+
+impl Eight for Halves {
+    const TILE: (usize, usize) = (4, 1);
+
+    #[inline(always)]
+    fn load(values: &[f64; LANES]) -> Self {
+        let start = values.as_ptr();
+        // SAFETY: eight readable numbers; only run where the processor has AVX2 and FMA.
+        unsafe { Self(_mm256_loadu_pd(start), _mm256_loadu_pd(start.add(4))) }
+    }
+
+    #[inline(always)]
+    fn store(self, values: &mut [f64; LANES]) {
+        let start = values.as_mut_ptr();
+        // SAFETY: room for eight numbers; only run where the processor has AVX2 and FMA.
+        unsafe {
+            _mm256_storeu_pd(start, self.0);
+            _mm256_storeu_pd(start.add(4), self.1);
+        }
+    }
+
+    #[inline(always)]
+    fn splat(value: f64) -> Self {
+        // SAFETY: only run where the processor has AVX2 and FMA, here and below.
+        let all = unsafe { _mm256_set1_pd(value) };
+        Self(all, all)
+    }
+
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            Self(
+                _mm256_add_pd(self.0, other.0),
+                _mm256_add_pd(self.1, other.1),
+            )
+        }
+    }
+
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            Self(
+                _mm256_sub_pd(self.0, other.0),
+                _mm256_sub_pd(self.1, other.1),
+            )
+        }
+    }
+
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            Self(
+                _mm256_mul_pd(self.0, other.0),
+                _mm256_mul_pd(self.1, other.1),
+            )
+        }
+    }
+
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            Self(
+                _mm256_div_pd(self.0, other.0),
+                _mm256_div_pd(self.1, other.1),
+            )
+        }
+    }
+
+    #[inline(always)]
+    fn add_product(self, a: Self, b: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            Self(
+                _mm256_fmadd_pd(a.0, b.0, self.0),
+                _mm256_fmadd_pd(a.1, b.1, self.1),
+            )
+        }
+    }
+
+    #[inline(always)]
+    fn sum(self) -> f64 {
+        // SAFETY: as `splat`.
+        unsafe { sum(_mm256_add_pd(self.0, self.1)) }
+    }
+
+    #[inline(always)]
+    fn size_up_to(self, limit: f64) -> Self {
+        // SAFETY: as `splat`.
+        let one = |v: __m256d| unsafe {
+            let size = _mm256_andnot_pd(_mm256_set1_pd(-0.0), v);
+            let limit = _mm256_set1_pd(limit);
+            _mm256_blendv_pd(size, limit, _mm256_cmp_pd::<_CMP_GT_OQ>(size, limit))
+        };
+        Self(one(self.0), one(self.1))
+    }
+
+    #[inline(always)]
+    fn power_of_two(self) -> Self {
+        // SAFETY: as `splat`.
+        let one = |v: __m256d| unsafe {
+            let exponent = _mm256_slli_epi64::<52>(_mm256_castpd_si256(v));
+            let one = _mm256_castpd_si256(_mm256_set1_pd(1.0));
+            _mm256_castsi256_pd(_mm256_add_epi64(exponent, one))
+        };
+        Self(one(self.0), one(self.1))
+    }
+
+    #[inline(always)]
+    fn with_sign(self, sign: Self) -> Self {
+        // SAFETY: as `splat`.
+        let one = |v: __m256d, sign: __m256d| unsafe {
+            let bit = _mm256_set1_pd(-0.0);
+            _mm256_or_pd(_mm256_andnot_pd(bit, v), _mm256_and_pd(bit, sign))
+        };
+        Self(one(self.0, sign.0), one(self.1, sign.1))
+    }
+}
+
+/// `(v0 + v2) + (v1 + v3)`.
+#[inline(always)]
+fn sum(v: __m256d) -> f64 {
+    // SAFETY: reached from AVX2 or AVX-512 only.
+    unsafe {
+        let pair = _mm_add_pd(_mm256_castpd256_pd128(v), _mm256_extractf128_pd::<1>(v));
+        _mm_cvtsd_f64(_mm_add_sd(pair, _mm_unpackhi_pd(pair, pair)))
+    }
+}
