@@ -94,6 +94,25 @@ def require_complete(data: Dataset) -> None:
         require_finite(e.y, f"{e.name}, output {data.output_name!r}", e.start, OUTPUT_REMEDY)
 
 
+LARGEST = 1e150
+"""Magnitude from which on squares leave the numbers: no measured quantity."""
+
+
+def require_sane(data: Dataset) -> None:
+    """Raise `DataError` where a value is infinite or beyond any measured quantity; NaN is none."""
+    for e in data.experiments:
+        columns = zip((*data.input_names, data.output_name), (*e.u.T, e.y), strict=True)
+        for name, column in columns:
+            bad = np.abs(column) >= LARGEST
+            if bad.any():
+                k = int(np.argmax(bad))
+                raise DataError(
+                    f"{e.name}, {name!r}: expected finite values, or NaN where nothing is known, "
+                    f"received {column[k]:g} at sample {e.start + k} (0-based); set it to NaN "
+                    "(of an output: Dataset.mask)"
+                )
+
+
 def require_excited(data: Dataset) -> None:
     """Raise `DataError` where an input or the output never moves: nothing to identify from."""
     for i, name in enumerate(data.input_names):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import DataError, SettingError
-from . import checks, gaps, pieces
+from . import checks, gaps, outliers, pieces, rates, trends
 from .arrays import range_of, texts
 from .experiment import Experiment
 from .units import labelled
@@ -176,6 +176,10 @@ class Dataset:
 
     mask = gaps.mask
     fill_inputs = gaps.fill_inputs
+    detrend = trends.detrend
+    restore = trends.restore
+    resample = rates.resample
+    mark_outliers = outliers.mark_outliers
 
     require_inputs = checks.require_inputs
     require_measured = checks.require_measured

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
 from .arrays import FloatArray, as_column, as_inputs
+
+if TYPE_CHECKING:
+    from .trends import Trend
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -30,6 +33,8 @@ class Experiment:
         Where it comes from, for messages.
     start : int
         Index of its first sample in the recording that it was cut from.
+    removed : Trend or None
+        What `Dataset.detrend` has taken off; `Dataset.restore` puts it back on.
 
     Raises
     ------
@@ -42,6 +47,7 @@ class Experiment:
     channels: Mapping[str, FloatArray] = field(default_factory=dict)
     name: str = "array"
     start: int = 0
+    removed: Trend | None = None
 
     def __post_init__(self) -> None:
         y = as_column(self.y, "y")
@@ -60,7 +66,8 @@ class Experiment:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # a mappingproxy cannot be pickled
-        return Experiment, (self.u, self.y, dict(self.channels), self.name, self.start)
+        values = (self.u, self.y, dict(self.channels), self.name, self.start, self.removed)
+        return Experiment, values
 
     @property
     def range_text(self) -> str:
@@ -124,5 +131,10 @@ class Experiment:
             )
         channels = {key: v[start:stop] for key, v in self.channels.items()}
         return Experiment(
-            self.u[start:stop], self.y[start:stop], channels, self.name, self.start + start
+            self.u[start:stop],
+            self.y[start:stop],
+            channels,
+            self.name,
+            self.start + start,
+            self.removed,
         )

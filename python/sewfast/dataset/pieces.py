@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
@@ -50,22 +52,90 @@ def range_of_text(text: str, e: Experiment) -> tuple[int, int]:
     return start, stop
 
 
-def split(data: Dataset, fraction: float) -> tuple[Dataset, Dataset]:
-    """The first `fraction` of every experiment, and the rest of it.
+def split(
+    data: Dataset,
+    *fractions: float,
+    at: Sequence[float] | None = None,
+    by: Literal["samples", "experiments"] = "samples",
+) -> tuple[Dataset, ...]:
+    """Parts in their order: by fractions, at times, or whole experiments.
+
+    Parameters
+    ----------
+    *fractions : float
+        Of each part but the last, which is the rest: `split(0.6, 0.2)` gives three parts.
+    at : sequence of float or None
+        Instead of fractions, where to cut [s] from the first sample of each experiment.
+    by : {"samples", "experiments"}
+        Whether every experiment is cut, or whole experiments go to the parts. Neighbouring samples
+        are alike, so whole experiments make the stronger test.
 
     Raises
     ------
     SettingError
-        Where the fraction is not between 0 and 1.
+        Where a fraction is not between 0 and 1, they leave no rest, times do not increase, or both
+        or none are given.
     DataError
-        Where an experiment is too short to leave samples on both sides.
+        Where an experiment is too short to leave samples in every part, or there are fewer
+        experiments than parts.
     """
-    if not 0.0 < fraction < 1.0:
-        raise SettingError(f"expected a fraction between 0 and 1, received {fraction}")
-    at = [round(fraction * len(e)) for e in data.experiments]
-    first = tuple(e.cut(0, k) for e, k in zip(data.experiments, at, strict=True))
-    rest = tuple(e.cut(k, len(e)) for e, k in zip(data.experiments, at, strict=True))
-    return replace(data, experiments=first), replace(data, experiments=rest)
+    if by not in ("samples", "experiments"):
+        raise SettingError(f"by: expected 'samples' or 'experiments', received {by!r}")
+    if (at is None) != bool(fractions) or (at is not None and by == "experiments"):
+        raise SettingError(
+            "split: expected fractions, such as split(0.7), or times, such as split(at=[10.0]); "
+            f"received {fractions} and at={at}, by={by!r}"
+        )
+    ends = _ends(fractions) if at is None else _times(at)
+    if by == "experiments":
+        return _whole_experiments(data, ends)
+    scale = [float(len(e)) if at is None else 1.0 / data.Ts for e in data.experiments]
+    edges = [
+        [0, *(round(end * s) for end in ends), len(e)]
+        for e, s in zip(data.experiments, scale, strict=True)
+    ]
+    parts = range(len(ends) + 1)
+    return tuple(
+        replace(
+            data,
+            experiments=tuple(
+                e.cut(k[i], k[i + 1]) for e, k in zip(data.experiments, edges, strict=True)
+            ),
+        )
+        for i in parts
+    )
+
+
+def _ends(fractions: Sequence[float]) -> list[float]:
+    for fraction in fractions:
+        number = isinstance(fraction, (int, float, np.number)) and not isinstance(fraction, bool)
+        if not (number and 0.0 < fraction < 1.0):
+            raise SettingError(f"expected a fraction between 0 and 1, received {fraction!r}")
+    ends = np.cumsum(fractions)
+    if ends[-1] > 1.0 - 1e-9:
+        raise SettingError(f"expected fractions that leave a rest, received a sum of {ends[-1]:g}")
+    return [float(end) for end in ends]
+
+
+def _times(at: Sequence[float]) -> list[float]:
+    times = np.asarray(at)
+    sound = times.ndim == 1 and times.dtype.kind in "iuf" and len(times) > 0
+    if not (sound and np.isfinite(times).all() and (np.diff(times, prepend=0.0) > 0.0).all()):
+        raise SettingError(f"at: expected increasing times [s] above 0, received {at!r}")
+    return [float(t) for t in times]
+
+
+def _whole_experiments(data: Dataset, ends: list[float]) -> tuple[Dataset, ...]:
+    total = len(data.experiments)
+    edges = [0, *(round(end * total) for end in ends), total]
+    if any(a >= b for a, b in itertools.pairwise(edges)):
+        raise DataError(
+            f"{data.source}: expected experiments for {len(ends) + 1} parts, received {total}; "
+            "record more, or split by samples"
+        )
+    return tuple(
+        replace(data, experiments=data.experiments[a:b]) for a, b in itertools.pairwise(edges)
+    )
 
 
 def split_at_gaps(

@@ -1,0 +1,168 @@
+"""Outliers: marks of single wrong outputs, which a separate step may take out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError, SettingError
+from .arrays import FloatArray
+from .checks import require_sane
+from .noise import MAD, quantum, white_noise
+
+if TYPE_CHECKING:
+    from ..models import Model
+    from .dataset import Dataset
+
+BoolArray = NDArray[np.bool_]
+
+_ROWS = 200_000
+_SHOWN = 8
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Outliers(Sequence[BoolArray]):
+    """Marks for `Dataset.mask`: a sequence of masks, one per experiment.
+
+    Attributes
+    ----------
+    masks : tuple of array of bool, shape (N,)
+        True where the output stands out.
+    distances : tuple of array, shape (N,)
+        How far each output is from its neighbours' median, in robust standard deviations; NaN where
+        it was not measured.
+    """
+
+    masks: tuple[BoolArray, ...]
+    distances: tuple[FloatArray, ...]
+    names: tuple[str, ...]
+    starts: tuple[int, ...]
+
+    @property
+    def marked(self) -> int:
+        """Marked samples in all experiments together."""
+        return int(sum(m.sum() for m in self.masks))
+
+    def __len__(self) -> int:
+        return len(self.masks)
+
+    def __iter__(self) -> Iterator[BoolArray]:
+        return iter(self.masks)
+
+    @overload
+    def __getitem__(self, i: int) -> BoolArray: ...
+    @overload
+    def __getitem__(self, i: slice) -> tuple[BoolArray, ...]: ...
+    def __getitem__(self, i: int | slice) -> BoolArray | tuple[BoolArray, ...]:
+        return self.masks[i]
+
+    def __repr__(self) -> str:
+        return f"Outliers({self.marked} of {sum(map(len, self.masks))} samples)"
+
+    def __str__(self) -> str:
+        lines = [f"{self.marked} of {sum(map(len, self.masks))} outputs stand out"]
+        for name, start, mask, far in zip(
+            self.names, self.starts, self.masks, self.distances, strict=True
+        ):
+            at = np.flatnonzero(mask)
+            if len(at):
+                shown = ", ".join(f"{start + k} ({far[k]:.0f} sd)" for k in at[:_SHOWN])
+                more = f", and {len(at) - _SHOWN} more" if len(at) > _SHOWN else ""
+                lines.append(f"  {name}: samples {shown}{more}")
+        return "\n".join(lines)
+
+
+def mark_outliers(
+    data: Dataset, *, threshold: float = 6.0, window: int = 7, model: Model | None = None
+) -> Outliers:
+    """Marks of outputs that stand out of their neighbours; nothing is changed.
+
+    An output is marked where its distance to the median of `window` samples around it is over
+    `threshold` robust standard deviations (Hampel 1974), of the window or of the record's white
+    noise, whichever is larger; the window's slope comes off first. Of white normal noise fewer than
+    one sample in ten million is marked. Runs of up to half a window are found.
+
+    Parameters
+    ----------
+    threshold : float
+        In standard deviations, above 0.
+    window : int
+        Odd, from 3 on.
+    model : Model or None
+        Looks at what this model's free run leaves of the output, so that fast motion of the plant
+        is not mistaken for an outlier.
+
+    Returns
+    -------
+    Outliers
+        `data.mask(data.mark_outliers())` takes the marked outputs out.
+
+    Raises
+    ------
+    SettingError
+        For a threshold or window that is none.
+    DataError, FitError
+        Where the model cannot run on the data.
+    """
+    number = isinstance(threshold, (int, float, np.number)) and not isinstance(threshold, bool)
+    if not number or not threshold > 0.0:
+        raise SettingError(f"threshold: expected a number above 0, received {threshold!r}")
+    odd = isinstance(window, (int, np.integer)) and not isinstance(window, bool)
+    if not odd or window < 3 or window % 2 == 0 or window > 1001:
+        raise SettingError(f"window: expected an odd number from 3 to 1001, received {window!r}")
+    require_sane(data)
+    series = _series(data, model)
+    distances = tuple(_distances(y, int(window)) for y in series)
+    masks = tuple(d > threshold for d in distances)
+    names, starts = zip(*((e.name, e.start) for e in data.experiments), strict=True)
+    return Outliers(masks, distances, names, starts)
+
+
+def _series(data: Dataset, model: Model | None) -> list[FloatArray]:
+    if model is None:
+        return [e.y for e in data.experiments]
+    if data.n_inputs != len(model.input_names):
+        raise DataError(
+            f"mark_outliers: the model has {len(model.input_names)} inputs, the data have "
+            f"{data.n_inputs}"
+        )
+    runs = model.simulate(data)
+    return [e.y - run for e, run in zip(data.experiments, runs, strict=True)]
+
+
+def _distances(y: FloatArray, window: int) -> FloatArray:
+    """|y - median of its window| over the larger of the window's and the record's deviation."""
+    half = window // 2
+    noise = np.nan_to_num(white_noise(y))
+    level = max(noise, 0.5 * (quantum(y) or 0.0), np.finfo(np.float64).tiny)
+    rows = np.lib.stride_tricks.sliding_window_view(np.pad(y, half, constant_values=np.nan), window)
+    distance = np.empty_like(y)
+    for first in range(0, len(y), _ROWS):
+        part = slice(first, first + _ROWS)
+        level_rows = _levelled(rows[part], level)
+        median = _medians(level_rows)
+        local = MAD * _medians(np.abs(level_rows - median[:, None]))
+        distance[part] = np.abs(y[part] - median) / np.fmax(local, level)
+    return distance
+
+
+def _levelled(rows: FloatArray, level: float) -> FloatArray:
+    """Windows without their slope, where it is clearly more than noise."""
+    slope = _medians(np.diff(rows, axis=1))
+    slope = np.where(np.abs(slope) > 2.0 * level, slope, 0.0)
+    width = rows.shape[1]
+    levelled: FloatArray = rows - slope[:, None] * (np.arange(width) - width // 2)
+    return levelled
+
+
+def _medians(rows: FloatArray) -> FloatArray:
+    """Median of each row over what is not NaN; NaN where nothing is."""
+    ordered = np.sort(rows, axis=1)
+    count = np.isfinite(ordered).sum(axis=1)
+    index, row = np.maximum(count, 1), np.arange(len(rows))
+    middle = 0.5 * (ordered[row, (index - 1) // 2] + ordered[row, index // 2])
+    return np.where(count > 0, middle, np.nan)

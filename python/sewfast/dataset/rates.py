@@ -1,0 +1,212 @@
+"""Another sample time: outputs filtered, held inputs averaged."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError, SettingError
+from .arrays import FloatArray, frozen
+from .checks import require_sane
+from .gaps import interpolated
+from .trends import Trend
+
+if TYPE_CHECKING:
+    from .dataset import Dataset
+    from .experiment import Experiment
+
+REACH = 10
+"""Half width of the filter, in samples of the slower rate."""
+KAISER = 5.653
+"""Its window's beta: 60 dB (Kaiser 1974); passband to .8, stopband from 1.2 of the Nyquist rate."""
+MOST_SAMPLES = 100_000_000
+_CHUNK = 2_000_000
+
+
+def resample(
+    data: Dataset,
+    Ts: float,
+    *,
+    inputs: Literal["held", "sampled"] = "held",
+    antialias: bool = True,
+) -> Dataset:
+    """The data at another sample time, slower or faster, by any ratio.
+
+    New sample j is at `t = j Ts` from the first sample of its experiment. The output there comes
+    out of a zero-phase low-pass filter (a sinc under a Kaiser window) at the Nyquist frequency of
+    the slower of both rates: what a slower rate cannot show does not come back as something else.
+
+    Parameters
+    ----------
+    Ts : float
+        New sample time [s].
+    inputs : {"held", "sampled"}
+        `held`: the input was commanded and held from sample to sample; the new value is its mean
+        over the new period, so that as much acts on the plant as before. `sampled`: the input was
+        measured like the output, and is filtered like it.
+    antialias : bool
+        False takes the output as it is at the new times, without a filter (between two samples, by
+        a straight line): for data without anything above the new Nyquist frequency, noise included.
+
+    Returns
+    -------
+    Dataset
+        A new output is NaN where at most half of the old ones around it were measured; a new input
+        wherever a part of its period is unknown.
+
+    Raises
+    ------
+    SettingError
+        For a sample time that is no positive number or makes over 100 million samples, or another
+        `inputs`.
+    DataError
+        Where an experiment is shorter than one new period.
+    """
+    if isinstance(Ts, bool) or not isinstance(Ts, (int, float, np.number)):
+        raise SettingError(f"resample: expected a sample time in seconds, received {Ts!r}")
+    if not (math.isfinite(Ts) and Ts > 0.0):
+        raise SettingError(f"resample: expected a positive sample time in seconds, received {Ts}")
+    if inputs not in ("held", "sampled"):
+        raise SettingError(f"inputs: expected 'held' or 'sampled', received {inputs!r}")
+    require_sane(data)
+    ratio = _rounded(float(Ts) / data.Ts)
+    if ratio == 1.0:
+        return data
+    if len(data) / ratio > MOST_SAMPLES:
+        raise SettingError(
+            f"resample: Ts = {Ts:g} s makes {len(data) / ratio:.3g} samples, expected at most "
+            f"{MOST_SAMPLES:,}; give a longer sample time"
+        )
+    experiments = tuple(_resampled(e, ratio, inputs, antialias) for e in data.experiments)
+    note = f"resampled from Ts = {data.Ts:g} s to {Ts:g} s, inputs {inputs}"
+    note += "" if antialias else ", without a filter"
+    if antialias and inputs == "held" and all(_is_held(e.u, ratio) for e in data.experiments):
+        note += "; every input is constant over whole new periods: antialias=False is exact"
+    return replace(data, experiments=experiments, Ts=float(Ts), notes=(*data.notes, note))
+
+
+def _rounded(ratio: float) -> float:
+    """A whole ratio where the sample times say it but for rounding."""
+    for whole in (round(ratio), 1.0 / max(round(1.0 / ratio), 1)):
+        if whole > 0 and abs(ratio / whole - 1.0) < 1e-9:
+            return float(whole)
+    return ratio
+
+
+def _is_held(u: FloatArray, ratio: float) -> bool:
+    """Whether the inputs change at the beginning of a new period only, over more than one."""
+    if ratio < 2.0 or not ratio.is_integer() or len(u) < 2 * ratio:
+        return False
+    changed = np.flatnonzero((np.diff(u, axis=0) != 0.0).any(axis=1)) + 1
+    return len(changed) > 0 and not (changed % int(ratio)).any()
+
+
+def _resampled(e: Experiment, ratio: float, inputs: str, antialias: bool) -> Experiment:
+    count = math.floor(len(e) / ratio + 1e-9)
+    if count < 1:
+        raise DataError(
+            f"{e.name} [{e.range_text}]: expected at least one new period, received {len(e)} "
+            f"samples of a {ratio:g}th of it; leave this experiment out"
+        )
+
+    def output(column: FloatArray) -> FloatArray:
+        return frozen(_at_times(column, ratio, count, antialias))
+
+    def held(column: FloatArray) -> FloatArray:
+        return _period_means(column, ratio, count)
+
+    u = np.column_stack([held(c) if inputs == "held" else output(c) for c in e.u.T])
+    start = round(e.start / ratio)
+    return replace(
+        e,
+        u=frozen(u),
+        y=output(e.y),
+        channels={name: output(c) for name, c in e.channels.items()},
+        start=start,
+        removed=_rescaled(e, ratio, start, inputs),
+    )
+
+
+def _rescaled(e: Experiment, ratio: float, start: int, inputs: str) -> Trend | None:
+    """The line that was taken off, over the new samples."""
+    if e.removed is None:
+        return None
+    at = np.full(len(e.removed.level), float(e.start))
+    if inputs == "held":
+        at[:-1] += 0.5 * (ratio - 1.0)
+    level = e.removed.level + e.removed.slope * (at - ratio * start)
+    return Trend(frozen(level), frozen(e.removed.slope * ratio))
+
+
+def _period_means(column: FloatArray, ratio: float, count: int) -> FloatArray:
+    """Mean over each new period of a column that is held from sample to sample."""
+    if ratio.is_integer():
+        whole = int(ratio)
+        means: FloatArray = column[: count * whole].reshape(count, whole).mean(axis=1)
+        return means
+    known = np.isfinite(column)
+    middle = column[known].mean() if known.any() else 0.0
+    edges = np.minimum(np.arange(count + 1) * ratio, len(column))
+    found = middle + _integrals(np.where(known, column - middle, 0.0), edges) / ratio
+    unknown = _integrals((~known).astype(np.float64), edges) > 1e-9
+    return np.where(unknown, np.nan, found)
+
+
+def _integrals(column: FloatArray, edges: FloatArray) -> FloatArray:
+    total = np.concatenate([[0.0], np.cumsum(column)])
+    return np.diff(np.interp(edges, np.arange(len(total)), total))
+
+
+def _at_times(column: FloatArray, ratio: float, count: int, antialias: bool) -> FloatArray:
+    """A sampled column at the new times, NaN where too little of it was measured there."""
+    known = np.isfinite(column)
+    if not known.any():
+        return np.full(count, np.nan)
+    times = np.minimum(np.arange(count) * ratio, len(column) - 1.0)
+    filled = interpolated(column)
+    if antialias:
+        values = _low_passed(filled, times, max(1.0, ratio))
+    else:
+        values = np.interp(times, np.arange(len(column)), filled)
+    return np.where(_measured_share(known, times, ratio) > 0.5, values, np.nan)
+
+
+def _measured_share(known: NDArray[np.bool_], times: FloatArray, ratio: float) -> FloatArray:
+    """Part of the old samples around each new one that were measured."""
+    low = np.minimum(np.floor(times), np.ceil(times - 0.5 * ratio))
+    high = np.maximum(np.ceil(times), np.floor(times + 0.5 * ratio))
+    low = np.clip(low, 0, len(known) - 1).astype(np.int64)
+    high = np.clip(high, 0, len(known) - 1).astype(np.int64)
+    total = np.concatenate([[0], np.cumsum(known)])
+    share: FloatArray = (total[high + 1] - total[low]) / (high + 1.0 - low)
+    return share
+
+
+def _low_passed(column: FloatArray, times: FloatArray, scale: float) -> FloatArray:
+    """The column behind a zero-phase low-pass of `1/scale` of its Nyquist frequency, at `times`."""
+    reach = math.ceil(REACH * scale)
+    padded = _extended(column, reach + 1)
+    offsets = np.arange(-reach, reach + 2)
+    found = np.empty(len(times))
+    rows = max(1, _CHUNK // len(offsets))
+    for first in range(0, len(times), rows):
+        t = times[first : first + rows, None]
+        k = np.floor(t).astype(np.int64) + offsets
+        x = (t - k) / scale
+        inside = np.clip(1.0 - (x / REACH) ** 2, 0.0, None)
+        weights = np.where(np.abs(x) < REACH, np.sinc(x) * np.i0(KAISER * np.sqrt(inside)), 0.0)
+        # the weights' sum, so that a constant stays one
+        found[first : first + rows] = (weights * padded[k + reach + 1]).sum(1) / weights.sum(1)
+    return found
+
+
+def _extended(column: FloatArray, reach: int) -> FloatArray:
+    """The column continued at both ends by its reflection in the end points, as far as it goes."""
+    turn = min(reach, len(column) - 1)
+    before = 2.0 * column[0] - column[turn:0:-1]
+    after = 2.0 * column[-1] - column[::-1][1 : turn + 1]
+    return np.pad(np.concatenate([before, column, after]), reach - turn, mode="edge")
