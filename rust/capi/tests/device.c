@@ -147,12 +147,12 @@ size_t board_write(const uint8_t *bytes, size_t count) {
 /* ---- host ---- */
 
 static const uint16_t TAG = 0x0042;
-static const uint32_t SESSION = 9;
+static uint32_t session = 9;
 static uint32_t commands, beats;
 
 static void say(uint8_t kind, const uint8_t *body, size_t length) {
     uint32_t sequence = kind == 1 ? 0 : kind < 0x20 ? ++commands : ++beats;
-    uint64_t told = kind == 1 ? now : (uint64_t)SESSION << 32 | (uint32_t)now;
+    uint64_t told = kind == 1 ? now : (uint64_t)session << 32 | (uint32_t)now;
     to_device_count += encode(to_device + to_device_count, kind, kind == 1 ? 0 : TAG, sequence, told, body, length);
 }
 
@@ -255,6 +255,22 @@ static void arm_and_start(void) {
     CHECK(command(0x0A, start, 20) == 0);
 }
 
+static void a_replaced_host_is_not_heard(void) {
+    uint32_t last = beats;
+    session = 8;
+    beats = 1000000;
+    for (int k = 0; k < 20; k++) {
+        drive(9.0f);
+        steps(1);
+        CHECK(applied.u == 3.0f);
+    }
+    session = 9;
+    beats = last;
+    drive(4.0f);
+    steps(2);
+    CHECK(applied.u == 4.0f);
+}
+
 static void motor_runs_while_the_host_watches(void) {
     arm_and_start();
     for (int k = 0; k < 500; k++) {
@@ -263,6 +279,7 @@ static void motor_runs_while_the_host_watches(void) {
         steps(1);
         CHECK(applied.enabled && (k < 2 || applied.u == 3.0f));
     }
+    a_replaced_host_is_not_heard();
     drive(99.0f);
     steps(2);
     CHECK(applied.u == 10.0f); /* the limit */
