@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +20,7 @@ from sewfast.experiment import run_demo
 from sewfast.link import Drive, VirtualDevice, connect
 from sewfast.loop import run
 from sewfast.recordfile import Header, RecordWriter, export, read_recording
+from sewfast.recordfile.sink import Sink
 from sewfast.recording import record
 
 U = np.round(3.0 * np.sin(np.arange(300) / 20.0), 3)
@@ -252,6 +254,22 @@ def test_a_file_that_cannot_be_made_any_more_is_told_by_the_next_call(tmp_path: 
     writer.samples(0, {"u": np.ones(5)})
     with pytest.raises(DataError, match="cannot be written"):
         writer.close()
+
+
+def test_a_disk_that_fills_up_meanwhile_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = tmp_path / "run.mcap"
+    writer = RecordWriter(path, Header("run", 0.001, {"u": "V"}), lazy=True)
+    monkeypatch.setattr(Sink, "append", full)
+    writer.samples(0, {"u": np.ones(5)})
+    with pytest.raises(DataError, match="No space left"):
+        writer.close()
+    assert not writer.is_made
+    assert not path.exists()
 
 
 def test_the_samples_that_were_taken_and_never_came_are_a_gap(tmp_path: Path) -> None:

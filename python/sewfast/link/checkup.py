@@ -117,7 +117,8 @@ def _state(status: wire.Status) -> Finding:
 
 
 _TRIPS = {
-    "watchdog": "its host fell silent or the cable was out; see the loss below",
+    "watchdog": "its host fell silent or the cable was out: see the loss below, and give a busy "
+    "computer more time (--watchdog 250)",
     "speed": "the speed limit was passed; check the limits and the controller",
     "acceleration": "the acceleration limit was passed; check the limits and the encoder",
     "current": "the current limit was passed; check the mechanics for a jam",

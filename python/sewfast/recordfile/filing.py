@@ -124,9 +124,10 @@ class Filing:
             self._append(message)
         except OSError as e:
             self._sink.close()
-            self._sink.path.unlink(missing_ok=True)
+            self._path.unlink(missing_ok=True)
+            self._opened = None
             raise DataError(
-                f"{self._sink.path}: cannot be written ({e.strerror}); free some space or write "
+                f"{self._path}: cannot be written ({e.strerror}); free some space or write "
                 "elsewhere"
             ) from e
 
