@@ -86,7 +86,7 @@ def save(card: ReportCard, folder: str | os.PathLike[str]) -> list[Path]:
 def residual_figure(card: ReportCard) -> Figure:
     """Every residual test: correlations over lags, their 99 % limits, the verdict."""
     rows = (len(card.tests) + 1) // 2
-    figure, axes = _panels(rows, 2, 2.3 * rows)
+    figure, axes = _panels(rows, 2, 2.1 * rows)
     for ax, t in zip(axes.ravel(), card.tests, strict=False):
         lags = t.lags * card.Ts * 1e3
         for i, name in enumerate(t.series):

@@ -28,6 +28,7 @@ STAGES = (
     "closed-loop recording",
     "default network",
     "scores",
+    "report card",
     "tuning",
     "closed loops",
     "writing",
@@ -143,6 +144,9 @@ def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, An
     clock.enter("scores")
     scored = identified.scores(models, recorded)
 
+    clock.enter("report card")
+    check, drawings = identified.report_card(models["neural_oe"], recorded["random"])
+
     clock.enter("tuning")
     tuning = loops.tuned(models["neural_oe"], coarse, seed)
 
@@ -164,6 +168,7 @@ def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, An
         "counts_per_rev": rig.counts_per_rev,
         "speed": speed,
         "identification": identification,
+        "check": check,
         **_controller_numbers(fopdt, controllers, tuning),
         "control": loops.control_numbers(runs),
         "paper_gains": loops.paper_numbers(paper_runs) | {"readings": loops.readings()},
@@ -178,6 +183,7 @@ def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, An
         controllers=controllers,
         predictions=identified.predictions(scored),
         runs=runs | paper_runs,
+        drawings=drawings,
     )
     report(target)
     clock.finish()

@@ -14,10 +14,17 @@ from ..errors import DataError, SettingError
 from ..loop import ClosedLoopRun
 from ..models import Model
 from ..recording import Recording
-from ..report.artefacts import FORMAT, VERSION, prediction_file, recording_file, run_file
+from ..report.artefacts import (
+    FORMAT,
+    VERSION,
+    drawing_file,
+    prediction_file,
+    recording_file,
+    run_file,
+)
 from ..writers import write_table
 
-_FOLDERS = ("recordings", "models", "controllers", "predictions", "runs")
+_FOLDERS = ("recordings", "models", "controllers", "predictions", "runs", "check")
 
 
 def require_own(folder: Path, *, overwrite: bool) -> None:
@@ -79,6 +86,7 @@ def write(
     controllers: Mapping[str, Controller],
     predictions: Mapping[str, Mapping[str, Any]],
     runs: Mapping[tuple[str, str], ClosedLoopRun],
+    drawings: Mapping[str, str],
 ) -> None:
     """Put the artefacts in place of those of an earlier experiment.
 
@@ -99,4 +107,6 @@ def write(
         write_table(folder / prediction_file(name), columns)
     for key, loop in runs.items():
         write_table(folder / run_file(*key), loop.columns())
+    for name, svg in drawings.items():
+        jsonfile.replace(folder / drawing_file(name), svg)
     jsonfile.write(folder / "results.json", FORMAT, VERSION, results)

@@ -8,11 +8,14 @@ from typing import Any, Literal
 import numpy as np
 
 from ..dataset import Dataset
+from ..evidence.figures import figures
 from ..identification import identify
 from ..machine import VirtualMachine
 from ..models import Model
 from ..recording import Recording, record
 from ..report.artefacts import SCORED, record_of
+from ..report.canvas import style, svg
+from ..report.figures.trust import CAPTIONS
 from ..signals import excitation
 from ..validation import Validation, validate
 
@@ -70,6 +73,17 @@ def scores(
         name: {r: validate(m, d, init=0, against="speed_true") for r, d in data.items()}
         for name, m in models.items()
     }
+
+
+def report_card(model: Model, recording: Recording) -> tuple[dict[str, Any], dict[str, str]]:
+    """The card of a model on a recording as JSON values, and its figures as inline SVG."""
+    card = model.check(recording.dataset())
+    with style():
+        drawn = {
+            name: svg(figure, f"check-{name}", CAPTIONS[name][1])
+            for name, figure in figures(card).items()
+        }
+    return {**card.to_json(), "figures": list(drawn)}, drawn
 
 
 def predictions(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,11 +26,21 @@ SCORED = ("chirp_lo_hi", "chirp_hi_lo", "random", "saturating")
 MODELS = ("paper", "neural_oe", "oe", "oe_all", "arx", "arx_raw")
 REFERENCES = ("trapezoid", "chirp_hi_lo", "chirp_lo_hi", "random")
 PLANTS = ("model", "machine")
+DRAWINGS = ("residuals", "bands", "bode", "poles", "region")
+"""Figures of the report card."""
+_ALIVE = re.compile(
+    r"<\s*(script|foreignobject|image)|\son\w+\s*=|javascript:|href=\"[^#]", re.IGNORECASE
+)
 
 Columns: TypeAlias = Mapping[str, NDArray[np.float64]]
 
 _RECORDING = ("t", "u", "counts", "y", "speed_true")
 _RUN = ("t", "r", "u", "y", "feedback")
+
+
+def drawing_file(name: str) -> str:
+    """Where in the folder a figure of the report card lies."""
+    return f"check/{name}.svg"
 
 
 def recording_file(record: str) -> str:
@@ -66,6 +77,8 @@ class Artefacts:
         `MODEL_simulation` and `MODEL_one_step` [RPM].
     runs : mapping of (reference, plant) to columns
         t [s], r [RPM], u [V], y (true speed) [RPM], feedback [RPM].
+    drawn : mapping of name to inline SVG
+        Figures of the report card; none in results of before there was one.
     """
 
     folder: Path
@@ -73,6 +86,7 @@ class Artefacts:
     recordings: Mapping[str, Columns]
     predictions: Mapping[str, Columns]
     runs: Mapping[tuple[str, str], Columns]
+    drawn: Mapping[str, str]
 
     def value(self, path: str) -> Any:
         """One value of `results.json` by its dotted path.
@@ -140,7 +154,31 @@ def load(folder: str | os.PathLike[str]) -> Artefacts:
         recordings,
         predictions,
         {key: _columns(folder, run_file(*key), _RUN) for key in runs},
+        {name: _drawing(folder / drawing_file(name)) for name in _drawings(results)},
     )
+
+
+def _drawings(results: Mapping[str, Any]) -> list[str]:
+    """The report card's figures that the results speak of."""
+    check = results.get("check")
+    named = check.get("figures", []) if isinstance(check, Mapping) else []
+    return [name for name in DRAWINGS if isinstance(named, list) and name in named]
+
+
+def _drawing(path: Path) -> str:
+    """An SVG that is nothing but a drawing."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as e:
+        raise DataError(
+            f"{path}: expected by the report, cannot be read ({e}); run `sewfast demo` again"
+        ) from e
+    if not text.startswith("<svg") or _ALIVE.search(text):
+        raise DataError(
+            f"{path}: expected a drawing as `sewfast demo` writes it, received something else; "
+            "run `sewfast demo` again"
+        )
+    return text
 
 
 def _require_alike(path: Path, columns: Columns, recording: Columns) -> None:

@@ -52,6 +52,8 @@ def _context(artefacts: Artefacts) -> dict[str, Any]:
         "value": artefacts.value,
         # results of before the link have none
         "link": artefacts.results.get("link"),
+        # nor have those of before the report card
+        "check": artefacts.results.get("check"),
     }
     # drawn last: where a number is missing nothing is drawn in vain
     with style():
@@ -59,6 +61,7 @@ def _context(artefacts: Artefacts) -> dict[str, Any]:
             "recorded": figures.recorded_pictures(artefacts),
             "scaled": figures.scaled_pictures(artefacts),
             "predicted": figures.prediction_pictures(artefacts),
+            "trust": figures.trust_pictures(artefacts),
             "arx": figures.arx_picture(artefacts),
             "loops": figures.loop_pictures(artefacts),
             "paper_gains": figures.paper_gain_pictures(artefacts),

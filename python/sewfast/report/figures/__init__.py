@@ -3,6 +3,7 @@
 from .excitation import recorded_pictures, scaled_pictures
 from .loops import loop_pictures, paper_gain_pictures
 from .prediction import arx_picture, prediction_pictures
+from .trust import trust_pictures
 
 __all__ = [
     "arx_picture",
@@ -11,4 +12,5 @@ __all__ = [
     "prediction_pictures",
     "recorded_pictures",
     "scaled_pictures",
+    "trust_pictures",
 ]
