@@ -106,6 +106,7 @@ impl NeuralOE {
         let mut gram = shape.gram();
         let mut scratch = Scratch::new(shape);
         let mut hidden = vec![[0.0; network::LANES]; shape.blocks()];
+        let mut bends = hidden.clone();
         for (i, &y) in y_past.iter().enumerate() {
             scratch.phi[i] = self.scaling.output(y);
             gram.past_mut(i + 1)[shape.state_column() + i] = 1.0;
@@ -114,11 +115,16 @@ impl NeuralOE {
         for k in 0..run.len() {
             shape.lags.write_inputs(&u, k, &mut scratch.phi[na..]);
             let phi = &scratch.phi;
-            let y = self
-                .network
-                .forward(|c| phi[c], |block, h| hidden[block] = *h);
+            let y = self.network.forward(
+                |c| phi[c],
+                |block, h, m| {
+                    hidden[block] = *h;
+                    bends[block] = m.map(tanh::slope);
+                },
+            );
+            let layer = (&hidden[..], |block: usize| bends[block]);
             self.network
-                .push_row(&mut gram, &mut scratch, &hidden, y, 0.0);
+                .push_row(&mut gram, &mut scratch, layer, y, 0.0);
             let row = gram.past_mut(1);
             rows.extend(columns.iter().map(|&c| row[c] * self.scaling.y_scale));
             rows.extend_from_slice(&row[shape.state_column()..][..na]);
@@ -137,7 +143,7 @@ impl Lagged for NeuralOE {
         let Lags { na, nb, .. } = self.lags();
         let scaled = self
             .network
-            .forward(|c| self.scaling.regressor(phi[c], c, na, nb), |_, _| ());
+            .forward(|c| self.scaling.regressor(phi[c], c, na, nb), |_, _, _| ());
         self.scaling.restored(scaled)
     }
 

@@ -1,6 +1,6 @@
 //! The network in scaled units: weights in blocks of four hidden units, its output and its slopes.
 
-use super::tanh::tanh;
+use super::tanh::{from_growth, growth, slope as bend_of};
 use crate::gram::Gram;
 use crate::lagged::{Lagged, Lags};
 use crate::{Error, Result};
@@ -141,12 +141,13 @@ impl Network {
         }
     }
 
-    /// The output for the regressor `phi(c)`; `hidden(block, values)` receives the hidden outputs.
+    /// The output for the regressor `phi(c)`; `hidden(block, h, m)` receives the hidden outputs and what their slopes
+    /// follow from.
     #[inline(always)]
     pub(super) fn forward(
         &self,
         phi: impl Fn(usize) -> f64,
-        mut hidden: impl FnMut(usize, &Block),
+        mut hidden: impl FnMut(usize, &Block, &Block),
     ) -> f64 {
         let n_phi = self.linear.len();
         let mut sum = [0.0; LANES];
@@ -159,11 +160,12 @@ impl Network {
                     *z += w * value;
                 }
             }
-            let h = z.map(tanh);
+            let m = z.map(growth);
+            let h: Block = std::array::from_fn(|lane| from_growth(m[lane], z[lane]));
             for ((sum, w), h) in sum.iter_mut().zip(&self.second[block]).zip(&h) {
                 *sum += w * h;
             }
-            hidden(block, &h);
+            hidden(block, &h, &m);
         }
         let mut direct = self.constant;
         if self.shape.bypass {
@@ -185,16 +187,17 @@ impl Network {
 
     /// Slopes of the output by each hidden unit's argument, and by each past output into `gains`.
     #[inline(always)]
-    fn slopes(&self, h: &[Block], slopes: &mut [Block], gains: &mut [f64]) {
+    fn slopes(&self, bends: impl Fn(usize) -> Block, slopes: &mut [Block], gains: &mut [f64]) {
         let n_phi = self.linear.len();
         gains.copy_from_slice(&self.linear[..gains.len()]);
-        for ((slope, h), (second, first)) in slopes
+        for (block, (slope, (second, first))) in slopes
             .iter_mut()
-            .zip(h)
             .zip(self.second.iter().zip(self.first.chunks_exact(n_phi)))
+            .enumerate()
         {
+            let bend = bends(block);
             for lane in 0..LANES {
-                slope[lane] = second[lane] * (1.0 - h[lane] * h[lane]);
+                slope[lane] = second[lane] * bend[lane];
             }
             for (gain, w) in gains.iter_mut().zip(first) {
                 let part: Block = std::array::from_fn(|lane| slope[lane] * w[lane]);
@@ -203,7 +206,8 @@ impl Network {
         }
     }
 
-    /// Appends the sensitivity row of a sample to `gram`; its last column holds `error`.
+    /// Appends the sensitivity row of a sample to `gram`; its last column holds `error`. `h` are the hidden outputs,
+    /// `bends(block)` the derivatives of tanh there.
     ///
     /// `d yhat(k)/d theta = d f/d theta + sum_m (d f/d phi_m) d yhat(k-m)/d theta`, zero where the output is clipped.
     #[inline(always)]
@@ -211,7 +215,7 @@ impl Network {
         &self,
         gram: &mut Gram,
         scratch: &mut Scratch,
-        h: &[Block],
+        (h, bends): (&[Block], impl Fn(usize) -> Block),
         output: f64,
         error: f64,
     ) {
@@ -222,7 +226,7 @@ impl Network {
             gram.push(gains, last, error, |row| row.fill(0.0));
             return;
         }
-        self.slopes(h, slopes, gains);
+        self.slopes(bends, slopes, gains);
         let (n_phi, padded) = (phi.len(), slopes.len() * LANES);
         gram.push(gains, last, error, |row| {
             let (units, tail) = row.split_at_mut((n_phi + 2) * padded);
@@ -267,7 +271,7 @@ impl Lagged for Network {
     }
 
     fn output(&self, phi: &[f64]) -> f64 {
-        self.forward(|c| phi[c], |_, _| ())
+        self.forward(|c| phi[c], |_, _, _| ())
     }
 
     fn output_and_slope(&self, phi: &[f64], slope: &mut [f64]) -> f64 {
@@ -275,12 +279,11 @@ impl Lagged for Network {
         slope.copy_from_slice(&self.linear[..slope.len()]);
         let output = self.forward(
             |c| phi[c],
-            |block, h| {
-                for (m, slope) in slope.iter_mut().enumerate() {
-                    let (w, v) = (&self.first[block * n_phi + m], &self.second[block]);
-                    *slope += (0..LANES)
-                        .map(|i| v[i] * (1.0 - h[i] * h[i]) * w[i])
-                        .sum::<f64>();
+            |block, _, m| {
+                let bend = m.map(bend_of);
+                for (c, slope) in slope.iter_mut().enumerate() {
+                    let (w, v) = (&self.first[block * n_phi + c], &self.second[block]);
+                    *slope += (0..LANES).map(|i| v[i] * bend[i] * w[i]).sum::<f64>();
                 }
             },
         );

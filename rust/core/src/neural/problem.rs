@@ -179,7 +179,7 @@ impl<'a> FreeRun<'a> {
             lags.write_inputs(&data.u, k, &mut phi[lags.na..]);
             let y = self
                 .network
-                .forward(|c| phi[c], |block, values| h[block] = *values);
+                .forward(|c| phi[c], |block, values, _| h[block] = *values);
             push_past(&mut phi[..lags.na], y);
             *out = y;
             if !data.y[k].is_nan() {
@@ -218,8 +218,15 @@ impl<'a> FreeRun<'a> {
             }
             let k = data.first + i;
             lags.write_inputs(&data.u, k, &mut self.scratch.phi[lags.na..]);
-            self.network
-                .push_row(&mut self.gram, &mut self.scratch, h, y, data.y[k] - y);
+            // what a saturated unit loses here is far below what a sum of squares shows
+            let bends = |block: usize| h[block].map(|h| 1.0 - h * h);
+            self.network.push_row(
+                &mut self.gram,
+                &mut self.scratch,
+                (h, bends),
+                y,
+                data.y[k] - y,
+            );
             push_past(&mut self.scratch.phi[..lags.na], y);
         }
     }

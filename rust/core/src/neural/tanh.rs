@@ -1,7 +1,7 @@
 //! A tanh without branches or library calls: the same bits on every platform, and four at a time.
 
-/// Beyond this `tanh` is 1 to the last bit.
-const SATURATED: f64 = 20.0;
+/// `tanh` is 1 to the last bit from 20 on; from here on its derivative is below 1e-294, too.
+const SATURATED: f64 = 340.0;
 /// Adding this rounds to an integer, which is then found in the low bits.
 const ROUND: f64 = 6_755_399_441_055_744.0;
 /// ln 2 in two parts; the first has so few bits that its product with a small integer is exact (Cody and Waite 1980).
@@ -25,6 +25,27 @@ const TAYLOR: [f64; 12] = [
 /// `tanh(x) = m/(m + 2)` with `m = exp(2|x|) - 1`, sign restored; within 1e-15 of the true value, NaN stays NaN.
 #[inline(always)]
 pub fn tanh(x: f64) -> f64 {
+    from_growth(growth(x), x)
+}
+
+/// `tanh(x)` from `growth(x)`.
+#[inline(always)]
+pub(super) fn from_growth(m: f64, x: f64) -> f64 {
+    (m / (m + 2.0)).copysign(x)
+}
+
+/// `d tanh(x)/dx = 1 - tanh(x)^2 = q (2 - q)` with `q = 1 - |tanh(x)| = 2/(m + 2)`, from `m = growth(x)`.
+///
+/// Near saturation `1 - h * h` has lost the digits that this one keeps.
+#[inline(always)]
+pub(super) fn slope(m: f64) -> f64 {
+    let q = 2.0 / (m + 2.0);
+    q * (2.0 - q)
+}
+
+/// `exp(2|x|) - 1`.
+#[inline(always)]
+pub(super) fn growth(x: f64) -> f64 {
     let size = x.abs();
     // A comparison rather than `min`, which would turn NaN into a number.
     let twice = 2.0 * if size > SATURATED { SATURATED } else { size };
@@ -32,8 +53,7 @@ pub fn tanh(x: f64) -> f64 {
     let n = shifted - ROUND;
     let r = (twice - n * LN2[0]) - n * LN2[1];
     let power = f64::from_bits((shifted.to_bits() << 52).wrapping_add(1023 << 52));
-    let m = power * (r + r * r * series(r)) + (power - 1.0);
-    (m / (m + 2.0)).copysign(x)
+    power * (r + r * r * series(r)) + (power - 1.0)
 }
 
 /// The Taylor sum in Estrin's form: short chains, so that a processor can do several things at once.
@@ -69,6 +89,13 @@ mod tests {
             prop_assert!((own - library).abs() <= 4e-15 * library.abs());
             prop_assert!(own.abs() <= 1.0);
             prop_assert_eq!(tanh(-x).to_bits(), (-own).to_bits());
+        }
+
+        #[test]
+        fn its_slope_keeps_its_digits_into_saturation(x in -300.0f64..300.0) {
+            let expected = 1.0 / x.cosh().powi(2);
+            let slope = slope(growth(x));
+            prop_assert!((slope - expected).abs() <= 1e-12 * expected, "{slope} {expected}");
         }
 
         #[test]

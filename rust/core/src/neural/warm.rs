@@ -25,7 +25,7 @@ pub(super) fn output_layer(network: &Network, experiments: &[Experiment]) -> Opt
             lags.write_inputs(&experiment.u, k, &mut phi[lags.na..]);
             network.forward(
                 |c| phi[c],
-                |block, values| {
+                |block, values, _| {
                     let first = block * LANES;
                     let count = LANES.min(hidden - first);
                     row[first..first + count].copy_from_slice(&values[..count]);
