@@ -57,6 +57,7 @@ COMMANDS = [
     "demo",
     "record",
     "signals",
+    "orders",
     "identify",
     "validate",
     "simulate",

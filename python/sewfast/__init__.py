@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         table_1,
     )
     from .dataset import Dataset, Experiment
+    from .delays import DelayEstimate, delay
     from .errors import (
         DataError,
         FitError,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from .loop import ClosedLoopRun, run
     from .machine import VirtualMachine
     from .models import ARX, IV, LinearOE, Model, NeuralOE, NeuralSS, load_model
+    from .order_table import OrderTable, orders
     from .readers import read, read_table
     from .recording import Recording, record
     from .speed import speed_from_counts
@@ -46,6 +48,7 @@ __all__ = [
     "Controller",
     "DataError",
     "Dataset",
+    "DelayEstimate",
     "Experiment",
     "FitError",
     "Gains",
@@ -57,6 +60,7 @@ __all__ = [
     "ModelFileError",
     "NeuralOE",
     "NeuralSS",
+    "OrderTable",
     "Recording",
     "ReportCard",
     "SettingError",
@@ -66,11 +70,13 @@ __all__ = [
     "VirtualMachine",
     "__version__",
     "check",
+    "delay",
     "fit_fopdt",
     "identify",
     "least_squares",
     "load_controller",
     "load_model",
+    "orders",
     "paper_controller",
     "read",
     "read_table",
@@ -89,6 +95,7 @@ _HOMES = {
     "_core": "__version__",
     "control": "Controller Gains fit_fopdt load_controller paper_controller table_1",
     "dataset": "Dataset Experiment",
+    "delays": "DelayEstimate delay",
     "errors": "DataError FitError Interrupted LinkError ModelFileError SettingError SewfastError",
     "evidence": "ReportCard check",
     "identification": "identify",
@@ -96,6 +103,7 @@ _HOMES = {
     "loop": "ClosedLoopRun run",
     "machine": "VirtualMachine",
     "models": "ARX IV LinearOE Model NeuralOE NeuralSS load_model",
+    "order_table": "OrderTable orders",
     "readers": "read read_table",
     "recording": "Recording record",
     "speed": "speed_from_counts",

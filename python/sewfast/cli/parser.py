@@ -14,6 +14,7 @@ from . import (
     files,
     identify,
     models,
+    orders,
     ports,
     recording,
 )
@@ -63,6 +64,7 @@ def build_parser() -> argparse.ArgumentParser:
         experiment,
         recording,
         files,
+        orders,
         identify,
         models,
         check,

@@ -1,0 +1,293 @@
+"""`delay`: how many samples pass before an input shows in the output."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from . import _core
+from .dataset import Dataset, FloatArray, require_dataset
+from .errors import DataError, FitError, SettingError
+from .regression import LaggedRegression
+
+LONGEST = 30
+"""Delays looked at, unless told otherwise [samples]."""
+ORDER = 4
+"""Past outputs and inputs of the ARX models."""
+REFINED = 2
+"""Past outputs and inputs of the models whose free runs are compared; more could feign a delay."""
+ITERATIONS = 6
+WHITENING = 20
+"""Order of the autoregression that makes an input white."""
+
+
+@dataclass(frozen=True, eq=False)
+class InputDelay:
+    """What the data say of one input's delay.
+
+    Attributes
+    ----------
+    name : str
+    nk : int
+        Delay of the model with the lowest cost in free run [samples].
+    low, high : int
+        The plausible delays lie between: their likelihood is at least `1 - confidence` of the best
+        one's.
+    first_correlated : int or None
+        First lag at which input and output, both filtered to make the input white, correlate beyond
+        chance; None: at none.
+    lags : array, shape (L,)
+    cost : array, shape (L,)
+        Mean square free-run error of a model with each delay [output unit squared]; inf where there
+        is none.
+    one_step_cost : array, shape (L,)
+        Mean square one-step error of an ARX model with each delay.
+    correlation : array, shape (L,)
+        Prewhitened cross-correlation at each lag.
+    bound : float
+        Of |correlation| where input and output are independent, for all lags together.
+    """
+
+    name: str
+    nk: int
+    low: int
+    high: int
+    first_correlated: int | None
+    lags: FloatArray
+    cost: FloatArray
+    one_step_cost: FloatArray
+    correlation: FloatArray
+    bound: float
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values."""
+        costs = (self.cost, self.one_step_cost, self.correlation)
+        arrays: dict[str, Any] = {"lags": [int(v) for v in self.lags]} | {
+            name: [v if math.isfinite(v) else None for v in values.tolist()]
+            for name, values in zip(("cost", "one_step_cost", "correlation"), costs, strict=True)
+        }
+        names = ("name", "nk", "low", "high", "first_correlated", "bound")
+        return {k: getattr(self, k) for k in names} | arrays
+
+    def __str__(self) -> str:
+        spread = f"{self.low}" if self.low == self.high else f"{self.low} to {self.high}"
+        seen = self.first_correlated
+        first = "no lag beyond chance" if seen is None else f"first beyond chance at lag {seen}"
+        return f"{self.name}: nk = {self.nk} (plausible: {spread}); correlation: {first}"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DelayEstimate:
+    """Delays of all inputs; prints itself.
+
+    Attributes
+    ----------
+    nk : int
+        Delay that a model with one delay for all inputs should have: the smallest of theirs.
+    inputs : tuple of InputDelay
+    Ts : float
+        Sample time [s].
+    confidence : float
+    """
+
+    nk: int
+    inputs: tuple[InputDelay, ...]
+    Ts: float
+    confidence: float
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values."""
+        inputs = [i.to_json() for i in self.inputs]
+        return {"nk": self.nk, "Ts": self.Ts, "confidence": self.confidence, "inputs": inputs}
+
+    def __str__(self) -> str:
+        head = f"delay: {self.nk} sample(s), {1e3 * self.nk * self.Ts:g} ms"
+        return "\n".join([head, *(f"  {i}" for i in self.inputs)])
+
+    __repr__ = __str__
+
+
+def delay(
+    data: Dataset, *, longest: int = LONGEST, least: int = 1, confidence: float = 0.95
+) -> DelayEstimate:
+    """Estimate the delay of each input in three ways.
+
+    Free run: models with two past outputs and two past inputs from `nk` on are fitted by
+    instrumental variables for every `nk`, the other inputs at their own best delays. The likelihood
+    of a delay relative to the best one is `(cost_best / cost)^(N/2)`.
+
+    One step: the same for ARX models of order 4, which cost next to nothing; at a high sampling
+    rate noise makes them late, so they are the start only.
+
+    Correlation: an autoregression of order 20 is fitted to the input, and input and output are
+    filtered by it; the input is then white, and independent series correlate within `z / sqrt(N)`
+    (Box, Jenkins, Reinsel 2008, section 12.1).
+
+    Parameters
+    ----------
+    data : Dataset
+        Samples that were not measured are left out.
+    longest : int
+        Largest delay looked at [samples].
+    least : int
+        Smallest one; 0 admits inputs that act at once, which feedback in the recording can feign.
+    confidence : float
+        Of the range of plausible delays, and of the bound on the correlations together.
+
+    Returns
+    -------
+    DelayEstimate
+
+    Raises
+    ------
+    DataError
+        Where the data are too short or never move.
+    SettingError
+        Where a setting is out of its range.
+
+    Notes
+    -----
+    A drive answers through its inertia: the first coefficients can be too small to be seen, so that
+    the estimate may be late by a sample or two. A model may then still begin at 1.
+    """
+    _require(data, longest, least, confidence)
+    regression = LaggedRegression(data, ORDER, longest + ORDER)
+    needed = 2 * regression.triangle.shape[1]
+    if regression.samples < needed:
+        raise DataError(
+            f"{data.source}: expected at least {needed} samples with {longest + ORDER} samples "
+            f"before them, received {regression.samples}; lower `longest`, or record longer"
+        )
+    lags = range(least, longest + 1)
+    one_step = [_one_step_costs(regression, j, lags) for j in range(data.n_inputs)]
+    best = [lags[int(np.argmin(c))] for c in one_step]
+    costs = one_step
+    for _ in range(1 if data.n_inputs == 1 else 2):
+        costs = []
+        for j in range(data.n_inputs):
+            costs.append(_free_run_costs(data, j, lags, best))
+            best[j] = lags[int(np.argmin(costs[j]))]
+    found = tuple(
+        _of_input(data, j, lags, confidence, costs[j], one_step[j]) for j in range(data.n_inputs)
+    )
+    return DelayEstimate(min(i.nk for i in found), found, data.Ts, confidence)
+
+
+def _require(data: Dataset, longest: int, least: int, confidence: float) -> None:
+    require_dataset(data, "data")
+    data.require_inputs()
+    data.require_excited()
+    for name, value, low, high in (("least", least, 0, 1000), ("longest", longest, least, 1000)):
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise SettingError(
+                f"{name}: expected a whole number from {low} to {high}, received {value!r}"
+            )
+    if not 0.0 < confidence < 1.0:
+        raise SettingError(f"confidence: expected a number between 0 and 1, received {confidence}")
+
+
+def _one_step_costs(regression: LaggedRegression, j: int, lags: range) -> FloatArray:
+    """Mean square errors of ARX models, in which the other inputs have every lag."""
+    everything = [(0, regression.lags)] * regression.n_inputs
+    costs = []
+    for nk in lags:
+        windows = [*everything[:j], (nk, nk + ORDER), *everything[j + 1 :]]
+        costs.append(regression.solve(regression.columns(ORDER, windows)).squares)
+    return np.array(costs) / regression.samples
+
+
+def _free_run_costs(data: Dataset, j: int, lags: range, best: list[int]) -> FloatArray:
+    """Mean square free-run errors with input `j` delayed by each lag, the others by their best."""
+    costs = []
+    for nk in lags:
+        delays = [*best[:j], nk, *best[j + 1 :]]
+        arrays = [(_delayed(e.u, delays), e.y) for e in data.experiments]
+        try:
+            fit = _core.fit_iv(arrays, na=REFINED, nb=REFINED, nk=1, max_iterations=ITERATIONS)
+        except (DataError, FitError):
+            costs.append(math.inf)
+            continue
+        if fit.termination == "interrupted":
+            raise KeyboardInterrupt
+        costs.append(2.0 * fit.cost)
+    if not np.isfinite(costs).any():
+        raise FitError(
+            f"{data.source}: expected a linear model with a finite free run, found none at any "
+            "delay; check units and signs, or record with more excitation"
+        )
+    return np.array(costs)
+
+
+def _delayed(u: FloatArray, delays: list[int]) -> FloatArray:
+    """Inputs delayed by one sample less than `delays`, held at their first values."""
+    k = np.arange(len(u))
+    shifted = [u[np.clip(k - (d - 1), 0, len(u) - 1), j] for j, d in enumerate(delays)]
+    return np.ascontiguousarray(np.stack(shifted, axis=1))
+
+
+def _of_input(
+    data: Dataset,
+    j: int,
+    lags: range,
+    confidence: float,
+    cost: FloatArray,
+    one_step_cost: FloatArray,
+) -> InputDelay:
+    measured = np.concatenate([e.y[np.isfinite(e.y)] for e in data.experiments])
+    # rounding: a clean record has costs of nearly zero, whose ratios mean nothing
+    floor = 1e-16 * float(np.var(measured))
+    deviance = len(measured) * np.log((cost + floor) / (cost.min() + floor))
+    plausible = np.flatnonzero(deviance <= -2.0 * math.log(1.0 - confidence))
+    correlation, samples = _prewhitened_correlation(data, j, lags)
+    # each of L lags is judged at the level that all together keep (Sidak)
+    each = 1.0 - (1.0 - confidence ** (1.0 / len(lags))) / 2.0
+    bound = _normal_quantile(each) / math.sqrt(samples)
+    beyond = np.flatnonzero(np.abs(correlation) > bound)
+    return InputDelay(
+        name=data.input_names[j],
+        nk=lags[int(np.argmin(cost))],
+        low=lags[int(plausible[0])],
+        high=lags[int(plausible[-1])],
+        first_correlated=lags[int(beyond[0])] if len(beyond) else None,
+        lags=np.arange(lags.start, lags.stop, dtype=np.float64),
+        cost=cost,
+        one_step_cost=one_step_cost,
+        correlation=correlation,
+        bound=bound,
+    )
+
+
+def _prewhitened_correlation(data: Dataset, j: int, lags: range) -> tuple[FloatArray, int]:
+    """Correlation of input `j` and the output after the filter that makes the input white."""
+    whitener = _autoregression([e.u[:, j] for e in data.experiments])
+    sums, power, samples = np.zeros(len(lags)), np.zeros(2), 0
+    for e in data.experiments:
+        u, y = (np.convolve(v - np.nanmean(v), whitener, "valid") for v in (e.u[:, j], e.y))
+        known = np.isfinite(y)
+        y = np.where(known, y, 0.0)
+        sums += [u[: len(u) - lag] @ y[lag:] if lag < len(u) else 0.0 for lag in lags]
+        power += [u @ u, y @ y]
+        samples += int(known.sum())
+    size = math.sqrt(power.prod())
+    return (sums / size if size > 0.0 else sums), max(samples, 1)
+
+
+def _autoregression(series: list[FloatArray]) -> FloatArray:
+    """Filter [1, c_1, .., c_n] that makes the series white, by least squares."""
+    order = min(WHITENING, *(max((len(s) - 1) // 4, 0) for s in series))
+    mean = np.mean(np.concatenate(series))
+    rows = [np.lib.stride_tricks.sliding_window_view(s - mean, order + 1)[:, ::-1] for s in series]
+    gram = np.sum([r.T @ r for r in rows], axis=0)
+    # a ridge keeps a filter for inputs that a few numbers describe (steps, sines) from exploding
+    ridge = 1e-8 * gram[0, 0] * np.eye(order)
+    return np.concatenate([[1.0], -np.linalg.solve(gram[1:, 1:] + ridge, gram[1:, 0])])
+
+
+def _normal_quantile(p: float) -> float:
+    """Inverse of the normal distribution function."""
+    from statistics import NormalDist
+
+    return NormalDist().inv_cdf(p)

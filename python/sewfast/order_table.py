@@ -1,0 +1,396 @@
+"""`OrderTable`: how well linear models of every order and delay do, and which one to take."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from . import _core
+from .dataset import Dataset, FloatArray, labelled, require_dataset
+from .delays import LONGEST, DelayEstimate, delay
+from .errors import DataError, FitError, SettingError
+from .lipschitz import lipschitz_index
+from .models.base import INIT
+from .regression import LaggedRegression, Solution
+
+Progress: TypeAlias = Callable[[int, int, float], object]
+
+BLOCKS = 10
+"""Parts of the later data whose errors tell how sure a difference between structures is."""
+ABOUT_AS_WELL = 1.005
+"""Ratio of free-run errors that is no difference: a tenth of the noise, where noise is all."""
+EXACT = 1e-3
+"""Part of the output's standard deviation that the unknown inputs before the later part cost."""
+IV_ITERATIONS = 10
+SHOWN = 12
+
+
+@dataclass(frozen=True)
+class Structure:
+    """One row: a linear model's orders and what the data say of it.
+
+    Attributes
+    ----------
+    na, nb, nk : int
+    parameters : int
+        Effective number: what the training data fix of them.
+    one_step : float
+        rms one-step error of the ARX model on later data [output unit].
+    free_run : float
+        rms free-run error on later data of that model, or of the one that instrumental variables
+        make of it where that is better; inf where neither has a free run.
+    aic, aicc, bic, fpe : float
+        Of the ARX model on the training data, every structure on the same samples (Ljung 1999,
+        section 16.4). FPE in the output's unit squared.
+    lipschitz : float
+        Index of He and Asada (1993) of a model with these lags, linear or not; relative to others.
+    """
+
+    na: int
+    nb: int
+    nk: int
+    parameters: int
+    one_step: float
+    free_run: float
+    aic: float
+    aicc: float
+    bic: float
+    fpe: float
+    lipschitz: float
+
+    @property
+    def orders(self) -> dict[str, int]:
+        """Arguments of `identify`."""
+        return {"na": self.na, "nb": self.nb, "nk": self.nk}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OrderTable:
+    """Structures, the choice among them and its reason; prints itself.
+
+    Attributes
+    ----------
+    rows : tuple of Structure
+    choice : Structure
+    reason : str
+    delay : DelayEstimate or None
+        None where the delays to try were given.
+    output : str
+        Name and unit of the output.
+    """
+
+    rows: tuple[Structure, ...]
+    choice: Structure
+    reason: str
+    delay: DelayEstimate | None
+    output: str
+
+    @property
+    def best(self) -> Structure:
+        """The row with the lowest free-run error."""
+        return min(self.rows, key=lambda r: r.free_run)
+
+    def minimum(self, criterion: str) -> Structure:
+        """The row with the lowest value of a column, such as `"bic"`."""
+        if criterion not in Structure.__dataclass_fields__:
+            raise SettingError(
+                f"criterion: expected one of {', '.join(Structure.__dataclass_fields__)}, "
+                f"received {criterion!r}"
+            )
+        least: Structure = min(self.rows, key=lambda r: getattr(r, criterion))
+        return least
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values; None where a number is not defined."""
+        rows = [
+            {k: v if math.isfinite(v) else None for k, v in asdict(r).items()} for r in self.rows
+        ]
+        return {
+            "output": self.output,
+            "choice": self.choice.orders,
+            "reason": self.reason,
+            "delay": self.delay and self.delay.to_json(),
+            "rows": rows,
+        }
+
+    def __str__(self) -> str:
+        head = " na  nb  nk   free run   one step        AIC        BIC        FPE  Lipschitz"
+        ranked = sorted(self.rows, key=lambda r: r.free_run)[:SHOWN]
+        shown = ranked if self.choice in ranked else [*ranked[:-1], self.choice]
+        lines = [_line(r, "<- choice" if r is self.choice else "") for r in shown]
+        left = len(self.rows) - len(shown)
+        more = [f"    and {left} more, see `rows`"] if left else []
+        by = {c: self.minimum(c) for c in ("aic", "aicc", "bic", "fpe", "one_step")}
+        votes = "; ".join(f"{c} {r.na} {r.nb} {r.nk}" for c, r in by.items())
+        orders = ", ".join(f"{k} = {v}" for k, v in self.choice.orders.items())
+        return "\n".join(
+            [
+                f"Orders and delay, errors of {self.output} on later data",
+                *([] if self.delay is None else [str(self.delay)]),
+                head,
+                *lines,
+                *more,
+                f"lowest: {votes}",
+                f"choice: {orders}: {self.reason}",
+            ]
+        )
+
+    __repr__ = __str__
+
+
+def _line(r: Structure, mark: str) -> str:
+    values = (r.free_run, r.one_step, r.aic, r.bic, r.fpe, r.lipschitz)
+    numbers = " ".join(f"{v:10.5g}" for v in values)
+    return f"{r.na:3d} {r.nb:3d} {r.nk:3d} {numbers}  {mark}".rstrip()
+
+
+def orders(
+    data: Dataset,
+    *,
+    na: int | Iterable[int] = 4,
+    nb: int | Iterable[int] = 4,
+    nk: int | Iterable[int] | None = None,
+    validation: Dataset | None = None,
+    held_out: float = 0.3,
+    progress: Progress | None = None,
+) -> OrderTable:
+    """Try linear models of every order and delay on one data set.
+
+    Parameters
+    ----------
+    data : Dataset
+    na, nb : int or iterable of int
+        Orders to try; a number stands for 1 up to it.
+    nk : int, iterable of int, or None
+        Delays to try; a number stands for itself. None: 1 and what `sewfast.delay` finds plausible.
+    validation : Dataset or None
+        Data for the errors; None: the last part of each experiment.
+    held_out : float
+        That part, between 0 and 1.
+    progress : callable(done, total, lowest_error) or None
+
+    Returns
+    -------
+    OrderTable
+        `identify(data, **table.choice.orders)` goes on with it.
+
+    Raises
+    ------
+    DataError
+        Where the data are too short or never move.
+    SettingError
+        Where a setting is out of its range.
+    FitError
+        Where no structure has a finite free run.
+
+    Notes
+    -----
+    The choice is the structure with the fewest parameters whose free-run error on later data is
+    within 0.5 % of the lowest, or above it by no more than one standard error of the difference
+    over ten blocks (the one-standard-error rule: Hastie, Tibshirani, Friedman 2009, section 7.10).
+    Errors below 0.1 % of the output's standard deviation count as none.
+    Information criteria judge one-step errors, which at a high sampling rate hardly depend on the
+    model; they are there to compare.
+    """
+    require_dataset(data, "data")
+    data.require_inputs()
+    data.require_excited()
+    train, later = _parts(data, validation, held_out)
+    found = delay(train, longest=_reach(train)) if nk is None else None
+    grid = _Grid(_upto("na", na, 1), _upto("nb", nb, 1), _delays(nk, found))
+    rows, errors = _tried(train, later, grid, progress)
+    exact = EXACT * float(np.nanstd(np.concatenate([e.y for e in later.experiments])))
+    choice, reason = _chosen(rows, errors, exact)
+    output = labelled(data.output_name, data.output_unit)
+    return OrderTable(tuple(rows), choice, reason, found, output)
+
+
+@dataclass(frozen=True)
+class _Grid:
+    na: tuple[int, ...]
+    nb: tuple[int, ...]
+    nk: tuple[int, ...]
+
+    def __iter__(self) -> Any:
+        return ((a, b, k) for k in self.nk for a in self.na for b in self.nb)
+
+    def __len__(self) -> int:
+        return len(self.na) * len(self.nb) * len(self.nk)
+
+    @property
+    def lags(self) -> int:
+        return max(self.nk) + max(self.nb)
+
+
+def _upto(name: str, value: int | Iterable[int], least: int) -> tuple[int, ...]:
+    wanted = range(least, value + 1) if isinstance(value, int) else value
+    return _whole(name, wanted, least)
+
+
+def _whole(name: str, values: Iterable[int], least: int) -> tuple[int, ...]:
+    found = tuple(sorted(set(values)))
+    good = all(isinstance(v, (int, np.integer)) and least <= v <= 100 for v in found)
+    if not found or not good:
+        raise SettingError(
+            f"{name}: expected whole numbers from {least} to 100, received {list(found)}"
+        )
+    return tuple(int(v) for v in found)
+
+
+def _delays(nk: int | Iterable[int] | None, found: DelayEstimate | None) -> tuple[int, ...]:
+    if nk is not None:
+        return _whole("nk", (nk,) if isinstance(nk, int) else nk, 0)
+    assert found is not None
+    return _whole("nk", {1, found.nk, *(i.low for i in found.inputs)}, 0)
+
+
+def _reach(data: Dataset) -> int:
+    """Delays that short records leave room for."""
+    shortest = min(len(e) for e in data.experiments)
+    return max(1, min(LONGEST, shortest // 10))
+
+
+def _parts(data: Dataset, validation: Dataset | None, held_out: float) -> tuple[Dataset, Dataset]:
+    if validation is None:
+        if not 0.0 < held_out < 1.0:
+            raise SettingError(f"held_out: expected a part between 0 and 1, received {held_out}")
+        train, later = _split(data, 1.0 - held_out)
+    else:
+        require_dataset(validation, "validation")
+        validation.require_inputs()
+        Dataset.concat([data, validation])
+        train, later = data, validation
+    for e in later.experiments:
+        if len(e) < 2 * INIT:
+            raise DataError(
+                f"{e.name}: expected at least {2 * INIT} later samples to judge on, received "
+                f"{len(e)}; record longer, or raise held_out"
+            )
+    return train, later
+
+
+def _split(data: Dataset, fraction: float) -> tuple[Dataset, Dataset]:
+    from dataclasses import replace
+
+    cuts = [max(1, min(len(e) - 1, round(fraction * len(e)))) for e in data.experiments]
+    pairs = list(zip(data.experiments, cuts, strict=True))
+    first = tuple(e.cut(0, k) for e, k in pairs)
+    rest = tuple(e.cut(k, len(e)) for e, k in pairs)
+    return replace(data, experiments=first), replace(data, experiments=rest)
+
+
+def _tried(
+    train: Dataset, later: Dataset, grid: _Grid, progress: Progress | None
+) -> tuple[list[Structure], list[FloatArray]]:
+    """Every row, and its squared free-run errors in blocks."""
+    largest = (max(grid.na), grid.lags)
+    known, fresh = LaggedRegression(train, *largest), LaggedRegression(later, *largest)
+    width = known.triangle.shape[1]
+    if known.samples < 2 * width or fresh.samples == 0:
+        raise DataError(
+            f"{train.source}: expected at least {2 * width} samples for {width - 1} parameters, "
+            f"received {known.samples} to fit and {fresh.samples} to judge on; record longer, or "
+            "lower na, nb and nk"
+        )
+    rows, errors, lowest = [], [], math.inf
+    for done, (na, nb, nk) in enumerate(grid, 1):
+        arx = known.solve(known.columns(na, [(nk, nk + nb)] * train.n_inputs))
+        models = _models(arx, train, na, nb, nk)
+        blocks = min((_blocks(m, later) for m in models), key=np.mean, default=_NO_MODEL)
+        free = math.sqrt(float(np.mean(blocks)))
+        lowest = min(lowest, free)
+        one_step = math.sqrt(fresh.squares(arx) / fresh.samples)
+        criteria = _criteria(arx, known.samples)
+        index = lipschitz_index(train, na, nb, nk)
+        rows.append(Structure(na, nb, nk, arx.rank, one_step, free, *criteria, index))
+        errors.append(blocks)
+        if progress is not None:
+            progress(done, len(grid), lowest)
+    return rows, errors
+
+
+def _criteria(arx: Solution, n: int) -> tuple[float, float, float, float]:
+    """AIC, AICc, BIC and FPE of a least-squares fit with `rank` parameters on n samples."""
+    p, variance = arx.rank, max(arx.squares, 1e-300) / n
+    aic = n * math.log(variance) + 2 * p
+    aicc = aic + 2 * p * (p + 1) / (n - p - 1)
+    bic = n * math.log(variance) + p * math.log(n)
+    return aic, aicc, bic, variance * (1 + p / n) / (1 - p / n)
+
+
+_NO_MODEL = np.full(BLOCKS, math.inf)
+
+
+def _models(
+    arx: Solution, train: Dataset, na: int, nb: int, nk: int
+) -> Iterator[_core.LinearModel]:
+    """The structure by least squares and by instrumental variables.
+
+    Where the drive is not linear, the second can follow the record's trend with a slow pole that no
+    other record shows; the first cannot.
+    """
+    theta, inputs = arx.theta, train.n_inputs
+    b = theta[na:-1].reshape(inputs, nb)
+    arrays = [(e.u, e.y) for e in train.experiments]
+    with suppress(FitError, DataError, SettingError):
+        yield _core.LinearModel(-theta[:na], b, nk, float(theta[-1]))
+    with suppress(FitError, DataError):
+        fit = _core.fit_iv(arrays, na=na, nb=nb, nk=nk, max_iterations=IV_ITERATIONS)
+        if fit.termination == "interrupted":
+            raise KeyboardInterrupt
+        yield fit.model
+
+
+def _blocks(model: _core.LinearModel, later: Dataset) -> FloatArray:
+    """Mean squared free-run error in each block of the later data; inf where it has no free run."""
+    try:
+        errors = [_errors(model, e.u, e.y) for e in later.experiments]
+    except FitError:
+        return _NO_MODEL
+    squares = np.concatenate(errors) ** 2
+    return np.array([part.mean() for part in np.array_split(squares, min(BLOCKS, len(squares)))])
+
+
+def _errors(model: _core.LinearModel, u: FloatArray, y: FloatArray) -> FloatArray:
+    state = model.estimate_initial_state(u[:INIT], y[:INIT])
+    error = (y - model.simulate(u, state))[INIT:]
+    return error[np.isfinite(error)]
+
+
+def _chosen(rows: list[Structure], errors: list[FloatArray], exact: float) -> tuple[Structure, str]:
+    best = min(range(len(rows)), key=lambda i: rows[i].free_run)
+    if not math.isfinite(rows[best].free_run):
+        raise FitError(
+            "expected a structure with a finite free run, found none; check units and signs, or "
+            "record with more excitation"
+        )
+    good = max(ABOUT_AS_WELL * rows[best].free_run, exact)
+    able = [
+        i
+        for i, row in enumerate(rows)
+        if row.free_run <= good or _is_not_worse(errors[i], errors[best])
+    ]
+    chosen = rows[min(able, key=lambda i: (rows[i].parameters, rows[i].free_run))]
+    least = rows[best]
+    if chosen is least:
+        return chosen, "lowest free-run error on later data, and none as good has fewer parameters"
+    ratio = 100.0 * (chosen.free_run / least.free_run - 1.0) if least.free_run > 0.0 else 0.0
+    return chosen, (
+        f"fewest parameters ({chosen.parameters}) among those whose free-run error on later data "
+        f"is not distinguishable from the lowest ({least.na} {least.nb} {least.nk}: "
+        f"{least.free_run:.5g}); it is {ratio:.1f} % above it"
+    )
+
+
+def _is_not_worse(errors: FloatArray, least: FloatArray) -> bool:
+    """By one standard error of the difference over the blocks."""
+    n = len(least)
+    if n < 3 or len(errors) != n or not np.isfinite(errors).all():
+        return False
+    difference = errors - least
+    return float(difference.mean()) <= float(difference.std(ddof=1)) / math.sqrt(n)
