@@ -16,7 +16,7 @@ from sewfast import _core
 from test_core_models import reference
 
 COUNT = 10_000 if os.environ.get("SEWFAST_SOAK") else 1_000
-SAMPLES = 40
+SAMPLES = 25
 WORST = 1e-10
 STEP = 1e-30
 
