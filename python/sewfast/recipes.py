@@ -348,6 +348,7 @@ def _model(
         "data": _sources(data),
         "samples": len(data),
         "unmeasured": sum(e.unmeasured for e in data.experiments),
+        "preparation": list(data.notes),
         "input_range": [list(r) for r in data.input_range],
         "output_range": list(data.output_range),
         "settings": {"max_iterations": task.iterations},

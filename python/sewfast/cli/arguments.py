@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING, TypeAlias
 from ..errors import SettingError
 
 if TYPE_CHECKING:
-    from ..dataset import Dataset
     from ..live import Kind
 
     Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
@@ -90,16 +88,6 @@ def add_split(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def split_at_gaps(data: Dataset, args: argparse.Namespace) -> Dataset:
-    """The data, in pieces where that is asked for; what is left out goes to standard error."""
-    if not args.split_at_gaps:
-        return data
-    pieces = data.split_at_gaps()
-    for note in pieces.notes:
-        print(note, file=sys.stderr)
-    return pieces
-
-
 def add_output(
     parser: argparse.ArgumentParser, metavar: str, help: str, *, required: bool = False
 ) -> None:
@@ -114,7 +102,7 @@ def add_overwrite(parser: argparse._ActionsContainer) -> None:
     )  # fmt: skip
 
 
-def require_place(path: Path | None, suffixes: tuple[str, ...]) -> None:
+def require_place(path: Path | None, suffixes: tuple[str, ...], *, option: str = "-o") -> None:
     """Refuse an output file that could not be written, before the work is done.
 
     Raises
@@ -126,10 +114,10 @@ def require_place(path: Path | None, suffixes: tuple[str, ...]) -> None:
         return
     if path.suffix.lower() not in suffixes:
         raise SettingError(
-            f"-o {path}: expected a file ending in {', '.join(suffixes)}, received "
+            f"{option} {path}: expected a file ending in {', '.join(suffixes)}, received "
             f"{path.suffix or 'none'!r}"
         )
     if not path.parent.is_dir():
-        raise SettingError(f"-o {path}: the folder {path.parent} does not exist; create it")
+        raise SettingError(f"{option} {path}: the folder {path.parent} does not exist; create it")
     if path.is_dir():
-        raise SettingError(f"-o {path}: expected a file, received a folder")
+        raise SettingError(f"{option} {path}: expected a file, received a folder")

@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .arguments import Commands, add_columns, add_command, add_split, split_at_gaps
+from .arguments import Commands, add_columns, add_command, add_split
 from .data import read_for_model
 from .models import whole
 from .output import print_json
+from .preparation import add_preparation, masked, prepared
 
 CHECK = """\
 The report card of a model on a recording, best one that it was not trained on: errors in free run
@@ -49,6 +50,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--plot", metavar="DIR", type=Path, help="folder for a PNG per question")
     add_columns(parser, from_model=True)
     add_split(parser)
+    add_preparation(parser)
 
 
 def check_command(args: argparse.Namespace) -> None:
@@ -56,7 +58,8 @@ def check_command(args: argparse.Namespace) -> None:
 
     model = load_model(args.model)
     data, _ = read_for_model(args.data, model, args)
-    part = split_at_gaps(data if args.range is None else data.slice(args.range), args)
+    data = masked(data, args)
+    part = prepared(data if args.range is None else data.slice(args.range), args, cut=True)
     training = None
     if args.training is not None:
         training, _ = read_for_model(args.training, model, args)

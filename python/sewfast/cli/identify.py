@@ -14,10 +14,10 @@ from .arguments import (
     add_output,
     add_split,
     require_place,
-    split_at_gaps,
 )
 from .data import read_training, split
 from .output import print_json
+from .preparation import add_preparation, masked, prepared
 from .progress import Progress
 
 if TYPE_CHECKING:
@@ -52,6 +52,9 @@ examples:
   sewfast identify slow.csv:u:y fast.csv:volt:rpm -o drive.json
       two experiments whose columns have different names
 
+  sewfast identify run.csv --input u --output y --mask 700:720 --resample 0.005 -o drive.json
+      two hundredths of a second without weight, a longer sample time; sewfast look says what helps
+
   sewfast identify run.mat --input u --output y --ts 0.02 --model oe -o linear.json
       a file without a time column; linear output error alone
 """
@@ -65,6 +68,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("data", nargs="+", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
     add_columns(parser, from_model=False)
     add_split(parser)
+    add_preparation(parser)
     _add_model(parser)
     parser.add_argument(
         "--train", metavar="A:B",
@@ -103,9 +107,9 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
 
 def identify_command(args: argparse.Namespace) -> int | None:
     require_place(args.out, (".json",))
-    train, held = split(read_training(args), args.train, args.validate)
-    train = split_at_gaps(train, args)
-    held = None if held is None else split_at_gaps(held, args)
+    train, held = split(masked(read_training(args), args), args.train, args.validate)
+    train = prepared(train, args, cut=True)
+    held = None if held is None else prepared(held, args, like=train, cut=True)
     try:
         with Progress("identify") as progress:
             model = _identify(args, train, held, progress)

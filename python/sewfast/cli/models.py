@@ -13,10 +13,10 @@ from .arguments import (
     add_output,
     add_split,
     require_place,
-    split_at_gaps,
 )
 from .data import read_for_model
 from .output import print_json, write_columns
+from .preparation import add_preparation, masked, prepared
 
 if TYPE_CHECKING:
     from ..dataset import Dataset, FloatArray
@@ -58,6 +58,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     _add_model_and_data(parser)
     add_split(parser)
+    add_preparation(parser)
     parser.add_argument(
         "--range", metavar="A:B", help="samples to score, 0-based, end excluded; default: all"
     )
@@ -97,7 +98,8 @@ def validate_command(args: argparse.Namespace) -> None:
 
     model = load_model(args.model)
     data, _ = read_for_model(args.data, model, args)
-    part = split_at_gaps(data if args.range is None else data.slice(args.range), args)
+    data = masked(data, args)
+    part = prepared(data if args.range is None else data.slice(args.range), args, cut=True)
     found = validate(model, part, init=args.init)
     if args.json:
         print_json(found.to_json())

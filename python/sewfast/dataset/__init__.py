@@ -4,15 +4,23 @@ from .arrays import FloatArray
 from .checks import require_dataset
 from .dataset import Dataset
 from .experiment import Experiment
+from .outliers import Outliers
 from .pieces import SHORTEST_PIECE
+from .summary import ColumnSummary, Summary, column_summary
+from .trends import Trend
 from .units import HasUnits, labelled, require_same_units
 
 __all__ = [
     "SHORTEST_PIECE",
+    "ColumnSummary",
     "Dataset",
     "Experiment",
     "FloatArray",
     "HasUnits",
+    "Outliers",
+    "Summary",
+    "Trend",
+    "column_summary",
     "labelled",
     "require_dataset",
     "require_same_units",

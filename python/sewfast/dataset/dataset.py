@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import DataError, SettingError
-from . import checks, gaps, outliers, pieces, rates, trends
+from . import checks, gaps, outliers, pieces, rates, summary, trends
 from .arrays import range_of, texts
 from .experiment import Experiment
 from .units import labelled
@@ -180,6 +180,7 @@ class Dataset:
     restore = trends.restore
     resample = rates.resample
     mark_outliers = outliers.mark_outliers
+    summary = summary.summary
 
     require_inputs = checks.require_inputs
     require_measured = checks.require_measured

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 BoolArray = NDArray[np.bool_]
 
+_ROUNDING = 1e-12
+"""Part of the range below which a deviation is rounding."""
 _ROWS = 200_000
 _SHOWN = 8
 
@@ -82,9 +84,9 @@ def mark_outliers(
     """Marks of outputs that stand out of their neighbours; nothing is changed.
 
     An output is marked where its distance to the median of `window` samples around it is over
-    `threshold` robust standard deviations (Hampel 1974), of the window or of the record's white
-    noise, whichever is larger; the window's slope comes off first. Of white normal noise fewer than
-    one sample in ten million is marked. Runs of up to half a window are found.
+    `threshold` robust standard deviations (Hampel 1974), of the window without its slope or of the
+    record's white noise, whichever is larger. Of white normal noise fewer than one sample in ten
+    million is marked. Runs of up to half a window are found.
 
     Parameters
     ----------
@@ -116,10 +118,10 @@ def mark_outliers(
         raise SettingError(f"window: expected an odd number from 3 to 1001, received {window!r}")
     require_sane(data)
     series = _series(data, model)
-    distances = tuple(_distances(y, int(window)) for y in series)
-    masks = tuple(d > threshold for d in distances)
+    far = tuple(distances(y, int(window)) for y in series)
+    masks = tuple(d > threshold for d in far)
     names, starts = zip(*((e.name, e.start) for e in data.experiments), strict=True)
-    return Outliers(masks, distances, names, starts)
+    return Outliers(masks, far, names, starts)
 
 
 def _series(data: Dataset, model: Model | None) -> list[FloatArray]:
@@ -134,19 +136,29 @@ def _series(data: Dataset, model: Model | None) -> list[FloatArray]:
     return [e.y - run for e, run in zip(data.experiments, runs, strict=True)]
 
 
-def _distances(y: FloatArray, window: int) -> FloatArray:
-    """|y - median of its window| over the larger of the window's and the record's deviation."""
-    half = window // 2
-    noise = np.nan_to_num(white_noise(y))
-    level = max(noise, 0.5 * (quantum(y) or 0.0), np.finfo(np.float64).tiny)
-    rows = np.lib.stride_tricks.sliding_window_view(np.pad(y, half, constant_values=np.nan), window)
+def distances(y: FloatArray, window: int = 7) -> FloatArray:
+    """How far each value stands out of its window, in robust standard deviations.
+
+    The smaller of two: the distance to the window's median over the record's deviation, which a
+    steep but steady window does not raise; the same without the window's slope, over the larger of
+    the window's and the record's deviation, which a spike on a slope does not hide in.
+    """
+    known = y[np.isfinite(y)]
+    if len(known) == 0:
+        return np.full_like(y, np.nan)
+    least = max(_ROUNDING * float(np.ptp(known)), np.finfo(np.float64).tiny)
+    level = max(float(np.nan_to_num(white_noise(y))), 0.5 * (quantum(y) or 0.0), least)
+    padded = np.pad(y, window // 2, constant_values=np.nan)
+    rows = np.lib.stride_tricks.sliding_window_view(padded, window)
     distance = np.empty_like(y)
     for first in range(0, len(y), _ROWS):
         part = slice(first, first + _ROWS)
-        level_rows = _levelled(rows[part], level)
-        median = _medians(level_rows)
-        local = MAD * _medians(np.abs(level_rows - median[:, None]))
-        distance[part] = np.abs(y[part] - median) / np.fmax(local, level)
+        levelled = _levelled(rows[part], level)
+        median = _medians(levelled)
+        local = MAD * _medians(np.abs(levelled - median[:, None]))
+        without_slope = np.abs(y[part] - median) / np.fmax(local, level)
+        plain = np.abs(y[part] - _medians(rows[part])) / level
+        distance[part] = np.minimum(plain, without_slope)
     return distance
 
 

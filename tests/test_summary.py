@@ -1,0 +1,176 @@
+"""What a summary of data says: every number, every piece of advice, `sewfast look`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+import sewfast as api
+from cli import refused, sewfast
+from sewfast.dataset import Dataset
+from sewfast.dataset.advice import nice
+from sewfast.dataset.spectrum import band, power_spectrum
+from sewfast.errors import SettingError
+
+N, TS = 20_000, 1e-3
+T = np.arange(N) * TS
+
+
+def advice(u: Any, y: Any, Ts: float = TS) -> str:
+    return "\n".join(Dataset.from_arrays(u, y, Ts).summary().advice)
+
+
+def excited(seed: int = 0) -> np.ndarray:
+    return np.repeat(np.random.default_rng(seed).standard_normal(N // 10), 10)
+
+
+def test_the_numbers_of_a_column() -> None:
+    random = np.random.default_rng(0)
+    y = 30.0 + 8.0 * np.sin(2 * np.pi * 7.0 * T) + 0.5 * T + 0.1 * random.standard_normal(N)
+    y[100:110] = np.nan
+    y[500] = np.nan
+    u = np.round(5.0 * np.sin(2 * np.pi * 3.0 * T)) * 0.25
+    found = Dataset.from_arrays(u, y, TS, output_name="speed", output_unit="RPM").summary()
+    uc, yc = found.columns
+    assert (yc.n, yc.missing, yc.gaps, yc.longest_gap) == (N, 11, 2, 10)
+    assert yc.low == np.nanmin(y)
+    assert yc.mean == pytest.approx(np.nanmean(y))
+    assert yc.std == pytest.approx(np.nanstd(y))
+    # the line of seven whole waves in a second is 0.5 a second, but for the waves' own share
+    assert yc.trend == pytest.approx(0.5 * 20, abs=0.2)
+    assert yc.quantum is None
+    assert uc.quantum == pytest.approx(0.25, rel=1e-9)
+    # 20,000 third differences fix the noise to about a percent
+    assert yc.noise == pytest.approx(0.1, rel=0.05)
+    assert yc.band is not None
+    assert yc.band[0] <= 7.0 <= yc.band[1] < 8.0
+    assert uc.at_high == pytest.approx(np.mean(u == u.max()), abs=1e-12)
+    assert "output speed [RPM]" in str(found)
+    assert found.to_json()["columns"][1]["missing"] == 11
+    json.dumps(found.to_json(), allow_nan=False)
+
+
+def test_the_spectrum_holds_the_power() -> None:
+    wave = 3.0 * np.sin(2 * np.pi * 50.0 * T)
+    frequency, power = power_spectrum([wave, wave[:5000]], TS)
+    assert power.sum() * (frequency[1] - frequency[0]) == pytest.approx(4.5, rel=0.01)
+    assert band(frequency, power) == pytest.approx((50.0, 50.0), abs=0.5)
+    white = np.random.default_rng(0).standard_normal(N)
+    low, high = band(*power_spectrum([white], TS)) or (0.0, 0.0)
+    assert (low, high) == pytest.approx((25.0, 475.0), abs=10.0)
+    assert len(power_spectrum([wave[:31]], TS)[0]) == 0
+
+
+@pytest.mark.parametrize(
+    ("u", "y", "words"),
+    [
+        (np.where(T[7] == T, np.nan, excited()), excited(1), "u is not known at 1 samples"),
+        (excited(), np.where(T < 1.0, np.nan, excited(1)), "not measured at 1000 samples (5.0%)"),
+        (excited(), np.full(N, np.nan), "nothing is known of y"),
+        (np.ones(N), excited(1), "u is constant at 1"),
+        (excited(), np.minimum(excited(1), 0.5), "y stays at 0.5 for 3"),
+        (excited(), np.random.default_rng(0).standard_normal(N), "of what y does: excite"),
+        (excited(), np.sin(T), "data.resample"),
+        (excited(), np.where(T[7] == T, np.inf, excited(1)), "1 values of y are infinite"),
+        (excited(), np.sin(9 * T) + 5.0 * (T[777] == T), "1 values of y stand out"),
+        (excited()[:300], excited(1)[:300], "300 samples are few"),
+        (excited(), np.sin(2 * np.pi * 300 * T), "close to half the sampling rate"),
+    ],
+)
+def test_each_finding_has_its_advice(u: Any, y: Any, words: str) -> None:
+    assert words in advice(u, y)
+
+
+def test_good_data_need_no_advice() -> None:
+    u = excited()
+    y = np.convolve(u, np.exp(-np.arange(100) / 20), "full")[:N]
+    y += 0.02 * np.random.default_rng(3).standard_normal(N)
+    assert advice(u, y) == ""
+    assert "nothing stands in the way" in str(Dataset.from_arrays(u, y, TS).summary())
+
+
+def test_round_numbers() -> None:
+    assert [nice(v) for v in (0.0199, 0.02, 7.0, 1.0)] == [0.01, 0.02, 5.0, 1.0]
+
+
+values = st.floats(width=64) | st.sampled_from([0.0, 1.0, np.nan, np.inf, 1e308, -1e308, 5e-324])
+
+
+@settings(deadline=None, max_examples=150)
+@given(st.data(), st.integers(1, 80), st.integers(1, 2))
+def test_a_summary_of_anything(draw: st.DataObject, n: int, inputs: int) -> None:
+    u = draw.draw(hnp.arrays(np.float64, (n, inputs), elements=values))
+    y = draw.draw(hnp.arrays(np.float64, n, elements=values))
+    found = Dataset.from_arrays(u, y, 0.01).summary()
+    assert len(found.columns) == inputs + 1
+    assert str(found)
+    json.dumps(found.to_json(), allow_nan=False)
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    u = excited()[:2000]
+    y = np.convolve(u, np.exp(-np.arange(100) / 20), "full")[:2000]
+    y[300:350] = np.nan
+    y[700] += 500.0
+    u[900:905] = np.nan
+    columns = {"t": T[:2000], "u": u, "speed": y}
+    api.write_table(tmp_path / "run.csv", columns, units={"t": "s", "u": "V", "speed": "RPM"})
+    return tmp_path
+
+
+def test_look_lists_columns_then_says_what_is_in_them(folder: Path) -> None:
+    listed = sewfast(folder, "look", "run.csv").out
+    assert "speed [RPM]" in listed
+    assert "--input COL --output COL" in listed
+    text = sewfast(folder, "look", "run.csv:u:speed").out
+    assert "50 in 1 gaps" in text
+    assert "1 values of speed stand out" in text
+    assert "--hold-inputs" in text
+    found = json.loads(
+        sewfast(folder, "look", "run.csv", "--input", "u", "--output", "speed", "--json").out
+    )
+    assert found["columns"][0]["missing"] == 5
+    assert found["outliers"] == 1
+    assert (
+        json.loads(sewfast(folder, "look", "run.csv", "--json").out)["run.csv"][2]["name"]
+        == "speed"
+    )
+
+
+def test_look_draws(folder: Path) -> None:
+    pytest.importorskip("matplotlib")
+    printed = sewfast(folder, "look", "run.csv:u:speed", "--plot", "look.png").out
+    assert "written to look.png" in printed
+    assert (folder / "look.png").read_bytes().startswith(b"\x89PNG")
+    assert ".png" in refused(folder, "look", "run.csv:u:speed", "--plot", "look.doc")
+    assert "which column" in refused(folder, "look", "run.csv", "--plot", "look.png")
+    with pytest.raises(SettingError, match="folder that exists"):
+        Dataset.from_arrays(T, T, TS).summary().plot(folder / "nowhere" / "look.png")
+
+
+def test_a_model_from_prepared_data(folder: Path) -> None:
+    options = ("--hold-inputs", "--mask", "700:701", "--resample", "0.002", "--model", "arx")
+    options += ("--train", "0:1500", "--validate", "1500:2000", "--detrend", "0")
+    done = sewfast(folder, "identify", "run.csv:u:speed", *options, "-o", "m.json")
+    model = api.load_model(folder / "m.json")
+    assert model.Ts == 0.002
+    told = "\n".join(model.training["preparation"])
+    for words in ("1 outputs masked", "held", "resampled from", "mean of all experiments taken"):
+        assert words in told
+        assert words in done.err
+    assert model.training["samples"] == 750
+    options = ("--hold-inputs", "--resample", "0.002")
+    assert "m.json" not in sewfast(folder, "validate", "m.json", "run.csv", *options).err
+    assert "sample 900" in refused(folder, "identify", "run.csv:u:speed", "-o", "x.json")
+    assert "0.001" in refused(folder, "validate", "m.json", "run.csv", "--hold-inputs")
