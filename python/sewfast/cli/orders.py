@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from .arguments import Commands, add_columns, add_command, add_split, split_at_gaps
+from .arguments import Commands, add_columns, add_command, add_split
 from .data import read_training
 from .output import print_json
+from .preparation import add_preparation, prepared
 from .progress import Progress
 
 TEXT = """\
@@ -35,6 +36,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("data", nargs="+", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
     add_columns(parser, from_model=False)
     add_split(parser)
+    add_preparation(parser)
     parser.add_argument("--na", type=int, default=4, metavar="N", help="past outputs up to (4)")
     parser.add_argument("--nb", type=int, default=4, metavar="N", help="past inputs up to (4)")
     parser.add_argument(
@@ -49,7 +51,7 @@ def add(commands: Commands) -> None:
 def orders_command(args: argparse.Namespace) -> None:
     from ..order_table import orders
 
-    data = split_at_gaps(read_training(args), args)
+    data = prepared(read_training(args), args)
     with Progress("orders") as progress:
         table = orders(
             data,
