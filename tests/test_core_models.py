@@ -189,7 +189,7 @@ def test_a_state_estimated_from_the_first_samples_continues_the_run() -> None:
 def test_hostile_data_is_refused_or_fitted_never_worse(
     u: np.ndarray, y: np.ndarray, na: int, nb: int, nk: int
 ) -> None:
-    for fit in (_core.fit_arx, _core.fit_oe):
+    for fit in (_core.fit_arx, _core.fit_iv, _core.fit_oe):
         with contextlib.suppress(DataError, SettingError, FitError):
             result = fit([(u, y)], na=na, nb=nb, nk=nk, offset=True)
             model = getattr(result, "model", result)

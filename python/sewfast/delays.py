@@ -20,6 +20,8 @@ ORDER = 4
 REFINED = 2
 """Past outputs and inputs of the models whose free runs are compared; more could feign a delay."""
 ITERATIONS = 6
+SMOOTH = 2000
+"""Lags over which a residual may correlate with itself."""
 WHITENING = 20
 """Order of the autoregression that makes an input white."""
 
@@ -35,7 +37,7 @@ class InputDelay:
         Delay of the model with the lowest cost in free run [samples].
     low, high : int
         The plausible delays lie between: their likelihood is at least `1 - confidence` of the best
-        one's.
+        one's, where as many samples count as the residual has independent ones.
     first_correlated : int or None
         First lag at which input and output, both filtered to make the input white, correlate beyond
         chance; None: at none.
@@ -117,7 +119,9 @@ def delay(
 
     Free run: models with two past outputs and two past inputs from `nk` on are fitted by
     instrumental variables for every `nk`, the other inputs at their own best delays. The likelihood
-    of a delay relative to the best one is `(cost_best / cost)^(N/2)`.
+    of a delay relative to the best one is `(cost_best / cost)^(N/2)`, with `N` the number of
+    samples over the sum of the squared residual autocorrelations: a drive that is not linear leaves
+    a smooth residual, which says less than its length.
 
     One step: the same for ARX models of order 4, which cost next to nothing; at a high sampling
     rate noise makes them late, so they are the start only.
@@ -170,8 +174,10 @@ def delay(
         for j in range(data.n_inputs):
             costs.append(_free_run_costs(data, j, lags, best))
             best[j] = lags[int(np.argmin(costs[j]))]
+    samples = _independent_samples(data, best)
     found = tuple(
-        _of_input(data, j, lags, confidence, costs[j], one_step[j]) for j in range(data.n_inputs)
+        _of_input(data, j, lags, confidence, samples, costs[j], one_step[j])
+        for j in range(data.n_inputs)
     )
     return DelayEstimate(min(i.nk for i in found), found, data.Ts, confidence)
 
@@ -221,6 +227,43 @@ def _free_run_costs(data: Dataset, j: int, lags: range, best: list[int]) -> Floa
     return np.array(costs)
 
 
+def _refined(data: Dataset, delays: list[int]) -> _core.LinearFit:
+    """The second-order model with these delays."""
+    arrays = [(_delayed(e.u, delays), e.y) for e in data.experiments]
+    fit = _core.fit_iv(arrays, na=REFINED, nb=REFINED, nk=1, max_iterations=ITERATIONS)
+    if fit.termination == "interrupted":
+        raise KeyboardInterrupt
+    return fit
+
+
+def _independent_samples(data: Dataset, delays: list[int]) -> float:
+    """Samples over the sum of the residual's squared autocorrelations (Bartlett)."""
+    fit = _refined(data, delays)
+    products, samples = np.zeros(1), 0
+    for e, state in zip(data.experiments, fit.initial_states, strict=True):
+        first = int(np.argmax(np.isfinite(e.y)))
+        error = e.y[first:] - fit.model.simulate(_delayed(e.u, delays)[first:], state)
+        error = np.where(np.isfinite(error), error - np.nanmean(error), 0.0)
+        power = np.abs(np.fft.rfft(error, 2 * len(error))) ** 2
+        found = np.fft.irfft(power)[: min(len(error) // 4 + 1, SMOOTH)]
+        products = _sum(products, found)
+        samples += int(np.isfinite(e.y).sum())
+    if products[0] <= 0.0:
+        return float(samples)
+    squares = (products[1:] / products[0]) ** 2
+    # those of a white residual have the mean 1/N
+    excess = float(squares.sum()) - len(squares) / samples
+    return samples / (1.0 + 2.0 * max(excess, 0.0))
+
+
+def _sum(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Of two series that start together and need not end together."""
+    total = np.zeros(max(len(one), len(other)))
+    total[: len(one)] += one
+    total[: len(other)] += other
+    return total
+
+
 def _delayed(u: FloatArray, delays: list[int]) -> FloatArray:
     """Inputs delayed by one sample less than `delays`, held at their first values."""
     k = np.arange(len(u))
@@ -233,13 +276,14 @@ def _of_input(
     j: int,
     lags: range,
     confidence: float,
+    independent: float,
     cost: FloatArray,
     one_step_cost: FloatArray,
 ) -> InputDelay:
     measured = np.concatenate([e.y[np.isfinite(e.y)] for e in data.experiments])
     # rounding: a clean record has costs of nearly zero, whose ratios mean nothing
     floor = 1e-16 * float(np.var(measured))
-    deviance = len(measured) * np.log((cost + floor) / (cost.min() + floor))
+    deviance = independent * np.log((cost + floor) / (cost.min() + floor))
     plausible = np.flatnonzero(deviance <= -2.0 * math.log(1.0 - confidence))
     correlation, samples = _prewhitened_correlation(data, j, lags)
     # each of L lags is judged at the level that all together keep (Sidak)

@@ -191,8 +191,8 @@ def orders(
     Notes
     -----
     The choice is the structure with the fewest parameters whose free-run error on later data is
-    within 0.5 % of the lowest, or above it by no more than one standard error of the difference
-    over ten blocks (the one-standard-error rule: Hastie, Tibshirani, Friedman 2009, section 7.10).
+    within 0.5 % of the lowest, or above it by no more than two standard errors of the difference
+    over ten blocks (compare the one-standard-error rule: Hastie, Tibshirani, Friedman 2009, 7.10).
     Errors below 0.1 % of the output's standard deviation count as none.
     Information criteria judge one-step errors, which at a high sampling rate hardly depend on the
     model; they are there to compare.
@@ -388,9 +388,9 @@ def _chosen(rows: list[Structure], errors: list[FloatArray], exact: float) -> tu
 
 
 def _is_not_worse(errors: FloatArray, least: FloatArray) -> bool:
-    """By one standard error of the difference over the blocks."""
+    """By two standard errors of the difference over the blocks."""
     n = len(least)
     if n < 3 or len(errors) != n or not np.isfinite(errors).all():
         return False
     difference = errors - least
-    return float(difference.mean()) <= float(difference.std(ddof=1)) / math.sqrt(n)
+    return float(difference.mean()) <= 2.0 * float(difference.std(ddof=1)) / math.sqrt(n)
