@@ -174,3 +174,13 @@ def test_a_model_from_prepared_data(folder: Path) -> None:
     assert "m.json" not in sewfast(folder, "validate", "m.json", "run.csv", *options).err
     assert "sample 900" in refused(folder, "identify", "run.csv:u:speed", "-o", "x.json")
     assert "0.001" in refused(folder, "validate", "m.json", "run.csv", "--hold-inputs")
+
+
+def test_simulate_holds_inputs(folder: Path) -> None:
+    sewfast(
+        folder, "identify", "run.csv:u:speed", "--hold-inputs", "--model", "arx", "-o", "m.json"
+    )
+    assert "sample 900" in refused(folder, "simulate", "m.json", "run.csv", "-o", "p.csv")
+    done = sewfast(folder, "simulate", "m.json", "run.csv", "--hold-inputs", "-o", "p.csv")
+    assert "held" in done.err
+    assert len(api.read_table(folder / "p.csv")["y_hat"]) == 2000

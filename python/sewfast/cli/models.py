@@ -16,7 +16,7 @@ from .arguments import (
 )
 from .data import read_for_model
 from .output import print_json, write_columns
-from .preparation import add_preparation, masked, prepared
+from .preparation import add_hold, add_preparation, held, masked, prepared
 
 if TYPE_CHECKING:
     from ..dataset import Dataset, FloatArray
@@ -67,6 +67,7 @@ def add(commands: Commands) -> None:
         summary="free run of a model", text=SIMULATE, examples=SIMULATE_EXAMPLES,
     )  # fmt: skip
     _add_model_and_data(parser)
+    add_hold(parser)
     add_output(parser, "OUT", "CSV, .npz, .mat or Parquet; default: CSV to standard output")
 
 
@@ -113,6 +114,7 @@ def simulate_command(args: argparse.Namespace) -> None:
     require_place(args.out, TABLES)
     model = load_model(args.model)
     data, table = read_for_model(args.data, model, args, needs_output=args.init > 0)
+    data = held(data, args)
     (y_hat,) = model.simulate(data, init=args.init)
     columns = {"t": _time(table, data), **_inputs(data), "y_hat": y_hat}
     low, high = float(y_hat.min()), float(y_hat.max())

@@ -17,10 +17,7 @@ def add_preparation(parser: argparse.ArgumentParser, *, detrend: bool = True) ->
         "--mask", action="append", metavar="A:B", default=[],
         help="outputs of each file to take out: no weight, no score; repeat it for several ranges",
     )  # fmt: skip
-    group.add_argument(
-        "--hold-inputs", action="store_true",
-        help="take an input that is missing to be the last known one, held",
-    )  # fmt: skip
+    add_hold(group)
     group.add_argument(
         "--resample", type=float, metavar="TS",
         help="new sample time [s]; the output is filtered, inputs are averaged as held ones",
@@ -30,6 +27,21 @@ def add_preparation(parser: argparse.ArgumentParser, *, detrend: bool = True) ->
             "--detrend", choices=("0", "1", "steady"),
             help="take off 0: the mean, 1: a straight line, steady: the level before inputs move",
         )  # fmt: skip
+
+
+def add_hold(parser: argparse._ActionsContainer) -> None:
+    parser.add_argument(
+        "--hold-inputs", action="store_true",
+        help="take an input that is missing to be the last known one, held",
+    )  # fmt: skip
+
+
+def held(data: Dataset, args: argparse.Namespace) -> Dataset:
+    """The data with missing inputs held, where that is asked for."""
+    before = len(data.notes)
+    data = data.fill_inputs("hold") if args.hold_inputs else data
+    _tell(data, before)
+    return data
 
 
 def masked(data: Dataset, args: argparse.Namespace) -> Dataset:
@@ -54,9 +66,8 @@ def prepared(
         The data were cut out of masked files already: leaves the mask out.
     """
     data = data if cut else masked(data, args)
+    data = held(data, args)
     before = len(data.notes)
-    if args.hold_inputs:
-        data = data.fill_inputs("hold")
     if getattr(args, "split_at_gaps", False):
         data = data.split_at_gaps()
     if args.resample is not None:
