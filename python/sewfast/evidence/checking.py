@@ -16,7 +16,7 @@ from . import questions
 from .card import Line, ReportCard
 from .criteria import Criteria
 from .operating import OperatingRange, operating_range
-from .parameters import Parameters, estimate
+from .parameters import Knowledge, Parameters, estimate
 from .portmanteau import LAGS, residual_tests
 from .region import Place, placed, training_region
 from .residuals import Residuals, representative
@@ -128,7 +128,7 @@ def remembered(model: Model, data: Dataset) -> Model:
 
 
 def training_evidence(model: Model, data: Dataset) -> dict[str, Any]:
-    """What a model should store of its training data: `region` and `uncertainty`, JSON values.
+    """What a model should store: `region`, `uncertainty`, `information`, JSON values.
 
     Parameters
     ----------
@@ -145,6 +145,10 @@ def training_evidence(model: Model, data: Dataset) -> dict[str, Any]:
     try:
         found["region"] = training_region(model, data)
         found["uncertainty"] = uncertainty(model, data).to_json()
+        residuals = Residuals.of(model, data)
+        known = None if getattr(model, "members", ()) else estimate(model, residuals)
+        if known is not None:
+            found["information"] = Knowledge.of(known, residuals.n).to_json()
     except (SewfastError, np.linalg.LinAlgError):
         return found
     return found
@@ -167,20 +171,22 @@ def _training_scores(model: Model, training: Dataset, init: int) -> Scores:
 def _parameters(
     model: Model, data: Dataset, training: Dataset | None, on_training: bool, init: int
 ) -> tuple[Parameters | None, Criteria | None, list[Line]]:
-    """Parameters and criteria from the training data where they are known, else from the data."""
+    """Parameters and criteria from the training data if at hand, else what is stored."""
+    source = training if training is not None else data if on_training else None
     if getattr(model, "members", ()):
         return None, None, []
-    source = training if training is not None else data
+    if source is None:
+        known = Knowledge.stored(model)
+        return None, None, questions.parameters(known) if known is not None else []
     residuals = Residuals.of(model, source, init)
     found = estimate(model, residuals)
     if found is None:
         return None, None, []
-    lines = questions.parameters(found, residuals.n)
-    if training is None and not on_training:
-        return found, None, lines
     squares = questions.residuals_power(residuals) * residuals.n
     criteria = Criteria.of(squares, residuals.n, found.effective)
-    return found, criteria, [*lines, questions.information(criteria, residuals.unit)]
+    lines = questions.parameters(Knowledge.of(found, residuals.n))
+    lines += [questions.looseness(found), questions.information(criteria, residuals.unit)]
+    return found, criteria, lines
 
 
 def _bands(

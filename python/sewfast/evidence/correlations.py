@@ -1,10 +1,12 @@
 """`ResidualTest`: a set of correlations under one verdict.
 
-The statistic is r'(Z'RZ)^+ r with r = Z'e, one column of Z per lag. R is the covariance matrix of
-the residual, coloured as it is (Bartlett's formula, with an autoregression for R), and Z is first
-freed of what a change of the parameters could have done to e: then it is chi-square whether the
-parameters were estimated on these data or on others (Ljung 1999, sections 16.5 and 16.6; Breusch
-and Godfrey 1978).
+The statistic is r'(Z'RZ)^+ r with r = Z'e, one column of Z per lag, R the covariance matrix of e.
+Z is first freed of what a change of the parameters could have done to e: then it is chi-square
+whether the parameters were estimated on these data or on others (Ljung 1999, sections 16.5 and
+16.6; Breusch and Godfrey 1978). Correlations and their limits are of the residual as it is,
+coloured (Bartlett's formula, with an autoregression for R). The statistic is that of the whitened
+residual and Z, where R is diagonal: a strongly coloured residual knows its own R too badly for 25
+sums at once.
 """
 
 from __future__ import annotations
@@ -141,12 +143,17 @@ def verdict(
     series: tuple[str, ...],
     sums: Sums,
     judges: bool,
+    decides: Sums | None = None,
 ) -> ResidualTest:
-    """The test that the sums make; they are in the order of the series, then of the lags."""
+    """The test that the sums make; they are in the order of the series, then of the lags.
+
+    With `decides` the statistic is of those sums, and `sums` give the correlations alone.
+    """
     shape = (len(series), len(lags))
     spread = np.sqrt(np.maximum(np.diag(sums.covariance), 0.0))
-    statistic, freedom = quadratic(sums.values, sums.covariance, sums.reference)
-    statistic = _likelihood_ratio(statistic, freedom, sums.room)
+    told = decides or sums
+    statistic, freedom = quadratic(told.values, told.covariance, told.reference)
+    statistic = _likelihood_ratio(statistic, freedom, told.room)
     return ResidualTest(
         name,
         title,

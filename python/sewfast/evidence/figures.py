@@ -150,6 +150,7 @@ def bode_figure(card: ReportCard) -> Figure:
     hertz = o.frequencies
     for i in range(width):
         here = [k for k, j in enumerate(o.varied) if j == i]
+        here = [k for k in here if o.points[k].known] or here
         shown = here[:: max(1, (len(here) - 1) // 4)]
         for n, k in enumerate(shown):
             look = {
@@ -158,9 +159,11 @@ def bode_figure(card: ReportCard) -> Figure:
                 "ls": _STYLES[n % len(_STYLES)],
             }
             g = o.points[k].response(hertz)[:, i]
+            if not np.abs(g).any():
+                continue
             value = labelled(f"{o.points[k].u[i]:.3g}", o.input_units[i])
             label = f"{o.input_names[i]} = {value}".replace("[", "").replace("]", "")
-            axes[0, i].loglog(hertz, np.maximum(np.abs(g), 1e-300), label=label, **look)
+            axes[0, i].loglog(hertz, np.abs(g), label=label, **look)
             axes[1, i].semilogx(hertz, np.degrees(np.unwrap(np.angle(g))), **look)
             _member_bands(axes[:, i], o.members, k, i, hertz, look["color"])
         gain = f"{o.output_unit or '1'}/{o.input_units[i] or '1'}"
@@ -197,14 +200,17 @@ def pole_figure(card: ReportCard) -> Figure:
     plane.plot(np.cos(angle), np.sin(angle), color="#777777", lw=0.9)
     _member_poles(plane, o.members, here)
     for n, p in enumerate(points):
+        if not p.known:
+            continue
         plane.plot(p.poles.real, p.poles.imag, "x", color=_shade(n, len(points)), ms=6, mew=1.6)
     plane.set_aspect("equal", "datalim")
     plane.set_xlabel("real part of z")
     plane.set_ylabel("imaginary part of z")
     plane.set_title("poles; dark: low input, light: high input")
+    steady_note = "steady output; filled: in the training data"
     label = labelled(o.input_names[0], o.input_units[0])
     rows = (
-        (steady, "steady output", lambda p: p.y, labelled(o.output_name, o.output_unit)),
+        (steady, steady_note, lambda p: p.y, labelled(o.output_name, o.output_unit)),
         (gain, "steady gain", lambda p: float(p.dc_gain[0]),
          f"gain [{o.output_unit or '1'}/{o.input_units[0] or '1'}]"),
         (slow, "slowest time constant", lambda p: float(p.time_constants.max(initial=0.0)),
@@ -215,7 +221,9 @@ def pole_figure(card: ReportCard) -> Figure:
             all_values = np.array([[value(m[k]) for k in here] for m in o.members])
             low, high = all_values.min(axis=0), all_values.max(axis=0)
             ax.fill_between(u, low, high, color="#999999", alpha=0.35, lw=0)
-        ax.plot(u, [value(p) for p in points], "o-", ms=3.5, color="#0072B2", lw=1.2)
+        ax.plot(u, [value(p) for p in points], "o-", ms=4.5, color="#0072B2", lw=1.2, mfc="white")
+        near = [k for k, p in enumerate(points) if p.known]
+        ax.plot(u[near], [value(points[k]) for k in near], "o", ms=4.5, color="#0072B2")
         ax.set_title(title)
         ax.set_xlabel(label)
         ax.set_ylabel(unit)

@@ -14,9 +14,13 @@ from ..dataset import FloatArray
 from ..errors import DataError, SettingError
 from ..models.base import Model
 from .linearised import Linearised, linearise
+from .region import Region, stored_region
+from .residuals import representative
 
 POINTS = 9
 FREQUENCIES = 120
+_CLOSING = 3
+"""Rounds in which the range of an input closes in on what the training data came near."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +40,8 @@ class OperatingPoint:
         of a long run (an integrator's drifts).
     saturated : bool
         Whether the output is on a limit: nothing passes through there.
+    known : bool
+        Whether the training data came near it; so too where the model does not store its region.
     Ts : float
         Sample time [s].
     """
@@ -49,6 +55,7 @@ class OperatingPoint:
     delay: int
     settled: bool
     saturated: bool
+    known: bool
     Ts: float
 
     @property
@@ -145,6 +152,7 @@ class OperatingPoint:
             "bandwidth_hz": _finite([self.bandwidth(i) for i in range(len(self.u))]),
             "settled": self.settled,
             "saturated": self.saturated,
+            "known": self.known,
         }
 
 
@@ -212,16 +220,23 @@ def operating_range(
     DataError
         Where the model does not store the range of its training inputs and none are given.
     """
-    grid, varied = _grid(model, points) if inputs is None else _given(model, inputs)
+    region = stored_region(model)
+    first = representative(model)
+    if inputs is None:
+        grid, varied = _grid(first, points, region)
+    else:
+        grid, varied = _given(model, inputs)
     members = tuple(getattr(model, "members", ())) or (model,)
-    found = tuple(tuple(_points(m, grid)) for m in members)
+    found = tuple(tuple(_points(m, grid, region)) for m in members)
     return OperatingRange(
         found[0], varied, found if len(found) > 1 else (), model.input_names, model.input_units,
         model.output_name, model.output_unit, model.Ts,
     )  # fmt: skip
 
 
-def _grid(model: Model, points: int) -> tuple[list[FloatArray], tuple[int, ...]]:
+def _grid(
+    model: Model, points: int, region: Region | None
+) -> tuple[list[FloatArray], tuple[int, ...]]:
     ranges = model.training.get("input_range")
     if not ranges:
         raise DataError(
@@ -229,15 +244,32 @@ def _grid(model: Model, points: int) -> tuple[list[FloatArray], tuple[int, ...]]
             "received one without; give the operating points (inputs=...)"
         )
     limits = np.array(ranges, dtype=np.float64)
-    middle = limits.mean(axis=1)
-    grid, varied = [], []
-    for i, (low, high) in enumerate(limits):
-        for value in np.linspace(low, high, points):
-            u = middle.copy()
-            u[i] = value
-            grid.append(u)
-            varied.append(i)
-    return grid, tuple(varied)
+    grid: list[FloatArray] = []
+    for i in range(len(limits)):
+        grid += _closed_in(model, limits, i, points, region)
+    return grid, tuple(i for i in range(len(limits)) for _ in range(points))
+
+
+def _closed_in(
+    model: Model, limits: FloatArray, i: int, points: int, region: Region | None
+) -> list[FloatArray]:
+    """Values of input i over what the data came near: a pulse's height was never held for long."""
+    low, high = limits[i]
+    for _ in range(_CLOSING):
+        line = _line(limits, i, low, high, points)
+        known = [k for k, p in enumerate(_points(model, line, region)) if p.known]
+        if not known or len(known) > 0.7 * points:
+            break
+        low = line[max(known[0] - 1, 0)][i]
+        high = line[min(known[-1] + 1, points - 1)][i]
+    return _line(limits, i, low, high, points)
+
+
+def _line(limits: FloatArray, i: int, low: float, high: float, points: int) -> list[FloatArray]:
+    """Input i from low to high, the others at their middles."""
+    grid = np.tile(limits.mean(axis=1), (points, 1))
+    grid[:, i] = np.linspace(low, high, points)
+    return list(grid)
 
 
 def _given(model: Model, inputs: Sequence[FloatArray]) -> tuple[list[FloatArray], tuple[int, ...]]:
@@ -251,7 +283,9 @@ def _given(model: Model, inputs: Sequence[FloatArray]) -> tuple[list[FloatArray]
     return grid, (0,) * len(grid)
 
 
-def _points(model: Model, grid: Sequence[FloatArray]) -> list[OperatingPoint]:
+def _points(
+    model: Model, grid: Sequence[FloatArray], region: Region | None
+) -> list[OperatingPoint]:
     found, state = [], None
     for u in grid:
         small: Linearised = linearise(model.core, u, state)
@@ -267,14 +301,30 @@ def _points(model: Model, grid: Sequence[FloatArray]) -> list[OperatingPoint]:
                 small.delay,
                 small.settled,
                 small.saturated,
+                _is_known(model, u, small, region),
                 model.Ts,
             )
         )
     return found
 
 
+def _is_known(model: Model, u: FloatArray, small: Linearised, region: Region | None) -> bool:
+    """Whether the point lies in the training region: a constant input may never have been held."""
+    if region is None:
+        return True
+    if "na" in model.orders:
+        y = np.full(model.orders["na"], small.y)
+        place = np.concatenate([y, np.tile(u, model.orders["nb"])])
+    else:
+        place = np.concatenate([small.state, u])
+    if len(place) != len(region.mean) or not np.isfinite(place).all():
+        return len(place) != len(region.mean)
+    return bool(region.distance(place[None])[0] <= region.radius)
+
+
 def _row(p: OperatingPoint, i: int) -> list[str]:
-    note = "" if p.settled else "no equilibrium"
+    note = "" if p.known else "not in the training data"
+    note = note if p.settled else "no equilibrium"
     note = "saturated" if p.saturated else note
     note = note if p.is_stable else "unstable"
     numbers = [p.dc_gain[i], float(p.time_constants.max(initial=0.0)), p.bandwidth(i)]

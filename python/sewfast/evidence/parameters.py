@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -101,6 +103,55 @@ class Information:
         return float(condition), lost
 
 
+@dataclass(frozen=True)
+class Knowledge:
+    """What stays with a model of how well its training data determine it.
+
+    Attributes
+    ----------
+    number, samples : int
+        Parameters and samples.
+    effective, condition : float
+    undetermined : int
+        As for `Parameters`.
+    """
+
+    number: int
+    samples: int
+    effective: float
+    condition: float
+    undetermined: int
+
+    @classmethod
+    def of(cls, p: Parameters, samples: int) -> Knowledge:
+        return cls(len(p.values), samples, p.effective, p.condition, p.undetermined)
+
+    def to_json(self) -> dict[str, float | None]:
+        """As JSON values: None for a condition that is infinite."""
+        return {k: v if np.isfinite(v) else None for k, v in asdict(self).items()}
+
+    @classmethod
+    def stored(cls, model: Model) -> Knowledge | None:
+        """What the model stores; None where there is nothing that can be read."""
+        values = model.training.get("information")
+        if not isinstance(values, Mapping):
+            return None
+        try:
+            number, samples, undetermined = (
+                int(values[k]) for k in ("number", "samples", "undetermined")
+            )
+            condition = values["condition"]
+            return cls(
+                number,
+                samples,
+                float(values["effective"]),
+                math.inf if condition is None else float(condition),
+                undetermined,
+            )
+        except (KeyError, TypeError, ValueError):
+            return None
+
+
 def estimate(model: Model, residuals: Residuals) -> Parameters | None:
     """What the data say of a model's parameters; None where the model has no sensitivities."""
     if residuals.width == 0:
@@ -141,7 +192,16 @@ def _network_decay(model: Model) -> tuple[FloatArray, float]:
     return np.concatenate([*parts, np.zeros(rest)]), float(s["y_scale"])
 
 
-_DECAYED = {"neural_oe": _network_decay}
+def _state_space_decay(model: Model) -> tuple[FloatArray, float]:
+    s = model.core.settings
+    nx, nu, ny, hidden = s["nx"], s["n_inputs"], s["n_outputs"], s["hidden"]
+    parts = [(nx * (nx + nu), 0.0), (nx * hidden, 1.0), (hidden * (nx + nu), 1.0), (hidden, 0.1)]
+    parts += [(ny * (nx + nu + 1), 0.0), (ny * hidden, 1.0)]
+    share = np.concatenate([np.full(size, weight) for size, weight in parts])
+    return share, float(s["y_scale"][0])
+
+
+_DECAYED = {"neural_oe": _network_decay, "neural_ss": _state_space_decay}
 
 
 def _meat(residuals: Residuals, noise: Noise) -> FloatArray:

@@ -86,6 +86,7 @@ class _Setting:
     noise: Noise
     directions: _Columns
     white: _Columns
+    white_directions: _Columns
     known: list[NDArray[np.bool_]]
     memory: int
 
@@ -97,8 +98,9 @@ class _Setting:
         noise = residuals.noise(spent=directions[0].shape[1])
         errors = residuals.errors
         known = [noise.whole(r.counts) for r in residuals.runs]
-        white = _innovations(errors, directions, known, noise)
-        return cls(residuals, errors, noise, directions, white, known, memory)
+        basis = _whitened_basis(directions, known, noise)
+        white = _innovations(errors, basis, known, noise)
+        return cls(residuals, errors, noise, directions, white, basis, known, memory)
 
     @property
     def runs(self) -> tuple[Run, ...]:
@@ -125,8 +127,15 @@ class _Setting:
         return _about_mean_of_columns([of(r.u) for r in self.runs])
 
 
+def _whitened_basis(columns: _Columns, known: list[NDArray[np.bool_]], noise: Noise) -> _Columns:
+    """An orthonormal basis of the whitened columns, over samples whose past is known."""
+    return independent_directions(
+        [noise.whitened(c) * k[:, None] for c, k in zip(columns, known, strict=True)]
+    )
+
+
 def _innovations(
-    errors: _Columns, directions: _Columns, known: list[NDArray[np.bool_]], noise: Noise
+    errors: _Columns, basis: _Columns, known: list[NDArray[np.bool_]], noise: Noise
 ) -> _Columns:
     """Whitened residuals, less what better parameters would take of them.
 
@@ -136,11 +145,31 @@ def _innovations(
         np.where(k, noise.whitened(e[:, None])[:, 0], 0.0)
         for e, k in zip(errors, known, strict=True)
     ]
-    basis = independent_directions(
-        [noise.whitened(d) * k[:, None] for d, k in zip(directions, known, strict=True)]
-    )
     taken = np.sum([d.T @ w for d, w in zip(basis, white, strict=True)], axis=0)
     return [w - d @ taken for d, w in zip(basis, white, strict=True)]
+
+
+def _linear(
+    s: _Setting,
+    name: str,
+    title: str,
+    lags: _Lags,
+    series: tuple[str, ...],
+    instruments: _Columns,
+    directions: _Columns | None = None,
+    judges: bool = True,
+) -> ResidualTest:
+    """The residual with columns that hold no noise; shown as it is, decided on whitened."""
+    basis = s.white_directions
+    if directions is not None:
+        basis = _whitened_basis(directions, s.known, s.noise)
+        directions = independent_directions(directions)
+    shown = Sums.of(instruments, s.errors, s.noise, directions or s.directions)
+    flat = [s.noise.whitened(z) * k[:, None] for z, k in zip(instruments, s.known, strict=True)]
+    room = max(sum(int(k.sum()) for k in s.known) - s.white_directions[0].shape[1], 1)
+    power = sum(float(w @ w) for w in s.white) / room
+    decides = Sums.of(flat, s.white, Noise(np.zeros(0), power, power), basis)
+    return verdict(name, title, lags, series, shown, judges, decides)
 
 
 def _products(u: FloatArray) -> FloatArray:
@@ -176,17 +205,15 @@ def _autocorrelation(s: _Setting) -> ResidualTest:
 def _input(s: _Setting) -> ResidualTest:
     lags = s.lags(len(s.names))
     past = s.spread(lagged, s.centred(lambda u: u), lags)
-    sums = Sums.of(past, s.errors, s.noise, s.directions)
-    return verdict("input", "residual with past inputs", lags, s.names, sums, True)
+    return _linear(s, "input", "residual with past inputs", lags, s.names, past)
 
 
 def _squared_input(s: _Setting) -> ResidualTest:
     names = _product_names(s.names)
     lags = s.lags(len(names))
     past = s.spread(lagged, _squares_about_mean(s), lags)
-    sums = Sums.of(past, s.errors, s.noise, s.directions)
     title = "residual with squares of past inputs"
-    return verdict("squared_input", title, lags, names, sums, True)
+    return _linear(s, "squared_input", title, lags, names, past)
 
 
 def _cubed_input(s: _Setting) -> ResidualTest:
@@ -195,9 +222,8 @@ def _cubed_input(s: _Setting) -> ResidualTest:
     lags = s.lags(len(names))
     mean = np.concatenate([r.u for r in s.runs]).mean(axis=0)
     past = s.spread(lagged, s.centred(lambda u: (u - mean) ** 3), lags)
-    sums = Sums.of(past, s.errors, s.noise, s.directions)
     title = "residual with cubes of past inputs"
-    return verdict("cubed_input", title, lags, names, sums, True)
+    return _linear(s, "cubed_input", title, lags, names, past)
 
 
 def _output(s: _Setting) -> ResidualTest:
@@ -208,9 +234,8 @@ def _output(s: _Setting) -> ResidualTest:
     scaled = [(r.yhat - mean) / spread for r in s.runs]
     powers = _about_mean_of_columns([np.column_stack([y**2, y**3]) for y in scaled])
     past = s.spread(lagged, powers, lags)
-    sums = Sums.of(past, s.errors, s.noise, s.directions)
     title = "residual with powers of the computed output"
-    return verdict("output", title, lags, ("ŷ²", "ŷ³"), sums, True)
+    return _linear(s, "output", title, lags, ("ŷ²", "ŷ³"), past)
 
 
 def _about_mean_of_columns(columns: _Columns) -> _Columns:
@@ -237,9 +262,9 @@ def _feedback(s: _Setting) -> ResidualTest:
     ahead = s.spread(leading, s.centred(lambda u: u), lags)
     past = s.spread(lagged, s.centred(lambda u: u), lags - 1)
     known = [np.hstack(pair) for pair in zip(s.directions, past, strict=True)]
+    title = "inputs with past residuals"
     # what the past input says of the coming one is no answer to the residual
-    sums = Sums.of(ahead, s.errors, s.noise, independent_directions(known))
-    return verdict("feedback", "inputs with past residuals", lags, s.names, sums, False)
+    return _linear(s, "feedback", title, lags, s.names, ahead, known, judges=False)
 
 
 def _squares_about_mean(s: _Setting) -> _Columns:

@@ -15,7 +15,7 @@ from .card import Line, Verdict
 from .correlations import LEVEL, ResidualTest
 from .criteria import Criteria
 from .operating import OperatingRange
-from .parameters import Parameters
+from .parameters import Knowledge, Parameters
 from .residuals import Residuals
 from .scores import HorizonScores, fit_text
 from .simulation_bands import Bands
@@ -198,13 +198,13 @@ def _probability(p: float) -> str:
     return "< 1e-12" if p < 1e-12 else f"{p:.2g}"
 
 
-def parameters(p: Parameters, n: int) -> list[Line]:
-    """Conditioning, undetermined directions, samples per parameter."""
-    ratio = n / max(p.effective, 1e-12)
+def parameters(p: Knowledge) -> list[Line]:
+    """Samples per parameter, conditioning."""
+    ratio = p.samples / max(p.effective, 1e-12)
     enough = ratio >= SAMPLES_PER_PARAMETER
     size = Line(
         "samples per parameter", ratio,
-        f"{n} / {p.effective:.1f} effective of {len(p.values)}",
+        f"{p.samples} / {p.effective:.1f} effective of {p.number}",
         f">= {SAMPLES_PER_PARAMETER:g}", "ok" if enough else "warn",
         "enough data for a model of this size"
         if enough
@@ -233,11 +233,11 @@ def parameters(p: Parameters, n: int) -> list[Line]:
             "ok" if sound else "info",
             text,
         ),
-        _looseness(p),
     ]
 
 
-def _looseness(p: Parameters) -> Line:
+def looseness(p: Parameters) -> Line:
+    """Parameters that could as well be zero."""
     loose = p.loose()
     shown = f"{len(loose)} of {len(p.values)}"
     named = ", ".join(loose[:5]) + (", .." if len(loose) > 5 else "")
@@ -303,20 +303,21 @@ def region(outside: float, farthest: float) -> Line:
 
 def operation(found: OperatingRange) -> list[Line]:
     """Stability, gain and bandwidth over the operating range."""
-    wild = [p for p in found.points if not p.is_stable]
+    known = [p for p in found.points if p.known] or list(found.points)
+    wild = [p for p in known if not p.is_stable]
     integrating = [p for p in wild if np.abs(p.poles).max(initial=0.0) < 1.0 + 1e-9]
-    largest = max(float(np.abs(p.poles).max(initial=0.0)) for p in found.points)
+    largest = max(float(np.abs(p.poles).max(initial=0.0)) for p in known)
     verdict: Verdict = "ok" if not wild else "info" if len(integrating) == len(wild) else "fail"
     text = {
-        "ok": "every operating point is stable",
+        "ok": "every operating point that the training data came near is stable",
         "info": "the model integrates its input",
-        "fail": f"{len(wild) - len(integrating)} of {len(found.points)} operating points are "
-        "unstable: a "
-        "loop tuned there is tuned on a plant that does not exist; train on data from there",
+        "fail": f"{len(wild) - len(integrating)} of {len(known)} operating points are "
+        "unstable: a loop tuned there is tuned on a plant that does not exist; train on data from "
+        "there",
     }[verdict]
     lines = [Line("largest pole", largest, f"{largest:.6g}", "< 1", verdict, text)]
     for i, name in enumerate(found.input_names):
-        here = [p for p, j in zip(found.points, found.varied, strict=True) if j == i]
+        here = [p for p, j in zip(found.points, found.varied, strict=True) if j == i and p.known]
         lines.append(_spread_line(f"gain from {name}", np.array([p.dc_gain[i] for p in here]), ""))
         widths = np.array([p.bandwidth(i) for p in here])
         lines.append(_spread_line(f"bandwidth from {name}", widths, "Hz"))

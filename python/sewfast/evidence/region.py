@@ -1,9 +1,10 @@
 """The training region: where in regressor or state space a model has been, and what lies outside.
 
 The training data's points are whitened and covered by balls about up to 200 of themselves (the
-greedy k-centre of Gonzalez 1985); the largest distance from any training point to its nearest
-centre is the radius, or what 99 % of the points keep from the centres of other parts of the
-record. A point farther than that from every centre is outside: no training sample was like it.
+greedy k-centre of Gonzalez 1985); what 99.5 % of the training points keep from their nearest
+centre is the radius, or what 98 % of them keep from the centres of other parts of the record where
+that is more. A point farther than that from every centre is outside: no training sample was like
+it.
 """
 
 from __future__ import annotations
@@ -56,7 +57,8 @@ class Region:
         every = max(1, len(points) // _MOST_POINTS)
         centres = _spread_out(((points - mean) @ turn)[::every])
         region = cls(mean, turn, centres, 0.0)
-        radius = max(float(region.distance(points).max()), _cross_radius(region, points[::every]))
+        covering = float(np.quantile(region.distance(points), 0.995))
+        radius = max(covering, _cross_radius(region, points[::every]))
         return cls(mean, turn, centres, radius * (1.0 + 1e-6) + 1e-9)
 
     def distance(self, points: FloatArray) -> FloatArray:
@@ -212,7 +214,7 @@ def _spread_out(points: FloatArray) -> FloatArray:
 
 
 def _cross_radius(region: Region, points: FloatArray) -> float:
-    """What 99 % of the points keep from the centres of the other half of the tenths of the record.
+    """What 98 % of the points keep from the centres of the other half of the tenths of the record.
 
     Without it every new record would seem to leave the region a little, as no two are the same.
     """
@@ -224,7 +226,7 @@ def _cross_radius(region: Region, points: FloatArray) -> float:
         replace(region, centres=_spread_out(white[one])).distance(points[~one])
         for one in (half, ~half)
     ]
-    return float(np.quantile(np.concatenate(distances), 0.99))
+    return float(np.quantile(np.concatenate(distances), 0.98))
 
 
 def _short(values: FloatArray) -> Any:
