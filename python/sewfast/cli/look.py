@@ -86,10 +86,12 @@ def _show_columns(tables: list[Table], args: argparse.Namespace) -> None:
         return
     from .output import print_rows
 
-    for path, found in columns.items():
+    for table, (path, found) in zip(tables, columns.items(), strict=True):
         print(f"{path}: {found[0].n if found else 0} rows")
         header = ("column", "from", "to", "standard deviation", "missing")
         print_rows([header, *map(_row, found)])
+        for name, reason in table.unusable.items():
+            print(f"not a column of numbers: {name}, {reason}")
     print("name the input and the output to see more: --input COL --output COL")
 
 

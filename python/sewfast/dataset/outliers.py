@@ -22,7 +22,7 @@ BoolArray = NDArray[np.bool_]
 
 _ROUNDING = 1e-12
 """Part of the range below which a deviation is rounding."""
-_ROWS = 200_000
+_CELLS = 2_000_000
 _SHOWN = 8
 
 
@@ -151,8 +151,9 @@ def distances(y: FloatArray, window: int = 7) -> FloatArray:
     padded = np.pad(y, window // 2, constant_values=np.nan)
     rows = np.lib.stride_tricks.sliding_window_view(padded, window)
     distance = np.empty_like(y)
-    for first in range(0, len(y), _ROWS):
-        part = slice(first, first + _ROWS)
+    count = max(1, _CELLS // window)
+    for first in range(0, len(y), count):
+        part = slice(first, first + count)
         levelled = _levelled(rows[part], level)
         median = _medians(levelled)
         local = MAD * _medians(np.abs(levelled - median[:, None]))
