@@ -333,14 +333,16 @@ def fit_neural_ss(
     experiments: _Experiments, validation: _Experiments, *, nx: int, nk: int, hidden: int,
     linear: LinearModel | None, output: Literal["linear", "saturation", "abs"], output_parameters: _F,
     integrator: bool, weight_decay: float, hidden_scale: float, max_iterations: int, starts: int,
-    first_start: int, seed: int, threads: int, progress: _Progress = None,
+    first_start: int, seed: int, threads: int, initial: Sequence[NeuralSS] | None = None,
+    progress: _Progress = None,
 ) -> NeuralSSFit:
     """Train in free run; each start is stopped and judged on ``validation``, without it on the training data.
 
     y is (N,) or (N, ny); NaN in it has no weight. Scaled units are means and standard deviations of the training data;
     with output 'abs' y_mean is 0 and y_scale the root mean square. ``linear`` has na = nx, nb <= nx + 1 and the same nk;
     without it a start begins with random states. Start i of the seed is ``first_start + i`` here: starts spread over
-    several calls, or over threads (0 takes all), have the same bits.
+    several calls, or over threads (0 takes all), have the same bits. With ``initial`` nothing is drawn: start i trains
+    the i-th of these models further, in their scaling; they are of one shape and as many as ``starts``.
     """
 
 # --- least_squares.rs --------------------------------------------------------------------------------------

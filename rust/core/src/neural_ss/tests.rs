@@ -218,6 +218,7 @@ fn settings(shape: Shape) -> Settings {
         nk: shape.nk,
         hidden: shape.hidden,
         linear: None,
+        initial: Vec::new(),
         output: OutputFunction::Linear,
         integrator: shape.integrator,
         weight_decay: 0.0,
@@ -283,4 +284,41 @@ fn the_threads_and_the_split_of_the_starts_do_not_matter() {
         assert_eq!(theta(&one.start_models[i]), theta(&many.start_models[i]));
     }
     assert_eq!(theta(&last.start_models[0]), theta(&one.start_models[2]));
+}
+
+#[test]
+fn a_model_is_trained_further_where_it_was_left() {
+    let truth = random_model(31, SMALL, OutputFunction::Linear);
+    let u = noise(300, 32);
+    let y = truth.simulate(&u, 1, &[0.2, 0.1]).unwrap();
+    let recording = [Recording::new(&u, 1, &y, 1).unwrap()];
+    let fit = |settings: &Settings| super::fit(&recording, &[], settings, &Monitor::default());
+    let first = fit(&Settings {
+        max_iterations: 5,
+        ..settings(SMALL)
+    })
+    .unwrap();
+    let further = Settings {
+        initial: first.models.clone(),
+        starts: first.models.len(),
+        ..settings(SMALL)
+    };
+    let second = fit(&further).unwrap();
+    assert!(second.trace[0] <= 1.001 * first.cost && second.cost < first.cost);
+    assert_eq!(second.model.scaling(), first.model.scaling());
+    let misfits = [
+        Settings {
+            starts: 1,
+            ..further.clone()
+        },
+        Settings {
+            hidden: 1,
+            ..further.clone()
+        },
+        Settings {
+            output: OutputFunction::Abs { width: 0.1 },
+            ..further
+        },
+    ];
+    assert!(misfits.iter().all(|settings| fit(settings).is_err()));
 }

@@ -80,6 +80,9 @@ pub struct Settings {
     pub hidden: usize,
     /// Where the starts begin, a model of order nx; without it they begin at random states.
     pub linear: Option<LinearModel>,
+    /// Models of this shape and output, of one scaling, that are trained further: start `first_start + i` begins at the
+    /// i-th. Where there are any, nothing is drawn, `linear` is not used, and there are as many starts.
+    pub initial: Vec<NeuralSS>,
     /// Output function, its parameters in scaled units.
     pub output: OutputFunction,
     /// Whether the last state is the sum of a function of the others.
@@ -222,7 +225,11 @@ impl<'a> Task<'a> {
         .checked()?;
         check(settings)?;
         check_recordings(recordings, validation, shape)?;
-        let scaling = scaling(recordings, settings.output)?;
+        let scaling = match settings.initial.first() {
+            Some(model) => model.scaling().clone(),
+            None => scaling(recordings, settings.output)?,
+        };
+        check_initial(settings, shape, &scaling)?;
         let scaled = |r: &Recording| Experiment {
             v: scaling.delayed_inputs(r.u, shape.nk),
             y: scaling.outputs(r.y),
@@ -261,12 +268,12 @@ impl<'a> Task<'a> {
             let decay = self.settings.weight_decay;
             let mut problem =
                 problem::Training::new(&self.experiments, network, decay, &runs, self.monitor);
-            let (theta, dead) = self.drawn(&mut problem, &mut random)?;
+            let (theta, dead) = self.drawn(&mut problem, start, &mut random)?;
             discarded += dead;
             let mut trained = self.train(&mut problem, theta, &runs)?;
             trained.discarded = discarded;
             let learnt = trained.cost < DEAD_COST * self.constant_cost;
-            if learnt || training + 1 == MOST_TRAININGS || self.monitor.stopped() {
+            if learnt || self.is_last(training) || self.monitor.stopped() {
                 return Some(trained);
             }
             discarded += 1;
@@ -278,8 +285,13 @@ impl<'a> Task<'a> {
     fn drawn(
         &self,
         problem: &mut problem::Training,
+        start: usize,
         random: &mut Random,
     ) -> Option<(Vec<f64>, usize)> {
+        if let Some(model) = self.settings.initial.get(start - self.settings.first_start) {
+            let theta = self.resumed(model);
+            return problem.cost(&theta).map(|_| (theta, 0));
+        }
         for dead in 0..MOST_DRAWS {
             let theta = match &self.linear {
                 Some(linear) => Some(self.begun(linear, random)),
@@ -298,12 +310,7 @@ impl<'a> Task<'a> {
 
     /// A hidden layer beside the linear equations, and the states at which those come nearest to the experiments.
     fn begun(&self, linear: &Realisation, random: &mut Random) -> Vec<f64> {
-        let Shape {
-            nx,
-            inputs,
-            outputs,
-            ..
-        } = self.shape;
+        let Shape { nx, outputs, .. } = self.shape;
         let network = Network::new(self.shape, self.settings.output, &linear.theta(self.shape));
         let unit = (0..nx * nx).map(|i| f64::from(u8::from(i % (nx + 1) == 0)));
         let prior = Statistics {
@@ -312,17 +319,31 @@ impl<'a> Task<'a> {
             residual_variance: vec![LINEAR_RESIDUAL; outputs],
             process_noise: 0.0,
         };
-        let mut theta = draw::beside(linear, self.shape, self.settings.hidden_scale, random);
+        let theta = draw::beside(linear, self.shape, self.settings.hidden_scale, random);
+        self.with_states(theta, &network, &prior)
+    }
+
+    /// A model that is trained further, and its states on the experiments.
+    fn resumed(&self, model: &NeuralSS) -> Vec<f64> {
+        let network = Network::new(self.shape, self.settings.output, model.theta());
+        self.with_states(model.theta().to_vec(), &network, model.statistics())
+    }
+
+    /// Whether a start that has learnt nothing is given up after this training.
+    fn is_last(&self, training: usize) -> bool {
+        training + 1 == MOST_TRAININGS || !self.settings.initial.is_empty()
+    }
+
+    /// The parameters, and after them the states at which `network` comes nearest to the experiments.
+    fn with_states(&self, mut theta: Vec<f64>, network: &Network, prior: &Statistics) -> Vec<f64> {
+        let Shape {
+            inputs, outputs, ..
+        } = self.shape;
         for Experiment { v, y } in &self.experiments {
             let samples = STATE_SAMPLES.min(y.len() / outputs);
             let (v, y) = (&v[..samples * inputs], &y[..samples * outputs]);
-            let state = state::update(
-                &network,
-                &prior,
-                v,
-                y,
-                std::slice::from_ref(&prior.state_mean),
-            );
+            let mean = std::slice::from_ref(&prior.state_mean);
+            let state = state::update(network, prior, v, y, mean);
             theta.extend(state.unwrap_or_else(|| prior.state_mean.clone()));
         }
         theta
@@ -558,6 +579,22 @@ fn check_recordings(
         )));
     }
     Ok(())
+}
+
+/// Models to be trained further are of one kind, and as many as there are starts.
+fn check_initial(settings: &Settings, shape: Shape, scaling: &Scaling) -> Result<()> {
+    let initial = &settings.initial;
+    let alike = |m: &NeuralSS| {
+        m.shape() == shape && m.output() == settings.output && m.scaling() == scaling
+    };
+    if initial.is_empty() || (initial.len() == settings.starts && initial.iter().all(alike)) {
+        return Ok(());
+    }
+    Err(Error::setting(format!(
+        "expected {} initial models, one for each start, all of {shape:?} with one scaling and output function, got {} models or others; train different models apart",
+        settings.starts,
+        initial.len()
+    )))
 }
 
 fn no_start() -> Error {

@@ -340,7 +340,7 @@ impl NeuralSSFit {
 #[pyfunction]
 #[pyo3(signature = (
     experiments, validation, *, nx, nk, hidden, linear, output, output_parameters, integrator, weight_decay,
-    hidden_scale, max_iterations, starts, first_start, seed, threads, progress = None
+    hidden_scale, max_iterations, starts, first_start, seed, threads, initial = None, progress = None
 ))]
 #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
 fn fit_neural_ss(
@@ -361,8 +361,10 @@ fn fit_neural_ss(
     first_start: usize,
     seed: u64,
     threads: usize,
+    initial: Option<Vec<PyRef<'_, NeuralSS>>>,
     progress: Option<Bound<'_, PyAny>>,
 ) -> PyResult<NeuralSSFit> {
+    let initial = initial.unwrap_or_default();
     let output: Result<OutputFunction> =
         OutputFunction::new(output, slice(&output_parameters, "output_parameters")?);
     let settings = Settings {
@@ -370,6 +372,7 @@ fn fit_neural_ss(
         nk,
         hidden,
         linear: linear.map(|l| l.inner.clone()),
+        initial: initial.iter().map(|m| m.inner.clone()).collect(),
         output: output.map_err(|e| raise(py, e))?,
         integrator,
         weight_decay,
