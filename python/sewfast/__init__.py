@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from .leastsquares import LeastSquaresResult, least_squares
     from .loop import ClosedLoopRun, run
     from .machine import VirtualMachine
-    from .models import ARX, IV, LinearOE, Model, NeuralOE, NeuralSS, load_model
+    from .models import ARX, IV, Ensemble, LinearOE, Model, NeuralOE, NeuralSS, load_model
     from .order_table import OrderTable, orders
     from .readers import read, read_table
     from .recording import Recording, record
@@ -49,6 +49,7 @@ __all__ = [
     "DataError",
     "Dataset",
     "DelayEstimate",
+    "Ensemble",
     "Experiment",
     "FitError",
     "Gains",
@@ -102,7 +103,7 @@ _HOMES = {
     "leastsquares": "LeastSquaresResult least_squares",
     "loop": "ClosedLoopRun run",
     "machine": "VirtualMachine",
-    "models": "ARX IV LinearOE Model NeuralOE NeuralSS load_model",
+    "models": "ARX IV Ensemble LinearOE Model NeuralOE NeuralSS load_model",
     "order_table": "OrderTable orders",
     "readers": "read read_table",
     "recording": "Recording record",

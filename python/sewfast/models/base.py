@@ -20,6 +20,7 @@ from ..dataset import (
     require_same_units,
 )
 from ..errors import DataError, SettingError
+from .choice import choice_lines
 
 if TYPE_CHECKING:
     from ..evidence import Bands, ReportCard
@@ -272,4 +273,5 @@ class Model(ABC):
             count = t.get("iterations")
             steps = "" if count is None else f"{count} iterations, "
             lines[0] += f"; {steps}{t['termination']}"
+        lines += choice_lines(t, self.output_unit)
         return lines + [str(note) for note in t.get("notes", [])]

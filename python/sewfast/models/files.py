@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping
+from importlib.resources import files
 from typing import Any, TypeAlias
 
 from .. import jsonfile
 from ..errors import ModelFileError, SewfastError
 from .base import FORMAT, VERSION, Model
+from .ensemble import COMBINATIONS, MOST_MEMBERS, Ensemble
 from .fields import Fields
 from .linear import ARX, IV, LinearOE
 from .neural import NeuralOE
 from .neural_ss import NeuralSS
 
+SCHEMA = f"model-{VERSION}.json"
 _Kind: TypeAlias = type[ARX] | type[IV] | type[LinearOE] | type[NeuralOE] | type[NeuralSS]
 _KINDS: dict[str, _Kind] = {c.kind: c for c in (ARX, IV, LinearOE, NeuralOE, NeuralSS)}
 _FIELDS = ("version", "kind", "Ts", "inputs", "output", "counts", "parameters", "training")
@@ -45,21 +49,47 @@ def from_dict(values: dict[str, Any]) -> Model:
     return _read(Fields("model", {"version": VERSION} | values))
 
 
+def model_schema() -> dict[str, Any]:
+    """The JSON schema (draft 2020-12) of the files that `Model.save` writes in this version."""
+    text = files("sewfast").joinpath("schema", SCHEMA).read_text(encoding="utf-8")
+    schema: dict[str, Any] = json.loads(text)
+    return schema
+
+
 def _read(fields: Fields) -> Model:
     fields.require_only(_FIELDS)
-    kind = fields.text("kind")
+    if fields.text("kind") == Ensemble.kind:
+        return _ensemble(fields)
+    return _single(fields, fields)
+
+
+def _ensemble(fields: Fields) -> Model:
+    parameters = fields.object("parameters")
+    parameters.require_only(("combine", "members"))
+    combine = next((c for c in COMBINATIONS if c == parameters.text("combine")), None)
+    if combine is None:
+        raise parameters.refuse("combine", "median or mean", parameters.any("combine"))
+    listed = parameters.items("members")
+    if not 1 <= len(listed) <= MOST_MEMBERS:
+        raise parameters.refuse("members", f"1 to {MOST_MEMBERS} models", len(listed))
+    members = [_single(fields, m) for m in parameters.objects("members")]
+    training = _training(fields.object("training"), len(members[0].input_names))
+    return Ensemble.of(members, combine, training)
+
+
+def _single(fields: Fields, own: Fields) -> Model:
+    """A model with the file's names and units, and its own kind, parameters and training."""
+    kind = own.text("kind")
     if kind not in _KINDS:
-        raise fields.refuse("kind", f"one of {', '.join(_KINDS)}", kind)
-    return _model(fields, _KINDS[kind])
-
-
-def _model(fields: Fields, cls: _Kind) -> Model:
+        known = (*_KINDS, Ensemble.kind) if own is fields else tuple(_KINDS)
+        raise own.refuse("kind", f"one of {', '.join(known)}", kind)
     inputs, output = fields.objects("inputs"), fields.object("output")
     if not inputs:
         raise fields.refuse("inputs", "at least one input", [])
-    core = _core(fields.object("parameters"), cls)
-    _require_width(fields, core, len(inputs))
-    return cls(
+    parameters = own.object("parameters")
+    core = _core(parameters, _KINDS[kind])
+    _require_width(fields, parameters, len(inputs))
+    return _KINDS[kind](
         core,
         fields.positive("Ts"),
         tuple(i.text("name") for i in inputs),
@@ -67,7 +97,7 @@ def _model(fields: Fields, cls: _Kind) -> Model:
         tuple(i.text("unit") for i in inputs),
         output.text("unit"),
         _counts(fields),
-        _training(fields.object("training"), len(inputs)),
+        _training(own.object("training"), len(inputs)),
     )
 
 
@@ -95,9 +125,8 @@ def _core(parameters: Fields, cls: _Kind) -> object:
         ) from e
 
 
-def _require_width(fields: Fields, core: object, inputs: int) -> None:
+def _require_width(fields: Fields, parameters: Fields, inputs: int) -> None:
     """Names and parameters must speak of the same number of inputs."""
-    parameters = fields.object("parameters")
     width = len(parameters.any("b")) if "b" in parameters.values else parameters.integer("n_inputs")
     if width != inputs:
         raise fields.refuse("inputs", f"{width} inputs, as in the parameters", fields.any("inputs"))
