@@ -2,6 +2,10 @@
 
 import json
 import os
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +16,15 @@ from plants import OFFSET, A, B, bent_data, linear_data
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError, Interrupted, SettingError
 from sewfast.identification import identify
-from sewfast.models import ARX, IV, LinearOE, NeuralOE
+from sewfast.models import ARX, IV, Ensemble, LinearOE, NeuralOE, NeuralSS
 from sewfast.readers import read
 from sewfast.validation import validate
 
 DATA = Path(os.environ.get("SEWFAST_DATA", Path(__file__).parents[2] / "shared" / "data"))
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="no measured data (set SEWFAST_DATA)")
 QUICK: dict[str, Any] = {"iterations": 20, "starts": 2, "hidden": 4}
+SEARCHED = ("auto", "neural_ss")
+SMALL: dict[str, Any] = {**QUICK, "nx": 2, "nk": 1}
 
 
 # --- recovery ---------------------------------------------------------------------------------
@@ -60,49 +66,123 @@ def test_the_network_fits_what_no_linear_model_can() -> None:
 
 
 def test_auto_takes_the_network_where_it_helps_and_says_why() -> None:
-    model = identify(bent_data(noise=0.01), **QUICK)
-    assert isinstance(model, NeuralOE)
+    model = identify(bent_data(noise=0.01), **SMALL)
+    assert isinstance(model, (NeuralSS, Ensemble))
     choice = model.training["choice"]
-    assert choice["chosen"] == "neural_oe"
+    assert choice["chosen"] == "neural_ss"
     rmse = choice["free_run_rmse"]
-    assert rmse["neural_oe"] < 0.98 * rmse["oe"]
+    assert rmse["neural_ss"] < 0.9 * rmse["oe"]
     assert "free-run error" in choice["reason"]
-    assert [d["range"] for d in choice["held_out"]] == ["200:300", "500:600"]
+    assert [d["range"] for d in choice["held_out"]] == ["640:800"]
     assert model.training["samples"] == 800
+    kinds = {c["kind"] for c in choice["candidates"]}
+    assert kinds == {"oe", "neural_ss"}
+    assert "chosen: neural_ss" in str(model)
 
 
 def test_auto_takes_the_linear_model_where_the_network_does_not_help() -> None:
-    model = identify(linear_data(800, noise=0.5), **QUICK)
+    model = identify(linear_data(800, noise=0.5), **SMALL)
     assert isinstance(model, LinearOE)
     assert model.training["choice"]["chosen"] == "oe"
 
 
-def test_the_network_says_where_it_does_not_help() -> None:
-    model = identify(linear_data(800, noise=0.5), model="neural_oe", **QUICK)
-    assert isinstance(model, NeuralOE)
+@pytest.mark.parametrize("kind", ["neural_oe", "neural_ss"])
+def test_the_network_says_where_it_does_not_help(kind: Any) -> None:
+    options = QUICK if kind == "neural_oe" else SMALL
+    model = identify(linear_data(800, noise=0.5), model=kind, **options)
+    assert isinstance(model, (NeuralOE, NeuralSS, Ensemble))
     assert "consider model oe" in model.training["notes"][0]
 
 
-def test_given_validation_data_decide() -> None:
+def test_given_validation_data_decide_and_are_not_learned_from() -> None:
     other = bent_data(300, seed=4, name="other")
-    model = identify(bent_data(), validation=other, **QUICK)
+    model = identify(bent_data(), validation=other, **SMALL)
     assert model.training["choice"]["held_out"] == [
         {"name": "other", "range": "0:300", "samples": 300}
     ]
+    assert model.training["samples_fitted"] == 800
 
 
 def test_records_too_short_to_hold_out_fall_back_on_the_linear_model() -> None:
-    model = identify(linear_data(150), **QUICK)
+    model = identify(linear_data(150), **SMALL)
     assert isinstance(model, LinearOE)
     assert "too short" in model.training["choice"]["reason"]
+
+
+def test_a_sensor_that_does_not_see_the_sign_is_found() -> None:
+    plain = bent_data(900, noise=0.005)
+    e = plain.experiments[0]
+    data = Dataset.from_arrays(e.u, np.abs(e.y), 0.01)
+    model = identify(data, **SMALL)
+    assert model.training["choice"]["chosen_structure"]["output"] == "abs"
+
+
+def test_a_sensor_that_ends_at_a_limit_is_found() -> None:
+    plain = bent_data(900, noise=0.005)
+    e = plain.experiments[0]
+    limit = float(np.quantile(e.y, 0.8))
+    data = Dataset.from_arrays(e.u, np.minimum(e.y, limit), 0.01)
+    tried = {c.get("output") for c in identify(data, **SMALL).training["choice"]["candidates"]}
+    assert "saturation" in tried
+
+
+# --- workers and time --------------------------------------------------------------------------
+
+
+def searched(**options: Any) -> Any:
+    few = {"iterations": 8, "starts": 3, "hidden": 4, "nx": 2, "nk": 1}
+    return identify(bent_data(400), model="neural_ss", **few, **options).parameters()
+
+
+def test_any_workers_give_the_same_bits(process_pool: Any) -> None:
+    expected = searched(threads=1)
+    with ThreadPoolExecutor(2) as threads:
+        assert searched(workers=threads) == expected
+    assert searched(workers=process_pool) == expected
+    assert searched(workers=map) == expected
+
+
+@pytest.fixture
+def process_pool() -> Iterator[ProcessPoolExecutor]:
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        yield pool
+
+
+def test_a_dask_cluster_gives_the_same_bits() -> None:
+    distributed = pytest.importorskip("distributed")
+    with warnings.catch_warnings():
+        # the cluster's own clean-up is not what is tested
+        warnings.simplefilter("ignore")
+        options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+        with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
+            found = searched(workers=client)
+            again = searched(workers=client.get_executor())
+    assert found == again == searched(threads=1)
+
+
+def test_what_cannot_map_is_no_worker() -> None:
+    with pytest.raises(SettingError, match="workers: expected an executor"):
+        identify(bent_data(), workers=4)  # type: ignore[arg-type]
+
+
+def test_a_time_budget_that_bites_is_told_and_leaves_a_model() -> None:
+    model = identify(bent_data(), time_budget=1e-6, **SMALL)
+    assert "time budget" in str(model.training["notes"])
+    assert np.isfinite(model.simulate(bent_data())[0]).all()
+
+
+def test_a_time_budget_that_does_not_bite_changes_nothing() -> None:
+    model = identify(bent_data(400), time_budget=1e6, **SMALL)
+    assert "notes" not in model.training
+    assert model.parameters() == identify(bent_data(400), **SMALL).parameters()
 
 
 # --- what is promised of every model ----------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["arx", "oe", "neural_oe", "auto"])
+@pytest.mark.parametrize("kind", ["arx", "oe", "neural_oe", "neural_ss", "auto"])
 def test_the_story_is_whole_and_is_json(kind: Any) -> None:
-    model = identify(bent_data(), model=kind, **QUICK)
+    model = identify(bent_data(), model=kind, **(SMALL if kind in SEARCHED else QUICK))
     story = json.loads(json.dumps(model.training, allow_nan=False))
     assert story["data"] == [{"name": "bent", "range": "0:800", "samples": 800}]
     assert story["cost"] >= 0
@@ -173,13 +253,13 @@ def test_an_interruption_hands_over_the_best_model(kind: Any) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"model": "narx"}, "auto, arx, iv, oe or neural-oe, received 'narx'"),
-        ({"model": "paper"}, "auto, arx, iv, oe or neural-oe"),
+        ({"model": "narx"}, "auto, arx, iv, oe, neural-oe or neural-ss, received 'narx'"),
+        ({"model": "paper"}, "auto, arx, iv, oe, neural-oe or"),
         ({"preset": "other"}, "'paper' or none"),
         ({"preset": "paper", "model": "arx"}, "neural-oe"),
         ({"preset": "paper", "na": 3}, "na = 2"),
-        ({"na": 0}, "na: expected a whole number from 1"),
-        ({"nb": 2.0}, "nb: expected a whole number"),
+        ({"na": 0, "model": "oe"}, "na: expected a whole number from 1"),
+        ({"nb": 2.0, "model": "oe"}, "nb: expected a whole number"),
         ({"nk": -1}, "nk"),
         ({"hidden": 0}, "hidden"),
         ({"starts": 0}, "starts"),
@@ -187,6 +267,11 @@ def test_an_interruption_hands_over_the_best_model(kind: Any) -> None:
         ({"iterations": 0}, "iterations"),
         ({"threads": 0}, "threads"),
         ({"hidden": True}, "hidden"),
+        ({"nx": 0, "model": "neural_ss"}, "nx"),
+        ({"nx": 2, "model": "oe"}, "nx: model oe has none"),
+        ({"na": 2}, "na: model auto has none, received 2; give nx, or name a lagged model"),
+        ({"output": "tanh"}, "output: expected one of linear, saturation, abs"),
+        ({"time_budget": 0}, "time_budget: expected seconds above 0"),
     ],
 )
 def test_settings_out_of_range_are_refused(options: dict[str, Any], words: str) -> None:
@@ -194,7 +279,7 @@ def test_settings_out_of_range_are_refused(options: dict[str, Any], words: str) 
         identify(linear_data(), **options)
 
 
-KINDS = ["arx", "oe", "neural_oe", "auto"]
+KINDS = ["arx", "oe", "neural_oe", "neural_ss", "auto"]
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Literal, TypeAlias
 
 from . import recipes
@@ -12,9 +13,14 @@ from .errors import DataError, SettingError
 from .evidence import remembered
 from .models import Model
 from .models.base import INIT
-from .recipes import Progress, Task
+from .recipes import Clock, Progress, Task
+from .recipes.output import OUTPUTS
+from .recipes.structure import Structure
+from .workers import Workers, require_workers
 
-Kind: TypeAlias = Literal["auto", "arx", "iv", "oe", "neural_oe", "neural-oe"]
+Kind: TypeAlias = Literal[
+    "auto", "arx", "iv", "oe", "neural_oe", "neural-oe", "neural_ss", "neural-ss"
+]
 
 _RECIPES: dict[str, Callable[[Task], Model]] = {
     "auto": recipes.auto,
@@ -22,10 +28,14 @@ _RECIPES: dict[str, Callable[[Task], Model]] = {
     "iv": recipes.iv,
     "oe": recipes.oe,
     "neural_oe": recipes.neural_oe,
+    "neural_ss": recipes.neural_ss,
     "paper": recipes.paper,
 }
-_STARTS = {"paper": 8}
-_USUAL_STARTS = 4
+_SEARCHED = ("auto", "neural_ss")
+"""Kinds that find their own structure; the others have lags."""
+_LAGS = 2
+_PAPER = {"na": 2, "nb": 2, "nk": 1, "hidden": 8}
+_PAPER_STARTS = 8
 
 
 def identify(
@@ -33,46 +43,69 @@ def identify(
     *,
     model: Kind = "auto",
     preset: Literal["paper"] | None = None,
-    na: int = 2,
-    nb: int = 2,
-    nk: int = 1,
-    hidden: int = 8,
+    na: int | None = None,
+    nb: int | None = None,
+    nk: int | None = None,
+    nx: int | None = None,
+    hidden: int | None = None,
+    output: Literal["linear", "saturation", "abs"] | None = None,
     starts: int | None = None,
     seed: int = 0,
-    iterations: int = 100,
+    iterations: int | None = None,
     validation: Dataset | None = None,
     threads: int | None = None,
+    workers: Workers | None = None,
+    time_budget: float | None = None,
     progress: Progress | None = None,
 ) -> Model:
     """Identify a model from recordings.
+
+    Without further settings a small grid of structures is searched (docs/choosing-a-model.md), and
+    the model says why it was chosen: `print(model)`, `model.training["choice"]`.
 
     Parameters
     ----------
     data : Dataset
         Training data: inputs complete; outputs that are NaN were not measured and have no weight.
-    model : {"auto", "arx", "iv", "oe", "neural_oe"}
+    model : {"auto", "arx", "iv", "oe", "neural_oe", "neural_ss"}
         `arx`: least squares of the one-step error. `iv`: refined instrumental variables, which
         measurement noise does not bias. `oe`: linear output error. `neural_oe`: the
-        network, trained in free run from the linear output-error model. `auto`: `oe` or
-        `neural_oe`, whichever has the smaller free-run error on data not trained on.
+        lagged network, trained in free run from the linear output-error model. `neural_ss`: the
+        state-space network. `auto`: `oe` or `neural_ss`, by the free-run error on data not trained
+        on; on little data the median of many networks, an `Ensemble`.
     preset : "paper" or None
         The paper's network (docs/CONVENTIONS.md): no linear start, fixed scaling and orders.
-    na, nb, nk : int
-        Past outputs, past inputs and delay [samples] in the regressor.
-    hidden : int
-        Hidden units of the network.
+    na, nb : int or None
+        Past outputs and past inputs in the regressor of a lagged model; None: 2.
+    nk : int or None
+        Delay [samples]. None: 1 for a lagged model; a searched one takes 1 unless the data say
+        otherwise. A plant of a control loop needs 1 or more.
+    nx : int or None
+        States of `neural_ss`; None: found.
+    hidden : int or None
+        Hidden units of a network; None: found, 8 for `neural_oe`.
+    output : {"linear", "saturation", "abs"} or None
+        Output function of `neural_ss`; None: `linear`, or another where the data suggest it and it
+        does better.
     starts : int or None
-        Random starts of the network's training; the best one is kept. None: 4, for the preset
-        `paper`, which has no linear model to start from, 8.
+        Random starts of a network's training. None: by the amount of data; 4 for `neural_oe`, 8
+        for the preset `paper`, which has no linear model to start from.
     seed : int
-        Of the starts. A seed gives the same model at any number of threads.
-    iterations : int
-        At most this many per start.
+        Of the starts. A seed gives the same model at any number of threads and with any workers,
+        as long as a time budget does not bite.
+    iterations : int or None
+        At most this many per start; None: by the amount of data, 100 for a lagged model.
     validation : Dataset or None
-        Data to select on: when training stops, which start, which kind. None holds out two of
-        eight blocks of every experiment; these are learned from in the end.
+        Data to select on, from which nothing is learned. None holds out the last fifth of every
+        experiment (two of eight blocks for `neural_oe`).
     threads : int or None
         None uses every core.
+    workers : executor or None
+        Where the starts of `auto` and `neural_ss` are trained: a `concurrent.futures.Executor`, a
+        Dask client, or anything with `map(function, jobs)`. None: threads of this process.
+    time_budget : float or None
+        Seconds after which `auto` and `neural_ss` keep the best so far; the model says where the
+        budget has cut the search short.
     progress : callable(done, total, best_cost) or None
         Called from the calling thread now and then, once through for each stage.
 
@@ -94,47 +127,100 @@ def identify(
 
     Notes
     -----
-    Output-error identification: Ljung, *System Identification*, 2nd ed., section 4.2; the network
-    and its training: paper, Eq. 2 to 4.
+    Output-error identification: Ljung, *System Identification*, 2nd ed., section 4.2; the lagged
+    network and its training: paper, Eq. 2 to 4; the state-space network: M. Schoukens, arXiv
+    2103.14516.
     """
     kind = str(model).replace("-", "_")
     if kind not in _RECIPES or kind == "paper":
-        raise SettingError(f"model: expected auto, arx, iv, oe or neural-oe, received {model!r}")
+        raise SettingError(
+            f"model: expected auto, arx, iv, oe, neural-oe or neural-ss, received {model!r}"
+        )
     if preset is not None:
-        kind = _preset(preset, kind, (na, nb, nk, hidden))
-    starts = _STARTS.get(kind, _USUAL_STARTS) if starts is None else starts
-    threads = _cores() if threads is None else threads
-    task = Task(data, validation, na, nb, nk, hidden, starts, seed, iterations, threads, progress)
-    _require_settings(task)
+        kind = _preset(preset, kind, {"na": na, "nb": nb, "nk": nk, "hidden": hidden})
+        starts = _PAPER_STARTS if starts is None else starts
+    _require_settings(
+        na=na, nb=nb, nk=nk, nx=nx, hidden=hidden, starts=starts, seed=seed,
+        iterations=iterations, threads=threads,
+    )  # fmt: skip
+    _require_meaning(kind, na=na, nb=nb, nx=nx, output=output, time_budget=time_budget)
+    require_workers(workers)
+    task = Task(
+        data=data,
+        validation=validation,
+        na=_LAGS if na is None else na,
+        nb=_LAGS if nb is None else nb,
+        nk=nk,
+        nx=nx,
+        hidden=hidden,
+        output=output,
+        starts=starts,
+        seed=seed,
+        iterations=iterations,
+        threads=_cores() if threads is None else threads,
+        progress=progress,
+        workers=workers,
+        clock=Clock(time_budget),
+    )
     _require_data(task, kind)
     return remembered(_RECIPES[kind](task), data)
 
 
-def _preset(preset: str, kind: str, orders: tuple[int, ...]) -> str:
+def _preset(preset: str, kind: str, orders: Mapping[str, int | None]) -> str:
     if preset != "paper":
         raise SettingError(f"preset: expected 'paper' or none, received {preset!r}")
     if kind not in ("auto", "neural_oe"):
         raise SettingError(
             f"preset 'paper' is a network: expected model neural-oe, received {kind}"
         )
-    if orders != (2, 2, 1, 8):
+    other = {k: v for k, v in orders.items() if v not in (None, _PAPER[k])}
+    if other:
         raise SettingError(
             "preset 'paper' fixes na = 2, nb = 2, nk = 1, hidden = 8; received "
-            f"{', '.join(map(str, orders))}; leave them out, or leave out the preset"
+            f"{', '.join(f'{k} = {v}' for k, v in other.items())}; leave them out, or leave out "
+            "the preset"
         )
     return "paper"
 
 
-def _require_settings(task: Task) -> None:
-    least = {"na": 1, "nb": 1, "nk": 0, "hidden": 1, "starts": 1, "seed": 0}
-    least |= {"iterations": 1, "threads": 1}
-    most = {"na": 100, "nb": 100, "nk": 1000, "hidden": 1000, "seed": 2**64 - 1}
-    for name, low in least.items():
-        value, high = getattr(task, name), most.get(name, 1_000_000)
+def _require_settings(**settings: object) -> None:
+    least = {"nk": 0, "seed": 0}
+    most = {"na": 100, "nb": 100, "nk": 1000, "nx": 100, "hidden": 1000, "seed": 2**64 - 1}
+    for name, value in settings.items():
+        if value is None:
+            continue
+        low, high = least.get(name, 1), most.get(name, 1_000_000)
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
             raise SettingError(
                 f"{name}: expected a whole number from {low} to {high}, received {value!r}"
             )
+
+
+def _require_meaning(
+    kind: str,
+    *,
+    na: int | None,
+    nb: int | None,
+    nx: int | None,
+    output: str | None,
+    time_budget: float | None,
+) -> None:
+    """Settings that another kind of model has are a misunderstanding."""
+    searched = kind in _SEARCHED
+    of_the_other = {"na": na, "nb": nb} if searched else {"nx": nx, "output": output}
+    for name, value in of_the_other.items():
+        if value is not None:
+            remedy = "give nx, or name a lagged model" if searched else "give na, nb and hidden"
+            raise SettingError(f"{name}: model {kind} has none, received {value!r}; {remedy}")
+    if output is not None and output not in OUTPUTS:
+        raise SettingError(f"output: expected one of {', '.join(OUTPUTS)}, received {output!r}")
+    if time_budget is None:
+        return
+    is_number = isinstance(time_budget, (int, float)) and not isinstance(time_budget, bool)
+    if not is_number or not 0.0 < time_budget < math.inf:
+        raise SettingError(
+            f"time_budget: expected seconds above 0, received {time_budget!r}; or leave it out"
+        )
 
 
 def _require_data(task: Task, kind: str) -> None:
@@ -162,18 +248,28 @@ def _require_longer(data: Dataset, least: int) -> None:
 
 def _require_enough(task: Task, kind: str) -> None:
     """Every experiment holds whole regressors; all together more samples than parameters."""
-    lag = max(task.na, task.nk + task.nb - 1)
+    lag, parameters = _sizes(task, kind)
     _require_longer(task.data, lag + INIT)
-    regressors = task.na + task.nb * task.data.n_inputs
-    parameters = regressors + 1
-    if kind in ("neural_oe", "paper"):
-        parameters += task.hidden * (regressors + 2)
     usable = sum(len(e) - e.unmeasured - lag for e in task.data.experiments)
     if usable < 2 * parameters:
         raise DataError(
             f"{task.data.source}: expected at least {2 * parameters} samples for {parameters} "
             f"parameters, received {usable}; record longer, or lower the orders"
         )
+
+
+def _sizes(task: Task, kind: str) -> tuple[int, int]:
+    """Samples that the first regressor reaches back, and the number of parameters."""
+    inputs = task.data.n_inputs
+    if kind == "neural_ss":
+        smallest = Structure(task.nx or 1, 1, task.hidden or 2, 0.0)
+        return task.na, smallest.parameters(inputs)
+    lag = max(task.na, task.orders["nk"] + task.nb - 1)
+    regressors = task.na + task.nb * inputs
+    parameters = regressors + 1
+    if kind in ("neural_oe", "paper"):
+        parameters += task.hidden_or_usual * (regressors + 2)
+    return lag, parameters
 
 
 def _cores() -> int:

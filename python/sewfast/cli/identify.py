@@ -31,8 +31,9 @@ Identify a model of a drive from recordings of its input and its output.
 DATA is a CSV, .mat, .npz, Parquet or MCAP file; several files are several experiments of one drive.
 FILE:IN:OUT names the columns of one file, IN1+IN2 several inputs.
 
-The default, auto, fits linear output error, then a network that starts from it, and keeps the
-network only where it does better in free run on samples that it was not fitted to.
+The default, auto, fits linear output error, then small state-space networks that start from it, and
+keeps a network only where it does better in free run on samples that it was not fitted to. What was
+tried, with its errors, is printed.
 """
 
 EXAMPLES = """\
@@ -57,6 +58,9 @@ examples:
 
   sewfast identify run.mat --input u --output y --ts 0.02 --model oe -o linear.json
       a file without a time column; linear output error alone
+
+  sewfast identify run.csv --input u --output y --time-budget 30 -o drive.json
+      the best model that is found in half a minute
 """
 
 
@@ -76,32 +80,39 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--validate", metavar="A:B",
-        help="samples of each file that are held out: they choose, and are scored; default: blocks "
-        "are held out to choose and learned from in the end",
+        help="samples of each file that are held out: they choose, and are scored; default: the "
+        "last fifth is held out to choose, and learned from in the end",
     )  # fmt: skip
     add_output(parser, "MODEL.json", "model file to write", required=True)
 
 
 def _add_model(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--model", choices=("auto", "arx", "iv", "oe", "neural-oe"), default="auto",
+        "--model", choices=("auto", "arx", "iv", "oe", "neural-oe", "neural-ss"), default="auto",
         help="arx: least squares one step ahead; iv: refined instrumental variables; oe: linear "
-        "output error; neural-oe: network output error; auto (default): oe or neural-oe, whichever "
-        "does better",
+        "output error; neural-oe: lagged network output error; neural-ss: neural state space; auto "
+        "(default): oe or neural-ss, whichever does better",
     )  # fmt: skip
     parser.add_argument(
         "--preset", choices=("paper",),
         help="paper: 8 tanh and a saturated output, u/10, y/1000, random starts, as published",
     )  # fmt: skip
-    parser.add_argument("--na", type=int, default=2, metavar="N", help="past outputs (2)")
-    parser.add_argument("--nb", type=int, default=2, metavar="N", help="past inputs (2)")
-    parser.add_argument("--nk", type=int, default=1, metavar="N", help="delay [samples] (1)")
-    parser.add_argument("--hidden", type=int, default=8, metavar="N", help="hidden units (8)")
-    parser.add_argument(
-        "--starts", type=int, metavar="N", help="random starts (4; preset paper: 8)"
-    )
-    parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="seed of the starts (0)"
+    whole: dict[str, Any] = {"type": int, "metavar": "N"}
+    add_argument = parser.add_argument
+    add_argument("--na", **whole, help="past outputs of a lagged model (2)")
+    add_argument("--nb", **whole, help="past inputs of a lagged model (2)")
+    add_argument("--nk", **whole, help="delay [samples] (1; auto, neural-ss: found)")
+    add_argument("--nx", **whole, help="states of neural-ss (found)")
+    add_argument("--hidden", **whole, help="hidden units (found; neural-oe: 8)")
+    add_argument(
+        "--output-function", choices=("linear", "saturation", "abs"),
+        help="output function of neural-ss: abs for a sensor that does not see the sign (found)",
+    )  # fmt: skip
+    add_argument("--starts", **whole, help="random starts (by the amount of data)")
+    add_argument("--seed", **whole, default=0, help="seed of the starts (0)")
+    add_argument(
+        "--time-budget", type=float, metavar="S",
+        help="seconds after which auto and neural-ss keep the best so far (none)",
     )  # fmt: skip
 
 
@@ -135,9 +146,12 @@ def _identify(
         na=args.na,
         nb=args.nb,
         nk=args.nk,
+        nx=args.nx,
         hidden=args.hidden,
+        output=args.output_function,
         starts=args.starts,
         seed=args.seed,
+        time_budget=args.time_budget,
         validation=held,
         progress=progress,
     )

@@ -1,0 +1,131 @@
+"""From the chosen candidate to the model: all starts, all data, one model or an ensemble."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from .. import _core
+from ..models.ensemble import EnsembleCore
+from .candidate import Candidate, judged, members
+from .holdout import held_out_error, split
+from .plan import FINAL_OPERATIONS
+from .search import Search
+from .structure import Start, Structure, Training, train
+
+ENOUGH_TO_CHOOSE_BY = 2_000
+"""Held-out samples from which on a single best start may be taken instead of the median."""
+ABOUT_AS_WELL = 1.1
+"""More starts are taken although their error is this much larger: a short tail is noisy."""
+CLEARLY_BETTER = 0.25
+"""Below this part of the linear model's error the network needs no second opinion."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What becomes the model.
+
+    Attributes
+    ----------
+    cores : tuple of NeuralSS
+        One, or the members of a median.
+    candidate : Candidate
+        Before anything was learned from the held-out part.
+    was_refitted : bool
+        Whether the held-out part was learned from in the end.
+    """
+
+    cores: tuple[_core.NeuralSS, ...]
+    candidate: Candidate
+    was_refitted: bool
+
+
+def finish(search: Search, best: Candidate) -> Finished:
+    """Train the chosen structure with all its starts, then on all data."""
+    final = _finally_trained(search, best)
+    cores = _one_or_all(search, final)
+    refitted = _refitted(search, final.structure, cores)
+    return Finished(tuple(refitted or cores), final, bool(refitted))
+
+
+def _finally_trained(search: Search, best: Candidate) -> Candidate:
+    """More starts, more iterations and more data, as long as there is time and it helps."""
+    task, plan, split_ = search.task, search.plan, search.split
+    if task.clock.over():
+        return best
+    training = search.training(best.structure, plan.final_starts, plan.final_iterations)
+    training = training.affordable(best.structure, FINAL_OPERATIONS)
+    trained = judged(best.structure, train(task, best.structure, training), search.trial)
+    final = trained if trained.error <= ABOUT_AS_WELL * best.error else best
+    if len(split_.fitted) == len(search.trial.fitted) or task.clock.over():
+        return final
+    begun = final.members[: plan.final_starts]
+    everything = Training(
+        split_.fitted, split_.held, None, len(begun), plan.all_iterations, initial=begun
+    )
+    everything = everything.affordable(best.structure, FINAL_OPERATIONS)
+    whole = judged(best.structure, train(task, best.structure, everything), split_)
+    before = judged(best.structure, final.starts, split_)
+    return whole if whole.error <= before.error else before
+
+
+def _one_or_all(search: Search, final: Candidate) -> list[_core.NeuralSS]:
+    """The best start where held-out data are long enough to tell it, else all that count."""
+    cores = final.members
+    if len(cores) < 3:
+        return cores[:1]
+    if search.split.scored < ENOUGH_TO_CHOOSE_BY:
+        return cores
+    alone = held_out_error(cores[0], search.split)
+    together = held_out_error(EnsembleCore(tuple(cores), "median"), search.split)
+    return cores[:1] if alone <= together else cores
+
+
+def _refitted(
+    search: Search, structure: Structure, cores: Sequence[_core.NeuralSS]
+) -> list[_core.NeuralSS]:
+    """A few more iterations on all data, the held-out part included; none where time is up."""
+    task = search.task
+    if search.split.is_given or task.clock.over():
+        return []
+    training = Training(
+        task.data, None, None, len(cores), search.plan.refit_iterations, initial=cores
+    )
+    starts = train(task, structure, training)
+    if len(starts) < len(cores) or task.clock.over():
+        return []
+    return [s.model for s in members(starts)]
+
+
+# --- a second opinion -----------------------------------------------------------------------------
+
+
+def confirmed(search: Search, best: Candidate, order: int, worth: float) -> tuple[bool, float]:
+    """Whether the network is worth it, and its error relative to the linear model's.
+
+    Where it does not win by far, both are fitted again without the last two fifths of every
+    experiment and compared on the fifth before the last as well: errors of both parts are pooled.
+    """
+    linear = search.linear_errors[order]
+    ratio = best.error / linear if linear > 0.0 else 1.0
+    if ratio < CLEARLY_BETTER or ratio >= worth or search.split.is_given:
+        return ratio < worth, ratio
+    earlier = _earlier(search)
+    if earlier is None or search.task.clock.over():
+        return True, ratio
+    model = earlier.start_model(order, earlier.nk)
+    again = math.inf if model is None else held_out_error(model, earlier.trial)
+    training = earlier.training(
+        best.structure, search.plan.trial_starts, search.plan.trial_iterations
+    )
+    starts: list[Start] = train(search.task, best.structure, training)
+    other = judged(best.structure, starts, earlier.trial)
+    pooled = ((best.error**2 + other.error**2) / (linear**2 + again**2)) ** 0.5
+    return pooled < worth, pooled
+
+
+def _earlier(search: Search) -> Search | None:
+    """The same search one fifth earlier."""
+    found = split(search.task.data, skipped=0.2)
+    return None if found is None else Search.of(search.task, search.plan, found)

@@ -1,0 +1,120 @@
+"""`Split`: what models are fitted to, and what they are chosen by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..dataset import Dataset, Experiment, FloatArray
+from ..errors import FitError
+from ..models.base import INIT, Core
+from .task import Story, sources
+
+SHARE = 0.2
+"""Part of every experiment that is held out, at its end.
+
+Blocks inside a record lie where the drive has been before and after, and favour a network that
+learns the record by heart; a later part is the honest question.
+"""
+LEAST_HELD_OUT = 2 * INIT
+RUN_UP = 10 * INIT
+"""Fitted samples that a held-out part begins with: its state is known when scoring starts."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """Data to fit to and data to choose by.
+
+    Attributes
+    ----------
+    fitted : Dataset
+    held : Dataset
+        Begins in the fitted data, with outputs unknown there but for the first `INIT` samples.
+    is_given : bool
+        The user's own validation data, from which nothing is ever learned.
+    sources : tuple of dict
+        What is scored, as JSON values.
+    """
+
+    fitted: Dataset
+    held: Dataset
+    is_given: bool = False
+    sources: tuple[Story, ...] = ()
+
+    @property
+    def scored(self) -> int:
+        """Samples that models are chosen by."""
+        return sum(int(np.isfinite(e.y[INIT:]).sum()) for e in self.held.experiments)
+
+    def shortened(self, fitted: int, held: int) -> Split:
+        """At most so many samples, of every experiment its proportional part from the beginning."""
+        return replace(
+            self, fitted=_shortened(self.fitted, fitted), held=_shortened(self.held, held)
+        )
+
+
+def split(data: Dataset, validation: Dataset | None = None, skipped: float = 0.0) -> Split | None:
+    """Hold out the end of every experiment; None where they are too short for that.
+
+    Parameters
+    ----------
+    data : Dataset
+    validation : Dataset or None
+        Taken instead.
+    skipped : float
+        Part of every experiment, at its end, that is left out altogether.
+    """
+    if validation is not None:
+        return Split(data, validation, is_given=True, sources=tuple(sources(validation)))
+    fitted: list[Experiment] = []
+    held: list[Experiment] = []
+    parts: list[Experiment] = []
+    for e in data.experiments:
+        stop = round((1.0 - skipped) * len(e))
+        at = stop - round(SHARE * len(e))
+        if stop - at < LEAST_HELD_OUT or at < LEAST_HELD_OUT:
+            return None
+        fitted.append(e.cut(0, at))
+        held.append(_with_run_up(e, at, stop))
+        parts.append(e.cut(at, stop))
+    pieces = (replace(data, experiments=tuple(p)) for p in (fitted, held, parts))
+    fitted_data, held_data, scored = pieces
+    return Split(fitted_data, held_data, sources=tuple(sources(scored)))
+
+
+def _with_run_up(e: Experiment, at: int, stop: int) -> Experiment:
+    begin = max(0, at - RUN_UP)
+    y = e.y[begin:stop].copy()
+    y[INIT : at - begin] = np.nan
+    return Experiment(e.u[begin:stop], y, {}, e.name, e.start + begin)
+
+
+def _shortened(data: Dataset, samples: int) -> Dataset:
+    if len(data) <= samples:
+        return data
+    share = samples / len(data)
+    kept = [max(LEAST_HELD_OUT, round(share * len(e))) for e in data.experiments]
+    pieces = (e.cut(0, min(n, len(e))) for n, e in zip(kept, data.experiments, strict=True))
+    return replace(data, experiments=tuple(pieces))
+
+
+def held_out_error(core: Core, split: Split) -> float:
+    """Root mean square of the free run's error on what is held out; infinite for a runaway."""
+    squares, known = 0.0, 0
+    for e in split.held.experiments:
+        run = _free_run(core, e)
+        if run is None:
+            return float("inf")
+        error = (e.y - run)[INIT:]
+        error = error[~np.isnan(error)]
+        squares, known = squares + float(error @ error), known + len(error)
+    return float(np.sqrt(squares / known)) if known else float("inf")
+
+
+def _free_run(core: Core, e: Experiment) -> FloatArray | None:
+    try:
+        state = core.estimate_initial_state(e.u[:INIT], e.y[:INIT])
+        return core.simulate(e.u, state)
+    except FitError:
+        return None

@@ -1,0 +1,215 @@
+"""The lagged network: the paper's preset, and the one that starts from linear output error."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from .. import _core
+from ..dataset import Experiment
+from ..errors import Interrupted
+from ..models import LinearOE, Model, NeuralOE
+from ..models.base import INIT
+from .linear import linear_fit
+from .task import (
+    Story,
+    Task,
+    arrays,
+    bare,
+    finite,
+    fit_story,
+    free_run_rmse,
+    sources,
+    with_story,
+)
+
+BLOCKS = 8
+HELD_OUT = (2, 5)
+"""Blocks to select on: inside the record, where a chirp is neither at its start nor at its end."""
+LEAST_BLOCK = 2 * INIT
+DECAYS = (1e-2, 1e-4)
+"""Weight decays that the default network is trained with, the strongest first."""
+ABOUT_AS_WELL = 1.25
+"""Largest ratio to the best held-out error at which a stronger weight decay is taken."""
+_USUAL_STARTS = 4
+WORTH_IT = 0.98
+"""The network must bring the free-run error below this part of the linear model's."""
+
+
+def paper(task: Task) -> Model:
+    """The paper's network, from random starts and in its fixed scaling."""
+    began = time.perf_counter()
+    fit = _core.fit_neural_oe(
+        arrays(task.data),
+        [] if task.validation is None else arrays(task.validation),
+        **task.orders,
+        hidden=task.hidden_or_usual,
+        linear=None,
+        u_mean=np.zeros(1),
+        u_scale=np.full(1, 10.0),
+        y_mean=0.0,
+        y_scale=1000.0,
+        saturate=0.2,
+        initial_state="measured",
+        weight_decay=0.0,
+        max_iterations=task.iterations_or_usual,
+        starts=_starts(task),
+        seed=task.seed,
+        threads=task.threads,
+        progress=task.progress,
+    )
+    story = {"preset": "paper", "initial_state": "measured"}
+    return _unless_interrupted(fit, _network_model(task, fit, began, story))
+
+
+def neural_oe(task: Task) -> Model:
+    """The network, trained in free run from the linear output-error model."""
+    began = time.perf_counter()
+    linear = linear_fit(task, began)
+    trial = task if task.validation is not None else _with_blocks_held_out(task)
+    network, decays = _selected_network(trial, linear, began)
+    story = {"samples_fitted": len(trial.data), **decays}
+    story |= _choice_story(_comparison(trial, linear, network))
+    return _network_model(task, network, began, story)
+
+
+# --- fits -------------------------------------------------------------------------------------
+
+
+def _selected_network(
+    task: Task, linear: _core.LinearFit, began: float
+) -> tuple[_core.NeuralFit, Story]:
+    """The network with the strongest weight decay that does about as well as the best.
+
+    Held-out blocks lie where the drive has been before; a smoother network is the safer one where
+    it has not (the one-standard-error rule: Hastie, Tibshirani, Friedman 2009, section 7.10). One
+    that runs away or sticks is taken only where all do.
+    """
+    decays = DECAYS if task.validation is not None else DECAYS[:1]
+    fits = [_network_fit(task, linear, decay, began) for decay in decays]
+    errors = [math.sqrt(2.0 * (f.validation_cost or 0.0)) for f in fits]
+    able = [i for i, f in enumerate(fits) if f.sound] or list(range(len(fits)))
+    bound = ABOUT_AS_WELL * min(errors[i] for i in able)
+    chosen = next(i for i in able if errors[i] <= bound)
+    tried = [
+        {"weight_decay": d, "held_out_error": e or None, "sound": f.sound}
+        for d, e, f in zip(decays, errors, fits, strict=True)
+    ]
+    return fits[chosen], {"weight_decay": decays[chosen], "weight_decays": tried}
+
+
+def _network_fit(
+    task: Task, linear: _core.LinearFit, decay: float, began: float
+) -> _core.NeuralFit:
+    fit = _core.fit_neural_oe(
+        arrays(task.data),
+        [] if task.validation is None else arrays(task.validation),
+        **task.orders,
+        hidden=task.hidden_or_usual,
+        linear=linear.model,
+        u_mean=None,
+        u_scale=None,
+        y_mean=None,
+        y_scale=None,
+        saturate=1.0,
+        initial_state="estimated",
+        weight_decay=decay,
+        max_iterations=task.iterations_or_usual,
+        starts=_starts(task),
+        seed=task.seed,
+        threads=task.threads,
+        progress=task.progress,
+    )
+    if fit.termination == "interrupted":
+        raise Interrupted(_network_model(task, fit, began))
+    return fit
+
+
+def _unless_interrupted(fit: _core.NeuralFit, model: Model) -> Model:
+    if fit.termination == "interrupted":
+        raise Interrupted(model)
+    return model
+
+
+# --- selection --------------------------------------------------------------------------------
+
+
+def _with_blocks_held_out(task: Task) -> Task:
+    """Two of eight blocks of every experiment become validation data, if they are long enough."""
+    kept: list[Experiment] = []
+    held: list[Experiment] = []
+    lag = max(task.na, task.orders["nk"] + task.nb)
+    for e in task.data.experiments:
+        edges = [round(i * len(e) / BLOCKS) for i in range(BLOCKS + 1)]
+        if edges[1] < LEAST_BLOCK + lag:
+            return task
+        held += [e.cut(edges[i], edges[i + 1]) for i in HELD_OUT]
+        starts, stops = (0, *(i + 1 for i in HELD_OUT)), (*HELD_OUT, BLOCKS)
+        kept += [e.cut(edges[i], edges[j]) for i, j in zip(starts, stops, strict=True)]
+    kept, held = _with_enough_measured(kept), _with_enough_measured(held)
+    if not kept or not held:
+        return task
+    return replace(
+        task,
+        data=replace(task.data, experiments=tuple(kept)),
+        validation=replace(task.data, experiments=tuple(held)),
+    )
+
+
+def _with_enough_measured(pieces: list[Experiment]) -> list[Experiment]:
+    """The pieces that a long gap in the output has left something of."""
+    return [e for e in pieces if len(e) - e.unmeasured > LEAST_BLOCK]
+
+
+_NOTHING_HELD_OUT: Story = {
+    "chosen": "oe",
+    "reason": f"the record is too short to hold out blocks of {LEAST_BLOCK} samples to compare on",
+}
+
+
+def _comparison(task: Task, linear: _core.LinearFit, network: _core.NeuralFit) -> Story:
+    """Free-run errors of both on data not trained on, the choice and its reason."""
+    if task.validation is None:
+        return _NOTHING_HELD_OUT
+    rmse = {
+        "oe": free_run_rmse(bare(LinearOE, linear.model, task.data), task.validation),
+        "neural_oe": free_run_rmse(bare(NeuralOE, network.model, task.data), task.validation),
+    }
+    is_better = network.sound and rmse["neural_oe"] < WORTH_IT * rmse["oe"]
+    ratio = rmse["neural_oe"] / rmse["oe"] if rmse["oe"] > 0.0 else 1.0
+    reason = (
+        f"free-run error of the network on data not trained on: {100 * ratio:.1f} % of the linear "
+        f"model's; the network is chosen below {100 * WORTH_IT:.0f} %"
+    )
+    if not network.sound:
+        reason += "; it runs away on larger inputs or does not forget its initial state"
+    return {
+        "chosen": "neural_oe" if is_better else "oe",
+        "reason": reason,
+        "free_run_rmse": {k: finite(v) for k, v in rmse.items()},
+        "held_out": sources(task.validation),
+    }
+
+
+def _choice_story(choice: Story) -> Story:
+    if choice["chosen"] != "neural_oe":
+        return {"choice": choice, "notes": [f"{choice['reason']}; consider model oe"]}
+    return {"choice": choice}
+
+
+def _network_model(
+    task: Task, fit: _core.NeuralFit, began: float, extra: Story | None = None
+) -> Model:
+    story: Story = {"initial_state": "estimated", "cost_unit": "scaled output squared"}
+    story |= {"seed": task.seed, "starts": _starts(task), "start": fit.start}
+    story |= {"start_costs": [finite(c) for c in fit.start_costs.tolist()]}
+    story |= {"validation_cost": fit.validation_cost}
+    told = fit_story(fit) | story | (extra or {})
+    return with_story(bare(NeuralOE, fit.model, task.data), task, began, told)
+
+
+def _starts(task: Task) -> int:
+    return _USUAL_STARTS if task.starts is None else task.starts

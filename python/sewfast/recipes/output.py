@@ -1,0 +1,167 @@
+"""Output functions that data suggest: a sensor that rectifies, or one that ends at a limit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .. import _core
+from ..dataset import Dataset, FloatArray
+from ..errors import FitError
+from .task import Pairs
+
+OUTPUTS = ("linear", "saturation", "abs")
+CORNER = 0.03
+"""Width of a corner, relative to the output's scale."""
+NEAR_ZERO = 0.05
+"""Part of the range within which an output counts as zero."""
+PILE = 0.02
+"""Share of the samples within a hundredth of the range from its end that makes a pile."""
+SHARPNESS = 4.0
+"""How many times denser than its surroundings a pile is."""
+MEMORIES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98)
+"""Poles of the low-pass filters whose sign is the first guess of the output's."""
+ROUNDS = 12
+SIGN_SAMPLES = 3_000
+
+
+@dataclass(frozen=True)
+class Output:
+    """An output function in the data's units; see docs/CONVENTIONS.md, State space."""
+
+    name: str
+    low: float = 0.0
+    high: float = 0.0
+
+    def parameters(self, mean: float, scale: float) -> FloatArray:
+        """As the core takes them, in scaled units."""
+        if self.name == "abs":
+            return np.array([CORNER])
+        if self.name == "saturation":
+            low, high = ((v - mean) / scale for v in (self.low, self.high))
+            return np.array([low, high, CORNER])
+        return np.zeros(0)
+
+
+LINEAR = Output("linear")
+ABS = Output("abs")
+
+
+def suggested(data: Dataset) -> list[Output]:
+    """Output functions worth a trial; the plain one always is."""
+    found = [LINEAR]
+    if _may_be_rectified(_known(data)):
+        found.append(ABS)
+    saturated = saturation(data)
+    return found if saturated is None else [*found, saturated]
+
+
+def named(name: str, data: Dataset) -> Output:
+    """The function of that name, its limits from the data."""
+    if name == "saturation":
+        return saturation(data) or Output(name, *data.output_range)
+    return Output(name)
+
+
+def saturation(data: Dataset) -> Output | None:
+    """Limits where the output piles up at an end of its range; the other end is left free."""
+    y = _known(data)
+    low, high = float(y.min()), float(y.max())
+    width = high - low
+    is_low, is_high = _piles(y - low, width), _piles(high - y, width)
+    if not (is_low or is_high):
+        return None
+    bottom = float(np.median(y[y <= low + width / 100.0])) if is_low else low - width
+    top = float(np.median(y[y >= high - width / 100.0])) if is_high else high + width
+    return Output("saturation", bottom, top)
+
+
+def scale_of(data: Dataset, output: Output) -> tuple[float, float]:
+    """Mean and scale of the output as the core takes them."""
+    y = _known(data)
+    if output.name == "abs":
+        return 0.0, float(np.sqrt(np.mean(y**2)))
+    return float(y.mean()), float(y.std())
+
+
+def _known(data: Dataset) -> FloatArray:
+    y: FloatArray = np.concatenate([e.y for e in data.experiments])
+    return y[~np.isnan(y)]
+
+
+def _piles(distance: FloatArray, width: float) -> bool:
+    """Whether samples crowd within a hundredth of the range, and not beside it."""
+    at = float(np.mean(distance <= width / 100.0))
+    beside = float(np.mean((distance > width / 100.0) & (distance <= width / 20.0))) / 4.0
+    return at >= PILE and at > SHARPNESS * beside
+
+
+def _may_be_rectified(y: FloatArray) -> bool:
+    """Never clearly below zero, and often at zero without staying there for good."""
+    top = float(y.max())
+    if top <= 0.0 or float(y.min()) < -NEAR_ZERO * top:
+        return False
+    return bool(np.mean(y <= NEAR_ZERO * top) > 0.005)
+
+
+# --- a linear start behind a rectifier ----------------------------------------------------------
+
+
+def rectified_start(data: Dataset, order: int, nk: int) -> _core.LinearModel | None:
+    """The linear model whose magnitude comes nearest to a rectified output.
+
+    Signs and model in turns: the model's own sign goes onto the measured magnitude, and output
+    error is fitted to that, from the signs of the input through low-pass filters of several
+    memories (alternating projections, as for the phase of a diffraction pattern: Fienup 1982).
+    """
+    pairs = [(e.u[:SIGN_SAMPLES], e.y[:SIGN_SAMPLES]) for e in data.experiments]
+    tried = [_restored(pairs, order, nk, memory) for memory in MEMORIES]
+    return min(tried, key=lambda t: t[0])[1]
+
+
+def _restored(
+    pairs: Pairs, order: int, nk: int, memory: float
+) -> tuple[float, _core.LinearModel | None]:
+    signs = [_sign(_low_pass(u, memory)) for u, _ in pairs]
+    best: tuple[float, _core.LinearModel | None] = (np.inf, None)
+    for _ in range(ROUNDS):
+        signed = [(u, y * s) for (u, y), s in zip(pairs, signs, strict=True)]
+        try:
+            fit = _core.fit_oe(signed, na=order, nb=order + 1, nk=nk, max_iterations=15)
+            runs = [_run(fit, i, u) for i, (u, _) in enumerate(signed)]
+        except FitError:
+            break
+        error = sum(
+            float(np.nansum((np.abs(run) - np.abs(y)) ** 2))
+            for run, (_, y) in zip(runs, pairs, strict=True)
+        )
+        if error < best[0]:
+            best = (error, fit.model)
+        following = [_sign(run) for run in runs]
+        if all(np.array_equal(a, b) for a, b in zip(signs, following, strict=True)):
+            break
+        signs = following
+    return best
+
+
+def _run(fit: _core.LinearFit, i: int, u: FloatArray) -> FloatArray:
+    run: FloatArray = fit.model.simulate(u, np.ascontiguousarray(fit.initial_states[i]))
+    return run
+
+
+def _sign(x: FloatArray) -> FloatArray:
+    signs: FloatArray = np.where(x >= 0.0, 1.0, -1.0)
+    return signs
+
+
+def _low_pass(u: FloatArray, memory: float) -> FloatArray:
+    """The inputs' sum, each over its standard deviation, through a first-order filter."""
+    spread = np.where(u.std(axis=0) > 0.0, u.std(axis=0), 1.0)
+    x = (u / spread).sum(axis=1)
+    y: FloatArray = np.empty_like(x)
+    last = 0.0
+    for k, value in enumerate(x):
+        last = memory * last + (1.0 - memory) * float(value)
+        y[k] = last
+    return y

@@ -1,0 +1,230 @@
+"""The search for a structure: a few steps from a usual one, each kept where free run gains."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+from .. import _core
+from ..errors import FitError
+from .candidate import Candidate, judged
+from .holdout import Split, held_out_error
+from .output import ABS, LINEAR, Output, named, rectified_start, suggested
+from .plan import SEARCH_OPERATIONS, Plan
+from .structure import Stopped, Structure, Training, train
+from .task import Pairs, Story, Task, arrays, finite
+
+LINEAR_ORDERS = (1, 2, 3, 4, 5, 6)
+WORTH_AN_ORDER = 0.97
+"""A larger linear order must bring the error below this part of the smaller one's."""
+WORTH_A_DECAY = 0.99
+WORTH_A_FEEDTHROUGH = 0.9
+"""nk = 0 is no plant for a loop: it must be worth more."""
+USUAL_HIDDEN = 8
+LEAST_NX, MOST_NX = 2, 8
+LEAST_DECAY, MOST_DECAY = 1e-10, 1e-1
+SAMPLES_PER_PARAMETER = 4
+SHARE_FOR_SEARCH = 0.6
+"""Part of a time budget after which no further candidate is tried."""
+
+
+@dataclass
+class Search:
+    """One search: what it works on, and the table it fills."""
+
+    task: Task
+    plan: Plan
+    split: Split
+    trial: Split
+    linear: dict[tuple[int, int, str], _core.LinearModel | None] = field(default_factory=dict)
+    linear_errors: dict[int, float] = field(default_factory=dict)
+    table: dict[Structure, Candidate] = field(default_factory=dict)
+    operations: float = 0.0
+
+    @classmethod
+    def of(cls, task: Task, plan: Plan, split: Split) -> Search:
+        """A search that has not begun."""
+        return cls(task, plan, split, split.shortened(plan.trial_samples, plan.held_samples))
+
+    @property
+    def nk(self) -> int:
+        """The delay to begin with."""
+        return 1 if self.task.nk is None else self.task.nk
+
+    # --- linear models --------------------------------------------------------------------------
+
+    def start_model(self, nx: int, nk: int, output: Output = LINEAR) -> _core.LinearModel | None:
+        """The linear model of that order, fitted once."""
+        key = (nx, nk, output.name)
+        if key not in self.linear:
+            data = self.trial.fitted
+            if output == ABS:
+                self.linear[key] = rectified_start(data, nx, nk)
+            else:
+                self.linear[key] = _output_error(self.task, arrays(data), nx, nk)
+        return self.linear[key]
+
+    def linear_order(self) -> int:
+        """The smallest order about as good in free run as the best; fills `linear_errors`."""
+        for order in LINEAR_ORDERS:
+            model = self.start_model(order, self.nk)
+            if model is not None:
+                self.linear_errors[order] = held_out_error(model, self.trial)
+        chosen = min(self.linear_errors, default=0)
+        for order, error in self.linear_errors.items():
+            if error < WORTH_AN_ORDER * self.linear_errors[chosen]:
+                chosen = order
+        return chosen
+
+    # --- networks -------------------------------------------------------------------------------
+
+    def ladder(self, order: int) -> Candidate | None:
+        """The best candidate after all steps; None where no network could be trained."""
+        nx = self.task.nx or min(max(order, LEAST_NX), LINEAR_ORDERS[-1])
+        hidden = (USUAL_HIDDEN, 4, 2) if self.task.hidden is None else (self.task.hidden,)
+        sizes = (Structure(nx, self.nk, h, self.plan.decay) for h in hidden)
+        base = next(filter(self._is_affordable, sizes), None)
+        if base is None:
+            return None
+        best = self._best_of(replace(base, output=o) for o in self._outputs())
+        for step in (
+            self._delays,
+            self._decays,
+            self._sizes,
+            self._orders,
+            self._sizes,
+            self._decays,
+        ):
+            best = step(best)
+        return best if best is not None and math.isfinite(best.error) else None
+
+    def _outputs(self) -> list[Output]:
+        data = self.trial.fitted
+        return suggested(data) if self.task.output is None else [named(self.task.output, data)]
+
+    def _decays(self, best: Candidate | None) -> Candidate | None:
+        if best is None:
+            return None
+        step = self.plan.decay_step
+        weaker = self._climbed(best, lambda s: _decayed(s, 1.0 / step), WORTH_A_DECAY)
+        if weaker is not best:
+            return weaker
+        return self._climbed(best, lambda s: _decayed(s, step), WORTH_A_DECAY)
+
+    def _orders(self, best: Candidate | None) -> Candidate | None:
+        if best is None or self.task.nx is not None:
+            return best
+        larger = self._climbed(best, _with_a_state_more)
+        if larger is not best or best.structure.nx <= 1:
+            return larger
+        return self._climbed(best, lambda s: replace(s, nx=s.nx - 1) if s.nx > 1 else None)
+
+    def _sizes(self, best: Candidate | None) -> Candidate | None:
+        if best is None or self.task.hidden is not None:
+            return best
+        most = self.plan.most_hidden
+        larger = self._climbed(
+            best, lambda s: replace(s, hidden=2 * s.hidden) if 2 * s.hidden <= most else None
+        )
+        if larger is not best:
+            return larger
+        return self._best_of([replace(best.structure, hidden=best.structure.hidden // 2)], best)
+
+    def _delays(self, best: Candidate | None) -> Candidate | None:
+        if best is None or self.task.nk is not None:
+            return best
+        later = self._best_of([replace(best.structure, nk=2)], best) or best
+        return self._best_of([replace(best.structure, nk=0)], later, WORTH_A_FEEDTHROUGH)
+
+    def _climbed(
+        self,
+        best: Candidate,
+        step: Callable[[Structure], Structure | None],
+        worth: float | None = None,
+    ) -> Candidate:
+        """Steps of one kind as long as each is worth it."""
+        while (following := step(best.structure)) is not None:
+            tried = self._best_of([following], best, worth)
+            if tried is best or tried is None:
+                break
+            best = tried
+        return best
+
+    def _best_of(
+        self,
+        structures: Iterable[Structure],
+        best: Candidate | None = None,
+        worth: float | None = None,
+    ) -> Candidate | None:
+        for structure in structures:
+            tried = self._tried(structure)
+            if tried is None:
+                continue
+            if best is None or tried.error < (worth or self.plan.worth_a_step) * best.error:
+                best = tried
+        return best
+
+    def _tried(self, structure: Structure) -> Candidate | None:
+        """The candidate, from the table where it was tried before; None where it cannot be."""
+        if structure in self.table:
+            return self.table[structure]
+        if self._is_over() or not self._is_affordable(structure):
+            return None
+        plan = self.plan
+        training = self.training(structure, plan.trial_starts, plan.trial_iterations)
+        starts = train(self.task, structure, training)
+        self.operations += training.operations(structure)
+        self.table[structure] = judged(structure, starts, self.trial)
+        return self.table[structure]
+
+    def _is_over(self) -> bool:
+        """Time or work is used up; the first candidate is always tried."""
+        out_of_time = self.task.clock.over(SHARE_FOR_SEARCH)
+        return bool(self.table) and (out_of_time or self.operations > SEARCH_OPERATIONS)
+
+    def training(self, structure: Structure, starts: int, iterations: int) -> Training:
+        """A training of the structure on the trial's part of the data."""
+        return Training(
+            self.trial.fitted,
+            self.trial.held,
+            self.start_model(structure.nx, structure.nk, structure.output),
+            starts if self.task.starts is None else self.task.starts,
+            _limited(iterations, self.task),
+        )
+
+    def _is_affordable(self, structure: Structure) -> bool:
+        wanted = structure.parameters(self.task.data.n_inputs) * SAMPLES_PER_PARAMETER
+        is_fixed = None not in (self.task.nx, self.task.hidden)
+        return is_fixed or wanted <= len(self.trial.fitted)
+
+    def rows(self) -> Iterator[Story]:
+        """The table: linear models, then networks in the order of their trials."""
+        for order, error in self.linear_errors.items():
+            row: Story = {"kind": "oe", "na": order, "nb": order + 1, "nk": self.nk}
+            yield row | {"free_run_rmse": finite(error)}
+        yield from (c.to_json() for c in self.table.values())
+
+
+def _with_a_state_more(structure: Structure) -> Structure | None:
+    return replace(structure, nx=structure.nx + 1) if structure.nx < MOST_NX else None
+
+
+def _decayed(structure: Structure, factor: float) -> Structure | None:
+    """With another weight decay, as long as that can matter."""
+    decay = float(f"{structure.decay * factor:.0e}")
+    return replace(structure, decay=decay) if LEAST_DECAY <= decay <= MOST_DECAY else None
+
+
+def _limited(iterations: int, task: Task) -> int:
+    return iterations if task.iterations is None else min(iterations, task.iterations)
+
+
+def _output_error(task: Task, pairs: Pairs, order: int, nk: int) -> _core.LinearModel | None:
+    try:
+        fit = _core.fit_oe(pairs, **task.fit_options(na=order, nb=order + 1, nk=nk))
+    except FitError:
+        return None
+    if fit.termination == "interrupted":
+        raise Stopped([])
+    return fit.model
