@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import os
 import struct
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -298,3 +300,62 @@ def test_the_end_that_an_unplug_took_is_listed(tmp_path: Path) -> None:
     assert len(found) == outcome.taken
     assert found.gaps == outcome.gaps
     assert outcome.gaps
+
+
+# --- two recorders --------------------------------------------------------------------------------
+
+
+def _writer(path: Path, **settings: bool) -> RecordWriter:
+    header = Header("run", 0.001, {"u": "V"}, 100, None, {"kind": "virtual"})
+    return RecordWriter(path, header, **settings)
+
+
+needs_locks = pytest.mark.skipif(os.name == "nt", reason="Windows has no flock")
+
+
+@needs_locks
+@pytest.mark.parametrize("lazy", [False, True])
+def test_a_recording_under_way_is_not_written_over(tmp_path: Path, lazy: bool) -> None:
+    path = tmp_path / "run.mcap"
+    with _writer(path) as first:
+        first.samples(0, {"u": np.ones(50)})
+        with pytest.raises(SettingError, match="nobody else writes"):
+            _writer(path, overwrite=True, lazy=lazy)
+        first.samples(50, {"u": np.ones(50)})
+    assert read_recording(path).complete
+    with _writer(path, overwrite=True) as second:
+        second.samples(0, {"u": np.zeros(100)})
+    assert not read_recording(path).columns["u"].any()
+
+
+@needs_locks
+def test_of_two_that_may_replace_a_file_one_does(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.touch()
+    one, other = (_writer(path, overwrite=True, lazy=True) for _ in range(2))
+    one.samples(0, {"u": np.ones(100)})
+    one.event("started")
+    while not path.stat().st_size:
+        time.sleep(0.001)
+    other.samples(0, {"u": np.zeros(100)})
+    with pytest.raises(SettingError, match="is kept"):
+        other.close()
+    one.close()
+    found = read_recording(path)
+    assert found.complete
+    assert not found.damage
+    assert found.columns["u"].all()
+
+
+def test_what_came_after_the_question_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with _writer(path) as first:
+        first.samples(0, {"u": np.ones(10)})
+    late = _writer(path, overwrite=True, lazy=True)
+    path.unlink()
+    with _writer(path) as second:
+        second.samples(0, {"u": np.ones(100)})
+    late.samples(0, {"u": np.zeros(100)})
+    with pytest.raises(SettingError, match="is kept"):
+        late.close()
+    assert read_recording(path).complete

@@ -18,7 +18,7 @@ from ..errors import DataError, SewfastError
 from . import samples
 from .container import Assembler, Message, opening
 from .header import Header, bearable
-from .sink import Sink, batched, require_writable
+from .sink import Sink, batched, exists, marked, require_writable
 from .topics import Topic
 
 MESSAGE_SAMPLES = 100
@@ -70,6 +70,7 @@ class Filing:
         self._gaps: list[tuple[int, int]] = []
         self._gap_count = 0
         self._items: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self._before = marked(path)
         if lazy:
             require_writable(path, overwrite=overwrite)
         else:
@@ -111,6 +112,9 @@ class Filing:
         return self._opened
 
     def _open(self) -> None:
+        # what has come since it was asked for may be the only account of a run
+        if marked(self._path) not in (None, self._before):
+            raise exists(self._path)
         self._opened = Sink(self._path, overwrite=self._overwrite)
         self._write_header()
 

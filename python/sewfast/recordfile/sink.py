@@ -8,10 +8,29 @@ import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from ..errors import DataError, SettingError
 
 _BATCH = 1 << 16
+
+
+class Mark(NamedTuple):
+    """What tells a file from one that has taken its place, or its content, since."""
+
+    device: int
+    inode: int
+    size: int
+    modified_ns: int
+
+
+def marked(path: Path) -> Mark | None:
+    """The mark of what is there; None for nothing."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return Mark(found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns)
 
 
 def require_writable(path: Path, *, overwrite: bool) -> None:
@@ -24,7 +43,7 @@ def require_writable(path: Path, *, overwrite: bool) -> None:
     """
     if path.exists() and not path.is_dir():
         if not overwrite:
-            raise _exists(path)
+            raise exists(path)
         _try(path, path, os.O_WRONLY)
         return
     if path.is_dir():
@@ -36,12 +55,51 @@ def require_writable(path: Path, *, overwrite: bool) -> None:
 
 def _try(path: Path, opened: Path, flags: int) -> None:
     try:
-        os.close(os.open(opened, flags, 0o666))
+        file = os.open(opened, flags, 0o666)
     except OSError as e:
         raise _unwritable(path, e) from e
+    try:
+        _own(path, file)
+    finally:
+        _give_back(file)
 
 
-def _exists(path: Path) -> SettingError:
+def _own(path: Path, file: int) -> None:
+    """Keep other recorders out of an open file: each would overwrite what the other has written.
+
+    Raises
+    ------
+    SettingError
+        Where another one has it.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise SettingError(
+            f"{path}: expected a file that nobody else writes, a recording is being made in it; it "
+            "is kept: choose another name"
+        ) from None
+    except OSError:
+        # a file system without locks
+        pass
+
+
+def _give_back(file: int) -> None:
+    with suppress(ImportError, OSError):
+        import fcntl
+
+        # a process that was forked meanwhile must not keep it
+        fcntl.flock(file, fcntl.LOCK_UN)
+    with suppress(OSError):
+        os.close(file)
+
+
+def exists(path: Path) -> SettingError:
+    """The refusal to write over a file."""
     return SettingError(
         f"{path}: the file exists and is kept; choose another name, or overwrite=True (--overwrite)"
     )
@@ -69,7 +127,7 @@ class Sink:
     Raises
     ------
     SettingError
-        Where the file exists and may not be replaced.
+        Where the file exists and may not be replaced, or another recording is being made in it.
     DataError
         Where it cannot be made: a folder, no such folder, no permission.
     """
@@ -81,11 +139,21 @@ class Sink:
         flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
         try:
             # without O_EXCL two writers could meet in one file
-            self._file = os.open(path, flags | (os.O_TRUNC if overwrite else os.O_EXCL), 0o666)
+            self._file = os.open(path, flags | (0 if overwrite else os.O_EXCL), 0o666)
         except FileExistsError as e:
-            raise (_folder(path) if path.is_dir() else _exists(path)) from e
+            raise (_folder(path) if path.is_dir() else exists(path)) from e
         except OSError as e:
             raise _unwritable(path, e) from e
+        try:
+            _own(path, self._file)
+            # nothing is lost before it is certain that the file is this one's
+            os.ftruncate(self._file, 0)
+        except OSError as e:
+            self.close()
+            raise _unwritable(path, e) from e
+        except BaseException:
+            self.close()
+            raise
 
     def append(self, piece: bytes) -> None:
         """Hand a piece to the operating system: from then on `kill -9` cannot take it away.
@@ -112,8 +180,7 @@ class Sink:
             os.fsync(self._file)
 
     def close(self) -> None:
-        with suppress(OSError):
-            os.close(self._file)
+        _give_back(self._file)
 
 
 def batched(pieces: Iterable[bytes]) -> Iterator[bytes]:
