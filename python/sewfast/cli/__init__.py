@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import SewfastError
+from .apart import require_apart
 from .parser import build_parser
 
 DONE, FAULT, REFUSED, INTERRUPTED = 0, 1, 2, 130
@@ -36,6 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _say("sewfast: interrupted; nothing was written", INTERRUPTED)
     began = time.time()
     try:
+        require_apart(args)
         code: int | None = args.command(args)
         if sys.stdout is not None:  # as it is where it was closed before the start
             sys.stdout.flush()

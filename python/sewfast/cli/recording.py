@@ -202,9 +202,11 @@ def _told(made: Recording, machine: str) -> tuple[dict[str, Any], str]:
         line += f"; {missing} samples were lost on the way (NaN)"
     if made.speed_true is not None:
         error = made.y - made.speed_true
-        rmse = float(np.sqrt(np.nanmean(error**2)))
+        known = error[np.isfinite(error)]
+        rmse = float(np.sqrt(np.mean(known**2))) if len(known) else None
         summary["speed_estimate_rmse_rpm"] = rmse
-        line += f"; y is within {rmse:.2g} RPM rms of the true speed"
+        if rmse is not None:
+            line += f"; y is within {rmse:.2g} RPM rms of the true speed"
     return summary, line
 
 
