@@ -179,11 +179,32 @@ def test_a_command_without_an_answer_is_given_up_and_the_next_one_works():
         link = linked(port)
         device.intercept = lambda frame: True
         seen = commands(device, script.STATUS)
-        with pytest.raises(LinkError, match=r"answer to STATUS, none came within 1 s; check cable"):
+        told = r"answer to STATUS, none came within 1(\.\d)? s to 1\d attempts, nor anything else"
+        with pytest.raises(LinkError, match=told):
             link.status()
         assert 9 <= len(seen) <= 11
         device.intercept = lambda frame: False
         assert link.status().state == "idle"
+
+
+def test_a_command_is_repeated_for_the_whole_watchdog_time():
+    with simulated() as (device, port):
+        link = linked(port, watchdog=5.0)
+        device.intercept = lambda frame: True
+        seen = commands(device, script.STOP)
+        began = port._clock.now
+        with pytest.raises(LinkError, match=r"answer to STOP, none came within 5 s"):
+            link.stop()
+        assert port._clock.now - began >= 5.0
+        assert len(seen) >= 400
+
+
+def test_what_else_came_is_said_where_an_answer_did_not():
+    with simulated() as (device, port):
+        link = linked(port)
+        device.intercept = lambda frame: device.send(0xC3, b"said") or True
+        with pytest.raises(LinkError, match=r"attempts, but 1\d other frames: it does not hear"):
+            link.status()
 
 
 def test_a_stop_is_repeated_sooner():

@@ -23,7 +23,7 @@ REPEAT = 0.1
 STOP_REPEAT = 0.01
 """The same for STOP, within any usual watchdog time."""
 PATIENCE = 1.0
-"""Time after which a command is given up [s]."""
+"""Time after which a command is given up, where the watchdog's is not longer [s]."""
 ATTEMPTS = 10
 """Times that a command is sent at least before it is given up."""
 WATCHDOG = 0.1
@@ -45,6 +45,8 @@ class _Command:
     last_sent: float
     since: float
     """From when on its patience counts: anew after the port was away."""
+    heard: int
+    """Intact frames that had come by then."""
     attempts: int = 1
     reply: Reply | None = None
 
@@ -204,7 +206,7 @@ class Connection:
         self._sequence = (self._sequence + 1) & 0xFFFFFFFF
         frame = self._frame(kind, self._sequence, body)
         now = time.monotonic()
-        self._command = _Command(kind, self._sequence, frame, now, now, now)
+        self._command = _Command(kind, self._sequence, frame, now, now, now, self._frames)
         self._send(frame)
 
     def answer(self) -> Reply | None:
@@ -280,11 +282,14 @@ class Connection:
         ------
         LinkError
             Where it was not confirmed: then the device's watchdog stops the motor.
+        SettingError
+            Where another thread uses the connection.
         """
-        self._command = None
-        # what an interrupted write has left is closed by a zero
-        self._send(b"\0")
-        self.ask(Kind.STOP)
+        with self.owned():
+            self._command = None
+            # what an interrupted write has left is closed by a zero
+            self._send(b"\0")
+            self.ask(Kind.STOP)
 
     def _repeat(self, command: _Command) -> None:
         now = time.monotonic()
@@ -292,15 +297,35 @@ class Connection:
         if command.reply is not None or now - command.last_sent < pause:
             return
         # a host that was not given the processor for a while has waited, but not asked
-        if now - command.since >= PATIENCE and command.attempts >= ATTEMPTS:
+        if now - command.since >= self._patience and command.attempts >= ATTEMPTS:
             self._command = None
-            raise LinkError(
-                f"{self.port.url}: expected an answer to {Kind(command.kind).name}, none came "
-                f"within {PATIENCE:g} s; check cable and device, then connect again"
-            )
+            raise self._unanswered(command, now)
         command.attempts += 1
         command.last_sent = now
         self._send(command.frame)
+
+    @property
+    def _patience(self) -> float:
+        """No less than the watchdog time: STOP is repeated for as long as the motor may turn."""
+        return max(PATIENCE, self.watchdog)
+
+    @property
+    def _frames(self) -> int:
+        return self.receiver.counters["frames"]
+
+    def _unanswered(self, command: _Command, now: float) -> LinkError:
+        others = self._frames - command.heard
+        heard = "nor anything else; check cable and device"
+        if others > 0:
+            heard = (
+                f"but {others} other frames: it does not hear, or is too busy to answer; "
+                "see `sewfast doctor`"
+            )
+        return LinkError(
+            f"{self.port.url}: expected an answer to {Kind(command.kind).name}, none came within "
+            f"{now - command.since:.2g} s to {command.attempts} attempts, {heard}, then connect "
+            "again"
+        )
 
     # --- heartbeats -----------------------------------------------------------------------------
 

@@ -181,9 +181,21 @@ def _closed(recorder: Recorder, ended: str, outcome: Outcome | None, error: Base
             error.__context__ = second
 
 
-_MORE_TIME = (
-    ". A busy computer needs more time: --watchdog 250 (watchdog=0.25), where the machine stands it"
-)
+_LONGEST = 10.0
+"""Watchdog time of the protocol [s]."""
+
+
+def _more_time(watchdog: float) -> str:
+    """What a busy computer needs: more than there was, where there is more."""
+    longer = min(max(0.25, 2.0 * watchdog), _LONGEST)
+    if longer <= watchdog:
+        return ""
+    return (
+        f". A busy computer needs more time: --watchdog {longer * 1e3:g} (watchdog={longer:g}), "
+        "where the machine stands it"
+    )
+
+
 _LIMITED = {"speed": (1, "RPM"), "acceleration": (2, "RPM/s"), "current": (3, "A")}
 """Trips with a limit of their own: its place among the limits, its unit."""
 
@@ -230,6 +242,6 @@ def _not_finished(outcome: Outcome, n: int, drive: Drive) -> str:
         return (
             f"expected the run to finish, the device tripped: {_why(outcome.reason, drive)}; its "
             f"output is safe and {came}; find out why, then clear it (sewfast clear PORT)"
-            + (_MORE_TIME if outcome.reason == "watchdog" else "")
+            + (_more_time(drive.watchdog) if outcome.reason == "watchdog" else "")
         )
     return f"expected the run to finish, the device ended it ({outcome.reason}); {came}"
