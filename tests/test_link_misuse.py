@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import copy
+import gc
 import pickle
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,7 @@ from link_device import RUNNING, ScriptedDevice
 from sewfast import Controller, Gains, VirtualMachine
 from sewfast.cli import main
 from sewfast.errors import DataError, LinkError, SettingError
-from sewfast.link import Drive, VirtualDevice, connect, examine, run_on_host
+from sewfast.link import Drive, Outcome, Plan, VirtualDevice, connect, examine, run_on_host
 from sewfast.loop import run
 from sewfast.recordfile import Header, RecordWriter, export, read_recording
 from sewfast.recording import record
@@ -177,3 +180,89 @@ def test_a_recording_can_be_handed_to_another_process(
 def test_a_virtual_machine_by_another_name_than_text() -> None:
     with pytest.raises(SettingError, match="got 5"):
         VirtualMachine.from_name(5)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_what_owns_a_port_is_not_copied(duplicate: Callable[[object], object]) -> None:
+    with VirtualDevice(fast=True) as device, connect(device.port) as drive:
+        for owner in (drive, drive._link, drive._link.port, device):
+            with pytest.raises(SettingError, match="one owner of a port"):
+                duplicate(owner)
+        # half a copy must not take the original's descriptor along
+        gc.collect()
+        assert drive.status().state == "idle"
+
+
+@pytest.mark.parametrize("u", [np.ones(5) * 1j, [1j], [10**400]])
+def test_what_would_lose_its_value_is_no_excitation(device: VirtualDevice, u: Any) -> None:
+    with pytest.raises(DataError, match="as numbers"):
+        record(VirtualMachine(), u)
+    with pytest.raises(DataError, match="expected numbers"):
+        Plan("commands", u)
+
+
+def test_a_name_with_a_zero_is_refused(drive: Drive) -> None:
+    with pytest.raises(SettingError, match="a file's name"):
+        record(drive, U, file="a\0.mcap")
+
+
+# --- from another thread --------------------------------------------------------------------------
+
+
+class Running:
+    """A record in a thread of its own, once samples come."""
+
+    def __init__(self, drive: Drive, n: int = 200_000) -> None:
+        self.began, self.error = threading.Event(), None
+        self.outcome: Outcome | None = None
+        self._work = (drive, Plan("commands", np.ones(n)))
+        self._thread = threading.Thread(target=self._stream)
+        self._thread.start()
+        assert self.began.wait(60.0)
+
+    def _stream(self) -> None:
+        drive, plan = self._work
+        try:
+            self.outcome = drive.stream(plan, self)
+        except Exception as error:
+            self.error, self.outcome = error, drive.outcome
+
+    def samples(self, first: int, columns: object) -> None:
+        self.began.set()
+
+    def event(self, kind: str, index: int, **detail: object) -> None: ...
+
+    def ended(self) -> Outcome:
+        self._thread.join(60.0)
+        assert not self._thread.is_alive()
+        assert self.outcome is not None
+        return self.outcome
+
+
+def test_a_stop_from_another_thread_ends_the_run() -> None:
+    with VirtualDevice() as device, connect(device.port, watchdog=10.0) as drive:
+        drive.set_limits()
+        run = Running(drive)
+        drive.stop()
+        outcome = run.ended()
+        assert (outcome.reason, outcome.state) == ("cancelled", "idle")
+        assert run.error is None
+        assert outcome.is_complete
+        assert outcome.taken is not None
+        assert outcome.taken < 200_000
+        # and the next one is not
+        assert drive.stream(Plan("commands", U), run).reason == "finished"
+
+
+def test_a_drive_closed_in_a_run_is_not_opened_again() -> None:
+    with VirtualDevice() as device:
+        drive = connect(device.port, watchdog=0.5, resume=30.0)
+        drive.set_limits()
+        run = Running(drive)
+        drive.close()
+        assert run.ended().state == "unknown"
+        assert isinstance(run.error, LinkError)
+        with connect(device.port) as again:
+            while (status := again.status()).state == "running":
+                time.sleep(0.01)
+            assert status.taken < 200_000

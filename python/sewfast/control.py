@@ -342,8 +342,10 @@ def vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
         For values that are not numbers or not one-dimensional.
     """
     try:
+        if np.iscomplexobj(values):
+            raise TypeError("complex ones; take their real part")
         array = np.ascontiguousarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise DataError(f"expected numbers in {name}, got {error}") from error
     if np.ndim(values) != 1:
         raise DataError(f"expected {name} of shape (N,), got {np.shape(values)}; give one column")

@@ -190,8 +190,10 @@ def record(
             "machine comes first: record(machine, u)"
         )
     try:
+        if np.iscomplexobj(u):
+            raise TypeError("complex numbers")
         command = np.array(u, dtype=np.float64)
-    except (TypeError, ValueError) as e:
+    except (TypeError, ValueError, OverflowError) as e:
         raise DataError(
             f"expected an excitation as numbers, got {str(u)[:60]!r}; a named one is "
             "sewfast.signals.excitation('step')"

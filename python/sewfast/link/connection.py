@@ -16,6 +16,7 @@ from ..errors import LinkError, SettingError
 from . import wire
 from .clock import Clock
 from .ports import Port
+from .unique import Unique
 from .wire import Event, Identity, Kind, Reply
 
 REPEAT = 0.1
@@ -30,6 +31,8 @@ WATCHDOG = 0.1
 WATCHDOG_ON_CREDIT = 0.25
 RETRY = 0.05
 """Time between two attempts to open a port that vanished [s]."""
+HALTED_WITHIN = 30.0
+"""Longest wait for another thread's run to end; it waits for rest after its STOP [s]."""
 SILENCE = 0.02
 """Longest wait for bytes in one turn [s]; Ctrl-C and cancelling are seen at least as often."""
 
@@ -61,7 +64,7 @@ class Loan:
     heartbeat: int
 
 
-class Connection:
+class Connection(Unique):
     """A session with the device behind a port; one thread uses it.
 
     Everything happens in `turn`: one read, what came is handed on, what is due is sent. A port that
@@ -102,6 +105,8 @@ class Connection:
         self.each_turn: Callable[[], None] | None = None
         #: Whether a vanished port is to be opened again.
         self.resumable = False
+        #: Another thread has asked for the end of the run under way.
+        self.halted = False
         #: Seconds that the port was away, each time.
         self.outages: list[float] = []
         self._sequence = 0
@@ -111,6 +116,7 @@ class Connection:
         self._greeting: Reply | None = None
         self._tag: int | None = None
         self._bytes = 0
+        self._is_closed = self._is_lent = False
         self.identity = self._greet(patience)
         self._tag = self.identity.tag
         usual = WATCHDOG_ON_CREDIT if self.identity.on_credit else WATCHDOG
@@ -278,18 +284,35 @@ class Connection:
     def stop(self) -> None:
         """STOP, at once, whatever is under way; returns when the device has confirmed it.
 
+        From another thread it ends the run there, which says STOP by itself, and waits for that.
+
         Raises
         ------
         LinkError
             Where it was not confirmed: then the device's watchdog stops the motor.
         SettingError
-            Where another thread uses the connection.
+            Where a loop on the host uses the connection, which is ended by Ctrl-C.
         """
+        self._halt()
         with self.owned():
             self._command = None
             # what an interrupted write has left is closed by a zero
             self._send(b"\0")
             self.ask(Kind.STOP)
+
+    def _halt(self) -> None:
+        """Have the thread that uses the connection end its run; nothing where that is this one."""
+        if self._owner.acquire(blocking=False):
+            self._owner.release()
+            return
+        if self._is_lent:
+            return
+        self.halted = True
+        try:
+            if self._owner.acquire(timeout=HALTED_WITHIN):
+                self._owner.release()
+        finally:
+            self.halted = False
 
     def _repeat(self, command: _Command) -> None:
         now = time.monotonic()
@@ -363,6 +386,7 @@ class Connection:
         self._command = None
         try:
             with self.owned():
+                self._is_lent = True
                 yield loan
         except BaseException:
             # numbers may have been used that were not left here: a STOP with one of those is old
@@ -370,6 +394,7 @@ class Connection:
             loan.heartbeat += 2**24
             raise
         finally:
+            self._is_lent = False
             self._sequence = loan.command & 0xFFFFFFFF
             self._beats = loan.heartbeat & 0xFFFFFFFF
             # what the device has sent meanwhile is not missing
@@ -412,7 +437,7 @@ class Connection:
 
     def _recover(self, error: LinkError) -> None:
         """Open the port again and confirm the session; the device may have gone on meanwhile."""
-        if not self.resumable or isinstance(error, DeviceReset):
+        if not self.resumable or self._is_closed or isinstance(error, DeviceReset):
             raise error
         self._failed = None
         lost = time.monotonic()
@@ -429,9 +454,11 @@ class Connection:
             self._command.since = now
 
     def _return(self, lost: float, error: LinkError) -> Identity:
-        while True:
+        while not self._is_closed:
             try:
                 self.port.reopen(max(RETRY, lost + self.resume - time.monotonic()))
+                if self._is_closed:
+                    self.port.close()
                 return self._greet(REPEAT)
             except LinkError as failed:
                 if time.monotonic() - lost + RETRY > self.resume:
@@ -440,9 +467,11 @@ class Connection:
                         f"its motor {self.watchdog:g} s after the last heartbeat"
                     ) from failed
             time.sleep(RETRY)
+        raise error
 
     def close(self) -> None:
-        """Give the port back."""
+        """Give the port back; a run under way in another thread does not open it again."""
+        self._is_closed = True
         self.port.close()
 
 

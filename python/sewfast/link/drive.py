@@ -20,15 +20,17 @@ from .plan import Layout, Outcome, Plan, Sink, layout, require_capable
 from .ports import open_port
 from .rest import await_measurement, wait_for_rest
 from .run import Run
+from .unique import Unique
 from .wire import Channel, Identity, Kind, Limits, Status
 
 PATIENCE = 3.0
 
 
-class Drive:
+class Drive(Unique):
     """A motor drive behind a port, made by `connect`; a context manager whose end stops the motor.
 
-    One thread uses it. Nothing here starts a motor but `stream`.
+    One thread uses it; `stop` and `close` may come from another one and end its run. Nothing here
+    starts a motor but `stream`.
 
     Parameters
     ----------
@@ -64,7 +66,7 @@ class Drive:
             self.close()
 
     def close(self) -> None:
-        """Give the port back without a word to the device."""
+        """Give the port back without a word to the device; what it runs ends by its watchdog."""
         self._link.close()
 
     # --- what it is -------------------------------------------------------------------------------
@@ -164,7 +166,11 @@ class Drive:
         self._link.ask(Kind.ARM, wire.watchdog(self._link.watchdog_us))
 
     def stop(self) -> None:
-        """Command 0 and drive disabled, at once; returns when the device has confirmed it."""
+        """Command 0 and drive disabled, at once; returns when the device has confirmed it.
+
+        While another thread runs something on the drive, that run is cancelled; this returns when
+        the motor is at rest.
+        """
         self._link.stop()
 
     def clear(self) -> None:

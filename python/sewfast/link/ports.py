@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 
 from ..errors import LinkError, SettingError
 from .failures import FAILURES, explain
+from .unique import Unique
 
 CHUNK = 65_536
 """Bytes asked for at once; a port gives what it has."""
@@ -21,7 +22,7 @@ WRITE_TIMEOUT = 1.0
 CONNECT_TIMEOUT = 5.0
 
 
-class Port(ABC):
+class Port(Unique, ABC):
     """Bytes in and out; every way it can fail is a `LinkError`.
 
     Parameters

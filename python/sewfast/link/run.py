@@ -91,6 +91,8 @@ class Run:
     def begin(self) -> None:
         """Arm and start; the motor moves from here on."""
         link, layout = self.link, self.layout
+        if link.halted:
+            raise LinkError("expected a run to start, it was stopped from elsewhere before")
         link.receiver.expect([(c.encoding, c.steps_per_unit) for c in layout.channels], self.period)
         link.receiver.take()
         link.events.clear()
@@ -113,7 +115,7 @@ class Run:
     def play(self, cancel: threading.Event | None) -> bool:
         """Pump until the run has ended; False where it was cancelled."""
         while not self.ended:
-            if cancel is not None and cancel.is_set():
+            if self.link.halted or (cancel is not None and cancel.is_set()):
                 return False
             self.link.turn(self._wait())
             reply = self.link.answer()

@@ -15,6 +15,7 @@ from .._core import DeviceServer
 from ..errors import LinkError, SettingError
 from ..gains import real
 from ..machine import VirtualMachine
+from .unique import Unique
 
 __all__ = ["VirtualDevice"]
 
@@ -24,7 +25,7 @@ _LARGEST_SEED = 2**64 - 1
 _BAUD = (300, 100_000_000)
 
 
-class VirtualDevice:
+class VirtualDevice(Unique):
     """The virtual sewing machine served on a port, with the state machine of a real device.
 
     It is there from the construction to `stop`, the end of the `with`, or the end of the

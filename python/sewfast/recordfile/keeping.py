@@ -23,7 +23,7 @@ def require_ending(path: str | os.PathLike[str]) -> Path:
     SettingError
         For another ending.
     """
-    if not isinstance(path, (str, os.PathLike)):
+    if not isinstance(path, (str, os.PathLike)) or "\0" in str(path):
         raise SettingError(f"expected a file's name, got {path!r}; as in file='run{ENDING}'")
     found = Path(path)
     if found.suffix.lower() != ENDING:
