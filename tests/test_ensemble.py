@@ -13,8 +13,10 @@ from plants import bent_data, linear_data
 from sewfast import _core
 from sewfast.dataset import Dataset
 from sewfast.errors import FitError, ModelFileError, SettingError
+from sewfast.loop import run
 from sewfast.models import Ensemble, LinearOE, Model, load_model, model_schema
 from sewfast.models.base import FORMAT, VERSION
+from sewfast.tuning import tune
 
 NAMES = (0.01, ("u",), "y", ("V",), "RPM")
 FILES = Path(__file__).parent / "files"
@@ -37,9 +39,9 @@ def three(combine: Any = "median") -> Ensemble:
 @pytest.mark.parametrize(("combine", "reduce"), [("median", np.median), ("mean", np.mean)])
 def test_runs_are_combined_sample_by_sample(combine: Any, reduce: Any) -> None:
     model, data = three(combine), bent_data(60)
-    for run in (lambda m: m.simulate(data), lambda m: m.predict(data, 2)):
-        each = np.array([run(m)[0] for m in model.members])
-        np.testing.assert_array_equal(run(model)[0], reduce(each, axis=0))
+    for free in (lambda m: m.simulate(data), lambda m: m.predict(data, 2)):
+        each = np.array([free(m)[0] for m in model.members])
+        np.testing.assert_array_equal(free(model)[0], reduce(each, axis=0))
 
 
 def test_every_member_has_its_own_initial_state() -> None:
@@ -94,6 +96,22 @@ def test_what_is_no_ensemble_is_refused() -> None:
     other = LinearOE(lag(1.0).core, 0.02, ("u",), "y", ("V",), "RPM")
     with pytest.raises(SettingError, match="models of one plant"):
         Ensemble.of([lag(1.0), other])
+
+
+# --- as a plant --------------------------------------------------------------------------------
+
+
+def test_a_controller_is_tuned_on_every_member_and_run_on_the_first() -> None:
+    members = [lag(g, 0.95) for g in (4.0, 5.0, 6.0)]
+    reference = np.repeat([0.0, 100.0, 0.0], 100)
+    options: dict[str, Any] = {"counts_per_rev": None, "evaluations": 12, "threads": 1}
+    together = tune(Ensemble.of(members), [reference], **options)
+    apart = tune(members, [reference], start=together.start, **options)
+    assert together.controller.gains == apart.controller.gains
+    ran = run(together.controller, Ensemble.of(members), reference)
+    alone = run(together.controller, members[0], reference)
+    np.testing.assert_array_equal(ran.y, alone.y)
+    assert ran.plant == "ensemble, first member"
 
 
 # --- files ------------------------------------------------------------------------------------

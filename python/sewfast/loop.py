@@ -15,7 +15,7 @@ from . import _core, signals
 from .control import Controller, vector
 from .errors import DataError, SettingError
 from .machine import VirtualMachine
-from .models import Model
+from .models import Ensemble, Model
 from .speed import speed_or_nan
 
 if TYPE_CHECKING:
@@ -188,7 +188,7 @@ def run(
         return _run_on(_require_drive(on), controller, r, title, file, live, overwrite)
     check_fits(controller, on)
     record = _core.closed_loop(
-        on.core, controller.core(), r, counts_per_unit=controller.counts_per_unit
+        single_core(on), controller.core(), r, counts_per_unit=controller.counts_per_unit
     )
     return ClosedLoopRun(
         t=np.arange(len(r), dtype=np.float64) * controller.Ts,
@@ -336,6 +336,13 @@ def plant_units(plant: Plant) -> tuple[str, str]:
     return plant.input_units[0], plant.output_unit
 
 
+def single_core(plant: Plant) -> Any:
+    """The compiled plant of one run: of an ensemble its first member, which did best."""
+    return plant.members[0].core if isinstance(plant, Ensemble) else plant.core
+
+
 def plant_name(plant: Plant) -> str:
     """What to call a plant: the machine's name, or the model's kind."""
+    if isinstance(plant, Ensemble):
+        return f"{plant.kind}, first member"
     return plant.name if isinstance(plant, VirtualMachine) else plant.kind

@@ -15,7 +15,7 @@ from .control import Controller, Fopdt, Gains, fit_fopdt, table_1
 from .errors import DataError, FitError, Interrupted, SettingError
 from .gains import real, whole
 from .loop import Plant, check_fits, plant_units, reference_samples
-from .models import Model
+from .models import Ensemble, Model
 from .units import REVOLUTIONS_PER_SECOND
 
 Progress: TypeAlias = Callable[[int, int, float], object]
@@ -101,7 +101,8 @@ def tune(
     Parameters
     ----------
     models : model, machine or sequence of them
-        Plants that one controller has to serve, with one input, one sample time, the same units.
+        Plants that one controller has to serve, with one input, one sample time, the same units;
+        every member of an ensemble is one.
     references : str, array of shape (N,), or sequence of them, optional
         Names (`sewfast.signals`) or samples [y]; `REFERENCES` by default.
     u_min, u_max : float
@@ -151,7 +152,7 @@ def tune(
     for plant in plants:
         check_fits(start, plant)
     found = _core.tune(
-        [plant.core for plant in plants],
+        [core for plant in plants for core in _cores(plant)],
         [reference_samples(r, start) for r in _each(references)],
         start=start.core(),
         counts_per_unit=start.counts_per_unit,
@@ -166,6 +167,11 @@ def tune(
     if result.termination == "interrupted":
         raise Interrupted(result.controller)
     return result
+
+
+def _cores(plant: Plant) -> list[Any]:
+    """A plant each: of an ensemble, every member."""
+    return [m.core for m in plant.members] if isinstance(plant, Ensemble) else [plant.core]
 
 
 def default_variations(controller: Controller) -> tuple[tuple[float, int], ...]:
