@@ -357,10 +357,8 @@ def _blocks(model: _core.LinearModel, later: Dataset) -> FloatArray:
 
 
 def _errors(model: _core.LinearModel, u: FloatArray, y: FloatArray) -> FloatArray:
-    known = np.flatnonzero(np.isfinite(y))[:INIT]
-    first = int(known[-1]) + 1 if len(known) else INIT
-    state = model.estimate_initial_state(u[:first], y[:first])
-    error = (y - model.simulate(u, state))[first:]
+    state = model.estimate_initial_state(u[:INIT], y[:INIT])
+    error = (y - model.simulate(u, state))[INIT:]
     return error[np.isfinite(error)]
 
 

@@ -56,9 +56,10 @@ def _chosen(search: Search, order: int, began: float, always_network: bool) -> M
     best = search.ladder(order)
     if best is None:
         return _linear(search, order, began, {}, _NO_NETWORK)
-    worth, ratio = True, math.nan
+    ratio = 0.0
     if order:
-        worth, ratio = confirmed(search, best, order, WORTH_IT)
+        ratio, order = confirmed(search, best, order, WORTH_IT)
+    worth = ratio < WORTH_IT
     rmse = {"oe": search.linear_errors.get(order), "neural_ss": best.error}
     reason = (
         f"free-run error of the network on data not trained on: {100 * ratio:.1f} % of the linear "

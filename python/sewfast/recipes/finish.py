@@ -101,31 +101,38 @@ def _refitted(
 # --- a second opinion -----------------------------------------------------------------------------
 
 
-def confirmed(search: Search, best: Candidate, order: int, worth: float) -> tuple[bool, float]:
-    """Whether the network is worth it, and its error relative to the linear model's.
+def confirmed(search: Search, best: Candidate, order: int, worth: float) -> tuple[float, int]:
+    """The network's error relative to the linear model's, and the order of that.
 
-    Where it does not win by far, both are fitted again without the last two fifths of every
-    experiment and compared on the fifth before the last as well: errors of both parts are pooled.
+    Where the network does not win by far, both are fitted again without the last two fifths of
+    every experiment and compared on the fifth before the last as well. The linear order is then
+    the best of both parts together, and the worse of the two ratios counts.
     """
-    linear = search.linear_errors[order]
-    ratio = best.error / linear if linear > 0.0 else 1.0
+    linear = search.linear_errors
+    ratio = _ratio(best.error, linear[order])
     if ratio < CLEARLY_BETTER or ratio >= worth or search.split.is_given:
-        return ratio < worth, ratio
+        return ratio, order
     earlier = _earlier(search)
     if earlier is None or search.task.clock.over():
-        return True, ratio
-    model = earlier.start_model(order, earlier.nk)
-    again = math.inf if model is None else held_out_error(model, earlier.trial)
-    training = earlier.training(
-        best.structure, search.plan.trial_starts, search.plan.trial_iterations
-    )
+        return ratio, order
+    earlier.linear_order()
+    pooled = {o: linear[o] ** 2 + e**2 for o, e in earlier.linear_errors.items() if o in linear}
+    order = min(pooled, key=lambda o: pooled[o], default=order)
+    plan = search.plan
+    training = earlier.training(best.structure, plan.trial_starts, plan.trial_iterations)
     starts: list[Start] = train(search.task, best.structure, training)
     other = judged(best.structure, starts, earlier.trial)
-    pooled = ((best.error**2 + other.error**2) / (linear**2 + again**2)) ** 0.5
-    return pooled < worth, pooled
+    again = earlier.linear_errors.get(order, math.inf)
+    return max(_ratio(best.error, linear[order]), _ratio(other.error, again)), order
+
+
+def _ratio(error: float, linear: float) -> float:
+    return error / linear if linear > 0.0 else 1.0
 
 
 def _earlier(search: Search) -> Search | None:
     """The same search one fifth earlier."""
     found = split(search.task.data, skipped=0.2)
-    return None if found is None else Search.of(search.task, search.plan, found)
+    if found is None or found.scored == 0:
+        return None
+    return Search.of(search.task, search.plan, found)

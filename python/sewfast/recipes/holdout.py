@@ -18,6 +18,7 @@ Blocks inside a record lie where the drive has been before and after, and favour
 learns the record by heart; a later part is the honest question.
 """
 LEAST_HELD_OUT = 2 * INIT
+BLOCKS = 4
 RUN_UP = 10 * INIT
 """Fitted samples that a held-out part begins with: its state is known when scoring starts."""
 
@@ -48,10 +49,8 @@ class Split:
         return sum(int(np.isfinite(e.y[INIT:]).sum()) for e in self.held.experiments)
 
     def shortened(self, fitted: int, held: int) -> Split:
-        """At most so many samples, of every experiment its proportional part from the beginning."""
-        return replace(
-            self, fitted=_shortened(self.fitted, fitted), held=_shortened(self.held, held)
-        )
+        """About so many samples, of every experiment its proportional part."""
+        return replace(self, fitted=_thinned(self.fitted, fitted), held=_shortened(self.held, held))
 
 
 def split(data: Dataset, validation: Dataset | None = None, skipped: float = 0.0) -> Split | None:
@@ -75,28 +74,18 @@ def split(data: Dataset, validation: Dataset | None = None, skipped: float = 0.0
         at = stop - round(SHARE * len(e))
         if stop - at < LEAST_HELD_OUT or at < LEAST_HELD_OUT:
             return None
-        if min(_measured(e.y[:at]), _measured(e.y[at:stop])) < LEAST_HELD_OUT:
-            # a long gap has left too little on one side to be split
-            fitted.append(e.cut(0, stop))
-            continue
         fitted.append(e.cut(0, at))
         held.append(_with_run_up(e, at, stop))
         parts.append(e.cut(at, stop))
-    if not held:
-        return None
     pieces = (replace(data, experiments=tuple(p)) for p in (fitted, held, parts))
     fitted_data, held_data, scored = pieces
     return Split(fitted_data, held_data, sources=tuple(sources(scored)))
 
 
-def _measured(y: FloatArray) -> int:
-    return int(np.isfinite(y).sum())
-
-
 def _with_run_up(e: Experiment, at: int, stop: int) -> Experiment:
     begin = max(0, at - RUN_UP)
     y = e.y[begin:stop].copy()
-    y[e.cut(begin, stop).initial_samples(INIT) : at - begin] = np.nan
+    y[INIT : at - begin] = np.nan
     return Experiment(e.u[begin:stop], y, {}, e.name, e.start + begin)
 
 
@@ -109,6 +98,24 @@ def _shortened(data: Dataset, samples: int) -> Dataset:
     return replace(data, experiments=tuple(pieces))
 
 
+def _thinned(data: Dataset, samples: int) -> Dataset:
+    """Blocks from all over every experiment: a chirp is another signal at its end."""
+    if len(data) <= samples:
+        return data
+    share = samples / len(data)
+    pieces = (piece for e in data.experiments for piece in _blocks(e, round(share * len(e))))
+    return replace(data, experiments=tuple(pieces))
+
+
+def _blocks(e: Experiment, samples: int) -> list[Experiment]:
+    length = max(LEAST_HELD_OUT, samples // BLOCKS)
+    if BLOCKS * length >= len(e):
+        return [e]
+    starts = (round(i * (len(e) - length) / (BLOCKS - 1)) for i in range(BLOCKS))
+    blocks = [e.cut(a, a + length) for a in starts]
+    return [b for b in blocks if len(b) - b.unmeasured > INIT]
+
+
 def held_out_error(core: Core, split: Split) -> float:
     """Root mean square of the free run's error on what is held out; infinite for a runaway."""
     squares, known = 0.0, 0
@@ -116,7 +123,7 @@ def held_out_error(core: Core, split: Split) -> float:
         run = _free_run(core, e)
         if run is None:
             return float("inf")
-        error = (e.y - run)[e.initial_samples(INIT) :]
+        error = (e.y - run)[INIT:]
         error = error[~np.isnan(error)]
         squares, known = squares + float(error @ error), known + len(error)
     return float(np.sqrt(squares / known)) if known else float("inf")
@@ -124,8 +131,7 @@ def held_out_error(core: Core, split: Split) -> float:
 
 def _free_run(core: Core, e: Experiment) -> FloatArray | None:
     try:
-        first = e.initial_samples(INIT)
-        state = core.estimate_initial_state(e.u[:first], e.y[:first])
+        state = core.estimate_initial_state(e.u[:INIT], e.y[:INIT])
         return core.simulate(e.u, state)
     except FitError:
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from .. import _core
 from ..dataset import Dataset, FloatArray
 from ..errors import FitError
+from ..models.base import INIT
 from .task import Pairs
 
 OUTPUTS = ("linear", "saturation", "abs")
@@ -165,3 +167,24 @@ def _low_pass(u: FloatArray, memory: float) -> FloatArray:
         last = memory * last + (1.0 - memory) * float(value)
         y[k] = last
     return y
+
+
+def rms_error(
+    model: _core.LinearModel,
+    pairs: Pairs,
+    seen: Callable[[FloatArray], FloatArray] = lambda s: s,
+) -> float:
+    """Root mean square of y - seen(free run), each run from its own estimated state.
+
+    Behind a sensor that does not see the sign, a state of either sign explains a start; the first
+    samples are not counted.
+    """
+    squares = []
+    for u, y in pairs:
+        try:
+            states = [model.estimate_initial_state(u[:INIT], s * y[:INIT]) for s in (1.0, -1.0)]
+            runs = [(y - seen(model.simulate(u, x)))[INIT:] for x in states]
+        except FitError:
+            return float("inf")
+        squares.append(min((run[~np.isnan(run)] ** 2 for run in runs), key=np.sum))
+    return float(np.sqrt(np.mean(np.concatenate(squares))))

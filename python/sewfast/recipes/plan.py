@@ -46,14 +46,14 @@ class Plan:
     worth_a_step: float
 
 
-SEARCH_OPERATIONS = 1e11
+SEARCH_OPERATIONS = 1.5e11
 """Multiplications after which no further candidate is tried; a core makes a few 1e9 in a second."""
-FINAL_OPERATIONS = 2.5e11
-"""Multiplications that the chosen structure's final training may take."""
+FINAL_OPERATIONS = 1.2e11
+"""Multiplications that either stage of the final training may take."""
 
 SMALL = Plan(12_000, 12_000, 6, 60, 24, 100, 0, 15, 1e-4, 10.0, 16, 0.97)
 MEDIUM = Plan(12_000, 12_000, 4, 60, 8, 150, 60, 15, 1e-5, 10.0, 16, 0.97)
-LARGE = Plan(12_000, 12_000, 2, 60, 2, 300, 60, 10, 1e-8, 1e3, 32, 0.985)
+LARGE = Plan(12_000, 12_000, 4, 60, 4, 300, 60, 10, 1e-8, 1e3, 32, 0.985)
 """Much data: little variance to average out, but larger networks to gain from."""
 
 

@@ -6,11 +6,13 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from .. import _core
 from ..errors import FitError
 from .candidate import Candidate, judged
 from .holdout import Split, held_out_error
-from .output import ABS, LINEAR, Output, named, rectified_start, suggested
+from .output import ABS, LINEAR, Output, named, rectified_start, rms_error, suggested
 from .plan import SEARCH_OPERATIONS, Plan
 from .structure import Stopped, Structure, Training, train
 from .task import Pairs, Story, Task, arrays, finite
@@ -19,9 +21,10 @@ LINEAR_ORDERS = (1, 2, 3, 4, 5, 6)
 WORTH_AN_ORDER = 0.97
 """A larger linear order must bring the error below this part of the smaller one's."""
 WORTH_A_DECAY = 0.99
-WORTH_A_FEEDTHROUGH = 0.9
-"""nk = 0 is no plant for a loop: it must be worth more."""
+WORTH_A_FEEDTHROUGH = 0.5
+"""nk = 0 is no plant for a loop, and a smoothed speed leans ahead a little: it must be worth it."""
 USUAL_HIDDEN = 8
+WORTH_A_RECTIFIER = 0.9
 LEAST_NX, MOST_NX = 2, 8
 LEAST_DECAY, MOST_DECAY = 1e-10, 1e-1
 SAMPLES_PER_PARAMETER = 4
@@ -87,7 +90,7 @@ class Search:
         base = next(filter(self._is_affordable, sizes), None)
         if base is None:
             return None
-        best = self._best_of(replace(base, output=o) for o in self._outputs())
+        best = self._best_of(replace(base, output=o) for o in self._outputs(nx))
         for step in (
             self._delays,
             self._decays,
@@ -99,9 +102,19 @@ class Search:
             best = step(best)
         return best if best is not None and math.isfinite(best.error) else None
 
-    def _outputs(self) -> list[Output]:
+    def _outputs(self, nx: int) -> list[Output]:
         data = self.trial.fitted
-        return suggested(data) if self.task.output is None else [named(self.task.output, data)]
+        if self.task.output is not None:
+            return [named(self.task.output, data)]
+        return [o for o in suggested(data) if o != ABS or self._is_rectified(nx)]
+
+    def _is_rectified(self, nx: int) -> bool:
+        """Whether a linear model behind a rectifier does better than one without."""
+        plain, behind = self.start_model(nx, self.nk), self.start_model(nx, self.nk, ABS)
+        if plain is None or behind is None:
+            return behind is not None
+        pairs = arrays(self.trial.fitted)
+        return rms_error(behind, pairs, np.abs) < WORTH_A_RECTIFIER * rms_error(plain, pairs)
 
     def _decays(self, best: Candidate | None) -> Candidate | None:
         if best is None:
@@ -135,6 +148,8 @@ class Search:
         if best is None or self.task.nk is not None:
             return best
         later = self._best_of([replace(best.structure, nk=2)], best) or best
+        if self.task.data.counts is not None:
+            return later
         return self._best_of([replace(best.structure, nk=0)], later, WORTH_A_FEEDTHROUGH)
 
     def _climbed(

@@ -19,6 +19,8 @@ from .output import LINEAR, Output, scale_of
 from .task import Pairs, Story, Task, arrays
 
 HIDDEN_SCALE = 1.0
+OVERHEAD = 2_000
+"""What a sample costs beside its sensitivities, in multiplications."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Structure:
     def operations(self, inputs: int, samples: int) -> float:
         """Multiplications of one iteration: sensitivities, and the sum of outer products."""
         p = self.parameters(inputs)
-        return samples * (p * p / 2.0 + self.nx * self.nx * p)
+        return samples * (p * p / 2.0 + self.nx * self.nx * p + OVERHEAD)
 
     def to_json(self) -> Story:
         """For the table of candidates."""
