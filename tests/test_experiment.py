@@ -172,7 +172,7 @@ def test_a_folder_that_was_interrupted_while_writing_is_no_result(
     with pytest.raises(KeyboardInterrupt):
         folder.write(
             out, {}, recordings={}, models=models, controllers={},
-            predictions={"random": {"t": np.zeros(3)}}, runs={},
+            predictions={"random": {"t": np.zeros(3)}}, runs={}, drawings={},
         )  # fmt: skip
     with pytest.raises(DataError, match=r"results\.json"):
         report(out)

@@ -118,6 +118,18 @@ def test_a_model_of_deviations_is_the_model_about_its_operating_point() -> None:
     np.testing.assert_allclose(run[20:], data.experiments[0].y[20:], atol=1e-6)
 
 
+def test_a_model_says_how_its_data_were_prepared() -> None:
+    u = steps(2000, 10)
+    data = Dataset.from_arrays(u, lag(u), TS, channels={"truth": lag(u)})
+    flat = data.mask("7:9").detrend(0)
+    model = identify(flat, model="arx", na=1, nb=1)
+    assert "prepared: array [0:2000]: 2 outputs masked" in str(model)
+    assert "mean of all experiments taken off" in model.training["preparation"][1]
+    with pytest.raises(DataError, match="offset was taken off"):
+        model.validate(flat, against="truth")
+    assert model.validate(data, against="truth").n == 1980
+
+
 def test_rest_is_the_level_before_an_input_moves() -> None:
     u = np.r_[np.full(100, 2.0), 2.0 + steps(400, 20)]
     y = 50.0 + np.r_[np.zeros(100), lag(u[100:] - 2.0)]

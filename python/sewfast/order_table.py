@@ -357,8 +357,10 @@ def _blocks(model: _core.LinearModel, later: Dataset) -> FloatArray:
 
 
 def _errors(model: _core.LinearModel, u: FloatArray, y: FloatArray) -> FloatArray:
-    state = model.estimate_initial_state(u[:INIT], y[:INIT])
-    error = (y - model.simulate(u, state))[INIT:]
+    known = np.flatnonzero(np.isfinite(y))[:INIT]
+    first = int(known[-1]) + 1 if len(known) else INIT
+    state = model.estimate_initial_state(u[:first], y[:first])
+    error = (y - model.simulate(u, state))[first:]
     return error[np.isfinite(error)]
 
 

@@ -258,6 +258,11 @@ def _target(experiment: Experiment, against: str | None, init: int) -> FloatArra
             f"{experiment.name}: no channel {against!r}; available: "
             f"{', '.join(experiment.channels) or 'none'}"
         )
+    if experiment.removed is not None:
+        raise DataError(
+            f"{experiment.name}: channel {against!r} is as it was recorded, but an offset was "
+            "taken off the output: compare it with data.restore(model.simulate(data))"
+        )
     target = experiment.channels[against]
     if np.isnan(target[experiment.initial_samples(init) :]).all():
         raise DataError(f"{experiment.name}: channel {against!r} is NaN at every scored sample")

@@ -30,6 +30,7 @@ FORMAT = "sewfast.model"
 VERSION = 1
 INIT = 20
 """Samples that set the initial state, unless told otherwise."""
+_STEPS_SHOWN = 4
 
 
 def require_init(init: int) -> None:
@@ -273,5 +274,9 @@ class Model(ABC):
             count = t.get("iterations")
             steps = "" if count is None else f"{count} iterations, "
             lines[0] += f"; {steps}{t['termination']}"
+        prepared = [f"prepared: {note}" for note in t.get("preparation", [])]
+        if len(prepared) > _STEPS_SHOWN:
+            prepared[_STEPS_SHOWN:] = [f"prepared: and {len(prepared) - _STEPS_SHOWN} more"]
+        lines += prepared
         lines += choice_lines(t, self.output_unit)
         return lines + [str(note) for note in t.get("notes", [])]

@@ -74,18 +74,28 @@ def split(data: Dataset, validation: Dataset | None = None, skipped: float = 0.0
         at = stop - round(SHARE * len(e))
         if stop - at < LEAST_HELD_OUT or at < LEAST_HELD_OUT:
             return None
+        if min(_measured(e.y[:at]), _measured(e.y[at:stop])) < LEAST_HELD_OUT:
+            # a long gap has left too little on one side to be split
+            fitted.append(e.cut(0, stop))
+            continue
         fitted.append(e.cut(0, at))
         held.append(_with_run_up(e, at, stop))
         parts.append(e.cut(at, stop))
+    if not held:
+        return None
     pieces = (replace(data, experiments=tuple(p)) for p in (fitted, held, parts))
     fitted_data, held_data, scored = pieces
     return Split(fitted_data, held_data, sources=tuple(sources(scored)))
 
 
+def _measured(y: FloatArray) -> int:
+    return int(np.isfinite(y).sum())
+
+
 def _with_run_up(e: Experiment, at: int, stop: int) -> Experiment:
     begin = max(0, at - RUN_UP)
     y = e.y[begin:stop].copy()
-    y[INIT : at - begin] = np.nan
+    y[e.cut(begin, stop).initial_samples(INIT) : at - begin] = np.nan
     return Experiment(e.u[begin:stop], y, {}, e.name, e.start + begin)
 
 
@@ -123,7 +133,7 @@ def held_out_error(core: Core, split: Split) -> float:
         run = _free_run(core, e)
         if run is None:
             return float("inf")
-        error = (e.y - run)[INIT:]
+        error = (e.y - run)[e.initial_samples(INIT) :]
         error = error[~np.isnan(error)]
         squares, known = squares + float(error @ error), known + len(error)
     return float(np.sqrt(squares / known)) if known else float("inf")
@@ -131,7 +141,8 @@ def held_out_error(core: Core, split: Split) -> float:
 
 def _free_run(core: Core, e: Experiment) -> FloatArray | None:
     try:
-        state = core.estimate_initial_state(e.u[:INIT], e.y[:INIT])
+        first = e.initial_samples(INIT)
+        state = core.estimate_initial_state(e.u[:first], e.y[:first])
         return core.simulate(e.u, state)
     except FitError:
         return None

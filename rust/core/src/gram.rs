@@ -120,6 +120,7 @@ impl Gram {
         // The rows that the next block sees are saved before those without weight are emptied.
         let kept = end - self.memory * width;
         self.rows.copy_within(kept..end, self.base);
+        self.rows[self.base..start].iter_mut().for_each(forget);
         for i in self.weightless.drain(..) {
             self.rows[start + i * width..][..width].fill(0.0);
         }
@@ -130,6 +131,17 @@ impl Gram {
             sums: &mut self.sums,
         });
         self.filled = 0;
+    }
+}
+
+/// Sensitivities below this are zero: squared they would be denormal, which many processors compute with slowly.
+const FORGOTTEN: f64 = 1e-140;
+
+/// Ends the decay of a sensitivity by the initial state.
+#[inline]
+pub(crate) fn forget(value: &mut f64) {
+    if value.abs() < FORGOTTEN {
+        *value = 0.0;
     }
 }
 

@@ -7,6 +7,7 @@
 use crate::Monitor;
 use crate::descent::{Method, Proposal, Verdict, descend};
 pub use crate::descent::{Outcome, Termination};
+use crate::simd::{self, Eight, Kernel};
 
 /// What is minimised. `normal_equations` is only called at the parameters of the last successful `cost`, whose
 /// simulation it may reuse.
@@ -228,21 +229,46 @@ impl System {
 
 /// Replaces the lower triangle of `a` (row by row) by its Cholesky factor; false where `a` is not positive definite.
 pub(crate) fn cholesky(a: &mut [f64], n: usize) -> bool {
-    for i in 0..n {
-        let (above, row) = a.split_at_mut(i * n);
-        for j in 0..i {
-            let other = &above[j * n..j * n + j + 1];
-            let dot: f64 = row[..j].iter().zip(other).map(|(x, y)| x * y).sum();
-            row[j] = (row[j] - dot) / other[j];
+    simd::run(Cholesky { a, n })
+}
+
+struct Cholesky<'a> {
+    a: &'a mut [f64],
+    n: usize,
+}
+
+impl Kernel for Cholesky<'_> {
+    type Output = bool;
+
+    #[inline(always)]
+    fn run<V: Eight>(self) -> bool {
+        let Self { a, n } = self;
+        for i in 0..n {
+            let (above, row) = a.split_at_mut(i * n);
+            for j in 0..i {
+                let other = &above[j * n..j * n + j + 1];
+                row[j] = (row[j] - dot::<V>(&row[..j], &other[..j])) / other[j];
+            }
+            let pivot = row[i] - dot::<V>(&row[..i], &row[..i]);
+            // Written so that NaN is refused too.
+            if !(pivot > 0.0 && pivot.is_finite()) {
+                return false;
+            }
+            row[i] = pivot.sqrt();
         }
-        let pivot = row[i] - row[..i].iter().map(|x| x * x).sum::<f64>();
-        // Written so that NaN is refused too.
-        if !(pivot > 0.0 && pivot.is_finite()) {
-            return false;
-        }
-        row[i] = pivot.sqrt();
+        true
     }
-    true
+}
+
+/// The sum of products, eight at a time.
+#[inline(always)]
+fn dot<V: Eight>(a: &[f64], b: &[f64]) -> f64 {
+    let ((a, a_rest), (b, b_rest)) = (a.as_chunks(), b.as_chunks());
+    let sum = a.iter().zip(b).fold(V::splat(0.0), |sum, (a, b)| {
+        sum.add_product(V::load(a), V::load(b))
+    });
+    let rest = a_rest.iter().zip(b_rest).map(|(a, b)| a * b);
+    sum.sum() + rest.sum::<f64>()
 }
 
 /// Solves `L L' x = b` in place.

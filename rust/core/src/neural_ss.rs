@@ -168,6 +168,7 @@ impl NeuralSS {
             y: &known,
             buffers: &mut Sensitivities::new(shape),
             rows: &mut dense,
+            exact: true,
             monitor: &Monitor::default(),
         });
         Ok((run, dense.rows))

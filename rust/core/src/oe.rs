@@ -1,14 +1,16 @@
 //! Linear output error: the free run fitted by Levenberg-Marquardt with exact sensitivities and stable poles.
 
+mod excerpt;
 mod problem;
 mod restart;
 mod starts;
 
+use excerpt::excerpt;
 use problem::OutputError;
 use restart::restart_error;
 
 use crate::linear_fit::LinearFit;
-use crate::lm::{self, Outcome, Settings, Termination};
+use crate::lm::{self, Outcome, Problem, Settings, Termination};
 use crate::{Error, Monitor, Record, Result, arx};
 
 /// How many of the candidates are refined: half of them for their cost, half for their restarts.
@@ -27,7 +29,7 @@ const HEAT: usize = 30;
 /// range of time constants, each with its best numerator. The best free runs are refined; steps that would move a pole
 /// out of the unit circle are rejected (Schur-Cohn test), so every accepted step is stable. Of the refined models that
 /// run on about as well as the best when started anew from a few samples ([`restart_error`]) the one with the lowest
-/// cost is chosen.
+/// cost is chosen. Of records of more than 40,000 samples an excerpt is searched so; all of them are fitted from there.
 ///
 /// ```
 /// use sewfast_core::lagged::Lagged;
@@ -57,11 +59,12 @@ pub fn fit(
     let lags = arx::check(records, na, nb, nk)?;
     let mut problem = OutputError::new(records, lags, offset, monitor)?;
     monitor.set_total((max_iterations + (REFINED - 1) * HEAT) as u64);
-    let candidates = starts::candidates(&mut problem, records, monitor);
-    let candidates = promising(&problem, records, candidates);
-    let heats = refined(&mut problem, candidates, max_iterations, monitor);
-    let spent: usize = heats.iter().map(|o| o.iterations).sum();
-    let best = chosen(&problem, records, heats).ok_or_else(no_model)?;
+    let from_pieces = excerpt(records)
+        .and_then(|pieces| searched_in(&pieces, &mut problem, max_iterations, monitor));
+    let (best, spent) = match from_pieces {
+        Some(found) => found,
+        None => searched(&mut problem, records, max_iterations, monitor).ok_or_else(no_model)?,
+    };
     let left = max_iterations.saturating_sub(best.iterations);
     let goes_on = best.termination == Termination::MaxIterations && left > 0;
     let (best, spent) = if goes_on {
@@ -86,6 +89,44 @@ pub fn fit(
         initial_states: problem.initial_states(&best.theta),
         covariance: problem.covariance(&best.theta, best.cost),
     })
+}
+
+/// The best of the refined candidates, and the iterations of all.
+fn searched(
+    problem: &mut OutputError,
+    records: &[Record],
+    max_iterations: usize,
+    monitor: &Monitor,
+) -> Option<(Outcome, usize)> {
+    let candidates = starts::candidates(problem, records, monitor);
+    let candidates = promising(problem, records, candidates);
+    let heats = refined(problem, candidates, max_iterations, monitor);
+    let spent = heats.iter().map(|o| o.iterations).sum();
+    Some((chosen(problem, records, heats)?, spent))
+}
+
+/// The same in pieces of the records; what comes out is a start for all of them.
+fn searched_in(
+    pieces: &[Record],
+    problem: &mut OutputError,
+    max_iterations: usize,
+    monitor: &Monitor,
+) -> Option<(Outcome, usize)> {
+    let offset = problem.shared() > problem.lags.regressors();
+    let mut part = OutputError::new(pieces, problem.lags, offset, monitor).ok()?;
+    let (mut found, spent) = searched(&mut part, pieces, max_iterations, monitor)?;
+    let states = vec![0.0; problem.parameters() - problem.shared()];
+    found.theta.truncate(problem.shared());
+    found.theta.extend(states);
+    if let Some((cost, theta)) = problem.with_poles(&found.theta[..problem.lags.na]) {
+        (found.cost, found.theta) = (cost, theta);
+    }
+    found.trace = vec![found.cost];
+    found.iterations = 0;
+    if !monitor.stopped() {
+        found.termination = Termination::MaxIterations;
+    }
+    Some((found, spent))
 }
 
 /// The candidates with the lowest cost and those that restart best, without repetition.
@@ -236,6 +277,16 @@ mod tests {
         .unwrap();
         let fit = check_reaches_noise(&truth, &chirp(8000, 2.0), 15.0);
         assert!((fit.model.dc_gain()[0] / truth.dc_gain()[0] - 1.0).abs() < 0.02);
+    }
+
+    #[test]
+    fn starts_from_an_excerpt_of_a_long_record_and_fits_all_of_it() {
+        let truth = LinearModel::new(vec![-1.5, 0.7], vec![0.5, 0.3], 1, 1, 0.4).unwrap();
+        let fit = check_reaches_noise(&truth, &chirp(60_000, 3.0), 0.5);
+        assert_eq!(fit.initial_states.len(), 1);
+        assert!((fit.cost / 0.125 - 1.0).abs() < 0.05, "{}", fit.cost);
+        let error = fit.standard_errors()[0];
+        assert!((fit.model.a()[0] + 1.5).abs() < 6.0 * error, "{error}");
     }
 
     #[test]

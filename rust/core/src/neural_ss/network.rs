@@ -2,7 +2,7 @@
 
 use super::output::OutputFunction;
 use super::shape::Shape;
-use super::tanh::tanh;
+use super::tanh::{rise, tanh};
 use crate::simd::{Eight, Group, LANES};
 
 /// The weights laid out for the kernels: hidden units in groups of eight, missing ones with weights of zero.
@@ -18,7 +18,7 @@ pub(super) struct Network {
     linear: Vec<f64>,
     /// `c`.
     constant: Vec<f64>,
-    /// For each hidden unit the products of its weights that stand beside `1 - h^2` in the slopes.
+    /// For each group of slopes, the products of each hidden unit's weights that stand beside its `1 - h^2`.
     products: Vec<Group>,
     /// The linear part of the slopes: `[A; C]` in the order of `products`.
     base: Vec<Group>,
@@ -60,9 +60,17 @@ impl Scratch {
     /// Takes up state and inputs of a step.
     #[inline(always)]
     pub fn set(&mut self, x: &[f64], v: &[f64]) {
-        let (states, rest) = self.arguments.split_at_mut(x.len());
-        states.copy_from_slice(x);
-        rest[..v.len()].copy_from_slice(v);
+        let (states, inputs) = self.arguments.split_at_mut(x.len());
+        copy(states, x);
+        copy(&mut inputs[..v.len()], v);
+    }
+
+    /// Takes up the state that the last step led to, and the inputs of the next one.
+    #[inline(always)]
+    pub fn go_on(&mut self, v: &[f64]) {
+        let (states, inputs) = self.arguments.split_at_mut(self.next.len());
+        copy(states, &self.next);
+        copy(&mut inputs[..v.len()], v);
     }
 
     /// Derivative `i` of the slopes, row by row.
@@ -71,6 +79,40 @@ impl Scratch {
         self.slopes[i / LANES].0[i % LANES]
     }
 }
+
+/// A copy of a few numbers, for which a call would take longer than the copy.
+#[inline(always)]
+pub(super) fn copy(to: &mut [f64], from: &[f64]) {
+    match (to, from) {
+        ([to], [from]) => *to = *from,
+        ([to, a], [from, b]) => (*to, *a) = (*from, *b),
+        ([to, a, c], [from, b, d]) => (*to, *a, *c) = (*from, *b, *d),
+        (to, from) => to.copy_from_slice(from),
+    }
+}
+
+/// `1 - h^2` from hidden outputs: fast, and exact to 1e-16.
+#[inline(always)]
+pub(super) fn rises_of<V: Eight>(hidden: &[Group], rises: &mut [Group]) {
+    for (rise, hidden) in rises.iter_mut().zip(hidden) {
+        let h = V::load(&hidden.0);
+        V::splat(1.0).sub(h.mul(h)).store(&mut rise.0);
+    }
+}
+
+/// Calls a method for a number of states, so that its loops are unrolled; 0 stands for any other number.
+macro_rules! unrolled {
+    ($nx:expr, $this:ident.$method:ident::<$V:ty>) => {
+        match $nx {
+            1 => $this.$method::<$V, 1>(),
+            2 => $this.$method::<$V, 2>(),
+            3 => $this.$method::<$V, 3>(),
+            4 => $this.$method::<$V, 4>(),
+            _ => $this.$method::<$V, 0>(),
+        }
+    };
+}
+pub(super) use unrolled;
 
 impl Network {
     /// A network with the weights `theta`, which has `shape.parameters()` values.
@@ -85,7 +127,7 @@ impl Network {
             second: vec![Group::ZERO; rows * groups],
             linear: vec![0.0; rows * width],
             constant: vec![0.0; shape.outputs],
-            products: vec![Group::ZERO; shape.hidden * slopes],
+            products: vec![Group::ZERO; slopes * groups * LANES],
             base: vec![Group::ZERO; slopes],
         };
         network.load(theta);
@@ -142,81 +184,90 @@ impl Network {
     /// Fills what only the slopes need.
     fn multiply(&mut self, wx: &[f64]) {
         let (nx, width, groups) = (self.shape.nx, self.shape.arguments(), self.groups());
-        let slopes = self.base.len();
         for q in 0..nx + self.shape.outputs {
             for j in 0..nx {
                 let (group, lane) = ((q * nx + j) / LANES, (q * nx + j) % LANES);
                 self.base[group].0[lane] = self.linear[q * width + j];
                 for i in 0..self.shape.hidden {
                     let weight = self.second[q * groups + i / LANES].0[i % LANES];
-                    self.products[i * slopes + group].0[lane] = weight * wx[i * nx + j];
+                    self.products[group * groups * LANES + i].0[lane] = weight * wx[i * nx + j];
                 }
             }
         }
     }
 
-    /// `h = tanh(Wx x + Wu v + bh)`, `x+ = A x + B v + E h`, `s = C x + D v + c + G h`.
+    /// The argument of a group of hidden units for `[x, v, 1]`.
     #[inline(always)]
-    pub fn step<V: Eight>(&self, scratch: &mut Scratch) {
-        let Scratch {
-            arguments,
-            hidden,
-            next,
-            sums,
-            ..
-        } = scratch;
-        let (nx, width) = (self.shape.nx, self.shape.arguments());
-        for (hidden, weights) in hidden.iter_mut().zip(self.first.chunks_exact(width + 1)) {
-            let mut z = V::load(&weights[width].0);
-            // The states come last: everything else is ready before they are known.
-            for (weights, value) in weights[..width].iter().zip(&*arguments).rev() {
-                z = z.add_product(V::load(&weights.0), V::splat(*value));
-            }
-            tanh(z).store(&mut hidden.0);
-        }
-        let rows = self
-            .linear
-            .chunks_exact(width)
-            .zip(self.second.chunks_exact(hidden.len()));
-        let outputs = next
-            .iter_mut()
-            .zip(std::iter::repeat(&0.0))
-            .chain(sums.iter_mut().zip(&self.constant));
-        for ((out, constant), (linear, weights)) in outputs.zip(rows) {
-            let mut sum = V::splat(0.0);
-            for (weights, hidden) in weights.iter().zip(&*hidden) {
-                sum = sum.add_product(V::load(&weights.0), V::load(&hidden.0));
-            }
-            let direct = linear[nx..]
-                .iter()
-                .zip(&arguments[nx..])
-                .fold(*constant, |d, (w, v)| d + w * v);
-            let direct = linear[..nx]
-                .iter()
-                .zip(&arguments[..nx])
-                .fold(direct, |d, (w, x)| d + w * x);
-            *out = direct + sum.sum();
+    fn argument<V: Eight>(&self, group: usize, states: &[f64], inputs: &[f64]) -> V {
+        let width = states.len() + inputs.len();
+        // The states come last: everything else is ready before they are known.
+        let (of_states, of_inputs) = self.first[group * width..][..width].split_at(states.len());
+        let sum = |sum: V, (weights, value): (&Group, &f64)| {
+            sum.add_product(V::load(&weights.0), V::splat(*value))
+        };
+        let z = of_inputs.iter().zip(inputs).fold(V::splat(0.0), sum);
+        of_states.iter().zip(states).fold(z, sum)
+    }
+
+    /// `1 - h^2` to its last digits, for `[x, v, 1]`; [`rises_of`] is faster, and less exact in saturation.
+    #[inline(always)]
+    pub fn rises<V: Eight>(&self, arguments: &[f64], rises: &mut [Group]) {
+        let (states, inputs) = arguments.split_at(self.shape.nx);
+        for (g, rises) in rises.iter_mut().enumerate() {
+            rise(self.argument::<V>(g, states, inputs)).store(&mut rises.0);
         }
     }
 
-    /// `1 - h^2`, and with it `dx+/dx = A + E diag(1 - h^2) Wx` and `ds/dx = C + G diag(1 - h^2) Wx`.
+    /// `h = tanh(Wx x + Wu v + bh)`, `x+ = A x + B v + E h`, `s = C x + D v + c + G h` for `[x, v, 1]`.
     #[inline(always)]
-    pub fn slopes<V: Eight>(&self, hidden: &[Group], rises: &mut [Group], slopes: &mut [Group]) {
-        for (rise, hidden) in rises.iter_mut().zip(hidden) {
-            let h = V::load(&hidden.0);
-            V::splat(1.0).sub(h.mul(h)).store(&mut rise.0);
+    pub fn step<V: Eight, const NX: usize>(
+        &self,
+        arguments: &[f64],
+        hidden: &mut [Group],
+        next: &mut [f64],
+        sums: &mut [f64],
+    ) {
+        let nx = if NX == 0 { self.shape.nx } else { NX };
+        let (states, inputs) = arguments.split_at(nx);
+        for (g, hidden) in hidden.iter_mut().enumerate() {
+            tanh(self.argument::<V>(g, states, inputs)).store(&mut hidden.0);
         }
-        let count = slopes.len();
-        for (g, slope) in slopes.iter_mut().enumerate() {
+        for (q, next) in next[..nx].iter_mut().enumerate() {
+            *next = self.row::<V>(q, states, inputs, hidden);
+        }
+        for (p, (sum, constant)) in sums.iter_mut().zip(&self.constant).enumerate() {
+            *sum = constant + self.row::<V>(nx + p, states, inputs, hidden);
+        }
+    }
+
+    /// A row of `[A B; C D] [x; v] + [E; G] h`.
+    #[inline(always)]
+    fn row<V: Eight>(&self, q: usize, x: &[f64], v: &[f64], hidden: &[Group]) -> f64 {
+        let width = self.shape.arguments();
+        let weights = &self.second[q * hidden.len()..][..hidden.len()];
+        let mut sum = V::splat(0.0);
+        for (weights, hidden) in weights.iter().zip(hidden) {
+            sum = sum.add_product(V::load(&weights.0), V::load(&hidden.0));
+        }
+        let (of_states, of_inputs) = self.linear[q * width..][..width].split_at(x.len());
+        let product = |sum: f64, (w, v): (&f64, &f64)| sum + w * v;
+        let direct = of_inputs.iter().zip(v).fold(0.0, product);
+        of_states.iter().zip(x).fold(direct, product) + sum.sum()
+    }
+
+    /// `dx+/dx = A + E diag(1 - h^2) Wx` and `ds/dx = C + G diag(1 - h^2) Wx` from `rises`, `1 - h^2`.
+    #[inline(always)]
+    pub fn slopes<V: Eight>(&self, rises: &[Group], slopes: &mut [Group]) {
+        let products = self.products.chunks_exact(rises.len() * LANES);
+        for ((slope, base), products) in slopes.iter_mut().zip(&self.base).zip(products) {
             // Two sums side by side: one alone would wait for each product.
-            let (mut even, mut odd) = (V::load(&self.base[g].0), V::splat(0.0));
-            for (i, products) in self.products.chunks_exact(count).enumerate() {
-                let rise = V::splat(rises[i / LANES].0[i % LANES]);
-                let product = V::load(&products[g].0);
-                if i % 2 == 0 {
-                    even = even.add_product(rise, product);
-                } else {
-                    odd = odd.add_product(rise, product);
+            let (mut even, mut odd) = (V::load(&base.0), V::splat(0.0));
+            let (products, _) = products.as_chunks::<LANES>();
+            for (rises, products) in rises.iter().zip(products) {
+                for lane in (0..LANES).step_by(2) {
+                    let (left, right) = (&products[lane], &products[lane + 1]);
+                    even = even.add_product(V::splat(rises.0[lane]), V::load(&left.0));
+                    odd = odd.add_product(V::splat(rises.0[lane + 1]), V::load(&right.0));
                 }
             }
             even.add(odd).store(&mut slope.0);

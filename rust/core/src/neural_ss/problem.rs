@@ -2,7 +2,7 @@
 
 use std::cell::RefCell;
 
-use super::network::{Network, Scratch};
+use super::network::{Network, Scratch, copy, unrolled};
 use super::sensitivities::{Columns, Recursion, Sensitivities};
 use super::shape::Shape;
 use crate::Monitor;
@@ -61,6 +61,14 @@ impl Kernel for FreeRun<'_> {
 
     #[inline(always)]
     fn run<V: Eight>(self) -> Option<()> {
+        unrolled!(self.network.shape.nx, self.samples::<V>)
+    }
+}
+
+impl FreeRun<'_> {
+    /// `NX` states; 0 stands for any number.
+    #[inline(always)]
+    fn samples<V: Eight, const NX: usize>(self) -> Option<()> {
         let Self {
             network,
             v,
@@ -71,28 +79,24 @@ impl Kernel for FreeRun<'_> {
             monitor,
         } = self;
         let Shape {
-            nx,
-            inputs,
-            outputs,
-            ..
+            inputs, outputs, ..
         } = network.shape;
+        let nx = if NX == 0 { network.shape.nx } else { NX };
         scratch.next.copy_from_slice(state);
         let kept = run
             .states
             .chunks_exact_mut(nx)
-            .zip(run.hidden.chunks_exact_mut(network.groups()));
-        let kept = kept.zip(run.sums.chunks_exact_mut(outputs));
+            .zip(run.hidden.chunks_exact_mut(network.groups()))
+            .zip(run.sums.chunks_exact_mut(outputs));
         for (k, (v, ((x, h), s))) in v.chunks_exact(inputs).zip(kept).enumerate() {
             // NaN is no number within the bound either.
-            let sound = scratch.next.iter().all(|x| x.abs() <= bound);
+            let sound = scratch.next[..nx].iter().all(|x| x.abs() <= bound);
             if !sound || (k % LOOK == 0 && monitor.stopped()) {
                 return None;
             }
-            x.copy_from_slice(&scratch.next);
+            copy(x, &scratch.next[..nx]);
             scratch.set(x, v);
-            network.step::<V>(scratch);
-            h.copy_from_slice(&scratch.hidden);
-            s.copy_from_slice(&scratch.sums);
+            network.step::<V, NX>(&scratch.arguments, h, &mut scratch.next, s);
         }
         Some(())
     }
@@ -258,6 +262,7 @@ impl Problem for Training<'_> {
                 y: &data.y,
                 buffers: &mut self.buffers,
                 rows: &mut self.gram,
+                exact: false,
                 monitor: self.monitor,
             });
             self.scatter(i, jtj, jte);

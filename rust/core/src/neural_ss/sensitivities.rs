@@ -3,15 +3,15 @@
 //! With `X = dx/d(theta, x0)`: `X(k+1) = (dx+/dx) X(k) + dx+/dtheta` and `dy(k) = f'(s) ((ds/dx) X(k) + ds/dtheta)`,
 //! all at the states and hidden outputs that the simulation left behind.
 
-use super::network::{Network, Scratch};
+use super::network::{Network, Scratch, rises_of, unrolled};
 use super::problem::Trajectory;
 use super::shape::Shape;
 use crate::Monitor;
-use crate::gram::Gram;
+use crate::gram::{Gram, forget};
 use crate::simd::{Eight, Group, Kernel, LANES};
 
-/// Samples between two looks at the monitor.
-const LOOK: usize = 512;
+/// Samples between two looks at the monitor, and at sensitivities that have all but decayed.
+const LOOK: usize = 64;
 
 /// Where the parameters' columns stand in a row: for each state, each input and the bias, then for each row of E, then
 /// for each row of G, all hidden units; then `[A B]` row by row, the initial state, `[C D c]` row by row, the error.
@@ -115,8 +115,12 @@ pub(super) struct Sensitivities {
     states: Vec<Group>,
     /// `dx+/d[A B x0]`, in groups as `states`.
     linear: Vec<Group>,
-    /// `[E; G] diag(1 - h^2)`.
+    /// `[E; f' G] diag(1 - h^2)`.
     weighted: Vec<Group>,
+    /// `f' ds/dx` of the outputs that are known.
+    outward: Vec<f64>,
+    /// Room for one group of columns of the states.
+    moved: Vec<Group>,
     scratch: Scratch,
     /// Outputs of a sample that are known: which, slope of the output function, error.
     known: Vec<(usize, f64, f64)>,
@@ -132,6 +136,8 @@ impl Sensitivities {
             states: vec![Group::ZERO; (hidden + small) * nx],
             linear: vec![Group::ZERO; small * nx],
             weighted: vec![Group::ZERO; (nx + shape.outputs) * groups],
+            outward: vec![0.0; nx * shape.outputs],
+            moved: vec![Group::ZERO; nx],
             scratch: Scratch::new(shape),
             known: Vec::with_capacity(shape.outputs),
         }
@@ -158,6 +164,8 @@ pub(super) struct Recursion<'a, R> {
     pub y: &'a [f64],
     pub buffers: &'a mut Sensitivities,
     pub rows: &'a mut R,
+    /// Whether the slopes of saturated units keep their digits, for which their arguments are computed once more.
+    pub exact: bool,
     pub monitor: &'a Monitor,
 }
 
@@ -166,18 +174,12 @@ impl<R: Rows> Kernel for Recursion<'_, R> {
 
     #[inline(always)]
     fn run<V: Eight>(self) {
-        match self.network.shape.nx {
-            1 => self.samples::<V, 1>(),
-            2 => self.samples::<V, 2>(),
-            3 => self.samples::<V, 3>(),
-            4 => self.samples::<V, 4>(),
-            _ => self.samples::<V, 0>(),
-        }
+        unrolled!(self.network.shape.nx, self.samples::<V>)
     }
 }
 
 impl<R: Rows> Recursion<'_, R> {
-    /// `NX` states, so that their loops are unrolled; 0 stands for any number.
+    /// `NX` states; 0 stands for any number.
     #[inline(always)]
     fn samples<V: Eight, const NX: usize>(self) {
         let Self {
@@ -187,14 +189,13 @@ impl<R: Rows> Recursion<'_, R> {
             y,
             buffers,
             rows,
+            exact,
             monitor,
         } = self;
         let Shape {
-            nx,
-            inputs,
-            outputs,
-            ..
+            inputs, outputs, ..
         } = network.shape;
+        let nx = if NX == 0 { network.shape.nx } else { NX };
         buffers.reset();
         let hidden = run.hidden.chunks_exact(network.groups());
         let samples = run
@@ -204,11 +205,17 @@ impl<R: Rows> Recursion<'_, R> {
             .zip(hidden);
         let sums = run.sums.chunks_exact(outputs).zip(y.chunks_exact(outputs));
         for (k, (((x, v), h), (s, y))) in samples.zip(sums).enumerate() {
-            if k % LOOK == 0 && monitor.stopped() {
-                return;
+            if k % LOOK == 0 {
+                if monitor.stopped() {
+                    return;
+                }
+                buffers
+                    .states
+                    .iter_mut()
+                    .for_each(|x| x.0.iter_mut().for_each(forget));
             }
             buffers.scratch.set(x, v);
-            buffers.prepare::<V>(network, h, s, y);
+            buffers.prepare::<V>(network, h, (s, y), exact);
             let count = buffers.known.len();
             let width = rows.width();
             buffers.advance::<V, NX>(network, h, rows.room(count), width);
@@ -220,7 +227,13 @@ impl<R: Rows> Recursion<'_, R> {
 impl Sensitivities {
     /// All that the columns have in common.
     #[inline(always)]
-    fn prepare<V: Eight>(&mut self, network: &Network, h: &[Group], s: &[f64], y: &[f64]) {
+    fn prepare<V: Eight>(
+        &mut self,
+        network: &Network,
+        h: &[Group],
+        (s, y): (&[f64], &[f64]),
+        exact: bool,
+    ) {
         let Scratch {
             arguments,
             rises,
@@ -235,16 +248,29 @@ impl Sensitivities {
                 self.known.push((p, slope, y - value));
             }
         }
-        network.slopes::<V>(h, rises, slopes);
-        for (weighted, weights) in self
-            .weighted
-            .chunks_exact_mut(rises.len())
-            .zip(network.second.chunks_exact(rises.len()))
-        {
+        if exact {
+            network.rises::<V>(arguments, rises);
+        } else {
+            rises_of::<V>(h, rises);
+        }
+        network.slopes::<V>(rises, slopes);
+        for (row, outward) in self.known.iter().zip(self.outward.chunks_exact_mut(nx)) {
+            for (j, outward) in outward.iter_mut().enumerate() {
+                let at = (nx + row.0) * nx + j;
+                *outward = row.1 * slopes[at / LANES].0[at % LANES];
+            }
+        }
+        let groups = rises.len();
+        let of_outputs = self
+            .known
+            .iter()
+            .map(|&(p, steepness, _)| (nx + p, steepness));
+        for (row, steepness) in (0..nx).map(|q| (q, 1.0)).chain(of_outputs) {
+            let weights = &network.second[row * groups..][..groups];
+            let weighted = &mut self.weighted[row * groups..][..groups];
             for ((weighted, weight), rise) in weighted.iter_mut().zip(weights).zip(&*rises) {
-                V::load(&weight.0)
-                    .mul(V::load(&rise.0))
-                    .store(&mut weighted.0);
+                let weight = V::load(&weight.0).mul(V::splat(steepness));
+                weight.mul(V::load(&rise.0)).store(&mut weighted.0);
             }
         }
         for q in 0..nx {
@@ -268,19 +294,23 @@ impl Sensitivities {
         let (groups, hidden) = (h.len(), network.shape.hidden);
         let width = network.shape.arguments();
         let (of_states, of_outputs) = self.weighted.split_at(nx * groups);
-        let slopes = Slopes {
+        let slope = |i: usize| V::splat(self.scratch.slope(i));
+        let slopes = Slopes::<V, NX> {
+            onward: std::array::from_fn(|q| std::array::from_fn(|j| slope(q * NX + j))),
             scratch: &self.scratch,
+            outward: &self.outward,
             known: &self.known,
-            nx,
         };
+        let moved = &mut self.moved;
         let mut states = self.states.chunks_exact_mut(nx);
         for (c, argument) in self.scratch.arguments.iter().enumerate() {
             let argument = V::splat(*argument);
             for g in 0..groups {
                 let Some(x) = states.next() else { return };
                 let place = (c * hidden + g * LANES, stride);
-                slopes.advance::<V, NX>(
+                slopes.advance(
                     x,
+                    moved,
                     rows,
                     place,
                     |p| argument.mul(V::load(&of_outputs[p * groups + g].0)),
@@ -300,72 +330,81 @@ impl Sensitivities {
                         V::splat(0.0)
                     }
                 };
-                slopes.advance::<V, NX>(x, rows, place, |_| V::splat(0.0), own);
+                slopes.advance(x, moved, rows, place, |_| V::splat(0.0), own);
             }
         }
-        slopes.write_direct::<V>(h, rows, stride, self.columns.direct, hidden);
+        slopes.write_direct(h, rows, stride, self.columns.direct, hidden);
         for (i, linear) in self.linear.chunks_exact(nx).enumerate() {
             let Some(x) = states.next() else { return };
             let start = self.columns.linear + i * LANES;
             let place = (start, stride);
-            slopes.advance::<V, NX>(x, rows, place, |_| V::splat(0.0), |q| V::load(&linear[q].0));
+            slopes.advance(
+                x,
+                moved,
+                rows,
+                place,
+                |_| V::splat(0.0),
+                |q| V::load(&linear[q].0),
+            );
         }
         slopes.write_sums(rows, stride, &self.columns);
     }
 }
 
 /// The slopes of one sample.
-struct Slopes<'a> {
+struct Slopes<'a, V, const NX: usize> {
+    /// `dx+/dx` in registers, where the number of states is known.
+    onward: [[V; NX]; NX],
     scratch: &'a Scratch,
+    outward: &'a [f64],
     known: &'a [(usize, f64, f64)],
-    nx: usize,
 }
 
-impl Slopes<'_> {
-    /// One group of columns: its part of the rows, from `start` on, and `X` one step on. `direct(p)` and `next(q)` are `ds/dtheta` and
-    /// `dx+/dtheta`.
+impl<V: Eight, const NX: usize> Slopes<'_, V, NX> {
+    /// One group of columns: its part of the rows, from `start` on, and `X` one step on. `direct(p)` and `next(q)` are
+    /// `f' ds/dtheta` and `dx+/dtheta`.
     #[inline(always)]
-    fn advance<V: Eight, const NX: usize>(
+    fn advance(
         &self,
         x: &mut [Group],
+        moved: &mut [Group],
         rows: &mut [f64],
         (start, stride): (usize, usize),
         direct: impl Fn(usize) -> V,
         next: impl Fn(usize) -> V,
     ) {
-        let nx = if NX == 0 { self.nx } else { NX };
-        let slope = |i: usize| V::splat(self.scratch.slope(i));
-        for (row, &(p, steepness, _)) in self.known.iter().enumerate() {
-            let first = (nx + p) * nx;
-            let sum = x.iter().enumerate().fold(direct(p), |sum, (j, x)| {
-                sum.add_product(slope(first + j), V::load(&x.0))
+        let nx = x.len();
+        let outward = self.outward.chunks_exact(nx);
+        for (row, ((p, ..), outward)) in self.known.iter().zip(outward).enumerate() {
+            let sum = outward.iter().zip(&*x).fold(direct(*p), |sum, (slope, x)| {
+                sum.add_product(V::splat(*slope), V::load(&x.0))
             });
-            sum.mul(V::splat(steepness))
-                .write(&mut rows[start + row * stride..]);
+            sum.write(&mut rows[start + row * stride..]);
         }
         if NX == 0 {
-            let mut moved = [Group::ZERO; 64];
-            for (q, moved) in moved[..nx].iter_mut().enumerate() {
+            for (q, moved) in moved.iter_mut().enumerate() {
                 let sum = x.iter().enumerate().fold(next(q), |sum, (j, x)| {
-                    sum.add_product(slope(q * nx + j), V::load(&x.0))
+                    let slope = V::splat(self.scratch.slope(q * nx + j));
+                    sum.add_product(slope, V::load(&x.0))
                 });
                 sum.store(&mut moved.0);
             }
-            x.copy_from_slice(&moved[..nx]);
+            x.copy_from_slice(moved);
             return;
         }
         let old: [V; NX] = std::array::from_fn(|j| V::load(&x[j].0));
-        for (q, x) in x.iter_mut().enumerate() {
-            let sum = old.iter().enumerate().fold(next(q), |sum, (j, old)| {
-                sum.add_product(slope(q * NX + j), *old)
-            });
+        for (q, (x, slopes)) in x.iter_mut().zip(&self.onward).enumerate() {
+            let sum = slopes
+                .iter()
+                .zip(&old)
+                .fold(next(q), |sum, (slope, old)| sum.add_product(*slope, *old));
             sum.store(&mut x.0);
         }
     }
 
     /// The columns of G.
     #[inline(always)]
-    fn write_direct<V: Eight>(
+    fn write_direct(
         &self,
         h: &[Group],
         rows: &mut [f64],

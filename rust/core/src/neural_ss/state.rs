@@ -1,6 +1,6 @@
 //! States of a model on new data: maximum a posteriori from a record's first samples, and rest.
 
-use super::network::{Network, Scratch};
+use super::network::{Network, Scratch, rises_of};
 use super::shape::Shape;
 use crate::lm::{cholesky, substitute};
 use crate::simd::{self, Eight, Kernel};
@@ -331,18 +331,18 @@ impl Kernel for Evaluation<'_, '_> {
 /// A step from `scratch.next`, and its slopes.
 #[inline(always)]
 pub(super) fn step_with_slopes<V: Eight>(network: &Network, scratch: &mut Scratch, v: &[f64]) {
-    let nx = network.shape.nx;
-    let (states, inputs) = scratch.arguments.split_at_mut(nx);
-    states.copy_from_slice(&scratch.next);
-    inputs[..v.len()].copy_from_slice(v);
-    network.step::<V>(scratch);
+    scratch.go_on(v);
     let Scratch {
+        arguments,
         hidden,
+        next,
+        sums,
         rises,
         slopes,
-        ..
     } = scratch;
-    network.slopes::<V>(hidden, rises, slopes);
+    network.step::<V, 0>(arguments, hidden, next, sums);
+    rises_of::<V>(hidden, rises);
+    network.slopes::<V>(rises, slopes);
 }
 
 /// The distance from rest.
@@ -414,10 +414,14 @@ impl Kernel for Next<'_> {
 
     #[inline(always)]
     fn run<V: Eight>(self) {
-        let nx = self.network.shape.nx;
-        let (states, inputs) = self.scratch.arguments.split_at_mut(nx);
-        states.copy_from_slice(&self.scratch.next);
-        inputs[..self.v.len()].copy_from_slice(self.v);
-        self.network.step::<V>(self.scratch);
+        self.scratch.go_on(self.v);
+        let Scratch {
+            arguments,
+            hidden,
+            next,
+            sums,
+            ..
+        } = self.scratch;
+        self.network.step::<V, 0>(arguments, hidden, next, sums);
     }
 }

@@ -2,8 +2,8 @@
 
 use crate::simd::Eight;
 
-/// Beyond this `tanh` is 1 to the last bit.
-const SATURATED: f64 = 20.0;
+/// `tanh` is 1 to the last bit from 20 on; from here on its derivative is below 1e-294, too.
+const SATURATED: f64 = 340.0;
 /// Adding this rounds to an integer, which is then found in the low bits.
 const ROUND: f64 = 6_755_399_441_055_744.0;
 /// ln 2 in two parts; the first has so few bits that its product with a small integer is exact (Cody and Waite 1980).
@@ -28,6 +28,21 @@ const TAYLOR: [f64; 12] = [
 /// products that are rounded once where the processor can. NaN stays NaN.
 #[inline(always)]
 pub(super) fn tanh<V: Eight>(x: V) -> V {
+    let m = growth(x);
+    m.div(m.add(V::splat(2.0))).with_sign(x)
+}
+
+/// `1 - tanh(x)^2 = q (2 - q)` with `q = 1 - |tanh(x)|`: near saturation the difference itself has lost its digits.
+#[inline(always)]
+pub(super) fn rise<V: Eight>(x: V) -> V {
+    let two = V::splat(2.0);
+    let q = two.div(growth(x).add(two));
+    q.mul(two.sub(q))
+}
+
+/// `exp(2|x|) - 1`.
+#[inline(always)]
+fn growth<V: Eight>(x: V) -> V {
     let one = V::splat(1.0);
     let size = x.size_up_to(SATURATED);
     let twice = size.add(size);
@@ -38,8 +53,7 @@ pub(super) fn tanh<V: Eight>(x: V) -> V {
         .add_product(n, V::splat(-LN2[1]));
     let power = shifted.power_of_two();
     let series = r.add_product(r.mul(r), series(r));
-    let m = power.sub(one).add_product(power, series);
-    m.div(m.add(V::splat(2.0))).with_sign(x)
+    power.sub(one).add_product(power, series)
 }
 
 /// The Taylor sum in Estrin's form: short chains, so that a processor can do several things at once.
@@ -59,6 +73,19 @@ mod tests {
     use proptest::prelude::*;
 
     struct Tanh([f64; LANES]);
+
+    struct Rise([f64; LANES]);
+
+    impl Kernel for Rise {
+        type Output = [f64; LANES];
+
+        #[inline(always)]
+        fn run<V: Eight>(self) -> Self::Output {
+            let mut values = self.0;
+            rise(V::load(&values)).store(&mut values);
+            values
+        }
+    }
 
     impl Kernel for Tanh {
         type Output = [f64; LANES];
@@ -105,6 +132,14 @@ mod tests {
                 let library = x.tanh();
                 prop_assert!((own - library).abs() <= 4e-15 * library.abs());
                 prop_assert!(own.abs() <= 1.0);
+            }
+        }
+
+        #[test]
+        fn its_slope_keeps_its_digits_into_saturation(x in prop::array::uniform8(-300.0f64..300.0)) {
+            for (own, x) in simd::run(Rise(x)).iter().zip(x) {
+                let expected = 1.0 / x.cosh().powi(2);
+                prop_assert!((own - expected).abs() <= 1e-12 * expected, "{own} {expected}");
             }
         }
     }

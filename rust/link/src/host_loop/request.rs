@@ -8,7 +8,7 @@ use super::kind;
 const REPEAT: u64 = 100_000;
 /// The same for STOP, within any usual watchdog time.
 const STOP_REPEAT: u64 = 10_000;
-/// How long a command is repeated before it is given up \[us\].
+/// How long a command is repeated before it is given up, where the watchdog's time is not longer \[us\].
 const PATIENCE: u64 = 1_000_000;
 
 /// One command and when it was sent.
@@ -55,8 +55,9 @@ impl Request {
         }
     }
 
-    /// True once the last try has waited long enough.
-    pub fn exhausted(&self, now: u64) -> bool {
-        self.sent >= PATIENCE / self.repeat() && now >= self.due()
+    /// True once the last try has waited long enough; STOP is repeated for as long as the `watchdog` lets the motor turn \[us\].
+    pub fn exhausted(&self, now: u64, watchdog: u32) -> bool {
+        let tries = PATIENCE.max(watchdog.into()) / self.repeat();
+        self.sent >= tries && now >= self.due()
     }
 }

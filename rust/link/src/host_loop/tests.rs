@@ -394,6 +394,17 @@ fn gives_up_a_device_that_never_answers() {
 }
 
 #[test]
+fn says_stop_for_as_long_as_the_motor_may_turn() {
+    let mut world = World::new(10);
+    world.looped.state.settings.watchdog = 5_000_000;
+    world.peer.deaf = true;
+    world.looped.stop(Outcome::Interrupted);
+    world.serve(u64::MAX);
+    assert_eq!(world.peer.count(kind::STOP), 500);
+    assert!(world.looped.done() && !world.looped.stopped());
+}
+
+#[test]
 fn feeds_the_watchdog_while_start_is_unanswered() {
     let mut world = World::new(10);
     world.call(1_000_000);

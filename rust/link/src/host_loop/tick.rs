@@ -218,7 +218,7 @@ type Said = Option<(Header, Body)>;
 impl State {
     /// Sends the request under way, again, or gives it up; feeds the watchdog of an armed device meanwhile.
     fn ask(&mut self, now: u64) -> Said {
-        if self.request.exhausted(now) {
+        if self.request.exhausted(now, self.settings.watchdog) {
             self.give_up();
         }
         if self.phase == Phase::Done {
