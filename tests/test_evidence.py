@@ -132,6 +132,19 @@ def test_a_wrong_order_is_detected() -> None:
     assert card.verdict in ("warn", "fail")
 
 
+def test_a_plant_that_has_changed_is_detected_and_one_that_has_not_is_not() -> None:
+    model, name = linear_model(), "parameters on these data"
+    e = linear_data(1500, seed=11, noise=0.5).experiments[0]
+    changed = Dataset.from_arrays(e.u, 1.1 * e.y, 0.01, input_units="V", output_unit="RPM")
+    assert model.check(changed).line(name).verdict == "fail"
+    accused = sum(
+        model.check(linear_data(800, seed=s, noise=0.5)).line(name).verdict != "ok"
+        for s in range(20, 44)
+    )
+    # at the 1 % level 4 or more of 24 come once in 10,000 runs
+    assert accused < 4
+
+
 def test_noise_that_grows_with_the_input_is_detected() -> None:
     data = linear_data(2000)
     e = data.experiments[0]

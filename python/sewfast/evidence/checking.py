@@ -17,7 +17,7 @@ from .card import Line, ReportCard
 from .criteria import Criteria
 from .operating import OperatingRange, operating_range
 from .parameters import Knowledge, Parameters, estimate
-from .portmanteau import LAGS, residual_tests
+from .portmanteau import LAGS, parameter_test, residual_tests
 from .region import Place, placed, training_region
 from .residuals import Residuals, representative
 from .scores import horizon_scores
@@ -78,6 +78,9 @@ def check(
     lines.append(questions.bias(free))
     tests = residual_tests(tested, memory(model, data, init))
     lines += [questions.correlation(t) for t in tests]
+    if not on_training and not getattr(model, "members", ()):
+        held = parameter_test(tested, int(model.training.get("samples") or 0))
+        lines += [questions.correlation(held)] if held is not None else []
     found = _parameters(model, data, training, on_training, init)
     lines += found[2]
     place = placed(model, data, training, init)

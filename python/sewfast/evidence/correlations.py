@@ -3,10 +3,11 @@
 The statistic is r'(Z'RZ)^+ r with r = Z'e, one column of Z per lag, R the covariance matrix of e.
 Z is first freed of what a change of the parameters could have done to e: then it is chi-square
 whether the parameters were estimated on these data or on others (Ljung 1999, sections 16.5 and
-16.6; Breusch and Godfrey 1978). Correlations and their limits are of the residual as it is,
-coloured (Bartlett's formula, with an autoregression for R). The statistic is that of the whitened
-residual and Z, where R is diagonal: a strongly coloured residual knows its own R too badly for 25
-sums at once.
+16.6; Breusch and Godfrey 1978). R is Bartlett's: the residual as it is, coloured, with an
+autoregression for R. A strongly coloured residual knows its own R too badly for 25 sums at once,
+and the form acquits too often; whitened by the same autoregression it is exact, but then accuses
+for the curvature of the model, which is large beside the innovation. The statistic of a test is
+the mean of both.
 """
 
 from __future__ import annotations
@@ -135,6 +136,11 @@ class Sums:
         room = sum(int(np.count_nonzero(e)) for e in target) - directions[0].shape[1]
         return cls(values, covariance, scales, reference, explained, float(room))
 
+    def statistic(self) -> tuple[float, int]:
+        """The quadratic form with Bartlett's factor, and its degrees of freedom."""
+        found, freedom = quadratic(self.values, self.covariance, self.reference)
+        return _likelihood_ratio(found, freedom, self.room), freedom
+
 
 def verdict(
     name: str,
@@ -143,17 +149,18 @@ def verdict(
     series: tuple[str, ...],
     sums: Sums,
     judges: bool,
-    decides: Sums | None = None,
+    white: Sums | None = None,
 ) -> ResidualTest:
     """The test that the sums make; they are in the order of the series, then of the lags.
 
-    With `decides` the statistic is of those sums, and `sums` give the correlations alone.
+    With `white`, the same sums of the whitened series, the statistic is the mean of both.
     """
     shape = (len(series), len(lags))
     spread = np.sqrt(np.maximum(np.diag(sums.covariance), 0.0))
-    told = decides or sums
-    statistic, freedom = quadratic(told.values, told.covariance, told.reference)
-    statistic = _likelihood_ratio(statistic, freedom, told.room)
+    statistic, freedom = sums.statistic()
+    if white is not None and freedom:
+        other, its_freedom = white.statistic()
+        statistic = max(0.5 * (statistic + other + freedom - its_freedom), 0.0)
     return ResidualTest(
         name,
         title,
@@ -217,14 +224,19 @@ def _explained(
     return float(np.clip((taken - chance) / power, 0.0, 1.0))
 
 
-def independent_directions(columns: Sequence[FloatArray]) -> list[FloatArray]:
-    """An orthonormal basis, over all experiments together, of what the columns (N, p) span."""
+def independent_directions(
+    columns: Sequence[FloatArray], determined: float = 1e-10
+) -> list[FloatArray]:
+    """An orthonormal basis, over all experiments together, of what the columns (N, p) span.
+
+    Directions whose information is below `determined` times the largest are left out.
+    """
     scale = np.sqrt(np.sum([np.square(c).sum(axis=0) for c in columns], axis=0))
     used = (scale > 0.0) & np.isfinite(scale)
     scaled = [c[:, used] / scale[used] for c in columns]
     if not used.any():
         return scaled
     sizes, vectors = np.linalg.eigh(np.sum([c.T @ c for c in scaled], axis=0))
-    kept = sizes > 1e-10 * sizes[-1]
+    kept = sizes > determined * sizes[-1]
     turn = vectors[:, kept] / np.sqrt(sizes[kept])
     return [c @ turn for c in scaled]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from typing import TypeAlias
 
@@ -17,6 +17,7 @@ from .residuals import Residuals, Run
 
 LAGS = 25
 LEAST_SAMPLES = 50
+_FOLLOWED = 1e-4
 LARGEST_SET = 50
 """Sums in one test: with several inputs there are fewer lags of each."""
 
@@ -51,6 +52,23 @@ def residual_tests(residuals: Residuals, memory: int = LAGS) -> tuple[ResidualTe
         return ()
     setting = _Setting.of(residuals, memory)
     return tuple(test(setting) for test in _TESTS)
+
+
+def parameter_test(residuals: Residuals, trained: int) -> ResidualTest | None:
+    """Whether other parameters would do better on data that the model was not fitted to.
+
+    The residual with its sensitivities, those that matter; their sums also hold what `trained`
+    samples left open. None where there are no sensitivities or too few samples.
+    """
+    if residuals.is_nothing or residuals.n < LEAST_SAMPLES or residuals.width == 0:
+        return None
+    basis = independent_directions([r.sensitivity for r in residuals.runs], _FOLLOWED)
+    constant = _constant([r.counts for r in residuals.runs])
+    sums = Sums.of(basis, residuals.errors, residuals.noise(), constant)
+    if trained > 0:
+        sums = replace(sums, covariance=sums.covariance * (1.0 + residuals.n / trained))
+    lags = np.arange(basis[0].shape[1])
+    return verdict("parameters", "parameters on these data", lags, ("e",), sums, True)
 
 
 def lags_over(memory: int, samples: int, count: int = LAGS) -> _Lags:
@@ -159,7 +177,7 @@ def _linear(
     directions: _Columns | None = None,
     judges: bool = True,
 ) -> ResidualTest:
-    """The residual with columns that hold no noise; shown as it is, decided on whitened."""
+    """The residual with columns that hold no noise, as it is and whitened."""
     basis = s.white_directions
     if directions is not None:
         basis = _whitened_basis(directions, s.known, s.noise)
@@ -168,8 +186,8 @@ def _linear(
     flat = [s.noise.whitened(z) * k[:, None] for z, k in zip(instruments, s.known, strict=True)]
     room = max(sum(int(k.sum()) for k in s.known) - s.white_directions[0].shape[1], 1)
     power = sum(float(w @ w) for w in s.white) / room
-    decides = Sums.of(flat, s.white, Noise(np.zeros(0), power, power), basis)
-    return verdict(name, title, lags, series, shown, judges, decides)
+    whitened = Sums.of(flat, s.white, Noise(np.zeros(0), power, power), basis)
+    return verdict(name, title, lags, series, shown, judges, whitened)
 
 
 def _products(u: FloatArray) -> FloatArray:

@@ -31,6 +31,13 @@ SAMPLES_PER_PARAMETER = 10.0
 GROWTH, LARGE_GROWTH = 1.5, 3.0
 
 _FOUND = {
+    "parameters": (
+        "the same kind of model with other parameters fits these data better: gain or time "
+        "constants "
+        "differ from the training data; the plant has changed, or the model is a compromise "
+        "between "
+        "regimes"
+    ),
     "autocorrelation": (
         "the noise model is too simple: predictions one step ahead waste what past errors "
         "say; raise "
@@ -68,6 +75,7 @@ _FOUND = {
     ),
 }
 _PASSED = {
+    "parameters": "the parameters found in training are those of these data",
     "autocorrelation": "the residual is white: nothing of it can be predicted from its own past",
     "input": "nothing of the input is left in the residual: the linear dynamics are complete",
     "squared_input": "no even nonlinearity is left in the residual",
