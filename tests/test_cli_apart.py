@@ -72,3 +72,13 @@ def test_a_model_is_not_written_over_by_its_controller(
     data.write_text("{}")
     assert "a file of its own" in refused(capsys, "identify", f"{data}:u:y", "-o", str(data))
     assert (model.read_text(), data.read_text()) == ("{}", "{}")
+
+
+@pytest.mark.parametrize("option", ["--trace", "--fault-log"])
+def test_a_recording_is_no_place_for_a_log(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
+) -> None:
+    kept = tmp_path / "run.mcap"
+    kept.write_bytes(b"what a drive did")
+    assert "it is kept" in refused(capsys, "device", option, str(kept), "--for", "0.1")
+    assert kept.read_bytes() == b"what a drive did"

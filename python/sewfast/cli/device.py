@@ -86,7 +86,11 @@ def add(commands: Commands) -> None:
 
 def device_command(args: argparse.Namespace) -> None:
     from ..link.virtual import VirtualDevice
+    from ..recordfile.keeping import require_replaceable
 
+    for log in (args.fault_log, args.trace):
+        if log is not None:
+            require_replaceable(log, overwrite=False)
     with _signals_as_interrupts():
         with (
             VirtualDevice(
