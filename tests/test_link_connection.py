@@ -244,6 +244,8 @@ def test_a_refusal_names_the_field():
         return str(caught.value)
 
     assert "speed is beyond a limit" in message(Kind.LIMITS, 6, 1)
+    assert "does not offer current; its limit is inf" in message(Kind.LIMITS, 8, 3)
+    assert "does not offer mode; leave it out" in message(Kind.START, 8, 0)
     assert "batch is outside its range" in message(Kind.START, 3, 5)
     assert "value 7 is beyond a limit" in message(Kind.UPLOAD, 6, 7)
     assert "not while tripped; find out why, then clear" in message(Kind.ARM, 4, 4)

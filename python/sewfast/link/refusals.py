@@ -23,6 +23,10 @@ def refusal(kind: int, result: int, detail: int) -> str:
     return f"expected the device to take {name}, it refused: {_refused(kind, result, detail)}"
 
 
+def _without(kind: int) -> str:
+    return "its limit is inf" if kind == wire.Kind.LIMITS else "leave it out"
+
+
 def _refused(kind: int, result: int, detail: int) -> str:
     where = _field(kind, detail)
     texts = {
@@ -33,7 +37,7 @@ def _refused(kind: int, result: int, detail: int) -> str:
         5: "it has been reset since; connect again, set the limits and start anew",
         6: f"{where} is beyond a limit; lower it or raise the limit",
         7: f"no room in its profile memory, {detail} values would fit; wait for it to play on",
-        8: f"it does not offer {where}; leave it out",
+        8: f"it does not offer {where}; {_without(kind)}",
         9: f"values out of order, it expects number {detail}; upload from there",
         10: f"it speaks protocol version {detail}, sewfast {wire.VERSION}; update the older one",
         11: "the motor is moving; wait for rest",
