@@ -29,7 +29,7 @@ class Plan:
         Weight decay to begin with, and the factor to the next one.
     most_hidden : int
     worth_a_step : float
-        A larger network must bring the error below this part; on much data it is well known.
+        A step in the ladder must bring the error below this part.
     """
 
     trial_samples: int
@@ -53,7 +53,7 @@ FINAL_OPERATIONS = 1.2e11
 
 SMALL = Plan(12_000, 12_000, 6, 60, 24, 100, 0, 15, 1e-4, 10.0, 16, 0.97)
 MEDIUM = Plan(12_000, 12_000, 4, 60, 8, 150, 60, 15, 1e-5, 10.0, 16, 0.97)
-LARGE = Plan(12_000, 12_000, 4, 60, 4, 300, 60, 10, 1e-8, 1e3, 32, 0.985)
+LARGE = Plan(12_000, 12_000, 4, 60, 4, 300, 60, 10, 1e-8, 1e3, 32, 0.97)
 """Much data: little variance to average out, but larger networks to gain from."""
 
 
