@@ -23,12 +23,14 @@ from sewfast.evidence import (
     check,
     estimate,
     operating_range,
+    remembered,
     residual_tests,
 )
 from sewfast.evidence.criteria import Criteria
 from sewfast.evidence.distributions import chi2_quantile, chi2_tail, normal_quantile
 from sewfast.evidence.linearised import linearise
 from sewfast.evidence.noise import Noise, fast_length
+from sewfast.models.ensemble import Ensemble
 
 
 @cache
@@ -171,6 +173,20 @@ def test_bands_need_a_level_and_a_model_that_knows() -> None:
         network().bands(data, 1.5)
     with pytest.raises(SettingError, match="identify it again"):
         replace(network(), training={}).bands(data)
+
+
+def test_an_ensemble_has_a_card_like_any_other() -> None:
+    parts = [linear_data(700, seed=s, noise=0.5) for s in (1, 2, 3)]
+    members = [sewfast.identify(p, model="oe") for p in parts]
+    training = {k: members[0].training[k] for k in ("input_range", "output_range")}
+    ensemble = remembered(Ensemble.of(members, training=training), Dataset.concat(parts))
+    card = ensemble.check(linear_data(1500, seed=11, noise=0.5))
+    assert card.bands is not None
+    assert 0.9 < card.bands.coverage < 0.99
+    assert card.line("free run").verdict == "ok"
+    assert card.operating is not None
+    assert len(card.operating.members) == 3
+    assert json.dumps(card.to_json(), allow_nan=False)
 
 
 def test_evidence_survives_the_file(tmp_path) -> None:

@@ -166,7 +166,7 @@ def points(model: Model, data: Dataset, init: int = INIT) -> list[FloatArray]:
     """
     single = representative(model)
     found = []
-    for e, yhat in zip(data.experiments, single.simulate(data, init=init), strict=True):
+    for e, yhat in zip(data.experiments, model.simulate(data, init=init), strict=True):
         states = getattr(single.core, "states", None)
         if states is not None:
             inputs = _late(e.u, single.orders["nk"])

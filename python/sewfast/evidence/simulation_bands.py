@@ -13,14 +13,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..dataset import Dataset, FloatArray
-from ..errors import SettingError
+from ..errors import FitError, SettingError
 from ..models.base import INIT, Model
 from .distributions import normal_quantile
 from .parameters import Information, estimate
@@ -300,7 +301,7 @@ def _spreads(
     own = [np.full(len(r.y), known.spread) for r in residuals.runs]
     members = getattr(model, "members", ())
     if members:
-        runs = [m.simulate(data, init=residuals.init) for m in members]
+        runs = _member_runs(members, data, residuals.init)
         together = zip(own, *runs, strict=True)
         return [np.sqrt(s**2 + _member_variance(np.stack(same))) for s, *same in together]
     factor = known.factor
@@ -310,6 +311,15 @@ def _spreads(
         np.sqrt(s**2 + np.square(r.psi @ factor).sum(axis=1))
         for s, r in zip(own, residuals.runs, strict=True)
     ]
+
+
+def _member_runs(members: Sequence[Model], data: Dataset, init: int) -> list[list[FloatArray]]:
+    """Free runs of the members that stand the input, as those count in the ensemble's own."""
+    found = []
+    for member in members:
+        with suppress(FitError):
+            found.append(member.simulate(data, init=init))
+    return found
 
 
 def _member_variance(runs: FloatArray) -> FloatArray:
