@@ -24,6 +24,7 @@ _STYLES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1, 2))
 _MARKERS = "osD^vP"
 _MOST_PANELS = 6
 _BUCKETS = 1200
+_FARTHEST = 20.0
 
 
 def figures(card: ReportCard) -> dict[str, Figure]:
@@ -251,7 +252,7 @@ def region_figure(card: ReportCard) -> Figure:
         ax.set_title(f"{run.name} [{run.range_text}]: {outside:.2f} % of samples outside")
         ax.set_ylabel("distance / radius")
         ax.set_xlabel("time [s]")
-        ax.set_ylim(0.0, max(1.2, 1.05 * float(d.max())))
+        ax.set_ylim(0.0, min(max(1.2, 1.05 * float(d.max())), _FARTHEST))
     return figure
 
 

@@ -30,6 +30,7 @@ Between one sample and the next of a fast record there is less; any new rate wou
 _MOST_POINTS = 20_000
 _BLOCK = 4096
 _TENTHS = 10
+_FARTHEST = 1e60
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,9 @@ class Region:
 
     def _squares(self, points: FloatArray) -> Iterator[FloatArray]:
         """Squared distances (n, c) of a block of points after the other to all centres."""
-        white = (points - self.mean) @ self.turn
+        # a run that leaves the world is far away, and no overflow
+        bounded = np.clip(np.nan_to_num(points), -_FARTHEST, _FARTHEST)
+        white = np.clip((bounded - self.mean) @ self.turn, -_FARTHEST, _FARTHEST)
         centres = np.square(self.centres).sum(axis=1)
         for a in range(0, len(white), _BLOCK):
             part = white[a : a + _BLOCK]

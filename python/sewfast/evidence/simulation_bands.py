@@ -6,7 +6,8 @@ sandwich covariance, so the residual's colour counts). An ensemble puts the spre
 place of the second part. The quantiles are those of residuals that the model was not fitted to:
 every tenth of the training data is left out in turn, to first order (Cook and Weisberg 1982), so
 that neither normality nor a perfect model is assumed (CV+ and normalised conformal bands: Barber et
-al. 2021, Lei et al. 2018). Outside the training region s grows in proportion to the distance.
+al. 2021, Lei et al. 2018). Outside the training region s grows in proportion to the distance, up
+to ten times.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ _FOLLOWED = 1e-4
 
 In weaker ones a network bends long before it has gone as far as the first order says.
 """
+_WIDEST = 10.0
 _LARGEST_GROWTH = 3.0
 """A residual is not trusted to grow further when its block is left out: first order ends there."""
 
@@ -190,7 +192,9 @@ def bands_of(
     low, high = known.quantile(tail), known.quantile(1.0 - tail)
     spreads = _spreads(model, data, residuals, known)
     if place is not None:
-        spreads = [s * np.maximum(1.0, d) for s, d in zip(spreads, place.distances, strict=True)]
+        spreads = [
+            s * np.clip(d, 1.0, _WIDEST) for s, d in zip(spreads, place.distances, strict=True)
+        ]
     lower = tuple(r.yhat + low * s for r, s in zip(residuals.runs, spreads, strict=True))
     upper = tuple(r.yhat + high * s for r, s in zip(residuals.runs, spreads, strict=True))
     hits = [
