@@ -156,7 +156,7 @@ def bode_figure(card: ReportCard) -> Figure:
         for n, k in enumerate(shown):
             look = {
                 "color": _shade(n, len(shown)),
-                "lw": 4.2 - 0.7 * n,
+                "lw": 4.2 - 3.2 * n / max(1, len(shown) - 1),
                 "ls": _STYLES[n % len(_STYLES)],
             }
             g = o.points[k].response(hertz)[:, i]
