@@ -6,7 +6,7 @@ mod network;
 mod problem;
 mod referee;
 mod scaling;
-mod tanh;
+pub(crate) mod tanh;
 mod train;
 mod warm;
 

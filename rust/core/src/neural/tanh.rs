@@ -1,13 +1,13 @@
 //! A tanh without branches or library calls: the same bits on every platform, and four at a time.
 
 /// `tanh` is 1 to the last bit from 20 on; from here on its derivative is below 1e-294, too.
-const SATURATED: f64 = 340.0;
+pub(crate) const SATURATED: f64 = 340.0;
 /// Adding this rounds to an integer, which is then found in the low bits.
-const ROUND: f64 = 6_755_399_441_055_744.0;
+pub(crate) const ROUND: f64 = 6_755_399_441_055_744.0;
 /// ln 2 in two parts; the first has so few bits that its product with a small integer is exact (Cody and Waite 1980).
-const LN2: [f64; 2] = [6.931_471_803_691_238e-1, 1.908_214_929_270_587_7e-10];
+pub(crate) const LN2: [f64; 2] = [6.931_471_803_691_238e-1, 1.908_214_929_270_587_7e-10];
 /// `1/(i + 2)!`: Taylor coefficients of `(exp(r) - 1 - r)/r^2`, exact to rounding for `|r| <= ln(2)/2`.
-const TAYLOR: [f64; 12] = [
+pub(crate) const TAYLOR: [f64; 12] = [
     1.0 / 2.0,
     1.0 / 6.0,
     1.0 / 24.0,

@@ -1,30 +1,9 @@
 //! The hyperbolic tangent, eight at a time.
 
+use crate::neural::tanh::{LN2, ROUND, SATURATED, TAYLOR};
 use crate::simd::Eight;
 
-/// `tanh` is 1 to the last bit from 20 on; from here on its derivative is below 1e-294, too.
-const SATURATED: f64 = 340.0;
-/// Adding this rounds to an integer, which is then found in the low bits.
-const ROUND: f64 = 6_755_399_441_055_744.0;
-/// ln 2 in two parts; the first has so few bits that its product with a small integer is exact (Cody and Waite 1980).
-const LN2: [f64; 2] = [6.931_471_803_691_238e-1, 1.908_214_929_270_587_7e-10];
-/// `1/(i + 2)!`: Taylor coefficients of `(exp(r) - 1 - r)/r^2`, exact to rounding for `|r| <= ln(2)/2`.
-const TAYLOR: [f64; 12] = [
-    1.0 / 2.0,
-    1.0 / 6.0,
-    1.0 / 24.0,
-    1.0 / 120.0,
-    1.0 / 720.0,
-    1.0 / 5_040.0,
-    1.0 / 40_320.0,
-    1.0 / 362_880.0,
-    1.0 / 3_628_800.0,
-    1.0 / 39_916_800.0,
-    1.0 / 479_001_600.0,
-    1.0 / 6_227_020_800.0,
-];
-
-/// `tanh(x) = m/(m + 2)` with `m = exp(2|x|) - 1`, sign restored: as [`crate::neural::tanh`], but in groups and with
+/// `tanh(x) = m/(m + 2)` with `m = exp(2|x|) - 1`, sign restored: as [`crate::neural::tanh()`], but in groups and with
 /// products that are rounded once where the processor can. NaN stays NaN.
 #[inline(always)]
 pub(super) fn tanh<V: Eight>(x: V) -> V {
