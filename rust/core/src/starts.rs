@@ -1,10 +1,87 @@
-//! Many starts of one fit: over threads, in their order, ranked.
+//! Many starts of one fit: drawn until they can learn, trained until they have, over threads, in their order, ranked.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
-use crate::Monitor;
+use crate::{Error, Monitor, Result};
+
+/// Draws of one start before it is given up.
+const MOST_DRAWS: usize = 50;
+/// Trainings of one start before it is given up: only those that ended dead are repeated.
+pub(crate) const MOST_TRAININGS: usize = 3;
+/// A training that ends above this share of a constant output's J has learnt nothing.
+const DEAD_COST: f64 = 0.9;
+
+/// Refuses numbers of iterations and starts that are no numbers of such.
+///
+/// # Errors
+/// `ErrorKind::Setting` outside 1 to 1,000,000.
+pub(crate) fn check(max_iterations: usize, starts: usize) -> Result<()> {
+    for (name, value) in [("max_iterations", max_iterations), ("starts", starts)] {
+        if value == 0 || value > 1_000_000 {
+            return Err(Error::setting(format!(
+                "expected {name} from 1 to 1,000,000, got {value}; 100 iterations and 8 starts are usual"
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// The first draw from which a training can begin, and how many could not.
+pub(crate) fn drawn<T>(
+    monitor: &Monitor,
+    mut draw: impl FnMut() -> Option<T>,
+) -> Option<(T, usize)> {
+    for dead in 0..MOST_DRAWS {
+        if let Some(theta) = draw() {
+            return Some((theta, dead));
+        }
+        if monitor.stopped() {
+            return None;
+        }
+    }
+    None
+}
+
+/// Whether a training has learnt anything: its J against that of the best constant output.
+pub(crate) fn has_learnt(cost: f64, constant_cost: f64) -> bool {
+    cost < DEAD_COST * constant_cost
+}
+
+/// The first of `trainings` that has learnt, or the last one, and how many draws and trainings were dead.
+///
+/// `train` returns its result and the dead draws before it.
+pub(crate) fn learnt<T>(
+    trainings: usize,
+    monitor: &Monitor,
+    mut train: impl FnMut() -> Option<(T, usize)>,
+    is_alive: impl Fn(&T) -> bool,
+) -> Option<(T, usize)> {
+    let mut discarded = 0;
+    for training in 1..=trainings {
+        let (trained, dead) = train()?;
+        discarded += dead;
+        if is_alive(&trained) || training == trainings || monitor.stopped() {
+            return Some((trained, discarded));
+        }
+        discarded += 1;
+    }
+    None
+}
+
+/// What a start is judged by: J on the validation data, else on the training data; infinite for what is no number.
+pub(crate) fn score(validation_cost: Option<f64>, cost: f64) -> f64 {
+    let score = validation_cost.unwrap_or(cost);
+    if score.is_nan() { f64::INFINITY } else { score }
+}
+
+/// All starts have failed.
+pub(crate) fn none_left() -> Error {
+    Error::fit(
+        "expected a start with a finite free run on training and validation data, found none; give more starts, a linear model to start from, or a smaller network",
+    )
+}
 
 /// Results of `run(0) .. run(starts - 1)` in their order, whatever the number of threads (0: as many as there are).
 ///
@@ -76,6 +153,45 @@ mod tests {
         let monitor = Monitor::default();
         monitor.request_stop();
         assert!(run_all(5, 2, &monitor, Some).is_empty());
+    }
+
+    #[test]
+    fn counts_the_draws_that_were_dead() {
+        let monitor = Monitor::default();
+        let mut draws = [None, None, Some('a')].into_iter();
+        assert_eq!(drawn(&monitor, || draws.next().flatten()), Some(('a', 2)));
+        let mut asked = 0;
+        let none = drawn(&monitor, || {
+            asked += 1;
+            None::<()>
+        });
+        assert_eq!((none, asked), (None, MOST_DRAWS));
+    }
+
+    #[test]
+    fn trains_again_until_it_learns_and_keeps_the_last() {
+        let monitor = Monitor::default();
+        let alive = |&cost: &f64| has_learnt(cost, 1.0);
+        let mut costs = [5.0, 4.0, 0.1].into_iter();
+        let found = learnt(MOST_TRAININGS, &monitor, || Some((costs.next()?, 2)), alive);
+        assert_eq!(found, Some((0.1, 8)));
+        assert_eq!(
+            learnt(2, &monitor, || Some((7.0, 0)), alive),
+            Some((7.0, 1))
+        );
+        assert_eq!(learnt(2, &monitor, || None, alive), None);
+        monitor.request_stop();
+        assert_eq!(
+            learnt(2, &monitor, || Some((7.0, 0)), alive),
+            Some((7.0, 0))
+        );
+    }
+
+    #[test]
+    fn a_score_that_is_no_number_is_the_worst() {
+        assert_eq!(score(None, 2.0), 2.0);
+        assert_eq!(score(Some(3.0), 2.0), 3.0);
+        assert_eq!(score(Some(f64::NAN), 2.0), f64::INFINITY);
     }
 
     #[test]

@@ -86,14 +86,8 @@ pub struct NeuralFit {
 /// First damping, the best of .01, .1 and 1 by training cost on one simulated drive: of 12 random starts 9, 10 and 11
 /// ended within 1.3 of the noise floor there. On other drives expect two of three.
 const FIRST_MU: f64 = 1.0;
-/// Draws of one start before it is given up.
-const MOST_DRAWS: usize = 50;
-/// Trainings of one start before it is given up: only those that ended dead are repeated.
-const MOST_TRAININGS: usize = 3;
 /// A start with more than this share of its samples on a limit has no slope to learn from.
 const DEAD_SHARE: f64 = 0.9;
-/// A training that ends above this share of a constant output's J has learnt nothing.
-const DEAD_COST: f64 = 0.9;
 
 /// Trains `settings.starts` networks in free run and chooses by validation J, without validation data by training J.
 ///
@@ -142,13 +136,6 @@ struct Trained {
     trace: Vec<f64>,
     discarded: usize,
     sound: bool,
-}
-
-impl Trained {
-    fn score(&self) -> f64 {
-        let score = self.validation_cost.unwrap_or(self.cost);
-        if score.is_nan() { f64::INFINITY } else { score }
-    }
 }
 
 impl<'a> Training<'a> {
@@ -201,20 +188,18 @@ impl<'a> Training<'a> {
     /// Trains one start, drawn again while it is dead.
     fn run(&self, start: usize) -> Option<Trained> {
         let mut random = Random::stream(self.settings.seed, start as u64);
-        let mut discarded = 0;
-        for training in 0..MOST_TRAININGS {
+        let train = || {
             let mut problem = self.problem();
             let (theta, dead) = self.drawn(&mut problem, &mut random)?;
-            discarded += dead;
-            let mut trained = self.train(&mut problem, theta)?;
-            trained.discarded = discarded;
-            let learnt = trained.cost < DEAD_COST * self.constant_cost;
-            if learnt || training + 1 == MOST_TRAININGS || self.monitor.stopped() {
-                return Some(trained);
-            }
-            discarded += 1;
-        }
-        None
+            Some((self.train(&mut problem, theta)?, dead))
+        };
+        let has_learnt = |t: &Trained| starts::has_learnt(t.cost, self.constant_cost);
+        let (trained, discarded) =
+            starts::learnt(starts::MOST_TRAININGS, self.monitor, train, has_learnt)?;
+        Some(Trained {
+            discarded,
+            ..trained
+        })
     }
 
     fn problem(&self) -> FreeRun<'_> {
@@ -231,21 +216,15 @@ impl<'a> Training<'a> {
 
     /// Parameters with a free run to learn from, and how many draws had none.
     fn drawn(&self, problem: &mut FreeRun, random: &mut Random) -> Option<(Vec<f64>, usize)> {
-        for dead in 0..MOST_DRAWS {
+        starts::drawn(self.monitor, || {
             let theta = match &self.linear {
                 Some(bypass) => draw::beside(bypass, self.shape, random),
                 None => self.warm(draw::small(self.shape, random)),
             };
             let theta = problem.start(&theta);
             let runs = lm::Problem::cost(problem, &theta).is_some();
-            if runs && problem.clipped_share() <= DEAD_SHARE {
-                return Some((theta, dead));
-            }
-            if self.monitor.stopped() {
-                return None;
-            }
-        }
-        None
+            (runs && problem.clipped_share() <= DEAD_SHARE).then_some(theta)
+        })
     }
 
     /// The draw with an output layer that predicts one step ahead.
@@ -293,7 +272,10 @@ impl<'a> Training<'a> {
     }
 
     fn chosen(&self, results: Vec<Option<Trained>>) -> Result<NeuralFit> {
-        let score = |t: &Option<Trained>| t.as_ref().map_or(f64::INFINITY, Trained::score);
+        let score = |t: &Option<Trained>| {
+            t.as_ref()
+                .map_or(f64::INFINITY, |t| starts::score(t.validation_cost, t.cost))
+        };
         let start_costs: Vec<f64> = results.iter().map(score).collect();
         let order = starts::ranked(&start_costs, |i| {
             results[i].as_ref().is_some_and(|t| t.sound)
@@ -303,12 +285,12 @@ impl<'a> Training<'a> {
             .filter_map(|&i| results[i].as_ref().map(|t| self.model(&t.theta)));
         let models = models.collect::<Result<Vec<_>>>()?;
         let discarded = results.iter().flatten().map(|t| t.discarded).sum();
-        let start = *order.first().ok_or_else(no_start)?;
+        let start = *order.first().ok_or_else(starts::none_left)?;
         let best = results
             .into_iter()
             .nth(start)
             .flatten()
-            .ok_or_else(no_start)?;
+            .ok_or_else(starts::none_left)?;
         let stopped = self.monitor.stopped();
         Ok(NeuralFit {
             model: models[0].clone(),
@@ -373,16 +355,7 @@ fn constant_cost(experiments: &[Experiment]) -> f64 {
 }
 
 fn check(settings: &Settings) -> Result<()> {
-    for (name, value) in [
-        ("max_iterations", settings.max_iterations),
-        ("starts", settings.starts),
-    ] {
-        if value == 0 || value > 1_000_000 {
-            return Err(Error::setting(format!(
-                "expected {name} from 1 to 1,000,000, got {value}; 100 iterations and 8 starts are usual"
-            )));
-        }
-    }
+    starts::check(settings.max_iterations, settings.starts)?;
     let sound = settings.weight_decay >= 0.0 && settings.weight_decay.is_finite();
     if !sound {
         return Err(Error::setting(format!(
@@ -433,10 +406,4 @@ fn check_starts(experiments: &[Experiment], validation: &[Experiment], na: usize
             "expected {na} measured outputs in a row and one after them, got none in an experiment; start at rest or estimate the initial state, or leave that experiment out"
         ))),
     }
-}
-
-fn no_start() -> Error {
-    Error::fit(
-        "expected a start with a finite free run on training and validation data, found none; give more starts, a linear model to start from, or a smaller network",
-    )
 }

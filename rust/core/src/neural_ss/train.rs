@@ -88,12 +88,6 @@ pub struct NeuralSSFit {
 const FIRST_MU: f64 = 1e-2;
 /// Relative reduction of the cost that counts as none.
 const NO_REDUCTION: f64 = 1e-7;
-/// Draws of one start before it is given up.
-const MOST_DRAWS: usize = 50;
-/// Trainings of one start before it is given up: only those that ended dead are repeated.
-const MOST_TRAININGS: usize = 3;
-/// A training that ends above this share of a constant output's J has learnt nothing.
-const DEAD_COST: f64 = 0.9;
 /// Samples of an experiment that its state is first estimated from.
 const STATE_SAMPLES: usize = 2_000;
 /// Share of the output's variance that a linear model is taken to miss while it is.
@@ -145,13 +139,6 @@ struct Trained {
     sound: bool,
 }
 
-impl Trained {
-    fn score(&self) -> f64 {
-        let score = self.validation_cost.unwrap_or(self.cost);
-        if score.is_nan() { f64::INFINITY } else { score }
-    }
-}
-
 impl<'a> Task<'a> {
     fn new(
         recordings: &[Recording],
@@ -201,8 +188,7 @@ impl<'a> Task<'a> {
     /// Trains one start, drawn again while it is dead.
     fn run(&self, start: usize) -> Option<Trained> {
         let mut random = Random::stream(self.settings.seed, start as u64);
-        let mut discarded = 0;
-        for training in 0..MOST_TRAININGS {
+        let train = || {
             let network = Network::new(
                 self.shape,
                 self.settings.output,
@@ -217,16 +203,19 @@ impl<'a> Task<'a> {
             let mut problem =
                 problem::Training::new(&self.experiments, network, decay, &runs, self.monitor);
             let (theta, dead) = self.drawn(&mut problem, start, &mut random)?;
-            discarded += dead;
-            let mut trained = self.train(&mut problem, theta, &runs)?;
-            trained.discarded = discarded;
-            let learnt = trained.cost < DEAD_COST * self.constant_cost;
-            if learnt || self.is_last(training) || self.monitor.stopped() {
-                return Some(trained);
-            }
-            discarded += 1;
-        }
-        None
+            Some((self.train(&mut problem, theta, &runs)?, dead))
+        };
+        // nothing is drawn where models are trained further, so that another training would end the same
+        let trainings = match self.settings.initial.is_empty() {
+            true => starts::MOST_TRAININGS,
+            false => 1,
+        };
+        let has_learnt = |t: &Trained| starts::has_learnt(t.cost, self.constant_cost);
+        let (trained, discarded) = starts::learnt(trainings, self.monitor, train, has_learnt)?;
+        Some(Trained {
+            discarded,
+            ..trained
+        })
     }
 
     /// Parameters with a free run to learn from, and how many draws had none.
@@ -240,20 +229,14 @@ impl<'a> Task<'a> {
             let theta = self.resumed(model);
             return problem.cost(&theta).map(|_| (theta, 0));
         }
-        for dead in 0..MOST_DRAWS {
+        starts::drawn(self.monitor, || {
             let theta = match &self.linear {
                 Some(linear) => Some(self.begun(linear, random)),
                 None => draw::small(self.shape, &self.experiments, random)
                     .map(|linear| self.begun(&linear, random)),
             };
-            if let Some(theta) = theta.filter(|theta| problem.cost(theta).is_some()) {
-                return Some((theta, dead));
-            }
-            if self.monitor.stopped() {
-                return None;
-            }
-        }
-        None
+            theta.filter(|theta| problem.cost(theta).is_some())
+        })
     }
 
     /// A hidden layer beside the linear equations, and the states at which those come nearest to the experiments.
@@ -275,11 +258,6 @@ impl<'a> Task<'a> {
     fn resumed(&self, model: &NeuralSS) -> Vec<f64> {
         let network = Network::new(self.shape, self.settings.output, model.theta());
         self.with_states(model.theta().to_vec(), &network, model.statistics())
-    }
-
-    /// Whether a start that has learnt nothing is given up after this training.
-    fn is_last(&self, training: usize) -> bool {
-        training + 1 == MOST_TRAININGS || !self.settings.initial.is_empty()
     }
 
     /// The parameters, and after them the states at which `network` comes nearest to the experiments.
@@ -376,7 +354,10 @@ impl<'a> Task<'a> {
 
     fn chosen(&self, mut results: Vec<Option<Trained>>) -> Result<NeuralSSFit> {
         results.resize_with(self.settings.starts, || None);
-        let score = |t: &Option<Trained>| t.as_ref().map_or(f64::INFINITY, Trained::score);
+        let score = |t: &Option<Trained>| {
+            t.as_ref()
+                .map_or(f64::INFINITY, |t| starts::score(t.validation_cost, t.cost))
+        };
         let start_costs: Vec<f64> = results.iter().map(score).collect();
         let is_sound = |t: &Option<Trained>| t.as_ref().is_some_and(|t| t.sound);
         let sounds: Vec<bool> = results.iter().map(is_sound).collect();
@@ -388,8 +369,8 @@ impl<'a> Task<'a> {
             .filter_map(|&i| start_models[i].clone())
             .collect();
         let discarded = results.iter().flatten().map(|t| t.discarded).sum();
-        let start = *order.first().ok_or_else(no_start)?;
-        let best = results.swap_remove(start).ok_or_else(no_start)?;
+        let start = *order.first().ok_or_else(starts::none_left)?;
+        let best = results.swap_remove(start).ok_or_else(starts::none_left)?;
         let stopped = self.monitor.stopped();
         Ok(NeuralSSFit {
             model: best.model,
@@ -415,16 +396,7 @@ impl<'a> Task<'a> {
 }
 
 fn check(settings: &Settings) -> Result<()> {
-    for (name, value) in [
-        ("max_iterations", settings.max_iterations),
-        ("starts", settings.starts),
-    ] {
-        if value == 0 || value > 1_000_000 {
-            return Err(Error::setting(format!(
-                "expected {name} from 1 to 1,000,000, got {value}; 100 iterations and 8 starts are usual"
-            )));
-        }
-    }
+    starts::check(settings.max_iterations, settings.starts)?;
     let decays = settings.weight_decay >= 0.0 && settings.weight_decay.is_finite();
     if !decays {
         return Err(Error::setting(format!(
@@ -456,10 +428,4 @@ fn check_initial(settings: &Settings, shape: Shape, scaling: &Scaling) -> Result
         settings.starts,
         initial.len()
     )))
-}
-
-fn no_start() -> Error {
-    Error::fit(
-        "expected a start with a finite free run on training and validation data, found none; give more starts, a linear model to start from, or a smaller network",
-    )
 }
