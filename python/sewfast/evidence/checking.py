@@ -21,7 +21,14 @@ from .portmanteau import LAGS, parameter_test, residual_tests
 from .region import Place, placed, training_region
 from .residuals import Residuals, representative
 from .scores import horizon_scores
-from .simulation_bands import LEVEL, Bands, bands_of, stored_uncertainty, uncertainty
+from .simulation_bands import (
+    LEVEL,
+    Bands,
+    bands_of,
+    stored_uncertainty,
+    uncertainty,
+    uncertainty_of,
+)
 
 _FORGOTTEN = 0.05
 
@@ -78,7 +85,7 @@ def check(
     lines.append(questions.bias(free))
     tests = residual_tests(tested, memory(model, data, init))
     lines += [questions.correlation(t) for t in tests]
-    if not on_training and not getattr(model, "members", ()):
+    if not on_training and not model.members:
         held = parameter_test(tested, int(model.training.get("samples") or 0))
         lines += [questions.correlation(held)] if held is not None else []
     found = _parameters(model, data, training, on_training, init)
@@ -147,9 +154,12 @@ def training_evidence(model: Model, data: Dataset) -> dict[str, Any]:
     found: dict[str, Any] = {}
     try:
         found["region"] = training_region(model, data)
-        found["uncertainty"] = uncertainty(model, data).to_json()
-        residuals = Residuals.of(model, data)
-        known = None if getattr(model, "members", ()) else estimate(model, residuals)
+        residuals = Residuals.of(model, data, horizon="free run")
+        known = None if model.members else estimate(model, residuals)
+        found["uncertainty"] = uncertainty_of(model, data, residuals, known).to_json()
+        if model.kind == "arx":
+            residuals = Residuals.of(model, data)
+            known = estimate(model, residuals)
         if known is not None:
             found["information"] = Knowledge.of(known, residuals.n).to_json()
     except (SewfastError, np.linalg.LinAlgError):
@@ -176,7 +186,7 @@ def _parameters(
 ) -> tuple[Parameters | None, Criteria | None, list[Line]]:
     """Parameters and criteria from the training data if at hand, else what is stored."""
     source = training if training is not None else data if on_training else None
-    if getattr(model, "members", ()):
+    if model.members:
         return None, None, []
     if source is None:
         known = Knowledge.stored(model)

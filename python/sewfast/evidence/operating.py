@@ -226,7 +226,7 @@ def operating_range(
         grid, varied = _grid(first, points, region)
     else:
         grid, varied = _given(model, inputs)
-    members = tuple(getattr(model, "members", ())) or (model,)
+    members = model.members or (model,)
     found = tuple(tuple(_points(m, grid, region)) for m in members)
     return OperatingRange(
         found[0], varied, found if len(found) > 1 else (), model.input_names, model.input_units,

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -140,7 +141,7 @@ class Place:
     region: Region
     points: list[FloatArray]
 
-    @property
+    @cached_property
     def distances(self) -> list[FloatArray]:
         radius = max(self.region.radius, 1e-300)
         return [self.region.distance(p) / radius for p in self.points]

@@ -160,8 +160,7 @@ class Residuals:
 
 def representative(model: Model) -> Model:
     """The model itself, or an ensemble's first member: it stands for all sensitivities."""
-    members = getattr(model, "members", ())
-    return members[0] if members else model
+    return model.members[0] if model.members else model
 
 
 def _free_runs(model: Model, data: Dataset, init: int) -> list[Run]:

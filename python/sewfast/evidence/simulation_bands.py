@@ -25,7 +25,7 @@ from ..dataset import Dataset, FloatArray
 from ..errors import FitError, SettingError
 from ..models.base import INIT, Model
 from .distributions import normal_quantile
-from .parameters import Information, estimate
+from .parameters import Information, Parameters, estimate
 from .region import Place, placed
 from .residuals import Residuals
 
@@ -216,7 +216,15 @@ def bands_of(
 def uncertainty(model: Model, data: Dataset, init: int = INIT) -> Uncertainty:
     """From the data that a model was identified from."""
     residuals = Residuals.of(model, data, init, "free run")
-    factor = np.zeros((0, 0)) if getattr(model, "members", ()) else _factor(model, residuals)
+    found = None if model.members else estimate(model, residuals)
+    return uncertainty_of(model, data, residuals, found)
+
+
+def uncertainty_of(
+    model: Model, data: Dataset, residuals: Residuals, found: Parameters | None
+) -> Uncertainty:
+    """From free runs on the training data, and what they say of the parameters."""
+    factor = np.zeros((0, 0)) if found is None else _factor(found, residuals)
     errors = _left_out(model, residuals)
     power = sum(
         float(np.sum(np.square(e[r.counts]))) for e, r in zip(errors, residuals.runs, strict=True)
@@ -247,11 +255,8 @@ def stored_uncertainty(model: Model) -> Uncertainty | None:
         return None
 
 
-def _factor(model: Model, residuals: Residuals) -> FloatArray:
+def _factor(found: Parameters, residuals: Residuals) -> FloatArray:
     """F with FF' about P, by the directions that move the free run most."""
-    found = estimate(model, residuals)
-    if found is None:
-        return np.zeros((0, 0))
     gram = np.sum([r.sensitivity.T @ r.sensitivity for r in residuals.runs], axis=0)
     sizes, vectors = np.linalg.eigh(found.covariance)
     root = vectors * np.sqrt(np.maximum(sizes, 0.0))
@@ -303,9 +308,8 @@ def _spreads(
 ) -> list[FloatArray]:
     """s(k) of every experiment."""
     own = [np.full(len(r.y), known.spread) for r in residuals.runs]
-    members = getattr(model, "members", ())
-    if members:
-        runs = _member_runs(members, data, residuals.init)
+    if model.members:
+        runs = _member_runs(model.members, data, residuals.init)
         together = zip(own, *runs, strict=True)
         return [np.sqrt(s**2 + _member_variance(np.stack(same))) for s, *same in together]
     factor = known.factor

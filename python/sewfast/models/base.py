@@ -98,6 +98,11 @@ class Model(ABC):
         """Lines about the model itself, for `str`."""
 
     @property
+    def members(self) -> tuple[Model, ...]:
+        """The models that an ensemble consists of; a single model has none."""
+        return ()
+
+    @property
     def columns(self) -> dict[str, Any]:
         """Arguments for `read` that name this model's columns in another recording."""
         column, per_rev = self.counts or (None, None)
