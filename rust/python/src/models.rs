@@ -1,5 +1,74 @@
 //! Bindings of the core's models.
 
+/// The methods of a fit: those that each has, and its own. PyO3 takes one block of methods a class.
+macro_rules! fit_methods {
+    ($fit:ident { $($own:tt)* }) => {
+        #[pymethods]
+        impl $fit {
+            #[getter]
+            fn cost(&self) -> f64 {
+                self.inner.cost
+            }
+
+            #[getter]
+            fn iterations(&self) -> usize {
+                self.inner.iterations
+            }
+
+            #[getter]
+            fn termination(&self) -> &'static str {
+                self.inner.termination.name()
+            }
+
+            #[getter]
+            fn remedy(&self) -> &'static str {
+                self.inner.termination.remedy()
+            }
+
+            #[getter]
+            fn trace<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+                array1(py, self.inner.trace.clone())
+            }
+
+            $($own)*
+        }
+    };
+}
+
+/// The methods of a fit that was chosen among starts.
+macro_rules! started_fit_methods {
+    ($fit:ident { $($own:tt)* }) => {
+        fit_methods!($fit {
+            #[getter]
+            fn validation_cost(&self) -> Option<f64> {
+                self.inner.validation_cost
+            }
+
+            #[getter]
+            fn start(&self) -> usize {
+                self.inner.start
+            }
+
+            #[getter]
+            fn start_costs<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+                array1(py, self.inner.start_costs.clone())
+            }
+
+            #[getter]
+            fn sound(&self) -> bool {
+                self.inner.sound
+            }
+
+            #[getter]
+            fn discarded(&self) -> usize {
+                self.inner.discarded
+            }
+
+            $($own)*
+        });
+    };
+}
+
 pub mod linear;
 pub mod neural;
 pub mod neural_ss;

@@ -132,38 +132,12 @@ pub struct LinearFit {
     inner: linear_fit::LinearFit,
 }
 
-#[pymethods]
-impl LinearFit {
+fit_methods!(LinearFit {
     #[getter]
     fn model(&self) -> LinearModel {
         LinearModel {
             inner: self.inner.model.clone(),
         }
-    }
-
-    #[getter]
-    fn cost(&self) -> f64 {
-        self.inner.cost
-    }
-
-    #[getter]
-    fn iterations(&self) -> usize {
-        self.inner.iterations
-    }
-
-    #[getter]
-    fn termination(&self) -> &'static str {
-        self.inner.termination.name()
-    }
-
-    #[getter]
-    fn remedy(&self) -> &'static str {
-        self.inner.termination.remedy()
-    }
-
-    #[getter]
-    fn trace<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        array1(py, self.inner.trace.clone())
     }
 
     #[getter]
@@ -182,7 +156,7 @@ impl LinearFit {
     fn standard_errors<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         array1(py, self.inner.standard_errors())
     }
-}
+});
 
 #[pyfunction]
 #[pyo3(signature = (experiments, *, na, nb, nk, offset))]

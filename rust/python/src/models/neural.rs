@@ -147,8 +147,7 @@ pub struct NeuralFit {
     inner: neural::NeuralFit,
 }
 
-#[pymethods]
-impl NeuralFit {
+started_fit_methods!(NeuralFit {
     #[getter]
     fn model(&self) -> NeuralOE {
         NeuralOE {
@@ -165,61 +164,11 @@ impl NeuralFit {
     }
 
     #[getter]
-    fn cost(&self) -> f64 {
-        self.inner.cost
-    }
-
-    #[getter]
-    fn validation_cost(&self) -> Option<f64> {
-        self.inner.validation_cost
-    }
-
-    #[getter]
-    fn iterations(&self) -> usize {
-        self.inner.iterations
-    }
-
-    #[getter]
-    fn termination(&self) -> &'static str {
-        self.inner.termination.name()
-    }
-
-    #[getter]
-    fn remedy(&self) -> &'static str {
-        self.inner.termination.remedy()
-    }
-
-    #[getter]
-    fn trace<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        array1(py, self.inner.trace.clone())
-    }
-
-    #[getter]
-    fn start(&self) -> usize {
-        self.inner.start
-    }
-
-    #[getter]
-    fn start_costs<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        array1(py, self.inner.start_costs.clone())
-    }
-
-    #[getter]
-    fn sound(&self) -> bool {
-        self.inner.sound
-    }
-
-    #[getter]
-    fn discarded(&self) -> usize {
-        self.inner.discarded
-    }
-
-    #[getter]
     fn initial_states<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let states = self.inner.initial_states.concat();
         array2(py, states, self.inner.model.lags().na)
     }
-}
+});
 
 #[pyfunction]
 #[pyo3(signature = (

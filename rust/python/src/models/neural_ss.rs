@@ -257,8 +257,7 @@ fn wrapped(inner: &neural_ss::NeuralSS) -> NeuralSS {
     }
 }
 
-#[pymethods]
-impl NeuralSSFit {
+started_fit_methods!(NeuralSSFit {
     #[getter]
     fn model(&self) -> NeuralSS {
         wrapped(&self.inner.model)
@@ -281,61 +280,11 @@ impl NeuralSSFit {
     }
 
     #[getter]
-    fn cost(&self) -> f64 {
-        self.inner.cost
-    }
-
-    #[getter]
-    fn validation_cost(&self) -> Option<f64> {
-        self.inner.validation_cost
-    }
-
-    #[getter]
-    fn iterations(&self) -> usize {
-        self.inner.iterations
-    }
-
-    #[getter]
-    fn termination(&self) -> &'static str {
-        self.inner.termination.name()
-    }
-
-    #[getter]
-    fn remedy(&self) -> &'static str {
-        self.inner.termination.remedy()
-    }
-
-    #[getter]
-    fn trace<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        array1(py, self.inner.trace.clone())
-    }
-
-    #[getter]
-    fn start(&self) -> usize {
-        self.inner.start
-    }
-
-    #[getter]
-    fn start_costs<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        array1(py, self.inner.start_costs.clone())
-    }
-
-    #[getter]
-    fn sound(&self) -> bool {
-        self.inner.sound
-    }
-
-    #[getter]
-    fn discarded(&self) -> usize {
-        self.inner.discarded
-    }
-
-    #[getter]
     fn initial_states<'py>(&self, py: Python<'py>) -> PyResult<Array<'py>> {
         let states = self.inner.initial_states.concat();
         shaped(py, states, &[self.inner.model.shape().nx])
     }
-}
+});
 
 #[pyfunction]
 #[pyo3(signature = (
