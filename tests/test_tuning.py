@@ -10,13 +10,14 @@ import pytest
 
 from sewfast import _core, signals
 from sewfast.control import Controller, Gains
+from sewfast.cost import Cost, terms
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError, FitError, Interrupted, SettingError
 from sewfast.identification import identify
 from sewfast.loop import run
 from sewfast.machine import VirtualMachine
 from sewfast.models import LinearOE
-from sewfast.tuning import default_variations, default_weights, first_controller, tune
+from sewfast.tuning import default_variations, first_controller, tune
 
 
 def linear(a: list[float], b: list[float]) -> LinearOE:
@@ -84,12 +85,46 @@ def test_one_controller_serves_several_plants_and_a_machine() -> None:
 
 def test_weights_buy_what_they_say() -> None:
     calm, wild = (
-        tune(drive(), SHORT, weights={"chatter": weight}, evaluations=400, threads=2)
-        for weight in (20.0, 0.0)
+        tune(drive(), SHORT, cost=Cost(chatter=weight), evaluations=400, threads=2)
+        for weight in (1500.0, 0.0)
     )
     effort = [run(r.controller, drive(), SHORT).metrics()["du_rms"] for r in (calm, wild)]
     assert effort[0] < effort[1]
-    assert calm.weights == {**default_weights(), "chatter": 20.0}
+    assert calm.weights == Cost(chatter=1500.0, overshoot=30.0, saturation=60.0)
+
+
+def test_the_cost_of_runs_is_that_of_the_search() -> None:
+    cost = Cost(chatter=5.0, effort=2.0, rise=1.0, lag=3.0)
+    references = ["trapezoid", SHORT, "random"]
+    settings: dict[str, Any] = {"variations": [(1.0, 0)], "evaluations": 1, "threads": 1}
+    found = tune(drive(), references, cost=cost, **settings)
+    runs = [run(found.start, drive(), r) for r in references]
+    assert cost.of(runs) == pytest.approx(found.start_cost, rel=1e-9)
+    told = terms(runs[0])
+    metrics = runs[0].metrics()
+    assert told["tracking"] == pytest.approx(metrics["rmse"], rel=1e-12)
+    assert told["overshoot"] == metrics["overshoot_percent"]
+    assert told["u_max"] == np.max(np.abs(runs[0].u))
+    assert 0 < told["lag"] < 100
+
+
+def test_the_worst_plant_counts_alone() -> None:
+    plants = [drive(), drive(gain=300.0)]
+    settings: dict[str, Any] = {"evaluations": 1, "threads": 1, "variations": [(1.0, 0)]}
+    settings["start"] = first_controller(drive())
+    apart = [tune(p, SHORT, **settings).cost for p in plants]
+    assert tune(plants, SHORT, aggregate="worst", **settings).cost == max(apart)
+    assert tune(plants, SHORT, **settings).cost == pytest.approx(np.mean(apart), rel=1e-12)
+
+
+@pytest.mark.parametrize("weight", [-1.0, math.inf, math.nan, "much"])
+def test_weights_that_make_no_sense_are_refused(weight: Any) -> None:
+    with pytest.raises(SettingError, match="lag"):
+        Cost(lag=weight)
+    with pytest.raises(SettingError, match="tracking"):
+        Cost(tracking=None)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="chater"):
+        Cost(chater=1.0)  # type: ignore[call-arg]
 
 
 def test_keeps_what_the_start_says() -> None:
@@ -142,8 +177,8 @@ def test_progress_is_told_and_ctrl_c_keeps_the_best() -> None:
         ({"u_max": math.inf}, "u_max"),
         ({"u_min": -math.inf}, "limits"),
         ({"u_max": -30.0}, "u_max"),
-        ({"weights": {"chater": 1.0}}, "chater"),
-        ({"weights": {"chatter": -1.0}}, "chatter"),
+        ({"cost": {"chatter": 1.0}}, "Cost"),
+        ({"aggregate": "best"}, "aggregate"),
         ({"evaluations": 0}, "evaluation"),
         ({"evaluations": 1.5}, "evaluations"),
         ({"seed": -1}, "seed"),

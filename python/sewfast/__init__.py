@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         paper_controller,
         table_1,
     )
+    from .cost import Cost
     from .dataset import Dataset, Experiment
     from .delays import DelayEstimate, delay
     from .errors import (
@@ -46,6 +47,7 @@ __all__ = [
     "IV",
     "ClosedLoopRun",
     "Controller",
+    "Cost",
     "DataError",
     "Dataset",
     "DelayEstimate",
@@ -95,6 +97,7 @@ __all__ = [
 _HOMES = {
     "_core": "__version__",
     "control": "Controller Gains fit_fopdt load_controller paper_controller table_1",
+    "cost": "Cost",
     "dataset": "Dataset Experiment",
     "delays": "DelayEstimate delay",
     "errors": "DataError FitError Interrupted LinkError ModelFileError SettingError SewfastError",

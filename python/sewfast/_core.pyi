@@ -398,18 +398,20 @@ def table_1(K: float, T: float, L: float, *, nearest: bool = False) -> dict[str,
     ``nearest`` takes the end row there instead.
     """
 
-def default_weights() -> dict[str, float]:
-    """chatter, overshoot, overshoot_limit [%], saturation."""
+def cost_terms(
+    reference: _F, u: _F, y: _F, *, u_min: float, u_max: float, Ts: float,
+) -> dict[str, float]:
+    """tracking, chatter, effort, overshoot [%], rise [ms], lag [ms], saturation, u_max of a run."""
 
 def tune(
     plants: Sequence[_Plant], references: Sequence[_F], *, start: Controller, counts_per_unit: float,
-    variations: Sequence[tuple[float, int]], weights: Mapping[str, float], evaluations: int, seed: int,
-    threads: int, progress: _Progress = None,
+    variations: Sequence[tuple[float, int]], cost: Mapping[str, float], aggregate: str, evaluations: int,
+    seed: int, threads: int, progress: _Progress = None,
 ) -> dict[str, Any]:
     """Search Kp, Ti, Td, alpha, beta, and N where the start's is finite.
 
-    Every plant is taken in every variation (gain, extra delay in samples). Weights left out keep their
-    defaults. Returns Kp, Ti, Td, alpha, beta, N, cost, start_cost, evaluations, trace, termination.
+    Every plant is taken in every variation (gain, extra delay in samples). Weights left out of ``cost`` keep
+    their defaults. Returns Kp, Ti, Td, alpha, beta, N, cost, start_cost, evaluations, trace, termination, weights.
     """
 
 def effort(u: _F, *, u_min: float, u_max: float) -> dict[str, float]:

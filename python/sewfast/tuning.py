@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import _core
 from .control import Controller, Fopdt, Gains, fit_fopdt, table_1
+from .cost import Cost
 from .errors import DataError, FitError, Interrupted, SettingError
 from .gains import real, whole
 from .loop import Plant, check_fits, plant_units, reference_samples
@@ -49,8 +50,10 @@ class TuningResult:
         The best cost so far, the start's first, then after each generation.
     termination : str
         ``evaluations``, ``converged`` or ``interrupted``.
-    weights : mapping
-        What counted how much.
+    weights : Cost
+        What counted how much, every weight a number.
+    aggregate : str
+        ``mean`` or ``worst``, over the plants.
     """
 
     controller: Controller
@@ -60,7 +63,8 @@ class TuningResult:
     evaluations: int
     trace: NDArray[np.float64]
     termination: str
-    weights: Mapping[str, float]
+    weights: Cost
+    aggregate: str
 
     def __str__(self) -> str:
         unit = self.controller.gains.y_unit
@@ -79,7 +83,8 @@ def tune(
     counts_per_rev: float | None = 1572.0,
     filter_samples: int = 8,
     start: Controller | None = None,
-    weights: Mapping[str, float] | None = None,
+    cost: Cost | None = None,
+    aggregate: Literal["mean", "worst"] = "mean",
     variations: Sequence[tuple[float, int]] | None = None,
     evaluations: int = 600,
     seed: int = 0,
@@ -89,13 +94,7 @@ def tune(
     """Search Kp, Ti, Td, alpha, beta (and N where finite) for the least cost of simulated loops.
 
     Every candidate runs on every plant in every variation over every reference, with encoder,
-    feedback filter and limits in the loop. The cost is the mean, in the output's unit, of::
-
-        rms(r - y) + R (chatter rms(du)/(u_max - u_min) + overshoot max(o - overshoot_limit, 0)/100
-                        + saturation s)
-
-    with R the references' span, du the command's change from sample to sample, o the overshoot [%]
-    of the 5-ms-smoothed output on steps and trapezoids, s the share of samples at a limit. The
+    feedback filter and limits in the loop. A run's cost is a weighted sum of terms (`Cost`). The
     search is differential evolution; a seed gives the same bits at any number of threads.
 
     Parameters
@@ -114,8 +113,10 @@ def tune(
     start : Controller, optional
         What to begin with; its limits, filters, encoder and sample time are kept, and the four
         settings above are not used. By default Table 1 on the first model's own step response.
-    weights : mapping, optional
-        Changes to `default_weights()`.
+    cost : Cost, optional
+        What counts how much.
+    aggregate : "mean" or "worst"
+        Over the plants in their variations; over the references it is the mean.
     variations : sequence of (gain, delay), optional
         Output gain and extra input delay in samples, applied to every plant. By default the plant
         as it is, and with the gains `GAINS` and a delay of a quarter of the moving average, at
@@ -157,13 +158,14 @@ def tune(
         start=start.core(),
         counts_per_unit=start.counts_per_unit,
         variations=_checked(default_variations(start) if variations is None else variations),
-        weights=dict(weights or {}),
+        cost=_cost(cost).named(),
+        aggregate=aggregate,
         evaluations=whole("evaluations", evaluations),
         seed=whole("seed", seed),
         threads=whole("threads", os.cpu_count() or 1 if threads is None else threads),
         progress=progress,
     )
-    result = _result(found, start, {**default_weights(), **(weights or {})}, _assumed(plants[0]))
+    result = _result(found, start, aggregate, _assumed(plants[0]))
     if result.termination == "interrupted":
         raise Interrupted(result.controller)
     return result
@@ -180,9 +182,12 @@ def default_variations(controller: Controller) -> tuple[tuple[float, int], ...]:
     return ((1.0, 0), *((gain, delay) for gain in GAINS))
 
 
-def default_weights() -> dict[str, float]:
-    """The cost's weights: chatter, overshoot, overshoot_limit [%], saturation; see `tune`."""
-    return _core.default_weights()
+def _cost(cost: Cost | None) -> Cost:
+    if not (cost is None or isinstance(cost, Cost)):
+        raise SettingError(
+            f"expected a Cost, got {type(cost).__name__}; for example Cost(chatter=5.0)"
+        )
+    return cost or Cost()
 
 
 def first_controller(
@@ -292,7 +297,7 @@ def _each(references: Any) -> list[str | ArrayLike]:
 
 
 def _result(
-    found: Mapping[str, Any], start: Controller, weights: Mapping[str, float], assumed: str
+    found: Mapping[str, Any], start: Controller, aggregate: str, assumed: str
 ) -> TuningResult:
     units = {"u_unit": start.gains.u_unit, "y_unit": start.gains.y_unit}
     tuned = replace(
@@ -311,5 +316,6 @@ def _result(
         evaluations=int(found["evaluations"]),
         trace=np.asarray(found["trace"]),
         termination=str(found["termination"]),
-        weights=weights,
+        weights=Cost(**found["weights"]),
+        aggregate=aggregate,
     )

@@ -90,7 +90,7 @@ impl Edge {
     }
 
     /// Time in samples from 10 % to 90 % of the step; NaN where `y` does not get there before the reference leaves.
-    fn rise(&self, y: &[f64]) -> f64 {
+    pub fn rise(&self, y: &[f64]) -> f64 {
         self.crossing(y, 0.9) - self.crossing(y, 0.1)
     }
 

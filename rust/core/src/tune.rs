@@ -3,10 +3,11 @@
 //! A candidate's cost is taken over every plant and every reference, with encoder, filter and limits in the loop;
 //! differential evolution searches the gains.
 
+mod bench;
 mod cost;
 mod search;
 
-pub use cost::Weights;
+pub use cost::{Cost, Terms, Weights, terms};
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
@@ -16,7 +17,7 @@ use sewfast_control::{Controller, Settings};
 use crate::closed_loop::{Plant, check_reference};
 use crate::encoder::Encoder;
 use crate::{Error, Monitor, Result};
-use cost::Bench;
+use bench::Bench;
 use search::{Bounds, Evolution, Trial};
 
 /// What is tuned, on what.
@@ -35,7 +36,19 @@ pub struct Task<'a, P> {
     /// Lag in the feedback \[s\].
     pub filter_time: f64,
     /// What counts how much.
-    pub weights: Weights,
+    pub cost: Cost,
+    /// How the plants' costs become one.
+    pub aggregate: Aggregate,
+}
+
+/// How a candidate's costs on the plants become one; a plant's cost is the mean over the references.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Aggregate {
+    /// The mean over the plants.
+    #[default]
+    Mean,
+    /// The worst plant's.
+    Worst,
 }
 
 /// How the search runs.
@@ -86,6 +99,8 @@ pub struct Tuned {
     pub trace: Vec<f64>,
     /// Why the search ended.
     pub termination: Termination,
+    /// The weights in numbers.
+    pub weights: Weights,
 }
 
 /// Searches `Kp`, `Ti`, `Td` (in their logarithms), `alpha`, `beta`, and `N` where the start has a finite one.
@@ -103,7 +118,7 @@ pub fn tune<P: Plant + Clone + Send + Sync>(
 ) -> Result<Tuned> {
     check(task, options)?;
     monitor.set_total(options.evaluations as u64);
-    let mut benches = vec![Bench::new(task); options.threads];
+    let mut benches = vec![Bench::new(task)?; options.threads];
     let start_cost = benches[0].cost(task, &task.start, f64::INFINITY, monitor);
     let mut evolution = Evolution::new(Bounds::about(&task.start), options.seed);
     let (mut used, mut trace) = (1, vec![start_cost]);
@@ -134,6 +149,7 @@ pub fn tune<P: Plant + Clone + Send + Sync>(
         evaluations: used,
         trace,
         termination,
+        weights: *benches[0].weights(),
     })
 }
 
@@ -168,7 +184,6 @@ fn check<P>(task: &Task<'_, P>, options: Options) -> Result<()> {
             task.references.len()
         )));
     }
-    task.weights.check()?;
     task.references.iter().try_for_each(|r| check_reference(r))
 }
 

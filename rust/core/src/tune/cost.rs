@@ -1,55 +1,69 @@
-//! What a candidate costs: tracking error, chatter, overshoot, saturation, over all plants and references.
+//! What a run costs: terms in the units of the field, and their weights.
 
-use sewfast_control::{Controller, Settings};
-
-use super::Task;
-use crate::closed_loop::{Outcome, Plant, Run};
+use crate::closed_loop::{Run, check_reference};
 use crate::metrics::{Edge, Effort, rmse, smooth};
-use crate::{Error, Monitor, Result};
+use crate::{Error, Result};
 
-/// What counts how much beside the tracking error, in shares of the references' span `R` (largest minus smallest value).
+/// What counts how much: a weight per unit of each term; docs/CONVENTIONS.md, Tuning.
 ///
-/// The cost of a run is, in the output's unit,
-///
-/// ```text
-/// rms(r - y) + R (chatter rms(du)/(u_max - u_min) + overshoot max(o - overshoot_limit, 0)/100 + saturation s)
-/// ```
-///
-/// with `du` the change of the command from sample to sample, `o` the overshoot in percent where the reference is a
-/// step or trapezoid, and `s` the share of samples at a limit. A run that diverges costs infinitely much.
+/// `None` is the default in shares of the references' span `R` (largest minus smallest value).
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Weights {
-    /// Weight of the command's restlessness.
-    pub chatter: f64,
-    /// Weight of the overshoot above its limit.
-    pub overshoot: f64,
+pub struct Cost {
+    /// Per unit of `rms(r - y)` \[y\].
+    pub tracking: f64,
+    /// Per unit of `rms(du)`, the command's change from sample to sample \[u\]; `.5 R/(u_max - u_min)`.
+    pub chatter: Option<f64>,
+    /// Per unit of `rms(u)` \[u\].
+    pub effort: f64,
+    /// Per percent of overshoot above its limit, on steps and trapezoids; `R/100`.
+    pub overshoot: Option<f64>,
     /// Overshoot that costs nothing \[%\].
     pub overshoot_limit: f64,
-    /// Weight of the time at a limit.
-    pub saturation: f64,
+    /// Per millisecond of rise time beyond the reference's own, on steps and trapezoids.
+    pub rise: f64,
+    /// Per millisecond of the output's shift against the reference.
+    pub lag: f64,
+    /// Per share 1 of samples at a limit; `.02 R`.
+    pub saturation: Option<f64>,
 }
 
-impl Default for Weights {
+impl Default for Cost {
     fn default() -> Self {
         Self {
-            chatter: 0.5,
-            overshoot: 1.0,
+            tracking: 1.0,
+            chatter: None,
+            effort: 0.0,
+            overshoot: None,
             overshoot_limit: 1.0,
-            saturation: 0.02,
+            rise: 0.0,
+            lag: 0.0,
+            saturation: None,
         }
     }
 }
 
-impl Weights {
-    pub(super) fn check(&self) -> Result<()> {
-        let all = [
-            ("chatter", self.chatter),
-            ("overshoot", self.overshoot),
-            ("overshoot_limit", self.overshoot_limit),
-            ("saturation", self.saturation),
-        ];
-        match all.iter().find(|(_, w)| !(*w >= 0.0 && w.is_finite())) {
-            None => Ok(()),
+impl Cost {
+    /// The weights in numbers, for references that span `span` and commands that may span `range`.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for weights that are negative or not finite.
+    pub fn weights(&self, span: f64, range: f64) -> Result<Weights> {
+        let weights = Weights {
+            tracking: self.tracking,
+            chatter: self.chatter.unwrap_or(0.5 * span / range),
+            effort: self.effort,
+            overshoot: self.overshoot.unwrap_or(span / 100.0),
+            overshoot_limit: self.overshoot_limit,
+            rise: self.rise,
+            lag: self.lag,
+            saturation: self.saturation.unwrap_or(0.02 * span),
+        };
+        match weights
+            .named()
+            .iter()
+            .find(|(_, w)| !(*w >= 0.0 && w.is_finite()))
+        {
+            None => Ok(weights),
             Some((name, weight)) => Err(Error::setting(format!(
                 "expected a finite weight of 0 or more for {name}, got {weight}"
             ))),
@@ -57,82 +71,262 @@ impl Weights {
     }
 }
 
+/// A [`Cost`] in numbers.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[expect(missing_docs, reason = "the fields are those of Cost")]
+pub struct Weights {
+    pub tracking: f64,
+    pub chatter: f64,
+    pub effort: f64,
+    pub overshoot: f64,
+    pub overshoot_limit: f64,
+    pub rise: f64,
+    pub lag: f64,
+    pub saturation: f64,
+}
+
+impl Weights {
+    /// Every weight by its name.
+    pub fn named(&self) -> [(&'static str, f64); 8] {
+        [
+            ("tracking", self.tracking),
+            ("chatter", self.chatter),
+            ("effort", self.effort),
+            ("overshoot", self.overshoot),
+            ("overshoot_limit", self.overshoot_limit),
+            ("rise", self.rise),
+            ("lag", self.lag),
+            ("saturation", self.saturation),
+        ]
+    }
+
+    /// The weighted sum, in the output's unit.
+    pub fn of(&self, terms: &Terms) -> f64 {
+        self.tracking * terms.tracking
+            + self.chatter * terms.chatter
+            + self.effort * terms.effort
+            + self.overshoot * (terms.overshoot - self.overshoot_limit).max(0.0)
+            + self.rise * terms.rise
+            + self.lag * terms.lag
+            + self.saturation * terms.saturation
+    }
+}
+
+/// What a run was like, each in the unit stated; 0 where the reference says nothing about it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Terms {
+    /// `rms(r - y)` \[y\].
+    pub tracking: f64,
+    /// `rms(du)` \[u\].
+    pub chatter: f64,
+    /// `rms(u)` \[u\].
+    pub effort: f64,
+    /// Overshoot on the first edge \[% of its step\].
+    pub overshoot: f64,
+    /// 10-to-90 % rise time beyond the reference's own \[ms\]; where 90 % is not reached, the whole time there was.
+    pub rise: f64,
+    /// Shift of the output against the reference with the least rms difference \[ms\].
+    pub lag: f64,
+    /// Share of samples at a limit.
+    pub saturation: f64,
+    /// Largest `|u|` \[u\].
+    pub u_max: f64,
+}
+
 /// Smoothing of the true output before its overshoot is taken [s]; docs/CONVENTIONS.md.
 const SMOOTHING: f64 = 5e-3;
 
-/// One thread's plants and memory.
-#[derive(Clone, Debug)]
-pub(super) struct Bench<P> {
-    plants: Vec<P>,
-    edges: Vec<Option<Edge>>,
-    span: f64,
-    run: Run,
+/// Terms of the runs over one reference; terms that nobody asks for are not computed.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Measure {
+    edge: Option<Edge>,
+    overshoot: bool,
+    rise: bool,
+    lag: bool,
 }
 
-impl<P: Plant + Clone> Bench<P> {
-    pub(super) fn new(task: &Task<'_, P>) -> Self {
-        let all = || task.references.iter().flat_map(|r| r.iter().copied());
-        let longest = task.references.iter().map(|r| r.len()).max().unwrap_or(0);
+impl Measure {
+    /// Every term of runs over `reference`.
+    pub fn all(reference: &[f64]) -> Self {
         Self {
-            plants: task.plants.to_vec(),
-            edges: task.references.iter().map(|r| Edge::first(r)).collect(),
-            span: all().fold(f64::MIN, f64::max) - all().fold(f64::MAX, f64::min),
-            run: Run::with_capacity(longest),
+            edge: Edge::first(reference),
+            overshoot: true,
+            rise: true,
+            lag: true,
         }
     }
 
-    /// The cost of a controller; infinite as soon as it cannot be below `to_beat` any more, or on a stop.
-    pub(super) fn cost(
-        &mut self,
-        task: &Task<'_, P>,
-        settings: &Settings<f64>,
-        to_beat: f64,
-        monitor: &Monitor,
-    ) -> f64 {
-        let controller = Controller::new(*settings, task.filter_samples, task.filter_time);
-        let Ok(mut controller) = controller else {
-            return f64::INFINITY;
+    /// The terms that have a weight.
+    pub fn needed(reference: &[f64], weights: &Weights) -> Self {
+        Self {
+            edge: Edge::first(reference),
+            overshoot: weights.overshoot > 0.0,
+            rise: weights.rise > 0.0,
+            lag: weights.lag > 0.0,
+        }
+    }
+
+    /// The terms of a run over the reference, under limits `low` and `high`.
+    pub fn of(&self, reference: &[f64], run: &Run, (low, high): (f64, f64), ts: f64) -> Terms {
+        let effort = Effort::of(&run.u, low, high);
+        let mut terms = Terms {
+            tracking: rmse(reference, &run.y),
+            chatter: effort.du_rms,
+            effort: effort.u_rms,
+            saturation: effort.saturated,
+            u_max: run.u.iter().fold(0.0, |most, u| f64::max(most, u.abs())),
+            ..Terms::default()
         };
-        let runs = (self.plants.len() * task.references.len()) as f64;
-        let mut sum = 0.0;
-        for plant in 0..self.plants.len() {
-            for reference in 0..task.references.len() {
-                sum += self.one(task, plant, reference, &mut controller, monitor);
-                let hopeless = sum > to_beat * runs || !sum.is_finite();
-                if hopeless || monitor.stopped() {
-                    return f64::INFINITY;
-                }
-            }
+        if let (Some(edge), true) = (self.edge, self.overshoot || self.rise) {
+            let y = smooth(&run.y, ts, SMOOTHING);
+            terms.overshoot = edge.overshoot_percent(&y);
+            terms.rise = 1e3 * ts * rise(&edge, reference, &y);
         }
-        sum / runs
+        if self.lag {
+            terms.lag = 1e3 * ts * lag(reference, &run.y, (LONGEST_LAG / ts) as usize);
+        }
+        terms
+    }
+}
+
+/// The terms of a run that was recorded elsewhere, under limits `low` and `high`.
+///
+/// # Errors
+/// `ErrorKind::Data` for lengths that differ, no samples, or values that are not finite, `ErrorKind::Setting` for a
+/// sample time that is not above 0.
+pub fn terms(reference: &[f64], run: &Run, (low, high): (f64, f64), ts: f64) -> Result<Terms> {
+    check_reference(reference)?;
+    let all = [("u", &run.u), ("y", &run.y)];
+    for (name, values) in all {
+        if values.len() != reference.len() || values.iter().any(|v| !v.is_finite()) {
+            return Err(Error::data(format!(
+                "expected {} finite samples in {name}, as many as in the reference, got {}; cut to where all are known",
+                reference.len(),
+                values.iter().filter(|v| v.is_finite()).count()
+            )));
+        }
+    }
+    if !(ts > 0.0 && ts.is_finite()) {
+        return Err(Error::setting(format!(
+            "expected a sample time above 0, got {ts}"
+        )));
+    }
+    Ok(Measure::all(reference).of(reference, run, (low, high), ts))
+}
+
+/// Rise time beyond the reference's own [samples].
+fn rise(edge: &Edge, reference: &[f64], y: &[f64]) -> f64 {
+    let own = edge.rise(reference);
+    let found = edge.rise(y);
+    if found.is_finite() {
+        (found - own).max(0.0)
+    } else {
+        (edge.end - edge.start) as f64
+    }
+}
+
+/// The longest lag that is looked for [s].
+const LONGEST_LAG: f64 = 0.25;
+/// Samples between the shifts that are tried first.
+const STRIDE: usize = 8;
+
+/// The shift `s >= 0` with the least `mean((r(k - s) - y(k))^2)`, by a parabola through the best three [samples].
+fn lag(reference: &[f64], y: &[f64], longest: usize) -> f64 {
+    let longest = longest.min(y.len() / 4);
+    let apart = |shift: usize| {
+        let pairs = y[shift..].iter().zip(reference);
+        pairs.map(|(y, r)| (y - r).powi(2)).sum::<f64>() / (y.len() - shift) as f64
+    };
+    let best = |shifts: &mut dyn Iterator<Item = usize>| {
+        shifts
+            .map(|s| (s, apart(s)))
+            .min_by(|a, b| a.1.total_cmp(&b.1))
+            .map_or(0, |(shift, _)| shift)
+    };
+    let coarse = best(&mut (0..=longest).step_by(STRIDE));
+    let near = coarse.saturating_sub(STRIDE)..=(coarse + STRIDE).min(longest);
+    let fine = best(&mut near.clone());
+    if fine == 0 || fine >= longest {
+        return fine as f64;
+    }
+    let (before, at, after) = (apart(fine - 1), apart(fine), apart(fine + 1));
+    let curvature = before - 2.0 * at + after;
+    let aside = if curvature > 0.0 {
+        0.5 * (before - after) / curvature
+    } else {
+        0.0
+    };
+    fine as f64 + aside.clamp(-0.5, 0.5)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn chirp(shift: f64) -> Vec<f64> {
+        (0..2000)
+            .map(|k| {
+                let t = (f64::from(k) - shift) * 1e-3;
+                1000.0 * (1.0 - (6.0 * t + 4.0 * t * t).cos())
+            })
+            .collect()
     }
 
-    fn one(
-        &mut self,
-        task: &Task<'_, P>,
-        plant: usize,
-        reference: usize,
-        controller: &mut Controller<f64>,
-        monitor: &Monitor,
-    ) -> f64 {
-        let (r, edge) = (task.references[reference], self.edges[reference]);
-        let plant = &mut self.plants[plant];
-        self.run
-            .record(plant, controller, r, task.encoder.as_ref(), monitor);
-        if self.run.outcome != Outcome::Completed {
-            return f64::INFINITY;
+    #[test]
+    fn finds_the_lag_between_samples_and_none_where_there_is_none() {
+        let r = chirp(0.0);
+        for shift in [0.0, 3.0, 17.0, 42.5] {
+            let found = lag(&r, &chirp(shift), 250);
+            assert!((found - shift).abs() < 0.05, "{shift}: {found}");
         }
-        let Settings {
-            u_min, u_max, ts, ..
-        } = *controller.settings();
-        let effort = Effort::of(&self.run.u, u_min, u_max);
-        let overshoot = edge.map_or(0.0, |edge| {
-            edge.overshoot_percent(&smooth(&self.run.y, ts, SMOOTHING))
-        });
-        let w = &task.weights;
-        let penalty = w.chatter * effort.du_rms / (u_max - u_min)
-            + w.overshoot * (overshoot - w.overshoot_limit).max(0.0) / 100.0
-            + w.saturation * effort.saturated;
-        rmse(r, &self.run.y) + self.span * penalty
+        assert_eq!(lag(&r, &chirp(-5.0), 250), 0.0);
+        assert_eq!(lag(&[1.0], &[2.0], 250), 0.0);
+    }
+
+    #[test]
+    fn weights_are_absolute_or_shares_of_the_span() {
+        let weights = Cost::default().weights(2000.0, 40.0).unwrap();
+        assert_eq!((weights.chatter, weights.overshoot), (25.0, 20.0));
+        assert_eq!((weights.saturation, weights.tracking), (40.0, 1.0));
+        let cost = Cost {
+            chatter: Some(5.0),
+            ..Cost::default()
+        };
+        assert_eq!(cost.weights(2000.0, 40.0).unwrap().chatter, 5.0);
+        for bad in [-1.0, f64::NAN, f64::INFINITY] {
+            let cost = Cost {
+                lag: bad,
+                ..Cost::default()
+            };
+            assert!(
+                cost.weights(1.0, 1.0)
+                    .unwrap_err()
+                    .message
+                    .contains("for lag")
+            );
+        }
+    }
+
+    #[test]
+    fn a_run_costs_the_weighted_sum_of_its_terms() {
+        let r: Vec<f64> = (0..200).map(|k| if k < 20 { 0.0 } else { 10.0 }).collect();
+        let y: Vec<f64> = r.iter().map(|r| 1.1 * r).collect();
+        let run = Run {
+            u: (0..200).map(|k| f64::from(k % 2)).collect(),
+            y,
+            ..Run::default()
+        };
+        let terms = terms(&r, &run, (-1.0, 1.0), 1e-3).unwrap();
+        assert!((terms.overshoot - 10.0).abs() < 1e-9 && (terms.chatter - 1.0).abs() < 1e-12);
+        assert!((terms.tracking - 0.9_f64.sqrt()).abs() < 1e-12 && terms.saturation == 0.5);
+        let cost = Cost {
+            chatter: Some(2.0),
+            overshoot: Some(3.0),
+            saturation: Some(0.0),
+            ..Cost::default()
+        };
+        let weights = cost.weights(10.0, 2.0).unwrap();
+        let expected = terms.tracking + 2.0 * terms.chatter + 3.0 * 9.0;
+        assert!((weights.of(&terms) - expected).abs() < 1e-9);
     }
 }

@@ -49,7 +49,8 @@ fn with_task<T>(
         start,
         filter_samples: 8,
         filter_time: 0.0,
-        weights: Weights::default(),
+        cost: Cost::default(),
+        aggregate: Aggregate::Mean,
     })
 }
 
@@ -71,8 +72,12 @@ fn finds_much_better_gains_than_its_start() {
         );
         assert!(tuned.trace.windows(2).all(|pair| pair[1] <= pair[0]) && tuned.evaluations <= 1000);
         assert_eq!(tuned.trace.last(), Some(&tuned.cost));
-        let again =
-            Bench::new(task).cost(task, &tuned.settings, f64::INFINITY, &Monitor::default());
+        let again = Bench::new(task).unwrap().cost(
+            task,
+            &tuned.settings,
+            f64::INFINITY,
+            &Monitor::default(),
+        );
         assert_eq!(again, tuned.cost);
     });
 }
@@ -125,10 +130,10 @@ fn recovers_from_a_start_that_oscillates() {
 
 #[test]
 fn refuses_tasks_that_make_no_sense() {
-    let refused = |start: Settings<f64>, weights: Weights, options: Options| {
+    let refused = |start: Settings<f64>, cost: Cost, options: Options| {
         with_task(start, |task| {
             let task = Task {
-                weights,
+                cost,
                 ..task.clone()
             };
             tune(&task, options, &Monitor::default())
@@ -136,7 +141,7 @@ fn refuses_tasks_that_make_no_sense() {
                 .message
         })
     };
-    let (good, once) = (Weights::default(), options(1, 1));
+    let (good, once) = (Cost::default(), options(1, 1));
     let unlimited = Settings {
         u_max: f64::INFINITY,
         ..start()
@@ -150,8 +155,8 @@ fn refuses_tasks_that_make_no_sense() {
     assert!(
         refused(
             start(),
-            Weights {
-                chatter: -1.0,
+            Cost {
+                chatter: Some(-1.0),
                 ..good
             },
             once
@@ -171,5 +176,31 @@ fn refuses_tasks_that_make_no_sense() {
             ..task.clone()
         };
         assert!(tune(&empty, once, &Monitor::default()).is_err());
+    });
+}
+
+#[test]
+fn the_worst_plant_costs_at_least_the_mean() {
+    with_task(start(), |task| {
+        let cost = |aggregate| {
+            let task = Task {
+                aggregate,
+                ..task.clone()
+            };
+            let mut bench = Bench::new(&task).unwrap();
+            bench.cost(&task, &task.start, f64::INFINITY, &Monitor::default())
+        };
+        let (mean, worst) = (cost(Aggregate::Mean), cost(Aggregate::Worst));
+        let one = |plant: usize| {
+            let task = Task {
+                plants: &task.plants[plant..=plant],
+                ..task.clone()
+            };
+            let mut bench = Bench::new(&task).unwrap();
+            bench.cost(&task, &task.start, f64::INFINITY, &Monitor::default())
+        };
+        let all = [one(0), one(1), one(2)];
+        assert!((mean - all.iter().sum::<f64>() / 3.0).abs() < 1e-9 * mean);
+        assert_eq!(worst, all.iter().fold(0.0, |w, c| f64::max(w, *c)));
     });
 }

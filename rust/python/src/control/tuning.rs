@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sewfast_core::closed_loop::{Varied, encoder};
-use sewfast_core::tune::{self as tuning, Options, Task, Tuned, Weights};
+use sewfast_core::closed_loop::{Run, Varied, encoder};
+use sewfast_core::tune::{self as tuning, Aggregate, Cost, Options, Task, Tuned, terms};
 use sewfast_core::{Error, Monitor, Result};
 
 use super::controller::Controller;
@@ -15,46 +15,81 @@ use crate::arrays::{array1, raise, slice};
 use crate::watch::watched;
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_function(wrap_pyfunction!(default_weights, module)?)?;
+    module.add_function(wrap_pyfunction!(cost_terms, module)?)?;
     module.add_function(wrap_pyfunction!(tune, module)?)
 }
 
-/// The cost's weights by name.
+/// A cost from its weights by name; those left out keep their defaults.
+fn cost(changes: &BTreeMap<String, f64>) -> Result<Cost> {
+    let mut cost = Cost::default();
+    for (name, &value) in changes {
+        match name.as_str() {
+            "tracking" => cost.tracking = value,
+            "chatter" => cost.chatter = Some(value),
+            "effort" => cost.effort = value,
+            "overshoot" => cost.overshoot = Some(value),
+            "overshoot_limit" => cost.overshoot_limit = value,
+            "rise" => cost.rise = value,
+            "lag" => cost.lag = value,
+            "saturation" => cost.saturation = Some(value),
+            _ => {
+                return Err(Error::setting(format!(
+                    "expected a term of the cost, tracking, chatter, effort, overshoot, overshoot_limit, rise, lag or \
+                     saturation, got '{name}'"
+                )));
+            }
+        }
+    }
+    Ok(cost)
+}
+
+fn aggregate(name: &str) -> Result<Aggregate> {
+    match name {
+        "mean" => Ok(Aggregate::Mean),
+        "worst" => Ok(Aggregate::Worst),
+        _ => Err(Error::setting(format!(
+            "expected aggregate 'mean' or 'worst', got '{name}'"
+        ))),
+    }
+}
+
+/// What a run was like, term by term.
 #[pyfunction]
-fn default_weights(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
-    let w = Weights::default();
+#[pyo3(signature = (reference, u, y, *, u_min, u_max, Ts))]
+#[expect(non_snake_case, reason = "the field's name for the sample time")]
+fn cost_terms<'py>(
+    py: Python<'py>,
+    reference: Values<'py>,
+    u: Values<'py>,
+    y: Values<'py>,
+    u_min: f64,
+    u_max: f64,
+    Ts: f64,
+) -> PyResult<Bound<'py, PyDict>> {
+    let reference = slice(&reference, "reference")?;
+    let run = Run {
+        u: slice(&u, "u")?.to_vec(),
+        y: slice(&y, "y")?.to_vec(),
+        ..Run::default()
+    };
+    let terms = terms(reference, &run, (u_min, u_max), Ts).map_err(|e| raise(py, e))?;
     named(
         py,
         [
-            ("chatter", w.chatter),
-            ("overshoot", w.overshoot),
-            ("overshoot_limit", w.overshoot_limit),
-            ("saturation", w.saturation),
+            ("tracking", terms.tracking),
+            ("chatter", terms.chatter),
+            ("effort", terms.effort),
+            ("overshoot", terms.overshoot),
+            ("rise", terms.rise),
+            ("lag", terms.lag),
+            ("saturation", terms.saturation),
+            ("u_max", terms.u_max),
         ],
     )
 }
 
-fn weights(changes: &BTreeMap<String, f64>) -> Result<Weights> {
-    let mut weights = Weights::default();
-    for (name, &value) in changes {
-        let place = match name.as_str() {
-            "chatter" => &mut weights.chatter,
-            "overshoot" => &mut weights.overshoot,
-            "overshoot_limit" => &mut weights.overshoot_limit,
-            "saturation" => &mut weights.saturation,
-            _ => {
-                return Err(Error::setting(format!(
-                    "expected weights named chatter, overshoot, overshoot_limit or saturation, got '{name}'"
-                )));
-            }
-        };
-        *place = value;
-    }
-    Ok(weights)
-}
-
 #[pyfunction]
-#[pyo3(signature = (plants, references, *, start, counts_per_unit, variations, weights, evaluations, seed, threads, progress=None))]
+#[pyo3(signature = (plants, references, *, start, counts_per_unit, variations, cost, aggregate, evaluations, seed, threads, progress=None))]
 #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
 fn tune<'py>(
     py: Python<'py>,
@@ -63,7 +98,8 @@ fn tune<'py>(
     start: &Bound<'py, Controller>,
     counts_per_unit: f64,
     variations: Vec<(f64, usize)>,
-    weights: BTreeMap<String, f64>,
+    cost: BTreeMap<String, f64>,
+    aggregate: &str,
     evaluations: usize,
     seed: u64,
     threads: usize,
@@ -84,7 +120,8 @@ fn tune<'py>(
         start: settings,
         filter_samples: start.filter_samples,
         filter_time: start.filter_time,
-        weights: self::weights(&weights).map_err(|e| raise(py, e))?,
+        cost: self::cost(&cost).map_err(|e| raise(py, e))?,
+        aggregate: self::aggregate(aggregate).map_err(|e| raise(py, e))?,
     };
     let options = Options {
         evaluations,
@@ -125,5 +162,6 @@ fn told(py: Python<'_>, tuned: Tuned) -> PyResult<Bound<'_, PyDict>> {
     dict.set_item("evaluations", tuned.evaluations)?;
     dict.set_item("trace", array1(py, tuned.trace))?;
     dict.set_item("termination", tuned.termination.name())?;
+    dict.set_item("weights", named(py, tuned.weights.named())?)?;
     Ok(dict)
 }
