@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from . import signals
+    from . import signals, trust
     from ._core import __version__
     from .control import (
         Controller,
@@ -88,6 +88,7 @@ __all__ = [
     "signals",
     "speed_from_counts",
     "table_1",
+    "trust",
     "tune",
     "validate",
     "write_table",

@@ -1,0 +1,219 @@
+"""`judge`: closed loops held against limits; a refusal where members of an ensemble disagree."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..control import Controller
+from ..dataset import Dataset
+from ..errors import FitError, SettingError, SewfastError
+from ..evidence.region import placed
+from ..loop import ClosedLoopRun, Plant, run
+from ..machine import VirtualMachine
+from ..models import Ensemble, Model
+from . import questions
+from .disagreement import disagreements
+from .judgement import JudgedRun, Judgement
+from .limits import Limits
+from .oscillation import oscillation
+
+if TYPE_CHECKING:
+    from ..tuning import TuningResult
+
+    Plants: TypeAlias = Plant | Sequence[Plant]
+    Judgeable: TypeAlias = ClosedLoopRun | Sequence[ClosedLoopRun] | Controller | TuningResult
+
+REFERENCES = ("trapezoid", "random")
+
+
+def judge(
+    what: Judgeable,
+    on: Plants | None = None,
+    references: str | ArrayLike | Sequence[str | ArrayLike] | None = None,
+    *,
+    limits: Limits | None = None,
+    seed: int = 0,
+    refuse: bool = True,
+) -> Judgement:
+    """Hold simulated or measured closed loops against limits.
+
+    - `training region`: the share of samples unlike any that the model was trained on. A measured
+      run is placed by its command: where would it lead the model?
+    - `saturation`: the share of samples with the command at a limit.
+    - `limit cycle`: a lasting oscillation of the loop's own making at constant reference
+      (`sewfast.trust.oscillation`).
+    - `disagreement`: how far plants part that ran the same reference under the same controller.
+
+    Parameters
+    ----------
+    what : ClosedLoopRun, sequence of them, Controller or TuningResult
+        Runs as they are; a controller, or what `tune` found, is run on every plant of `on`.
+    on : Model, VirtualMachine or sequence of them, optional
+        The plants of a controller, every member of an ensemble one of them. With runs: the models
+        in whose training region they are to lie.
+    references : str, array of shape (N,), or sequence of them, optional
+        Of a controller; `REFERENCES` by default, where it is in RPM at 1 ms.
+    limits : Limits, optional
+        The bounds.
+    seed : int
+        Chooses named random references.
+    refuse : bool
+        Whether to raise where members disagree; else the line `disagreement` fails.
+
+    Returns
+    -------
+    Judgement
+
+    Raises
+    ------
+    FitError
+        Where members of an ensemble disagree by more than the bound, or one runs away.
+    SettingError
+        For arguments that are none of these, or a controller without plants.
+    """
+    limits = limits or Limits()
+    models = _plants(on)
+    runs = _runs(what, models, references, seed)
+    regions = [m for m in models if isinstance(m, Model)]
+    found = tuple(_judged(r, model) for r, model in _with_model(runs, regions, what))
+    apart = disagreements([r for r, _ in runs])
+    unit = found[0].run.units["y"]
+    lines = (
+        questions.region(found, limits),
+        questions.saturation(found, limits),
+        questions.limit_cycle(found, limits),
+        questions.disagreement(apart, limits, unit),
+    )
+    if refuse and lines[-1].verdict == "fail":
+        raise FitError(_refusal(lines[-1].shown, lines[-1].limit, lines[-1].meaning))
+    return Judgement(lines, found, apart, limits)
+
+
+def _refusal(shown: str, limit: str, meaning: str) -> str:
+    return f"expected plants that agree in closed loop ({limit}), received {shown}: {meaning}"
+
+
+def _plants(on: Plants | None) -> list[Plant]:
+    """Every plant by itself: of an ensemble its members."""
+    if on is None:
+        return []
+    each = list(on) if isinstance(on, Sequence) else [on]
+    for plant in each:
+        if not isinstance(plant, (Model, VirtualMachine)):
+            raise SettingError(
+                f"on: expected models or virtual machines, got {type(plant).__name__}; load a "
+                "model with load_model"
+            )
+    return [m for plant in each for m in _singles(plant)]
+
+
+def _singles(plant: Plant) -> list[Plant]:
+    if not isinstance(plant, Ensemble):
+        return [plant]
+    region = plant.training.get("region")
+    return [
+        m if "region" in m.training or region is None or not _alike(m, plant) else
+        replace(m, training={**m.training, "region": region})
+        for m in plant.members
+    ]  # fmt: skip
+
+
+def _alike(member: Model, ensemble: Ensemble) -> bool:
+    """Whether the ensemble's region, which is its first member's, is one in this one's terms."""
+    return member is ensemble.members[0] or "na" in member.orders
+
+
+_Run: TypeAlias = tuple[ClosedLoopRun, "Plant | None"]
+
+
+def _runs(
+    what: Judgeable, plants: list[Plant], references: Any, seed: int
+) -> list[_Run]:  # fmt: skip
+    if isinstance(what, ClosedLoopRun):
+        return [(what, None)]
+    controller = getattr(what, "controller", what)
+    if isinstance(controller, Controller):
+        if not plants:
+            raise SettingError(
+                "expected plants to run the controller on, got none; give judge(controller, models)"
+            )
+        return [
+            (_tried(controller, plant, r, seed, title), plant)
+            for r in _each(references)
+            for plant, title in zip(plants, _titles(plants), strict=True)
+        ]
+    if isinstance(what, Sequence) and what and all(isinstance(r, ClosedLoopRun) for r in what):
+        return [(r, None) for r in what]
+    raise SettingError(
+        "expected closed-loop runs, a Controller or a TuningResult to judge, got "
+        f"{type(what).__name__}; run(controller, plant, reference) gives a run"
+    )
+
+
+def _each(references: Any) -> list[Any]:
+    if references is None:
+        return list(REFERENCES)
+    if isinstance(references, str):
+        return [references]
+    several = not isinstance(references, np.ndarray) and any(
+        isinstance(r, str) or np.ndim(r) for r in references
+    )
+    return list(references) if several or np.ndim(references) == 2 else [references]
+
+
+def _titles(plants: list[Plant]) -> list[str]:
+    names = [p.name if isinstance(p, VirtualMachine) else p.kind for p in plants]
+    if len(plants) == 1:
+        return names
+    return [f"{name}, {i + 1} of {len(names)}" for i, name in enumerate(names)]
+
+
+def _tried(
+    controller: Controller, plant: Plant, reference: Any, seed: int, title: str
+) -> ClosedLoopRun:
+    try:
+        return replace(run(controller, plant, reference, seed=seed), plant=title)
+    except FitError as e:
+        named = reference if isinstance(reference, str) else "reference"
+        raise FitError(
+            f"expected a loop that stays bounded, received one that runs away on {title}, "
+            f"{named}: {e}"
+        ) from e
+
+
+def _with_model(runs: list[_Run], models: list[Model], what: Any) -> list[_Run]:
+    """Each run with the model whose region it is to lie in, if there is one."""
+    given = models[0] if models else None
+    return [(r, plant if isinstance(plant, Model) else given) for r, plant in runs]
+
+
+def _judged(found: ClosedLoopRun, model: Any) -> JudgedRun:
+    outside, farthest = _outside(found, model)
+    saturated = found.metrics()["saturated"] or 0.0
+    return JudgedRun(found, outside, farthest, saturated, oscillation(found))
+
+
+def _outside(found: ClosedLoopRun, model: Model | None) -> tuple[float, float]:
+    """Share of samples outside, farthest distance; NaN where no region is known."""
+    if model is None or not len(found.u):
+        return math.nan, math.nan
+    known = np.isfinite(found.u)
+    u = np.interp(np.arange(len(known)), np.flatnonzero(known), found.u[known])
+    data = Dataset.from_arrays(
+        u, None, model.Ts, input_names=model.input_names, input_units=model.input_units,
+        output_name=model.output_name, output_unit=model.output_unit, name=found.reference,
+    )  # fmt: skip
+    try:
+        place = placed(model, data, init=0)
+    except SewfastError:
+        return 1.0, math.inf
+    if place is None:
+        return math.nan, math.nan
+    distances = place.distances[0]
+    return float(np.mean(distances > 1.0)), float(distances.max())
