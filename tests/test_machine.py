@@ -195,3 +195,14 @@ def test_any_finite_command_gives_a_finite_run(u: list[float]) -> None:
     assert np.isfinite(run.speed_rpm).all()
     assert (np.abs(run.speed_rpm) < 11_000).all()
     np.testing.assert_array_equal(run.counts, np.round(run.counts))
+
+
+def test_a_load_slows_the_machine_and_comes_off_again() -> None:
+    machine = VirtualMachine()
+    free = machine.run(np.full(2000, 4.0)).speed_rpm[-1]
+    machine.set_load(0.1)
+    assert machine.run(np.full(2000, 4.0)).speed_rpm[-1] < free - 100.0
+    machine.set_load(0.0)
+    assert machine.run(np.full(2000, 4.0)).speed_rpm[-1] == pytest.approx(free, abs=25.0)
+    with pytest.raises(SettingError, match="finite load"):
+        machine.set_load(math.inf)

@@ -67,6 +67,8 @@ class Machine:
     @property
     def parameters(self) -> dict[str, float]: ...
     def reset(self) -> None: ...
+    def set_load(self, torque: float) -> None:
+        """A constant load torque [N m] from now on, through resets as well; 0 takes it off."""
     def step(self, u: float) -> tuple[float, float]:
         """Hold ``u`` [V] for one sample; counts and true speed [RPM] at its end."""
     def run(self, u: _F) -> tuple[_F, _F]:

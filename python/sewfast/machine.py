@@ -139,6 +139,18 @@ class VirtualMachine:
         """Back to rest at the initial crank angle, counter at zero."""
         self._core.reset()
 
+    def set_load(self, torque: float) -> None:
+        """Load the shaft with a constant torque [N m] from now on, through resets as well.
+
+        It brakes where it has the sign of the speed; 0 takes it off.
+
+        Raises
+        ------
+        SettingError
+            Where the torque is not finite.
+        """
+        self._core.set_load(torque)
+
     def step(self, u: float) -> tuple[float, float]:
         """Hold the command ``u`` [V] for one sample; counts and true speed [RPM] at its end.
 

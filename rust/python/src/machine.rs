@@ -81,6 +81,10 @@ impl Machine {
         self.core.reset();
     }
 
+    fn set_load(&mut self, py: Python<'_>, torque: f64) -> PyResult<()> {
+        self.core.set_load(torque).map_err(|e| raise(py, e))
+    }
+
     fn step(&mut self, py: Python<'_>, u: f64) -> PyResult<(f64, f64)> {
         self.core.run(&[u]).map_err(|e| raise(py, e))?;
         Ok((self.core.counts(), self.core.speed_rpm()))

@@ -4,7 +4,7 @@
 //!
 //! ```text
 //! L di/dt = v - V_dead s(i / i_ripple) - R i - K(th) w            s(x) = x / sqrt(1 + x^2)
-//! J(th) dw/dt + J'(th) w^2 / 2 = K(th) i - load(th) - friction(w)
+//! J(th) dw/dt + J'(th) w^2 / 2 = K(th) i - load(th) - load - friction(w)
 //! friction(w) = sign(w) (T_coulomb + T_stribeck / (1 + (w / w_stribeck)^2)) + b w
 //! ```
 //!
@@ -40,7 +40,7 @@ pub struct Crank {
     pub inertia: f64,
     /// `J'(th) / 2`.
     half_slope: f64,
-    /// `load(th)`.
+    /// `load(th) + load`.
     pub load: f64,
 }
 
@@ -58,6 +58,8 @@ pub struct Dynamics {
     ripple_wave: [f64; 2],
     load_first: [f64; 2],
     load_second: [f64; 2],
+    /// Load torque beside that of the crank \[N m\].
+    pub load: f64,
     coulomb_torque: f64,
     stribeck_torque: f64,
     per_stribeck_squared: f64,
@@ -87,6 +89,7 @@ impl Dynamics {
             ripple_wave: wave(ripple, 4.0, p.torque_ripple_angle),
             load_first: wave(varying * p.load_first, 1.0, p.load_first_angle),
             load_second: wave(varying * p.load_second, 2.0, p.load_second_angle),
+            load: 0.0,
             coulomb_torque: p.coulomb_torque,
             stribeck_torque: p.stribeck_torque,
             per_stribeck_squared: p.stribeck_speed.powi(-2),
@@ -108,7 +111,8 @@ impl Dynamics {
             inertia: self.inertia + jc * c2 + js * s2,
             half_slope: js * c2 - jc * s2,
             load: (self.load_first[0] * c1 + self.load_first[1] * s1)
-                + (self.load_second[0] * c2 + self.load_second[1] * s2),
+                + (self.load_second[0] * c2 + self.load_second[1] * s2)
+                + self.load,
         }
     }
 

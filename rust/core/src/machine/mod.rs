@@ -113,6 +113,23 @@ impl Machine {
         self.settle();
     }
 
+    /// Loads the shaft with a constant torque \[N m\] from now on, through resets as well; 0 takes it off.
+    ///
+    /// It brakes where it has the sign of the speed, and turns the machine backwards where nothing holds it.
+    ///
+    /// # Errors
+    /// A setting error where `torque` is not finite.
+    pub fn set_load(&mut self, torque: f64) -> Result<()> {
+        if !torque.is_finite() {
+            return Err(Error::setting(format!(
+                "expected a finite load torque [N m], got {torque}; 0 takes the load off"
+            )));
+        }
+        self.dynamics.load = torque;
+        self.settle();
+        Ok(())
+    }
+
     /// True speed [RPM].
     pub fn speed_rpm(&self) -> f64 {
         self.state.speed * RPM

@@ -292,3 +292,40 @@ fn answers_a_small_step_as_linearised() {
     let area = (1..5000).map(missing).sum::<f64>() + 0.5 * missing(0);
     assert_like_the_real_machine(rise / 0.05, [slow, area * SAMPLE_TIME - slow]);
 }
+
+#[test]
+fn a_load_slows_by_its_torque_and_turns_back_what_nothing_holds() {
+    let smooth = [("angle_dependence", 0.0)];
+    let mut free = machine(&smooth);
+    let mut loaded = machine(&smooth);
+    for _ in 0..3000 {
+        free.advance(4.0);
+        loaded.advance(4.0);
+    }
+    assert_eq!(free.speed_rpm(), loaded.speed_rpm());
+    loaded.set_load(0.1).unwrap();
+    for _ in 0..3000 {
+        free.advance(4.0);
+        loaded.advance(4.0);
+    }
+    // what carries the load is current, which costs voltage that speed no longer gets
+    let p = Parameters::default();
+    let carried = loaded.current() - free.current();
+    let lost = (free.speed_rpm() - loaded.speed_rpm()) / RPM;
+    let friction = p.viscous_friction * lost;
+    assert!((p.motor_constant * carried - 0.1 + friction).abs() < 1e-3);
+    assert!((p.resistance * carried - p.motor_constant * lost).abs() < 0.02);
+    loaded.reset();
+    loaded.set_load(0.5).unwrap();
+    (0..200).for_each(|_| loaded.advance(0.0));
+    assert!(loaded.speed_rpm() < -100.0);
+    assert!(loaded.set_load(f64::NAN).is_err());
+}
+
+#[test]
+fn no_load_changes_no_bit() {
+    let (mut one, mut other) = (nominal(), nominal());
+    other.set_load(0.0).unwrap();
+    let u = random(5, 4000, 40, 20.0);
+    assert_eq!(one.run(&u).unwrap(), other.run(&u).unwrap());
+}
