@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..control import Controller
 from ..dataset import Dataset
 from ..errors import FitError, SettingError, SewfastError
 from ..evidence.region import placed
-from ..loop import ClosedLoopRun, Plant, run
-from ..machine import VirtualMachine
-from ..models import Ensemble, Model
+from ..loop import ClosedLoopRun, Plant
+from ..models import Model
+from ..plants import Plants, References, each_plant, each_reference, titles, trial
 from . import questions
 from .disagreement import disagreements
 from .judgement import JudgedRun, Judgement
@@ -26,7 +24,6 @@ from .oscillation import oscillation
 if TYPE_CHECKING:
     from ..tuning import TuningResult
 
-    Plants: TypeAlias = Plant | Sequence[Plant]
     Judgeable: TypeAlias = ClosedLoopRun | Sequence[ClosedLoopRun] | Controller | TuningResult
 
 REFERENCES = ("trapezoid", "random")
@@ -35,7 +32,7 @@ REFERENCES = ("trapezoid", "random")
 def judge(
     what: Judgeable,
     on: Plants | None = None,
-    references: str | ArrayLike | Sequence[str | ArrayLike] | None = None,
+    references: References = None,
     *,
     limits: Limits | None = None,
     seed: int = 0,
@@ -78,10 +75,10 @@ def judge(
         For arguments that are none of these, or a controller without plants.
     """
     limits = limits or Limits()
-    models = _plants(on)
+    models = each_plant(on)
     runs = _runs(what, models, references, seed)
     regions = [m for m in models if isinstance(m, Model)]
-    found = tuple(_judged(r, model) for r, model in _with_model(runs, regions, what))
+    found = tuple(_judged(r, model) for r, model in _with_model(runs, regions))
     apart = disagreements([r for r, _ in runs])
     unit = found[0].run.units["y"]
     lines = (
@@ -99,41 +96,11 @@ def _refusal(shown: str, limit: str, meaning: str) -> str:
     return f"expected plants that agree in closed loop ({limit}), received {shown}: {meaning}"
 
 
-def _plants(on: Plants | None) -> list[Plant]:
-    """Every plant by itself: of an ensemble its members."""
-    if on is None:
-        return []
-    each = list(on) if isinstance(on, Sequence) else [on]
-    for plant in each:
-        if not isinstance(plant, (Model, VirtualMachine)):
-            raise SettingError(
-                f"on: expected models or virtual machines, got {type(plant).__name__}; load a "
-                "model with load_model"
-            )
-    return [m for plant in each for m in _singles(plant)]
-
-
-def _singles(plant: Plant) -> list[Plant]:
-    if not isinstance(plant, Ensemble):
-        return [plant]
-    region = plant.training.get("region")
-    return [
-        m if "region" in m.training or region is None or not _alike(m, plant) else
-        replace(m, training={**m.training, "region": region})
-        for m in plant.members
-    ]  # fmt: skip
-
-
-def _alike(member: Model, ensemble: Ensemble) -> bool:
-    """Whether the ensemble's region, which is its first member's, is one in this one's terms."""
-    return member is ensemble.members[0] or "na" in member.orders
-
-
 _Run: TypeAlias = tuple[ClosedLoopRun, "Plant | None"]
 
 
 def _runs(
-    what: Judgeable, plants: list[Plant], references: Any, seed: int
+    what: Judgeable, plants: list[Plant], references: References, seed: int
 ) -> list[_Run]:  # fmt: skip
     if isinstance(what, ClosedLoopRun):
         return [(what, None)]
@@ -144,9 +111,9 @@ def _runs(
                 "expected plants to run the controller on, got none; give judge(controller, models)"
             )
         return [
-            (_tried(controller, plant, r, seed, title), plant)
-            for r in _each(references)
-            for plant, title in zip(plants, _titles(plants), strict=True)
+            (trial(controller, plant, r, title, seed), plant)
+            for r in each_reference(references, REFERENCES)
+            for plant, title in zip(plants, titles(plants), strict=True)
         ]
     if isinstance(what, Sequence) and what and all(isinstance(r, ClosedLoopRun) for r in what):
         return [(r, None) for r in what]
@@ -156,38 +123,7 @@ def _runs(
     )
 
 
-def _each(references: Any) -> list[Any]:
-    if references is None:
-        return list(REFERENCES)
-    if isinstance(references, str):
-        return [references]
-    several = not isinstance(references, np.ndarray) and any(
-        isinstance(r, str) or np.ndim(r) for r in references
-    )
-    return list(references) if several or np.ndim(references) == 2 else [references]
-
-
-def _titles(plants: list[Plant]) -> list[str]:
-    names = [p.name if isinstance(p, VirtualMachine) else p.kind for p in plants]
-    if len(plants) == 1:
-        return names
-    return [f"{name}, {i + 1} of {len(names)}" for i, name in enumerate(names)]
-
-
-def _tried(
-    controller: Controller, plant: Plant, reference: Any, seed: int, title: str
-) -> ClosedLoopRun:
-    try:
-        return replace(run(controller, plant, reference, seed=seed), plant=title)
-    except FitError as e:
-        named = reference if isinstance(reference, str) else "reference"
-        raise FitError(
-            f"expected a loop that stays bounded, received one that runs away on {title}, "
-            f"{named}: {e}"
-        ) from e
-
-
-def _with_model(runs: list[_Run], models: list[Model], what: Any) -> list[_Run]:
+def _with_model(runs: list[_Run], models: list[Model]) -> list[_Run]:
     """Each run with the model whose region it is to lie in, if there is one."""
     given = models[0] if models else None
     return [(r, plant if isinstance(plant, Model) else given) for r, plant in runs]
