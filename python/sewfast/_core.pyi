@@ -371,8 +371,21 @@ class Controller:
     def __new__(
         cls, *, Kp: float, Ti: float, Td: float, alpha: float, beta: float, N: float, Tt: float,
         u_min: float, u_max: float, slew: float, Ts: float, filter_samples: int, filter_time: float,
-    ) -> Controller: ...
-    def step(self, r: float, y: float) -> float: ...
+        observer_time: float = 0.0, r_rate: float = ...,
+        schedule: Sequence[tuple[float, float, float, float]] = ...,
+    ) -> Controller:
+        """``schedule`` has rows of speed, Kp, Ti, Td; empty for constant gains."""
+
+    def step(self, r: float, y: float, feedforward: float = 0.0) -> float: ...
+    def set_design(self, other: Controller) -> None:
+        """Take over the other one's settings without a bump; its sample time must be this one's."""
+
+    def set_manual(self, u: float) -> None:
+        """From the next sample on the command is ``u``, within the limits."""
+
+    def set_automatic(self) -> None: ...
+    @property
+    def manual(self) -> bool: ...
     def reset(self) -> None: ...
     @property
     def filtered(self) -> float:

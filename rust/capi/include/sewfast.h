@@ -197,7 +197,7 @@ typedef struct sewfast_pid_settings {
 } sewfast_pid_settings;
 
 /* Enough bytes on any target. */
-#define SEWFAST_PID_SIZE 512
+#define SEWFAST_PID_SIZE 1024
 
 size_t sewfast_pid_size(void);
 

@@ -3,7 +3,7 @@
 use crate::{place, tell};
 use core::ffi::c_void;
 use core::ptr::null_mut;
-use sewfast_control::{Controller, Settings, Standard};
+use sewfast_control::{Controller, Design, Settings, Standard};
 
 /// `sewfast_pid_settings`.
 #[repr(C)]
@@ -110,7 +110,11 @@ impl CSettings {
             slew: self.slew,
             ts: self.ts,
         };
-        let controller = Controller::new(settings, self.filter_samples.into(), self.filter_time);
+        let controller = Controller::new(Design {
+            filter_samples: self.filter_samples.into(),
+            filter_time: self.filter_time,
+            ..Design::new(settings)
+        });
         controller.map_err(|refused| number(refused.name))
     }
 }

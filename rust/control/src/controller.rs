@@ -1,35 +1,48 @@
-//! The whole controller of the paper's Fig. 16: feedback filter, then two-degree-of-freedom PID.
+//! The whole controller of the paper's Fig. 16: feedback filter, reference ramp, then two-degree-of-freedom PID.
 
-use crate::{Feedback, Pid, Real, Refused, Settings};
+use crate::schedule::Table;
+use crate::{Design, Feedback, Pid, Ramp, Real, Refused, Settings};
 
-/// Feedback filter and PID behind one step.
+/// Feedback filter, reference ramp, gain schedule and PID behind one step.
 #[derive(Clone, Debug)]
 pub struct Controller<T> {
+    design: Design<T>,
     filter: Feedback<T>,
+    ramp: Ramp<T>,
+    table: Option<Table<T>>,
     pid: Pid<T>,
     filtered: T,
 }
 
 impl<T: Real> Controller<T> {
-    /// A controller whose feedback is averaged over `filter_samples`, then lagged by `filter_time` \[s\].
+    /// A controller at rest, in automatic.
     ///
     /// # Errors
     /// The first setting that is outside its range.
-    pub fn new(
-        settings: Settings<T>,
-        filter_samples: usize,
-        filter_time: T,
-    ) -> Result<Self, Refused> {
+    pub fn new(design: Design<T>) -> Result<Self, Refused> {
+        let Design {
+            pid,
+            filter_samples,
+            filter_time,
+            observer_time,
+            r_rate,
+            schedule,
+        } = design;
+        let ts = pid.ts;
         Ok(Self {
-            pid: Pid::new(settings)?,
-            filter: Feedback::new(filter_samples, filter_time, settings.ts)?,
+            pid: Pid::new(pid)?,
+            filter: Feedback::new(filter_samples, filter_time, observer_time, ts)?,
+            ramp: Ramp::new(r_rate, ts)?,
+            table: Table::new(&schedule, &pid),
+            design,
             filtered: T::ZERO,
         })
     }
 
-    /// Back to the state before the first sample.
+    /// Back to the state before the first sample, in automatic.
     pub fn reset(&mut self) {
         self.filter.reset();
+        self.ramp.reset();
         self.pid.reset();
         self.filtered = T::ZERO;
     }
@@ -38,16 +51,76 @@ impl<T: Real> Controller<T> {
     ///
     /// A measurement that is not finite is skipped: the filter keeps its memory, the command its value.
     pub fn step(&mut self, r: T, y: T) -> T {
+        // x + (-0) is x for every x, even for -0
+        self.step_with(r, y, -T::ZERO)
+    }
+
+    /// [`step`](Self::step) with a command that is added before the limits.
+    pub fn step_with(&mut self, r: T, y: T, feedforward: T) -> T {
         if !y.is_finite() {
-            return self.pid.output();
+            return self.pid.hold();
         }
         self.filtered = self.filter.step(y);
-        self.pid.step(r, self.filtered)
+        let r = self.ramp.step(r, self.filtered);
+        let terms = match &self.table {
+            Some(table) => table.at(self.filtered),
+            None => self.pid.terms(),
+        };
+        self.pid.step_by(terms, r, self.filtered, feedforward)
+    }
+
+    /// Another design from the next sample on, without a bump in the command: filter, ramp and derivative keep what they
+    /// remember, and the integral term takes up what the other terms change by.
+    ///
+    /// Without integral action what it took up stays; [`reset`](Self::reset) forgets it.
+    ///
+    /// # Errors
+    /// The first setting that is outside its range, or another sample time; nothing is changed then.
+    pub fn set_design(&mut self, design: Design<T>) -> Result<(), Refused> {
+        let (ts, now) = (design.pid.ts, self.design.pid.ts);
+        let expected = "the sample time at which the controller runs";
+        Refused::unless(ts == now, "Ts", expected, ts.to_f64())?;
+        let new = Self::new(design)?;
+        self.filter = new.filter.after(&self.filter);
+        self.ramp = new.ramp.after(&self.ramp);
+        let terms = match &new.table {
+            Some(table) => table.at(self.filtered),
+            None => new.pid.terms(),
+        };
+        self.pid.change(design.pid, terms);
+        (self.table, self.design) = (new.table, design);
+        Ok(())
+    }
+
+    /// Hands the command to the operator: from the next sample on it is `u`, within the limits.
+    ///
+    /// Filter, ramp and derivative keep following, and the integral term is what automatic would need for the same command.
+    /// A sample without measurement applies `u` all the same.
+    ///
+    /// # Errors
+    /// A command that is not finite.
+    pub fn set_manual(&mut self, u: T) -> Result<(), Refused> {
+        self.pid.set_manual(u)
+    }
+
+    /// Hands the command back to the controller, which begins where the operator's was.
+    pub fn set_automatic(&mut self) {
+        self.pid.set_automatic();
+    }
+
+    /// Whether the command is the operator's.
+    pub fn is_manual(&self) -> bool {
+        self.pid.is_manual()
     }
 
     /// The feedback after its filter, at the last step.
     pub fn filtered(&self) -> T {
         self.filtered
+    }
+
+    /// What it is made from.
+    pub fn design(&self) -> &Design<T> {
+        &self.design
     }
 
     /// The settings of the PID.
@@ -57,22 +130,4 @@ impl<T: Real> Controller<T> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::Standard;
-
-    #[test]
-    fn feeds_back_the_filtered_output_and_skips_a_lost_measurement() {
-        let gains = Standard {
-            kp: 1.0,
-            ti: f64::INFINITY,
-            td: 0.0,
-        };
-        let mut controller = Controller::new(Settings::new(gains, 1e-3), 2, 0.0).unwrap();
-        assert_eq!(controller.step(0.0, 4.0), -4.0);
-        assert_eq!(controller.step(0.0, 0.0), -2.0);
-        assert_eq!(controller.filtered(), 2.0);
-        assert_eq!(controller.step(0.0, f64::NAN), -2.0);
-        assert_eq!(controller.step(0.0, 0.0), 0.0);
-    }
-}
+mod tests;

@@ -1,7 +1,7 @@
-//! Feedback filters: moving average, first-order lag.
+//! Feedback filters: moving average, first-order lag, and the chain of them with the observer.
 
 use crate::gains::sample_time;
-use crate::{Real, Refused};
+use crate::{Observer, Real, Refused};
 
 /// The longest moving average, in samples.
 pub const CAPACITY: usize = 64;
@@ -53,8 +53,23 @@ impl<T: Real> MovingAverage<T> {
         }
         let next = self.next + 1;
         self.next = if next < self.length { next } else { 0 };
+        self.mean()
+    }
+
+    fn mean(&self) -> T {
+        let memory = self.samples.get(..self.length).unwrap_or_default();
         let sum = memory.iter().fold(T::ZERO, |sum, &x| sum + x);
         sum / T::from_count(self.length)
+    }
+
+    /// This average's length with the memory of `other`: all of it, or where the lengths differ its mean.
+    fn after(mut self, other: &Self) -> Self {
+        if self.length == other.length {
+            return other.clone();
+        }
+        self.samples = [other.mean(); CAPACITY];
+        self.started = other.started;
+        self
     }
 }
 
@@ -95,24 +110,33 @@ impl<T: Real> Lag<T> {
         self.y = from + self.weight * (x - from);
         self.y
     }
+
+    /// This lag's time constant with the memory of `other`.
+    fn after(mut self, other: &Self) -> Self {
+        self.y = other.y;
+        self.started = other.started;
+        self
+    }
 }
 
-/// The feedback filter: a moving average, then a lag.
+/// The feedback filter: a moving average, then a lag, then an observer.
 #[derive(Clone, Debug)]
 pub struct Feedback<T> {
     average: MovingAverage<T>,
     lag: Lag<T>,
+    observer: Observer<T>,
 }
 
 impl<T: Real> Feedback<T> {
-    /// An average of `samples`, then a lag of `time` \[s\], at sample time `ts` \[s\].
+    /// An average of `samples`, a lag of `time` \[s\], an observer of `observer_time` \[s\], at sample time `ts` \[s\].
     ///
     /// # Errors
-    /// What [`MovingAverage::new`] and [`Lag::new`] refuse.
-    pub fn new(samples: usize, time: T, ts: T) -> Result<Self, Refused> {
+    /// What [`MovingAverage::new`], [`Lag::new`] and [`Observer::new`] refuse.
+    pub fn new(samples: usize, time: T, observer_time: T, ts: T) -> Result<Self, Refused> {
         Ok(Self {
             average: MovingAverage::new(samples)?,
             lag: Lag::new(time, ts)?,
+            observer: Observer::new(observer_time, ts)?,
         })
     }
 
@@ -120,11 +144,21 @@ impl<T: Real> Feedback<T> {
     pub fn reset(&mut self) {
         self.average.reset();
         self.lag.reset();
+        self.observer.reset();
     }
 
     /// Takes a sample, gives the filtered value.
     pub fn step(&mut self, x: T) -> T {
-        self.lag.step(self.average.step(x))
+        self.observer.step(self.lag.step(self.average.step(x)))
+    }
+
+    /// These settings with the memory of `other`, so that a constant output goes on where that one's was.
+    pub(crate) fn after(self, other: &Self) -> Self {
+        Self {
+            average: self.average.after(&other.average),
+            lag: self.lag.after(&other.lag),
+            observer: self.observer.after(&other.observer),
+        }
     }
 }
 
@@ -168,20 +202,20 @@ mod tests {
 
     #[test]
     fn passes_through_where_switched_off_and_refuses_nonsense() {
-        let mut off = Feedback::new(1, 0.0, 1e-3).unwrap();
+        let mut off = Feedback::new(1, 0.0, 0.0, 1e-3).unwrap();
         assert_eq!([3.0, -1.0, 2.0].map(|x| off.step(x)), [3.0, -1.0, 2.0]);
         for samples in [0, CAPACITY + 1] {
             assert_eq!(
-                Feedback::new(samples, 0.0, 1e-3).unwrap_err().name,
+                Feedback::new(samples, 0.0, 0.0, 1e-3).unwrap_err().name,
                 "filter_samples"
             );
         }
         for time in [-1.0, f64::NAN, f64::INFINITY] {
             assert_eq!(
-                Feedback::new(1, time, 1e-3).unwrap_err().name,
+                Feedback::new(1, time, 0.0, 1e-3).unwrap_err().name,
                 "filter_time"
             );
         }
-        assert!(Feedback::new(CAPACITY, 0.01_f32, 1e-3).is_ok());
+        assert!(Feedback::new(CAPACITY, 0.01_f32, 0.004, 1e-3).is_ok());
     }
 }

@@ -42,7 +42,16 @@ impl<T: Real> Settings<T> {
         }
     }
 
-    fn checked(self) -> Result<Self, Refused> {
+    /// `Ts/Tt`; 0 for conditional integration, which does not track.
+    fn tracking(&self) -> T {
+        if self.tt == T::ZERO {
+            T::ZERO
+        } else {
+            self.ts / self.tt
+        }
+    }
+
+    pub(crate) fn checked(self) -> Result<Self, Refused> {
         self.gains.checked()?;
         sample_time(self.ts)?;
         let unless = Refused::unless;
@@ -71,26 +80,71 @@ impl<T: Real> Settings<T> {
     }
 }
 
-/// `u = Kp (e + (1/Ti) int e dt + Td de/dt) - Kp (alpha r + beta Td dr/dt)`, `e = r - y`, limited.
-#[derive(Clone, Debug)]
-pub struct Pid<T> {
-    settings: Settings<T>,
+/// The gains of one sample in the form in which the step uses them.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Terms<T> {
+    /// Proportional gain.
+    kp: T,
     /// Integral gain per sample, `Kp Ts/Ti`.
     ki: T,
     /// Gain on the difference of the derivative's input, `Kp Td/(Td/N + Ts)`.
     kd: T,
     /// Pole of the derivative's filter, `(Td/N)/(Td/N + Ts)`.
     pole: T,
+    /// Gain on the rate, `Kp Td`.
+    rate: T,
+}
+
+impl<T: Real> Terms<T> {
+    /// From `Kp`, `Kp Ts/Ti`, `Td` with the filter's `N` at sample time `ts`.
+    pub(crate) fn new(kp: T, ki: T, td: T, n: T, ts: T) -> Self {
+        let filter = td / n;
+        Self {
+            kp,
+            ki,
+            kd: kp * td / (filter + ts),
+            pole: filter / (filter + ts),
+            rate: kp * td,
+        }
+    }
+
+    /// The constant gains of the settings.
+    pub(crate) fn constant(settings: &Settings<T>) -> Self {
+        let Settings { gains, n, ts, .. } = *settings;
+        Self::new(gains.kp, gains.kp * ts / gains.ti, gains.td, n, ts)
+    }
+}
+
+#[cfg(test)]
+impl Terms<f64> {
+    /// Whether all are equal to so many parts; to the last bit for 0.
+    pub(crate) fn close_to(&self, other: &Self, parts: f64) -> bool {
+        let all = |t: &Self| [t.kp, t.ki, t.kd, t.pole, t.rate];
+        let mut pairs = all(self).into_iter().zip(all(other));
+        pairs.all(|(a, b)| (a - b).abs() <= parts * b.abs())
+    }
+}
+
+/// `u = Kp (e + (1/Ti) int e dt + Td de/dt) - Kp (alpha r + beta Td dr/dt)`, `e = r - y`, plus feedforward, limited.
+#[derive(Clone, Debug)]
+pub struct Pid<T> {
+    settings: Settings<T>,
+    /// The gains at the last sample.
+    terms: Terms<T>,
     /// Share of the excess taken from the integral in one sample, `Ts/Tt`.
     tracking: T,
     /// Integral term \[u\].
     integral: T,
     /// Derivative term \[u\].
     derivative: T,
-    /// The derivative's input at the last sample, `(1 - beta) r - y`.
-    rate_input: T,
+    /// Reference at the last sample.
+    r: T,
+    /// Error at the last sample.
+    e: T,
     /// Output at the last sample \[u\].
     u: T,
+    /// The operator's command in manual.
+    manual: Option<T>,
     started: bool,
 }
 
@@ -100,31 +154,30 @@ impl<T: Real> Pid<T> {
     /// # Errors
     /// The first setting that is outside its range.
     pub fn new(settings: Settings<T>) -> Result<Self, Refused> {
-        let Settings {
-            gains, n, tt, ts, ..
-        } = settings.checked()?;
-        let filter = gains.td / n;
+        let settings = settings.checked()?;
         let mut pid = Self {
             settings,
-            ki: gains.kp * ts / gains.ti,
-            kd: gains.kp * gains.td / (filter + ts),
-            pole: filter / (filter + ts),
-            tracking: if tt == T::ZERO { T::ZERO } else { ts / tt },
+            terms: Terms::constant(&settings),
+            tracking: settings.tracking(),
             integral: T::ZERO,
             derivative: T::ZERO,
-            rate_input: T::ZERO,
+            r: T::ZERO,
+            e: T::ZERO,
             u: T::ZERO,
+            manual: None,
             started: false,
         };
         pid.reset();
         Ok(pid)
     }
 
-    /// Back to the state before the first sample; the output, from which slew counts, is 0 or the limit next to it.
+    /// Back to the state before the first sample, in automatic; the output, from which slew counts, is 0 or the limit next
+    /// to it.
     pub fn reset(&mut self) {
         self.integral = T::ZERO;
         self.derivative = T::ZERO;
         self.u = T::ZERO.limit(self.settings.u_min, self.settings.u_max);
+        self.manual = None;
         self.started = false;
     }
 
@@ -132,23 +185,89 @@ impl<T: Real> Pid<T> {
     ///
     /// Where the command would not be finite, as after a lost measurement, state and output stay as they are.
     pub fn step(&mut self, r: T, y: T) -> T {
-        let Settings {
-            gains, alpha, beta, ..
-        } = self.settings;
+        // x + (-0) is x for every x, even for -0
+        self.step_by(self.terms, r, y, -T::ZERO)
+    }
+
+    /// [`step`](Self::step) with the gains of this sample and a command that is added before the limits.
+    ///
+    /// Every branch costs the same arithmetic: what is not wanted is computed and left.
+    pub(crate) fn step_by(&mut self, terms: Terms<T>, r: T, y: T, feedforward: T) -> T {
+        let Settings { alpha, beta, .. } = self.settings;
         let e = r - y;
         let rate_input = e - beta * r;
-        let derivative = self.derivative_for(rate_input);
-        let integral = self.integral + self.ki * e;
-        let wanted = gains.kp * (e - alpha * r) + integral + derivative;
+        let change = rate_input - (self.e - beta * self.r);
+        let change = if self.started { change } else { T::ZERO };
+        let derivative = terms.pole * self.derivative + terms.kd * change;
+        let integral = self.integral + terms.ki * e;
+        let proportional = terms.kp * (e - alpha * r);
+        let wanted = proportional + integral + derivative + feedforward;
         if !(wanted.is_finite() && rate_input.is_finite()) {
-            return self.u;
+            return self.hold();
         }
-        self.u = self.limited(wanted);
-        self.integral = self.without_windup(integral, self.u - wanted);
+        self.u = self.limited(self.manual.unwrap_or(wanted));
+        let kept = self.without_windup(terms.ki, integral, self.u - wanted);
+        let bumpless = self.u - proportional - derivative - feedforward;
+        let automatic = self.manual.is_none();
+        self.integral = if automatic { kept } else { bumpless };
         self.derivative = derivative;
-        self.rate_input = rate_input;
-        self.started = true;
+        (self.terms, self.r, self.e, self.started) = (terms, r, e, true);
         self.u
+    }
+
+    /// A sample without measurement: the command and the memory stay; in manual the command is still the operator's.
+    pub(crate) fn hold(&mut self) -> T {
+        if let Some(manual) = self.manual {
+            let u = self.limited(manual);
+            self.integral += u - self.u;
+            self.u = u;
+        }
+        self.u
+    }
+
+    /// Other settings from the next sample on, without a bump: what proportional and derivative term change by, the integral
+    /// term takes up. The derivative's memory stands for the same rate as before.
+    pub(crate) fn change(&mut self, settings: Settings<T>, terms: Terms<T>) {
+        if self.started {
+            let before = self.terms;
+            let shown = |alpha: T| self.e - alpha * self.r;
+            let rescaled = self.derivative * (terms.rate / before.rate);
+            let known = before.rate != T::ZERO && rescaled.is_finite();
+            let derivative = if known { rescaled } else { T::ZERO };
+            let proportional =
+                before.kp * shown(self.settings.alpha) - terms.kp * shown(settings.alpha);
+            self.integral += proportional + (self.derivative - derivative);
+            self.derivative = derivative;
+        } else {
+            self.u = T::ZERO.limit(settings.u_min, settings.u_max);
+        }
+        self.tracking = settings.tracking();
+        (self.settings, self.terms) = (settings, terms);
+    }
+
+    /// The operator's command from the next sample on, within the limits; the integral term follows it.
+    ///
+    /// # Errors
+    /// A command that is not finite.
+    pub fn set_manual(&mut self, u: T) -> Result<(), Refused> {
+        Refused::unless(u.is_finite(), "manual", "a finite command", u.to_f64())?;
+        self.manual = Some(u);
+        Ok(())
+    }
+
+    /// The controller's command again, beginning where the operator's was.
+    pub fn set_automatic(&mut self) {
+        self.manual = None;
+    }
+
+    /// Whether the command is the operator's.
+    pub fn is_manual(&self) -> bool {
+        self.manual.is_some()
+    }
+
+    /// The gains of the last sample; the constant ones where no other came.
+    pub(crate) fn terms(&self) -> Terms<T> {
+        self.terms
     }
 
     /// The output of the last step.
@@ -159,15 +278,6 @@ impl<T: Real> Pid<T> {
     /// The settings it was made from.
     pub fn settings(&self) -> &Settings<T> {
         &self.settings
-    }
-
-    fn derivative_for(&self, rate_input: T) -> T {
-        let change = if self.started {
-            rate_input - self.rate_input
-        } else {
-            T::ZERO
-        };
-        self.pole * self.derivative + self.kd * change
     }
 
     fn limited(&self, wanted: T) -> T {
@@ -187,12 +297,15 @@ impl<T: Real> Pid<T> {
     /// The integral to keep when the limits moved the output by `excess`.
     ///
     /// Conditional integration still lets the integral move away from the limit, or it could stay there for ever.
-    fn without_windup(&self, integral: T, excess: T) -> T {
+    fn without_windup(&self, ki: T, integral: T, excess: T) -> T {
         let pushes_on = (integral - self.integral) * excess < T::ZERO;
-        if excess == T::ZERO || self.ki == T::ZERO {
+        let tracked = integral + self.tracking * excess;
+        let (free, none) = (excess == T::ZERO, ki == T::ZERO);
+        let tracks = self.settings.tt != T::ZERO;
+        if free | none {
             integral
-        } else if self.settings.tt != T::ZERO {
-            integral + self.tracking * excess
+        } else if tracks {
+            tracked
         } else if pushes_on {
             self.integral
         } else {

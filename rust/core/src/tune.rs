@@ -12,7 +12,7 @@ pub use cost::{Cost, Terms, Weights, terms};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
-use sewfast_control::{Controller, Settings};
+use sewfast_control::{Controller, Design, Settings};
 
 use crate::closed_loop::{Plant, check_reference};
 use crate::encoder::Encoder;
@@ -29,12 +29,8 @@ pub struct Task<'a, P> {
     pub references: &'a [&'a [f64]],
     /// The encoder of plants that bring none; `None` for ideal feedback.
     pub encoder: Option<Encoder>,
-    /// Limits, sample time, derivative filter and the gains to begin with.
-    pub start: Settings<f64>,
-    /// Moving average in the feedback \[samples\].
-    pub filter_samples: usize,
-    /// Lag in the feedback \[s\].
-    pub filter_time: f64,
+    /// The controller to begin with; what is not searched is kept.
+    pub start: Design<f64>,
     /// What counts how much.
     pub cost: Cost,
     /// How the plants' costs become one.
@@ -119,8 +115,8 @@ pub fn tune<P: Plant + Clone + Send + Sync>(
     check(task, options)?;
     monitor.set_total(options.evaluations as u64);
     let mut benches = vec![Bench::new(task)?; options.threads];
-    let start_cost = benches[0].cost(task, &task.start, f64::INFINITY, monitor);
-    let mut evolution = Evolution::new(Bounds::about(&task.start), options.seed);
+    let start_cost = benches[0].cost(task, &task.start.pid, f64::INFINITY, monitor);
+    let mut evolution = Evolution::new(Bounds::about(&task.start.pid), options.seed);
     let (mut used, mut trace) = (1, vec![start_cost]);
     let termination = loop {
         if monitor.stopped() {
@@ -135,7 +131,7 @@ pub fn tune<P: Plant + Clone + Send + Sync>(
         used += trials.len();
         trace.push(evolution.best_cost().min(start_cost));
     };
-    let (settings, cost) = evolution.best_or(task.start, start_cost);
+    let (settings, cost) = evolution.best_or(task.start.pid, start_cost);
     if !cost.is_finite() {
         return Err(Error::fit(format!(
             "expected gains with which no loop diverges, found none in {used} trials; begin with smaller gains, give \
@@ -154,7 +150,7 @@ pub fn tune<P: Plant + Clone + Send + Sync>(
 }
 
 fn check<P>(task: &Task<'_, P>, options: Options) -> Result<()> {
-    let controller = Controller::new(task.start, task.filter_samples, task.filter_time)?;
+    let controller = Controller::new(task.start)?;
     let Settings {
         u_min,
         u_max,
@@ -165,6 +161,11 @@ fn check<P>(task: &Task<'_, P>, options: Options) -> Result<()> {
         return Err(Error::setting(format!(
             "expected finite output limits to tune within, got {u_min} and {u_max}; give those of the amplifier"
         )));
+    }
+    if !task.start.schedule.is_empty() {
+        return Err(Error::setting(
+            "expected a start with constant gains, got a gain schedule; leave it out while tuning",
+        ));
     }
     if gains.kp == 0.0 {
         return Err(Error::setting(

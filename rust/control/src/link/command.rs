@@ -3,7 +3,7 @@
 use super::Fields;
 use super::device::State;
 use super::identity::Limits;
-use crate::{Controller, Refused, Settings, Standard};
+use crate::{Controller, Design, Refused, Settings, Standard};
 
 /// Shortest and longest time of a watchdog \[us\].
 const WATCHDOG: core::ops::RangeInclusive<u32> = 1_000..=10_000_000;
@@ -99,7 +99,11 @@ impl Gains {
             ts,
             ..self.settings
         };
-        Controller::new(clipped, self.filter_samples.into(), self.filter_time)
+        Controller::new(Design {
+            filter_samples: self.filter_samples.into(),
+            filter_time: self.filter_time,
+            ..Design::new(clipped)
+        })
     }
 
     /// # Errors

@@ -1,7 +1,7 @@
 //! The loop against its linear state-space form, its encoder, its plants and its outcomes.
 
 use nalgebra::{Matrix3, Vector3};
-use sewfast_control::{Settings, Standard};
+use sewfast_control::{Design, Settings, Standard};
 
 use super::*;
 use crate::lagged::Lagged;
@@ -24,7 +24,11 @@ fn lag() -> LinearModel {
 }
 
 fn controller(settings: Settings<f64>, samples: usize) -> Controller<f64> {
-    Controller::new(settings, samples, 0.0).unwrap()
+    let design = Design {
+        filter_samples: samples,
+        ..Design::new(settings)
+    };
+    Controller::new(design).unwrap()
 }
 
 fn pi(kp: f64, ti: f64) -> Settings<f64> {

@@ -1,6 +1,6 @@
 //! One thread's plants and memory: a controller's cost over all plants and references.
 
-use sewfast_control::{Controller, Settings};
+use sewfast_control::{Controller, Design, Settings};
 
 use super::cost::{Measure, Weights};
 use super::{Aggregate, Task};
@@ -23,7 +23,7 @@ pub(super) struct Bench<P> {
 
 impl<P: Plant + Clone> Bench<P> {
     pub(super) fn new(task: &Task<'_, P>) -> Result<Self> {
-        let Settings { u_min, u_max, .. } = task.start;
+        let Settings { u_min, u_max, .. } = task.start.pid;
         let weights = task.cost.weights(span(task.references), u_max - u_min)?;
         let longest = task.references.iter().map(|r| r.len()).max().unwrap_or(0);
         let measure = |r: &&[f64]| Measure::needed(r, &weights);
@@ -47,7 +47,10 @@ impl<P: Plant + Clone> Bench<P> {
         to_beat: f64,
         monitor: &Monitor,
     ) -> f64 {
-        let controller = Controller::new(*settings, task.filter_samples, task.filter_time);
+        let controller = Controller::new(Design {
+            pid: *settings,
+            ..task.start
+        });
         let Ok(mut controller) = controller else {
             return f64::INFINITY;
         };

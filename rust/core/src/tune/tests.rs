@@ -3,7 +3,7 @@
 use super::*;
 use crate::closed_loop::{LaggedPlant, Varied};
 use crate::linear::LinearModel;
-use sewfast_control::Standard;
+use sewfast_control::{Design, Standard};
 
 const TS: f64 = 1e-3;
 
@@ -46,9 +46,10 @@ fn with_task<T>(
         plants: &plants,
         references: &[&r],
         encoder: Some(Encoder::new(26.2, 0.5)),
-        start,
-        filter_samples: 8,
-        filter_time: 0.0,
+        start: Design {
+            filter_samples: 8,
+            ..Design::new(start)
+        },
         cost: Cost::default(),
         aggregate: Aggregate::Mean,
     })
@@ -104,7 +105,10 @@ fn gives_the_same_bits_at_any_number_of_threads() {
 fn is_never_worse_than_its_start_and_keeps_it_where_it_has_no_time() {
     with_task(start(), |task| {
         let tuned = tune(task, options(1, 1), &Monitor::default()).unwrap();
-        assert_eq!((tuned.settings, tuned.cost), (task.start, tuned.start_cost));
+        assert_eq!(
+            (tuned.settings, tuned.cost),
+            (task.start.pid, tuned.start_cost)
+        );
         let monitor = Monitor::default();
         monitor.request_stop();
         let stopped = tune(task, options(100, 1), &monitor);
@@ -188,7 +192,7 @@ fn the_worst_plant_costs_at_least_the_mean() {
                 ..task.clone()
             };
             let mut bench = Bench::new(&task).unwrap();
-            bench.cost(&task, &task.start, f64::INFINITY, &Monitor::default())
+            bench.cost(&task, &task.start.pid, f64::INFINITY, &Monitor::default())
         };
         let (mean, worst) = (cost(Aggregate::Mean), cost(Aggregate::Worst));
         let one = |plant: usize| {
@@ -197,7 +201,7 @@ fn the_worst_plant_costs_at_least_the_mean() {
                 ..task.clone()
             };
             let mut bench = Bench::new(&task).unwrap();
-            bench.cost(&task, &task.start, f64::INFINITY, &Monitor::default())
+            bench.cost(&task, &task.start.pid, f64::INFINITY, &Monitor::default())
         };
         let all = [one(0), one(1), one(2)];
         assert!((mean - all.iter().sum::<f64>() / 3.0).abs() < 1e-9 * mean);

@@ -111,15 +111,13 @@ fn tune<'py>(
         .map(|r| slice(r, "references"))
         .collect::<PyResult<_>>()?;
     let start = start.borrow();
-    let settings = *start.core.settings();
-    let varied = varied(&models, &variations, settings.ts).map_err(|e| raise(py, e))?;
+    let design = *start.core.design();
+    let varied = varied(&models, &variations, design.pid.ts).map_err(|e| raise(py, e))?;
     let task = Task {
         plants: &varied,
         references: &references,
         encoder: encoder(counts_per_unit, 0.5).map_err(|e| raise(py, e))?,
-        start: settings,
-        filter_samples: start.filter_samples,
-        filter_time: start.filter_time,
+        start: design,
         cost: self::cost(&cost).map_err(|e| raise(py, e))?,
         aggregate: self::aggregate(aggregate).map_err(|e| raise(py, e))?,
     };

@@ -4,7 +4,7 @@ use sewfast_control::link::{
     Body, Device, Header, Identity, Limits, MAX_WIRE, Measurement, Reason, Source, State,
 };
 use sewfast_control::link::{Channel as Streamed, Encoding, capability, encode};
-use sewfast_control::{Controller, Settings as Pid, Standard};
+use sewfast_control::{Controller, Design, Settings as Pid, Standard};
 use sewfast_core::machine::{Machine, Parameters};
 
 use super::super::{HostLoop, Outcome, Settings};
@@ -44,7 +44,7 @@ fn controller() -> Controller<f64> {
         tt: 0.0,
         ..Pid::new(gains, TS)
     };
-    Controller::new(settings, 1, 0.0).unwrap()
+    Controller::new(Design::new(settings)).unwrap()
 }
 
 fn reference() -> Vec<f64> {

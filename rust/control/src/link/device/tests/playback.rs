@@ -2,7 +2,7 @@
 
 use super::rig::*;
 use crate::link::{Fields, Reason, State};
-use crate::{Controller, Settings, Standard};
+use crate::{Controller, Design, Settings, Standard};
 use proptest::prelude::*;
 use std::vec;
 use std::vec::Vec;
@@ -76,7 +76,8 @@ proptest! {
             alpha: 0.4, beta: 0.2, n: 10.0, tt, u_min: -10.0, u_max: 8.0, slew: 2000.0,
             ..Settings::new(Standard { kp, ti, td }, 1e-3)
         };
-        let mut controller = Controller::<f32>::new(settings, filter.into(), 0.002).unwrap();
+        let design = Design { filter_samples: filter.into(), filter_time: 0.002, ..Design::new(settings) };
+        let mut controller = Controller::<f32>::new(design).unwrap();
         let mut expected = Vec::new();
         for (&reference, &count) in references.iter().zip(&moves) {
             rig.counts += count;

@@ -1,0 +1,384 @@
+//! The whole controller: what it was before, changes without a bump, constant cost.
+
+use super::*;
+use crate::real::counted::{Counted, operations};
+use crate::{Point, Schedule, Standard};
+use proptest::prelude::*;
+use std::vec::Vec;
+
+mod golden;
+
+const TS: f64 = 1e-3;
+
+fn pid(kp: f64, ti: f64, td: f64) -> Settings<f64> {
+    Settings::new(Standard { kp, ti, td }, TS)
+}
+
+fn point<T>(speed: T, kp: T, ti: T, td: T) -> Point<T> {
+    let gains = Standard { kp, ti, td };
+    Point { speed, gains }
+}
+
+/// Any design without limits.
+fn free() -> impl Strategy<Value = Design<f64>> {
+    let ti = || prop_oneof![0.05..10.0, Just(f64::INFINITY)];
+    let gains = (0.01..2.0, ti(), 0.0..0.05, -0.5..1.5, -0.5..1.5);
+    let n = prop_oneof![1.0..20.0, Just(f64::INFINITY)];
+    let filter = (1..12_usize, 0.0..0.01, prop_oneof![Just(0.0), 1e-3..0.02]);
+    let rate = prop_oneof![Just(f64::INFINITY), 1e2..1e5];
+    let points = prop_oneof![
+        Just(Schedule::NONE),
+        (0.01..2.0, ti(), 0.0..0.05, 0.01..2.0, ti(), 0.0..0.05).prop_map(|g| Schedule::new(&[
+            point(0.0, g.0, g.1, g.2),
+            point(50.0, g.3, g.4, g.5)
+        ])
+        .unwrap()),
+    ];
+    (gains, n, filter, rate, points).prop_map(|(g, n, filter, r_rate, schedule)| Design {
+        pid: Settings {
+            alpha: g.3,
+            beta: g.4,
+            n,
+            ..pid(g.0, g.1, g.2)
+        },
+        filter_samples: filter.0,
+        filter_time: filter.1,
+        observer_time: filter.2,
+        r_rate,
+        schedule,
+    })
+}
+
+/// The integral's own move in one sample, at most.
+fn creep(design: &Design<f64>, e: f64) -> f64 {
+    let all = design.schedule.points().iter().map(|p| p.gains);
+    let gains = all.chain([design.pid.gains]);
+    let largest = gains.map(|g| g.kp * TS / g.ti).fold(0.0, f64::max);
+    largest * e.abs()
+}
+
+proptest! {
+    #[test]
+    fn a_change_of_design_moves_nothing_at_once(
+        old in free(), new in free(), r in -40.0..40.0, y in -40.0..40.0, feedforward in -5.0..5.0,
+    ) {
+        let mut controller = Controller::new(old).unwrap();
+        controller.step_with(r, y / 2.0, feedforward);
+        let before = (0..20_000).map(|_| controller.step_with(r, y, feedforward)).last().unwrap();
+        controller.set_design(new).unwrap();
+        let after = controller.step_with(r, y, feedforward);
+        let scale = 1e-11 * (1.0 + before.abs() + 400.0);
+        prop_assert!((after - before).abs() <= creep(&new, r - y) * (1.0 + 1e-9) + scale, "{before} {after}");
+    }
+
+    #[test]
+    fn a_change_on_a_ramp_of_the_output_moves_nothing_at_once(
+        kp in 0.01..2.0, kp2 in 0.01..2.0_f64, td in 1e-3..0.05, td2 in 1e-3..0.05, n in 1.0..20.0, slope in -1.0..1.0_f64,
+    ) {
+        // Without integral action only the proportional term moves on a ramp, by Kp slope a sample.
+        let inf = f64::INFINITY;
+        let old = Design::new(Settings { n, ..pid(kp, inf, td) });
+        let new = Design::new(Settings { n, ..pid(kp2, inf, td2) });
+        let mut controller = Controller::new(old).unwrap();
+        let before = (0..5000).map(|k| controller.step(0.0, slope * f64::from(k))).last().unwrap();
+        controller.set_design(new).unwrap();
+        let after = controller.step(0.0, slope * 5000.0);
+        prop_assert!((after - before + kp2 * slope).abs() <= 1e-9 * (1.0 + before.abs()), "{before} {after}");
+    }
+
+    #[test]
+    fn the_same_design_again_changes_no_bit(
+        design in free(), signals in prop::collection::vec((-40.0..40.0, -40.0..40.0), 40), limit in 1.0..50.0_f64,
+    ) {
+        let pid = Settings { u_min: -limit, u_max: limit, slew: 1e4, ..design.pid };
+        let design = Design { pid, ..design };
+        let mut left = Controller::new(design).unwrap();
+        let mut touched = left.clone();
+        for (r, y) in signals {
+            prop_assert_eq!(left.step(r, y).to_bits(), touched.step(r, y).to_bits());
+            touched.set_design(design).unwrap();
+        }
+    }
+
+    #[test]
+    fn manual_hands_over_where_the_operator_was(
+        design in free(), r in -40.0..40.0, y in -40.0..40.0, manual in -12.0..12.0, feedforward in -5.0..5.0,
+    ) {
+        let pid = Settings { u_min: -10.0, u_max: 10.0, ..design.pid };
+        let design = Design { pid, ..design };
+        let mut controller = Controller::new(design).unwrap();
+        controller.step_with(r, y / 3.0, feedforward);
+        controller.set_manual(manual).unwrap();
+        let mut u = 0.0;
+        for _ in 0..20_000 {
+            u = controller.step_with(r, y, feedforward);
+            prop_assert_eq!(u, manual.clamp(-10.0, 10.0));
+        }
+        prop_assert!(controller.is_manual());
+        controller.set_automatic();
+        let after = controller.step_with(r, y, feedforward);
+        prop_assert!((after - u).abs() <= creep(&design, r - y) * (1.0 + 1e-9) + 1e-9, "{u} {after}");
+    }
+
+    #[test]
+    fn stays_within_its_limits_whatever_comes(
+        design in free(), other in free(),
+        signals in prop::collection::vec((prop::num::f64::ANY, prop::num::f64::ANY, prop::num::f64::ANY, 0..5), 40),
+    ) {
+        let limited = |d: Design<f64>| Design { pid: Settings { u_min: -3.0, u_max: 5.0, slew: 1e3, tt: 0.01, ..d.pid }, ..d };
+        let mut controller = Controller::new(limited(design)).unwrap();
+        let mut last = 0.0;
+        for (r, y, feedforward, what) in signals {
+            match what {
+                0 => controller.set_design(limited(other)).unwrap(),
+                1 => drop(controller.set_manual(feedforward)),
+                2 => controller.set_automatic(),
+                _ => {}
+            }
+            let u = controller.step_with(r, y, feedforward);
+            prop_assert!((-3.0..=5.0).contains(&u) && f64::abs(u - last) <= 1.0 + 1e-12);
+            last = u;
+        }
+    }
+
+    #[test]
+    fn equal_points_are_constant_gains_bit_for_bit(
+        design in free(), count in 1..=8_usize, spacing in 1.0..30.0,
+        signals in prop::collection::vec((-40.0..40.0, -40.0..40.0), 60),
+    ) {
+        let constant = Design { schedule: Schedule::NONE, ..design };
+        let gains = design.pid.gains;
+        let points: Vec<_> =
+            (0..count).map(|i| Point { speed: spacing * i as f64, gains }).collect();
+        let scheduled = Design { schedule: Schedule::new(&points).unwrap(), ..design };
+        let (mut a, mut b) = (Controller::new(constant).unwrap(), Controller::new(scheduled).unwrap());
+        for (r, y) in signals {
+            prop_assert_eq!(a.step(r, y).to_bits(), b.step(r, y).to_bits());
+        }
+    }
+
+    #[test]
+    fn feedforward_is_added_before_the_limits(
+        design in free(), signals in prop::collection::vec((-40.0..40.0, -40.0..40.0, -20.0..20.0), 40),
+    ) {
+        let mut with = Controller::new(design).unwrap();
+        let mut without = with.clone();
+        for (r, y, feedforward) in signals {
+            let (u, base) = (with.step_with(r, y, feedforward), without.step(r, y));
+            prop_assert!((u - base - feedforward).abs() <= 1e-9 * (1.0 + u.abs() + base.abs()));
+        }
+    }
+}
+
+#[test]
+fn feeds_back_the_filtered_output_and_skips_a_lost_measurement() {
+    let design = Design {
+        filter_samples: 2,
+        ..Design::new(pid(1.0, f64::INFINITY, 0.0))
+    };
+    let mut controller = Controller::new(design).unwrap();
+    assert_eq!(controller.step(0.0, 4.0), -4.0);
+    assert_eq!(controller.step(0.0, 0.0), -2.0);
+    assert_eq!(controller.filtered(), 2.0);
+    assert_eq!(controller.step(0.0, f64::NAN), -2.0);
+    assert_eq!(controller.step(0.0, 0.0), 0.0);
+}
+
+#[test]
+fn anti_windup_sees_the_feedforward() {
+    // The sum is limited, so the integral must not go on; without feedforward it may.
+    let design = Design::new(Settings {
+        u_min: -1.0,
+        u_max: 1.0,
+        ..pid(0.1, 0.1, 0.0)
+    });
+    let mut controller = Controller::new(design).unwrap();
+    for _ in 0..1000 {
+        assert_eq!(controller.step_with(1.0, 0.0, 2.0), 1.0);
+    }
+    let u = controller.step(1.0, 0.0);
+    assert!((u - 0.1 - 0.001).abs() < 1e-12, "{u}");
+}
+
+#[test]
+fn the_reference_ramps_from_the_first_output() {
+    let design = Design {
+        r_rate: 1000.0,
+        ..Design::new(pid(1.0, f64::INFINITY, 0.0))
+    };
+    let mut controller = Controller::new(design).unwrap();
+    for _ in 0..2 {
+        let u: Vec<f64> = (0..3).map(|_| controller.step(100.0, 50.0)).collect();
+        assert_eq!(u, [1.0, 2.0, 3.0]);
+        controller.reset();
+    }
+}
+
+#[test]
+fn manual_works_without_a_measurement_and_is_slewed() {
+    let design = Design::new(Settings {
+        u_max: 2.0,
+        slew: 500.0,
+        ..pid(1.0, 1.0, 0.0)
+    });
+    let mut controller = Controller::new(design).unwrap();
+    controller.step(1.0, 1.0);
+    controller.set_manual(5.0).unwrap();
+    let lost: Vec<f64> = (0..5).map(|_| controller.step(1.0, f64::NAN)).collect();
+    assert_eq!(lost, [0.5, 1.0, 1.5, 2.0, 2.0]);
+    controller.set_automatic();
+    assert_eq!(controller.step(1.0, 1.0), 2.0);
+    assert_eq!(controller.set_manual(f64::NAN).unwrap_err().name, "manual");
+    controller.set_manual(1.0).unwrap();
+    controller.reset();
+    assert!(!controller.is_manual());
+}
+
+#[test]
+fn a_change_that_is_refused_changes_nothing() {
+    let design = Design::new(pid(1.0, 1.0, 0.0));
+    let mut controller = Controller::new(design).unwrap();
+    let slower = Settings {
+        ts: 2e-3,
+        ..design.pid
+    };
+    assert_eq!(
+        controller.set_design(Design::new(slower)).unwrap_err().name,
+        "Ts"
+    );
+    let bad = Design {
+        observer_time: -1.0,
+        ..design
+    };
+    assert_eq!(
+        controller.set_design(bad).unwrap_err().name,
+        "observer_time"
+    );
+    assert_eq!(controller.design(), &design);
+}
+
+#[test]
+fn refuses_what_its_parts_refuse() {
+    let good = Design::new(pid(1.0, 1.0, 0.0));
+    let refused = |design| Controller::<f64>::new(design).unwrap_err().name;
+    let r_rate = 0.0;
+    assert_eq!(refused(Design { r_rate, ..good }), "r_rate");
+    let filter_samples = 65;
+    assert_eq!(
+        refused(Design {
+            filter_samples,
+            ..good
+        }),
+        "filter_samples"
+    );
+    let filter_time = f64::NAN;
+    assert_eq!(
+        refused(Design {
+            filter_time,
+            ..good
+        }),
+        "filter_time"
+    );
+    let observer_time = f64::INFINITY;
+    assert_eq!(
+        refused(Design {
+            observer_time,
+            ..good
+        }),
+        "observer_time"
+    );
+}
+
+/// Everything on.
+fn whole() -> Design<Counted> {
+    let c = Counted;
+    let gains = |kp| Standard {
+        kp: c(kp),
+        ti: c(0.2),
+        td: c(0.004),
+    };
+    let points: Vec<_> = (0..8)
+        .map(|i| Point {
+            speed: c(300.0 * f64::from(i)),
+            gains: gains(0.01 + 0.002 * f64::from(i)),
+        })
+        .collect();
+    Design {
+        pid: Settings {
+            alpha: c(0.4),
+            beta: c(0.2),
+            n: c(8.0),
+            tt: c(0.05),
+            u_min: c(-10.0),
+            u_max: c(10.0),
+            slew: c(2000.0),
+            ..Settings::new(gains(0.02), c(1e-3))
+        },
+        filter_samples: 8,
+        filter_time: c(0.002),
+        observer_time: c(0.004),
+        r_rate: c(5000.0),
+        schedule: Schedule::new(&points).unwrap(),
+    }
+}
+
+/// Operations of each step over inputs of every kind.
+fn costs(design: Design<Counted>, manual: bool) -> (Vec<u64>, Vec<u64>) {
+    let mut controller = Controller::new(design).unwrap();
+    let (mut taken, mut skipped) = (Vec::new(), Vec::new());
+    let values = [
+        0.0,
+        -0.0,
+        1e-300,
+        3.0,
+        -5e3,
+        1e9,
+        -1e300,
+        f64::INFINITY,
+        f64::NAN,
+    ];
+    for round in 0..60_usize {
+        if manual && round == 20 {
+            controller.set_manual(Counted(7.0)).unwrap();
+        }
+        for (i, &r) in values.iter().enumerate() {
+            for &y in &values[..] {
+                let y = if round % 2 == 0 {
+                    y
+                } else {
+                    y.clamp(-1e3, 2e3)
+                };
+                let feedforward = values[(i + round) % values.len()];
+                let [r, y, feedforward] = [r, y, feedforward].map(Counted);
+                let count = operations(|| {
+                    controller.step_with(r, y, feedforward);
+                });
+                let finite = [r, y, feedforward].iter().all(|x| x.0.abs() < 1e10);
+                if finite { &mut taken } else { &mut skipped }.push(count);
+            }
+        }
+    }
+    (taken, skipped)
+}
+
+#[test]
+fn a_step_costs_the_same_whatever_comes() {
+    let constant = Design {
+        schedule: Schedule::NONE,
+        ..whole()
+    };
+    let plain = Design::new(Settings {
+        tt: Counted(0.0),
+        ..whole().pid
+    });
+    for (design, most) in [(whole(), 150), (constant, 120), (plain, 90)] {
+        for manual in [false, true] {
+            let (taken, skipped) = costs(design, manual);
+            let first = taken[0];
+            assert!(first <= most, "{first}");
+            let (least, dearest) = (taken.iter().min(), taken.iter().max());
+            assert_eq!((least, dearest), (Some(&first), Some(&first)));
+            assert!(skipped.iter().max() <= Some(&first));
+        }
+    }
+}

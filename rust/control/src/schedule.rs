@@ -1,0 +1,186 @@
+//! Gains over speed: the points as they are given, the rows as they are used.
+
+use crate::pid::Terms;
+use crate::{Real, Refused, Settings, Standard};
+
+/// The most points of a schedule.
+pub const POINTS: usize = 8;
+
+/// Gains at one speed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Point<T> {
+    /// Size of the filtered output \[y\], 0 or more.
+    pub speed: T,
+    /// The gains there, in standard form.
+    pub gains: Standard<T>,
+}
+
+/// Up to [`POINTS`] points with growing speeds; empty for constant gains.
+///
+/// ```
+/// use sewfast_control::{Point, Schedule, Standard};
+///
+/// let slow = Point { speed: 300.0, gains: Standard { kp: 0.01, ti: 0.3, td: 0.0 } };
+/// let fast = Point { speed: 2000.0, gains: Standard { kp: 0.02, ti: 0.2, td: 0.0 } };
+/// assert_eq!(Schedule::new(&[slow, fast])?.points(), [slow, fast]);
+/// assert!(Schedule::new(&[fast, slow]).is_err());
+/// # Ok::<(), sewfast_control::Refused>(())
+/// ```
+#[derive(Clone, Copy, Debug)]
+pub struct Schedule<T> {
+    points: [Point<T>; POINTS],
+    length: usize,
+}
+
+impl<T: Real> Schedule<T> {
+    /// No points: constant gains.
+    pub const NONE: Self = Self {
+        points: [Point {
+            speed: T::ZERO,
+            gains: Standard {
+                kp: T::ZERO,
+                ti: T::INFINITY,
+                td: T::ZERO,
+            },
+        }; POINTS],
+        length: 0,
+    };
+
+    /// A schedule through these points.
+    ///
+    /// # Errors
+    /// More than [`POINTS`] points, speeds that are not finite, below 0 or do not grow, gains that make no sense, gains
+    /// `Kp` of both signs.
+    pub fn new(points: &[Point<T>]) -> Result<Self, Refused> {
+        let mut schedule = Self::NONE;
+        let refuse = |holds, expected, received: T| {
+            Refused::unless(holds, "schedule", expected, received.to_f64())
+        };
+        let room = schedule.points.get_mut(..points.len());
+        let Some(room) = room else {
+            let count = T::from_count(points.len());
+            refuse(false, "at most 8 points", count)?;
+            return Ok(schedule);
+        };
+        room.copy_from_slice(points);
+        let (mut last, mut positive, mut negative) = (None, false, false);
+        for &Point { speed, gains } in points {
+            refuse(
+                speed >= T::ZERO && speed.is_finite(),
+                "finite speeds of 0 or more",
+                speed,
+            )?;
+            let grows = |last| speed > last && (T::ONE / (speed - last)).is_finite();
+            refuse(last.is_none_or(grows), "growing speeds", speed)?;
+            gains.checked().map_err(|refused| Refused {
+                name: "schedule",
+                expected: expected_in_point(refused.name),
+                received: refused.received,
+            })?;
+            positive |= gains.kp > T::ZERO;
+            negative |= gains.kp < T::ZERO;
+            refuse(
+                !(positive && negative),
+                "Kp of one sign in all points",
+                gains.kp,
+            )?;
+            last = Some(speed);
+        }
+        schedule.length = points.len();
+        Ok(schedule)
+    }
+
+    /// The points, by growing speed.
+    pub fn points(&self) -> &[Point<T>] {
+        self.points.get(..self.length).unwrap_or_default()
+    }
+
+    /// Whether the gains are constant.
+    pub fn is_empty(&self) -> bool {
+        self.length == 0
+    }
+}
+
+impl<T: PartialEq> PartialEq for Schedule<T> {
+    fn eq(&self, other: &Self) -> bool {
+        self.points.get(..self.length) == other.points.get(..other.length)
+    }
+}
+
+fn expected_in_point(name: &str) -> &'static str {
+    match name {
+        "Kp" => "a finite Kp in every point",
+        "Ti" => "a Ti above 0 s, or inf, in every point",
+        _ => "a finite Td of 0 s or more in every point",
+    }
+}
+
+/// A point in the form that is interpolated, and the way to the next one.
+#[derive(Clone, Copy, Debug)]
+struct Row<T> {
+    speed: T,
+    kp: T,
+    /// `Kp Ts/Ti`.
+    ki: T,
+    td: T,
+    /// One over the distance to the next point; 0 after the last.
+    inverse: T,
+}
+
+/// A schedule as the step uses it: one row more than points, the last one repeated, so that every look-up takes the same
+/// number of steps.
+#[derive(Clone, Debug)]
+pub(crate) struct Table<T> {
+    rows: [Row<T>; POINTS + 1],
+    n: T,
+    ts: T,
+}
+
+impl<T: Real> Table<T> {
+    /// `None` for an empty schedule.
+    pub(crate) fn new(schedule: &Schedule<T>, settings: &Settings<T>) -> Option<Self> {
+        let Settings { n, ts, .. } = *settings;
+        let row = |point: &Point<T>, inverse| Row {
+            speed: point.speed,
+            kp: point.gains.kp,
+            ki: point.gains.kp * ts / point.gains.ti,
+            td: point.gains.td,
+            inverse,
+        };
+        let mut rows = [row(schedule.points().last()?, T::ZERO); POINTS + 1];
+        for (place, pair) in rows.iter_mut().zip(schedule.points().windows(2)) {
+            if let [this, next] = pair {
+                *place = row(this, T::ONE / (next.speed - this.speed));
+            }
+        }
+        Some(Self { rows, n, ts })
+    }
+
+    /// The gains where the filtered output is `y`.
+    ///
+    /// `Kp`, `Kp/Ti` and `Kp Td` are linear between points. `Td` itself, of which the derivative's filter is a share, is then
+    /// the mean of both ends' with their `Kp` as weights; written so, equal points give their gains to the last bit.
+    pub(crate) fn at(&self, y: T) -> Terms<T> {
+        let negated = -y;
+        let size = if y < T::ZERO { negated } else { y };
+        let [first, ..] = self.rows;
+        let (mut low, mut high) = (first, first);
+        for pair in self.rows.windows(2) {
+            if let [this, next] = pair
+                && size >= this.speed
+            {
+                (low, high) = (*this, *next);
+            }
+        }
+        let share = ((size - low.speed) * low.inverse).limit(T::ZERO, T::ONE);
+        let between = |low: T, high: T| low + share * (high - low);
+        let kp = between(low.kp, high.kp);
+        let weight = share * high.kp / kp;
+        let weight = if kp == T::ZERO { T::ZERO } else { weight };
+        let td = low.td + weight * (high.td - low.td);
+        Terms::new(kp, between(low.ki, high.ki), td, self.n, self.ts)
+    }
+}
+
+#[cfg(test)]
+mod tests;
