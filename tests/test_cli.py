@@ -55,6 +55,7 @@ def header_and_rows(path: Path) -> tuple[list[str], list[list[str]]]:
 
 COMMANDS = [
     "demo",
+    "commission",
     "record",
     "signals",
     "orders",

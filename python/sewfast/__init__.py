@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from . import signals, trust
     from ._core import __version__
+    from .commissioning import Commissioning, commission
     from .control import (
         Controller,
         Gains,
@@ -46,6 +47,7 @@ __all__ = [
     "ARX",
     "IV",
     "ClosedLoopRun",
+    "Commissioning",
     "Controller",
     "Cost",
     "DataError",
@@ -73,6 +75,7 @@ __all__ = [
     "VirtualMachine",
     "__version__",
     "check",
+    "commission",
     "delay",
     "fit_fopdt",
     "identify",
@@ -97,6 +100,7 @@ __all__ = [
 # names are loaded when first used, so that `import sewfast` and `sewfast --help` cost nothing
 _HOMES = {
     "_core": "__version__",
+    "commissioning": "Commissioning commission",
     "control": "Controller Gains fit_fopdt load_controller paper_controller table_1",
     "cost": "Cost",
     "dataset": "Dataset Experiment",

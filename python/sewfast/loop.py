@@ -241,7 +241,7 @@ def _run_on(
     from .link.play import Played, Stopped, play
 
     def made(played: Played) -> ClosedLoopRun:
-        return _of_drive(played.columns, drive, controller, r, name)
+        return run_of_drive(played.columns, drive, controller, r, name)
 
     plan = Plan("controller", r, controller)
     try:
@@ -250,7 +250,7 @@ def _run_on(
         raise stopped.as_error(made) from stopped.cause
 
 
-def _of_drive(
+def run_of_drive(
     columns: Mapping[str, FloatArray],
     drive: Drive,
     controller: Controller,

@@ -231,7 +231,7 @@ def _record_on(
     from .link.play import Played, Stopped, play
 
     def recording(played: Played) -> Recording:
-        return _of_drive(played.columns, drive, name, method)
+        return recording_of_drive(played.columns, drive, name, method)
 
     try:
         plan = Plan("commands", command)
@@ -245,7 +245,7 @@ def _record_on(
         raise stopped.as_error(recording) from stopped.cause
 
 
-def _of_drive(
+def recording_of_drive(
     columns: Mapping[str, FloatArray], drive: Drive, name: str, method: Method
 ) -> Recording:
     """Counts from the first sample on; the speed as far as gaps let it be known."""

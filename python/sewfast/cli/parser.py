@@ -6,6 +6,7 @@ import argparse
 
 from . import (
     check,
+    commission,
     control,
     device,
     doctor,
@@ -63,6 +64,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     groups = (
         experiment,
+        commission,
         recording,
         files,
         look,

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from .. import jsonfile
-from . import artefacts, canvas, page
+from . import artefacts, canvas, commissioned, page
 
 __all__ = ["report"]
 
@@ -17,7 +17,8 @@ def report(folder: str | os.PathLike[str]) -> Path:
     Parameters
     ----------
     folder : path
-        What `sewfast demo --out DIR` left: see docs/ARCHITECTURE.md for its layout.
+        What `sewfast demo --out DIR` or `sewfast commission --out DIR` left: see
+        docs/ARCHITECTURE.md for the layouts.
 
     Returns
     -------
@@ -32,7 +33,10 @@ def report(folder: str | os.PathLike[str]) -> Path:
         Where matplotlib or Jinja2 is not installed.
     """
     canvas.require()
-    found = artefacts.load(folder)
     target = Path(folder) / "report.html"
-    jsonfile.replace(target, page.render(found))
+    if commissioned.is_commissioning(Path(folder)):
+        text = page.fill("commissioning.html", commissioned.context(Path(folder)))
+    else:
+        text = page.render(artefacts.load(folder))
+    jsonfile.replace(target, text)
     return target

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
@@ -21,6 +22,11 @@ from .tables import (
 
 def render(artefacts: Artefacts) -> str:
     """The report as one self-contained HTML document."""
+    return fill("page.html", _context(artefacts))
+
+
+def fill(template: str, context: Mapping[str, Any]) -> str:
+    """A template with values in it."""
     from jinja2 import Environment, FunctionLoader, StrictUndefined
 
     environment = Environment(
@@ -33,7 +39,7 @@ def render(artefacts: Artefacts) -> str:
     environment.filters.update(
         significant=significant, rpm=rpm, percent=percent, milliseconds=milliseconds
     )
-    return environment.get_template("page.html").render(_context(artefacts))
+    return environment.get_template(template).render(context)
 
 
 def _source(name: str) -> str:

@@ -1,0 +1,112 @@
+"""`sewfast commission`: from a machine at rest to a verified controller."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import Interrupted
+from .arguments import Commands, add_command, add_overwrite
+from .drive import add_drive, is_port, opened
+from .output import print_json
+from .progress import Progress
+
+if TYPE_CHECKING:
+    from ..commissioning import Commissioning
+
+TEXT = """\
+Do what an engineer does to a drive: find out which command moves it, record its step response,
+take first gains by rule, record a sweep and a closed loop under these, train an ensemble of
+networks, tune the gains on all of them, run them on the machine and report the prediction beside
+the measurement. It stops with a reason where the evidence is not good enough.
+
+The machine turns freely up to a quarter more than the top speed (--speed), again and again, each
+time from rest. DIR holds recordings, models, controllers, runs and report.html; Ctrl-C stops the
+motor and keeps what there is.
+"""
+
+EXAMPLES = """\
+examples:
+  sewfast commission --on virtual --out virtual
+  sewfast commission --on virtual:7 --out seven --speed 1500
+  sewfast commission --on /dev/ttyUSB0 --out machine --u-max 10 --speed 2000 \\
+      --limits volt=10,speed=3500,acceleration=30000,current=15
+"""
+
+
+def add(commands: Commands) -> None:
+    parser = add_command(
+        commands, "commission", command,
+        summary="from a machine at rest to a verified controller", text=TEXT, examples=EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument(
+        "--on", required=True, metavar="virtual[:SEED]|PORT", help="what to commission"
+    )
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder to fill")
+    parser.add_argument(
+        "--u-max", type=float, metavar="V", help="largest command to either side (the machine's)"
+    )
+    parser.add_argument(
+        "--speed", type=float, metavar="RPM",
+        help="top of the working range (the largest reference, else 2000)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--reference", action="append", metavar="NAME",
+        help="a named reference to tune for and to verify on (`sewfast signals`); may repeat",
+    )  # fmt: skip
+    parser.add_argument("--members", type=int, default=4, metavar="N", help="networks (4)")
+    parser.add_argument(
+        "--evaluations", type=int, default=600, metavar="N", help="controllers tried (600)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N",
+        help="of the random signals, the networks and the search (0)",
+    )  # fmt: skip
+    add_overwrite(parser)
+    add_drive(parser)
+
+
+def command(args: argparse.Namespace) -> int | None:
+    from ..commissioning import Refusal
+    from ..commissioning.folder import prepare, require_own
+
+    require_own(args.out, overwrite=args.overwrite)
+    prepare(args.out)
+    try:
+        found = _commissioned(args)
+    except Refusal as refusal:
+        if refusal.so_far is not None:
+            refusal.so_far.save(args.out, overwrite=True)
+        raise Refusal(f"{refusal}; what there is lies in {args.out}") from refusal
+    except Interrupted as stop:
+        place = stop.best.save(args.out, overwrite=True)
+        print(f"interrupted; the best so far is kept: {place}", file=sys.stderr)
+        return 130
+    page = found.save(args.out, overwrite=True)
+    if args.json:
+        print_json({"folder": str(args.out), **found.numbers()})
+    else:
+        print(f"{found}\nlook at {page}")
+    return None
+
+
+def _commissioned(args: argparse.Namespace) -> Commissioning:
+    from ..commissioning import commission
+    from ..machine import VirtualMachine
+
+    with Progress("commission") as progress:
+        options = {
+            "u_max": args.u_max,
+            "speed": args.speed,
+            "references": args.reference,
+            "members": args.members,
+            "evaluations": args.evaluations,
+            "seed": args.seed,
+            "progress": lambda done, total, stage: progress.say(stage),
+        }
+        if is_port(args.on):
+            with opened(args) as drive:
+                return commission(drive, **options)
+        return commission(VirtualMachine.from_name(args.on), **options)

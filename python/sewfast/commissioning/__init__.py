@@ -1,0 +1,17 @@
+"""Commissioning: from a machine at rest to a verified controller."""
+
+from .bench import Bench, Followed
+from .procedure import STAGES, commission
+from .refusal import Refusal
+from .result import Commissioning
+from .verification import Comparison
+
+__all__ = [
+    "STAGES",
+    "Bench",
+    "Commissioning",
+    "Comparison",
+    "Followed",
+    "Refusal",
+    "commission",
+]

@@ -1,0 +1,225 @@
+"""`Bench`: what is commissioned, as commissioning sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol, cast
+
+from ..control import Controller
+from ..dataset import FloatArray
+from ..errors import LinkError, SettingError
+from ..loop import ClosedLoopRun, run, run_of_drive
+from ..machine import VirtualMachine
+from ..recording import Recording, record, recording_of_drive
+
+if TYPE_CHECKING:
+    from ..link import Drive
+    from ..link.plan import Plan
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """A closed loop on a machine.
+
+    Attributes
+    ----------
+    run : ClosedLoopRun
+        With the true speed where the machine is a virtual one.
+    recording : Recording
+        The same with what its encoder saw: what may be learned from.
+    """
+
+    run: ClosedLoopRun
+    recording: Recording
+
+
+class Bench(Protocol):
+    """A machine that can be excited and run, each time from rest.
+
+    Anything with these members can be commissioned.
+    """
+
+    @property
+    def name(self) -> str:
+        """Of the machine."""
+
+    @property
+    def Ts(self) -> float:
+        """Sample time [s]."""
+
+    @property
+    def counts_per_rev(self) -> float:
+        """Encoder counts of one turn."""
+
+    @property
+    def volt(self) -> float:
+        """Largest command that it takes [V]."""
+
+    @property
+    def speed(self) -> float:
+        """Speed beyond which it stops by itself [RPM]; inf where there is none."""
+
+    def excite(self, u: FloatArray, name: str) -> Recording:
+        """Play commands [V]."""
+
+    def follow(self, controller: Controller, r: FloatArray, name: str) -> Followed:
+        """Run a controller along a reference [RPM]."""
+
+
+@dataclass(frozen=True)
+class MachineBench:
+    """A virtual machine of this process."""
+
+    machine: VirtualMachine
+    speed: float = float("inf")
+
+    @property
+    def name(self) -> str:
+        return self.machine.name
+
+    @property
+    def Ts(self) -> float:
+        return self.machine.Ts
+
+    @property
+    def counts_per_rev(self) -> float:
+        return self.machine.counts_per_rev
+
+    @property
+    def volt(self) -> float:
+        return self.machine.parameters["u_limit"]
+
+    def excite(self, u: FloatArray, name: str) -> Recording:
+        return record(self.machine, u, name=name)
+
+    def follow(self, controller: Controller, r: FloatArray, name: str) -> Followed:
+        # undisturbed, the machine does the same again and shows its counts
+        found = run(controller, self.machine, r, name=name)
+        return Followed(found, record(self.machine, found.u, name=name))
+
+
+@dataclass(frozen=True)
+class DriveBench:
+    """A drive behind a port, whose limits have been set."""
+
+    drive: Drive
+
+    @property
+    def name(self) -> str:
+        return self.drive.identity.name
+
+    @property
+    def Ts(self) -> float:
+        return self.drive.identity.Ts
+
+    @property
+    def counts_per_rev(self) -> float:
+        return self.drive.identity.counts_per_rev
+
+    @property
+    def volt(self) -> float:
+        return self.drive.limits().values[0]
+
+    @property
+    def speed(self) -> float:
+        return self.drive.limits().values[1]
+
+    def excite(self, u: FloatArray, name: str) -> Recording:
+        from ..link.plan import Plan
+
+        columns = self._whole(Plan("commands", u), name)
+        return recording_of_drive(columns, self.drive, name, "kalman")
+
+    def follow(self, controller: Controller, r: FloatArray, name: str) -> Followed:
+        from ..link.plan import Plan
+
+        columns = self._whole(Plan("controller", r, controller), name)
+        return Followed(
+            run_of_drive(columns, self.drive, controller, r, name),
+            recording_of_drive(columns, self.drive, name, "kalman"),
+        )
+
+    def _whole(self, plan: Plan, name: str) -> dict[str, FloatArray]:
+        """The columns of a run of which nothing is missing."""
+        from ..link.play import Stopped, play
+
+        try:
+            played = play(self.drive, plan, name=name)
+        except Stopped as stopped:
+            raise stopped.cause from None
+        if not played.outcome.is_complete:
+            raise LinkError(
+                f"{name}: expected every sample of the run, received: {played.outcome}; mend the "
+                "link (sewfast doctor PORT), then commission again"
+            )
+        return played.columns
+
+
+@dataclass(frozen=True)
+class NotedBench:
+    """A bench that tells `note` of every recording as it comes, so that a refusal has them."""
+
+    inner: Bench
+    note: Callable[[str, Recording], object]
+
+    @property
+    def name(self) -> str:
+        return self.inner.name
+
+    @property
+    def Ts(self) -> float:
+        return self.inner.Ts
+
+    @property
+    def counts_per_rev(self) -> float:
+        return self.inner.counts_per_rev
+
+    @property
+    def volt(self) -> float:
+        return self.inner.volt
+
+    @property
+    def speed(self) -> float:
+        return self.inner.speed
+
+    def excite(self, u: FloatArray, name: str) -> Recording:
+        recording = self.inner.excite(u, name)
+        self.note(name, recording)
+        return recording
+
+    def follow(self, controller: Controller, r: FloatArray, name: str) -> Followed:
+        found = self.inner.follow(controller, r, name)
+        self.note(name, found.recording)
+        return found
+
+
+@contextmanager
+def bench_of(on: object, u_max: float | None) -> Iterator[Bench]:
+    """The bench of a machine; a drive's volt limit is at most `u_max` as long as it lasts.
+
+    Raises
+    ------
+    SettingError
+        For anything else.
+    """
+    if isinstance(on, VirtualMachine):
+        yield MachineBench(on)
+    elif hasattr(on, "stream"):
+        drive = cast("Drive", on)
+        before = drive.limits().volt
+        if u_max is not None and u_max < before:
+            drive.set_limits(volt=u_max)
+        try:
+            yield DriveBench(drive)
+        finally:
+            if drive.limits().volt != before:
+                drive.set_limits(volt=before)
+    elif hasattr(on, "excite") and hasattr(on, "follow"):
+        yield cast(Bench, on)
+    else:
+        raise SettingError(
+            "expected a VirtualMachine, a Drive or a Bench to commission, got "
+            f"{type(on).__name__}; sewfast.VirtualMachine(), or connect to a drive"
+        )

@@ -1,0 +1,104 @@
+"""`Demands`: what a machine is commissioned for, and what commissioning may do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from ..dataset import FloatArray
+from ..errors import SettingError
+from ..gains import real, whole
+from .bench import Bench
+
+OVER = 1.25
+"""Training reaches this many times the top of the working range: the loop overshoots it."""
+
+
+@dataclass(frozen=True)
+class Demands:
+    """Limits, working range and effort.
+
+    Attributes
+    ----------
+    u_max : float
+        Largest command to either side [V].
+    speed : float
+        Top of the working range [RPM].
+    references : mapping of name to array, or None
+        What to verify on [RPM]; None for those of `references.standard`.
+    members, evaluations : int
+        Models in the ensemble; controllers that the search tries.
+    seed, threads : int
+    """
+
+    u_max: float
+    speed: float
+    references: Mapping[str, FloatArray] | None
+    members: int
+    evaluations: int
+    seed: int
+    threads: int
+
+    @property
+    def top(self) -> float:
+        """Largest speed that is planned [RPM]."""
+        return OVER * self.speed
+
+
+def demands(
+    bench: Bench,
+    *,
+    u_max: float | None,
+    speed: float | None,
+    references: Mapping[str, FloatArray] | None,
+    members: int,
+    evaluations: int,
+    seed: int,
+    threads: int,
+) -> Demands:
+    """The demands, checked against what the bench allows.
+
+    Raises
+    ------
+    SettingError
+    """
+    volt = bench.volt if u_max is None else real("u_max", u_max)
+    if not 0.0 < volt < math.inf:
+        raise SettingError(f"expected a u_max above 0 V, got {volt:g}; give the amplifier's limit")
+    if volt > bench.volt * (1.0 + 1e-6):
+        raise SettingError(
+            f"expected a u_max within the machine's limit of {bench.volt:g} V, got {volt:g}"
+        )
+    named = max((float(r.max()) for r in references.values()), default=0.0) if references else None
+    top = real("speed", speed if speed is not None else named if named is not None else 2000.0)
+    if not 0.0 < top < math.inf:
+        raise SettingError(f"expected a top speed above 0 RPM, got {top:g}")
+    if named is not None and named > top * (1.0 + 1e-9):
+        raise SettingError(
+            f"expected references up to the top speed of {top:g} RPM, got one up to {named:g}; "
+            "raise speed, or lower that reference"
+        )
+    if top * OVER > bench.speed:
+        raise SettingError(
+            f"expected a speed limit of the machine of {OVER:g} times the top speed, that is "
+            f"{OVER * top:g} RPM, as training goes beyond the working range; its limit is "
+            f"{bench.speed:g}: raise that limit, or lower speed"
+        )
+    return Demands(
+        volt,
+        top,
+        None if references is None else MappingProxyType(dict(references)),
+        _at_least(1, "members", members),
+        _at_least(1, "evaluations", evaluations),
+        whole("seed", seed),
+        _at_least(1, "threads", threads),
+    )
+
+
+def _at_least(least: int, name: str, value: int) -> int:
+    number = whole(name, value)
+    if number < least:
+        raise SettingError(f"expected {name} of {least} or more, got {number}")
+    return number

@@ -1,0 +1,94 @@
+"""Signals for a machine that is known as a first order with dead time only."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .. import _core
+from ..control import Fopdt
+from ..dataset import FloatArray
+from .demands import Demands
+
+SWEEP = (0.025, 0.75)
+"""Of the chirp, from and to, times the time constant [cycles]."""
+CHIRP = 48.0
+"""Length of the chirp in time constants."""
+LONGEST = 60.0
+"""Of any excitation [s]."""
+SLOW = 0.15
+"""Speed between the trapezoids in shares of the top: a shaft that friction holds tells nothing."""
+TRAPEZOIDS = (
+    (0.45, 0.12, 0.12),
+    (0.90, 0.40, 0.25),
+    (0.25, 0.60, 0.60),
+    (1.00, 0.20, 0.35),
+    (0.65, 0.60, 0.40),
+    (0.30, 0.06, 0.30),
+    (0.80, 0.25, 0.15),
+)
+"""Height in shares of the top, accelerations up and down in shares of what the limit allows."""
+
+
+def acceleration(fopdt: Fopdt, demands: Demands) -> float:
+    """What the largest command gives at rest [RPM/s]."""
+    return fopdt.K * demands.u_max / fopdt.T
+
+
+def step(u: float, seconds: float, Ts: float) -> FloatArray:
+    """From 0 to `u` after a tenth."""
+    return _core.step(duration=seconds, Ts=Ts, at=0.1 * seconds, low=0.0, high=u)
+
+
+def chirp(fopdt: Fopdt, demands: Demands, Ts: float) -> FloatArray:
+    """A sweep whose amplitude grows, always forward: the paper's training record to scale [V]."""
+    largest = min((demands.top - fopdt.offset) / fopdt.K, demands.u_max)
+    low, high = (cycles / fopdt.T for cycles in SWEEP)
+    return _core.chirp(
+        duration=min(CHIRP * fopdt.T, LONGEST),
+        Ts=Ts,
+        f_start=low,
+        f_end=min(high, 0.05 / Ts),
+        amplitude_start=0.05 * largest,
+        amplitude_end=0.46 * largest,
+        offset_start=0.1 * largest,
+        offset_end=0.52 * largest,
+    )
+
+
+def trapezoids(fopdt: Fopdt, demands: Demands, Ts: float) -> FloatArray:
+    """A reference over the working range, edges from gentle to steep [RPM]."""
+    top, fastest = demands.top, acceleration(fopdt, demands)
+    hold = 1.5 * fopdt.T
+    slow = SLOW * top
+    parts = [np.linspace(0.0, slow, max(2, round(0.4 * fopdt.T / Ts)))]
+    for height, up, down in TRAPEZOIDS:
+        rise, fall = ((height * top - slow) / (share * fastest) for share in (up, down))
+        parts.append(
+            _core.trapezoid(
+                duration=rise + fall + 2.4 * hold,
+                Ts=Ts,
+                start=0.4 * hold,
+                rise=max(rise, Ts),
+                hold=hold,
+                fall=max(fall, Ts),
+                low=slow,
+                high=height * top,
+            )
+        )
+    return np.concatenate(parts)
+
+
+def levels(fopdt: Fopdt, demands: Demands, Ts: float, seed: int) -> FloatArray:
+    """A reference of random levels over the working range, to judge models by [RPM]."""
+    T = fopdt.T
+    return _core.random_steps(
+        duration=min(20.0 * T, LONGEST),
+        Ts=Ts,
+        low=0.1 * demands.speed,
+        high=demands.speed,
+        hold_min=T,
+        hold_max=3.0 * T,
+        smoothing=max(0.8 * T, 4.0 * demands.speed / acceleration(fopdt, demands)),
+        seed=seed,
+        start=0.0,
+    )

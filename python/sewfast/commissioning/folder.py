@@ -1,0 +1,110 @@
+"""The folder of a commissioning: every artefact written whole, `commissioning.json` last."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .. import __version__, jsonfile
+from ..errors import DataError, SettingError
+from ..report.commissioned import FORMAT, NUMBERS, VERSION, run_file
+from ..writers import write_table
+from .numbers import numbers
+
+if TYPE_CHECKING:
+    from .result import Commissioning
+
+_FOLDERS = ("recordings", "models", "controllers", "runs")
+
+
+def require_own(folder: Path, *, overwrite: bool) -> None:
+    """Refuse a folder whose files would be lost and are of no commissioning of a virtual machine.
+
+    Raises
+    ------
+    SettingError
+    """
+    if overwrite or _may_be_replaced(folder):
+        return
+    for name in (*_FOLDERS, NUMBERS, "results.json", "report.html"):
+        place = folder / name
+        if place.is_file() or (place.is_dir() and any(place.iterdir())):
+            raise SettingError(
+                f"{place}: expected a folder without such files, or one of a virtual machine's "
+                "commissioning, which can be repeated; choose another folder, or overwrite them "
+                "(--overwrite)"
+            )
+
+
+def _may_be_replaced(folder: Path) -> bool:
+    try:
+        found = json.loads((folder / NUMBERS).read_bytes())
+    except (OSError, ValueError):
+        return False
+    return (
+        isinstance(found, dict)
+        and found.get("format") == FORMAT
+        and str(found.get("machine", "")).startswith("virtual")
+    )
+
+
+def prepare(folder: Path) -> None:
+    """Make the folder, so that one that cannot be made is refused before the machine moves.
+
+    Raises
+    ------
+    DataError
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be made ({error.strerror}); choose a folder that is writable"
+        ) from error
+
+
+def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
+    """Put the artefacts in place of those of an earlier commissioning; then the page.
+
+    Without `commissioning.json` a folder is refused by the report: an interruption in between
+    leaves no mixture that looks whole.
+    """
+    require_own(folder, overwrite=overwrite)
+    prepare(folder)
+    for name in (NUMBERS, "report.html"):
+        (folder / name).unlink(missing_ok=True)
+    for name in _FOLDERS:
+        place = folder / name
+        place.mkdir(exist_ok=True)
+        # artefacts of an earlier one that this one has not would pass for its own
+        for old in place.iterdir():
+            if old.suffix in (".csv", ".json", ".npz"):
+                old.unlink()
+    _artefacts(found, folder)
+    jsonfile.write(folder / NUMBERS, FORMAT, VERSION, {"sewfast": __version__, **numbers(found)})
+    return _page(folder)
+
+
+def _artefacts(found: Commissioning, folder: Path) -> None:
+    for name, recording in found.recordings.items():
+        recording.save(folder / "recordings" / f"{name}.csv")
+    if found.models is not None:
+        found.models.save(folder / "models" / "ensemble.json")
+    for name, controller in (("first", found.first), ("tuned", found.controller)):
+        if controller is not None:
+            controller.save(folder / "controllers" / f"{name}.json")
+    for c in found.comparisons:
+        for kind, loop in (("predicted", c.predicted), ("measured", c.measured)):
+            if loop is not None:
+                write_table(folder / run_file(c.reference, kind), loop.columns())
+
+
+def _page(folder: Path) -> Path:
+    from ..report import report
+
+    try:
+        return report(folder)
+    except SettingError:
+        # the page is an extra; `sewfast report DIR` writes it once its packages are there
+        return folder / NUMBERS

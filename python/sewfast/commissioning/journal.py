@@ -1,0 +1,77 @@
+"""`Journal`: what has come of a commissioning so far, stage by stage."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+from ..recording import Recording
+from .result import Commissioning
+
+Progress: TypeAlias = Callable[[int, int, str], object]
+"""Called with stages done, stages in all, and what comes now."""
+
+STAGES = (
+    "first motion",
+    "step response",
+    "open loop",
+    "closed loop",
+    "training",
+    "tuning",
+    "verification",
+)
+
+
+class Journal:
+    """Collects results; a `Commissioning` can be had at any time.
+
+    Parameters
+    ----------
+    machine : str
+    progress : callable or None
+    """
+
+    def __init__(self, machine: str, progress: Progress | None) -> None:
+        self._progress = progress
+        self._began: list[tuple[str, float]] = []
+        self._values: dict[str, Any] = {"machine": machine, "recordings": {}}
+
+    @property
+    def stage(self) -> str:
+        """The one that is on."""
+        return self._began[-1][0] if self._began else STAGES[0]
+
+    def enter(self, stage: str) -> None:
+        """Begin a stage."""
+        self._tell(STAGES.index(stage), stage)
+        self._began.append((stage, time.perf_counter()))
+
+    def within(self, done: int, total: int) -> None:
+        """Tell how far the stage is."""
+        self._tell(STAGES.index(self.stage), f"{self.stage} {done}/{total}")
+
+    def finish(self) -> None:
+        """All stages are through."""
+        self._tell(len(STAGES), "done")
+
+    def _tell(self, done: int, text: str) -> None:
+        if self._progress is not None:
+            self._progress(done, len(STAGES), text)
+
+    def keep(self, **values: Any) -> None:
+        """Results."""
+        self._values |= values
+
+    def note(self, name: str, recording: Recording) -> None:
+        """A recording, but for those of the verification, which are runs."""
+        if self.stage != STAGES[-1]:
+            self._values["recordings"] = {**self._values["recordings"], name: recording}
+
+    def result(self, verdict: str, reason: str = "") -> Commissioning:
+        """What there is."""
+        ends = [t for _, t in self._began[1:]] + [time.perf_counter()]
+        seconds = {s: end - t for (s, t), end in zip(self._began, ends, strict=True)}
+        return Commissioning(
+            **self._values, verdict=verdict, stage=self.stage, reason=reason, seconds=seconds
+        )

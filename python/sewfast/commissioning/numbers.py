@@ -1,0 +1,74 @@
+"""The numbers of a commissioning as JSON values."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from ..control import Controller
+from ..loop import ClosedLoopRun
+from .verification import Comparison
+
+if TYPE_CHECKING:
+    from .result import Commissioning
+
+_FOPDT = ("K", "T", "L", "offset", "u_low", "u_high", "fit_percent")
+
+
+def numbers(c: Commissioning) -> dict[str, Any]:
+    """`commissioning.json`; null where there is nothing yet."""
+    return {
+        "machine": c.machine,
+        "verdict": c.verdict,
+        "stage": c.stage,
+        "reason": c.reason,
+        "seconds": dict(c.seconds),
+        "recordings": {name: len(r) * r.Ts for name, r in c.recordings.items()},
+        "motion": None if c.motion is None else dict(vars(c.motion)),
+        "fopdt": None if c.fopdt is None else {n: getattr(c.fopdt, n) for n in _FOPDT},
+        "models": {"members": 0 if c.models is None else len(c.models.members)}
+        | {"levels_rmse_rpm": list(c.rmse)},
+        "controllers": {
+            name: _gains(controller)
+            for name, controller in (("first", c.first), ("tuned", c.controller))
+            if controller is not None
+        },
+        "tuning": None
+        if c.tuning is None
+        else {
+            "evaluations": c.tuning.evaluations,
+            "cost": c.tuning.cost,
+            "start_cost": c.tuning.start_cost,
+            "termination": c.tuning.termination,
+        },
+        "cost": None if c.cost is None else dict(vars(c.cost)),
+        "predicted_cost": c.predicted_cost,
+        "measured_cost": c.measured_cost,
+        "references": {x.reference: _comparison(x) for x in c.comparisons},
+    }
+
+
+def _gains(controller: Controller) -> dict[str, Any]:
+    """As in its file, in standard form, infinity as null."""
+    return {**controller.to_dict(), "gains": controller.gains.to("standard").to_dict()}
+
+
+def _comparison(c: Comparison) -> dict[str, Any]:
+    return {
+        "predicted": _run(c.predicted),
+        "measured": None if c.measured is None else _run(c.measured),
+        "apart_rmse_rpm": c.apart,
+        "disagreement_rmse_rpm": c.disagreement,
+    }
+
+
+def _run(found: ClosedLoopRun) -> dict[str, float | None]:
+    told = found.metrics()
+    return {
+        "rmse_rpm": told["rmse"],
+        "max_abs_rpm": told["max_abs"],
+        "rise_time_ms": told["rise_time_ms"],
+        "overshoot_percent": told["overshoot_percent"],
+        "effort_v": told["u_rms"],
+        "chatter_v": told["du_rms"],
+        "saturated": told["saturated"],
+    }

@@ -1,0 +1,201 @@
+"""`commission`: what an engineer does to a drive, one stage after the other."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import ArrayLike
+
+from .. import signals
+from ..control import Controller, vector
+from ..cost import Cost
+from ..dataset import FloatArray
+from ..errors import Interrupted, SettingError
+from ..machine import VirtualMachine
+from . import excitations
+from .bench import Bench, NotedBench, bench_of
+from .demands import Demands, demands
+from .first_order import step_response
+from .gains import cost_of, first_gains, search
+from .journal import STAGES, Journal, Progress
+from .motion import first_motion
+from .references import standard
+from .refusal import Refusal
+from .result import Commissioning
+from .training import train
+from .verification import measure, predict, require_alike, require_unsaturated
+
+if TYPE_CHECKING:
+    from ..link import Drive
+
+__all__ = ["STAGES", "commission"]
+
+MEMBERS = 4
+EVALUATIONS = 600
+
+References = Mapping[str, ArrayLike] | Sequence[str]
+
+
+def commission(
+    on: VirtualMachine | Drive | Bench,
+    *,
+    u_max: float | None = None,
+    speed: float | None = None,
+    references: References | None = None,
+    cost: Cost | None = None,
+    members: int = MEMBERS,
+    evaluations: int = EVALUATIONS,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Commissioning:
+    """From a machine at rest to a controller that was verified on it.
+
+    First motion, step response, first gains by rule, an open-loop sweep, a closed loop under the
+    first gains, an ensemble of networks from both, gains by search on all members with encoder,
+    feedback filter, gain spread and delay in the loop, and the machine under these beside what was
+    predicted. Every stage begins and ends at rest, and stops with a reason where the evidence is
+    not good enough (docs/commissioning.md).
+
+    Parameters
+    ----------
+    on : VirtualMachine, Drive or Bench
+        The machine; of a drive the limits must have been set. It turns forward only, but for what
+        a controller does at the end of a reference.
+    u_max : float, optional
+        Largest command to either side [V]; the machine's own limit by default.
+    speed : float, optional
+        Top of the working range [RPM]: the largest reference, or 2,000. A quarter more is planned.
+    references : mapping of name to array, or sequence of names, optional
+        What to tune for and to verify on [RPM] at the machine's sample time; names are those of
+        `sewfast.signals`. By default `sewfast.commissioning.references.standard`, of which shorter
+        ones are tuned on.
+    cost : Cost, optional
+        What counts how much; by default 1 per RPM of tracking error, 5 per volt of chatter and 3
+        per percent of overshoot beyond 1, to the scale of speed and u_max.
+    members : int
+        Networks in the ensemble.
+    evaluations : int
+        Controllers that the search tries.
+    seed : int
+        Of the random signals, the networks' starts and the search.
+    threads : int, optional
+        All processors by default.
+    progress : callable(done, total, stage), optional
+        Called as each stage begins, within long ones, and at the end.
+
+    Returns
+    -------
+    Commissioning
+        Its `verdict` is ``verified``.
+
+    Raises
+    ------
+    Refusal
+        Where the evidence is not good enough; `so_far` holds it.
+    SettingError
+        For demands that contradict the machine's limits, before anything moves.
+    LinkError
+        Where port or drive failed or tripped; the motor is stopped.
+    Interrupted
+        On Ctrl-C; the motor is stopped, `best` is the `Commissioning` so far.
+    """
+    with bench_of(on, u_max) as bench:
+        asked = demands(
+            bench,
+            u_max=u_max,
+            speed=speed,
+            references=_samples(references, bench, seed),
+            members=members,
+            evaluations=evaluations,
+            seed=seed,
+            threads=os.cpu_count() or 1 if threads is None else threads,
+        )
+        journal = Journal(bench.name, progress)
+        journal.keep(cost=cost_of(asked) if cost is None else cost)
+        try:
+            return _carry_out(NotedBench(bench, journal.note), asked, journal)
+        except Refusal as refusal:
+            refusal.stage = journal.stage
+            refusal.so_far = journal.result("refused", str(refusal))
+            raise
+        except KeyboardInterrupt as stop:
+            best = getattr(stop, "best", None)
+            if isinstance(best, Controller):
+                journal.keep(controller=best)
+            raise Interrupted(journal.result("interrupted", "Ctrl-C")) from stop
+
+
+def _carry_out(bench: Bench, asked: Demands, journal: Journal) -> Commissioning:
+    """The stages."""
+    journal.enter("first motion")
+    motion = first_motion(bench, asked)
+    journal.keep(motion=motion)
+
+    journal.enter("step response")
+    fopdt = step_response(bench, asked, motion)
+    first = first_gains(fopdt, bench, asked)
+    journal.keep(fopdt=fopdt, first=first, controller=first)
+
+    journal.enter("open loop")
+    chirp = bench.excite(excitations.chirp(fopdt, asked, bench.Ts), "chirp")
+
+    journal.enter("closed loop")
+    trapezoids = bench.follow(first, excitations.trapezoids(fopdt, asked, bench.Ts), "trapezoids")
+    require_unsaturated(trapezoids.run)
+    levels = bench.follow(first, excitations.levels(fopdt, asked, bench.Ts, asked.seed), "levels")
+
+    journal.enter("training")
+    trained = train([chirp, trapezoids.recording], levels.recording, asked, journal.within)
+    journal.keep(models=trained.ensemble, rmse=trained.rmse)
+
+    journal.enter("tuning")
+    weights: Cost = journal.result("").cost or cost_of(asked)
+    verify, practice = _references(fopdt, asked, bench)
+    tuning = search(trained.ensemble, practice, first, asked, weights, journal.within)
+    controller = replace(tuning.controller, notes="commissioned on an ensemble of networks")
+    journal.keep(tuning=tuning, controller=controller)
+
+    journal.enter("verification")
+    comparisons = predict(controller, trained.ensemble, verify)
+    journal.keep(comparisons=comparisons)
+    comparisons = measure(controller, bench, comparisons)
+    journal.keep(comparisons=comparisons)
+    require_alike(comparisons)
+    journal.finish()
+    return journal.result("verified")
+
+
+def _references(
+    fopdt: Any, asked: Demands, bench: Bench
+) -> tuple[Mapping[str, FloatArray], Mapping[str, FloatArray]]:
+    """To verify on, and to tune on."""
+    if asked.references is not None:
+        return asked.references, asked.references
+    return (
+        standard(fopdt, asked, bench.Ts, short=False),
+        standard(fopdt, asked, bench.Ts, short=True),
+    )
+
+
+def _samples(
+    references: References | None, bench: Bench, seed: int
+) -> Mapping[str, FloatArray] | None:
+    if references is None:
+        return None
+    if isinstance(references, str) or not references:
+        raise SettingError(
+            "expected references by name, as a mapping from names to samples or a sequence of "
+            f"names, got {references!r}; leave it out for the standard ones"
+        )
+    if isinstance(references, Mapping):
+        return {str(name): vector(str(name), r).copy() for name, r in references.items()}
+    if abs(bench.Ts - signals.TS) > 1e-9:
+        raise SettingError(
+            f"expected a machine at {signals.TS} s for references by name, this one has "
+            f"{bench.Ts:g} s; give references as samples"
+        )
+    return {name: signals.reference(name, seed) for name in references}

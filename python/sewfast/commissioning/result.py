@@ -1,0 +1,153 @@
+"""`Commissioning`: everything that came of one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..control import Controller, Fopdt
+from ..cost import Cost
+from ..models import Ensemble
+from ..recording import Recording
+from ..tuning import TuningResult
+from .motion import Motion
+from .verification import Comparison
+
+VERDICTS = ("verified", "refused", "interrupted")
+
+
+@dataclass(frozen=True, eq=False)
+class Commissioning:
+    """A controller with the evidence for it.
+
+    Attributes
+    ----------
+    machine : str
+    verdict : str
+        ``verified``: run on the machine, where it did as predicted. ``refused``, ``interrupted``:
+        ended at `stage`; what there is until then is here, the rest is None or empty.
+    stage, reason : str
+        The last stage; why it ended there.
+    seconds : mapping of stage to float
+    recordings : mapping of name to Recording
+        Of the machine, for `identify`.
+    motion : Motion or None
+    fopdt : Fopdt or None
+        From the step response.
+    first : Controller or None
+        The gains by rule, under which the closed loop was recorded.
+    models : Ensemble or None
+    rmse : tuple of float
+        Of each member on the recording `levels`, which none was trained on [RPM].
+    controller : Controller or None
+        The best there is: tuned, or else the first.
+    tuning : TuningResult or None
+    cost : Cost or None
+        What counted how much.
+    comparisons : tuple of Comparison
+        Predicted and measured, per reference.
+    """
+
+    machine: str
+    verdict: str
+    stage: str
+    reason: str
+    seconds: Mapping[str, float]
+    recordings: Mapping[str, Recording] = field(default_factory=dict)
+    motion: Motion | None = None
+    fopdt: Fopdt | None = None
+    first: Controller | None = None
+    models: Ensemble | None = None
+    rmse: tuple[float, ...] = ()
+    controller: Controller | None = None
+    tuning: TuningResult | None = None
+    cost: Cost | None = None
+    comparisons: tuple[Comparison, ...] = ()
+
+    @property
+    def is_verified(self) -> bool:
+        """Whether the machine did as predicted."""
+        return self.verdict == "verified"
+
+    @property
+    def predicted_cost(self) -> float | None:
+        """Over the references [RPM]."""
+        if self.cost is None or not self.comparisons:
+            return None
+        return self.cost.of([c.predicted for c in self.comparisons])
+
+    @property
+    def measured_cost(self) -> float | None:
+        """Over the references, on the machine [RPM]."""
+        runs = [c.measured for c in self.comparisons if c.measured is not None]
+        if self.cost is None or not runs or len(runs) < len(self.comparisons):
+            return None
+        return self.cost.of(runs)
+
+    def numbers(self) -> dict[str, Any]:
+        """Every number as JSON values."""
+        from .numbers import numbers
+
+        return numbers(self)
+
+    def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+        """Write recordings, models, controllers, runs, `commissioning.json` and `report.html`.
+
+        Parameters
+        ----------
+        folder : path
+            Made where it is not there; see docs/ARCHITECTURE.md for the layout.
+        overwrite : bool
+            Whether files of these names may be replaced that no commissioning has left.
+
+        Returns
+        -------
+        Path
+            The page, or `commissioning.json` where the report's packages are missing.
+
+        Raises
+        ------
+        SettingError
+            For a folder with files of somebody else's.
+        DataError
+            Where it cannot be made.
+        """
+        from .folder import write
+
+        return write(self, Path(folder), overwrite=overwrite)
+
+    def __str__(self) -> str:
+        lines = [f"commissioning of {self.machine}: {self.verdict}"]
+        if self.reason:
+            lines.append(f"  at {self.stage}: {self.reason}")
+        if self.fopdt is not None:
+            lines.append(f"  step response  {self.fopdt}")
+        if self.models is not None:
+            worst = f"{min(self.rmse):.3g} to {max(self.rmse):.3g}"
+            lines.append(
+                f"  models         {len(self.models.members)}, free run on data not trained on "
+                f"{worst} RPM rms"
+            )
+        lines += [_told(c) for c in self.comparisons]
+        if self.measured_cost is not None and self.predicted_cost is not None:
+            lines.append(
+                f"  cost           predicted {self.predicted_cost:.4g}, measured "
+                f"{self.measured_cost:.4g} RPM"
+            )
+        if self.controller is not None:
+            lines.append(str(self.controller))
+        lines.append(f"  {sum(self.seconds.values()):.1f} s")
+        return "\n".join(lines)
+
+
+def _told(c: Comparison) -> str:
+    predicted = c.predicted.metrics()["rmse"]
+    text = f"  {c.reference:<14} error predicted {predicted:.4g}"
+    if c.measured is None:
+        return text + " RPM rms"
+    return (
+        f"{text}, measured {c.measured.metrics()['rmse']:.4g} RPM rms; {c.apart:.3g} RPM rms apart"
+    )

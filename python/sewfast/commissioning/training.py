@@ -1,0 +1,133 @@
+"""The ensemble: several networks from the same recordings, and which of them are fit to tune on."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+from ..dataset import Dataset
+from ..errors import FitError
+from ..identification import identify
+from ..models import Ensemble, Model
+from ..recording import Recording
+from ..validation import validate
+from .demands import Demands
+from .refusal import require
+
+WORST = 2.0
+"""Members with a larger multiple of the best one's error on data not trained on are left out."""
+LEAST_FIT = 85.0
+"""Percent of the best member in free run on data not trained on."""
+LEAST_SHARE = 0.5
+"""Of the members trained that must be fit to use."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """An ensemble with its errors.
+
+    Attributes
+    ----------
+    ensemble : Ensemble
+    rmse : tuple of float
+        Of each member in free run on the recording to judge by [RPM].
+    fit_percent : float
+        Of the best one.
+    dropped : int
+        Members that were left out.
+    """
+
+    ensemble: Ensemble
+    rmse: tuple[float, ...]
+    fit_percent: float
+    dropped: int
+
+
+def train(
+    recordings: Sequence[Recording],
+    judge: Recording,
+    demands: Demands,
+    progress: Callable[[int, int], object],
+) -> Trained:
+    """Train members that differ in their seeds; keep those that predict what they have not seen.
+
+    Raises
+    ------
+    Refusal
+        Where members differ too much, or none predicts.
+    Interrupted
+        On Ctrl-C.
+    """
+    data = Dataset.concat([r.dataset() for r in recordings])
+    members = _members(data, demands, progress)
+    require(
+        bool(members),
+        "expected networks that can be trained on the recordings, none could; see the recordings "
+        "and `sewfast identify`",
+    )
+    held_out = judge.dataset()
+    scores = [validate_member(m, held_out) for m in members]
+    best = min(rmse for rmse, _ in scores)
+    kept = [i for i, (rmse, _) in enumerate(scores) if rmse <= WORST * best]
+    fit = max(fit for _, fit in scores)
+    require(
+        fit >= LEAST_FIT,
+        f"expected a free-run fit of {LEAST_FIT:g} % or more on the recording {judge.name!r}, "
+        f"which was not trained on, the best of {len(members)} networks has {fit:.1f} % "
+        f"({best:.3g} RPM rms); see the recordings: a load that varied, a limit reached, a "
+        "shaft that slips",
+    )
+    require(
+        len(kept) >= LEAST_SHARE * len(members),
+        f"expected networks that agree on the recording {judge.name!r}, {len(members) - len(kept)} "
+        f"of {len(members)} have more than {WORST:g} times the error of the best ({best:.3g} RPM "
+        "rms); record longer, or raise members",
+    )
+    return Trained(
+        Ensemble.of([members[i] for i in kept]),
+        tuple(scores[i][0] for i in kept),
+        fit,
+        len(members) - len(kept),
+    )
+
+
+def validate_member(model: Model, data: Dataset) -> tuple[float, float]:
+    """Error and fit of the free run from rest; infinite where it runs away."""
+    try:
+        found = validate(model, data, init=0).simulation
+    except FitError:
+        return float("inf"), -float("inf")
+    return found.rmse, found.fit_percent
+
+
+def _members(
+    data: Dataset, demands: Demands, progress: Callable[[int, int], object]
+) -> list[Model]:
+    """Networks by seed, side by side; a Ctrl-C ends all of them."""
+    stopped = threading.Event()
+    done: list[Model | None] = [None] * demands.members
+
+    def one(i: int) -> None:
+        def look(*_: object) -> None:
+            if stopped.is_set():
+                raise InterruptedError
+
+        try:
+            done[i] = identify(
+                data, model="neural_oe", starts=1, seed=demands.seed + i, threads=1, progress=look
+            )
+        except (FitError, InterruptedError):
+            return
+
+    with ThreadPoolExecutor(min(demands.threads, demands.members)) as pool:
+        try:
+            for i, future in enumerate([pool.submit(one, i) for i in range(demands.members)]):
+                future.result()
+                progress(i + 1, demands.members)
+        except BaseException:
+            stopped.set()
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    return [m for m in done if m is not None]

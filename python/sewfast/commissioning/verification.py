@@ -1,0 +1,145 @@
+"""Verification: the tuned controller on the machine, its prediction beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..control import Controller
+from ..dataset import FloatArray
+from ..errors import FitError
+from ..loop import ClosedLoopRun, run
+from ..models import Ensemble
+from .bench import Bench
+from .refusal import Refusal, require
+
+APART = 0.05
+"""Largest distance of measurement from prediction, rms over the reference's span."""
+DISAGREE = 0.05
+"""Largest distance of a member from the median of all, rms over the reference's span."""
+SATURATED = 0.5
+"""Largest share of samples at a limit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """One reference: predicted and measured.
+
+    Attributes
+    ----------
+    reference : str
+    predicted : ClosedLoopRun
+        The median of the members' runs.
+    measured : ClosedLoopRun or None
+        On the machine; None where it was not run.
+    members : tuple of ClosedLoopRun
+    """
+
+    reference: str
+    predicted: ClosedLoopRun
+    measured: ClosedLoopRun | None
+    members: tuple[ClosedLoopRun, ...]
+
+    @property
+    def span(self) -> float:
+        """Of the reference [RPM]."""
+        return float(np.ptp(self.predicted.r))
+
+    @property
+    def apart(self) -> float | None:
+        """Rms distance of the measured output from the predicted one [RPM]."""
+        if self.measured is None:
+            return None
+        return _rms(self.measured.y - self.predicted.y)
+
+    @property
+    def disagreement(self) -> float:
+        """Rms distance of the member farthest from the median [RPM]."""
+        return max(_rms(m.y - self.predicted.y) for m in self.members)
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def predict(
+    controller: Controller, ensemble: Ensemble, references: Mapping[str, FloatArray]
+) -> tuple[Comparison, ...]:
+    """What the ensemble says of every reference.
+
+    Raises
+    ------
+    Refusal
+        Where members disagree, or run away.
+    """
+    found = []
+    for name, r in references.items():
+        try:
+            runs = tuple(run(controller, m, r, name=name) for m in ensemble.members)
+        except FitError as error:
+            raise Refusal(
+                f"expected predictions of {name!r}, a member ran away: {error}"
+            ) from error
+        median = replace(
+            runs[0],
+            y=np.median([m.y for m in runs], axis=0),
+            u=np.median([m.u for m in runs], axis=0),
+            feedback=np.median([m.feedback for m in runs], axis=0),
+            plant="ensemble",
+        )
+        comparison = Comparison(name, median, None, runs)
+        require(
+            comparison.disagreement <= DISAGREE * comparison.span,
+            f"expected members that agree on {name!r} within {100 * DISAGREE:g} % of its span, one "
+            f"is {comparison.disagreement:.3g} RPM rms from the median; record longer, so that "
+            "they know this reference's world, or demand less of it",
+        )
+        found.append(comparison)
+    return tuple(found)
+
+
+def measure(
+    controller: Controller, bench: Bench, predicted: tuple[Comparison, ...]
+) -> tuple[Comparison, ...]:
+    """The same on the machine."""
+    return tuple(
+        replace(c, measured=bench.follow(controller, c.predicted.r, c.reference).run)
+        for c in predicted
+    )
+
+
+def require_alike(comparisons: tuple[Comparison, ...]) -> None:
+    """Refuse a prediction that the machine has not borne out.
+
+    Raises
+    ------
+    Refusal
+    """
+    for c in comparisons:
+        assert c.measured is not None
+        assert c.apart is not None
+        require_unsaturated(c.measured)
+        require(
+            c.apart <= APART * c.span,
+            f"expected the machine within {100 * APART:g} % of the span from the prediction on "
+            f"{c.reference!r}, it was {c.apart:.3g} RPM rms apart; the controller is not verified: "
+            "see both in the report; the machine may have changed since it was recorded, or the "
+            "reference goes where it was not",
+        )
+
+
+def require_unsaturated(found: ClosedLoopRun) -> None:
+    """Refuse a loop that leans on the limit of its command.
+
+    Raises
+    ------
+    Refusal
+    """
+    saturated = found.metrics()["saturated"] or 0.0
+    require(
+        saturated <= SATURATED,
+        f"expected the command within its limits most of the time on {found.reference!r}, it was "
+        f"at one for {100 * saturated:.0f} % of the samples; raise u_max, or lower speed",
+    )

@@ -1,0 +1,150 @@
+"""The page of a commissioning, from its folder only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from .. import jsonfile
+from ..errors import DataError, ModelFileError
+from ..readers import read_table
+from .canvas import Picture, draw, legend, panels, style, svg
+from .numbers import milliseconds, percent, rpm, significant, volt
+from .table import Table
+
+FORMAT = "sewfast.commissioning"
+VERSION = 1
+NUMBERS = "commissioning.json"
+_RUN = ("t", "r", "u", "y")
+_HOW = {
+    "first motion": "which command moves the machine, and which way",
+    "step response": "gain, time constant and dead time; first gains by rule",
+    "open loop": "a sweep of the command",
+    "closed loop": "trapezoids and random levels under the first gains",
+    "training": "networks that differ in their seeds; judged on the random levels",
+    "tuning": "gains of least cost on all networks, with encoder, filter, gain spread and delay",
+    "verification": "prediction, then the machine",
+}
+
+
+def run_file(reference: str, kind: str) -> str:
+    """Where in the folder a closed loop lies; `kind` is predicted or measured."""
+    safe = "".join(c if c.isalnum() or c in "-_." else "_" for c in reference)
+    return f"runs/{safe}_{kind}.npz"
+
+
+def is_commissioning(folder: Path) -> bool:
+    """Whether a folder was left by a commissioning."""
+    return (folder / NUMBERS).is_file()
+
+
+def context(folder: Path) -> dict[str, Any]:
+    """What the template shows.
+
+    Raises
+    ------
+    DataError, ModelFileError
+        Where a file is missing or damaged.
+    """
+    found = jsonfile.read(folder / NUMBERS, FORMAT, {VERSION})
+    try:
+        with style():
+            return {
+                "found": found,
+                "stages": _stages(found),
+                "gains": _gains(found),
+                "verified": _verified(found),
+                "loops": [_picture(folder, name, n) for name, n in found["references"].items()],
+            }
+    except (KeyError, TypeError, AttributeError) as e:
+        raise ModelFileError(
+            f"{folder / NUMBERS}: expected the numbers of a commissioning, one is missing or of "
+            f"another kind ({e}); commission again"
+        ) from e
+
+
+def _stages(found: Mapping[str, Any]) -> Table:
+    rows = tuple((s, _HOW.get(s, ""), f"{t:.2f}") for s, t in found["seconds"].items())
+    return Table("What was done, and how long it took.", ("stage", "what", "seconds"), rows)
+
+
+def _gains(found: Mapping[str, Any]) -> Table:
+    names = {"first": "first gains, by rule", "tuned": "the controller"}
+    rows = tuple(
+        (
+            names[key],
+            significant(c["gains"]["Kp"]),
+            significant(_ms(c["gains"]["Ti"])),
+            significant(_ms(c["gains"]["Td"])),
+            significant(c["alpha"]),
+            significant(c["beta"]),
+            significant(c["N"]),
+        )
+        for key, c in found["controllers"].items()
+    )
+    header = ("controller", "Kp [V/RPM]", "Ti [ms]", "Td [ms]", "α", "β", "N")
+    return Table("Gains in standard form.", header, rows)
+
+
+def _ms(seconds: float | None) -> float | None:
+    return None if seconds is None else 1e3 * seconds
+
+
+def _verified(found: Mapping[str, Any]) -> Table:
+    rows = []
+    for name, n in found["references"].items():
+        for kind in ("predicted", "measured"):
+            if n[kind] is None:
+                continue
+            rows.append((f"{name}, {kind}", *_cells(n[kind]), _apart(n, kind)))
+    header = (
+        "reference", "tracking error (rms)", "10–90 % rise", "overshoot", "command (rms)",
+        "its change per sample (rms)", "measured from predicted (rms)",
+    )  # fmt: skip
+    return Table("Prediction and machine.", header, tuple(rows))
+
+
+def _cells(n: Mapping[str, float | None]) -> tuple[str, ...]:
+    return (
+        rpm(n["rmse_rpm"]),
+        milliseconds(n["rise_time_ms"]),
+        percent(n["overshoot_percent"]),
+        volt(n["effort_v"]),
+        volt(n["chatter_v"]),
+    )
+
+
+def _apart(n: Mapping[str, Any], kind: str) -> str:
+    return rpm(n["apart_rmse_rpm"]) if kind == "measured" else ""
+
+
+def _picture(folder: Path, name: str, n: Mapping[str, Any]) -> Picture:
+    kinds = [k for k in ("predicted", "measured") if n[k] is not None]
+    runs = {k: _columns(folder / run_file(name, k)) for k in kinds}
+    looks = {"predicted": "model", "measured": "machine"}
+    figure, axes = panels([2.2, 1.3, 1.3])
+    speed, error, command = axes[:, 0]
+    for kind in reversed(kinds):
+        c, look = runs[kind], looks[kind]
+        draw(speed, c["t"], c["y"], look, kind)
+        draw(error, c["t"], c["r"] - c["y"], look, width=1.2)
+        draw(command, c["t"], c["u"], look, width=1.2)
+    first = runs[kinds[0]]
+    draw(speed, first["t"], first["r"], "reference", "reference")
+    legend(speed)
+    for ax, label in ((speed, "speed [RPM]"), (error, "error [RPM]"), (command, "command [V]")):
+        ax.set_ylabel(label)
+        ax.margins(x=0.01)
+    command.set_xlabel("time [s]")
+    key = "run-" + "".join(c if c.isalnum() else "-" for c in name)
+    alt = f"{name}: reference, predicted and measured speed, tracking error and command over time"
+    caption = "The median of the ensemble's runs, and the machine."
+    return Picture(key, "", name, alt, caption, svg(figure, key, alt))
+
+
+def _columns(path: Path) -> Mapping[str, Any]:
+    if not path.is_file():
+        raise DataError(f"{path}: expected by the report, found none; commission again")
+    table = read_table(path)
+    return {n: table[n] for n in _RUN}
