@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 __version__: str
+cpu: Literal["baseline", "avx2", "avx512"]  # what the kernels run on; SEWFAST_CPU forces one
 
 _F: TypeAlias = NDArray[np.float64]
 _Experiments: TypeAlias = Sequence[tuple[_F, _F]]

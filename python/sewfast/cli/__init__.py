@@ -35,6 +35,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         args = build_parser().parse_args(argv)
     except KeyboardInterrupt:
         return _say("sewfast: interrupted; nothing was written", INTERRUPTED)
+    except SewfastError as e:
+        return _say(f"sewfast: {e}", REFUSED)
     began = time.time()
     try:
         require_apart(args)

@@ -28,9 +28,14 @@ pub(crate) struct Gram {
 impl Gram {
     /// Room for rows of at least `columns` values, each of which sees `memory` rows before it.
     pub fn new(columns: usize, memory: usize) -> Self {
+        Self::with_room(columns, columns, memory)
+    }
+
+    /// As [`Gram::new`], where rows are written up to `room` values, of which only `columns` count.
+    pub fn with_room(columns: usize, room: usize, memory: usize) -> Self {
         let groups = columns.div_ceil(LANES);
         // An odd number of cache lines: rows apart by a power of two would share the same few places of a cache.
-        let width = (groups | 1) * LANES;
+        let width = (room.div_ceil(LANES) | 1) * LANES;
         let rows = vec![0.0; (memory + BLOCK) * width + LANES];
         Self {
             groups,
@@ -70,17 +75,32 @@ impl Gram {
     /// its column `last` is set to `value`, outside the recursion. A row whose `value` is NaN is part of the recursion
     /// and not of the sum: a sample that was not measured.
     pub fn push(&mut self, gains: &[f64], last: usize, value: f64, write: impl FnOnce(&mut [f64])) {
-        let width = self.width;
-        let next = self.base + (self.memory + self.filled) * width;
-        let (past, rest) = self.rows.split_at_mut(next);
-        let row = &mut rest[..width];
+        let (past, row) = self.place();
         write(row);
-        for (gain, old) in gains.iter().zip(past.rchunks_exact(width)) {
+        for (gain, old) in gains.iter().zip(past.rchunks_exact(row.len())) {
             for (value, old) in row.iter_mut().zip(old) {
                 *value += gain * old;
             }
         }
         row[last] = value;
+        self.keep_weighed(value);
+    }
+
+    /// The rows before the next one, the oldest first, and room for it, which comes with old values.
+    #[inline(always)]
+    pub fn place(&mut self) -> (&[f64], &mut [f64]) {
+        let next = self.base + (self.memory + self.filled) * self.width;
+        let (past, rest) = self.rows.split_at_mut(next);
+        (
+            &past[self.base + self.filled * self.width..],
+            &mut rest[..self.width],
+        )
+    }
+
+    /// Appends the row that was written into [`Gram::place`]. Where `value` is NaN it is part of the recursion alone: a
+    /// sample that was not measured.
+    #[inline(always)]
+    pub fn keep_weighed(&mut self, value: f64) {
         if value.is_nan() {
             self.weightless.push(self.filled);
         }

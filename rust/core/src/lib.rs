@@ -28,7 +28,7 @@ pub mod oe;
 pub mod random;
 pub mod rules;
 pub mod signals;
-mod simd;
+pub mod simd;
 pub mod speed;
 mod starts;
 pub mod tune;

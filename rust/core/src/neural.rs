@@ -1,23 +1,25 @@
 //! The network output-error model: a free-running network with its scaling.
 
 mod draw;
+mod free_run;
 mod guard;
 mod network;
 mod problem;
 mod referee;
 mod scaling;
-pub(crate) mod tanh;
+mod sensitivities;
 mod train;
 mod warm;
 
 pub use network::{Network, Shape};
 pub use scaling::Scaling;
-pub use tanh::tanh;
 pub use train::{InitialState, NeuralFit, Settings, fit};
 
-use network::Scratch;
+use free_run::FreeRun;
+use sensitivities::{Recursion, Rows};
 
-use crate::lagged::{Lagged, Lags, push_past};
+use crate::gram::Gram;
+use crate::lagged::{Lagged, Lags, finite};
 use crate::{Error, Result};
 
 /// `f = w2 . tanh(W1 phi + b1) + b2 [+ linear . phi]` in scaled units, clipped to the limits (docs/CONVENTIONS.md).
@@ -99,38 +101,93 @@ impl NeuralOE {
         channels: usize,
         y_past: &[f64],
     ) -> Result<(Vec<f64>, Vec<f64>)> {
-        let run = self.simulate(u, channels, y_past)?;
-        let (shape, na) = (self.shape(), self.shape().lags.na);
-        let u: Vec<f64> = self.scaling.inputs(u);
-        let columns = shape.columns();
-        let mut gram = shape.gram();
-        let mut scratch = Scratch::new(shape);
-        let mut hidden = vec![[0.0; network::LANES]; shape.blocks()];
-        let mut bends = hidden.clone();
-        for (i, &y) in y_past.iter().enumerate() {
-            scratch.phi[i] = self.scaling.output(y);
-            gram.past_mut(i + 1)[shape.state_column() + i] = 1.0;
+        let samples = self.lags().check(u, channels, y_past)?;
+        let (u, state) = (self.scaling.inputs(u), self.scaled_state(y_past));
+        let scaled = self.free_run(&u, &state, samples);
+        let (shape, na) = (self.shape(), self.lags().na);
+        let mut rows = Recording::of(self, samples);
+        for i in 0..na {
+            rows.gram.past_mut(i + 1)[shape.state_column() + i] = 1.0;
         }
-        let mut rows = Vec::with_capacity(run.len() * (columns.len() + na));
-        for k in 0..run.len() {
-            shape.lags.write_inputs(&u, k, &mut scratch.phi[na..]);
-            let phi = &scratch.phi;
-            let y = self.network.forward(
-                |c| phi[c],
-                |block, h, m| {
-                    hidden[block] = *h;
-                    bends[block] = m.map(tanh::slope);
-                },
-            );
-            let layer = (&hidden[..], |block: usize| bends[block]);
-            self.network
-                .push_row(&mut gram, &mut scratch, layer, y, 0.0);
-            let row = gram.past_mut(1);
-            rows.extend(columns.iter().map(|&c| row[c] * self.scaling.y_scale));
-            rows.extend_from_slice(&row[shape.state_column()..][..na]);
-            push_past(&mut scratch.phi[..na], y);
+        Recursion {
+            network: &self.network,
+            u: &u,
+            first: 0,
+            state: &state,
+            run: &scaled,
+            hidden: None,
+            y: &scaled,
+            rows: &mut rows,
+            monitor: None,
         }
-        Ok((run, rows))
+        .go();
+        let rows = rows.rows;
+        Ok((finite(self.restored(scaled))?, rows))
+    }
+
+    fn scaled_state(&self, y_past: &[f64]) -> Vec<f64> {
+        y_past.iter().map(|y| self.scaling.output(*y)).collect()
+    }
+
+    /// The free run in scaled units; NaN from where on it leaves the finite numbers.
+    fn free_run(&self, u: &[f64], state: &[f64], samples: usize) -> Vec<f64> {
+        let mut run = vec![f64::NAN; samples];
+        let free = FreeRun {
+            network: &self.network,
+            u,
+            first: 0,
+            state,
+            run: &mut run,
+            hidden: &mut [],
+            bound: f64::INFINITY,
+            monitor: None,
+        };
+        // where it ends early, NaN says so
+        let _ = free.go();
+        run
+    }
+
+    fn restored(&self, mut run: Vec<f64>) -> Vec<f64> {
+        run.iter_mut().for_each(|y| *y = self.scaling.restored(*y));
+        run
+    }
+}
+
+/// The rows of a free run in the data's units, in the order of theta and the past outputs.
+struct Recording {
+    gram: Gram,
+    columns: Vec<usize>,
+    /// Columns of the past outputs, whose unit is that of the output.
+    states: std::ops::Range<usize>,
+    y_scale: f64,
+    rows: Vec<f64>,
+}
+
+impl Recording {
+    fn of(model: &NeuralOE, samples: usize) -> Self {
+        let (shape, columns) = (model.shape(), model.shape().columns());
+        let states = shape.state_column()..shape.error_column();
+        Self {
+            gram: shape.gram(),
+            y_scale: model.scaling.y_scale,
+            rows: Vec::with_capacity(samples * (columns.len() + states.len())),
+            columns,
+            states,
+        }
+    }
+}
+
+impl Rows for Recording {
+    fn place(&mut self) -> (&[f64], &mut [f64]) {
+        self.gram.place()
+    }
+
+    fn keep(&mut self, error: f64) {
+        self.gram.keep_weighed(error);
+        let row = self.gram.past_mut(1);
+        let scaled = self.columns.iter().map(|&c| row[c] * self.y_scale);
+        self.rows.extend(scaled);
+        self.rows.extend_from_slice(&row[self.states.clone()]);
     }
 }
 
@@ -140,20 +197,29 @@ impl Lagged for NeuralOE {
     }
 
     fn output(&self, phi: &[f64]) -> f64 {
-        let Lags { na, nb, .. } = self.lags();
-        let scaled = self
-            .network
-            .forward(|c| self.scaling.regressor(phi[c], c, na, nb), |_, _, _| ());
-        self.scaling.restored(scaled)
+        self.output_and_slope(phi, &mut [])
     }
 
     fn output_and_slope(&self, phi: &[f64], slope: &mut [f64]) -> f64 {
         let Lags { na, nb, .. } = self.lags();
-        let scaled: Vec<f64> = (0..phi.len())
-            .map(|c| self.scaling.regressor(phi[c], c, na, nb))
-            .collect();
+        // regressors of the usual size need no room of their own
+        let (mut few, mut many) = ([0.0; 32], Vec::new());
+        let scaled = match few.get_mut(..phi.len()) {
+            Some(few) => few,
+            None => {
+                many.resize(phi.len(), 0.0);
+                &mut many[..]
+            }
+        };
+        self.scaling.regressor(phi, na, nb, scaled);
         self.scaling
-            .restored(self.network.output_and_slope(&scaled, slope))
+            .restored(self.network.output_and_slope(scaled, slope))
+    }
+
+    fn simulate(&self, u: &[f64], channels: usize, y_past: &[f64]) -> Result<Vec<f64>> {
+        let samples = self.lags().check(u, channels, y_past)?;
+        let (u, state) = (self.scaling.inputs(u), self.scaled_state(y_past));
+        finite(self.restored(self.free_run(&u, &state, samples)))
     }
 }
 

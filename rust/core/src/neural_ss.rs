@@ -14,7 +14,6 @@ mod sensitivities;
 mod shape;
 mod state;
 mod stepper;
-mod tanh;
 mod train;
 
 pub use output::OutputFunction;

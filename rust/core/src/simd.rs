@@ -1,12 +1,16 @@
 //! Eight numbers side by side, in the widest registers that the processor has.
 //!
 //! A [`Kernel`] is written once over [`Eight`] and compiled for AVX-512, for AVX2 with fused multiply-add and for the
-//! baseline; [`run`] takes the best one at run time. All do the same operations in the same order and differ only in
-//! the rounding of products that are added at once: on one kind of processor a kernel has one answer.
+//! baseline; [`run`] takes the best one at run time, or the one that `SEWFAST_CPU` names. All do the same operations in
+//! the same order and differ only in the rounding of products that are added at once: on one level a kernel has one answer.
 
+mod level;
 mod plain;
+pub(crate) mod tanh;
 #[cfg(target_arch = "x86_64")]
 mod x86;
+
+pub use level::{Level, level};
 
 /// Numbers in a group.
 pub(crate) const LANES: usize = 8;
@@ -39,10 +43,12 @@ pub(crate) trait Eight: Copy {
     fn sum(self) -> f64;
     /// `|self|`, but `limit` where that is larger; NaN stays NaN.
     fn size_up_to(self, limit: f64) -> Self;
+    /// The smaller of `self` and `limit`; NaN stays NaN.
+    fn at_most(self, limit: f64) -> Self;
+    /// The larger of `self` and `limit`; NaN stays NaN.
+    fn at_least(self, limit: f64) -> Self;
     /// `2^n` for numbers that hold the integer `n` in their low bits.
     fn power_of_two(self) -> Self;
-    /// The size of `self` with the sign of `sign`.
-    fn with_sign(self, sign: Self) -> Self;
 
     /// The first eight numbers of a slice.
     #[inline(always)]
@@ -70,21 +76,34 @@ pub(crate) trait Kernel {
     fn run<V: Eight>(self) -> Self::Output;
 }
 
-/// Does the work as this processor does it best.
+/// Does the work on the level in use.
 #[inline]
 pub(crate) fn run<K: Kernel>(kernel: K) -> K::Output {
+    run_at(level::in_use(), kernel)
+}
+
+/// Does the work on a level that this processor has.
+#[inline]
+fn run_at<K: Kernel>(level: Level, kernel: K) -> K::Output {
     #[cfg(target_arch = "x86_64")]
-    {
-        if is_x86_feature_detected!("avx512f") {
-            // SAFETY: the processor has what the function is compiled for.
-            return unsafe { x86::wide(kernel) };
-        }
-        if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-            // SAFETY: as above.
-            return unsafe { x86::half(kernel) };
-        }
+    match level {
+        // SAFETY: levels that are handed on are those of the processor.
+        Level::Avx512 => return unsafe { x86::wide(kernel) },
+        // SAFETY: as above.
+        Level::Avx2 => return unsafe { x86::half(kernel) },
+        Level::Baseline => (),
     }
+    let _ = level;
     kernel.run::<plain::Plain>()
+}
+
+/// The kernel's result on every level that this processor has, the baseline first.
+#[cfg(test)]
+pub(crate) fn run_everywhere<K: Kernel>(mut kernel: impl FnMut() -> K) -> Vec<(Level, K::Output)> {
+    let levels = Level::ALL.into_iter().filter(|level| level.is_here());
+    levels
+        .map(|level| (level, run_at(level, kernel())))
+        .collect()
 }
 
 #[cfg(test)]
@@ -108,7 +127,7 @@ mod tests {
                 a.add_product(a, b),
                 V::splat(a.sum()),
                 a.size_up_to(2.5),
-                a.with_sign(b),
+                a.at_most(2.5).at_least(-1.5),
                 V::splat(f64::from_bits(3)).power_of_two(),
             ];
             let stored = |v: V| {
@@ -124,14 +143,19 @@ mod tests {
     fn every_processor_computes_alike() {
         let a = [1.0, -2.0, 3.5, -0.0, 1e300, 0.5, f64::INFINITY, -7.25];
         let b = [-4.0, 2.0, -0.5, 3.0, 1.0, -1.0, 2.0, 8.0];
-        let plain = All(a, b).run::<plain::Plain>();
-        let best = run(All(a, b));
-        for (operation, (plain, best)) in plain.iter().zip(&best).enumerate() {
-            for (x, y) in plain.iter().zip(best) {
-                assert!(x == y || (x.is_nan() && y.is_nan()), "{operation}: {x} {y}");
+        let all = run_everywhere(|| All(a, b));
+        for (level, values) in &all {
+            for (operation, (plain, best)) in all[0].1.iter().zip(values).enumerate() {
+                for (x, y) in plain.iter().zip(best) {
+                    let same = x == y || (x.is_nan() && y.is_nan());
+                    assert!(same, "{level:?}, {operation}: {x} {y}");
+                }
             }
+            assert_eq!(values[8][0], 8.0);
+            assert_eq!(values[7][..3], [1.0, -1.5, 2.5]);
         }
-        assert_eq!(best[8][0], 8.0);
-        assert!(run(All([f64::NAN; LANES], b))[6][0].is_nan());
+        for (_, values) in run_everywhere(|| All([f64::NAN; LANES], b)) {
+            assert!(values[6][0].is_nan() && values[7][0].is_nan());
+        }
     }
 }

@@ -13,9 +13,12 @@ mod speed;
 mod watch;
 
 use pyo3::prelude::*;
+use sewfast_core::simd;
 
 #[pymodule(gil_used = false)]
 fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    let level = simd::level().map_err(|error| arrays::raise(module.py(), error))?;
+    module.add("cpu", level.name())?;
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
     signals::register(module)?;
     machine::register(module)?;

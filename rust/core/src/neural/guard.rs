@@ -1,9 +1,10 @@
 //! The runs by which a network is guarded: from past outputs beside the data's, and over larger inputs.
 
+use super::free_run::FreeRun;
 use super::network::Network;
 use super::problem::Experiment;
 use crate::guard::{Guard, enlarged};
-use crate::lagged::{Lagged, push_past};
+use crate::lagged::Lagged;
 
 /// True where the free run forgets its initial state and answers somewhat larger inputs with outputs of like size.
 pub(super) fn is_sound(network: &Network, experiments: &[Experiment]) -> bool {
@@ -28,17 +29,23 @@ pub(super) fn is_sound(network: &Network, experiments: &[Experiment]) -> bool {
     })
 }
 
+/// The free run; NaN from where on it leaves the finite numbers.
 fn run(network: &Network, u: &[f64], first: usize, state: &[f64]) -> Vec<f64> {
-    let lags = network.lags();
-    let mut phi = vec![0.0; lags.regressors()];
-    phi[..lags.na].copy_from_slice(state);
-    let next = |k: usize| {
-        lags.write_inputs(u, k, &mut phi[lags.na..]);
-        let y = network.output(&phi);
-        push_past(&mut phi[..lags.na], y);
-        y
+    let samples = u.len() / network.lags().channels;
+    let mut run = vec![f64::NAN; samples - first];
+    let free = FreeRun {
+        network,
+        u,
+        first,
+        state,
+        run: &mut run,
+        hidden: &mut [],
+        bound: f64::INFINITY,
+        monitor: None,
     };
-    (first..u.len() / lags.channels).map(next).collect()
+    // where it ends early, NaN says so
+    let _ = free.go();
+    run
 }
 
 #[cfg(test)]

@@ -1,13 +1,10 @@
-//! The network in scaled units: weights in blocks of four hidden units, its output and its slopes.
+//! The network in scaled units: weights in groups of eight hidden units, one step and its slopes.
 
-use super::tanh::{from_growth, growth, slope as bend_of};
 use crate::gram::Gram;
 use crate::lagged::{Lagged, Lags};
+use crate::simd::tanh::{rise, tanh};
+use crate::simd::{self, Eight, Group, Kernel, LANES};
 use crate::{Error, Result};
-
-/// Hidden units are computed side by side in blocks of this many; missing ones have weights of zero.
-pub(super) const LANES: usize = 4;
-pub(super) type Block = [f64; LANES];
 
 /// What fixes the length and the order of the parameter vector.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -58,39 +55,40 @@ impl Shape {
         [bias, second, constant, constant + 1]
     }
 
-    pub(super) fn blocks(&self) -> usize {
+    /// Groups of hidden units; missing units have weights of zero.
+    pub(super) fn groups(&self) -> usize {
         self.hidden.div_ceil(LANES)
     }
 
     /// For each entry of theta its column in a sensitivity row. A row holds, for each regressor, then for `b1`, then
-    /// for `w2`, all hidden units (padded to whole blocks), then `b2`, `linear`, the past outputs and the error.
+    /// for `w2`, all hidden units, then `b2`, `linear`, the past outputs and the error.
     pub(super) fn columns(&self) -> Vec<usize> {
-        let (n_phi, padded) = (self.lags.regressors(), self.blocks() * LANES);
-        let first = (0..self.hidden).flat_map(|i| (0..n_phi).map(move |c| c * padded + i));
-        let bias = (0..self.hidden).map(|i| n_phi * padded + i);
-        let second = (0..self.hidden).map(|i| (n_phi + 1) * padded + i);
-        let tail = self.tail();
-        let rest = self.parameters() - self.offsets()[2];
-        first
-            .chain(bias)
-            .chain(second)
-            .chain((0..rest).map(|i| tail + i))
-            .collect()
+        let (n_phi, hidden) = (self.lags.regressors(), self.hidden);
+        let first = (0..hidden).flat_map(|i| (0..n_phi).map(move |c| c * hidden + i));
+        let others = n_phi * hidden..self.state_column();
+        first.chain(others).collect()
     }
 
     /// Column of `b2`.
     pub(super) fn tail(&self) -> usize {
-        (self.lags.regressors() + 2) * self.blocks() * LANES
+        (self.lags.regressors() + 2) * self.hidden
     }
 
     /// Column of the first past output.
     pub(super) fn state_column(&self) -> usize {
-        self.tail() + self.parameters() - self.offsets()[2]
+        self.parameters()
     }
 
-    /// A buffer for sensitivity rows of this shape.
+    /// Column of the error.
+    pub(super) fn error_column(&self) -> usize {
+        self.state_column() + self.lags.na
+    }
+
+    /// A buffer for sensitivity rows of this shape, which are written in whole groups.
     pub(super) fn gram(&self) -> Gram {
-        Gram::new(self.state_column() + self.lags.na + 1, self.lags.na)
+        let written = self.tail() + (self.error_column() + 1 - self.tail()).next_multiple_of(LANES);
+        let units = (self.lags.regressors() + 1) * self.hidden + self.groups() * LANES;
+        Gram::with_room(self.error_column() + 1, written.max(units), self.lags.na)
     }
 }
 
@@ -101,23 +99,26 @@ pub struct Network {
     pub shape: Shape,
     /// Lowest and highest output, infinite where it does not saturate.
     pub limits: (f64, f64),
-    first: Vec<Block>,
-    bias: Vec<Block>,
-    second: Vec<Block>,
+    saturates: bool,
+    /// For each group its weights for the regressor.
+    pub(super) first: Vec<Group>,
+    bias: Vec<Group>,
+    pub(super) second: Vec<Group>,
     constant: f64,
-    linear: Vec<f64>,
+    pub(super) linear: Vec<f64>,
 }
 
 impl Network {
     /// A network with all weights zero.
     pub fn zero(shape: Shape, limits: (f64, f64)) -> Self {
-        let (blocks, n_phi) = (shape.blocks(), shape.lags.regressors());
+        let (groups, n_phi) = (shape.groups(), shape.lags.regressors());
         Self {
             shape,
             limits,
-            first: vec![[0.0; LANES]; blocks * n_phi],
-            bias: vec![[0.0; LANES]; blocks],
-            second: vec![[0.0; LANES]; blocks],
+            saturates: limits.0 > f64::NEG_INFINITY || limits.1 < f64::INFINITY,
+            first: vec![Group::ZERO; groups * n_phi],
+            bias: vec![Group::ZERO; groups],
+            second: vec![Group::ZERO; groups],
             constant: 0.0,
             linear: vec![0.0; n_phi],
         }
@@ -128,12 +129,12 @@ impl Network {
         let n_phi = self.shape.lags.regressors();
         let [bias, second, constant, linear] = self.shape.offsets();
         for i in 0..self.shape.hidden {
-            let (block, lane) = (i / LANES, i % LANES);
+            let (group, lane) = (i / LANES, i % LANES);
             for c in 0..n_phi {
-                self.first[block * n_phi + c][lane] = theta[i * n_phi + c];
+                self.first[group * n_phi + c].0[lane] = theta[i * n_phi + c];
             }
-            self.bias[block][lane] = theta[bias + i];
-            self.second[block][lane] = theta[second + i];
+            self.bias[group].0[lane] = theta[bias + i];
+            self.second[group].0[lane] = theta[second + i];
         }
         self.constant = theta[constant];
         if self.shape.bypass {
@@ -141,127 +142,111 @@ impl Network {
         }
     }
 
-    /// The output for the regressor `phi(c)`; `hidden(block, h, m)` receives the hidden outputs and what their slopes
-    /// follow from.
+    /// The arguments of a group of hidden units for the regressor whose first entry is `newest`, the others those of
+    /// `phi`.
+    ///
+    /// The newest output comes last: everything else is ready before it is known.
     #[inline(always)]
-    pub(super) fn forward(
+    fn argument<V: Eight>(&self, group: usize, newest: f64, phi: &[f64]) -> V {
+        let weights = &self.first[group * phi.len()..][..phi.len()];
+        let older = weights.iter().zip(phi).skip(1).rev();
+        let sum =
+            |sum: V, (w, value): (&Group, &f64)| sum.add_product(V::load(&w.0), V::splat(*value));
+        let z = older.fold(V::load(&self.bias[group].0), sum);
+        sum(z, (&weights[0], &newest))
+    }
+
+    /// The output for the regressor whose first entry is `newest`, the others those of `phi`; `hidden` receives the
+    /// outputs of each group of hidden units.
+    #[inline(always)]
+    pub(super) fn step<V: Eight>(
         &self,
-        phi: impl Fn(usize) -> f64,
-        mut hidden: impl FnMut(usize, &Block, &Block),
+        newest: f64,
+        phi: &[f64],
+        mut hidden: impl FnMut(usize, V),
     ) -> f64 {
-        let n_phi = self.linear.len();
-        let mut sum = [0.0; LANES];
-        for (block, first) in self.first.chunks_exact(n_phi).enumerate() {
-            let mut z = self.bias[block];
-            // The newest output comes last: everything else is ready before it is known.
-            for c in (0..n_phi).rev() {
-                let value = phi(c);
-                for (z, w) in z.iter_mut().zip(&first[c]) {
-                    *z += w * value;
-                }
-            }
-            let m = z.map(growth);
-            let h: Block = std::array::from_fn(|lane| from_growth(m[lane], z[lane]));
-            for ((sum, w), h) in sum.iter_mut().zip(&self.second[block]).zip(&h) {
-                *sum += w * h;
-            }
-            hidden(block, &h, &m);
+        let mut sum = V::splat(0.0);
+        for (group, second) in self.second.iter().enumerate() {
+            let h = tanh(self.argument::<V>(group, newest, phi));
+            sum = sum.add_product(V::load(&second.0), h);
+            hidden(group, h);
         }
         let mut direct = self.constant;
         if self.shape.bypass {
-            direct = self
-                .linear
-                .iter()
-                .enumerate()
-                .rev()
-                .fold(direct, |d, (c, w)| d + w * phi(c));
+            let older = self.linear.iter().zip(phi).skip(1).rev();
+            direct = older.fold(direct, |sum, (w, value)| sum + w * value);
+            direct += self.linear[0] * newest;
         }
-        let output = direct + ((sum[0] + sum[2]) + (sum[1] + sum[3]));
-        output.clamp(self.limits.0, self.limits.1)
+        let output = direct + sum.sum();
+        if self.saturates {
+            output.clamp(self.limits.0, self.limits.1)
+        } else {
+            output
+        }
     }
 
     /// True where the output lies on a limit, and so has no slope.
+    #[inline(always)]
     pub(super) fn is_clipped(&self, output: f64) -> bool {
         output <= self.limits.0 || output >= self.limits.1
     }
 
-    /// Slopes of the output by each hidden unit's argument, and by each past output into `gains`.
+    /// `1 - h^2` of a group to its last digits.
     #[inline(always)]
-    fn slopes(&self, bends: impl Fn(usize) -> Block, slopes: &mut [Block], gains: &mut [f64]) {
-        let n_phi = self.linear.len();
-        gains.copy_from_slice(&self.linear[..gains.len()]);
-        for (block, (slope, (second, first))) in slopes
-            .iter_mut()
-            .zip(self.second.iter().zip(self.first.chunks_exact(n_phi)))
-            .enumerate()
-        {
-            let bend = bends(block);
-            for lane in 0..LANES {
-                slope[lane] = second[lane] * bend[lane];
-            }
-            for (gain, w) in gains.iter_mut().zip(first) {
-                let part: Block = std::array::from_fn(|lane| slope[lane] * w[lane]);
-                *gain += (part[0] + part[2]) + (part[1] + part[3]);
-            }
-        }
+    pub(super) fn rise<V: Eight>(&self, group: usize, phi: &[f64]) -> V {
+        rise(self.argument::<V>(group, phi[0], phi))
     }
 
-    /// Appends the sensitivity row of a sample to `gram`; its last column holds `error`. `h` are the hidden outputs,
-    /// `bends(block)` the derivatives of tanh there.
-    ///
-    /// `d yhat(k)/d theta = d f/d theta + sum_m (d f/d phi_m) d yhat(k-m)/d theta`, zero where the output is clipped.
-    #[inline(always)]
-    pub(super) fn push_row(
-        &self,
-        gram: &mut Gram,
-        scratch: &mut Scratch,
-        (h, bends): (&[Block], impl Fn(usize) -> Block),
-        output: f64,
-        error: f64,
-    ) {
-        let last = self.shape.state_column() + self.shape.lags.na;
-        let Scratch { phi, slopes, gains } = scratch;
-        if self.is_clipped(output) {
-            gains.fill(0.0);
-            gram.push(gains, last, error, |row| row.fill(0.0));
-            return;
-        }
-        self.slopes(bends, slopes, gains);
-        let (n_phi, padded) = (phi.len(), slopes.len() * LANES);
-        gram.push(gains, last, error, |row| {
-            let (units, tail) = row.split_at_mut((n_phi + 2) * padded);
-            let (regressors, rest) = units.split_at_mut(n_phi * padded);
-            for (columns, &value) in regressors.chunks_exact_mut(padded).zip(&*phi) {
-                for (column, slope) in columns.iter_mut().zip(slopes.as_flattened()) {
-                    *column = slope * value;
-                }
-            }
-            rest[..padded].copy_from_slice(slopes.as_flattened());
-            rest[padded..].copy_from_slice(h.as_flattened());
-            tail.fill(0.0);
-            tail[0] = 1.0;
-            if self.shape.bypass {
-                tail[1..1 + n_phi].copy_from_slice(phi);
-            }
+    /// The outputs of all hidden units for the regressor `phi`.
+    pub(super) fn hidden(&self, phi: &[f64], hidden: &mut [Group]) {
+        simd::run(Once {
+            network: self,
+            phi,
+            hidden,
+            slope: &mut [],
         });
     }
 }
 
-/// Buffers of one sample.
-#[derive(Clone, Debug)]
-pub(super) struct Scratch {
-    pub phi: Vec<f64>,
-    slopes: Vec<Block>,
-    gains: Vec<f64>,
+/// One step: output, hidden outputs and slopes by past outputs where there is room for them.
+struct Once<'a> {
+    network: &'a Network,
+    phi: &'a [f64],
+    hidden: &'a mut [Group],
+    slope: &'a mut [f64],
 }
 
-impl Scratch {
-    pub fn new(shape: Shape) -> Self {
-        Self {
-            phi: vec![0.0; shape.lags.regressors()],
-            slopes: vec![[0.0; LANES]; shape.blocks()],
-            gains: vec![0.0; shape.lags.na],
+impl Kernel for Once<'_> {
+    type Output = f64;
+
+    #[inline(always)]
+    fn run<V: Eight>(self) -> f64 {
+        let Self {
+            network,
+            phi,
+            hidden,
+            slope,
+        } = self;
+        let output = network.step::<V>(phi[0], phi, |group, h| {
+            if let Some(hidden) = hidden.get_mut(group) {
+                h.store(&mut hidden.0);
+            }
+        });
+        if network.is_clipped(output) {
+            slope.fill(0.0);
+            return output;
         }
+        if !slope.is_empty() {
+            slope.copy_from_slice(&network.linear[..slope.len()]);
+            for (group, second) in network.second.iter().enumerate() {
+                let steep = V::load(&second.0).mul(network.rise::<V>(group, phi));
+                let weights = &network.first[group * phi.len()..];
+                for (slope, w) in slope.iter_mut().zip(weights) {
+                    *slope += steep.mul(V::load(&w.0)).sum();
+                }
+            }
+        }
+        output
     }
 }
 
@@ -271,25 +256,15 @@ impl Lagged for Network {
     }
 
     fn output(&self, phi: &[f64]) -> f64 {
-        self.forward(|c| phi[c], |_, _, _| ())
+        self.output_and_slope(phi, &mut [])
     }
 
     fn output_and_slope(&self, phi: &[f64], slope: &mut [f64]) -> f64 {
-        let n_phi = phi.len();
-        slope.copy_from_slice(&self.linear[..slope.len()]);
-        let output = self.forward(
-            |c| phi[c],
-            |block, _, m| {
-                let bend = m.map(bend_of);
-                for (c, slope) in slope.iter_mut().enumerate() {
-                    let (w, v) = (&self.first[block * n_phi + c], &self.second[block]);
-                    *slope += (0..LANES).map(|i| v[i] * bend[i] * w[i]).sum::<f64>();
-                }
-            },
-        );
-        if self.is_clipped(output) {
-            slope.fill(0.0);
-        }
-        output
+        simd::run(Once {
+            network: self,
+            phi,
+            hidden: &mut [],
+            slope,
+        })
     }
 }

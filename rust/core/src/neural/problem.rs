@@ -1,17 +1,17 @@
 //! The network's free run as a least-squares problem.
 
-use super::network::{Block, LANES, Network, Scratch, Shape};
+use super::free_run;
+use super::network::{Network, Shape};
 use super::scaling::Scaling;
+use super::sensitivities::Recursion;
 use super::train::InitialState;
 use crate::gram::Gram;
-use crate::lagged::push_past;
 use crate::lm::Problem;
+use crate::simd::{Group, LANES};
 use crate::{Monitor, Record};
 
 /// A free run beyond this many scales has diverged.
 const DIVERGED: f64 = 1e4;
-/// Samples between two looks at the monitor.
-const LOOK: usize = 4096;
 
 /// One experiment in scaled units.
 #[derive(Clone, Debug)]
@@ -41,6 +41,14 @@ impl Experiment {
         }
     }
 
+    /// The past outputs before the first sample: its own, or those that begin at `place` among the parameters.
+    fn state_in<'t>(&'t self, theta: &'t [f64], place: Option<usize>) -> &'t [f64] {
+        match place {
+            Some(place) => &theta[place..][..self.state.len()],
+            None => &self.state,
+        }
+    }
+
     /// Simulated samples.
     pub fn samples(&self) -> usize {
         self.y.len() - self.first
@@ -50,6 +58,24 @@ impl Experiment {
     pub fn measured(&self) -> usize {
         self.y[self.first..].iter().filter(|y| !y.is_nan()).count()
     }
+}
+
+/// Over the samples that were measured; eight sums side by side, as one alone would wait for each addition.
+pub(super) fn squared_errors(measured: &[f64], run: &[f64]) -> f64 {
+    let square = |(y, run): (&f64, &f64)| {
+        let error = y - run;
+        if error.is_nan() { 0.0 } else { error * error }
+    };
+    let (groups, rest) = measured.as_chunks::<LANES>();
+    let (runs, rest_run) = run.as_chunks::<LANES>();
+    let mut sums = [0.0; LANES];
+    for (y, run) in groups.iter().zip(runs) {
+        for (sum, pair) in sums.iter_mut().zip(y.iter().zip(run)) {
+            *sum += square(pair);
+        }
+    }
+    let rest: f64 = rest.iter().zip(rest_run).map(square).sum();
+    sums.iter().sum::<f64>() + rest
 }
 
 /// The first sample behind `na` measured ones and those, newest first; the end where there is none.
@@ -78,9 +104,8 @@ pub(super) struct FreeRun<'a> {
     samples: f64,
     /// Outputs and hidden outputs of the last simulation, experiment by experiment.
     runs: Vec<Vec<f64>>,
-    hidden: Vec<Vec<Block>>,
+    hidden: Vec<Vec<Group>>,
     gram: Gram,
-    scratch: Scratch,
     columns: Vec<usize>,
 }
 
@@ -102,10 +127,9 @@ impl<'a> FreeRun<'a> {
             runs: experiments.iter().map(|e| vec![0.0; e.samples()]).collect(),
             hidden: experiments
                 .iter()
-                .map(|e| vec![[0.0; LANES]; e.samples() * shape.blocks()])
+                .map(|e| vec![Group::ZERO; e.samples() * shape.groups()])
                 .collect(),
             gram: shape.gram(),
-            scratch: Scratch::new(shape),
             columns: shape.columns(),
             network,
         }
@@ -153,82 +177,53 @@ impl<'a> FreeRun<'a> {
         clipped as f64 / self.runs.iter().map(Vec::len).sum::<usize>() as f64
     }
 
-    fn state<'t>(&'t self, theta: &'t [f64], experiment: usize) -> &'t [f64] {
-        let (own, na) = (self.shape().parameters(), self.shape().lags.na);
-        if self.estimated {
-            &theta[own + experiment * na..][..na]
-        } else {
-            &self.experiments[experiment].state
-        }
-    }
-
     /// Sum of squared errors of the free run, whose outputs are stored.
     fn simulate(&mut self, theta: &[f64], experiment: usize) -> Option<f64> {
-        let (lags, blocks) = (self.shape().lags, self.shape().blocks());
         let data = &self.experiments[experiment];
-        let mut phi = std::mem::take(&mut self.scratch.phi);
-        phi[..lags.na].copy_from_slice(self.state(theta, experiment));
-        let (run, hidden) = (&mut self.runs[experiment], &mut self.hidden[experiment]);
-        let mut sum = 0.0;
-        for (i, (out, h)) in run
-            .iter_mut()
-            .zip(hidden.chunks_exact_mut(blocks))
-            .enumerate()
-        {
-            let k = data.first + i;
-            lags.write_inputs(&data.u, k, &mut phi[lags.na..]);
-            let y = self
-                .network
-                .forward(|c| phi[c], |block, values, _| h[block] = *values);
-            push_past(&mut phi[..lags.na], y);
-            *out = y;
-            if !data.y[k].is_nan() {
-                sum += (data.y[k] - y) * (data.y[k] - y);
-            }
-            // NaN is no number below the bound either.
-            let sound = y.abs() < DIVERGED;
-            if !sound || (i % LOOK == 0 && self.monitor.stopped()) {
-                sum = f64::NAN;
-                break;
-            }
+        free_run::FreeRun {
+            network: &self.network,
+            u: &data.u,
+            first: data.first,
+            state: data.state_in(theta, self.state_at(experiment)),
+            run: &mut self.runs[experiment],
+            hidden: &mut self.hidden[experiment],
+            bound: DIVERGED,
+            monitor: Some(self.monitor),
         }
-        self.scratch.phi = phi;
-        sum.is_finite().then_some(sum)
+        .go()?;
+        Some(squared_errors(
+            &data.y[data.first..],
+            &self.runs[experiment],
+        ))
+    }
+
+    /// Where an experiment's own state begins among the parameters.
+    fn state_at(&self, experiment: usize) -> Option<usize> {
+        let lags = self.shape().lags;
+        self.estimated
+            .then(|| self.shape().parameters() + experiment * lags.na)
     }
 
     fn sensitivities(&mut self, theta: &[f64], experiment: usize) {
-        let (shape, lags) = (self.shape(), self.shape().lags);
-        let data = &self.experiments[experiment];
+        let (shape, data) = (self.shape(), &self.experiments[experiment]);
         self.gram.clear();
         if self.estimated {
-            for i in 0..lags.na {
+            for i in 0..shape.lags.na {
                 self.gram.past_mut(i + 1)[shape.state_column() + i] = 1.0;
             }
         }
-        let state = self.state(theta, experiment).to_vec();
-        self.scratch.phi[..lags.na].copy_from_slice(&state);
-        let (run, hidden) = (&self.runs[experiment], &self.hidden[experiment]);
-        for (i, (&y, h)) in run
-            .iter()
-            .zip(hidden.chunks_exact(shape.blocks()))
-            .enumerate()
-        {
-            if i % LOOK == 0 && self.monitor.stopped() {
-                return;
-            }
-            let k = data.first + i;
-            lags.write_inputs(&data.u, k, &mut self.scratch.phi[lags.na..]);
-            // what a saturated unit loses here is far below what a sum of squares shows
-            let bends = |block: usize| h[block].map(|h| 1.0 - h * h);
-            self.network.push_row(
-                &mut self.gram,
-                &mut self.scratch,
-                (h, bends),
-                y,
-                data.y[k] - y,
-            );
-            push_past(&mut self.scratch.phi[..lags.na], y);
+        Recursion {
+            network: &self.network,
+            u: &data.u,
+            first: data.first,
+            state: data.state_in(theta, self.state_at(experiment)),
+            run: &self.runs[experiment],
+            hidden: Some(&self.hidden[experiment]),
+            y: &data.y[data.first..],
+            rows: &mut self.gram,
+            monitor: Some(self.monitor),
         }
+        .go();
     }
 
     /// Adds the experiment's sums to the system.

@@ -1,10 +1,11 @@
 //! Which iterate of a start is kept: the best on the validation data, else the best on the training data.
 
+use super::free_run::FreeRun;
 use super::network::Network;
-use super::problem::Experiment;
+use super::problem::{Experiment, squared_errors};
 use super::train::{InitialState, Training};
 use crate::data::window;
-use crate::lagged::{Lagged, STATE_SAMPLES, push_past};
+use crate::lagged::{Lagged, STATE_SAMPLES};
 
 /// Keeps the best iterate of a start: on the validation data, else on the training data.
 pub(super) struct Referee<'t> {
@@ -52,7 +53,6 @@ impl<'t> Referee<'t> {
         } else {
             (experiment.first, experiment.first)
         };
-        let mut phi = vec![0.0; lags.regressors()];
         let state = match estimated {
             true => {
                 let u = &experiment.u[..skipped * lags.channels];
@@ -64,19 +64,22 @@ impl<'t> Referee<'t> {
         let Ok(state) = state else {
             return (f64::INFINITY, 1);
         };
-        phi[..lags.na].copy_from_slice(&state);
-        let (mut sum, mut count) = (0.0, 0);
-        for k in first..experiment.y.len() {
-            lags.write_inputs(&experiment.u, k, &mut phi[lags.na..]);
-            let y = self.network.output(&phi);
-            push_past(&mut phi[..lags.na], y);
-            if k >= skipped && !experiment.y[k].is_nan() {
-                (sum, count) = (
-                    sum + (experiment.y[k] - y) * (experiment.y[k] - y),
-                    count + 1,
-                );
-            }
+        let mut run = vec![0.0; experiment.y.len() - first];
+        let whole = FreeRun {
+            network: &self.network,
+            u: &experiment.u,
+            first,
+            state: &state,
+            run: &mut run,
+            hidden: &mut [],
+            bound: f64::INFINITY,
+            monitor: None,
+        };
+        if whole.go().is_none() {
+            return (f64::INFINITY, 1);
         }
-        (sum, count)
+        let judged = &experiment.y[skipped..];
+        let count = judged.iter().filter(|y| !y.is_nan()).count();
+        (squared_errors(judged, &run[skipped - first..]), count)
     }
 }

@@ -70,10 +70,13 @@ impl Scaling {
 
     /// All inputs, scaled.
     pub fn inputs(&self, u: &[f64]) -> Vec<f64> {
-        let channels = self.u_mean.len();
-        let scaled =
-            |(i, u): (usize, &f64)| (u - self.u_mean[i % channels]) / self.u_scale[i % channels];
-        u.iter().enumerate().map(scaled).collect()
+        let mut scaled = u.to_vec();
+        for row in scaled.chunks_exact_mut(self.u_mean.len()) {
+            for ((u, mean), scale) in row.iter_mut().zip(&self.u_mean).zip(&self.u_scale) {
+                *u = (*u - mean) / scale;
+            }
+        }
+        scaled
     }
 
     /// An output, scaled.
@@ -86,14 +89,15 @@ impl Scaling {
         scaled * self.y_scale + self.y_mean
     }
 
-    /// Entry `c` of a regressor, scaled.
-    #[inline(always)]
-    pub(super) fn regressor(&self, value: f64, c: usize, na: usize, nb: usize) -> f64 {
-        if c < na {
-            return self.output(value);
+    /// A regressor with `na` past outputs and `nb` past values of each input, scaled.
+    pub(super) fn regressor(&self, phi: &[f64], na: usize, nb: usize, scaled: &mut [f64]) {
+        let (outputs, inputs) = scaled.split_at_mut(na);
+        for (scaled, y) in outputs.iter_mut().zip(phi) {
+            *scaled = self.output(*y);
         }
-        let j = (c - na) / nb;
-        (value - self.u_mean[j]) / self.u_scale[j]
+        for (j, (scaled, u)) in inputs.iter_mut().zip(&phi[na..]).enumerate() {
+            *scaled = (u - self.u_mean[j / nb]) / self.u_scale[j / nb];
+        }
     }
 }
 

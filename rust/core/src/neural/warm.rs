@@ -1,9 +1,10 @@
 //! Output weights that predict one step ahead as well as given hidden units allow: where a start without a linear model
 //! begins.
 
-use super::network::{LANES, Network};
+use super::network::Network;
 use super::problem::Experiment;
 use crate::lm::{cholesky, substitute};
+use crate::simd::{Group, LANES};
 
 /// Added to the diagonal, relative to its mean: hidden outputs of small weights are nearly collinear.
 const RIDGE: f64 = 1e-9;
@@ -17,20 +18,17 @@ pub(super) fn output_layer(network: &Network, experiments: &[Experiment]) -> Opt
     let n = hidden + 1;
     let (mut left, mut right) = (vec![0.0; n * n], vec![0.0; n]);
     let (mut phi, mut row) = (vec![0.0; lags.regressors()], vec![1.0; n]);
+    let mut groups = vec![Group::ZERO; network.shape.groups()];
     for experiment in experiments {
         let measured = |k: &usize| experiment.y[k - lags.na..=*k].iter().all(|y| !y.is_nan());
         for k in (lags.na..experiment.y.len()).filter(measured) {
             let past = experiment.y[k - lags.na..k].iter().rev();
             phi.iter_mut().zip(past).for_each(|(phi, y)| *phi = *y);
             lags.write_inputs(&experiment.u, k, &mut phi[lags.na..]);
-            network.forward(
-                |c| phi[c],
-                |block, values, _| {
-                    let first = block * LANES;
-                    let count = LANES.min(hidden - first);
-                    row[first..first + count].copy_from_slice(&values[..count]);
-                },
-            );
+            network.hidden(&phi, &mut groups);
+            for (i, value) in row[..hidden].iter_mut().enumerate() {
+                *value = groups[i / LANES].0[i % LANES];
+            }
             for i in 0..n {
                 right[i] += row[i] * experiment.y[k];
                 for j in 0..=i {

@@ -2,7 +2,7 @@
 
 use super::output::OutputFunction;
 use super::shape::Shape;
-use super::tanh::{rise, tanh};
+use crate::simd::tanh::{rise, tanh};
 use crate::simd::{Eight, Group, LANES};
 
 /// The weights laid out for the kernels: hidden units in groups of eight, missing ones with weights of zero.

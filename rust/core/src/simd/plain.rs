@@ -75,13 +75,18 @@ impl Eight for Plain {
     }
 
     #[inline(always)]
-    fn power_of_two(self) -> Self {
-        let power = |v: f64| f64::from_bits((v.to_bits() << 52).wrapping_add(1023 << 52));
-        Self(self.0.map(power))
+    fn at_most(self, limit: f64) -> Self {
+        Self(self.0.map(|v| if v > limit { limit } else { v }))
     }
 
     #[inline(always)]
-    fn with_sign(self, sign: Self) -> Self {
-        self.with(sign, f64::copysign)
+    fn at_least(self, limit: f64) -> Self {
+        Self(self.0.map(|v| if v < limit { limit } else { v }))
+    }
+
+    #[inline(always)]
+    fn power_of_two(self) -> Self {
+        let power = |v: f64| f64::from_bits((v.to_bits() << 52).wrapping_add(1023 << 52));
+        Self(self.0.map(power))
     }
 }

@@ -92,23 +92,24 @@ impl Eight for Wide {
     }
 
     #[inline(always)]
+    fn at_most(self, limit: f64) -> Self {
+        // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand.
+        unsafe { Self(_mm512_min_pd(_mm512_set1_pd(limit), self.0)) }
+    }
+
+    #[inline(always)]
+    fn at_least(self, limit: f64) -> Self {
+        // SAFETY: as `at_most`.
+        unsafe { Self(_mm512_max_pd(_mm512_set1_pd(limit), self.0)) }
+    }
+
+    #[inline(always)]
     fn power_of_two(self) -> Self {
         // SAFETY: as `splat`.
         unsafe {
             let exponent = _mm512_slli_epi64::<52>(_mm512_castpd_si512(self.0));
             let one = _mm512_castpd_si512(_mm512_set1_pd(1.0));
             Self(_mm512_castsi512_pd(_mm512_add_epi64(exponent, one)))
-        }
-    }
-
-    #[inline(always)]
-    fn with_sign(self, sign: Self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe {
-            let bit = _mm512_castpd_si512(_mm512_set1_pd(-0.0));
-            let sign = _mm512_and_si512(bit, _mm512_castpd_si512(sign.0));
-            let size = _mm512_andnot_si512(bit, _mm512_castpd_si512(self.0));
-            Self(_mm512_castsi512_pd(_mm512_or_si512(size, sign)))
         }
     }
 }
@@ -216,6 +217,20 @@ impl Eight for Halves {
     }
 
     #[inline(always)]
+    fn at_most(self, limit: f64) -> Self {
+        // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand.
+        let one = |v: __m256d| unsafe { _mm256_min_pd(_mm256_set1_pd(limit), v) };
+        Self(one(self.0), one(self.1))
+    }
+
+    #[inline(always)]
+    fn at_least(self, limit: f64) -> Self {
+        // SAFETY: as `at_most`.
+        let one = |v: __m256d| unsafe { _mm256_max_pd(_mm256_set1_pd(limit), v) };
+        Self(one(self.0), one(self.1))
+    }
+
+    #[inline(always)]
     fn power_of_two(self) -> Self {
         // SAFETY: as `splat`.
         let one = |v: __m256d| unsafe {
@@ -224,16 +239,6 @@ impl Eight for Halves {
             _mm256_castsi256_pd(_mm256_add_epi64(exponent, one))
         };
         Self(one(self.0), one(self.1))
-    }
-
-    #[inline(always)]
-    fn with_sign(self, sign: Self) -> Self {
-        // SAFETY: as `splat`.
-        let one = |v: __m256d, sign: __m256d| unsafe {
-            let bit = _mm256_set1_pd(-0.0);
-            _mm256_or_pd(_mm256_andnot_pd(bit, v), _mm256_and_pd(bit, sign))
-        };
-        Self(one(self.0, sign.0), one(self.1, sign.1))
     }
 }
 
