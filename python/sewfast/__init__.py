@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from .order_table import OrderTable, orders
     from .readers import read, read_table
     from .recording import Recording, record
+    from .robustness import Margins, margins
     from .speed import speed_from_counts
     from .tuning import TuningResult, tune
     from .validation import Validation, validate
@@ -61,6 +62,7 @@ __all__ = [
     "LeastSquaresResult",
     "LinearOE",
     "LinkError",
+    "Margins",
     "Model",
     "ModelFileError",
     "NeuralOE",
@@ -82,6 +84,7 @@ __all__ = [
     "least_squares",
     "load_controller",
     "load_model",
+    "margins",
     "orders",
     "paper_controller",
     "read",
@@ -115,6 +118,7 @@ _HOMES = {
     "order_table": "OrderTable orders",
     "readers": "read read_table",
     "recording": "Recording record",
+    "robustness": "Margins margins",
     "speed": "speed_from_counts",
     "tuning": "TuningResult tune",
     "validation": "Validation validate",

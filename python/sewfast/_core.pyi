@@ -430,6 +430,34 @@ def tune(
     their defaults. Returns Kp, Ti, Td, alpha, beta, N, cost, start_cost, evaluations, trace, termination, weights.
     """
 
+# --- loop_transfer.rs -------------------------------------------------------------------------------------
+
+@final
+class LoopPath:
+    """What of a controller lies in the loop: gains in standard form, derivative filter, feedback filters.
+
+    ``encoder``: the output is measured as a mean over the sample before. ``slope`` [u/y] is added to the
+    proportional gain: what a gain schedule makes of ``-Kp alpha r``.
+    """
+
+    def __new__(
+        cls, *, Kp: float, Ti: float, Td: float, N: float, Ts: float, filter_samples: int,
+        filter_time: float, observer_time: float, encoder: bool, slope: float = 0.0,
+    ) -> LoopPath: ...
+
+def sampled_fopdt(K: float, T: float, L: float, *, Ts: float) -> tuple[_F, _F]:
+    """num, den in powers of z^-1 of K e^(-sL)/(1 + sT) under a zero-order hold; L may be any fraction of Ts."""
+
+def loop_response(path: LoopPath, num: _F, den: _F, omega: _F) -> NDArray[np.complex128]:
+    """L, broken at the plant's input, at omega [rad/s]; the plant in powers of z^-1."""
+
+def margins(path: LoopPath, num: _F, den: _F) -> dict[str, Any]:
+    """stable, largest_pole, Ms, Ms_omega, Mt, Mt_omega, gain_margin, gain_reduction, phase_margin_deg,
+    delay_margin_s, noise_gain, gain_crossovers, phase_crossovers; omegas and crossovers in rad/s.
+
+    An unstable loop has infinite peaks and noise gain, its other margins are NaN.
+    """
+
 def effort(u: _F, *, u_min: float, u_max: float) -> dict[str, float]:
     """u_rms, du_rms (change from sample to sample), saturated (share of samples at a limit)."""
 

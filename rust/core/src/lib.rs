@@ -19,6 +19,7 @@ pub mod least_squares;
 pub mod linear;
 pub mod linear_fit;
 pub mod lm;
+pub mod loop_transfer;
 pub mod machine;
 pub mod metrics;
 pub mod monitor;

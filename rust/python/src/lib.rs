@@ -6,6 +6,7 @@ mod device;
 mod host_loop;
 mod least_squares;
 mod link;
+mod loop_transfer;
 mod machine;
 mod models;
 mod signals;
@@ -27,6 +28,7 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     models::register(module)?;
     least_squares::register(module)?;
     control::register(module)?;
+    loop_transfer::register(module)?;
     link::register(module)?;
     device::register(module)
 }

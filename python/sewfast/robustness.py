@@ -1,0 +1,188 @@
+"""`margins`: how far a controller on a linear plant is from instability."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import _core
+from .control import Controller
+from .errors import SettingError
+from .gains import real
+from .linear_plant import sampled
+
+__all__ = ["Margins", "loop_path", "loop_response", "margins"]
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Margins of the sampled loop, broken at the plant's input (docs/CONVENTIONS.md, Control).
+
+    Of an unstable loop the peaks and the noise gain are infinite and the other margins NaN.
+
+    Attributes
+    ----------
+    stable : bool
+        Whether every closed-loop pole lies inside the unit circle.
+    Ms, Mt : float
+        Largest |S| and |T|; `Ms` is the inverse of the distance of L to -1.
+    Ms_omega, Mt_omega : float
+        Where [rad/s].
+    gain_margin : float
+        The factor above 1 on the loop's gain that makes it unstable; inf where none does.
+    gain_reduction : float
+        The factor below 1 that does; 0 where none does.
+    phase_margin_deg : float
+        The least turn of L, to either side, that does [deg].
+    delay_margin_s : float
+        The additional delay that does [s].
+    gain_crossovers, phase_crossovers : tuple of float
+        Where |L| is 1, and where L is real and negative [rad/s].
+    noise_gain : float
+        rms of the command over rms of white noise on the measured output [u/y].
+    largest_pole : float
+        Largest size of a closed-loop pole; NaN with a memory of more than 250 samples.
+    u_unit, y_unit : str
+    """
+
+    stable: bool
+    Ms: float
+    Ms_omega: float
+    Mt: float
+    Mt_omega: float
+    gain_margin: float
+    gain_reduction: float
+    phase_margin_deg: float
+    delay_margin_s: float
+    gain_crossovers: tuple[float, ...]
+    phase_crossovers: tuple[float, ...]
+    noise_gain: float
+    largest_pole: float
+    u_unit: str = "V"
+    y_unit: str = "RPM"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything by name."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+    def __str__(self) -> str:
+        if not self.stable:
+            known = not math.isnan(self.largest_pole)
+            return "unstable" + (f", largest pole {self.largest_pole:.6g}" if known else "")
+        crossing = ", ".join(f"{w / (2 * math.pi):.4g}" for w in self.gain_crossovers) or "nowhere"
+        less = f", down to {self.gain_reduction:.3g}" if self.gain_reduction else ""
+        return "\n".join(
+            [
+                f"Ms {self.Ms:.3f} at {_hertz(self.Ms_omega)}, Mt {self.Mt:.3f} at "
+                f"{_hertz(self.Mt_omega)}",
+                f"gain margin {self.gain_margin:.3g}{less}, phase margin "
+                f"{self.phase_margin_deg:.1f} deg, delay margin {1e3 * self.delay_margin_s:.3g} ms",
+                f"crossover {crossing} Hz, noise gain {self.noise_gain:.4g} "
+                f"{self.u_unit}/{self.y_unit}",
+            ]
+        )
+
+
+def margins(controller: Controller, plant: Any, *, speed: float | None = None) -> Margins:
+    """Margins of a controller on a linear plant at the controller's sample time.
+
+    What is in the loop: the gains, the derivative's filter, the feedback filters, the encoder's
+    mean over a sample where the controller has one, the zero-order hold, every delay. What is
+    not: limits, the reference's weights and ramp, the encoder's rounding.
+
+    Parameters
+    ----------
+    controller : Controller
+    plant : Fopdt, model, OperatingPoint, or system of python-control or scipy.signal
+        An `Fopdt` and systems in continuous time are sampled under a zero-order hold. A nonlinear
+        model is linearised at the steady state with output `speed`; `operating_range(model)` gives
+        operating points. One input.
+    speed : float, optional
+        Output at which the gains of a schedule, and a nonlinear model, are taken [y].
+
+    Raises
+    ------
+    SettingError
+        Without a speed where one is needed, for several inputs, another sample time, or a plant
+        that answers within the same sample.
+    """
+    found = _core.margins(loop_path(controller, speed=speed), *sampled(plant, controller.Ts, speed))
+    for name in ("gain_crossovers", "phase_crossovers"):
+        found[name] = tuple(found[name])
+    gains = controller.gains
+    return Margins(**found, u_unit=gains.u_unit, y_unit=gains.y_unit)
+
+
+def loop_response(
+    controller: Controller, plant: Any, omega: ArrayLike, *, speed: float | None = None
+) -> NDArray[np.complex128]:
+    """L at `omega` [rad/s], shape (len(omega),); S is 1/(1 + L), T is L/(1 + L).
+
+    Parameters as in `margins`.
+    """
+    w = np.ascontiguousarray(np.atleast_1d(np.asarray(omega, dtype=np.float64)))
+    nyquist = math.pi / controller.Ts
+    if not (w.ndim == 1 and np.all((w > 0.0) & (w <= nyquist * (1 + 1e-12)))):
+        raise SettingError(
+            f"omega: expected frequencies above 0 and up to half the sample rate, {nyquist:.6g} "
+            f"rad/s, received {omega!r}"
+        )
+    path = loop_path(controller, speed=speed)
+    return _core.loop_response(path, *sampled(plant, controller.Ts, speed), w)
+
+
+def loop_path(controller: Controller, *, speed: float | None = None) -> _core.LoopPath:
+    """What of the controller lies in the loop, with a schedule's gains at `speed`.
+
+    Raises
+    ------
+    SettingError
+        For a schedule without a speed.
+    """
+    gains = controller.gains.to("standard")
+    Kp, Ti, Td, slope = gains.Kp, gains.Ti, gains.Td, 0.0
+    schedule = getattr(controller, "schedule", ())
+    if schedule:
+        if speed is None:
+            raise SettingError(
+                "expected the speed at which the gain schedule is taken, received none; give speed"
+            )
+        Kp, Ti, Td, slope = _scheduled(controller, schedule, real("speed", speed))
+    return _core.LoopPath(
+        Kp=Kp,
+        Ti=Ti,
+        Td=Td,
+        slope=slope,
+        N=controller.N,
+        Ts=controller.Ts,
+        filter_samples=controller.filter_samples,
+        filter_time=controller.filter_time,
+        observer_time=getattr(controller, "observer_time", 0.0),
+        encoder=controller.counts_per_rev is not None,
+    )
+
+
+def _scheduled(
+    controller: Controller, schedule: Any, speed: float
+) -> tuple[float, float, float, float]:
+    """Kp, Ti, Td at a speed, and `alpha r dKp/dy` at r = y: -Kp alpha r follows the output too."""
+    at = np.array([point[0] for point in schedule])
+    rows = [point[1].to("parallel") for point in schedule]
+    size = abs(speed)
+    Kp, Ki, Kd = (
+        float(np.interp(size, at, [getattr(g, name) for g in rows])) for name in ("Kp", "Ki", "Kd")
+    )
+    slope = 0.0
+    above = int(np.searchsorted(at, size, side="right"))
+    if 0 < above < len(at):
+        steepness = (rows[above].Kp - rows[above - 1].Kp) / (at[above] - at[above - 1])
+        slope = float(controller.alpha * size * steepness)
+    return Kp, Kp / Ki if Ki else math.inf, Kd / Kp if Kp else 0.0, slope
+
+
+def _hertz(omega: float) -> str:
+    return f"{omega / (2 * math.pi):.4g} Hz"

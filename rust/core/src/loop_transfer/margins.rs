@@ -1,0 +1,271 @@
+//! Margins of the sampled loop: how much gain, phase and delay it bears, how it passes on disturbances and noise.
+
+use nalgebra::Complex;
+use std::cmp::Ordering;
+use std::f64::consts::PI;
+
+use super::curve::{Curve, Point};
+use super::states::States;
+use super::{Loop, Place};
+
+/// Halvings that locate a crossing, and narrowings that locate a peak.
+const LOCATED: usize = 60;
+
+/// Distances from instability, and peaks. Frequencies in rad/s.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Margins {
+    /// Whether every closed-loop pole lies inside the unit circle.
+    pub stable: bool,
+    /// The largest size of a closed-loop pole; NaN with a memory of more than 250 samples.
+    pub largest_pole: f64,
+    /// `max |S|`, and where.
+    pub ms: (f64, f64),
+    /// `max |T|`, and where.
+    pub mt: (f64, f64),
+    /// The factor above 1 on the loop's gain that reaches instability; infinite where none does.
+    pub gain_margin: f64,
+    /// The factor below 1 that does; 0 where none does.
+    pub gain_reduction: f64,
+    /// The least turn of `L` either way that reaches instability \[deg\]; infinite where `|L|` is nowhere 1.
+    pub phase_margin: f64,
+    /// The additional delay that reaches instability \[s\].
+    pub delay_margin: f64,
+    /// Where `|L| = 1`.
+    pub gain_crossovers: Vec<f64>,
+    /// Where `L` is real and negative.
+    pub phase_crossovers: Vec<f64>,
+    /// rms of the command over rms of white noise on the measured output.
+    pub noise_gain: f64,
+}
+
+/// All margins of a loop; for an unstable one the peaks and the noise gain are infinite, the other margins NaN.
+pub fn margins(closed: &Loop<'_>) -> Margins {
+    let (curve, states) = (Curve::of(closed), States::of(closed));
+    let largest_pole = states.as_ref().map_or(f64::NAN, States::largest_pole);
+    // NaN where there are too many states to ask
+    let stable = curve.unstable == Some(0)
+        && !matches!(
+            largest_pole.partial_cmp(&1.0),
+            Some(Ordering::Equal | Ordering::Greater)
+        );
+    let noise = || {
+        states
+            .as_ref()
+            .map_or_else(|| noise_on(closed, &curve.points), States::noise_gain)
+    };
+    let ts = closed.path.ts;
+    let gain_crossovers = crossings(closed, &curve.points, |l| l.norm_sqr() - 1.0, |_| true);
+    let phase_crossovers = phase_crossings(closed, &curve.points);
+    let per_second = |found: &[Point]| found.iter().map(|p| p.theta / ts).collect();
+    let unless_unstable = |value: f64, otherwise: f64| if stable { value } else { otherwise };
+    let peak = |size: fn(Complex<f64>) -> f64| {
+        let (value, theta) = peak(closed, &curve.points, size);
+        (
+            unless_unstable(value, f64::INFINITY),
+            unless_unstable(theta / ts, f64::NAN),
+        )
+    };
+    let (above, below) = gain_factors(&phase_crossovers);
+    Margins {
+        stable,
+        largest_pole,
+        ms: peak(sensitivity),
+        mt: peak(complementary),
+        gain_margin: unless_unstable(above, f64::NAN),
+        gain_reduction: unless_unstable(below, f64::NAN),
+        phase_margin: unless_unstable(phase_margin(&gain_crossovers), f64::NAN),
+        delay_margin: unless_unstable(ts * delay_margin(&gain_crossovers), f64::NAN),
+        gain_crossovers: per_second(&gain_crossovers),
+        phase_crossovers: per_second(&phase_crossovers),
+        noise_gain: if stable { noise() } else { f64::INFINITY },
+    }
+}
+
+/// `max |S|`, infinite where the loop is unstable; without the other margins.
+pub fn peak_sensitivity(closed: &Loop<'_>) -> f64 {
+    let curve = Curve::of(closed);
+    match curve.unstable {
+        Some(0) => peak(closed, &curve.points, sensitivity).0,
+        _ => f64::INFINITY,
+    }
+}
+
+fn sensitivity(l: Complex<f64>) -> f64 {
+    1.0 / (l + 1.0).norm()
+}
+
+fn complementary(l: Complex<f64>) -> f64 {
+    l.norm() / (l + 1.0).norm()
+}
+
+/// Largest value of `size` and its angle: the best point of the locus, narrowed between its neighbours.
+fn peak(closed: &Loop<'_>, points: &[Point], size: fn(Complex<f64>) -> f64) -> (f64, f64) {
+    let values: Vec<f64> = points.iter().map(|p| size(p.l)).collect();
+    let top = values.iter().copied().fold(0.0, f64::max);
+    let mut best = (0.0, f64::NAN);
+    for i in 0..points.len() {
+        let (before, after) = (i.saturating_sub(1), (i + 1).min(points.len() - 1));
+        // a peak between points is at most little higher than they are, as densely as they lie
+        if values[i] >= 0.9 * top && values[i] >= values[before] && values[i] >= values[after] {
+            let found = narrowed(closed, points[before].theta, points[after].theta, size);
+            let own = (values[i], points[i].theta);
+            let found = if found.0 > own.0 { found } else { own };
+            best = if found.0 > best.0 { found } else { best };
+        }
+    }
+    best
+}
+
+/// Golden section.
+fn narrowed(
+    closed: &Loop<'_>,
+    mut low: f64,
+    mut high: f64,
+    size: fn(Complex<f64>) -> f64,
+) -> (f64, f64) {
+    let share = 0.5 * (5.0_f64.sqrt() - 1.0);
+    let value = |theta: f64| size(closed.at(&Place::at(theta)));
+    let inner = |low: f64, high: f64| (high - share * (high - low), low + share * (high - low));
+    let (mut left, mut right) = inner(low, high);
+    let (mut at_left, mut at_right) = (value(left), value(right));
+    for _ in 0..LOCATED {
+        if at_left > at_right {
+            (high, right, at_right) = (right, left, at_left);
+            left = inner(low, high).0;
+            at_left = value(left);
+        } else {
+            (low, left, at_left) = (left, right, at_right);
+            right = inner(low, high).1;
+            at_right = value(right);
+        }
+        if high - low < 1e-9 * high {
+            break;
+        }
+    }
+    if at_left > at_right {
+        (at_left, left)
+    } else {
+        (at_right, right)
+    }
+}
+
+/// Points where `of(L)` changes its sign and `counts` holds.
+fn crossings(
+    closed: &Loop<'_>,
+    points: &[Point],
+    of: impl Fn(Complex<f64>) -> f64,
+    counts: impl Fn(Complex<f64>) -> bool,
+) -> Vec<Point> {
+    let at = |theta: f64| Point {
+        theta,
+        l: closed.at(&Place::at(theta)),
+    };
+    let mut found = Vec::new();
+    for pair in points.windows(2) {
+        let (mut low, mut high) = (pair[0], pair[1]);
+        let sign = of(low.l) > 0.0;
+        if sign == (of(high.l) > 0.0) {
+            continue;
+        }
+        for _ in 0..LOCATED {
+            let middle = at(0.5 * (low.theta + high.theta));
+            if (of(middle.l) > 0.0) == sign {
+                low = middle
+            } else {
+                high = middle
+            }
+        }
+        if counts(high.l) {
+            found.push(high);
+        }
+    }
+    found
+}
+
+/// Where `L` is real and negative, half the sample rate and, without an integrator, frequency 0 among them.
+fn phase_crossings(closed: &Loop<'_>, points: &[Point]) -> Vec<Point> {
+    let (first, last) = (points[0], points[points.len() - 1]);
+    let mut found = Vec::new();
+    if first.theta == 0.0 && first.l.re < 0.0 {
+        found.push(first);
+    }
+    // at half the sample rate itself the imaginary part is rounding
+    let mut inner = points.to_vec();
+    if let Some(end) = inner.last_mut() {
+        let theta = PI * (1.0 - 1e-7);
+        *end = Point {
+            theta,
+            l: closed.at(&Place::at(theta)),
+        };
+    }
+    found.extend(crossings(closed, &inner, |l| l.im, |l| l.re < 0.0));
+    if last.l.re < 0.0 {
+        found.push(Point {
+            theta: PI,
+            l: Complex::new(last.l.re, 0.0),
+        });
+    }
+    found
+}
+
+/// The nearest factors above and below 1.
+fn gain_factors(crossings: &[Point]) -> (f64, f64) {
+    let factors = || crossings.iter().map(|p| -1.0 / p.l.re);
+    let above = factors().filter(|f| *f > 1.0).fold(f64::INFINITY, f64::min);
+    let below = factors().filter(|f| *f < 1.0).fold(0.0, f64::max);
+    (above, below)
+}
+
+/// What `L` has to turn back to lie on -1, from 0 to below 2 pi.
+fn lag_left(l: Complex<f64>) -> f64 {
+    (l.arg() + PI).rem_euclid(2.0 * PI)
+}
+
+fn phase_margin(crossings: &[Point]) -> f64 {
+    let either = |p: &Point| lag_left(p.l).min(2.0 * PI - lag_left(p.l));
+    crossings
+        .iter()
+        .map(either)
+        .fold(f64::INFINITY, f64::min)
+        .to_degrees()
+}
+
+/// In samples.
+fn delay_margin(crossings: &[Point]) -> f64 {
+    crossings
+        .iter()
+        .map(|p| lag_left(p.l) / p.theta)
+        .fold(f64::INFINITY, f64::min)
+}
+
+/// Nodes and weights of Gauss and Legendre from -1 to 1.
+const GAUSS: [(f64, f64); 4] = [
+    (-0.861_136_311_594_052_6, 0.347_854_845_137_453_86),
+    (-0.339_981_043_584_856_26, 0.652_145_154_862_546_1),
+    (0.339_981_043_584_856_26, 0.652_145_154_862_546_1),
+    (0.861_136_311_594_052_6, 0.347_854_845_137_453_86),
+];
+
+/// Noise gain where there are too many states: the square root of `1/pi int |R/(1 + L)|^2 dtheta`, interval by interval.
+pub(super) fn noise_on(closed: &Loop<'_>, points: &[Point]) -> f64 {
+    let power = |theta: f64| {
+        let place = Place::at(theta);
+        (closed.path.response(&place) / (closed.at(&place) + 1.0)).norm_sqr()
+    };
+    let over = |low: f64, high: f64| -> f64 {
+        let (middle, half) = (0.5 * (low + high), 0.5 * (high - low));
+        GAUSS
+            .iter()
+            .map(|(x, w)| w * half * power(middle + half * x))
+            .sum()
+    };
+    let first = points
+        .iter()
+        .find(|p| p.theta > 0.0)
+        .map_or(PI, |p| p.theta);
+    let inner: f64 = points
+        .windows(2)
+        .map(|p| over(p[0].theta, p[1].theta))
+        .sum();
+    ((inner + first * power(first)) / PI).sqrt()
+}

@@ -1,0 +1,148 @@
+//! The feedback path of a controller: encoder, filters and PID between the plant's output and its input.
+
+use nalgebra::Complex;
+use sewfast_control::{CAPACITY, Refused, Standard};
+
+use super::Place;
+use crate::{Error, Result};
+
+/// What of a controller lies in the loop, in plain numbers; alpha, beta and the limits do not.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Path {
+    /// Gains in standard form.
+    pub gains: Standard<f64>,
+    /// Gain that a schedule adds to the proportional one \[u/y\]: where `Kp` depends on the output, `-Kp alpha r` does too,
+    /// and `alpha r dKp/dy` acts on the output's deviation.
+    pub slope: f64,
+    /// The derivative is filtered with time constant `Td/N`; infinite for no filter.
+    pub n: f64,
+    /// Samples of the moving average; 1 for none.
+    pub filter_samples: usize,
+    /// Time constant of the lag \[s\]; 0 for none.
+    pub filter_time: f64,
+    /// Time constant of the alpha-beta observer \[s\]; 0 for none.
+    pub observer_time: f64,
+    /// Whether the output is measured as a difference of positions: the mean over the sample before.
+    pub encoder: bool,
+    /// Sample time \[s\].
+    pub ts: f64,
+}
+
+impl Path {
+    /// Gains at a sample time, without filters.
+    pub fn new(gains: Standard<f64>, ts: f64) -> Self {
+        Self {
+            gains,
+            slope: 0.0,
+            n: f64::INFINITY,
+            filter_samples: 1,
+            filter_time: 0.0,
+            observer_time: 0.0,
+            encoder: false,
+            ts,
+        }
+    }
+
+    pub(super) fn check(&self) -> Result<()> {
+        self.gains.checked()?;
+        let unless = |holds: bool, name, expected, received| match holds {
+            true => Ok(()),
+            false => Err(Error::from(Refused {
+                name,
+                expected,
+                received,
+            })),
+        };
+        let time = |t: f64| t >= 0.0 && t.is_finite();
+        let finite_time = "a finite time of 0 s or more";
+        let average = (1..=CAPACITY).contains(&self.filter_samples);
+        unless(
+            self.ts > 0.0 && self.ts.is_finite(),
+            "Ts",
+            "a sample time above 0 s",
+            self.ts,
+        )?;
+        unless(self.n > 0.0, "N", "a number above 0, or inf", self.n)?;
+        unless(self.slope.is_finite(), "slope", "a finite gain", self.slope)?;
+        unless(
+            average,
+            "filter_samples",
+            "1 to 64 samples",
+            self.filter_samples as f64,
+        )?;
+        unless(
+            time(self.filter_time),
+            "filter_time",
+            finite_time,
+            self.filter_time,
+        )?;
+        unless(
+            time(self.observer_time),
+            "observer_time",
+            finite_time,
+            self.observer_time,
+        )
+    }
+
+    /// Gain on the sum of errors, `Kp Ts/Ti`.
+    pub(super) fn ki(&self) -> f64 {
+        self.gains.kp * self.ts / self.gains.ti
+    }
+
+    /// Gain on the difference of the output, `Kp Td/(Td/N + Ts)`.
+    pub(super) fn kd(&self) -> f64 {
+        self.gains.kp * self.gains.td / (self.gains.td / self.n + self.ts)
+    }
+
+    /// Pole of the derivative's filter, `(Td/N)/(Td/N + Ts)`.
+    pub(super) fn pole(&self) -> f64 {
+        let filter = self.gains.td / self.n;
+        filter / (filter + self.ts)
+    }
+
+    /// Weight of the newest sample in the lag, `Ts/(Ts + filter_time)`.
+    pub(super) fn weight(&self) -> f64 {
+        self.ts / (self.ts + self.filter_time)
+    }
+
+    /// `exp(-Ts/observer_time)`, both poles of the observer.
+    pub(super) fn theta(&self) -> f64 {
+        (-self.ts / self.observer_time).exp()
+    }
+
+    /// From the measured output to the command, with its sign turned:
+    ///
+    /// ```text
+    /// R = (Kp + slope + Ki/(1 - 1/z) + Kd (1 - 1/z)/(1 - pole/z)) F,
+    /// F = (1 - z^-n)/(n (1 - 1/z))  w/(1 - (1 - w)/z)  ((1 - theta)/(1 - theta/z))^2
+    /// ```
+    pub(super) fn response(&self, at: &Place) -> Complex<f64> {
+        let (d, one) = (at.difference, Complex::new(1.0, 0.0));
+        let lag = |pole: f64| one * (1.0 - pole) / (d * pole + (1.0 - pole));
+        let pole = self.pole();
+        let mut response = Complex::new(self.gains.kp + self.slope, 0.0)
+            + d * self.kd() / (d * pole + (1.0 - pole));
+        if self.ki() != 0.0 {
+            response += one * self.ki() / d;
+        }
+        // at frequency 0 the mean is 1
+        if self.filter_samples > 1 && at.theta > 0.0 {
+            let n = self.filter_samples as f64;
+            response *= Place::at(n * at.theta).difference / (d * n);
+        }
+        if self.filter_time > 0.0 {
+            response *= lag(1.0 - self.weight());
+        }
+        if self.observer_time > 0.0 {
+            let once = lag(self.theta());
+            response *= once * once;
+        }
+        response
+    }
+
+    /// The encoder: `(1 + 1/z)/2`, as the output runs straight between samples.
+    pub(super) fn encoder_response(&self, at: &Place) -> Complex<f64> {
+        let half = if self.encoder { 0.5 } else { 0.0 };
+        Complex::new(1.0, 0.0) - at.difference * half
+    }
+}

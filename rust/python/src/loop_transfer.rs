@@ -1,0 +1,132 @@
+//! Bindings of the sampled linear loop: its frequency response and its margins.
+
+use numpy::{Complex64, PyArray1, PyReadonlyArray1};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use sewfast_control::Standard;
+use sewfast_core::Result;
+use sewfast_core::loop_transfer::{self, Loop, Path, Plant};
+
+use crate::arrays::{array1, raise, slice};
+use crate::watch::watched;
+
+type Values<'py> = PyReadonlyArray1<'py, f64>;
+
+pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<LoopPath>()?;
+    module.add_function(wrap_pyfunction!(sampled_fopdt, module)?)?;
+    module.add_function(wrap_pyfunction!(loop_response, module)?)?;
+    module.add_function(wrap_pyfunction!(margins, module)?)
+}
+
+/// The feedback path of a controller: what of it lies in the loop. Gains in standard form.
+#[pyclass(module = "sewfast._core", frozen)]
+pub struct LoopPath(Path);
+
+#[pymethods]
+impl LoopPath {
+    #[new]
+    #[pyo3(signature = (*, Kp, Ti, Td, N, Ts, filter_samples, filter_time, observer_time, encoder, slope=0.0))]
+    #[expect(non_snake_case, reason = "the field's names")]
+    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+    fn new(
+        Kp: f64,
+        Ti: f64,
+        Td: f64,
+        N: f64,
+        Ts: f64,
+        filter_samples: usize,
+        filter_time: f64,
+        observer_time: f64,
+        encoder: bool,
+        slope: f64,
+    ) -> Self {
+        let gains = Standard {
+            kp: Kp,
+            ti: Ti,
+            td: Td,
+        };
+        Self(Path {
+            gains,
+            slope,
+            n: N,
+            filter_samples,
+            filter_time,
+            observer_time,
+            encoder,
+            ts: Ts,
+        })
+    }
+}
+
+/// Numerator and denominator of a plant in powers of z^-1, as NumPy has them.
+type Fraction<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>);
+
+#[pyfunction]
+#[pyo3(signature = (K, T, L, *, Ts))]
+#[expect(non_snake_case, reason = "the field's names")]
+fn sampled_fopdt(py: Python<'_>, K: f64, T: f64, L: f64, Ts: f64) -> PyResult<Fraction<'_>> {
+    let plant = Plant::fopdt(K, T, L, Ts).map_err(|e| raise(py, e))?;
+    Ok((
+        array1(py, plant.num().to_vec()),
+        array1(py, plant.den().to_vec()),
+    ))
+}
+
+#[pyfunction]
+#[pyo3(signature = (path, num, den, omega))]
+fn loop_response<'py>(
+    py: Python<'py>,
+    path: &LoopPath,
+    num: Values<'py>,
+    den: Values<'py>,
+    omega: Values<'py>,
+) -> PyResult<Bound<'py, PyArray1<Complex64>>> {
+    let (num, den, omega) = (
+        slice(&num, "num")?,
+        slice(&den, "den")?,
+        slice(&omega, "omega")?,
+    );
+    let response = || -> Result<Vec<Complex64>> {
+        let plant = Plant::new(num, den)?;
+        let closed = Loop::new(&path.0, &plant)?;
+        Ok(omega.iter().map(|&w| closed.response(w)).collect())
+    };
+    let response = response().map_err(|e| raise(py, e))?;
+    Ok(PyArray1::from_vec(py, response))
+}
+
+#[pyfunction]
+#[pyo3(signature = (path, num, den))]
+fn margins<'py>(
+    py: Python<'py>,
+    path: &LoopPath,
+    num: Values<'py>,
+    den: Values<'py>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let (num, den) = (slice(&num, "num")?, slice(&den, "den")?);
+    let found = watched(py, None, |_| {
+        let plant = Plant::new(num, den)?;
+        Ok(loop_transfer::margins(&Loop::new(&path.0, &plant)?))
+    })?;
+    let dict = PyDict::new(py);
+    dict.set_item("stable", found.stable)?;
+    let numbers = [
+        ("largest_pole", found.largest_pole),
+        ("Ms", found.ms.0),
+        ("Ms_omega", found.ms.1),
+        ("Mt", found.mt.0),
+        ("Mt_omega", found.mt.1),
+        ("gain_margin", found.gain_margin),
+        ("gain_reduction", found.gain_reduction),
+        ("phase_margin_deg", found.phase_margin),
+        ("delay_margin_s", found.delay_margin),
+        ("noise_gain", found.noise_gain),
+    ];
+    for (name, value) in numbers {
+        dict.set_item(name, value)?;
+    }
+    dict.set_item("gain_crossovers", found.gain_crossovers)?;
+    dict.set_item("phase_crossovers", found.phase_crossovers)?;
+    Ok(dict)
+}
