@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo accuracy bench bench-device clean $(MARKED)
+.PHONY: help demo accuracy commissioning bench bench-device clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -98,6 +98,9 @@ bench: $(VENV)/bench.stamp ## end-to-end benchmarks beside their rivals
 
 accuracy: $(DEV) ## accuracy of the default configuration on public records, beside published figures (SEWFAST_DATA)
 	$(BIN)/python benches/accuracy.py
+
+commissioning: $(DEV) ## figures of commissioning on five virtual machines, beside an oracle (docs/RESULTS.md)
+	$(BIN)/python benches/commissioning.py
 
 SOAKED := tests/test_soak.py tests/test_watchdog.py tests/test_recordfile_kill.py tests/test_recordfile_damage.py \
   tests/test_link_connection.py tests/test_link_drive.py tests/test_link_virtual.py

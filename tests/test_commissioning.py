@@ -133,8 +133,8 @@ def test_nothing_is_learned_from_the_true_speed_or_the_recording_judged_by(
 ) -> None:
     assert whole.models is not None
     for member in whole.models.members:
-        assert {d["name"] for d in member.training["data"]} <= {"chirp", "trapezoids"}
-    for name in ("chirp", "trapezoids", "levels"):
+        assert {d["name"] for d in member.training["data"]} <= {"pulses", "trapezoids"}
+    for name in ("pulses", "trapezoids", "levels"):
         recording = whole.recordings[name]
         np.testing.assert_array_equal(recording.y, recording.speed("kalman"))
 
@@ -291,7 +291,7 @@ def test_only_machines_are_commissioned() -> None:
 # --- Ctrl-C -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stage", ["open loop", "training", "tuning", "verification"])
+@pytest.mark.parametrize("stage", ["closed loop", "training", "tuning", "verification"])
 def test_an_interruption_keeps_what_there_is(stage: str, tmp_path: Path) -> None:
     def interrupt(done: int, total: int, text: str) -> None:
         if text == stage:
@@ -335,7 +335,7 @@ def test_the_folder_holds_everything_and_its_page_is_written_anew(
     assert load_controller(out / "controllers" / "tuned.json") == whole.controller
     assert whole.models is not None
     assert len(load_model(out / "models" / "ensemble.json").members) == 2  # type: ignore[attr-defined]
-    assert len(read_table(out / "recordings" / "chirp.csv")["y"]) > 1000
+    assert len(read_table(out / "recordings" / "pulses.csv")["y"]) > 1000
     assert {p.name for p in (out / "runs").iterdir()} == {
         f"{c.reference}_{kind}.npz" for c in whole.comparisons for kind in ("predicted", "measured")
     }

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 TEXT = """\
 Do what an engineer does to a drive: find out which command moves it, record its step response,
-take first gains by rule, record a sweep and a closed loop under these, train an ensemble of
-networks, tune the gains on all of them, run them on the machine and report the prediction beside
-the measurement. It stops with a reason where the evidence is not good enough.
+take first gains by rule, record a closed loop under these and pulses up to the command's limit,
+train an ensemble of networks, tune the gains on all of them, run them on the machine and report
+the prediction beside the measurement. It stops with a reason where the evidence is not good enough.
 
 The machine turns freely up to a quarter more than the top speed (--speed), again and again, each
 time from rest. DIR holds recordings, models, controllers, runs and report.html; Ctrl-C stops the

@@ -9,12 +9,12 @@ from ..control import Fopdt
 from ..dataset import FloatArray
 from .demands import Demands
 
-SWEEP = (0.025, 0.75)
-"""Of the chirp, from and to, times the time constant [cycles]."""
-CHIRP = 48.0
-"""Length of the chirp in time constants."""
 LONGEST = 60.0
 """Of any excitation [s]."""
+PULSES = 20.0
+"""Length of the pulses in time constants."""
+HARD = 0.8
+"""Least size of a pulse in shares of the largest command."""
 SLOW = 0.15
 """Speed between the trapezoids in shares of the top: a shaft that friction holds tells nothing."""
 TRAPEZOIDS = (
@@ -37,22 +37,6 @@ def acceleration(fopdt: Fopdt, demands: Demands) -> float:
 def step(u: float, seconds: float, Ts: float) -> FloatArray:
     """From 0 to `u` after a tenth."""
     return _core.step(duration=seconds, Ts=Ts, at=0.1 * seconds, low=0.0, high=u)
-
-
-def chirp(fopdt: Fopdt, demands: Demands, Ts: float) -> FloatArray:
-    """A sweep whose amplitude grows, always forward: the paper's training record to scale [V]."""
-    largest = min((demands.top - fopdt.offset) / fopdt.K, demands.u_max)
-    low, high = (cycles / fopdt.T for cycles in SWEEP)
-    return _core.chirp(
-        duration=min(CHIRP * fopdt.T, LONGEST),
-        Ts=Ts,
-        f_start=low,
-        f_end=min(high, 0.05 / Ts),
-        amplitude_start=0.05 * largest,
-        amplitude_end=0.46 * largest,
-        offset_start=0.1 * largest,
-        offset_end=0.52 * largest,
-    )
 
 
 def trapezoids(fopdt: Fopdt, demands: Demands, Ts: float) -> FloatArray:
@@ -91,4 +75,29 @@ def levels(fopdt: Fopdt, demands: Demands, Ts: float, seed: int) -> FloatArray:
         smoothing=max(0.8 * T, 4.0 * demands.speed / acceleration(fopdt, demands)),
         seed=seed,
         start=0.0,
+    )
+
+
+def pulses(fopdt: Fopdt, demands: Demands, Ts: float, seed: int) -> FloatArray:
+    """Short commands near the largest, between speeds of the working range [V].
+
+    A drive limits its current there, which no gentle loop reaches and every fast one does. They are
+    planned with the acceleration that the command would give without such a limit: what is there
+    is less, and the speed stays below the plan.
+    """
+    T = fopdt.T
+    return _core.jumps(
+        duration=min(PULSES * T, LONGEST),
+        Ts=Ts,
+        speed_low=SLOW * demands.top,
+        speed_high=demands.top,
+        change_min=0.25 * demands.top,
+        level_min=HARD * demands.u_max,
+        level_max=demands.u_max,
+        hold_min=0.4 * T,
+        hold_max=2.0 * T,
+        ramp=0.0,
+        gain=fopdt.K,
+        acceleration=acceleration(fopdt, demands),
+        seed=seed,
     )

@@ -15,8 +15,8 @@ Progress: TypeAlias = Callable[[int, int, str], object]
 STAGES = (
     "first motion",
     "step response",
-    "open loop",
     "closed loop",
+    "limits",
     "training",
     "tuning",
     "verification",

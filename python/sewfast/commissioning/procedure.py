@@ -54,11 +54,11 @@ def commission(
 ) -> Commissioning:
     """From a machine at rest to a controller that was verified on it.
 
-    First motion, step response, first gains by rule, an open-loop sweep, a closed loop under the
-    first gains, an ensemble of networks from both, gains by search on all members with encoder,
-    feedback filter, gain spread and delay in the loop, and the machine under these beside what was
-    predicted. Every stage begins and ends at rest, and stops with a reason where the evidence is
-    not good enough (docs/commissioning.md).
+    First motion, step response, first gains by rule, a closed loop under the first gains, pulses up
+    to the command's limit, an ensemble of networks from both, gains by search on all members with
+    encoder, feedback filter, gain spread and delay in the loop, and the machine under these beside
+    what was predicted. Every stage begins and ends at rest, and stops with a reason where the
+    evidence is not good enough (docs/commissioning.md).
 
     Parameters
     ----------
@@ -140,16 +140,16 @@ def _carry_out(bench: Bench, asked: Demands, journal: Journal) -> Commissioning:
     first = first_gains(fopdt, bench, asked)
     journal.keep(fopdt=fopdt, first=first, controller=first)
 
-    journal.enter("open loop")
-    chirp = bench.excite(excitations.chirp(fopdt, asked, bench.Ts), "chirp")
-
     journal.enter("closed loop")
     trapezoids = bench.follow(first, excitations.trapezoids(fopdt, asked, bench.Ts), "trapezoids")
     require_unsaturated(trapezoids.run)
     levels = bench.follow(first, excitations.levels(fopdt, asked, bench.Ts, asked.seed), "levels")
 
+    journal.enter("limits")
+    pulses = bench.excite(excitations.pulses(fopdt, asked, bench.Ts, asked.seed), "pulses")
+
     journal.enter("training")
-    trained = train([chirp, trapezoids.recording], levels.recording, asked, journal.within)
+    trained = train([trapezoids.recording, pulses], levels.recording, asked, journal.within)
     journal.keep(models=trained.ensemble, rmse=trained.rmse)
 
     journal.enter("tuning")

@@ -20,8 +20,8 @@ _RUN = ("t", "r", "u", "y")
 _HOW = {
     "first motion": "which command moves the machine, and which way",
     "step response": "gain, time constant and dead time; first gains by rule",
-    "open loop": "a sweep of the command",
     "closed loop": "trapezoids and random levels under the first gains",
+    "limits": "short pulses of nearly the largest command",
     "training": "networks that differ in their seeds; judged on the random levels",
     "tuning": "gains of least cost on all networks, with encoder, filter, gain spread and delay",
     "verification": "prediction, then the machine",
