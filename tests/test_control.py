@@ -98,6 +98,20 @@ def test_values_do_not_change() -> None:
         ({"filter_samples": -1}, "filter_samples"),
         ({"filter_samples": True}, "filter_samples"),
         ({"filter_time": math.inf}, "filter_time"),
+        ({"observer_time": -1.0}, "observer_time"),
+        ({"observer_time": math.inf}, "observer_time"),
+        ({"r_rate": 0.0}, "r_rate"),
+        ({"r_rate": "fast"}, "r_rate"),
+        ({"schedule": 3}, "schedule"),
+        ({"schedule": [1.0]}, "schedule"),
+        ({"schedule": [(1.0, 2.0)]}, "Gains"),
+        ({"schedule": [("slow", Gains.standard(1, 1))]}, "speed"),
+        ({"schedule": [(-1.0, Gains.standard(1, 1))]}, "0 or more"),
+        ({"schedule": [(1.0, Gains.standard(1, 1))] * 2}, "growing"),
+        ({"schedule": [(k, Gains.standard(1, 1)) for k in range(9)]}, "at most 8"),
+        ({"schedule": [(k, Gains.standard(1 - 2 * k, 1)) for k in range(2)]}, "one sign"),
+        ({"schedule": [(1.0, Gains.standard(1, 1, u_unit="A"))]}, "units"),
+        ({"schedule": [(1.0, Gains.per_sample(1, 1, Ts=0.002))]}, "convert them"),
         ({"counts_per_rev": 0.0}, "counts_per_rev"),
         ({"u_max": None}, "u_max"),
         ({"notes": 1}, "notes"),
@@ -115,6 +129,42 @@ def test_one_step_by_hand() -> None:
     core.reset()
     assert core.step(1.0, 1.0) == pytest.approx(-1.0)
     assert core.filtered == 1.0
+    assert core.step(1.0, 1.0, 0.25) == pytest.approx(-0.75)
+
+
+def test_the_core_changes_gains_and_mode_without_a_bump() -> None:
+    slow, fast = Controller(Gains.standard(1.0, 0.5)), Controller(Gains.standard(3.0, 0.1))
+    core = slow.core()
+    before = [core.step(2.0, 1.0) for _ in range(50)][-1]
+    core.set_design(fast.core())
+    assert core.step(2.0, 1.0) == pytest.approx(before + 3.0 * 0.001 / 0.1)
+    core.set_manual(-4.0)
+    assert core.manual
+    assert core.step(2.0, 1.0) == -4.0
+    core.set_automatic()
+    assert not core.manual
+    assert core.step(2.0, 1.0) == pytest.approx(-4.0 + 3.0 * 0.001 / 0.1)
+    core.set_design(core)
+    for refused in (
+        lambda: core.set_manual(math.nan),
+        lambda: core.set_design(replace(fast, Ts=0.002).core()),
+    ):
+        with pytest.raises(SettingError):
+            refused()
+
+
+def test_ramp_observer_and_schedule_by_hand() -> None:
+    points = [(100.0, Gains.standard(1.0, math.inf)), (300.0, Gains.parallel(2.0, 0.0))]
+    core = Controller(Gains.standard(9.0, 9.0), schedule=points, r_rate=1000.0).core()  # type: ignore[arg-type]
+    assert core.step(0.0, 50.0) == pytest.approx(1.0 * (49.0 - 50.0))
+    assert core.step(0.0, -200.0) == pytest.approx(1.5 * (48.0 + 200.0))
+    assert core.step(0.0, 900.0) == pytest.approx(2.0 * (47.0 - 900.0))
+    core = Controller(Gains.standard(1.0, math.inf), observer_time=0.002).core()
+    theta = math.exp(-0.5)
+    core.step(0.0, 10.0)
+    assert core.filtered == 10.0
+    core.step(0.0, 20.0)
+    assert core.filtered == pytest.approx(10.0 + 10.0 * (1 - theta) ** 2)
 
 
 CONTROLLERS = st.builds(
@@ -130,6 +180,16 @@ CONTROLLERS = st.builds(
     slew=times_or_none(math.inf),
     filter_samples=st.integers(1, 64),
     filter_time=st.floats(0, 1),
+    observer_time=st.floats(0, 1),
+    r_rate=times_or_none(math.inf),
+    schedule=st.lists(
+        st.tuples(
+            st.floats(0, 1e6),
+            st.builds(Gains.standard, POSITIVE, times_or_none(math.inf), times_or_none(0.0)),
+        ),
+        max_size=8,
+        unique_by=lambda point: round(point[0]),
+    ).map(lambda points: tuple(sorted(points, key=lambda point: point[0]))),
     counts_per_rev=st.none() | POSITIVE,
     notes=st.text(max_size=20),
 )
@@ -152,9 +212,41 @@ def test_files_of_every_form_and_without_infinities(tmp_path: Path) -> None:
         assert "Infinity" not in path.read_text()
 
 
+def test_a_file_of_version_1_is_read() -> None:
+    controller = load_controller(Path(__file__).parent / "golden" / "controller_1.json")
+    assert controller == Controller(
+        Gains.parallel(0.02, 0.1, 6e-5), alpha=0.3, beta=-1.25, N=5, Tt=0.05, u_min=-20, u_max=20,
+        filter_samples=8, filter_time=0.001, counts_per_rev=1572, notes="a file of version 1",
+    )  # fmt: skip
+
+
+def test_a_file_of_version_1_holds_nothing_of_version_2(tmp_path: Path) -> None:
+    path = tmp_path / "mixed.json"
+    paper_controller().save(path)
+    path.write_text(json.dumps({**json.loads(path.read_text()), "version": 1}))
+    with pytest.raises(ModelFileError, match=r"observer_time|r_rate|schedule"):
+        load_controller(path)
+
+
+def test_a_controller_prints_its_parts() -> None:
+    gains = Gains.standard(0.02, 0.1)
+    told = str(Controller(gains, observer_time=0.004, r_rate=5e3, schedule=((300.0, gains),)))
+    assert "observer of 0.004 s" in told
+    assert "ramp of 5000 RPM/s" in told
+    assert "at 300 RPM: Kp 0.02 V/RPM" in told
+    plain = str(Controller(gains))
+    assert "observer" not in plain
+    assert "ramp" not in plain
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
+        ({"schedule": None}, "schedule"),
+        ({"schedule": [{"speed": 1.0}]}, "gains"),
+        ({"schedule": [{"speed": None, "gains": {}}]}, "speed"),
+        ({"schedule": [{"speed": 1.0, "gains": {"form": "serial"}}]}, "form"),
+        ({"observer_time": None}, "observer_time"),
         ({"alpha": "0.4"}, "alpha"),
         ({"alpha": None}, "alpha"),
         ({"alpha": True}, "alpha"),

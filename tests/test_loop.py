@@ -159,3 +159,35 @@ def test_named_references_need_rpm_at_a_millisecond() -> None:
     gains = Gains.standard(0.2, 0.05, y_unit="rad/s")
     with pytest.raises(SettingError, match="as samples"):
         run(Controller(gains), linear([-0.9], [1.0], unit="rad/s"), "trapezoid")
+
+
+def test_feedforward_and_disturbance_are_what_the_core_makes_of_them() -> None:
+    r = np.full(300, 500.0)
+    feedforward, disturbance = r / 490.0, np.where(np.arange(300) < 150, 0.0, -1.0)
+    told = run(TUNED, drive(), r, feedforward=feedforward, disturbance=disturbance)
+    core = TUNED.core()
+    core.step(r[0], told.feedback[0], feedforward[0])
+    plain = run(TUNED, drive(), r)
+    assert told.u[0] == pytest.approx(plain.u[0] + feedforward[0])
+    assert np.array_equal(told.y[:150], run(TUNED, drive(), r, feedforward=feedforward).y[:150])
+    assert np.min(told.y[150:]) < np.min(run(TUNED, drive(), r, feedforward=feedforward).y[150:])
+    ahead = run(TUNED, VirtualMachine(), r, feedforward=feedforward)
+    assert ahead.u[0] == pytest.approx(plain.u[0] + feedforward[0])
+
+
+def test_signals_that_a_plant_cannot_take_are_refused() -> None:
+    r = np.full(10, 500.0)
+    with pytest.raises(SettingError, match="set_load"):
+        run(TUNED, VirtualMachine(), r, disturbance=r)
+    for bad in (r[:5], np.full(10, math.nan), np.ones((10, 2)), "none"):
+        with pytest.raises(DataError, match="feedforward"):
+            run(TUNED, drive(), r, feedforward=bad)
+
+
+def test_a_model_with_an_offset_begins_where_it_rests() -> None:
+    core = _core.LinearModel(np.array([-0.9]), np.array([[10.0]]), 1, -5.0)
+    model = LinearOE(core, 0.001, ("u",), "y", ("V",), "RPM")
+    ideal = replace(TUNED, alpha=0.0, counts_per_rev=None)
+    told = run(ideal, model, np.full(50, -50.0))
+    assert told.y == pytest.approx(np.full(50, -50.0))
+    assert told.u == pytest.approx(np.zeros(50), abs=1e-9)

@@ -396,9 +396,11 @@ _Plant: TypeAlias = Machine | LinearModel | NeuralOE | NeuralSS
 
 def closed_loop(
     plant: _Plant, controller: Controller, reference: _F, *, counts_per_unit: float,
-    encoder_phase: float = 0.5,
+    encoder_phase: float = 0.5, feedforward: _F | None = None, disturbance: _F | None = None,
 ) -> dict[str, _F]:
     """Keys u, y (true output), feedback (after encoder and filter); all (N,). From rest, controller reset.
+
+    ``feedforward`` is added to the command before its limits, ``disturbance`` behind them; both (N,) [u].
 
     ``counts_per_unit`` is counts per (output unit x second); 0 feeds the plant's output back unquantised.
     A virtual machine brings its own encoder. The controller passed in is not stepped. A loop that diverges

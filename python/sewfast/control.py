@@ -30,7 +30,8 @@ __all__ = [
 ]
 
 FORMAT = "sewfast.controller"
-VERSION = 1
+VERSION = 2
+"""Of the files that are written; version 1 had no observer, ramp or schedule."""
 
 _UNBOUNDED = {
     "N": math.inf,
@@ -38,9 +39,11 @@ _UNBOUNDED = {
     "u_min": -math.inf,
     "u_max": math.inf,
     "slew": math.inf,
+    "r_rate": math.inf,
 }
 """What null means in a file, where JSON has no infinity."""
-_REALS = ("Ts", "alpha", "beta", "N", "Tt", "u_min", "u_max", "slew", "filter_time")
+_FIRST_REALS = ("Ts", "alpha", "beta", "N", "Tt", "u_min", "u_max", "slew", "filter_time")
+_REALS = (*_FIRST_REALS, "observer_time", "r_rate")
 _OTHERS = ("version", "gains", "u_unit", "y_unit", "filter_samples", "counts_per_rev", "notes")
 
 
@@ -69,6 +72,14 @@ class Controller:
         Moving average in the feedback, 1 to 64 samples; 1 for none.
     filter_time : float
         First-order lag in the feedback after it [s]; 0 for none.
+    observer_time : float
+        Time constant of the alpha-beta observer in the feedback after that [s]; 0 for none.
+    r_rate : float
+        Largest change of the reference that is controlled to [y/s]; inf for none.
+    schedule : sequence of (float, Gains)
+        Gains over the size of the filtered output [y]: up to 8 points with growing speeds of 0 or
+        more. Kp, Kp/Ti and Kp Td are linear between them and held outside. Where it is not empty,
+        `gains` has no part in the command.
     counts_per_rev : float or None
         The encoder that measures a model's output; None for ideal feedback. A machine has its own.
     notes : str
@@ -91,23 +102,38 @@ class Controller:
     slew: float = math.inf
     filter_samples: int = 1
     filter_time: float = 0.0
+    observer_time: float = 0.0
+    r_rate: float = math.inf
+    schedule: tuple[tuple[float, Gains], ...] = ()
     counts_per_rev: float | None = None
     notes: str = ""
 
     def __post_init__(self) -> None:
         for name in _REALS:
             object.__setattr__(self, name, real(name, getattr(self, name)))
-        if self.gains.Ts is not None and not math.isclose(self.gains.Ts, self.Ts, rel_tol=1e-9):
-            raise SettingError(
-                f"expected gains for the controller's sample time of {self.Ts} s, got per-sample "
-                f"gains at {self.gains.Ts} s; convert them with gains.to('standard')"
-            )
+        object.__setattr__(self, "schedule", _points(self.schedule))
+        self._check_gains(self.gains)
+        for _, gains in self.schedule:
+            self._check_gains(gains)
         object.__setattr__(self, "filter_samples", whole("filter_samples", self.filter_samples))
         if self.counts_per_rev is not None:
             object.__setattr__(self, "counts_per_rev", real("counts_per_rev", self.counts_per_rev))
         if not isinstance(self.notes, str):
             raise SettingError(f"expected text for notes, got {self.notes!r}")
         _ = (self.core(), self.counts_per_unit)
+
+    def _check_gains(self, gains: Gains) -> None:
+        if gains.Ts is not None and not math.isclose(gains.Ts, self.Ts, rel_tol=1e-9):
+            raise SettingError(
+                f"expected gains for the controller's sample time of {self.Ts} s, got per-sample "
+                f"gains at {gains.Ts} s; convert them with gains.to('standard')"
+            )
+        units, others = (gains.u_unit, gains.y_unit), (self.gains.u_unit, self.gains.y_unit)
+        if units != others:
+            raise SettingError(
+                f"expected a schedule in the gains' units {others[0]} and {others[1]}, got "
+                f"{units[0]} and {units[1]}; convert one of them"
+            )
 
     @property
     def counts_per_unit(self) -> float:
@@ -117,15 +143,25 @@ class Controller:
         return counts_per_unit(self.counts_per_rev, self.gains.y_unit)
 
     def core(self) -> _core.Controller:
-        """The arithmetic itself, at rest: `step(r, y)` once per sample gives the command."""
+        """The arithmetic itself, at rest: `step(r, y, feedforward)` gives the command of a sample.
+
+        `set_design(other.core())` changes its settings and `set_manual(u)`, `set_automatic()` its
+        mode while it runs, without a bump.
+        """
         gains = self.gains.to("standard")
         return _core.Controller(
             Kp=gains.Kp,
             Ti=gains.Ti,
             Td=gains.Td,
             filter_samples=self.filter_samples,
+            schedule=self.schedule_rows(),
             **{name: getattr(self, name) for name in _REALS},
         )
+
+    def schedule_rows(self) -> list[tuple[float, float, float, float]]:
+        """Speed [y], Kp [u/y], Ti [s], Td [s] of each point of the schedule."""
+        standard = [(speed, gains.to("standard")) for speed, gains in self.schedule]
+        return [(speed, g.Kp, g.Ti, g.Td) for speed, g in standard]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write it as JSON (docs/CONVENTIONS.md, Files); the file appears whole or not at all.
@@ -141,11 +177,12 @@ class Controller:
         """Everything as JSON values; null stands for a limit or filter that is not there."""
         values = {name: _bounded(getattr(self, name)) for name in _REALS}
         return {
-            "gains": {k: _bounded(v) for k, v in self.gains.to_dict().items()},
+            "gains": _gains_to_dict(self.gains),
             "u_unit": self.gains.u_unit,
             "y_unit": self.gains.y_unit,
             **values,
             "filter_samples": self.filter_samples,
+            "schedule": [{"speed": v, "gains": _gains_to_dict(g)} for v, g in self.schedule],
             "counts_per_rev": self.counts_per_rev,
             "notes": self.notes,
         }
@@ -153,14 +190,20 @@ class Controller:
     def __str__(self) -> str:
         u, y = self.gains.u_unit, self.gains.y_unit
         lag = f", then a lag of {self.filter_time:g} s" if self.filter_time else ""
+        if self.observer_time:
+            lag += f", then an observer of {self.observer_time:g} s"
+        ramp = "" if math.isinf(self.r_rate) else f", ramp of {self.r_rate:g} {y}/s"
+        gains = [f"  gains     {self.gains}"]
+        if self.schedule:
+            gains = [f"  gains     at {speed:g} {y}: {g}" for speed, g in self.schedule]
         encoder = "ideal" if self.counts_per_rev is None else f"{self.counts_per_rev:g} counts/rev"
         windup = (
             "conditional integration" if self.Tt == 0 else f"back-calculation, Tt {self.Tt:g} s"
         )
         lines = [
             f"2-DOF PID at {self.Ts:g} s from {y} to {u}",
-            f"  gains     {self.gains}",
-            f"  reference alpha {self.alpha:.6g}, beta {self.beta:.6g}",
+            *gains,
+            f"  reference alpha {self.alpha:.6g}, beta {self.beta:.6g}{ramp}",
             f"  derivative filter N {self.N:.6g}",
             f"  limits    {self.u_min:g} to {self.u_max:g} {u}, slew {self.slew:g} {u}/s; {windup}",
             f"  feedback  {encoder}, mean of {self.filter_samples} samples{lag}",
@@ -177,15 +220,19 @@ def load_controller(path: str | os.PathLike[str]) -> Controller:
         Where the file is missing, damaged, of another format or of an unknown version, or holds a
         setting outside its range; the message names the file and the field.
     """
-    fields = Fields(os.fspath(path), jsonfile.read(path, FORMAT, (VERSION,)))
-    fields.require_only((*_OTHERS, *_REALS))
+    fields = Fields(os.fspath(path), jsonfile.read(path, FORMAT, (1, VERSION)))
+    first = fields.integer("version") == 1
+    reals = _FIRST_REALS if first else _REALS
+    fields.require_only((*_OTHERS, *reals, *(() if first else ("schedule",))))
+    units = {"u_unit": fields.text("u_unit"), "y_unit": fields.text("y_unit")}
     try:
         return Controller(
-            gains=_gains(fields),
+            gains=_gains(fields.object("gains"), units),
             filter_samples=fields.integer("filter_samples"),
+            schedule=() if first else _schedule(fields, units),
             counts_per_rev=fields.optional_number("counts_per_rev"),
             notes=fields.text("notes"),
-            **{name: _unbounded(fields, name, _UNBOUNDED) for name in _REALS},
+            **{name: _unbounded(fields, name, _UNBOUNDED) for name in reals},
         )
     except ModelFileError:
         raise
@@ -193,16 +240,43 @@ def load_controller(path: str | os.PathLike[str]) -> Controller:
         raise ModelFileError(f"{path}: {error}") from error
 
 
-def _gains(fields: Fields) -> Gains:
-    part = fields.object("gains")
+def _schedule(fields: Fields, units: Mapping[str, str]) -> tuple[tuple[float, Gains], ...]:
+    points = fields.objects("schedule")
+    for point in points:
+        point.require_only(("speed", "gains"))
+    return tuple((p.number("speed"), _gains(p.object("gains"), units)) for p in points)
+
+
+def _gains(part: Fields, units: Mapping[str, str]) -> Gains:
     form = part.text("form")
     names = Gains.fields_of(form)
     if names is None:
         raise part.refuse("form", "standard, parallel or per_sample", form)
     part.require_only(("form", *names))
     values = [_unbounded(part, name, {"Ti": math.inf}) for name in names]
-    units = {"u_unit": fields.text("u_unit"), "y_unit": fields.text("y_unit")}
     return Gains(form, *values, **units)  # type: ignore[arg-type]
+
+
+def _gains_to_dict(gains: Gains) -> dict[str, Any]:
+    return {name: _bounded(value) for name, value in gains.to_dict().items()}
+
+
+def _points(schedule: Any) -> tuple[tuple[float, Gains], ...]:
+    """The schedule as pairs of a speed and gains; anything else is refused."""
+    try:
+        points = [(speed, gains) for speed, gains in schedule]
+    except (TypeError, ValueError) as error:
+        raise SettingError(
+            f"expected a schedule of (speed, Gains) pairs, got {schedule!r}; give () for constant "
+            "gains"
+        ) from error
+    for _, gains in points:
+        if not isinstance(gains, Gains):
+            raise SettingError(
+                f"expected Gains beside each speed of the schedule, got {gains!r}; make them with "
+                "Gains.standard, Gains.parallel or Gains.per_sample"
+            )
+    return tuple((real("speed", speed), gains) for speed, gains in points)
 
 
 def _unbounded(fields: Fields, name: str, unbounded: Mapping[str, float]) -> float:

@@ -130,6 +130,8 @@ def run(
     on: Plant | Drive,
     reference: str | ArrayLike,
     *,
+    feedforward: ArrayLike | None = None,
+    disturbance: ArrayLike | None = None,
     seed: int = 0,
     name: str | None = None,
     file: str | os.PathLike[str] | None = None,
@@ -150,6 +152,11 @@ def run(
         set.
     reference : str or array, shape (N,)
         Name of a reference (`sewfast.signals`) or its samples at the controller's sample time [y].
+    feedforward : array, shape (N,), optional
+        A command that is added before the limits [u]; a drive takes none.
+    disturbance : array, shape (N,), optional
+        Of a model: a command that is added behind the limits, unseen by the controller [u]. A
+        virtual machine has `set_load`.
     seed : int
         Chooses a named random reference.
     name : str, optional
@@ -170,9 +177,10 @@ def run(
     Raises
     ------
     SettingError
-        Where sample times or units of controller, plant and reference disagree.
+        Where sample times or units of controller, plant and reference disagree, or for signals that
+        the plant cannot take.
     DataError
-        For a reference that is empty or not finite.
+        For signals that are empty, not finite or of different lengths.
     FitError
         Where the loop diverges.
     LinkError
@@ -184,11 +192,17 @@ def run(
     require_controller(controller, on, "run(controller, plant, reference)")
     r = reference_samples(reference, controller, seed)
     title = name or (reference if isinstance(reference, str) else "reference")
+    beside = _beside(on, feedforward, disturbance)
     if not isinstance(on, (Model, VirtualMachine)):
         return _run_on(_require_drive(on), controller, r, title, file, live, overwrite)
     check_fits(controller, on)
     record = _core.closed_loop(
-        single_core(on), controller.core(), r, counts_per_unit=controller.counts_per_unit
+        single_core(on),
+        controller.core(),
+        r,
+        counts_per_unit=controller.counts_per_unit,
+        feedforward=beside.get("feedforward"),
+        disturbance=beside.get("disturbance"),
     )
     return ClosedLoopRun(
         t=np.arange(len(r), dtype=np.float64) * controller.Ts,
@@ -198,6 +212,24 @@ def run(
         plant=plant_name(on),
         reference=title,
     )
+
+
+def _beside(
+    on: Any, feedforward: ArrayLike | None, disturbance: ArrayLike | None
+) -> dict[str, FloatArray]:
+    """The signals beside the reference that were given."""
+    given = {"feedforward": feedforward, "disturbance": disturbance}
+    signals = {name: vector(name, v) for name, v in given.items() if v is not None}
+    if "disturbance" in signals and not isinstance(on, Model):
+        raise SettingError(
+            "expected a disturbance on a model only; load a virtual machine by its set_load"
+        )
+    if signals and not isinstance(on, (Model, VirtualMachine)):
+        raise SettingError(
+            "expected no feedforward on a drive, whose device takes a reference only; run it on a "
+            "model or a virtual machine"
+        )
+    return signals
 
 
 def require_controller(controller: Any, plant: Any, call: str) -> None:

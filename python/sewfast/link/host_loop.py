@@ -145,7 +145,10 @@ def at_period(controller: Controller, Ts: float) -> Controller:
     note = f"made for {controller.Ts:g} s, run at {Ts:g} s"
     notes = f"{controller.notes}; {note}" if controller.notes else note
     gains = controller.gains.to("standard")
-    return replace(controller, gains=gains, Ts=Ts, filter_samples=samples, notes=notes)
+    schedule = tuple((speed, g.to("standard")) for speed, g in controller.schedule)
+    return replace(
+        controller, gains=gains, schedule=schedule, Ts=Ts, filter_samples=samples, notes=notes
+    )
 
 
 def _batch(ratio: int) -> int:

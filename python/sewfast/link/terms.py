@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from ..control import Controller
@@ -76,6 +77,13 @@ def gains(controller: Controller, streamed: Sequence[Channel], counts_per_rev: f
         Where its gains are not in the device's units.
     """
     g, c = fitting(controller, streamed), controller
+    named = ("observer_time", bool(c.observer_time)), ("r_rate", c.r_rate != math.inf)
+    further = [name for name, used in (*named, ("schedule", bool(c.schedule))) if used]
+    if further:
+        raise SettingError(
+            f"expected a controller without {' and '.join(further)} for this device, whose "
+            "firmware does not know them; leave them out or run it on the host"
+        )
     values = (
         g.Kp, g.Ti, g.Td, c.alpha, c.beta, c.N, c.Tt, c.u_min, c.u_max, c.slew, c.filter_time,
         counts_per_unit(counts_per_rev, g.y_unit),

@@ -1,8 +1,10 @@
 //! A controller and a plant in closed loop, with encoder, feedback filter and limits inside the loop.
 
 mod plants;
+mod signals;
 
 pub use plants::{LaggedPlant, StatePlant, Varied};
+pub use signals::Signals;
 
 use sewfast_control::{Controller, Refused};
 
@@ -41,10 +43,16 @@ pub fn encoder(counts_per_unit: f64, phase: f64) -> Result<Option<Encoder>> {
     Ok((counts_per_unit > 0.0).then(|| Encoder::new(counts_per_unit, phase)))
 }
 
-/// The counter of the plant's encoder, or else of the loop's, and its scale; `None` without an encoder.
-fn counts(plant: &(impl Plant + ?Sized), encoder: Option<&Encoder>) -> Option<(f64, f64)> {
+/// The counter of the plant's encoder, or else of the loop's, a time `since` from now at the present output, and its scale;
+/// `None` without an encoder.
+fn counts(
+    plant: &(impl Plant + ?Sized),
+    encoder: Option<&Encoder>,
+    since: f64,
+) -> Option<(f64, f64)> {
     let encoder = plant.encoder().or(encoder)?;
-    Some((encoder.count(plant.position()), encoder.counts_per_unit()))
+    let position = plant.position() + since * plant.output();
+    Some((encoder.count(position), encoder.counts_per_unit()))
 }
 
 /// How a run ended.
@@ -101,13 +109,26 @@ impl Run {
         encoder: Option<&Encoder>,
         monitor: &Monitor,
     ) {
+        let signals = Signals::new(reference);
+        self.record_with(plant, controller, signals, encoder, monitor);
+    }
+
+    /// [`record`](Self::record) with signals from outside beside the reference; where they are shorter, 0 stands for the rest.
+    pub fn record_with(
+        &mut self,
+        plant: &mut (impl Plant + ?Sized),
+        controller: &mut Controller<f64>,
+        signals: Signals<'_>,
+        encoder: Option<&Encoder>,
+        monitor: &Monitor,
+    ) {
         self.clear();
         plant.reset();
         controller.reset();
         let ts = controller.settings().ts;
-        let mut before = counts(plant, encoder);
-        for (k, &r) in reference.iter().enumerate() {
-            let (y, now) = (plant.output(), counts(plant, encoder));
+        let mut before = counts(plant, encoder, -ts);
+        for (k, &r) in signals.reference.iter().enumerate() {
+            let (y, now) = (plant.output(), counts(plant, encoder, 0.0));
             let measured = match (before, now) {
                 (Some((before, _)), Some((now, scale))) => (now - before) / (ts * scale),
                 _ => y,
@@ -121,11 +142,11 @@ impl Run {
                 self.outcome = Outcome::Interrupted(k);
                 return;
             }
-            let u = controller.step(r, measured);
+            let u = signals.command(controller, k, r, measured);
             self.u.push(u);
             self.y.push(y);
             self.feedback.push(controller.filtered());
-            plant.advance(u);
+            plant.advance(signals.disturbed(k, u));
         }
     }
 
@@ -140,8 +161,7 @@ impl Run {
 /// Runs `controller` on `plant` over `reference`, from rest.
 ///
 /// # Errors
-/// `ErrorKind::Data` for a reference that is empty or not finite. A loop that diverges or is stopped is an
-/// [`Outcome`], not an error.
+/// As for [`closed_loop_with`].
 pub fn closed_loop(
     plant: &mut (impl Plant + ?Sized),
     controller: &mut Controller<f64>,
@@ -149,9 +169,24 @@ pub fn closed_loop(
     encoder: Option<&Encoder>,
     monitor: &Monitor,
 ) -> Result<Run> {
-    check_reference(reference)?;
-    let mut run = Run::with_capacity(reference.len());
-    run.record(plant, controller, reference, encoder, monitor);
+    closed_loop_with(plant, controller, Signals::new(reference), encoder, monitor)
+}
+
+/// Runs `controller` on `plant` under `signals`, from rest.
+///
+/// # Errors
+/// `ErrorKind::Data` for signals that are empty, not finite or of different lengths. A loop that diverges or is stopped is
+/// an [`Outcome`], not an error.
+pub fn closed_loop_with(
+    plant: &mut (impl Plant + ?Sized),
+    controller: &mut Controller<f64>,
+    signals: Signals<'_>,
+    encoder: Option<&Encoder>,
+    monitor: &Monitor,
+) -> Result<Run> {
+    signals.check()?;
+    let mut run = Run::with_capacity(signals.reference.len());
+    run.record_with(plant, controller, signals, encoder, monitor);
     Ok(run)
 }
 
@@ -165,13 +200,7 @@ pub fn check_reference(reference: &[f64]) -> Result<()> {
             "expected a reference with samples, got an empty one",
         ));
     }
-    match reference.iter().position(|r| !r.is_finite()) {
-        None => Ok(()),
-        Some(k) => Err(Error::data(format!(
-            "expected finite values in the reference, got {} at sample {k}; fill or cut it there",
-            reference[k]
-        ))),
-    }
+    signals::check_finite("reference", reference)
 }
 
 impl From<Refused> for Error {

@@ -8,7 +8,7 @@ use numpy::PyReadonlyArray1;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_control::{Parallel, PerSample, Refused, Standard};
-use sewfast_core::closed_loop::{self as looped, Outcome, Run};
+use sewfast_core::closed_loop::{self as looped, Outcome, Run, Signals};
 use sewfast_core::fopdt::fit_fopdt as fit;
 use sewfast_core::metrics::{self, Effort};
 use sewfast_core::rules::{self, Outside};
@@ -92,7 +92,8 @@ fn unknown_form(form: &str) -> Error {
 }
 
 #[pyfunction]
-#[pyo3(signature = (plant, controller, reference, *, counts_per_unit, encoder_phase=0.5))]
+#[pyo3(signature = (plant, controller, reference, *, counts_per_unit, encoder_phase=0.5, feedforward=None, disturbance=None))]
+#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
 fn closed_loop<'py>(
     py: Python<'py>,
     plant: &Bound<'py, PyAny>,
@@ -100,15 +101,27 @@ fn closed_loop<'py>(
     reference: Values<'py>,
     counts_per_unit: f64,
     encoder_phase: f64,
+    feedforward: Option<Values<'py>>,
+    disturbance: Option<Values<'py>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let (model, mut controller) = (Model::of(plant)?, controller.borrow().core.clone());
-    let reference = slice(&reference, "reference")?;
+    let beside = |values: &'_ Option<Values<'py>>, name| -> PyResult<Option<Vec<f64>>> {
+        let values = values.as_ref().map(|values| slice(values, name));
+        Ok(values.transpose()?.map(<[f64]>::to_vec))
+    };
+    let feedforward = beside(&feedforward, "feedforward")?;
+    let disturbance = beside(&disturbance, "disturbance")?;
+    let signals = Signals {
+        reference: slice(&reference, "reference")?,
+        feedforward: feedforward.as_deref(),
+        disturbance: disturbance.as_deref(),
+    };
     let run = watched(py, None, |monitor| {
         let encoder = looped::encoder(counts_per_unit, encoder_phase)?;
         let ts = controller.settings().ts;
         let mut plant = model.plant(ts)?;
         let encoder = encoder.as_ref();
-        looped::closed_loop(&mut plant, &mut controller, reference, encoder, monitor)
+        looped::closed_loop_with(&mut plant, &mut controller, signals, encoder, monitor)
             .and_then(|run| completed(run, ts))
     })?;
     let record = PyDict::new(py);

@@ -1,6 +1,9 @@
 //! The loop against its linear state-space form, its encoder, its plants and its outcomes.
 
 use nalgebra::{Matrix3, Vector3};
+
+mod state_space;
+
 use sewfast_control::{Design, Settings, Standard};
 
 use super::*;
@@ -232,4 +235,70 @@ fn stops_on_request() {
     let mut plant = LaggedPlant::new(&model, TS).unwrap();
     let run = closed_loop(&mut plant, &mut c, &[1.0; 10], None, &monitor).unwrap();
     assert_eq!((run.outcome, run.u.len()), (Outcome::Interrupted(0), 0));
+}
+
+#[test]
+fn a_model_with_an_offset_begins_where_it_rests() {
+    let model = LinearModel::new(vec![-1.5, 0.54], vec![3.0], 1, 1, -2.0).unwrap();
+    let mut plant = LaggedPlant::new(&model, TS).unwrap();
+    let rest = -2.0 / 0.04;
+    assert!((plant.output() - rest).abs() < 1e-9);
+    plant.advance(0.0);
+    assert!((plant.output() - rest).abs() < 1e-9 && (plant.position() - TS * rest).abs() < 1e-12);
+    plant.reset();
+    // told to stay there, the loop does nothing; its encoder has seen the motion before the first sample
+    for sensor in [None, encoder(1e6, 0.5).unwrap()] {
+        let mut c = controller(pi(0.01, 0.1), 1);
+        let run = closed(&mut plant, &mut c, &[rest; 50], sensor.as_ref()).unwrap();
+        assert!(run.u.iter().all(|u| u.abs() < 2e-5), "{:?}", run.u);
+        assert!((run.feedback[0] - rest).abs() < 2e-3);
+    }
+}
+
+#[test]
+fn a_model_that_does_not_rest_begins_at_zero() {
+    for a in [vec![-1.0], vec![-1.1], vec![1.0]] {
+        let model = LinearModel::new(a, vec![3.0], 1, 1, -2.0).unwrap();
+        assert_eq!(LaggedPlant::new(&model, TS).unwrap().output(), 0.0);
+    }
+}
+
+#[test]
+fn signals_that_do_not_fit_are_refused() {
+    let model = lag();
+    let mut plant = LaggedPlant::new(&model, TS).unwrap();
+    let mut c = controller(pi(1e-3, 0.1), 1);
+    let mut refused = |feedforward, disturbance| {
+        let signals = Signals {
+            feedforward,
+            disturbance,
+            ..Signals::new(&[1.0; 3])
+        };
+        let monitor = Monitor::default();
+        let run = closed_loop_with(&mut plant, &mut c, signals, None, &monitor);
+        run.unwrap_err().message
+    };
+    assert!(refused(Some(&[0.0; 2]), None).contains("feedforward"));
+    assert!(refused(None, Some(&[0.0; 4])).contains("disturbance"));
+    assert!(refused(None, Some(&[0.0, f64::NAN, 0.0])).contains("sample 1"));
+}
+
+#[test]
+fn a_disturbance_acts_behind_the_limits() {
+    let model = lag();
+    let mut plant = LaggedPlant::new(&model, TS).unwrap();
+    let limited = Settings {
+        u_min: -0.5,
+        u_max: 0.5,
+        ..pi(1.0, 0.1)
+    };
+    let signals = Signals {
+        disturbance: Some(&[2.0; 2000]),
+        ..Signals::new(&[0.0; 2000])
+    };
+    let monitor = Monitor::default();
+    let mut c = controller(limited, 1);
+    let run = closed_loop_with(&mut plant, &mut c, signals, None, &monitor).unwrap();
+    assert!(run.u.iter().all(|u| u.abs() <= 0.5));
+    assert!((run.y[1999] - 490.0 * 1.5).abs() < 1e-6);
 }
