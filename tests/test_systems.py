@@ -10,12 +10,14 @@ from sewfast import run
 from sewfast.analysis.systems import LinearLoop, response, simulate
 from sewfast.control import Controller, Gains
 from sewfast.models import LinearOE
+from sewfast.robustness import loop_response
 
 IDEAL = replace(QUIET, counts_per_rev=None, u_min=-np.inf, u_max=np.inf)
 CONTROLLERS = {
     "plain": replace(IDEAL, filter_samples=1, N=np.inf),
     "averaged": IDEAL,
     "lagged": replace(IDEAL, filter_time=0.004, beta=0.6),
+    "observed": replace(IDEAL, observer_time=0.003),
     "without integral": replace(IDEAL, gains=Gains.standard(0.02, np.inf, 0.003)),
 }
 
@@ -55,6 +57,26 @@ def test_alpha_and_beta_do_not_touch_the_disturbance() -> None:
     assert np.array_equal(one, two)
     r = d[:, ::-1]
     assert not np.allclose(*(simulate(loop(c).closed, r) for c in (IDEAL, other)))
+
+
+def test_a_schedule_is_taken_at_a_speed_with_its_slope() -> None:
+    points = (
+        (200.0, Gains.standard(0.01, 0.1, 0.002)),
+        (2000.0, Gains.standard(0.03, 0.05, 0.002)),
+    )
+    scheduled = replace(IDEAL, schedule=points, alpha=0.3)
+    hertz = np.geomspace(0.5, 400.0, 40)
+    for speed in (100.0, 1000.0, 3000.0):
+        linear = LinearLoop.of(scheduled, drive().to_ss(), speed=speed)
+        expected = loop_response(scheduled, drive(), 2 * np.pi * hertz, speed=speed)
+        assert np.allclose(response(linear.L, hertz, 0.001), expected, rtol=1e-7)
+    # small signals about 1,000 RPM are those of the simulated loop
+    r = np.full(3000, 1000.0)
+    r[2500:] += 1e-3
+    told = run(scheduled, drive(), r).y[2500:] - 1000.0
+    linear = LinearLoop.of(scheduled, drive().to_ss(), speed=1000.0)
+    step = simulate(linear.tracking, np.full((500, 1), 1e-3))[:, 0]
+    assert np.allclose(told, step, rtol=0, atol=2e-5)
 
 
 def test_the_encoder_delays_by_half_a_sample() -> None:

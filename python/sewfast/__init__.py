@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from . import signals, trust
     from ._core import __version__
+    from .analysis import Analysis, analyse
     from .commissioning import Commissioning, commission
     from .control import (
         Controller,
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ARX",
     "IV",
+    "Analysis",
     "ClosedLoopRun",
     "Commissioning",
     "Controller",
@@ -76,6 +78,7 @@ __all__ = [
     "Validation",
     "VirtualMachine",
     "__version__",
+    "analyse",
     "check",
     "commission",
     "delay",
@@ -104,6 +107,7 @@ __all__ = [
 _HOMES = {
     "_core": "__version__",
     "commissioning": "Commissioning commission",
+    "analysis": "Analysis analyse",
     "control": "Controller Gains fit_fopdt load_controller paper_controller table_1",
     "cost": "Cost",
     "dataset": "Dataset Experiment",

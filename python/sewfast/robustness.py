@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import _core
 from .control import Controller
 from .errors import SettingError
-from .gains import real
+from .gains import Gains, real
 from .linear_plant import sampled
 
 __all__ = ["Margins", "loop_path", "loop_response", "margins"]
@@ -143,36 +143,42 @@ def loop_path(controller: Controller, *, speed: float | None = None) -> _core.Lo
     SettingError
         For a schedule without a speed.
     """
-    gains = controller.gains.to("standard")
-    Kp, Ti, Td, slope = gains.Kp, gains.Ti, gains.Td, 0.0
-    schedule = getattr(controller, "schedule", ())
-    if schedule:
-        if speed is None:
-            raise SettingError(
-                "expected the speed at which the gain schedule is taken, received none; give speed"
-            )
-        Kp, Ti, Td, slope = _scheduled(controller, schedule, real("speed", speed))
+    gains, slope = scheduled_gains(controller, speed)
     return _core.LoopPath(
-        Kp=Kp,
-        Ti=Ti,
-        Td=Td,
+        Kp=gains.Kp,
+        Ti=gains.Ti,
+        Td=gains.Td,
         slope=slope,
         N=controller.N,
         Ts=controller.Ts,
         filter_samples=controller.filter_samples,
         filter_time=controller.filter_time,
-        observer_time=getattr(controller, "observer_time", 0.0),
+        observer_time=controller.observer_time,
         encoder=controller.counts_per_rev is not None,
     )
 
 
-def _scheduled(
-    controller: Controller, schedule: Any, speed: float
-) -> tuple[float, float, float, float]:
-    """Kp, Ti, Td at a speed, and `alpha r dKp/dy` at r = y: -Kp alpha r follows the output too."""
+def scheduled_gains(controller: Controller, speed: float | None) -> tuple[Gains, float]:
+    """Gains in standard form where the output is `speed`, and what the schedule adds to Kp there.
+
+    That is `alpha r dKp/dy` at r = y [u/y]: `-Kp alpha r` follows the output, too. 0 without a
+    schedule.
+
+    Raises
+    ------
+    SettingError
+        For a schedule without a speed.
+    """
+    schedule = controller.schedule
+    if not schedule:
+        return controller.gains.to("standard"), 0.0
+    if speed is None:
+        raise SettingError(
+            "expected the speed at which the gain schedule is taken, received none; give speed"
+        )
     at = np.array([point[0] for point in schedule])
     rows = [point[1].to("parallel") for point in schedule]
-    size = abs(speed)
+    size = abs(real("speed", speed))
     Kp, Ki, Kd = (
         float(np.interp(size, at, [getattr(g, name) for g in rows])) for name in ("Kp", "Ki", "Kd")
     )
@@ -181,7 +187,9 @@ def _scheduled(
     if 0 < above < len(at):
         steepness = (rows[above].Kp - rows[above - 1].Kp) / (at[above] - at[above - 1])
         slope = float(controller.alpha * size * steepness)
-    return Kp, Kp / Ki if Ki else math.inf, Kd / Kp if Kp else 0.0, slope
+    units = {"u_unit": controller.gains.u_unit, "y_unit": controller.gains.y_unit}
+    Ti, Td = Kp / Ki if Ki else math.inf, Kd / Kp if Kp else 0.0
+    return Gains.standard(Kp, Ti, Td, **units), slope
 
 
 def _hertz(omega: float) -> str:

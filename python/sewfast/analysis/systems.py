@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from ..control import Controller
 from ..dataset import FloatArray
-from ..gains import Gains
 from ..models.conversion import StateSpace
 from ..models.toolboxes import require_control, require_scipy_signal
+from ..robustness import scheduled_gains
 
 
 def gain(D: Any) -> StateSpace:
@@ -100,19 +100,20 @@ def measurement(controller: Controller, encoder: bool) -> StateSpace:
     if encoder:
         found = series(moving_average(2), found)
     found = series(found, lag(controller.filter_time, controller.Ts))
-    return series(found, observer(getattr(controller, "observer_time", 0.0), controller.Ts))
+    return series(found, observer(controller.observer_time, controller.Ts))
 
 
-def pid(controller: Controller, gains: Gains | None = None) -> StateSpace:
+def pid(controller: Controller, speed: float = 0.0) -> StateSpace:
     """From reference and filtered output, in this order, to the command.
 
     Parameters
     ----------
     controller : Controller
-    gains : Gains, optional
-        Instead of the controller's, as a schedule has them at a speed.
+    speed : float
+        Output at which the gains of a schedule are taken [y].
     """
-    g, Ts = (gains or controller.gains).to("standard"), controller.Ts
+    g, slope = scheduled_gains(controller, speed)
+    Ts = controller.Ts
     ki = g.Kp * Ts / g.Ti
     filtered = g.Td / controller.N
     kd = g.Kp * g.Td / (filtered + Ts)
@@ -120,7 +121,7 @@ def pid(controller: Controller, gains: Gains | None = None) -> StateSpace:
     b, c = 1.0 - controller.alpha, 1.0 - controller.beta
     integral = series(gain([[ki, -ki]]), _first_order(1.0, 1.0, 1.0))
     derivative = series(gain([[c, -1.0]]), _first_order(pole, kd * (pole - 1.0), kd))
-    return plus(gain([[g.Kp * b, -g.Kp]]), plus(integral, derivative))
+    return plus(gain([[g.Kp * b, -g.Kp - slope]]), plus(integral, derivative))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,13 +152,14 @@ class LinearLoop:
         plant: StateSpace,
         *,
         encoder: bool | None = None,
-        gains: Gains | None = None,
+        speed: float = 0.0,
     ) -> LinearLoop:
-        """Close the loop; `encoder` as the controller has one unless told, `gains` as for `pid`."""
+        """Close the loop; `encoder` as the controller has one unless told, a schedule's gains at
+        `speed`."""
         if encoder is None:
             encoder = controller.counts_per_rev is not None
         return cls(
-            plant, measurement(controller, encoder), pid(controller, gains), controller.Ts
+            plant, measurement(controller, encoder), pid(controller, speed), controller.Ts
         )  # fmt: skip
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from . import (
+    analyse,
     check,
     commission,
     control,
@@ -73,6 +74,7 @@ def build_parser() -> argparse.ArgumentParser:
         models,
         check,
         control,
+        analyse,
         ports,
         doctor,
         drive,

@@ -40,8 +40,9 @@ def figures(card: ReportCard) -> dict[str, Figure]:
     SettingError
         Where matplotlib is not installed.
     """
-    _require()
-    from ..report.canvas import style
+    from ..report.canvas import require_matplotlib, style
+
+    require_matplotlib()
 
     found: dict[str, Figure] = {}
     with style():
@@ -155,7 +156,7 @@ def bode_figure(card: ReportCard) -> Figure:
         shown = here[:: max(1, (len(here) - 1) // 4)]
         for n, k in enumerate(shown):
             look = {
-                "color": _shade(n, len(shown)),
+                "color": shade(n, len(shown)),
                 "lw": 4.2 - 3.2 * n / max(1, len(shown) - 1),
                 "ls": _STYLES[n % len(_STYLES)],
             }
@@ -203,7 +204,7 @@ def pole_figure(card: ReportCard) -> Figure:
     for n, p in enumerate(points):
         if not p.known:
             continue
-        plane.plot(p.poles.real, p.poles.imag, "x", color=_shade(n, len(points)), ms=6, mew=1.6)
+        plane.plot(p.poles.real, p.poles.imag, "x", color=shade(n, len(points)), ms=6, mew=1.6)
     plane.set_aspect("equal", "datalim")
     plane.set_xlabel("real part of z")
     plane.set_ylabel("imaginary part of z")
@@ -267,7 +268,7 @@ def _panels(rows: int, columns: int, height: float, share_x: bool = True) -> tup
     return figure, axes
 
 
-def _shade(n: int, count: int) -> str:
+def shade(n: int, count: int) -> str:
     """From dark to light in one hue: order is told by lightness, in grey print as well."""
     import matplotlib
 
@@ -296,12 +297,3 @@ def _envelope(ax: Axes, t: FloatArray, low: FloatArray, high: FloatArray) -> Non
     starts = np.arange(0, len(t), step)
     lows, highs = np.minimum.reduceat(low, starts), np.maximum.reduceat(high, starts)
     ax.fill_between(t[starts], lows, highs, color="#E69F00", alpha=0.4, lw=0, label="band")
-
-
-def _require() -> None:
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as e:
-        raise SettingError(
-            'figures need matplotlib, which is not installed: pip install "sewfast[report]"'
-        ) from e

@@ -154,7 +154,7 @@ def load(folder: str | os.PathLike[str]) -> Artefacts:
         recordings,
         predictions,
         {key: _columns(folder, run_file(*key), _RUN) for key in runs},
-        {name: _drawing(folder / drawing_file(name)) for name in _drawings(results)},
+        {name: drawing(folder / drawing_file(name)) for name in _drawings(results)},
     )
 
 
@@ -165,8 +165,14 @@ def _drawings(results: Mapping[str, Any]) -> list[str]:
     return [name for name in DRAWINGS if isinstance(named, list) and name in named]
 
 
-def _drawing(path: Path) -> str:
-    """An SVG that is nothing but a drawing."""
+def drawing(path: Path) -> str:
+    """An SVG that is nothing but a drawing.
+
+    Raises
+    ------
+    DataError
+        Where it cannot be read, or is something else.
+    """
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as e:

@@ -78,6 +78,16 @@ def require() -> None:
         ) from e
 
 
+def require_matplotlib() -> None:
+    """Refuse with a remedy where matplotlib is not installed."""
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as e:
+        raise SettingError(
+            'figures need matplotlib, which is not installed: pip install "sewfast[report]"'
+        ) from e
+
+
 @contextlib.contextmanager
 def style() -> Iterator[None]:
     """The look of the figures drawn and written inside."""

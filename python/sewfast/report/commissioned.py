@@ -9,6 +9,7 @@ from typing import Any
 from .. import jsonfile
 from ..errors import DataError, ModelFileError
 from ..readers import read_table
+from . import analysed
 from .canvas import Picture, draw, legend, panels, style, svg
 from .numbers import milliseconds, percent, rpm, significant, volt
 from .table import Table
@@ -55,6 +56,7 @@ def context(folder: Path) -> dict[str, Any]:
                 "stages": _stages(found),
                 "gains": _gains(found),
                 "verified": _verified(found),
+                "analysed": analysed.section(folder),
                 "loops": [_picture(folder, name, n) for name, n in found["references"].items()],
             }
     except (KeyError, TypeError, AttributeError) as e:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
-from . import figures
+from . import analysed, figures
 from .artefacts import Artefacts
 from .canvas import style
 from .goals import goals
@@ -60,6 +60,7 @@ def _context(artefacts: Artefacts) -> dict[str, Any]:
         "link": artefacts.results.get("link"),
         # nor have those of before the report card
         "check": artefacts.results.get("check"),
+        "analysed": analysed.section(artefacts.folder),
     }
     # drawn last: where a number is missing nothing is drawn in vain
     with style():

@@ -1,0 +1,276 @@
+"""`analyse`: a controller on models or a virtual machine, looked at from every side."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import signals
+from ..control import Controller
+from ..cost import Cost
+from ..errors import FitError, SettingError
+from ..loop import check_fits, require_controller
+from ..plants import Plants, References, each_plant, each_reference, titles
+from ..trust import Judgement, Limits, judge
+from .bode import LoopBode, loop_bodes
+from .changes import Change
+from .points import PlantPoint, plant_points
+from .responses import Responses, Steps, default_steps, responses
+from .scoring import Score, Task
+from .sensitivity import GainSensitivity, gain_sensitivity
+from .systems import LinearLoop
+from .whatif import WhatIf, what_if
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FORMAT = "sewfast.analysis"
+VERSION = 1
+REFERENCES = ("trapezoid", "random")
+MOST = 8
+"""Members that gains and plants are varied on; those of an ensemble are sorted, the best first."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Analysis:
+    """What a controller does on plants, and what it would do if things were a little different.
+
+    Attributes
+    ----------
+    controller : Controller
+    plants, references : tuple of str
+        What it was analysed on.
+    loops : tuple of LoopBode
+        L, S, T and margins, per operating point.
+    main : int
+        Which of them the steps and the sensitivities are taken at.
+    responses : tuple of Responses
+        Reference step and disturbance step; empty where the loop runs away.
+    score : Score
+        Cost on the references, worst error and overshoot, Ms.
+    sensitivity : tuple of GainSensitivity
+    what_if : tuple of WhatIf
+    judgement : Judgement
+        What speaks against the loops (`sewfast.trust`); a refusal is a line that fails.
+    """
+
+    controller: Controller
+    plants: tuple[str, ...]
+    references: tuple[str, ...]
+    loops: tuple[LoopBode, ...]
+    main: int
+    responses: tuple[Responses, ...]
+    score: Score
+    sensitivity: tuple[GainSensitivity, ...]
+    what_if: tuple[WhatIf, ...]
+    judgement: Judgement | None
+
+    @property
+    def Ms(self) -> float:
+        """The largest peak of |S| over plants and operating points."""
+        return max(loop.Ms for loop in self.loops)
+
+    def linear(self, point: int | None = None, plant: int = 0) -> LinearLoop:
+        """The linear loop about an operating point (the main one): L, S, T as state space.
+
+        `linear().to_control("S")` and `.to_scipy("S")` give the toolboxes' objects.
+        """
+        row = self.loops[self.main if point is None else point].points
+        return LinearLoop.of(self.controller, row[plant].system, speed=row[plant].y)
+
+    def figures(self) -> dict[str, Figure]:
+        """`responses`, `bode`, `sensitivity`, `what_if`: matplotlib figures.
+
+        Raises
+        ------
+        SettingError
+            Where matplotlib is not installed.
+        """
+        from .figures import figures
+
+        return figures(self)
+
+    def save(self, folder: str | os.PathLike[str]) -> list[Path]:
+        """Write `analysis.json` and every figure as PNG and SVG into a folder, made where missing.
+
+        Raises
+        ------
+        SettingError
+            Where matplotlib is not installed or the folder cannot be written to.
+        """
+        from .filing import save
+
+        return save(self, folder)
+
+    def to_json(self) -> dict[str, Any]:
+        """Every number as JSON values; what is not finite is None."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "controller": self.controller.to_dict(),
+            "plants": list(self.plants),
+            "references": list(self.references),
+            "units": {"u": self.controller.gains.u_unit, "y": self.controller.gains.y_unit},
+            "Ms": self.Ms if math.isfinite(self.Ms) else None,
+            "main": self.main,
+            "loops": [loop.to_json() for loop in self.loops],
+            "responses": [r.to_json() for r in self.responses],
+            "score": self.score.to_json(),
+            "sensitivity": [s.to_json() for s in self.sensitivity],
+            "what_if": [w.to_json() for w in self.what_if],
+            "judgement": self.judgement and self.judgement.to_json(),
+        }
+
+    def __repr__(self) -> str:
+        return f"Analysis(Ms {self.Ms:.3g}, {len(self.plants)} plants)"
+
+    def __str__(self) -> str:
+        from .text import text
+
+        return text(self)
+
+
+def analyse(
+    controller: Controller,
+    on: Plants,
+    *,
+    speeds: Sequence[float] | None = None,
+    level: float | None = None,
+    step: float | None = None,
+    disturbance: float | None = None,
+    seconds: float | None = None,
+    references: References = None,
+    cost: Cost | None = None,
+    changes: Sequence[Change] | None = None,
+    limits: Limits | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+) -> Analysis:
+    """Responses, loop transfers, margins, sensitivities and guards of a controller on plants.
+
+    Parameters
+    ----------
+    controller : Controller
+    on : Model, VirtualMachine or sequence of them
+        With one input each; every member of an ensemble is a plant.
+    speeds : sequence of float, optional
+        Steady outputs about which the plants are linearised [y]; by default three over what the
+        first model's training data came near.
+    level, step : float, optional
+        Output before the steps and size of the reference step [y]; by default the middle of
+        `speeds` and a tenth of it.
+    disturbance : float, optional
+        Of the disturbance step, at the plant's input [u]; by default what would move the output by
+        `step` without control. On a virtual machine it is the load torque that costs as much.
+    seconds : float, optional
+        How long the steps are looked at; by default five times the slowest closed-loop pole's time
+        constant.
+    references : str, array of shape (N,), or sequence of them, optional
+        What the cost is taken over; `REFERENCES` by default where the controller is in RPM at 1 ms,
+        else the reference step.
+    cost : Cost, optional
+        As for `sewfast.tune`.
+    changes : sequence of Change, optional
+        For the what-if; see `sewfast.analysis.changes`.
+    limits : Limits, optional
+        For the guards.
+    seed : int
+        Chooses named random references.
+    threads : int, optional
+        All processors by default; the result is the same at any number.
+
+    Returns
+    -------
+    Analysis
+
+    Raises
+    ------
+    SettingError
+        For plants whose sample time or units are not the controller's, or that cannot rest at any
+        of `speeds`.
+    DataError
+        For a reference that cannot be used.
+    """
+    require_controller(controller, on, "analyse(controller, plants)")
+    plants = each_plant(on)
+    if not plants:
+        raise SettingError("expected at least one plant to analyse on, got none")
+    for plant in plants:
+        check_fits(controller, plant)
+    names = titles(plants)
+    points = plant_points(plants, names, speeds)
+    main = _main(points, level)
+    slowest = _slowest(controller, points[main])
+    steps = default_steps(
+        controller, points[main], slowest,
+        level=level, step=step, disturbance=disturbance, seconds=seconds,
+    )  # fmt: skip
+    wanted = each_reference(references, _default_references(controller, steps))
+    task = Task(
+        tuple(plants[:MOST]), tuple(names[:MOST]), points[main][:MOST], tuple(wanted),
+        cost or Cost(), seed,
+    )  # fmt: skip
+    return Analysis(
+        controller=controller,
+        plants=tuple(names),
+        references=tuple(r if isinstance(r, str) else "reference" for r in wanted),
+        loops=loop_bodes(controller, points, slowest),
+        main=main,
+        responses=_responses(controller, plants, names, steps),
+        score=task.score(controller),
+        sensitivity=gain_sensitivity(controller, task, threads=threads),
+        what_if=what_if(controller, task, changes, threads=threads),
+        judgement=_judgement(controller, plants, wanted, limits, seed),
+    )
+
+
+def _main(points: Sequence[Sequence[PlantPoint]], level: float | None) -> int:
+    """The operating point nearest to the level of the steps; the middle one."""
+    if level is None:
+        return len(points) // 2
+    return int(np.argmin([abs(row[0].y - level) for row in points]))
+
+
+def _slowest(controller: Controller, row: Sequence[PlantPoint]) -> float:
+    """The slowest closed-loop time constant of all plants [s]; of an unstable loop a tenth of a
+    thousand samples."""
+    sizes = [
+        abs(LinearLoop.of(controller, p.system, speed=p.y).poles()[0]) for p in row
+    ]  # fmt: skip
+    largest = max(sizes, default=0.0)
+    if not 1e-6 < largest < 1.0 - 1e-9:
+        return 100.0 * controller.Ts
+    return float(-controller.Ts / math.log(largest))
+
+
+def _default_references(controller: Controller, steps: Steps) -> Sequence[Any]:
+    rpm = controller.gains.y_unit.lower() == "rpm"
+    if rpm and math.isclose(controller.Ts, signals.TS, rel_tol=1e-9):
+        return REFERENCES
+    n = steps.samples
+    return [np.concatenate([np.full(n, steps.level), np.full(n, steps.level + steps.step)])]
+
+
+def _responses(
+    controller: Controller, plants: Sequence[Any], names: Sequence[str], steps: Steps
+) -> tuple[Responses, ...]:
+    try:
+        return responses(controller, plants, names, steps)
+    except FitError:
+        return ()
+
+
+def _judgement(
+    controller: Controller, plants: Sequence[Any], references: Any, limits: Limits | None, seed: int
+) -> Judgement | None:
+    """None where a loop runs away: the score says so."""
+    try:
+        return judge(controller, plants, references, limits=limits, seed=seed, refuse=False)
+    except FitError:
+        return None

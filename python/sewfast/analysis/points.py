@@ -1,0 +1,180 @@
+"""`PlantPoint`: a plant as a linear system about a steady output."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..dataset import FloatArray
+from ..errors import SettingError
+from ..evidence.operating import OperatingPoint, operating_range
+from ..linear_plant import operating_point
+from ..loop import Plant
+from ..machine import VirtualMachine
+from ..models import Model
+from ..models.conversion import StateSpace
+from ..models.linear import LinearDifference
+
+SHARES = (0.1, 0.5, 0.9)
+"""Of the outputs that the training data came near: where plants are linearised."""
+_MACHINE_SPEEDS = (300.0, 1000.0, 2000.0)
+
+
+@dataclass(frozen=True, eq=False)
+class PlantPoint:
+    """One plant about one steady output.
+
+    Attributes
+    ----------
+    plant : str
+        Its title.
+    u, y : float
+        Steady input and output [u], [y].
+    system : StateSpace
+        Deviations from there, delay included.
+    gain : float
+        Steady output over steady input [y/u]; infinite for an integrator.
+    known : bool
+        Whether the model's training data came near.
+    """
+
+    plant: str
+    u: float
+    y: float
+    system: StateSpace
+    gain: float
+    known: bool
+    Ts: float
+
+    # what margins take for a plant
+    @property
+    def A(self) -> FloatArray:
+        """State matrix."""
+        return self.system.A
+
+    @property
+    def B(self) -> FloatArray:
+        """Input matrix."""
+        return self.system.B
+
+    @property
+    def C(self) -> FloatArray:
+        """Output matrix."""
+        return self.system.C
+
+    @property
+    def D(self) -> FloatArray:
+        """Direct way through: 0."""
+        return self.system.D
+
+    @property
+    def dt(self) -> float:
+        """Sample time [s], by the name that toolboxes have for it."""
+        return self.Ts
+
+
+def plant_points(
+    plants: Sequence[Plant], names: Sequence[str], speeds: Sequence[float] | None
+) -> tuple[tuple[PlantPoint, ...], ...]:
+    """The plants about each of the operating points; a plant that cannot rest at one is not there.
+
+    Parameters
+    ----------
+    plants : sequence of Model or VirtualMachine
+    names : sequence of str
+    speeds : sequence of float, optional
+        Steady outputs [y]; by default over what the first model's training data came near.
+
+    Raises
+    ------
+    SettingError
+        Where no plant can rest at any of them.
+    """
+    wanted = _speeds(plants) if speeds is None else [float(s) for s in speeds]
+    rows, reason = [], None
+    for speed in wanted:
+        row = []
+        for plant, name in zip(plants, names, strict=True):
+            try:
+                row.append(_of(plant, name, speed))
+            except SettingError as e:
+                reason = e
+        if row:
+            rows.append(tuple(row))
+    if not rows:
+        raise SettingError(f"expected an output at which a plant can rest: {reason}") from reason
+    return tuple(rows)
+
+
+def _speeds(plants: Sequence[Plant]) -> list[float]:
+    first = next((p for p in plants if isinstance(p, Model)), None)
+    if first is None:
+        return list(_MACHINE_SPEEDS)
+    if isinstance(first, LinearDifference) or not first.training.get("input_range"):
+        low, high = first.training.get("output_range", (0.0, 0.0))
+        return [0.5 * (low + high)]
+    known = [p for p in operating_range(first).points if p.known and p.settled and not p.saturated]
+    if not known:
+        low, high = first.training["output_range"]
+        return [0.5 * (low + high)]
+    low, high = min(p.y for p in known), max(p.y for p in known)
+    return [low + share * (high - low) for share in SHARES]
+
+
+def _of(plant: Plant, name: str, speed: float) -> PlantPoint:
+    if isinstance(plant, VirtualMachine):
+        return _machine_point(plant, name, speed)
+    if len(plant.input_names) != 1:
+        raise SettingError(
+            f"expected a model with one input, got {len(plant.input_names)}; identify it from the "
+            "command alone"
+        )
+    if isinstance(plant, LinearDifference):
+        return _linear_point(plant, name, speed)
+    return _model_point(plant, name, operating_point(plant, speed))
+
+
+def _model_point(model: Model, name: str, p: OperatingPoint) -> PlantPoint:
+    system = StateSpace(*p.delayed())
+    gain = float(p.dc_gain[0])
+    return PlantPoint(name, float(p.u[0]), p.y, system, gain, p.known, model.Ts)
+
+
+def _linear_point(model: LinearDifference, name: str, y: float) -> PlantPoint:
+    num, den = model.to_tf()
+    below = float(den.sum())
+    gain = float(num.sum()) / below if abs(below) > 1e-12 else math.inf
+    u = (y * below - model.core.offset) / float(num.sum()) if num.sum() else 0.0
+    known = model.training.get("output_range", (y, y))
+    inside = known[0] <= y <= known[1]
+    return PlantPoint(name, float(u), y, model.to_ss(), gain, inside, model.Ts)
+
+
+def _machine_point(machine: VirtualMachine, name: str, speed: float) -> PlantPoint:
+    small = machine.linearise(speed)
+    system = two_lags(small["gain"], small["T1"], small["T2"], machine.Ts)
+    return PlantPoint(name, small["command"], speed, system, small["gain"], True, machine.Ts)
+
+
+def two_lags(gain: float, T1: float, T2: float, Ts: float) -> StateSpace:
+    """`gain/((T1 s + 1)(T2 s + 1))` under a zero-order hold, exactly; T1 and T2 differ."""
+    p, q = math.exp(-Ts / T1), math.exp(-Ts / T2)
+    # partial fractions: two lags side by side
+    a, b = gain * T1 / (T1 - T2), -gain * T2 / (T1 - T2)
+    C = np.array([[a * (1.0 - p), b * (1.0 - q)]])
+    return StateSpace(np.diag([p, q]), np.ones((2, 1)), C, np.zeros((1, 1)))
+
+
+def to_json(point: PlantPoint) -> dict[str, Any]:
+    """As JSON values."""
+    return {
+        "plant": point.plant,
+        "u": point.u,
+        "y": point.y,
+        "gain": point.gain if math.isfinite(point.gain) else None,
+        "known": point.known,
+    }
