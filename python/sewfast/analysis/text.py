@@ -61,7 +61,7 @@ def _response_line(r: Responses) -> str:
             f"{span([m['settling_ms'] for m in found])} ms"
         )
     return (
-        f"disturbance step of {r.disturbance:.3g} {r.u_unit}: "
+        f"disturbance worth {r.disturbance:.3g} {r.u_unit} at the plant's input: "
         f"{span([m['peak'] for m in found])} {r.y_unit} off, back within "
         f"{span([m['recovery_ms'] for m in found])} ms"
     )
