@@ -3,6 +3,8 @@
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -192,3 +194,9 @@ def test_a_loop_that_runs_away_names_the_member() -> None:
                    counts_per_rev=None)  # fmt: skip
     with pytest.raises(FitError, match=r"runs away on oe, 1 of 2"):
         judge(wild, [drive(), drive()], LEVELS)
+
+
+def test_what_commission_found_brings_its_own_models() -> None:
+    found: Any = SimpleNamespace(controller=QUIET, models=Ensemble.of([drive(), drive()]))
+    assert len(judge(found, references="trapezoid").runs) == 2
+    assert len(judge(found, drive(), "trapezoid").runs) == 1

@@ -96,8 +96,17 @@ class Analysis:
 
         return figures(self)
 
-    def save(self, folder: str | os.PathLike[str]) -> list[Path]:
-        """Write `analysis.json` and every figure as PNG and SVG into a folder, made where missing.
+    def save(self, folder: str | os.PathLike[str], *, png: bool = True) -> list[Path]:
+        """Write `analysis.json` and every figure as SVG, and as PNG, into a folder.
+
+        `sewfast report` shows them where the folder is that of a demo or a commissioning.
+
+        Parameters
+        ----------
+        folder : path
+            Is made where it does not exist.
+        png : bool
+            Whether to write PNGs as well.
 
         Raises
         ------
@@ -106,7 +115,7 @@ class Analysis:
         """
         from .filing import save
 
-        return save(self, folder)
+        return save(self, folder, png=png)
 
     def to_json(self) -> dict[str, Any]:
         """Every number as JSON values; what is not finite is None."""

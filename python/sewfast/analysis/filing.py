@@ -24,8 +24,8 @@ ALT = {
 }
 
 
-def save(a: Analysis, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write everything; what was written.
+def save(a: Analysis, folder: str | os.PathLike[str], *, png: bool = True) -> list[Path]:
+    """Write everything, or without the PNGs, which the report has no use for; what was written.
 
     Raises
     ------
@@ -41,10 +41,12 @@ def save(a: Analysis, folder: str | os.PathLike[str]) -> list[Path]:
         place.mkdir(parents=True, exist_ok=True)
         for name, figure in drawn.items():
             with style():
-                figure.savefig(place / f"{name}.png", dpi=150)
                 text = svg(figure, f"analysis-{name}", ALT[name])
+                if png:
+                    figure.savefig(place / f"{name}.png", dpi=150)
+                    written.append(place / f"{name}.png")
             (place / f"{name}.svg").write_text(text, encoding="utf-8")
-            written += [place / f"{name}.png", place / f"{name}.svg"]
+            written.append(place / f"{name}.svg")
         target = Path(folder) / NUMBERS
         values = {k: v for k, v in a.to_json().items() if k not in ("format", "version")}
         jsonfile.write(target, "sewfast.analysis", 1, {**values, "figures": list(drawn)})

@@ -22,9 +22,12 @@ from .limits import Limits
 from .oscillation import oscillation
 
 if TYPE_CHECKING:
+    from ..commissioning import Commissioning
     from ..tuning import TuningResult
 
-    Judgeable: TypeAlias = ClosedLoopRun | Sequence[ClosedLoopRun] | Controller | TuningResult
+    Judgeable: TypeAlias = (
+        ClosedLoopRun | Sequence[ClosedLoopRun] | Controller | TuningResult | Commissioning
+    )
 
 REFERENCES = ("trapezoid", "random")
 
@@ -49,11 +52,13 @@ def judge(
 
     Parameters
     ----------
-    what : ClosedLoopRun, sequence of them, Controller or TuningResult
-        Runs as they are; a controller, or what `tune` found, is run on every plant of `on`.
+    what : ClosedLoopRun, sequence of them, Controller, TuningResult or Commissioning
+        Runs as they are; a controller, or what `tune` or `commission` found, is run on every plant
+        of `on`.
     on : Model, VirtualMachine or sequence of them, optional
-        The plants of a controller, every member of an ensemble one of them. With runs: the models
-        in whose training region they are to lie.
+        The plants of a controller, every member of an ensemble one of them; of a commissioning its
+        own models, unless others are given. With runs: the models in whose training region they
+        are to lie.
     references : str, array of shape (N,), or sequence of them, optional
         Of a controller; `REFERENCES` by default, where it is in RPM at 1 ms.
     limits : Limits, optional
@@ -75,7 +80,7 @@ def judge(
         For arguments that are none of these, or a controller without plants.
     """
     limits = limits or Limits()
-    models = each_plant(on)
+    models = each_plant(getattr(what, "models", None) if on is None else on)
     runs = _runs(what, models, references, seed)
     regions = [m for m in models if isinstance(m, Model)]
     found = tuple(_judged(r, model) for r, model in _with_model(runs, regions))
