@@ -12,7 +12,7 @@ import pytest
 import result_folder
 from cli import sewfast as command
 from loops import QUIET, drive
-from sewfast import Cost, Ensemble, VirtualMachine, identify, run
+from sewfast import Cost, Ensemble, VirtualMachine, _core, identify, run
 from sewfast.analysis import Analysis, analyse, changes, run_under_load
 from sewfast.analysis.systems import LinearLoop, response, simulate
 from sewfast.control import Controller, Gains
@@ -276,6 +276,10 @@ def test_refusals_say_what_to_give() -> None:
         analyse(drive(), QUIET)  # type: ignore[arg-type]
     with pytest.raises(SettingError, match="at least one plant"):
         analyse(IDEAL, [])
+    core = _core.LinearModel(np.array([-0.9]), np.array([[0.1], [0.2]]), 1, 0.0)
+    two = LinearOE(core, 0.001, ("u", "load"), "y", ("V", "N m"), "RPM")
+    with pytest.raises(SettingError, match=r"one input.*with 2"):
+        analyse(IDEAL, two)
     with pytest.raises(SettingError, match="sample time"):
         analyse(replace(IDEAL, Ts=0.002), drive())
 

@@ -92,8 +92,14 @@ def plant_points(
     Raises
     ------
     SettingError
-        Where no plant can rest at any of them.
+        For a model with several inputs, or where no plant can rest at any of the outputs.
     """
+    for plant in plants:
+        if isinstance(plant, Model) and len(plant.input_names) != 1:
+            raise SettingError(
+                f"expected models with one input, got one with {len(plant.input_names)}; identify "
+                "it from the command alone"
+            )
     wanted = _speeds(plants) if speeds is None else [float(s) for s in speeds]
     rows, reason = [], None
     for speed in wanted:
@@ -116,23 +122,19 @@ def _speeds(plants: Sequence[Plant]) -> list[float]:
         return list(_MACHINE_SPEEDS)
     if isinstance(first, LinearDifference) or not first.training.get("input_range"):
         low, high = first.training.get("output_range", (0.0, 0.0))
-        return [0.5 * (low + high)]
+        return [float(f"{0.5 * (low + high):.2g}")]
     known = [p for p in operating_range(first).points if p.known and p.settled and not p.saturated]
     if not known:
         low, high = first.training["output_range"]
-        return [0.5 * (low + high)]
+        return [float(f"{0.5 * (low + high):.2g}")]
     low, high = min(p.y for p in known), max(p.y for p in known)
-    return [low + share * (high - low) for share in SHARES]
+    # two digits: no more is meant
+    return [float(f"{low + share * (high - low):.2g}") for share in SHARES]
 
 
 def _of(plant: Plant, name: str, speed: float) -> PlantPoint:
     if isinstance(plant, VirtualMachine):
         return _machine_point(plant, name, speed)
-    if len(plant.input_names) != 1:
-        raise SettingError(
-            f"expected a model with one input, got {len(plant.input_names)}; identify it from the "
-            "command alone"
-        )
     if isinstance(plant, LinearDifference):
         return _linear_point(plant, name, speed)
     return _model_point(plant, name, operating_point(plant, speed))

@@ -60,7 +60,8 @@ def _context(artefacts: Artefacts) -> dict[str, Any]:
         "link": artefacts.results.get("link"),
         # nor have those of before the report card
         "check": artefacts.results.get("check"),
-        "analysed": analysed.section(artefacts.folder),
+        "analysed": analysed.section(artefacts.folder)
+        or analysed.section(artefacts.folder / "commissioning"),
     }
     # drawn last: where a number is missing nothing is drawn in vain
     with style():
