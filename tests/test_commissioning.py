@@ -341,6 +341,7 @@ def test_the_folder_holds_everything_and_its_page_is_written_anew(
     }
     text = page.read_text()
     assert "Commissioning of virtual: verified" in text
+    assert '<figure id="analysis-bode">' in text
     page.unlink()
     assert report(out) == page
     assert page.read_text() == text

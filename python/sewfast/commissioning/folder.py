@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .. import __version__, jsonfile
+from ..analysis.filing import NUMBERS as ANALYSIS
 from ..errors import DataError, SettingError
 from ..report.commissioned import FORMAT, NUMBERS, VERSION, run_file
 from ..writers import write_table
@@ -15,7 +17,9 @@ from .numbers import numbers
 if TYPE_CHECKING:
     from .result import Commissioning
 
-_FOLDERS = ("recordings", "models", "controllers", "runs")
+_FOLDERS = ("recordings", "models", "controllers", "runs", "analysis")
+_SHORT = 5.0
+"""References of up to this are analysed on [s]."""
 
 
 def require_own(folder: Path, *, overwrite: bool) -> None:
@@ -72,16 +76,17 @@ def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
     """
     require_own(folder, overwrite=overwrite)
     prepare(folder)
-    for name in (NUMBERS, "report.html"):
+    for name in (NUMBERS, ANALYSIS, "report.html"):
         (folder / name).unlink(missing_ok=True)
     for name in _FOLDERS:
         place = folder / name
         place.mkdir(exist_ok=True)
         # artefacts of an earlier one that this one has not would pass for its own
         for old in place.iterdir():
-            if old.suffix in (".csv", ".json", ".npz"):
+            if old.suffix in (".csv", ".json", ".npz", ".svg"):
                 old.unlink()
     _artefacts(found, folder)
+    _analysis(found, folder)
     jsonfile.write(folder / NUMBERS, FORMAT, VERSION, {"sewfast": __version__, **numbers(found)})
     return _page(folder)
 
@@ -98,6 +103,18 @@ def _artefacts(found: Commissioning, folder: Path) -> None:
         for kind, loop in (("predicted", c.predicted), ("measured", c.measured)):
             if loop is not None:
                 write_table(folder / run_file(c.reference, kind), loop.columns())
+
+
+def _analysis(found: Commissioning, folder: Path) -> None:
+    """The loop from every side, for the page; an extra as that one is."""
+    from ..analysis import analyse
+
+    if found.controller is None or found.models is None:
+        return
+    runs = [c.predicted for c in found.comparisons]
+    references = [r.r for r in runs if r.t[-1] <= _SHORT] or [r.r for r in runs[:1]] or None
+    with suppress(SettingError):
+        analyse(found.controller, found.models, references=references).save(folder, png=False)
 
 
 def _page(folder: Path) -> Path:
