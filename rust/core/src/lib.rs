@@ -28,6 +28,7 @@ pub mod neural_ss;
 pub mod oe;
 pub mod random;
 pub mod rules;
+pub mod search;
 pub mod signals;
 pub mod simd;
 pub mod speed;

@@ -1,0 +1,196 @@
+//! Searches of the unit box for the least cost, or for a front of least values; none of them knows what it searches.
+//!
+//! Candidates are judged in batches over threads. Who judges what has no part in the result: a seed gives the same
+//! bits at any number of threads.
+
+mod batch;
+pub mod cma_es;
+pub mod genetic;
+pub mod nsga2;
+
+use std::cmp::Ordering;
+
+use crate::{Error, Monitor, Result};
+
+/// How good a candidate is: feasible before infeasible, then by cost (Deb 2000).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Judgement {
+    /// Sum of the relative violations of the constraints; 0 for a feasible candidate.
+    pub violation: f64,
+    /// What it costs; where that is above the judgement to beat, any number above it.
+    pub cost: f64,
+}
+
+impl Judgement {
+    /// Of a candidate that cannot be judged at all.
+    pub const HOPELESS: Self = Self {
+        violation: f64::INFINITY,
+        cost: f64::INFINITY,
+    };
+
+    /// A feasible candidate's.
+    pub fn feasible(cost: f64) -> Self {
+        Self {
+            violation: 0.0,
+            cost,
+        }
+    }
+
+    /// Of two feasible candidates the cheaper is less, of two infeasible ones that with the smaller violation.
+    pub fn order(&self, other: &Self) -> Ordering {
+        self.violation
+            .total_cmp(&other.violation)
+            .then(self.cost.total_cmp(&other.cost))
+    }
+
+    /// Whether it is better than another.
+    pub fn beats(&self, other: &Self) -> bool {
+        self.order(other) == Ordering::Less
+    }
+}
+
+/// What is searched: a function over the unit box.
+pub trait Problem: Sync {
+    /// What one thread needs to judge candidates.
+    type Memory: Send;
+
+    /// Coordinates of a point.
+    fn dimensions(&self) -> usize;
+
+    /// Fresh memory for a thread.
+    fn memory(&self) -> Self::Memory;
+
+    /// How good `point` is; the work may end as soon as it cannot beat `to_beat` any more, or on a stop.
+    fn judge(
+        &self,
+        memory: &mut Self::Memory,
+        point: &[f64],
+        to_beat: &Judgement,
+        monitor: &Monitor,
+    ) -> Judgement;
+}
+
+/// How a search runs.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Options {
+    /// Candidates judged.
+    pub evaluations: usize,
+    /// Seed of the search; the result is the same at any number of threads.
+    pub seed: u64,
+    /// Threads.
+    pub threads: usize,
+    /// A population has come together when its costs lie within this share of the best.
+    pub tolerance: f64,
+}
+
+impl Options {
+    pub(crate) fn check(&self) -> Result<()> {
+        if self.evaluations == 0 || self.threads == 0 || self.threads > 1024 {
+            return Err(Error::setting(format!(
+                "expected at least one evaluation and 1 to 1,024 threads, got {} and {}",
+                self.evaluations, self.threads
+            )));
+        }
+        Ok(())
+    }
+}
+
+/// Why a search ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Termination {
+    /// All evaluations were used.
+    Evaluations,
+    /// All candidates had come together.
+    Converged,
+    /// A stop was requested; the best so far is returned.
+    Interrupted,
+}
+
+impl Termination {
+    /// The name of the outcome.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Evaluations => "evaluations",
+            Self::Converged => "converged",
+            Self::Interrupted => "interrupted",
+        }
+    }
+}
+
+/// The best point and the story of its search.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Found {
+    /// The best point.
+    pub point: Vec<f64>,
+    /// How good it is.
+    pub judgement: Judgement,
+    /// The best so far after each evaluation.
+    pub trace: Vec<Judgement>,
+    /// Why the search ended.
+    pub termination: Termination,
+}
+
+/// A point to be judged, and what it has to beat to be of any use.
+#[derive(Clone, Debug)]
+struct Candidate {
+    point: Vec<f64>,
+    to_beat: Judgement,
+}
+
+/// A way to search: it is asked for candidates and told how good they are.
+trait Strategy {
+    /// The next candidates, 1 to `limit`.
+    fn ask(&mut self, limit: usize) -> Vec<Candidate>;
+    /// What they were worth.
+    fn tell(&mut self, candidates: Vec<Candidate>, judgements: &[Judgement]);
+    /// Whether more candidates would be of no use.
+    fn converged(&self) -> bool;
+}
+
+/// Asks, judges and tells until the evaluations are used.
+fn run<P: Problem>(
+    problem: &P,
+    strategy: &mut impl Strategy,
+    options: Options,
+    monitor: &Monitor,
+) -> Found {
+    let mut memories: Vec<_> = (0..options.threads).map(|_| problem.memory()).collect();
+    let mut best = (vec![0.5; problem.dimensions()], Judgement::HOPELESS);
+    let mut trace = Vec::with_capacity(options.evaluations.min(1 << 20));
+    let termination = loop {
+        if monitor.stopped() {
+            break Termination::Interrupted;
+        } else if trace.len() >= options.evaluations {
+            break Termination::Evaluations;
+        } else if strategy.converged() {
+            break Termination::Converged;
+        }
+        let candidates = strategy.ask(options.evaluations - trace.len());
+        let judgements = batch::each(&mut memories, &candidates, |memory, candidate| {
+            let judged = problem.judge(memory, &candidate.point, &candidate.to_beat, monitor);
+            monitor.advance(1);
+            if judged.violation == 0.0 {
+                monitor.report_cost(judged.cost);
+            }
+            judged
+        });
+        for (candidate, judged) in candidates.iter().zip(&judgements) {
+            if judged.beats(&best.1) {
+                best = (candidate.point.clone(), *judged);
+            }
+            trace.push(best.1);
+        }
+        strategy.tell(candidates, &judgements);
+    };
+    Found {
+        point: best.0,
+        judgement: best.1,
+        trace,
+        termination,
+    }
+}
+
+#[cfg(test)]
+mod functions;
+#[cfg(test)]
+mod tests;

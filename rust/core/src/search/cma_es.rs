@@ -1,0 +1,305 @@
+//! CMA-ES with restarts: the covariance matrix adapts to the landscape (Hansen, arXiv 1604.00772), and a search that
+//! has come to its end begins anew with a larger or with a smaller population (BIPOP, Hansen 2009).
+
+use nalgebra::{DMatrix, DVector, SymmetricEigen};
+
+use super::genetic::inside;
+use super::{Candidate, Found, Judgement, Options, Problem, Strategy, run};
+use crate::random::Random;
+use crate::{Monitor, Result};
+
+/// First step about a start, and without one, in shares of the box.
+const STEP: (f64, f64) = (0.15, 0.3);
+/// Steps smaller than this share of the box change nothing.
+const SMALLEST_STEP: f64 = 1e-11;
+/// Ratio of the longest to the shortest axis, squared, beyond which the matrix is of no use.
+const WORST_CONDITION: f64 = 1e14;
+/// A candidate dearer than this many times the last generation's median is not judged to its end.
+const ABANDONED: f64 = 3.0;
+
+/// Searches the box, beginning about `start` where there is one.
+///
+/// # Errors
+/// `ErrorKind::Setting` without evaluations or threads.
+pub fn search<P: Problem>(
+    problem: &P,
+    start: Option<&[f64]>,
+    options: Options,
+    monitor: &Monitor,
+) -> Result<Found> {
+    options.check()?;
+    let mut strategy = Restarts::new(problem.dimensions(), start, options);
+    Ok(run(problem, &mut strategy, options, monitor))
+}
+
+/// Evolutions one after the other; the evaluations of large and small populations are kept equal.
+struct Restarts {
+    random: Random,
+    options: Options,
+    dimensions: usize,
+    now: Evolution,
+    /// How often the large population was doubled.
+    doublings: u32,
+    large: bool,
+    used: [usize; 2],
+}
+
+impl Restarts {
+    fn new(dimensions: usize, start: Option<&[f64]>, options: Options) -> Self {
+        let step = if start.is_some() { STEP.0 } else { STEP.1 };
+        let mean = start.map_or_else(|| vec![0.5; dimensions], <[f64]>::to_vec);
+        Self {
+            random: Random::new(options.seed),
+            options,
+            dimensions,
+            now: Evolution::new(mean, step, population(dimensions)),
+            doublings: 0,
+            large: true,
+            used: [0; 2],
+        }
+    }
+
+    fn restart(&mut self) {
+        let least = population(self.dimensions) as f64;
+        self.large = self.used[1] <= self.used[0];
+        let (size, step) = if self.large {
+            self.doublings += 1;
+            (least * f64::from(1 << self.doublings.min(16)), STEP.1)
+        } else {
+            let share = self.random.uniform().powi(2);
+            let most = 0.5 * f64::from(1 << self.doublings.min(16));
+            let step = STEP.1 * 10.0_f64.powf(-2.0 * self.random.uniform());
+            (least * most.powf(share), step)
+        };
+        let random = &mut self.random;
+        let mean = (0..self.dimensions).map(|_| random.uniform()).collect();
+        self.now = Evolution::new(mean, step, size as usize);
+    }
+}
+
+/// The default population, `4 + 3 ln n`.
+fn population(dimensions: usize) -> usize {
+    4 + (3.0 * (dimensions as f64).ln()) as usize
+}
+
+impl Strategy for Restarts {
+    fn ask(&mut self, limit: usize) -> Vec<Candidate> {
+        if self.now.ended(self.options.tolerance) {
+            self.restart();
+        }
+        self.now.ask(limit, &mut self.random)
+    }
+
+    fn tell(&mut self, candidates: Vec<Candidate>, judgements: &[Judgement]) {
+        self.used[usize::from(self.large)] += candidates.len();
+        self.now.adapt(judgements);
+    }
+
+    /// There is always another restart.
+    fn converged(&self) -> bool {
+        false
+    }
+}
+
+/// Constants of a population of a size (Hansen 2016, Table 1).
+#[derive(Clone, Debug)]
+struct Weights {
+    size: usize,
+    /// Of the best half, they sum to 1.
+    parents: Vec<f64>,
+    /// Effective number of parents.
+    effective: f64,
+    c_sigma: f64,
+    damping: f64,
+    c_c: f64,
+    c_1: f64,
+    c_mu: f64,
+    /// Expected length of a standard normal vector.
+    length: f64,
+}
+
+impl Weights {
+    fn new(dimensions: usize, size: usize) -> Self {
+        let n = dimensions as f64;
+        let raw: Vec<f64> = (0..size / 2)
+            .map(|i| ((size as f64 + 1.0) / 2.0).ln() - ((i + 1) as f64).ln())
+            .collect();
+        let sum: f64 = raw.iter().sum();
+        let parents: Vec<f64> = raw.iter().map(|w| w / sum).collect();
+        let effective = 1.0 / parents.iter().map(|w| w * w).sum::<f64>();
+        let c_sigma = (effective + 2.0) / (n + effective + 5.0);
+        let c_1 = 2.0 / ((n + 1.3).powi(2) + effective);
+        let c_mu = 2.0 * (effective - 2.0 + 1.0 / effective) / ((n + 2.0).powi(2) + effective);
+        Self {
+            size,
+            parents,
+            effective,
+            c_sigma,
+            damping: 1.0 + 2.0 * (((effective - 1.0) / (n + 1.0)).sqrt() - 1.0).max(0.0) + c_sigma,
+            c_c: (4.0 + effective / n) / (n + 4.0 + 2.0 * effective / n),
+            c_1,
+            c_mu: c_mu.min(1.0 - c_1),
+            length: n.sqrt() * (1.0 - 1.0 / (4.0 * n) + 1.0 / (21.0 * n * n)),
+        }
+    }
+}
+
+/// One run of the evolution, in coordinates that are mirrored into the box.
+pub(super) struct Evolution {
+    weights: Weights,
+    mean: DVector<f64>,
+    sigma: f64,
+    covariance: DMatrix<f64>,
+    /// Axes of the distribution, and their lengths.
+    axes: DMatrix<f64>,
+    lengths: DVector<f64>,
+    path_sigma: DVector<f64>,
+    path_c: DVector<f64>,
+    generation: usize,
+    /// Steps `(x - mean)/sigma` of this generation.
+    steps: Vec<DVector<f64>>,
+    /// Best of each generation.
+    history: Vec<Judgement>,
+    last: Vec<Judgement>,
+}
+
+impl Evolution {
+    fn new(mean: Vec<f64>, sigma: f64, size: usize) -> Self {
+        let n = mean.len();
+        Self {
+            weights: Weights::new(n, size.max(4)),
+            mean: DVector::from_vec(mean),
+            sigma,
+            covariance: DMatrix::identity(n, n),
+            axes: DMatrix::identity(n, n),
+            lengths: DVector::from_element(n, 1.0),
+            path_sigma: DVector::zeros(n),
+            path_c: DVector::zeros(n),
+            generation: 0,
+            steps: Vec::new(),
+            history: Vec::new(),
+            last: Vec::new(),
+        }
+    }
+
+    /// From a point on, in the distribution with this covariance.
+    pub(super) fn spread(mean: DVector<f64>, covariance: DMatrix<f64>) -> Self {
+        let size = population(mean.len());
+        let mut new = Self::new(mean.as_slice().to_vec(), 1.0, size);
+        new.covariance = covariance;
+        new.decompose();
+        new
+    }
+
+    /// A generation, or what of it is left to be judged.
+    pub(super) fn ask(&mut self, limit: usize, random: &mut Random) -> Vec<Candidate> {
+        let to_beat = self.to_beat();
+        (0..self.weights.size.min(limit))
+            .map(|_| Candidate {
+                point: self.sample(random),
+                to_beat,
+            })
+            .collect()
+    }
+
+    fn sample(&mut self, random: &mut Random) -> Vec<f64> {
+        let n = self.mean.len();
+        let z = DVector::from_fn(n, |i, _| self.lengths[i] * random.normal());
+        let step = &self.axes * z;
+        let point = &self.mean + self.sigma * &step;
+        self.steps.push(step);
+        point.iter().map(|x| inside(*x)).collect()
+    }
+
+    /// Above this a candidate would be among the worst anyway.
+    fn to_beat(&self) -> Judgement {
+        let median = self.last.get(self.last.len() / 2);
+        match median {
+            Some(j) if j.violation == 0.0 && j.cost > 0.0 => {
+                Judgement::feasible(ABANDONED * j.cost)
+            }
+            _ => Judgement::HOPELESS,
+        }
+    }
+
+    /// The mean moves to the best, the paths remember where to, step size and matrix follow (Hansen 2016, Fig. 6).
+    pub(super) fn adapt(&mut self, judgements: &[Judgement]) {
+        let mut order: Vec<usize> = (0..judgements.len()).collect();
+        order.sort_by(|&a, &b| judgements[a].order(&judgements[b]));
+        let steps = std::mem::take(&mut self.steps);
+        self.last = order.iter().map(|&i| judgements[i]).collect();
+        self.history.push(self.last[0]);
+        self.generation += 1;
+        if judgements.len() < self.weights.size {
+            return;
+        }
+        let w = &self.weights;
+        let n = self.mean.len() as f64;
+        let parents = || w.parents.iter().zip(order.iter().map(|&i| &steps[i]));
+        let mut mean_step = DVector::zeros(self.mean.len());
+        for (weight, step) in parents() {
+            mean_step.axpy(*weight, step, 1.0);
+        }
+        self.mean.axpy(self.sigma, &mean_step, 1.0);
+
+        let whitened = self.axes.tr_mul(&mean_step).component_div(&self.lengths);
+        let gain = (w.c_sigma * (2.0 - w.c_sigma) * w.effective).sqrt();
+        self.path_sigma *= 1.0 - w.c_sigma;
+        self.path_sigma += gain * (&self.axes * whitened);
+        let length = self.path_sigma.norm();
+        let settled = 1.0 - (1.0 - w.c_sigma).powi(2 * self.generation as i32);
+        let calm = length / settled.sqrt() < (1.4 + 2.0 / (n + 1.0)) * w.length;
+        self.path_c *= 1.0 - w.c_c;
+        if calm {
+            self.path_c.axpy(
+                (w.c_c * (2.0 - w.c_c) * w.effective).sqrt(),
+                &mean_step,
+                1.0,
+            );
+        }
+        let lost = if calm {
+            0.0
+        } else {
+            w.c_1 * w.c_c * (2.0 - w.c_c)
+        };
+        self.covariance *= 1.0 - w.c_1 - w.c_mu + lost;
+        self.covariance.ger(w.c_1, &self.path_c, &self.path_c, 1.0);
+        for (weight, step) in parents() {
+            self.covariance.ger(w.c_mu * weight, step, step, 1.0);
+        }
+        self.sigma *= ((w.c_sigma / w.damping) * (length / w.length - 1.0))
+            .min(1.0)
+            .exp();
+        self.decompose();
+    }
+
+    fn decompose(&mut self) {
+        let symmetric = (&self.covariance + self.covariance.transpose()) / 2.0;
+        let found = SymmetricEigen::new(symmetric);
+        self.lengths = found.eigenvalues.map(|v| v.max(0.0).sqrt());
+        self.axes = found.eigenvectors;
+    }
+
+    /// Whether this run has come to its end: nothing changes any more, or the distribution has degenerated.
+    pub(super) fn ended(&self, tolerance: f64) -> bool {
+        let (least, most) = (self.lengths.min(), self.lengths.max());
+        let degenerate =
+            !(most.is_finite() && least > 0.0 && most * most < WORST_CONDITION * least * least);
+        degenerate || self.sigma * most < SMALLEST_STEP || self.flat(tolerance)
+    }
+
+    /// The best of the last generations and all of the last one cost the same.
+    fn flat(&self, tolerance: f64) -> bool {
+        let dimensions = self.mean.len() as f64;
+        let window = 10 + (30.0 * dimensions / self.weights.size as f64) as usize;
+        if self.history.len() < window {
+            return false;
+        }
+        let recent = self.history[self.history.len() - window..].iter();
+        let all = || recent.clone().chain(&self.last);
+        let least = all().map(|j| j.cost).fold(f64::INFINITY, f64::min);
+        let most = all().map(|j| j.cost).fold(f64::NEG_INFINITY, f64::max);
+        let feasible = all().all(|j| j.violation == 0.0);
+        feasible && most - least <= tolerance * least.abs()
+    }
+}

@@ -1,0 +1,236 @@
+//! A real-coded genetic algorithm with elitism and local refinement.
+//!
+//! Breeding: children come from tournament winners by blend crossover (Eshelman and Schaffer 1993, BLX-.5) and a
+//! mutation that narrows from generation to generation; the best of parents and children survive. Refinement: the best
+//! member moves on in a normal distribution that begins as that of the best quarter and adapts (`cma_es`). When that has come to
+//! its end, a new population is bred around the best so far.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::cma_es::Evolution;
+use super::{Candidate, Found, Judgement, Options, Problem, Strategy, run};
+use crate::random::Random;
+use crate::{Monitor, Result};
+
+/// Members of the population for each dimension, and at least.
+const MEMBERS: (usize, usize) = (4, 20);
+/// Share of the first members that lie near the start, where there is one.
+const NEAR: f64 = 0.5;
+/// Spread of the members near the start, in shares of the box.
+const JITTER: f64 = 0.08;
+/// Share of all evaluations for the breeding before a refinement.
+const BRED: f64 = 0.25;
+/// Share of the population whose spread a refinement begins with.
+const ELITE: f64 = 0.25;
+/// Least spread that a refinement begins with.
+const LEAST_SPREAD: f64 = 0.003;
+/// How far blends reach beyond their parents, in shares of the parents' distance.
+const BLEND: f64 = 0.5;
+/// Spread of a mutation at the beginning and at the end of a breeding.
+const MUTATION: (f64, f64) = (0.1, 0.01);
+
+/// Searches the box, beginning about `start` where there is one.
+///
+/// # Errors
+/// `ErrorKind::Setting` without evaluations or threads.
+pub fn search<P: Problem>(
+    problem: &P,
+    start: Option<&[f64]>,
+    options: Options,
+    monitor: &Monitor,
+) -> Result<Found> {
+    options.check()?;
+    let mut strategy = Genetic::new(problem.dimensions(), start, options);
+    Ok(run(problem, &mut strategy, options, monitor))
+}
+
+#[derive(Clone, Debug)]
+struct Member {
+    point: Vec<f64>,
+    judgement: Judgement,
+}
+
+struct Genetic {
+    random: Random,
+    size: usize,
+    dimensions: usize,
+    /// Best first.
+    members: Vec<Member>,
+    /// First members that are still to be judged.
+    unborn: Vec<Vec<f64>>,
+    /// Judged in this breeding.
+    bred: usize,
+    refinement: Option<Evolution>,
+    best: Option<Member>,
+    options: Options,
+}
+
+impl Genetic {
+    fn new(dimensions: usize, start: Option<&[f64]>, options: Options) -> Self {
+        let mut new = Self {
+            random: Random::new(options.seed),
+            size: MEMBERS.1.max(MEMBERS.0 * dimensions),
+            dimensions,
+            members: Vec::new(),
+            unborn: Vec::new(),
+            bred: 0,
+            refinement: None,
+            best: None,
+            options,
+        };
+        new.settle(start);
+        new
+    }
+
+    /// A first population, about `start` where there is one.
+    fn settle(&mut self, start: Option<&[f64]>) {
+        let mut near = 0;
+        if let Some(start) = start {
+            near = (NEAR * self.size as f64) as usize;
+            self.unborn.push(start.to_vec());
+            let random = &mut self.random;
+            self.unborn
+                .extend((1..near).map(|_| jittered(start, random)));
+        }
+        let others = stratified(self.size - near, self.dimensions, &mut self.random);
+        self.unborn.extend(others);
+        self.members.clear();
+        self.bred = 0;
+    }
+
+    fn evaluations_to_breed(&self) -> f64 {
+        (BRED * self.options.evaluations as f64).max(4.0 * self.size as f64)
+    }
+
+    fn breed(&mut self, limit: usize) -> Vec<Candidate> {
+        let first = !self.unborn.is_empty();
+        let count = limit.min(if first { self.unborn.len() } else { self.size });
+        let points: Vec<Vec<f64>> = if first {
+            self.unborn.drain(..count).collect()
+        } else {
+            (0..count).map(|_| self.child()).collect()
+        };
+        // A child that is no better than the worst survivor is of no use.
+        let full = self.members.len() == self.size;
+        let to_beat = match self.members.last() {
+            Some(worst) if full => worst.judgement,
+            _ => Judgement::HOPELESS,
+        };
+        let candidate = |point| Candidate { point, to_beat };
+        points.into_iter().map(candidate).collect()
+    }
+
+    fn child(&mut self) -> Vec<f64> {
+        let mut child = self.blend();
+        self.mutate(&mut child);
+        child
+    }
+
+    /// From the best member on, with the spread of the best quarter about it.
+    fn refine(&mut self) -> Evolution {
+        let elite = ((ELITE * self.members.len() as f64) as usize).max(1);
+        let best = DVector::from_column_slice(&self.members[0].point);
+        let mut spread = DMatrix::identity(self.dimensions, self.dimensions) * LEAST_SPREAD.powi(2);
+        for member in &self.members[1..elite.max(2).min(self.members.len())] {
+            let apart = DVector::from_column_slice(&member.point) - &best;
+            spread.ger(1.0 / elite as f64, &apart, &apart, 1.0);
+        }
+        Evolution::spread(best, spread)
+    }
+
+    /// The better of two members.
+    fn winner(&mut self) -> usize {
+        let pick = |random: &mut Random| (random.uniform() * self.members.len() as f64) as usize;
+        pick(&mut self.random).min(pick(&mut self.random))
+    }
+
+    fn blend(&mut self) -> Vec<f64> {
+        let (a, b) = (self.winner(), self.winner());
+        let parents = self.members[a].point.iter().zip(&self.members[b].point);
+        let random = &mut self.random;
+        parents
+            .map(|(a, b)| inside(a + random.between(-BLEND, 1.0 + BLEND) * (b - a)))
+            .collect()
+    }
+
+    fn mutate(&mut self, child: &mut [f64]) {
+        let progress = (self.bred as f64 / self.evaluations_to_breed()).min(1.0);
+        let spread = MUTATION.0 * (MUTATION.1 / MUTATION.0).powf(progress);
+        let chance = 1.0 / child.len() as f64;
+        for x in child {
+            if self.random.uniform() < chance {
+                *x = inside(*x + spread * self.random.normal());
+            }
+        }
+    }
+}
+
+impl Strategy for Genetic {
+    fn ask(&mut self, limit: usize) -> Vec<Candidate> {
+        let ended = |e: &Evolution| e.ended(self.options.tolerance);
+        if self.refinement.as_ref().is_some_and(ended) {
+            self.refinement = None;
+            let best = self.best.as_ref().map(|b| b.point.clone());
+            self.settle(best.as_deref());
+        }
+        if self.refinement.is_none() && self.bred as f64 >= self.evaluations_to_breed() {
+            self.refinement = Some(self.refine());
+        }
+        match &mut self.refinement {
+            Some(evolution) => evolution.ask(limit, &mut self.random),
+            None => self.breed(limit),
+        }
+    }
+
+    fn tell(&mut self, candidates: Vec<Candidate>, judgements: &[Judgement]) {
+        if let Some(evolution) = &mut self.refinement {
+            evolution.adapt(judgements);
+        }
+        let told = candidates.into_iter().zip(judgements);
+        let born = told.map(|(candidate, judgement)| Member {
+            point: candidate.point,
+            judgement: *judgement,
+        });
+        self.members.extend(born);
+        self.members.sort_by(|a, b| a.judgement.order(&b.judgement));
+        self.members.truncate(self.size);
+        self.bred += judgements.len();
+        if let Some(first) = self.members.first() {
+            let better = |b: &Member| first.judgement.beats(&b.judgement);
+            if self.best.as_ref().is_none_or(better) {
+                self.best = Some(first.clone());
+            }
+        }
+    }
+
+    /// There is always another population.
+    fn converged(&self) -> bool {
+        false
+    }
+}
+
+fn jittered(start: &[f64], random: &mut Random) -> Vec<f64> {
+    let about = |x: &f64| (x + JITTER * random.normal()).clamp(0.0, 1.0);
+    start.iter().map(about).collect()
+}
+
+/// Points of which each coordinate has one in every slice of the box (Latin hypercube, McKay 1979).
+pub(super) fn stratified(count: usize, dimensions: usize, random: &mut Random) -> Vec<Vec<f64>> {
+    let mut points = vec![vec![0.0; dimensions]; count];
+    let mut order: Vec<usize> = (0..count).collect();
+    for i in 0..dimensions {
+        for k in (1..count).rev() {
+            order.swap(k, (random.uniform() * (k + 1) as f64) as usize);
+        }
+        for (point, slice) in points.iter_mut().zip(&order) {
+            point[i] = (*slice as f64 + random.uniform()) / count as f64;
+        }
+    }
+    points
+}
+
+/// Mirrored into 0 .. 1.
+pub(super) fn inside(x: f64) -> f64 {
+    let folded = x.rem_euclid(2.0);
+    if folded > 1.0 { 2.0 - folded } else { folded }
+}

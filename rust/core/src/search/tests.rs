@@ -1,0 +1,216 @@
+//! The searches on functions with known minima, fronts and constraints; same bits at any number of threads.
+
+use super::functions::{Function, Zdt, rastrigin, rosenbrock, sphere, volume};
+use super::*;
+
+fn options(evaluations: usize, seed: u64, threads: usize) -> Options {
+    Options {
+        evaluations,
+        seed,
+        threads,
+        tolerance: 1e-12,
+    }
+}
+
+type Search = fn(&Function, Option<&[f64]>, Options, &Monitor) -> Result<Found>;
+const SEARCHES: [(&str, Search); 2] = [
+    ("genetic", genetic::search::<Function>),
+    ("cma_es", cma_es::search::<Function>),
+];
+
+/// The median over seeds of the least value found.
+fn median(search: Search, function: &Function, evaluations: usize) -> f64 {
+    let mut found: Vec<f64> = (0..7)
+        .map(|seed| {
+            let found = search(
+                function,
+                None,
+                options(evaluations, seed, 2),
+                &Monitor::default(),
+            );
+            found.unwrap().judgement.cost
+        })
+        .collect();
+    found.sort_by(f64::total_cmp);
+    found[3]
+}
+
+#[test]
+fn finds_the_bottom_of_a_sphere_and_of_a_curved_valley() {
+    let sphere = Function::new(6, (-5.0, 5.0), sphere);
+    let valley = Function::new(4, (-2.0, 2.0), rosenbrock);
+    for (name, search) in SEARCHES {
+        let bottom = median(search, &sphere, 1500);
+        println!(
+            "{name}: sphere {bottom:e}, valley {:e}",
+            median(search, &valley, 4000)
+        );
+        assert!(bottom < 1e-4, "{name}: {bottom}");
+        let bottom = median(search, &valley, 4000);
+        assert!(bottom < 1e-2, "{name}: {bottom}");
+    }
+}
+
+#[test]
+fn leaves_local_minima() {
+    // The best local minima beside the global one are worth 1.
+    let function = Function::new(3, (-5.12, 4.5), rastrigin);
+    for (name, search) in SEARCHES {
+        let least = median(search, &function, 6000);
+        println!("{name}: rastrigin {least:e}");
+        assert!(least < 0.9, "{name}: {least}");
+    }
+}
+
+#[test]
+fn a_minimum_on_the_edge_is_found() {
+    let function = Function::new(3, (1.5, 3.0), sphere);
+    for (name, search) in SEARCHES {
+        let least = median(search, &function, 1500);
+        assert!((least - 0.75).abs() < 1e-3, "{name}: {least}");
+    }
+}
+
+#[test]
+fn constraints_hold_and_the_way_to_the_feasible_is_found() {
+    // Least x^2 + y^2 with x + y >= 3: at (1.5, 1.5); of the box -5 .. 5 a quarter is feasible.
+    let function = Function {
+        violation: |x| (3.0 - x[0] - x[1]).max(0.0),
+        ..Function::new(2, (-5.0, 5.0), |x| x.iter().map(|x| x * x).sum())
+    };
+    for (name, search) in SEARCHES {
+        let start = [0.1, 0.1];
+        let found = search(
+            &function,
+            Some(&start),
+            options(2000, 1, 2),
+            &Monitor::default(),
+        )
+        .unwrap();
+        assert_eq!(found.judgement.violation, 0.0, "{name}");
+        assert!(
+            (found.judgement.cost - 4.5).abs() < 0.05,
+            "{name}: {found:?}"
+        );
+    }
+}
+
+#[test]
+fn a_seed_gives_the_same_bits_at_any_number_of_threads() {
+    let function = Function::new(5, (-2.0, 2.0), rosenbrock);
+    for (name, search) in SEARCHES {
+        let run = |seed, threads| {
+            search(
+                &function,
+                None,
+                options(700, seed, threads),
+                &Monitor::default(),
+            )
+            .unwrap()
+        };
+        assert_eq!(run(3, 1), run(3, 4), "{name}");
+        assert_ne!(run(3, 1).point, run(4, 1).point, "{name}");
+        assert_eq!(run(3, 2).trace.len(), 700, "{name}");
+    }
+    let front = |threads| {
+        nsga2::search(
+            &Zdt::One,
+            &[],
+            20,
+            options(400, 3, threads),
+            &Monitor::default(),
+        )
+        .unwrap()
+    };
+    assert_eq!(front(1), front(3));
+}
+
+#[test]
+fn the_trace_falls_and_ends_at_what_was_found() {
+    let function = Function::new(3, (-2.0, 2.0), rosenbrock);
+    for (name, search) in SEARCHES {
+        let found = search(
+            &function,
+            Some(&[0.2, 0.9, 0.1]),
+            options(301, 1, 2),
+            &Monitor::default(),
+        )
+        .unwrap();
+        assert!(
+            found.trace.windows(2).all(|p| !p[1].order(&p[0]).is_gt()),
+            "{name}"
+        );
+        assert_eq!(found.trace.last(), Some(&found.judgement), "{name}");
+        assert_eq!(
+            (function.value)(&function.at(&found.point)),
+            found.judgement.cost
+        );
+    }
+}
+
+#[test]
+fn stops_on_request_and_refuses_no_work() {
+    let function = Function::new(3, (-2.0, 2.0), sphere);
+    let monitor = Monitor::default();
+    monitor.request_stop();
+    for (name, search) in SEARCHES {
+        let found = search(&function, None, options(100, 1, 1), &monitor).unwrap();
+        assert_eq!(found.termination, Termination::Interrupted, "{name}");
+        for (evaluations, threads) in [(0, 1), (1, 0), (1, 5000)] {
+            assert!(search(&function, None, options(evaluations, 1, threads), &monitor).is_err());
+        }
+    }
+    let none = nsga2::search(&Zdt::One, &[], 20, options(100, 1, 1), &monitor).unwrap();
+    assert!(none.members.is_empty());
+    assert!(nsga2::search(&Zdt::One, &[], 3, options(100, 1, 1), &monitor).is_err());
+}
+
+#[test]
+fn approaches_the_fronts_of_zitzler_deb_and_thiele() {
+    for (problem, evaluations) in [
+        (Zdt::One, 20_000),
+        (Zdt::Two, 20_000),
+        (Zdt::Three, 20_000),
+        (Zdt::Six, 30_000),
+    ] {
+        let front = nsga2::search(
+            &problem,
+            &[],
+            100,
+            options(evaluations, 1, 2),
+            &Monitor::default(),
+        )
+        .unwrap();
+        let points = front
+            .members
+            .iter()
+            .map(|m| [m.values.objectives[0], m.values.objectives[1]]);
+        let (found, best) = (volume(points.collect()), problem.best_volume());
+        println!(
+            "{problem:?}: {found} of {best}, {} points",
+            front.members.len()
+        );
+        assert!(
+            found > 0.97 * best && found <= best,
+            "{problem:?}: {found} of {best}"
+        );
+        assert!(front.members.len() >= 90, "{problem:?}");
+    }
+}
+
+#[test]
+fn no_point_of_a_front_dominates_another() {
+    let front = nsga2::search(
+        &Zdt::Three,
+        &[],
+        40,
+        options(2_000, 5, 1),
+        &Monitor::default(),
+    )
+    .unwrap();
+    let all = &front.members;
+    assert!(
+        all.iter()
+            .all(|a| all.iter().all(|b| !a.values.dominate(&b.values)))
+    );
+}
