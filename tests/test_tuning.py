@@ -3,12 +3,14 @@
 import math
 import signal
 import threading
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sewfast import _core, signals
+from sewfast import _core, pareto, signals
+from sewfast.constraints import Constraints
 from sewfast.control import Controller, Gains
 from sewfast.cost import Cost, terms
 from sewfast.dataset import Dataset
@@ -17,7 +19,7 @@ from sewfast.identification import identify
 from sewfast.loop import run
 from sewfast.machine import VirtualMachine
 from sewfast.models import LinearOE
-from sewfast.tuning import default_variations, first_controller, tune
+from sewfast.tuning import costs, default_variations, first_controller, tune
 
 
 def linear(a: list[float], b: list[float]) -> LinearOE:
@@ -83,6 +85,88 @@ def test_one_controller_serves_several_plants_and_a_machine() -> None:
         assert run(result.controller, plant, SHORT).metrics()["rmse"] < 150
 
 
+def test_cma_es_is_the_other_method() -> None:
+    found = {
+        method: tune(drive(), SHORT, method=method, evaluations=500, threads=2)
+        for method in ("genetic", "cma-es")
+    }
+    assert found["cma-es"].cost == pytest.approx(found["genetic"].cost, rel=0.1)
+    assert found["cma-es"].controller != found["genetic"].controller
+
+
+def test_only_what_is_named_is_searched_within_its_bounds() -> None:
+    start = first_controller(drive())
+    wanted = ["alpha", ("Kp", 0.01, 0.02), ("filter_samples", 2, 5)]
+    found = tune(drive(), SHORT, start=start, variables=wanted, evaluations=80, threads=2)
+    assert [v.name for v in found.variables] == ["alpha", "Kp", "filter_samples"]
+    tuned, kept = found.controller, start.gains.to("standard")
+    assert 0.01 <= tuned.gains.Kp <= 0.02
+    assert tuned.filter_samples in (2, 3, 4, 5)
+    assert (tuned.gains.Ti, tuned.gains.Td) == (kept.Ti, kept.Td)
+    assert (tuned.beta, tuned.N) == (start.beta, start.N)
+    assert found.variables[1].value == tuned.gains.Kp
+    assert "searched  alpha" in str(found)
+
+
+def test_a_bound_that_is_reached_is_told() -> None:
+    start = first_controller(drive())
+    wanted = [("Kp", 1e-4, 2e-4)]
+    found = tune(drive(), SHORT, start=start, variables=wanted, evaluations=60, threads=2)
+    assert found.variables[0].at_bound
+    assert "at a bound" in str(found)
+
+
+def test_constraints_come_before_the_cost() -> None:
+    settings: dict[str, Any] = {"evaluations": 300, "threads": 2, "variations": [(1.0, 0)]}
+    free = tune(drive(), SHORT, **settings)
+    limit = 0.8 * float(np.max(np.abs(run(free.controller, drive(), SHORT).u)))
+    bound = tune(drive(), SHORT, constraints=Constraints(u=limit), **settings)
+    assert np.max(np.abs(run(bound.controller, drive(), SHORT).u)) <= limit
+    assert bound.cost > free.cost
+    assert "u <= " in str(bound)
+    with pytest.raises(FitError, match="constraints"):
+        tune(drive(), SHORT, constraints=Constraints(u=1e-6), evaluations=30, threads=1)
+
+
+def test_costs_compare_controllers_as_the_search_does() -> None:
+    found = tune(drive(), SHORT, evaluations=60, threads=2)
+    both = costs([found.start, found.controller], drive(), SHORT, threads=1)
+    assert list(both) == [found.start_cost, found.cost]
+    assert costs(found.start, drive(), SHORT) == found.start_cost
+    with pytest.raises(SettingError, match="controllers"):
+        costs([], drive(), SHORT)
+
+
+def test_a_front_trades_one_for_the_other(tmp_path: Path) -> None:
+    front = pareto(drive(), SHORT, evaluations=600, size=20, threads=2)
+    tracking, chatter = front.values.T
+    assert len(front) >= 5
+    assert np.all(np.diff(tracking) >= 0)
+    assert np.all(np.diff(chatter) <= 0)
+    assert front.units == {"tracking": "RPM", "chatter": "V"}
+    assert front.picked is front.controllers[front.pick]
+    assert 0 < front.pick < len(front) - 1
+    first, last = (terms(run(front.best(o), drive(), SHORT)) for o in front.objectives)
+    assert first["tracking"] < last["tracking"]
+    assert first["chatter"] > last["chatter"]
+    assert "* the knee" in str(front)
+    front.save(tmp_path / "front.csv")
+    table = np.genfromtxt(tmp_path / "front.csv", delimiter=",", names=True)
+    assert len(table) == len(front)
+    for name in ("front.png", "front.svg"):
+        assert front.plot(tmp_path / name).stat().st_size > 1000
+    with pytest.raises(SettingError, match=r"\.png"):
+        front.plot(tmp_path / "front.txt")
+    with pytest.raises(SettingError, match="tracking, chatter"):
+        front.best("lag")
+
+
+@pytest.mark.parametrize("objectives", ["tracking", ["tracking"], ["tracking", "speed"], [1, 2]])
+def test_objectives_that_make_no_sense_are_refused(objectives: Any) -> None:
+    with pytest.raises(SettingError, match="objectives"):
+        pareto(drive(), SHORT, objectives=objectives, evaluations=40, threads=1)
+
+
 def test_weights_buy_what_they_say() -> None:
     calm, wild = (
         tune(drive(), SHORT, cost=Cost(chatter=weight), evaluations=400, threads=2)
@@ -115,6 +199,12 @@ def test_the_worst_plant_counts_alone() -> None:
     apart = [tune(p, SHORT, **settings).cost for p in plants]
     assert tune(plants, SHORT, aggregate="worst", **settings).cost == max(apart)
     assert tune(plants, SHORT, **settings).cost == pytest.approx(np.mean(apart), rel=1e-12)
+
+
+@pytest.mark.parametrize("limits", [{"Ms": 1.0}, {"u": -1.0}, {"overshoot": math.inf}])
+def test_limits_that_make_no_sense_are_refused(limits: dict[str, float]) -> None:
+    with pytest.raises(SettingError, match="above"):
+        Constraints(**limits)
 
 
 @pytest.mark.parametrize("weight", [-1.0, math.inf, math.nan, "much"])
@@ -179,6 +269,17 @@ def test_progress_is_told_and_ctrl_c_keeps_the_best() -> None:
         ({"u_max": -30.0}, "u_max"),
         ({"cost": {"chatter": 1.0}}, "Cost"),
         ({"aggregate": "best"}, "aggregate"),
+        ({"method": "luck"}, "method"),
+        ({"constraints": {"u": 1.0}}, "Constraints"),
+        ({"variables": []}, "variables"),
+        ({"variables": "Kp"}, "variables"),
+        ({"variables": ["Kq"]}, "Kq"),
+        ({"variables": ["Kp", "Kp"]}, "Kp twice"),
+        ({"variables": [("Kp", 1.0)]}, "name, low, high"),
+        ({"variables": [("Kp", "low", 1.0)]}, "bounds of Kp"),
+        ({"variables": [("Ti", -1.0, 1.0)]}, "Ti"),
+        ({"variables": ["Kp[0]"]}, "schedule"),
+        ({"variables": ["r_rate"]}, "r_rate"),
         ({"evaluations": 0}, "evaluation"),
         ({"evaluations": 1.5}, "evaluations"),
         ({"seed": -1}, "seed"),

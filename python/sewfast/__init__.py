@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from ._core import __version__
     from .analysis import Analysis, analyse
     from .commissioning import Commissioning, commission
+    from .constraints import Constraints
     from .control import (
         Controller,
         Gains,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
         SewfastError,
     )
     from .evidence import ReportCard, check
+    from .front import ParetoFront, pareto
     from .identification import identify
     from .leastsquares import LeastSquaresResult, least_squares
     from .loop import ClosedLoopRun, run
@@ -51,6 +53,7 @@ __all__ = [
     "Analysis",
     "ClosedLoopRun",
     "Commissioning",
+    "Constraints",
     "Controller",
     "Cost",
     "DataError",
@@ -70,6 +73,7 @@ __all__ = [
     "NeuralOE",
     "NeuralSS",
     "OrderTable",
+    "ParetoFront",
     "Recording",
     "ReportCard",
     "SettingError",
@@ -90,6 +94,7 @@ __all__ = [
     "margins",
     "orders",
     "paper_controller",
+    "pareto",
     "read",
     "read_table",
     "record",
@@ -108,6 +113,7 @@ _HOMES = {
     "_core": "__version__",
     "commissioning": "Commissioning commission",
     "analysis": "Analysis analyse",
+    "constraints": "Constraints",
     "control": "Controller Gains fit_fopdt load_controller paper_controller table_1",
     "cost": "Cost",
     "dataset": "Dataset Experiment",
@@ -120,6 +126,7 @@ _HOMES = {
     "machine": "VirtualMachine",
     "models": "ARX IV Ensemble LinearOE Model NeuralOE NeuralSS load_model",
     "order_table": "OrderTable orders",
+    "front": "ParetoFront pareto",
     "readers": "read read_table",
     "recording": "Recording record",
     "robustness": "Margins margins",

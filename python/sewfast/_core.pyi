@@ -421,16 +421,37 @@ def cost_terms(
 ) -> dict[str, float]:
     """tracking, chatter, effort, overshoot [%], rise [ms], lag [ms], saturation, u_max of a run."""
 
+_Variable: TypeAlias = tuple[str, tuple[float, float] | None]
+_Limits: TypeAlias = tuple[float | None, float | None, float | None]
+
 def tune(
     plants: Sequence[_Plant], references: Sequence[_F], *, start: Controller, counts_per_unit: float,
-    variations: Sequence[tuple[float, int]], cost: Mapping[str, float], aggregate: str, evaluations: int,
-    seed: int, threads: int, progress: _Progress = None,
+    variations: Sequence[tuple[float, int]], variables: Sequence[_Variable], cost: Mapping[str, float],
+    aggregate: str, limits: _Limits, loops: Sequence[tuple[_F, _F]], method: str, evaluations: int, seed: int, threads: int,
+    progress: _Progress = None,
 ) -> dict[str, Any]:
-    """Search Kp, Ti, Td, alpha, beta, and N where the start's is finite.
+    """Search ``variables`` (name, bounds or None), or the usual ones where there are none.
 
     Every plant is taken in every variation (gain, extra delay in samples). Weights left out of ``cost`` keep
-    their defaults. Returns Kp, Ti, Td, alpha, beta, N, cost, start_cost, evaluations, trace, termination, weights.
+    their defaults; ``limits`` are Ms, overshoot [%], |u|; Ms is that of ``loops`` (num, den in powers of z^-1). Returns cost, violation, start_cost, variables (name,
+    low, high), values, start (the values it began with), moved (whether the start
+    lay outside bounds), trace, termination, weights.
     """
+
+def tuning_costs(
+    plants: Sequence[_Plant], references: Sequence[_F], controllers: Sequence[Controller], *,
+    counts_per_unit: float, variations: Sequence[tuple[float, int]], cost: Mapping[str, float],
+    aggregate: str, limits: _Limits, loops: Sequence[tuple[_F, _F]], threads: int, progress: _Progress = None,
+) -> list[tuple[float, float]]:
+    """Cost and violation of each controller."""
+
+def pareto(
+    plants: Sequence[_Plant], references: Sequence[_F], *, start: Controller, others: Sequence[Controller],
+    counts_per_unit: float, variations: Sequence[tuple[float, int]], variables: Sequence[_Variable],
+    cost: Mapping[str, float], aggregate: str, limits: _Limits, loops: Sequence[tuple[_F, _F]], objectives: Sequence[str], size: int,
+    evaluations: int, seed: int, threads: int, progress: _Progress = None,
+) -> dict[str, Any]:
+    """Returns controllers (values of the variables), values (of the objectives), variables, evaluations, termination."""
 
 # --- loop_transfer.rs -------------------------------------------------------------------------------------
 

@@ -1,35 +1,38 @@
-"""Fine tuning by simulated closed loops: `tune`."""
+"""Fine tuning by simulated closed loops: `tune`, `costs`."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from . import _core
-from .control import Controller, Fopdt, Gains, fit_fopdt, table_1
+from .constraints import Constraints
+from .control import Controller
 from .cost import Cost
-from .errors import DataError, FitError, Interrupted, SettingError
-from .gains import real, whole
-from .loop import Plant, check_fits, plant_units, reference_samples
-from .models import Ensemble, Model
-from .units import REVOLUTIONS_PER_SECOND
+from .errors import Interrupted, SettingError
+from .gains import whole
+from .starting import first_controller
+from .tuning_task import (
+    Aggregate,
+    Models,
+    Progress,
+    References,
+    TuningTask,
+    default_variations,
+    threads_or_all,
+)
+from .variables import Variable, Wanted, applied
 
-Progress: TypeAlias = Callable[[int, int, float], object]
+__all__ = ["TuningResult", "costs", "default_variations", "first_controller", "tune"]
 
-REFERENCES = ("trapezoid", "trapezoids", "random")
-"""References to tune on unless others are given."""
-GAINS = (0.8, 1.25)
-"""Plant gains beside the identified one that a controller has to bear, so that it transfers."""
-DERIVATIVE_FILTER = 10.0
-"""N to begin with."""
-_STEP_SHARES = (0.25, 0.5, 0.1)
-"""Shares of u_max that the first step response is looked for at."""
-_STEP_SAMPLES = (4_000, 16_000)
+Method: TypeAlias = Literal["genetic", "cma-es"]
+
+EVALUATIONS = 1500
+"""Controllers tried unless said otherwise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,61 +44,79 @@ class TuningResult:
     controller : Controller
         Ready to run.
     start : Controller
-        What the search began with.
+        What the search began with; moved to the bounds that were given where it lay outside.
     cost, start_cost : float
-        Cost of both in the output's unit, mean over plants and references; inf where one diverges.
-    evaluations : int
-        Controllers tried.
-    trace : array
-        The best cost so far, the start's first, then after each generation.
+        Cost of both in the output's unit, over plants and references; inf where one diverges.
+    variables : tuple of Variable
+        What was searched, between which bounds, and what was found.
+    trace : array, shape (evaluations,)
+        The cost of the best controller so far after each evaluation, the start's first.
     termination : str
-        ``evaluations``, ``converged`` or ``interrupted``.
+        ``evaluations`` or ``interrupted``.
     weights : Cost
         What counted how much, every weight a number.
     aggregate : str
         ``mean`` or ``worst``, over the plants.
+    constraints : Constraints
+        What had to be kept.
+    method : str
+        ``genetic`` or ``cma-es``.
     """
 
     controller: Controller
     start: Controller
     cost: float
     start_cost: float
-    evaluations: int
+    variables: tuple[Variable, ...]
     trace: NDArray[np.float64]
     termination: str
     weights: Cost
     aggregate: str
+    constraints: Constraints
+    method: str
+
+    @property
+    def evaluations(self) -> int:
+        """Controllers tried."""
+        return len(self.trace)
 
     def __str__(self) -> str:
         unit = self.controller.gains.y_unit
-        return (
+        lines = [
             f"cost {self.cost:.4g} {unit} (start {self.start_cost:.4g}) after {self.evaluations} "
-            f"evaluations, {self.termination}\n{self.controller}"
-        )
+            f"evaluations, {self.termination}",
+            "  searched  " + "\n            ".join(str(v) for v in self.variables),
+        ]
+        if self.constraints != Constraints():
+            lines.append(f"  within    {self.constraints}")
+        return "\n".join([*lines, str(self.controller)])
 
 
 def tune(
-    models: Plant | Sequence[Plant],
-    references: str | ArrayLike | Sequence[str | ArrayLike] | None = None,
+    models: Models,
+    references: References = None,
     *,
     u_min: float = -20.0,
     u_max: float = 20.0,
     counts_per_rev: float | None = 1572.0,
     filter_samples: int = 8,
     start: Controller | None = None,
+    variables: Sequence[Wanted] | None = None,
     cost: Cost | None = None,
-    aggregate: Literal["mean", "worst"] = "mean",
+    aggregate: Aggregate = "mean",
+    constraints: Constraints | None = None,
     variations: Sequence[tuple[float, int]] | None = None,
-    evaluations: int = 600,
+    method: Method = "genetic",
+    evaluations: int = EVALUATIONS,
     seed: int = 0,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> TuningResult:
-    """Search Kp, Ti, Td, alpha, beta (and N where finite) for the least cost of simulated loops.
+    """Search a controller's numbers for the least cost of simulated loops.
 
     Every candidate runs on every plant in every variation over every reference, with encoder,
-    feedback filter and limits in the loop. A run's cost is a weighted sum of terms (`Cost`). The
-    search is differential evolution; a seed gives the same bits at any number of threads.
+    feedback filter and limits in the loop. A run's cost is a weighted sum of terms (`Cost`). A seed
+    gives the same bits at any number of threads. The result is never worse than the start.
 
     Parameters
     ----------
@@ -103,7 +124,7 @@ def tune(
         Plants that one controller has to serve, with one input, one sample time, the same units;
         every member of an ensemble is one.
     references : str, array of shape (N,), or sequence of them, optional
-        Names (`sewfast.signals`) or samples [y]; `REFERENCES` by default.
+        Names (`sewfast.signals`) or samples [y]; trapezoid, trapezoids and random by default.
     u_min, u_max : float
         Limits of the command [u].
     counts_per_rev : float or None
@@ -111,16 +132,25 @@ def tune(
     filter_samples : int
         Moving average in the feedback.
     start : Controller, optional
-        What to begin with; its limits, filters, encoder and sample time are kept, and the four
-        settings above are not used. By default Table 1 on the first model's own step response.
+        What to begin with; what is not searched is kept, and the four settings above are not used.
+        By default Table 1 on the first model's own step response.
+    variables : sequence of str or (str, float, float), optional
+        What to search, by name or with its bounds: ``Kp``, ``Ti``, ``Td``, ``alpha``, ``beta``,
+        ``N``, ``Tt``, ``filter_samples``, ``filter_time``, ``observer_time``, ``r_rate``;
+        ``Kp[0]``, ``Ti[0]``, ``Td[0]`` and so on of a gain schedule's points, ``schedule`` for all
+        of them. By default the gains, alpha, beta, and N where the start has a derivative filter.
     cost : Cost, optional
         What counts how much.
     aggregate : "mean" or "worst"
         Over the plants in their variations; over the references it is the mean.
+    constraints : Constraints, optional
+        What must be kept whatever it costs.
     variations : sequence of (gain, delay), optional
         Output gain and extra input delay in samples, applied to every plant. By default the plant
-        as it is, and with the gains `GAINS` and a delay of a quarter of the moving average, at
+        as it is, and with the gains .8 and 1.25 and a delay of a quarter of the moving average, at
         least one sample: dynamics that identification missed must not upset the loop.
+    method : "genetic" or "cma-es"
+        A genetic algorithm with local refinement, or CMA-ES with restarts.
     evaluations : int
         Candidates tried.
     seed : int
@@ -135,187 +165,109 @@ def tune(
     SettingError, DataError
         For plants, references or settings that cannot be used.
     FitError
-        Where every candidate diverges.
+        Where every candidate diverges or breaks a constraint.
     Interrupted
         After Ctrl-C; its `best` is the best controller so far.
     """
-    plants = list(models) if isinstance(models, Sequence) else [models]
-    if not plants:
-        raise SettingError("expected at least one plant to tune on, got none")
-    if start is None:
-        start = first_controller(
-            plants[0],
-            u_min=u_min,
-            u_max=u_max,
-            counts_per_rev=counts_per_rev,
-            filter_samples=filter_samples,
-        )
-    for plant in plants:
-        check_fits(start, plant)
-    found = _core.tune(
-        [core for plant in plants for core in _cores(plant)],
-        [reference_samples(r, start) for r in _each(references)],
-        start=start.core(),
-        counts_per_unit=start.counts_per_unit,
-        variations=_checked(default_variations(start) if variations is None else variations),
-        cost=_cost(cost).named(),
+    first = {
+        "u_min": u_min,
+        "u_max": u_max,
+        "counts_per_rev": counts_per_rev,
+        "filter_samples": filter_samples,
+    }
+    task = TuningTask.of(
+        models,
+        references,
+        start=start,
+        first=first,
+        cost=cost,
         aggregate=aggregate,
+        constraints=constraints,
+        variations=variations,
+    )
+    found = _core.tune(
+        task.cores,
+        task.references,
+        start=task.start.core(),
+        variables=task.variables(variables),
+        method=method,
         evaluations=whole("evaluations", evaluations),
         seed=whole("seed", seed),
-        threads=whole("threads", os.cpu_count() or 1 if threads is None else threads),
+        threads=threads_or_all(threads),
         progress=progress,
+        **task.keywords(),
     )
-    result = _result(found, start, aggregate, _assumed(plants[0]))
+    result = _result(found, task, method)
     if result.termination == "interrupted":
         raise Interrupted(result.controller)
     return result
 
 
-def _cores(plant: Plant) -> list[Any]:
-    """A plant each: of an ensemble, every member."""
-    return [m.core for m in plant.members] if isinstance(plant, Ensemble) else [plant.core]
-
-
-def default_variations(controller: Controller) -> tuple[tuple[float, int], ...]:
-    """(gain, extra delay in samples) of the plants that a controller is tuned on; see `tune`."""
-    delay = max(1, controller.filter_samples // 4)
-    return ((1.0, 0), *((gain, delay) for gain in GAINS))
-
-
-def _cost(cost: Cost | None) -> Cost:
-    if not (cost is None or isinstance(cost, Cost)):
-        raise SettingError(
-            f"expected a Cost, got {type(cost).__name__}; for example Cost(chatter=5.0)"
-        )
-    return cost or Cost()
-
-
-def first_controller(
-    plant: Plant,
+def costs(
+    controllers: Controller | Sequence[Controller],
+    models: Models,
+    references: References = None,
     *,
-    u_min: float = -20.0,
-    u_max: float = 20.0,
-    counts_per_rev: float | None = 1572.0,
-    filter_samples: int = 8,
-) -> Controller:
-    """A conservative controller from a model's own step response by Table 1 (nearest row).
+    cost: Cost | None = None,
+    aggregate: Aggregate = "mean",
+    variations: Sequence[tuple[float, int]] | None = None,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> NDArray[np.float64]:
+    """What controllers cost on plants, as `tune` counts it; shape (controllers,).
 
-    The moving average's delay counts as dead time.
+    Parameters are those of `tune`. The limits and the encoder of the first controller decide the
+    default weights and the default variations. A controller that diverges costs inf.
 
     Raises
     ------
-    SettingError
-        For a machine: record its step response and use `fit_fopdt` and `table_1`.
-    FitError
-        Where no step of the model settles.
+    SettingError, DataError
+        For controllers, plants or references that cannot be used.
     """
-    if not isinstance(plant, Model):
+    given = [controllers] if isinstance(controllers, Controller) else list(controllers)
+    if not given or not all(isinstance(c, Controller) for c in given):
+        raise SettingError(f"expected controllers to compare, got {controllers!r}")
+    if len({c.counts_per_unit for c in given}) > 1:
         raise SettingError(
-            "expected a model to find a start from, got a machine; give start=, or tune on a model"
+            "expected controllers with one encoder, got several; compare them one by one"
         )
-    if not np.isfinite(u_max) or u_max == 0:
-        raise SettingError(
-            f"expected a finite u_max other than 0 to size the step by, got {u_max}; give the "
-            "amplifier's limit"
-        )
-    u_unit, y_unit = _stated_units(plant)
-    fopdt = _step_fit(plant, u_max)
-    delayed = replace(fopdt, L=fopdt.L + (filter_samples - 1) / 2 * plant.Ts)
-    rule = table_1(delayed, outside="nearest")
-    gains = Gains.standard(
-        rule.gains.Kp, rule.gains.Ti, rule.gains.Td, u_unit=u_unit, y_unit=y_unit
+    task = TuningTask.of(
+        models,
+        references,
+        start=given[0],
+        first={},
+        cost=cost,
+        aggregate=aggregate,
+        constraints=None,
+        variations=variations,
     )
-    turns = y_unit.lower() in REVOLUTIONS_PER_SECOND
-    return Controller(
-        gains=gains,
-        Ts=plant.Ts,
-        alpha=rule.alpha,
-        beta=rule.beta,
-        N=DERIVATIVE_FILTER,
-        u_min=u_min,
-        u_max=u_max,
-        filter_samples=filter_samples,
-        counts_per_rev=counts_per_rev if turns else None,
-        notes="Table 1 on the model's step response" + _assumed(plant),
+    judged = _core.tuning_costs(
+        task.cores,
+        task.references,
+        [c.core() for c in given],
+        threads=threads_or_all(threads),
+        progress=progress,
+        **task.keywords(),
     )
+    return np.array([cost for cost, _ in judged])
 
 
-def _stated_units(plant: Plant) -> tuple[str, str]:
-    """Units of command and output; what a model leaves open counts as volt and RPM."""
-    u_unit, y_unit = plant_units(plant)
-    return u_unit or "V", y_unit or "RPM"
-
-
-def _assumed(plant: Plant) -> str:
-    """What was taken for granted about the units, for a controller's notes."""
-    names = ("command in V", "output in RPM")
-    open_ = [n for n, unit in zip(names, plant_units(plant), strict=True) if not unit]
-    return f"; the model states no unit, taken: {', '.join(open_)}" if open_ else ""
-
-
-def _step_fit(model: Model, u_max: float) -> Fopdt:
-    """The model's step response, at the first size and length at which it settles."""
-    if len(model.input_names) != 1:
-        raise SettingError(
-            f"expected a model with one input to tune on, got {len(model.input_names)}; identify "
-            "it from the command alone"
-        )
-    reason: Exception | None = None
-    for share in _STEP_SHARES:
-        for samples in _STEP_SAMPLES:
-            u = np.zeros(samples)
-            u[samples // 20 :] = share * u_max
-            try:
-                y = model.core.simulate(u[:, None], model.core.rest_state())
-                return fit_fopdt(u, y, Ts=model.Ts)
-            except (DataError, FitError) as error:
-                reason = error
-    raise FitError(
-        f"expected a model whose step response settles, got none up to u = {0.5 * u_max:g} "
-        f"({reason}); give a controller to start from"
-    ) from reason
-
-
-def _checked(variations: Sequence[tuple[float, int]]) -> list[tuple[float, int]]:
-    if not variations or not all(np.shape(v) == (2,) for v in variations):
-        raise SettingError(
-            f"expected variations as pairs of a gain and a delay in samples, got {variations!r}"
-        )
-    return [(real("a variation's gain", g), whole("a variation's delay", d)) for g, d in variations]
-
-
-def _each(references: Any) -> list[str | ArrayLike]:
-    """The references one by one: a name or a vector is one, a sequence of those is several."""
-    if references is None:
-        return list(REFERENCES)
-    if isinstance(references, str):
-        return [references]
-    several = not isinstance(references, np.ndarray) and any(
-        isinstance(r, str) or np.ndim(r) for r in references
-    )
-    return list(references) if several or np.ndim(references) == 2 else [references]
-
-
-def _result(
-    found: Mapping[str, Any], start: Controller, aggregate: str, assumed: str
-) -> TuningResult:
-    units = {"u_unit": start.gains.u_unit, "y_unit": start.gains.y_unit}
-    tuned = replace(
-        start,
-        gains=Gains.standard(found["Kp"], found["Ti"], found["Td"], **units),
-        alpha=found["alpha"],
-        beta=found["beta"],
-        N=found["N"],
-        notes="tuned by simulated closed loops" + assumed,
-    )
+def _result(found: Mapping[str, Any], task: TuningTask, method: str) -> TuningResult:
+    rows = zip(found["variables"], found["values"], strict=True)
+    variables = tuple(Variable(name, low, high, value) for (name, low, high), value in rows)
+    values = {v.name: v.value for v in variables}
+    began = {v.name: value for v, value in zip(variables, found["start"], strict=True)}
+    notes = "tuned by simulated closed loops" + task.assumed
     return TuningResult(
-        controller=tuned,
-        start=start,
+        controller=applied(values, task.start, notes),
+        start=applied(began, task.start, task.start.notes) if found["moved"] else task.start,
         cost=found["cost"],
         start_cost=found["start_cost"],
-        evaluations=int(found["evaluations"]),
+        variables=variables,
         trace=np.asarray(found["trace"]),
         termination=str(found["termination"]),
         weights=Cost(**found["weights"]),
-        aggregate=aggregate,
+        aggregate=task.aggregate,
+        constraints=task.constraints,
+        method=method,
     )

@@ -57,7 +57,7 @@ def analyse_command(args: argparse.Namespace) -> None:
     from ..analysis import analyse
     from ..control import load_controller
     from .control import _plant as plant_of
-    from .control import _reference as reference_of
+    from .control import reference_of
 
     controller = load_controller(args.controller)
     references = [

@@ -1,9 +1,8 @@
-"""`sewfast tune`, `sewfast run`: a controller for a model, and the loop that it closes."""
+"""`sewfast run`: the loop that a controller closes."""
 
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,31 +18,12 @@ from .arguments import (
 )
 from .drive import add_drive, is_port, opened, recording_place, say_interrupted
 from .host_loop import add_host_loop, at_loops_period, run_host_loop
-from .output import print_json, print_rows, write_columns
-from .progress import Progress
+from .output import write_columns
 
 if TYPE_CHECKING:
-    from ..control import Controller, Gains
+    from ..control import Controller
     from ..dataset import FloatArray
     from ..loop import ClosedLoopRun, Plant
-    from ..tuning import TuningResult
-
-FORMS = ("standard", "parallel", "per_sample")
-
-TUNE = """\
-Tune a 2-DOF PID on an identified model, by simulating the loop with the encoder, the feedback
-filter and the command's limits in it. The model alone is used; no machine is touched.
-
-A reference is a named one (`sewfast signals`) or a CSV with columns t [s], r [output unit].
-Named ones are in RPM at 1 ms. Several references are tuned for together.
-"""
-
-TUNE_EXAMPLES = """\
-examples:
-  sewfast tune drive.json -o controller.json
-  sewfast tune drive.json --reference trapezoid --reference random -o controller.json
-  sewfast tune drive.json --reference cycle.csv --u-min -10 --u-max 10 --filter 4 -o controller.json
-"""
 
 RUN = """\
 Close the loop around a model, a virtual machine or a drive, with the same controller arithmetic.
@@ -69,30 +49,6 @@ examples:
 
 def add(commands: Commands) -> None:
     parser = add_command(
-        commands, "tune", tune_command,
-        summary="a controller for a model", text=TUNE, examples=TUNE_EXAMPLES,
-    )  # fmt: skip
-    parser.add_argument("model", metavar="MODEL.json", help="model file that identify wrote")
-    parser.add_argument(
-        "--reference", action="append", metavar="FILE|NAME",
-        help="what to track; may repeat (trapezoid, trapezoids, random)",
-    )  # fmt: skip
-    parser.add_argument("--u-min", type=float, metavar="V", help="least command (-20)")
-    parser.add_argument("--u-max", type=float, metavar="V", help="largest command (20)")
-    parser.add_argument(
-        "--limits-of", metavar="RECORDING.mcap",
-        help="take the volt limit that a drive had in a recording, both ways, for those not given",
-    )  # fmt: skip
-    parser.add_argument(
-        "--counts-per-rev", type=float, metavar="N",
-        help="encoder in the loop; default: the model's own, else 1572 where the output is a speed",
-    )  # fmt: skip
-    parser.add_argument(
-        "--filter", type=int, default=8, metavar="N",
-        help="moving average over N samples of the feedback (8); 1: none",
-    )  # fmt: skip
-    add_output(parser, "CONTROLLER.json", "controller file to write", required=True)
-    parser = add_command(
         commands, "run", run_command,
         summary="a closed loop on a model, a machine or a drive", text=RUN, examples=RUN_EXAMPLES,
     )  # fmt: skip
@@ -108,101 +64,6 @@ def add(commands: Commands) -> None:
     add_overwrite(parser)
     add_drive(parser)
     add_host_loop(parser)
-
-
-def tune_command(args: argparse.Namespace) -> int | None:
-    from ..models import load_model
-    from ..tuning import tune
-
-    require_place(args.out, (".json",))
-    model = load_model(args.model)
-    counts = args.counts_per_rev or (model.counts[1] if model.counts else 1572.0)
-    u_min, u_max = _command_limits(args)
-    references = [
-        _reference(text, model.Ts, model.output_unit) for text in args.reference or ()
-    ] or None
-    try:
-        with Progress("tune") as progress:
-            found = tune(
-                model,
-                references,
-                u_min=u_min,
-                u_max=u_max,
-                counts_per_rev=counts,
-                filter_samples=args.filter,
-                progress=progress,
-            )
-    except Interrupted as e:
-        e.best.save(args.out)
-        print(f"interrupted; kept the best so far in {args.out}", file=sys.stderr)
-        return 130
-    found.controller.save(args.out)
-    _show_tuned(args, found)
-    return None
-
-
-def _command_limits(args: argparse.Namespace) -> tuple[float, float]:
-    """Least and largest command [V]: as given, else of a recording, else those of +-20 V.
-
-    Raises
-    ------
-    SettingError, DataError
-        For a recording without a volt limit, or one that cannot be read.
-    """
-    volt = 20.0 if args.limits_of is None else _volt_limit(args.limits_of)
-    return (
-        -volt if args.u_min is None else args.u_min,
-        volt if args.u_max is None else args.u_max,
-    )
-
-
-def _volt_limit(path: str) -> float:
-    from ..recordfile.reader import read_header
-
-    limits = read_header(path).settings.get("limits")
-    volt = limits.get("volt") if isinstance(limits, dict) else None
-    if not isinstance(volt, (int, float)) or isinstance(volt, bool) or volt <= 0.0:
-        raise SettingError(
-            f"--limits-of {path}: expected a recording of a drive with a volt limit, it states "
-            "none; give --u-min and --u-max"
-        )
-    return float(volt)
-
-
-def _show_tuned(args: argparse.Namespace, found: TuningResult) -> None:
-    if args.json:
-        print_json(
-            {
-                "file": str(args.out),
-                "cost": found.cost,
-                "start_cost": found.start_cost,
-                "cost_unit": found.controller.gains.y_unit,
-                "evaluations": found.evaluations,
-                "termination": found.termination,
-                "gains": {
-                    g.form: {**g.to_dict(), "units": g.units} for g in _forms(found.controller)
-                },
-                "controller": found.controller.to_dict(),
-            }
-        )
-        return
-    print(found)
-    print("the same gains in every form:")
-    print_rows([_gain_row(g) for g in _forms(found.controller)])
-    print(f"written to {args.out}; try it: sewfast run {args.out} --on MODEL.json|virtual "
-          "--reference NAME")  # fmt: skip
-
-
-def _forms(controller: Controller) -> list[Gains]:
-    return [controller.gains.to(form, Ts=controller.Ts) for form in FORMS]  # type: ignore[arg-type]
-
-
-def _gain_row(gains: Gains) -> list[str]:
-    """Form, then each number with its unit."""
-    values = gains.to_dict()
-    cells = [f"{name} = {values[name]:.6g} {unit}" for name, unit in gains.units.items()]
-    cells += [""] * (4 - len(cells))
-    return [f"  {gains.form.replace('_', '-')}", *cells]
 
 
 def run_command(args: argparse.Namespace) -> int | None:
@@ -256,10 +117,10 @@ def _plant(text: str) -> Plant:
 
 def _wanted(args: argparse.Namespace, controller: Controller) -> str | FloatArray:
     """The reference of a run."""
-    return _reference(args.reference, controller.Ts, controller.gains.y_unit)
+    return reference_of(args.reference, controller.Ts, controller.gains.y_unit)
 
 
-def _reference(text: str, Ts: float, unit: str) -> str | FloatArray:
+def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
     """The name of a reference, or the samples of a file with columns t, r.
 
     Raises

@@ -20,6 +20,7 @@ from . import (
     orders,
     ports,
     recording,
+    tune,
 )
 from .arguments import Commands, Help
 
@@ -73,6 +74,7 @@ def build_parser() -> argparse.ArgumentParser:
         identify,
         models,
         check,
+        tune,
         control,
         analyse,
         ports,

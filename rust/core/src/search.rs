@@ -8,6 +8,8 @@ pub mod cma_es;
 pub mod genetic;
 pub mod nsga2;
 
+pub(crate) use batch::each;
+
 use std::cmp::Ordering;
 
 use crate::{Error, Monitor, Result};
@@ -17,7 +19,7 @@ use crate::{Error, Monitor, Result};
 pub struct Judgement {
     /// Sum of the relative violations of the constraints; 0 for a feasible candidate.
     pub violation: f64,
-    /// What it costs; where that is above the judgement to beat, any number above it.
+    /// What it costs; of a candidate that cannot beat what it has to, what it costs at least.
     pub cost: f64,
 }
 
@@ -166,7 +168,7 @@ fn run<P: Problem>(
             break Termination::Converged;
         }
         let candidates = strategy.ask(options.evaluations - trace.len());
-        let judgements = batch::each(&mut memories, &candidates, |memory, candidate| {
+        let judgements = each(&mut memories, &candidates, |memory, candidate| {
             let judged = problem.judge(memory, &candidate.point, &candidate.to_beat, monitor);
             monitor.advance(1);
             if judged.violation == 0.0 {

@@ -1,24 +1,27 @@
-//! Tuning of controller gains by simulated closed loops.
+//! Tuning of controllers by simulated closed loops.
 //!
 //! A candidate's cost is taken over every plant and every reference, with encoder, filter and limits in the loop;
-//! differential evolution searches the gains.
+//! [`search`](crate::search) finds the least, or the front of what can be had ([`pareto`]).
 
 mod bench;
+mod constraint;
 mod cost;
-mod search;
+mod front;
+mod variable;
 
+pub use constraint::{Constraints, Sensitivity};
 pub use cost::{Cost, Terms, Weights, terms};
-
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::thread;
+pub use front::{Front, Objective, pareto};
+pub use variable::{Parameter, Variable};
 
 use sewfast_control::{Controller, Design, Settings};
 
 use crate::closed_loop::{Plant, check_reference};
 use crate::encoder::Encoder;
+use crate::search::{Judgement, Options, Problem, Termination, cma_es, each, genetic};
 use crate::{Error, Monitor, Result};
 use bench::Bench;
-use search::{Bounds, Evolution, Trial};
+use variable::{designed, moved, place};
 
 /// What is tuned, on what.
 #[derive(Clone, Debug)]
@@ -31,10 +34,14 @@ pub struct Task<'a, P> {
     pub encoder: Option<Encoder>,
     /// The controller to begin with; what is not searched is kept.
     pub start: Design<f64>,
+    /// What is searched.
+    pub variables: &'a [Variable],
     /// What counts how much.
     pub cost: Cost,
     /// How the plants' costs become one.
     pub aggregate: Aggregate,
+    /// What every controller has to keep to.
+    pub constraints: Constraints<'a>,
 }
 
 /// How a candidate's costs on the plants become one; a plant's cost is the mean over the references.
@@ -47,51 +54,30 @@ pub enum Aggregate {
     Worst,
 }
 
-/// How the search runs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Options {
-    /// Controllers tried, each on every plant and reference.
-    pub evaluations: usize,
-    /// Seed of the search; the result is the same at any number of threads.
-    pub seed: u64,
-    /// Threads.
-    pub threads: usize,
-}
-
-/// Why the search ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Termination {
-    /// All evaluations were used.
-    Evaluations,
-    /// All candidates had come together.
-    Converged,
-    /// A stop was requested; the best so far is returned.
-    Interrupted,
-}
-
-impl Termination {
-    /// The name of the outcome.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Evaluations => "evaluations",
-            Self::Converged => "converged",
-            Self::Interrupted => "interrupted",
-        }
-    }
+/// How the box is searched.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Method {
+    /// A genetic algorithm with local refinement.
+    #[default]
+    Genetic,
+    /// CMA-ES with restarts.
+    CmaEs,
 }
 
 /// The best controller and the story of its search.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tuned {
-    /// Settings of the best controller.
-    pub settings: Settings<f64>,
+    /// The best controller.
+    pub design: Design<f64>,
+    /// What the search began with: the task's start, moved to the bounds that were asked for.
+    pub start: Design<f64>,
     /// Its cost.
     pub cost: f64,
+    /// Sum of its relative violations of the constraints; above 0 only where the search was interrupted.
+    pub violation: f64,
     /// The cost of the start; infinite where it diverges.
     pub start_cost: f64,
-    /// Controllers tried.
-    pub evaluations: usize,
-    /// The best cost after each generation, the start's first.
+    /// The cost of the best so far after each evaluation, the start's first.
     pub trace: Vec<f64>,
     /// Why the search ended.
     pub termination: Termination,
@@ -99,129 +85,185 @@ pub struct Tuned {
     pub weights: Weights,
 }
 
-/// Searches `Kp`, `Ti`, `Td` (in their logarithms), `alpha`, `beta`, and `N` where the start has a finite one.
-///
-/// The bounds are wide multiples of the start and of the sample time; the sign of `Kp` is the start's. The result is
-/// never worse than the start.
+/// Costs that differ by less than this share are equal, when it is asked whether a population has come together.
+pub const TOLERANCE: f64 = 1e-5;
+
+/// Searches the task's variables for the least cost. The result is never worse than the start, which is moved to the
+/// bounds that were asked for where it lies outside.
 ///
 /// # Errors
-/// `ErrorKind::Setting` for limits that are not finite or a start, weights or options out of range,
-/// `ErrorKind::Data` for references that cannot be run, `ErrorKind::Fit` where every controller tried diverges.
+/// `ErrorKind::Setting` for limits that are not finite or a start, variables, weights, constraints or options out of
+/// range, `ErrorKind::Data` for references that cannot be run, `ErrorKind::Fit` where every controller tried diverges or
+/// violates a constraint.
 pub fn tune<P: Plant + Clone + Send + Sync>(
     task: &Task<'_, P>,
+    method: Method,
     options: Options,
     monitor: &Monitor,
 ) -> Result<Tuned> {
-    check(task, options)?;
+    task.check()?;
+    options.check()?;
     monitor.set_total(options.evaluations as u64);
-    let mut benches = vec![Bench::new(task)?; options.threads];
-    let start_cost = benches[0].cost(task, &task.start.pid, f64::INFINITY, monitor);
-    let mut evolution = Evolution::new(Bounds::about(&task.start.pid), options.seed);
-    let (mut used, mut trace) = (1, vec![start_cost]);
-    let termination = loop {
-        if monitor.stopped() {
-            break Termination::Interrupted;
-        } else if used >= options.evaluations {
-            break Termination::Evaluations;
-        } else if evolution.converged() {
-            break Termination::Converged;
-        }
-        let trials = evolution.trials(options.evaluations - used);
-        evolution.select(&trials, &evaluate(task, &mut benches, &trials, monitor));
-        used += trials.len();
-        trace.push(evolution.best_cost().min(start_cost));
+    let mut bench = Bench::new(task)?;
+    let problem = Searched {
+        task,
+        bench: bench.clone(),
     };
-    let (settings, cost) = evolution.best_or(task.start.pid, start_cost);
-    if !cost.is_finite() {
-        return Err(Error::fit(format!(
-            "expected gains with which no loop diverges, found none in {used} trials; begin with smaller gains, give \
-             more evaluations, or check the model on new data first"
-        )));
+    let first = moved(task.variables, &task.start)?;
+    let start = bench.judge(task, &first, &Judgement::HOPELESS, monitor);
+    monitor.advance(1);
+    monitor.report_cost(start.cost);
+    let mut tuned = Tuned {
+        design: first,
+        start: first,
+        cost: start.cost,
+        violation: start.violation,
+        start_cost: start.cost,
+        trace: vec![start.cost],
+        termination: Termination::Evaluations,
+        weights: *bench.weights(),
+    };
+    let rest = Options {
+        evaluations: options.evaluations - 1,
+        ..options
+    };
+    if rest.evaluations > 0 {
+        let point = place(task.variables, &first);
+        let found = match method {
+            Method::Genetic => genetic::search(&problem, Some(&point), rest, monitor)?,
+            Method::CmaEs => cma_es::search(&problem, Some(&point), rest, monitor)?,
+        };
+        if found.judgement.beats(&start) {
+            tuned.design = designed(task.variables, &found.point, &task.start)?;
+            tuned.cost = found.judgement.cost;
+            tuned.violation = found.judgement.violation;
+        }
+        let better = |j: &Judgement| if j.beats(&start) { j.cost } else { start.cost };
+        tuned.trace.extend(found.trace.iter().map(better));
+        tuned.termination = found.termination;
     }
-    Ok(Tuned {
-        settings,
-        cost,
-        start_cost,
-        evaluations: used,
-        trace,
-        termination,
-        weights: *benches[0].weights(),
-    })
+    tuned.checked()
 }
 
-fn check<P>(task: &Task<'_, P>, options: Options) -> Result<()> {
-    let controller = Controller::new(task.start)?;
-    let Settings {
-        u_min,
-        u_max,
-        gains,
-        ..
-    } = *controller.settings();
-    if !(u_min.is_finite() && u_max.is_finite()) {
-        return Err(Error::setting(format!(
-            "expected finite output limits to tune within, got {u_min} and {u_max}; give those of the amplifier"
-        )));
-    }
-    if !task.start.schedule.is_empty() {
-        return Err(Error::setting(
-            "expected a start with constant gains, got a gain schedule; leave it out while tuning",
-        ));
-    }
-    if gains.kp == 0.0 {
-        return Err(Error::setting(
-            "expected a start with Kp other than 0, got 0; its sign says which way the plant acts",
-        ));
-    }
-    if options.evaluations == 0 || options.threads == 0 {
-        return Err(Error::setting(format!(
-            "expected at least one evaluation and one thread, got {} and {}",
-            options.evaluations, options.threads
-        )));
-    }
-    if task.plants.is_empty() || task.references.is_empty() {
-        return Err(Error::setting(format!(
-            "expected at least one plant and one reference, got {} and {}",
-            task.plants.len(),
-            task.references.len()
-        )));
-    }
-    task.references.iter().try_for_each(|r| check_reference(r))
-}
-
-/// Costs of the trials, by as many threads as there are benches; who computes what has no part in the result.
-fn evaluate<P: Plant + Clone + Send + Sync>(
+/// What each design costs, and by how much it violates the constraints; infinite where a run diverges.
+///
+/// # Errors
+/// As [`tune`], but for designs that are of no use.
+pub fn costs<P: Plant + Clone + Send + Sync>(
     task: &Task<'_, P>,
-    benches: &mut [Bench<P>],
-    trials: &[Trial],
+    designs: &[Design<f64>],
+    threads: usize,
     monitor: &Monitor,
-) -> Vec<f64> {
-    let next = AtomicUsize::new(0);
-    let work = |bench: &mut Bench<P>| {
-        let mut done = Vec::new();
-        while let Some(trial) = trials.get(next.fetch_add(1, Ordering::Relaxed)) {
-            let cost = bench.cost(task, &trial.settings, trial.to_beat, monitor);
-            monitor.advance(1);
-            monitor.report_cost(cost);
-            done.push((trial.index, cost));
+) -> Result<Vec<Judgement>> {
+    task.check()?;
+    monitor.set_total(designs.len() as u64);
+    let bench = Bench::new(task)?;
+    let mut benches = vec![bench; threads.clamp(1, designs.len().max(1))];
+    Ok(each(&mut benches, designs, |bench, design| {
+        let judged = bench.judge(task, design, &Judgement::HOPELESS, monitor);
+        monitor.advance(1);
+        judged
+    }))
+}
+
+impl Tuned {
+    fn checked(self) -> Result<Self> {
+        let tried = self.trace.len();
+        let interrupted = self.termination == Termination::Interrupted;
+        if !self.cost.is_finite() {
+            Err(Error::fit(format!(
+                "expected a controller with which no loop diverges, found none in {tried} trials; begin with smaller \
+                 gains, give more evaluations, or check the model on new data first"
+            )))
+        } else if self.violation > 0.0 && !interrupted {
+            Err(Error::fit(format!(
+                "expected a controller that keeps to the constraints, found none in {tried} trials: the best exceeds \
+                 them by {:.3} of their limits in sum; relax them, search more variables, or give more evaluations",
+                self.violation
+            )))
+        } else {
+            Ok(self)
         }
-        done
-    };
-    let mut costs = vec![f64::INFINITY; trials.len()];
-    thread::scope(|scope| {
-        let workers: Vec<_> = benches
-            .iter_mut()
-            .map(|bench| scope.spawn(|| work(bench)))
-            .collect();
-        for worker in workers {
-            let done = worker
-                .join()
-                .unwrap_or_else(|panic| std::panic::resume_unwind(panic));
-            for (index, cost) in done {
-                costs[index] = cost;
+    }
+}
+
+impl<P> Task<'_, P> {
+    fn check(&self) -> Result<()> {
+        let controller = Controller::new(self.start)?;
+        let Settings {
+            u_min,
+            u_max,
+            gains,
+            ..
+        } = *controller.settings();
+        if !(u_min.is_finite() && u_max.is_finite()) {
+            return Err(Error::setting(format!(
+                "expected finite output limits to tune within, got {u_min} and {u_max}; give those of the amplifier"
+            )));
+        }
+        if gains.kp == 0.0 && self.start.schedule.is_empty() {
+            return Err(Error::setting(
+                "expected a start with Kp other than 0, got 0; its sign says which way the plant acts",
+            ));
+        }
+        if self.plants.is_empty() || self.references.is_empty() {
+            return Err(Error::setting(format!(
+                "expected at least one plant and one reference, got {} and {}",
+                self.plants.len(),
+                self.references.len()
+            )));
+        }
+        self.check_variables()?;
+        self.constraints.check()?;
+        self.references.iter().try_for_each(|r| check_reference(r))
+    }
+
+    fn check_variables(&self) -> Result<()> {
+        if self.variables.is_empty() {
+            return Err(Error::setting("expected a variable to search, got none"));
+        }
+        for (i, variable) in self.variables.iter().enumerate() {
+            let same = |v: &Variable| v.parameter == variable.parameter;
+            if self.variables[..i].iter().any(same) {
+                return Err(Error::setting(format!(
+                    "expected each variable once, got {} twice",
+                    variable.parameter.name()
+                )));
             }
         }
-    });
-    costs
+        Ok(())
+    }
+}
+
+/// The cost over the box of the variables.
+struct Searched<'a, P> {
+    task: &'a Task<'a, P>,
+    bench: Bench<P>,
+}
+
+impl<P: Plant + Clone + Send + Sync> Problem for Searched<'_, P> {
+    type Memory = Bench<P>;
+
+    fn dimensions(&self) -> usize {
+        self.task.variables.len()
+    }
+
+    fn memory(&self) -> Bench<P> {
+        self.bench.clone()
+    }
+
+    fn judge(
+        &self,
+        bench: &mut Bench<P>,
+        point: &[f64],
+        to_beat: &Judgement,
+        monitor: &Monitor,
+    ) -> Judgement {
+        match designed(self.task.variables, point, &self.task.start) {
+            Ok(design) => bench.judge(self.task, &design, to_beat, monitor),
+            Err(_) => Judgement::HOPELESS,
+        }
+    }
 }
 
 #[cfg(test)]

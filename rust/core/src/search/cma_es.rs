@@ -182,10 +182,10 @@ impl Evolution {
         }
     }
 
-    /// From a point on, in the distribution with this covariance.
-    pub(super) fn spread(mean: DVector<f64>, covariance: DMatrix<f64>) -> Self {
-        let size = population(mean.len());
-        let mut new = Self::new(mean.as_slice().to_vec(), 1.0, size);
+    /// From a point on, in the distribution with this covariance, by generations so many times the usual size.
+    pub(super) fn spread(mean: DVector<f64>, covariance: DMatrix<f64>, larger: f64) -> Self {
+        let size = larger * population(mean.len()) as f64;
+        let mut new = Self::new(mean.as_slice().to_vec(), 1.0, size as usize);
         new.covariance = covariance;
         new.decompose();
         new
@@ -286,6 +286,20 @@ impl Evolution {
         let degenerate =
             !(most.is_finite() && least > 0.0 && most * most < WORST_CONDITION * least * least);
         degenerate || self.sigma * most < SMALLEST_STEP || self.flat(tolerance)
+    }
+
+    /// Whether the best has improved by less than a share within the last generations.
+    pub(super) fn stalled(&self, (share, generations): (f64, usize)) -> bool {
+        let Some(earlier) = self.history.len().checked_sub(generations + 1) else {
+            return false;
+        };
+        let best = |judged: &[Judgement]| {
+            let first = Judgement::HOPELESS;
+            let better = |best: Judgement, j: &Judgement| if j.beats(&best) { *j } else { best };
+            judged.iter().fold(first, better)
+        };
+        let (before, now) = (best(&self.history[..=earlier]), best(&self.history));
+        before.violation == now.violation && before.cost - now.cost <= share * now.cost.abs()
     }
 
     /// The best of the last generations and all of the last one cost the same.

@@ -17,13 +17,20 @@ const MEMBERS: (usize, usize) = (4, 20);
 /// Share of the first members that lie near the start, where there is one.
 const NEAR: f64 = 0.5;
 /// Spread of the members near the start, in shares of the box.
-const JITTER: f64 = 0.08;
+pub(super) const JITTER: f64 = 0.08;
+/// Spread of a later population's members about the best so far, which itself is not among them: it would draw all
+/// others into its basin.
+const AWAY: f64 = 0.2;
+/// A refinement has come to its end when the best improves by less than this share within so many generations.
+const STALLED: (f64, usize) = (1e-3, 12);
 /// Share of all evaluations for the breeding before a refinement.
-const BRED: f64 = 0.25;
+const BRED: f64 = 0.18;
 /// Share of the population whose spread a refinement begins with.
 const ELITE: f64 = 0.25;
+/// Size of a refinement's generations against the usual one: larger ones follow a rough landscape's slope.
+const GENERATION: f64 = 1.4;
 /// Least spread that a refinement begins with.
-const LEAST_SPREAD: f64 = 0.003;
+const LEAST_SPREAD: f64 = 0.015;
 /// How far blends reach beyond their parents, in shares of the parents' distance.
 const BLEND: f64 = 0.5;
 /// Spread of a mutation at the beginning and at the end of a breeding.
@@ -78,19 +85,19 @@ impl Genetic {
             best: None,
             options,
         };
-        new.settle(start);
+        new.unborn.extend(start.map(<[f64]>::to_vec));
+        new.settle(start, JITTER);
         new
     }
 
-    /// A first population, about `start` where there is one.
-    fn settle(&mut self, start: Option<&[f64]>) {
-        let mut near = 0;
-        if let Some(start) = start {
-            near = (NEAR * self.size as f64) as usize;
-            self.unborn.push(start.to_vec());
-            let random = &mut self.random;
-            self.unborn
-                .extend((1..near).map(|_| jittered(start, random)));
+    /// A new population, half of it about a point where there is one.
+    fn settle(&mut self, about: Option<&[f64]>, spread: f64) {
+        let near = about.map_or(0, |_| (NEAR * self.size as f64) as usize);
+        if let Some(point) = about {
+            for _ in self.unborn.len()..near {
+                let member = jittered(point, spread, &mut self.random);
+                self.unborn.push(member);
+            }
         }
         let others = stratified(self.size - near, self.dimensions, &mut self.random);
         self.unborn.extend(others);
@@ -135,7 +142,7 @@ impl Genetic {
             let apart = DVector::from_column_slice(&member.point) - &best;
             spread.ger(1.0 / elite as f64, &apart, &apart, 1.0);
         }
-        Evolution::spread(best, spread)
+        Evolution::spread(best, spread, GENERATION)
     }
 
     /// The better of two members.
@@ -167,11 +174,12 @@ impl Genetic {
 
 impl Strategy for Genetic {
     fn ask(&mut self, limit: usize) -> Vec<Candidate> {
-        let ended = |e: &Evolution| e.ended(self.options.tolerance);
+        let tolerance = self.options.tolerance;
+        let ended = |e: &Evolution| e.ended(tolerance) || e.stalled(STALLED);
         if self.refinement.as_ref().is_some_and(ended) {
             self.refinement = None;
             let best = self.best.as_ref().map(|b| b.point.clone());
-            self.settle(best.as_deref());
+            self.settle(best.as_deref(), AWAY);
         }
         if self.refinement.is_none() && self.bred as f64 >= self.evaluations_to_breed() {
             self.refinement = Some(self.refine());
@@ -209,9 +217,10 @@ impl Strategy for Genetic {
     }
 }
 
-fn jittered(start: &[f64], random: &mut Random) -> Vec<f64> {
-    let about = |x: &f64| (x + JITTER * random.normal()).clamp(0.0, 1.0);
-    start.iter().map(about).collect()
+/// A point beside another one.
+pub(super) fn jittered(point: &[f64], spread: f64, random: &mut Random) -> Vec<f64> {
+    let about = |x: &f64| (x + spread * random.normal()).clamp(0.0, 1.0);
+    point.iter().map(about).collect()
 }
 
 /// Points of which each coordinate has one in every slice of the box (Latin hypercube, McKay 1979).

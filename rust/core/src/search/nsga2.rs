@@ -3,7 +3,8 @@
 
 use std::cmp::Ordering;
 
-use super::{Options, Termination, batch};
+use super::genetic::{JITTER, jittered, stratified};
+use super::{Options, Termination, each};
 use crate::random::Random;
 use crate::{Error, Monitor, Result};
 
@@ -103,7 +104,7 @@ pub fn search<P: Objectives>(
         } else {
             offspring(&parents, count, &mut random)
         };
-        let values = batch::each(&mut memories, &points, |memory, point| {
+        let values = each(&mut memories, &points, |memory, point| {
             let values = problem.judge(memory, point, monitor);
             monitor.advance(1);
             values
@@ -139,6 +140,7 @@ impl Ranked {
     }
 }
 
+/// The starts, then as many points about them as anywhere.
 fn first(
     starts: &[Vec<f64>],
     count: usize,
@@ -146,8 +148,12 @@ fn first(
     random: &mut Random,
 ) -> Vec<Vec<f64>> {
     let mut points: Vec<Vec<f64>> = starts.iter().take(count).cloned().collect();
+    let near = if starts.is_empty() { 0 } else { count / 2 };
+    for k in points.len()..near {
+        points.push(jittered(&starts[k % starts.len()], JITTER, random));
+    }
     let others = count - points.len();
-    points.extend(super::genetic::stratified(others, dimensions, random));
+    points.extend(stratified(others, dimensions, random));
     points
 }
 

@@ -8,7 +8,7 @@ fn options(evaluations: usize, seed: u64, threads: usize) -> Options {
         evaluations,
         seed,
         threads,
-        tolerance: 1e-12,
+        tolerance: 1e-8,
     }
 }
 
@@ -41,10 +41,6 @@ fn finds_the_bottom_of_a_sphere_and_of_a_curved_valley() {
     let valley = Function::new(4, (-2.0, 2.0), rosenbrock);
     for (name, search) in SEARCHES {
         let bottom = median(search, &sphere, 1500);
-        println!(
-            "{name}: sphere {bottom:e}, valley {:e}",
-            median(search, &valley, 4000)
-        );
         assert!(bottom < 1e-4, "{name}: {bottom}");
         let bottom = median(search, &valley, 4000);
         assert!(bottom < 1e-2, "{name}: {bottom}");
@@ -56,8 +52,7 @@ fn leaves_local_minima() {
     // The best local minima beside the global one are worth 1.
     let function = Function::new(3, (-5.12, 4.5), rastrigin);
     for (name, search) in SEARCHES {
-        let least = median(search, &function, 6000);
-        println!("{name}: rastrigin {least:e}");
+        let least = median(search, &function, 20_000);
         assert!(least < 0.9, "{name}: {least}");
     }
 }
@@ -173,28 +168,24 @@ fn approaches_the_fronts_of_zitzler_deb_and_thiele() {
         (Zdt::Three, 20_000),
         (Zdt::Six, 30_000),
     ] {
-        let front = nsga2::search(
-            &problem,
-            &[],
-            100,
-            options(evaluations, 1, 2),
-            &Monitor::default(),
-        )
-        .unwrap();
-        let points = front
-            .members
-            .iter()
-            .map(|m| [m.values.objectives[0], m.values.objectives[1]]);
-        let (found, best) = (volume(points.collect()), problem.best_volume());
-        println!(
-            "{problem:?}: {found} of {best}, {} points",
-            front.members.len()
-        );
+        let best = problem.best_volume();
+        let mut found: Vec<f64> = (0..5)
+            .map(|seed| {
+                let options = options(evaluations, seed, 2);
+                let front = nsga2::search(&problem, &[], 100, options, &Monitor::default());
+                let values = |m: &nsga2::Member| [m.values.objectives[0], m.values.objectives[1]];
+                let points: Vec<_> = front.unwrap().members.iter().map(values).collect();
+                assert!(points.len() >= 90, "{problem:?}: {}", points.len());
+                volume(points)
+            })
+            .collect();
+        found.sort_by(f64::total_cmp);
+        // Now and then the population leaves one of the five pieces of the third front.
+        let volume = found[2];
         assert!(
-            found > 0.97 * best && found <= best,
-            "{problem:?}: {found} of {best}"
+            volume > 0.98 * best && volume <= best,
+            "{problem:?}: {volume} of {best}"
         );
-        assert!(front.members.len() >= 90, "{problem:?}");
     }
 }
 

@@ -1,14 +1,15 @@
-//! One thread's plants and memory: a controller's cost over all plants and references.
+//! One thread's plants and memory: a controller's terms and cost over all plants and references.
 
 use sewfast_control::{Controller, Design, Settings};
 
-use super::cost::{Measure, Weights};
+use super::cost::{Measure, Terms, Weights};
 use super::{Aggregate, Task};
 use crate::closed_loop::{Outcome, Plant, Run};
+use crate::search::Judgement;
 use crate::{Monitor, Result};
 
 /// Largest minus smallest value of all references.
-pub(super) fn span(references: &[&[f64]]) -> f64 {
+fn span(references: &[&[f64]]) -> f64 {
     let all = || references.iter().flat_map(|r| r.iter().copied());
     all().fold(f64::MIN, f64::max) - all().fold(f64::MAX, f64::min)
 }
@@ -26,7 +27,13 @@ impl<P: Plant + Clone> Bench<P> {
         let Settings { u_min, u_max, .. } = task.start.pid;
         let weights = task.cost.weights(span(task.references), u_max - u_min)?;
         let longest = task.references.iter().map(|r| r.len()).max().unwrap_or(0);
-        let measure = |r: &&[f64]| Measure::needed(r, &weights);
+        let measure = |r: &&[f64]| {
+            let measure = Measure::needed(r, &weights);
+            match task.constraints.overshoot {
+                Some(_) => measure.with_overshoot(),
+                None => measure,
+            }
+        };
         Ok(Self {
             plants: task.plants.to_vec(),
             measures: task.references.iter().map(measure).collect(),
@@ -35,71 +42,131 @@ impl<P: Plant + Clone> Bench<P> {
         })
     }
 
+    /// The same, for values of which every term is wanted.
+    pub(super) fn with_all_terms(mut self, task: &Task<'_, P>) -> Self {
+        self.measures = task.references.iter().map(|r| Measure::all(r)).collect();
+        self
+    }
+
     pub(super) fn weights(&self) -> &Weights {
         &self.weights
     }
 
-    /// The cost of a controller; infinite as soon as it cannot be below `to_beat` any more, or on a stop.
-    pub(super) fn cost(
+    /// How good a controller is; hopeless where a run diverges or on a stop.
+    ///
+    /// The work ends as soon as it cannot beat `to_beat` any more: a cost is then what it costs at least.
+    pub(super) fn judge(
         &mut self,
         task: &Task<'_, P>,
-        settings: &Settings<f64>,
-        to_beat: f64,
+        design: &Design<f64>,
+        to_beat: &Judgement,
         monitor: &Monitor,
-    ) -> f64 {
-        let controller = Controller::new(Design {
-            pid: *settings,
-            ..task.start
-        });
-        let Ok(mut controller) = controller else {
-            return f64::INFINITY;
+    ) -> Judgement {
+        let Ok(mut controller) = Controller::new(*design) else {
+            return Judgement::HOPELESS;
         };
+        let loops = task.constraints.of_loops(design);
         let references = task.references.len() as f64;
-        let (mut sum, mut worst) = (0.0, 0.0);
+        let (mut total, mut largest) = (Total::default(), Terms::default());
         for plant in 0..self.plants.len() {
-            let mut own = 0.0;
             for reference in 0..task.references.len() {
-                own += self.one(task, plant, reference, &mut controller, monitor) / references;
-                let lower_bound = task.aggregate.of(sum + own, f64::max(worst, own), task);
-                if lower_bound > to_beat || !lower_bound.is_finite() || monitor.stopped() {
-                    return f64::INFINITY;
+                let Some(terms) = self.run(task, plant, reference, &mut controller, monitor) else {
+                    return Judgement::HOPELESS;
+                };
+                largest = largest.max(&terms);
+                total.add(self.weights.of(&terms) / references);
+                let least = Judgement {
+                    violation: loops + task.constraints.of_runs(&largest),
+                    cost: total.lower_bound(task),
+                };
+                // Later runs can only add to either.
+                if to_beat.beats(&least) {
+                    return least;
                 }
             }
-            sum += own;
-            worst = f64::max(worst, own);
+            total.next_plant();
         }
-        task.aggregate.of(sum, worst, task)
+        Judgement {
+            violation: loops + task.constraints.of_runs(&largest),
+            cost: total.lower_bound(task),
+        }
     }
 
-    fn one(
+    /// Terms over all plants and references, as the task aggregates them, and the violation of its constraints; `None`
+    /// where a run diverges or on a stop.
+    pub(super) fn terms(
+        &mut self,
+        task: &Task<'_, P>,
+        design: &Design<f64>,
+        monitor: &Monitor,
+    ) -> Option<(Terms, f64)> {
+        let mut controller = Controller::new(*design).ok()?;
+        let share = 1.0 / task.references.len() as f64;
+        let (mut sum, mut worst) = (Terms::default(), Terms::default());
+        let mut largest = Terms::default();
+        for plant in 0..self.plants.len() {
+            let mut own = Terms::default();
+            for reference in 0..task.references.len() {
+                let terms = self.run(task, plant, reference, &mut controller, monitor)?;
+                largest = largest.max(&terms);
+                own = own.plus(&terms, share);
+            }
+            sum = sum.plus(&own, 1.0 / self.plants.len() as f64);
+            worst = worst.max(&own);
+        }
+        let violation = task.constraints.of_loops(design) + task.constraints.of_runs(&largest);
+        let terms = match task.aggregate {
+            Aggregate::Mean => sum,
+            Aggregate::Worst => worst,
+        };
+        Some((terms, violation))
+    }
+
+    fn run(
         &mut self,
         task: &Task<'_, P>,
         plant: usize,
         reference: usize,
         controller: &mut Controller<f64>,
         monitor: &Monitor,
-    ) -> f64 {
+    ) -> Option<Terms> {
         let r = task.references[reference];
         let plant = &mut self.plants[plant];
         self.run
             .record(plant, controller, r, task.encoder.as_ref(), monitor);
-        if self.run.outcome != Outcome::Completed {
-            return f64::INFINITY;
+        if self.run.outcome != Outcome::Completed || monitor.stopped() {
+            return None;
         }
         let Settings {
             u_min, u_max, ts, ..
         } = *controller.settings();
-        let terms = self.measures[reference].of(r, &self.run, (u_min, u_max), ts);
-        self.weights.of(&terms)
+        Some(self.measures[reference].of(r, &self.run, (u_min, u_max), ts))
     }
 }
 
-impl Aggregate {
-    /// Over plants, of the sum of their costs and of the largest.
-    fn of<P>(self, sum: f64, worst: f64, task: &Task<'_, P>) -> f64 {
-        match self {
-            Self::Mean => sum / task.plants.len() as f64,
-            Self::Worst => worst,
+/// The costs so far.
+#[derive(Clone, Copy, Debug, Default)]
+struct Total {
+    finished: f64,
+    worst: f64,
+    own: f64,
+}
+
+impl Total {
+    fn add(&mut self, cost: f64) {
+        self.own += cost;
+    }
+
+    fn next_plant(&mut self) {
+        self.finished += self.own;
+        self.worst = self.worst.max(self.own);
+        self.own = 0.0;
+    }
+
+    fn lower_bound<P>(&self, task: &Task<'_, P>) -> f64 {
+        match task.aggregate {
+            Aggregate::Mean => (self.finished + self.own) / task.plants.len() as f64,
+            Aggregate::Worst => self.worst.max(self.own),
         }
     }
 }

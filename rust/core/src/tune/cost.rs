@@ -133,6 +133,31 @@ pub struct Terms {
     pub u_max: f64,
 }
 
+impl Terms {
+    /// The larger of each.
+    pub(super) fn max(&self, other: &Self) -> Self {
+        self.with(other, f64::max)
+    }
+
+    /// This and a share of another.
+    pub(super) fn plus(&self, other: &Self, share: f64) -> Self {
+        self.with(other, |a, b| a + share * b)
+    }
+
+    fn with(&self, other: &Self, of: impl Fn(f64, f64) -> f64) -> Self {
+        Self {
+            tracking: of(self.tracking, other.tracking),
+            chatter: of(self.chatter, other.chatter),
+            effort: of(self.effort, other.effort),
+            overshoot: of(self.overshoot, other.overshoot),
+            rise: of(self.rise, other.rise),
+            lag: of(self.lag, other.lag),
+            saturation: of(self.saturation, other.saturation),
+            u_max: of(self.u_max, other.u_max),
+        }
+    }
+}
+
 /// Smoothing of the true output before its overshoot is taken [s]; docs/CONVENTIONS.md.
 const SMOOTHING: f64 = 5e-3;
 
@@ -163,6 +188,15 @@ impl Measure {
             overshoot: weights.overshoot > 0.0,
             rise: weights.rise > 0.0,
             lag: weights.lag > 0.0,
+        }
+    }
+
+    /// The same, with the overshoot.
+    #[must_use]
+    pub fn with_overshoot(self) -> Self {
+        Self {
+            overshoot: true,
+            ..self
         }
     }
 

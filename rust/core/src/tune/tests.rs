@@ -3,7 +3,7 @@
 use super::*;
 use crate::closed_loop::{LaggedPlant, Varied};
 use crate::linear::LinearModel;
-use sewfast_control::{Design, Standard};
+use sewfast_control::{Point, Schedule, Standard};
 
 const TS: f64 = 1e-3;
 
@@ -42,16 +42,20 @@ fn with_task<T>(
     let (model, r) = (drive(), trapezoid());
     let plants = [0.8, 1.0, 1.25]
         .map(|gain| Varied::new(LaggedPlant::new(&model, TS).unwrap(), gain, 0).unwrap());
+    let start = Design {
+        filter_samples: 8,
+        ..Design::new(start)
+    };
+    let usual = Variable::new(Parameter::Alpha, None, &start).unwrap();
     work(&Task {
         plants: &plants,
         references: &[&r],
         encoder: Some(Encoder::new(26.2, 0.5)),
-        start: Design {
-            filter_samples: 8,
-            ..Design::new(start)
-        },
+        start,
+        variables: &Variable::usual(&start).unwrap_or(vec![usual]),
         cost: Cost::default(),
         aggregate: Aggregate::Mean,
+        constraints: Constraints::default(),
     })
 }
 
@@ -60,33 +64,45 @@ fn options(evaluations: usize, threads: usize) -> Options {
         evaluations,
         seed: 1,
         threads,
+        tolerance: TOLERANCE,
     }
 }
 
 #[test]
 fn finds_much_better_gains_than_its_start() {
     with_task(start(), |task| {
-        let tuned = tune(task, options(1000, 2), &Monitor::default()).unwrap();
+        let tuned = tune(task, Method::Genetic, options(1000, 2), &Monitor::default()).unwrap();
         assert!(
             tuned.cost < 0.2 * tuned.start_cost && tuned.cost < 80.0,
             "{tuned:?}"
         );
-        assert!(tuned.trace.windows(2).all(|pair| pair[1] <= pair[0]) && tuned.evaluations <= 1000);
-        assert_eq!(tuned.trace.last(), Some(&tuned.cost));
-        let again = Bench::new(task).unwrap().cost(
-            task,
-            &tuned.settings,
-            f64::INFINITY,
-            &Monitor::default(),
+        assert!(tuned.trace.windows(2).all(|pair| pair[1] <= pair[0]));
+        assert_eq!(
+            (tuned.trace.len(), tuned.trace[0]),
+            (1000, tuned.start_cost)
         );
-        assert_eq!(again, tuned.cost);
+        assert_eq!(tuned.trace.last(), Some(&tuned.cost));
+        assert_eq!(cost(task, &tuned.design), tuned.cost);
     });
+}
+
+fn cost<P: Plant + Clone + Send + Sync>(task: &Task<'_, P>, design: &Design<f64>) -> f64 {
+    let judged = costs(task, &[*design], 1, &Monitor::default()).unwrap()[0];
+    judged.cost
 }
 
 #[test]
 fn gives_the_same_bits_at_any_number_of_threads() {
     with_task(start(), |task| {
-        let tuned = |threads| tune(task, options(150, threads), &Monitor::default()).unwrap();
+        let tuned = |threads| {
+            tune(
+                task,
+                Method::Genetic,
+                options(150, threads),
+                &Monitor::default(),
+            )
+            .unwrap()
+        };
         let one = tuned(1);
         assert_eq!(one, tuned(2));
         assert_eq!(one, tuned(5));
@@ -95,8 +111,10 @@ fn gives_the_same_bits_at_any_number_of_threads() {
             ..options(150, 2)
         };
         assert_ne!(
-            one.settings,
-            tune(task, other, &Monitor::default()).unwrap().settings
+            one.design,
+            tune(task, Method::Genetic, other, &Monitor::default())
+                .unwrap()
+                .design
         );
     });
 }
@@ -104,14 +122,11 @@ fn gives_the_same_bits_at_any_number_of_threads() {
 #[test]
 fn is_never_worse_than_its_start_and_keeps_it_where_it_has_no_time() {
     with_task(start(), |task| {
-        let tuned = tune(task, options(1, 1), &Monitor::default()).unwrap();
-        assert_eq!(
-            (tuned.settings, tuned.cost),
-            (task.start.pid, tuned.start_cost)
-        );
+        let tuned = tune(task, Method::Genetic, options(1, 1), &Monitor::default()).unwrap();
+        assert_eq!((tuned.design, tuned.cost), (task.start, tuned.start_cost));
         let monitor = Monitor::default();
         monitor.request_stop();
-        let stopped = tune(task, options(100, 1), &monitor);
+        let stopped = tune(task, Method::Genetic, options(100, 1), &monitor);
         assert!(stopped.is_err() || stopped.unwrap().termination == Termination::Interrupted);
     });
 }
@@ -127,7 +142,7 @@ fn recovers_from_a_start_that_oscillates() {
         ..start()
     };
     with_task(wild, |task| {
-        let tuned = tune(task, options(1200, 2), &Monitor::default()).unwrap();
+        let tuned = tune(task, Method::Genetic, options(1200, 2), &Monitor::default()).unwrap();
         assert!(tuned.cost < 80.0 && tuned.start_cost > 100.0, "{tuned:?}");
     });
 }
@@ -140,7 +155,7 @@ fn refuses_tasks_that_make_no_sense() {
                 cost,
                 ..task.clone()
             };
-            tune(&task, options, &Monitor::default())
+            tune(&task, Method::Genetic, options, &Monitor::default())
                 .unwrap_err()
                 .message
         })
@@ -174,37 +189,215 @@ fn refuses_tasks_that_make_no_sense() {
             references: &[],
             ..task.clone()
         };
-        assert!(tune(&none, once, &Monitor::default()).is_err());
+        assert!(tune(&none, Method::Genetic, once, &Monitor::default()).is_err());
         let empty = Task {
             references: &[&[]],
             ..task.clone()
         };
-        assert!(tune(&empty, once, &Monitor::default()).is_err());
+        assert!(tune(&empty, Method::Genetic, once, &Monitor::default()).is_err());
     });
 }
 
 #[test]
 fn the_worst_plant_costs_at_least_the_mean() {
     with_task(start(), |task| {
-        let cost = |aggregate| {
+        let over = |plants, aggregate| {
             let task = Task {
+                plants,
                 aggregate,
                 ..task.clone()
             };
-            let mut bench = Bench::new(&task).unwrap();
-            bench.cost(&task, &task.start.pid, f64::INFINITY, &Monitor::default())
+            cost(&task, &task.start)
         };
-        let (mean, worst) = (cost(Aggregate::Mean), cost(Aggregate::Worst));
-        let one = |plant: usize| {
-            let task = Task {
-                plants: &task.plants[plant..=plant],
-                ..task.clone()
-            };
-            let mut bench = Bench::new(&task).unwrap();
-            bench.cost(&task, &task.start.pid, f64::INFINITY, &Monitor::default())
-        };
-        let all = [one(0), one(1), one(2)];
+        let mean = over(task.plants, Aggregate::Mean);
+        let all = [0, 1, 2].map(|k| over(&task.plants[k..=k], Aggregate::Mean));
         assert!((mean - all.iter().sum::<f64>() / 3.0).abs() < 1e-9 * mean);
-        assert_eq!(worst, all.iter().fold(0.0, |w, c| f64::max(w, *c)));
+        let worst = all.iter().fold(0.0, |w, c| f64::max(w, *c));
+        assert_eq!(over(task.plants, Aggregate::Worst), worst);
+    });
+}
+
+#[test]
+fn cma_es_finds_as_good_gains() {
+    with_task(start(), |task| {
+        let tuned = |method| {
+            tune(task, method, options(800, 2), &Monitor::default())
+                .unwrap()
+                .cost
+        };
+        let (genetic, cma_es) = (tuned(Method::Genetic), tuned(Method::CmaEs));
+        assert!((genetic / cma_es).ln().abs() < 0.1, "{genetic} {cma_es}");
+    });
+}
+
+#[test]
+fn what_is_not_searched_is_kept_and_what_is_stays_within_bounds() {
+    with_task(start(), |task| {
+        let variable = |parameter, bounds| Variable::new(parameter, bounds, &task.start).unwrap();
+        let variables = [
+            variable(Parameter::Kp, Some((0.005, 0.02))),
+            variable(Parameter::FilterSamples, Some((4.0, 6.0))),
+            variable(Parameter::ObserverTime, None),
+        ];
+        let task = Task {
+            variables: &variables,
+            ..task.clone()
+        };
+        let tuned = tune(&task, Method::Genetic, options(100, 2), &Monitor::default()).unwrap();
+        let Design { pid, .. } = tuned.design;
+        let kept = Settings {
+            gains: Standard {
+                kp: pid.gains.kp,
+                ..start().gains
+            },
+            ..start()
+        };
+        assert_eq!(pid, kept);
+        assert!((0.005..=0.02).contains(&pid.gains.kp), "{tuned:?}");
+        assert!((4..=6).contains(&tuned.design.filter_samples), "{tuned:?}");
+        assert!(tuned.design.observer_time >= 0.25 * TS && tuned.cost < tuned.start_cost);
+    });
+}
+
+#[test]
+fn the_gains_of_a_schedule_are_searched_and_keep_their_speeds() {
+    with_task(start(), |task| {
+        let point = |speed| Point {
+            speed,
+            gains: task.start.pid.gains,
+        };
+        let start = Design {
+            schedule: Schedule::new(&[point(0.0), point(2000.0)]).unwrap(),
+            ..task.start
+        };
+        let variables = Variable::usual(&start).unwrap();
+        assert_eq!(variables.len(), 9);
+        let task = Task {
+            start,
+            variables: &variables,
+            ..task.clone()
+        };
+        let tuned = tune(&task, Method::Genetic, options(400, 2), &Monitor::default()).unwrap();
+        let points = tuned.design.schedule.points();
+        assert_eq!((points[0].speed, points[1].speed), (0.0, 2000.0));
+        assert_ne!(points[0].gains, points[1].gains);
+        assert!(tuned.cost < 0.7 * tuned.start_cost, "{tuned:?}");
+    });
+}
+
+#[test]
+fn constraints_are_kept_and_what_cannot_be_kept_is_said() {
+    with_task(start(), |task| {
+        // Stands for the linear loop: the more gain, the more sensitive.
+        let sensitivity = |design: &Design<f64>| 1.0 + 100.0 * design.pid.gains.kp;
+        let within = |constraints| Task {
+            constraints,
+            ..task.clone()
+        };
+        let limited = |u| Constraints {
+            u: Some(u),
+            ms: Some((1.8, &sensitivity as &Sensitivity<'_>)),
+            ..Constraints::default()
+        };
+        let task = within(limited(14.0));
+        let tuned = tune(&task, Method::Genetic, options(300, 2), &Monitor::default()).unwrap();
+        assert!(tuned.violation == 0.0 && tuned.design.pid.gains.kp <= 0.008);
+        let free = tune(
+            &within(Constraints::default()),
+            Method::Genetic,
+            options(300, 2),
+            &Monitor::default(),
+        );
+        assert!(free.unwrap().cost < tuned.cost);
+        let none = tune(
+            &within(limited(1e-3)),
+            Method::Genetic,
+            options(30, 2),
+            &Monitor::default(),
+        );
+        assert!(none.unwrap_err().message.contains("constraints"));
+        let refused = tune(
+            &within(limited(0.0)),
+            Method::Genetic,
+            options(30, 2),
+            &Monitor::default(),
+        );
+        assert!(refused.unwrap_err().message.contains("above 0 for u"));
+    });
+}
+
+#[test]
+fn a_front_trades_tracking_for_calm() {
+    with_task(start(), |task| {
+        let objectives = [Objective::Tracking, Objective::Chatter];
+        let front = pareto(
+            task,
+            &objectives,
+            &[task.start],
+            24,
+            options(480, 2),
+            &Monitor::default(),
+        )
+        .unwrap();
+        assert!(front.designs.len() > 5, "{front:?}");
+        for pair in front.values.windows(2) {
+            assert!(
+                pair[0][0] <= pair[1][0] && pair[0][1] >= pair[1][1],
+                "{pair:?}"
+            );
+        }
+        let first = &front.values[0];
+        let alone = Task {
+            cost: Cost {
+                chatter: Some(0.0),
+                overshoot: Some(0.0),
+                saturation: Some(0.0),
+                ..Cost::default()
+            },
+            ..task.clone()
+        };
+        assert!((cost(&alone, &front.designs[0]) - first[0]).abs() < 1e-9 * first[0]);
+        let refused = |objectives: &[Objective]| {
+            let found = pareto(
+                task,
+                objectives,
+                &[],
+                24,
+                options(48, 1),
+                &Monitor::default(),
+            );
+            found.unwrap_err().message
+        };
+        assert!(refused(&objectives[..1]).contains("two objectives"));
+        assert!(refused(&[objectives[0]; 2]).contains("twice"));
+        assert!(refused(&[Objective::Ms, Objective::Lag]).contains("linear plant"));
+    });
+}
+
+#[test]
+fn variables_that_make_no_sense_are_refused() {
+    let start = Design::new(start());
+    let refused = |parameter, bounds| {
+        Variable::new(parameter, bounds, &start)
+            .unwrap_err()
+            .message
+    };
+    assert!(refused(Parameter::Kp, Some((0.1, 0.1))).contains("differ"));
+    assert!(refused(Parameter::Ti, Some((-1.0, 1.0))).contains("Ti"));
+    assert!(refused(Parameter::FilterSamples, Some((1.0, 100.0))).contains("filter_samples"));
+    assert!(refused(Parameter::RRate, None).contains("r_rate"));
+    assert!(refused(Parameter::KpAt(0), None).contains("0 points"));
+    assert!(Parameter::named("Kq").is_err() && Parameter::named("Kp[").is_err());
+    for name in ["Kp", "alpha", "observer_time", "Td[3]"] {
+        assert_eq!(Parameter::named(name).unwrap().name(), name);
+    }
+    with_task(self::start(), |task| {
+        let twice = [task.variables[0], task.variables[0]];
+        let task = Task {
+            variables: &twice,
+            ..task.clone()
+        };
+        let refused = tune(&task, Method::Genetic, options(2, 1), &Monitor::default());
+        assert!(refused.unwrap_err().message.contains("Kp twice"));
     });
 }

@@ -1,0 +1,362 @@
+"""`sewfast tune`: a controller for a model, or the front of what can be had."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import Interrupted, SettingError
+from .arguments import TABLES, Commands, add_command, add_output, require_place
+from .control import reference_of
+from .output import print_json, print_rows
+from .progress import Progress
+
+if TYPE_CHECKING:
+    from ..constraints import Constraints
+    from ..control import Controller, Gains
+    from ..cost import Cost
+    from ..front import ParetoFront
+    from ..tuning import TuningResult
+    from ..variables import Wanted
+
+FORMS = ("standard", "parallel", "per_sample")
+FIGURES = (".png", ".svg", ".pdf")
+
+TUNE = """\
+Tune a 2-DOF PID on identified models, by simulating the loop with the encoder, the feedback
+filter and the command's limits in it. The models alone are used; no machine is touched. Several
+models are plants that one controller has to serve; of an ensemble every member is one.
+
+A reference is a named one (`sewfast signals`) or a CSV with columns t [s], r [output unit].
+Named ones are in RPM at 1 ms. Several references are tuned for together.
+
+The cost of a run is a weighted sum of tracking [y], chatter [u], effort [u], overshoot [%], rise
+[ms], lag [ms], saturation (a share); --cost NAME=WEIGHT sets the weight of one, overshoot_limit
+what overshoot is free. --constraint sets limits that come first: Ms, overshoot, u. --pareto
+OBJECTIVES searches for the front of what can be had instead, and takes its knee.
+"""
+
+TUNE_EXAMPLES = """\
+examples:
+  sewfast tune drive.json -o controller.json
+  sewfast tune drive.json --reference trapezoid --reference random -o controller.json
+  sewfast tune drive.json --reference cycle.csv --u-min -10 --u-max 10 --filter 4 -o controller.json
+  sewfast tune drive.json --cost chatter=50 --constraint overshoot=2 -o calm.json
+  sewfast tune one.json two.json --aggregate worst --variables Kp,Ti,alpha -o controller.json
+  sewfast tune drive.json --pareto tracking,chatter --front front.png -o controller.json
+"""
+
+
+def add(commands: Commands) -> None:
+    parser = add_command(
+        commands, "tune", tune_command,
+        summary="a controller for a model", text=TUNE, examples=TUNE_EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument(
+        "model", nargs="+", metavar="MODEL.json", help="model file that identify wrote"
+    )
+    parser.add_argument(
+        "--reference", action="append", metavar="FILE|NAME",
+        help="what to track; may repeat (trapezoid, trapezoids, random)",
+    )  # fmt: skip
+    parser.add_argument("--u-min", type=float, metavar="V", help="least command (-20)")
+    parser.add_argument("--u-max", type=float, metavar="V", help="largest command (20)")
+    parser.add_argument(
+        "--limits-of", metavar="RECORDING.mcap",
+        help="take the volt limit that a drive had in a recording, both ways, for those not given",
+    )  # fmt: skip
+    parser.add_argument(
+        "--counts-per-rev", type=float, metavar="N",
+        help="encoder in the loop; default: the model's own, else 1572 where the output is a speed",
+    )  # fmt: skip
+    parser.add_argument(
+        "--filter", type=int, default=8, metavar="N",
+        help="moving average over N samples of the feedback (8); 1: none",
+    )  # fmt: skip
+    _add_search(parser)
+    add_output(parser, "CONTROLLER.json", "controller file to write", required=True)
+
+
+def _add_search(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--variables", metavar="NAME[=LOW:HIGH],..",
+        help="what to search (Kp,Ti,Td,alpha,beta,N); also Tt, filter_samples, filter_time, "
+        "observer_time, r_rate",
+    )  # fmt: skip
+    parser.add_argument(
+        "--cost", action="append", metavar="NAME=WEIGHT", help="weight of a term; may repeat"
+    )
+    parser.add_argument(
+        "--constraint", action="append", metavar="NAME=LIMIT",
+        help="limit of Ms, overshoot [%%] or u; may repeat",
+    )  # fmt: skip
+    parser.add_argument(
+        "--aggregate", choices=("mean", "worst"), default="mean", help="over the plants (mean)"
+    )
+    parser.add_argument(
+        "--method", choices=("genetic", "cma-es"), default="genetic",
+        help="how to search (genetic)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--evaluations", type=int, metavar="N",
+        help="controllers tried (1500; 3000 with --pareto)",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the search (0)")
+    parser.add_argument(
+        "--pareto", metavar="NAME,NAME",
+        help="objectives of a front: tracking, chatter, effort, overshoot, rise, lag, saturation, "
+        "cost, Ms; -o is its knee",
+    )  # fmt: skip
+    parser.add_argument(
+        "--front", type=Path, metavar="FILE",
+        help="the front as a table (.csv, .npz, .mat, .parquet) or a figure (.png, .svg, .pdf)",
+    )  # fmt: skip
+
+
+def tune_command(args: argparse.Namespace) -> int | None:
+    from ..models import load_model
+
+    require_place(args.out, (".json",))
+    if args.front is not None and args.pareto is None:
+        raise SettingError("--front: expected --pareto with the objectives of the front as well")
+    if args.pareto is not None and args.method != "genetic":
+        raise SettingError(
+            "--method: a front is searched by NSGA-II; leave --method or --pareto out"
+        )
+    require_place(args.front, (*TABLES, *FIGURES), option="--front")
+    models = [load_model(path) for path in args.model]
+    first = models[0]
+    references = [
+        reference_of(text, first.Ts, first.output_unit) for text in args.reference or ()
+    ] or None
+    settings = _settings(args)
+    try:
+        if args.pareto is None:
+            found = _tuned(args, models, references, settings)
+            found.controller.save(args.out)
+            _show_tuned(args, found)
+        else:
+            front = _front(args, models, references, settings)
+            front.picked.save(args.out)
+            _show_front(args, front)
+    except Interrupted as e:
+        getattr(e.best, "picked", e.best).save(args.out)
+        print(f"interrupted; kept the best so far in {args.out}", file=sys.stderr)
+        return 130
+    return None
+
+
+def _settings(args: argparse.Namespace) -> dict[str, Any]:
+    """What both searches take."""
+    settings: dict[str, Any] = {
+        "variables": _variables(args.variables),
+        "cost": _cost(args.cost),
+        "constraints": _constraints(args.constraint),
+        "aggregate": args.aggregate,
+        "seed": args.seed,
+    }
+    if args.evaluations is not None:
+        settings["evaluations"] = args.evaluations
+    return settings
+
+
+def _loop(args: argparse.Namespace, model: Any) -> dict[str, Any]:
+    """Limits, encoder and filter of the first controller."""
+    u_min, u_max = _command_limits(args)
+    counts = args.counts_per_rev or (model.counts[1] if model.counts else 1572.0)
+    return {
+        "u_min": u_min,
+        "u_max": u_max,
+        "counts_per_rev": counts,
+        "filter_samples": args.filter,
+    }
+
+
+def _tuned(
+    args: argparse.Namespace, models: list[Any], references: Any, settings: dict[str, Any]
+) -> TuningResult:
+    from ..tuning import tune
+
+    with Progress("tune") as progress:
+        return tune(
+            models, references, **_loop(args, models[0]), **settings, method=args.method,
+            progress=progress,
+        )  # fmt: skip
+
+
+def _front(
+    args: argparse.Namespace, models: list[Any], references: Any, settings: dict[str, Any]
+) -> ParetoFront:
+    from ..front import pareto
+    from ..starting import first_controller
+
+    start = first_controller(models[0], **_loop(args, models[0]))
+    with Progress("tune") as progress:
+        return pareto(
+            models, references, objectives=args.pareto.split(","), start=start, **settings,
+            progress=progress,
+        )  # fmt: skip
+
+
+def _pairs(given: list[str] | None, option: str) -> dict[str, float]:
+    """NAME=NUMBER of every time that an option was given."""
+    pairs = {}
+    for text in given or ():
+        name, equals, number = text.partition("=")
+        try:
+            pairs[name.strip()] = float(number)
+        except ValueError:
+            equals = ""
+        if not equals or not name.strip():
+            raise SettingError(f"{option} {text}: expected NAME=NUMBER, as in {option} overshoot=2")
+    return pairs
+
+
+def _cost(given: list[str] | None) -> Cost:
+    from ..cost import Cost
+
+    return Cost(**_known(_pairs(given, "--cost"), "--cost", tuple(Cost.__dataclass_fields__)))
+
+
+def _constraints(given: list[str] | None) -> Constraints:
+    from ..constraints import Constraints
+
+    pairs = _pairs(given, "--constraint")
+    return Constraints(**_known(pairs, "--constraint", ("Ms", "overshoot", "u")))
+
+
+def _known(pairs: dict[str, float], option: str, names: tuple[str, ...]) -> dict[str, Any]:
+    for name in pairs:
+        if name not in names:
+            raise SettingError(f"{option} {name}: expected one of {', '.join(names)}")
+    return dict(pairs)
+
+
+def _variables(text: str | None) -> list[Wanted] | None:
+    """`Kp,Ti=0.02:0.5` as names and (name, low, high).
+
+    Raises
+    ------
+    SettingError
+        For bounds that are not two numbers.
+    """
+    if text is None:
+        return None
+    found: list[Wanted] = []
+    for part in text.split(","):
+        name, equals, bounds = (piece.strip() for piece in part.partition("="))
+        if not equals:
+            found.append(name)
+            continue
+        try:
+            low, high = (float(bound) for bound in bounds.split(":"))
+        except ValueError:
+            raise SettingError(
+                f"--variables {part}: expected NAME or NAME=LOW:HIGH, as in Ti=0.02:0.5"
+            ) from None
+        found.append((name, low, high))
+    return found
+
+
+def _command_limits(args: argparse.Namespace) -> tuple[float, float]:
+    """Least and largest command [V]: as given, else of a recording, else those of +-20 V.
+
+    Raises
+    ------
+    SettingError, DataError
+        For a recording without a volt limit, or one that cannot be read.
+    """
+    volt = 20.0 if args.limits_of is None else _volt_limit(args.limits_of)
+    return (
+        -volt if args.u_min is None else args.u_min,
+        volt if args.u_max is None else args.u_max,
+    )
+
+
+def _volt_limit(path: str) -> float:
+    from ..recordfile.reader import read_header
+
+    limits = read_header(path).settings.get("limits")
+    volt = limits.get("volt") if isinstance(limits, dict) else None
+    if not isinstance(volt, (int, float)) or isinstance(volt, bool) or volt <= 0.0:
+        raise SettingError(
+            f"--limits-of {path}: expected a recording of a drive with a volt limit, it states "
+            "none; give --u-min and --u-max"
+        )
+    return float(volt)
+
+
+def _show_tuned(args: argparse.Namespace, found: TuningResult) -> None:
+    if args.json:
+        print_json(
+            {
+                "file": str(args.out),
+                "cost": found.cost,
+                "start_cost": found.start_cost,
+                "cost_unit": found.controller.gains.y_unit,
+                "evaluations": found.evaluations,
+                "termination": found.termination,
+                "method": found.method,
+                "weights": found.weights.named(),
+                "variables": {
+                    v.name: {"value": v.value, "low": v.low, "high": v.high}
+                    for v in found.variables
+                },
+                **_controller(found.controller),
+            }
+        )
+        return
+    print(found)
+    _show_gains(args, found.controller)
+
+
+def _show_front(args: argparse.Namespace, front: ParetoFront) -> None:
+    if args.front is not None and args.front.suffix.lower() in FIGURES:
+        front.plot(args.front)
+    elif args.front is not None:
+        front.save(args.front)
+    if args.json:
+        print_json(
+            {
+                "file": str(args.out),
+                "objectives": list(front.objectives),
+                "units": front.units,
+                "values": front.values.tolist(),
+                "pick": front.pick,
+                "evaluations": front.evaluations,
+                **_controller(front.picked),
+            }
+        )
+        return
+    print(front)
+    print(front.picked)
+    _show_gains(args, front.picked)
+
+
+def _controller(controller: Controller) -> dict[str, Any]:
+    forms = _forms(controller)
+    return {
+        "gains": {g.form: {**g.to_dict(), "units": g.units} for g in forms},
+        "controller": controller.to_dict(),
+    }
+
+
+def _show_gains(args: argparse.Namespace, controller: Controller) -> None:
+    print("the same gains in every form:")
+    print_rows([_gain_row(g) for g in _forms(controller)])
+    print(f"written to {args.out}; try it: sewfast run {args.out} --on MODEL.json|virtual "
+          "--reference NAME")  # fmt: skip
+
+
+def _forms(controller: Controller) -> list[Gains]:
+    return [controller.gains.to(form, Ts=controller.Ts) for form in FORMS]  # type: ignore[arg-type]
+
+
+def _gain_row(gains: Gains) -> list[str]:
+    """Form, then each number with its unit."""
+    values = gains.to_dict()
+    cells = [f"{name} = {values[name]:.6g} {unit}" for name, unit in gains.units.items()]
+    cells += [""] * (4 - len(cells))
+    return [f"  {gains.form.replace('_', '-')}", *cells]

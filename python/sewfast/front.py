@@ -1,0 +1,287 @@
+"""`pareto`: what can be had, where more of one thing costs another."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import _core
+from .constraints import Constraints
+from .control import Controller
+from .cost import Cost
+from .errors import Interrupted, SettingError
+from .gains import whole
+from .tuning import tune
+from .tuning_task import (
+    Aggregate,
+    Models,
+    Progress,
+    References,
+    TuningTask,
+    threads_or_all,
+)
+from .variables import Wanted, applied
+
+EVALUATIONS = 3000
+SIZE = 40
+_TUNED = 0.25
+"""Share of the evaluations for the tuned controller that the front begins with."""
+
+
+@dataclass(frozen=True, eq=False)
+class ParetoFront:
+    """Controllers of which none is better than another in everything.
+
+    Attributes
+    ----------
+    controllers : tuple of Controller
+        By their first objective.
+    objectives : tuple of str
+        What was to be small.
+    units : dict
+        The unit of each objective.
+    values : array, shape (controllers, objectives)
+        In these units, over plants and references.
+    pick : int
+        The knee: the controller closest to the best of every objective at once, each in shares of
+        its range on the front.
+    evaluations : int
+        Controllers tried.
+    """
+
+    controllers: tuple[Controller, ...]
+    objectives: tuple[str, ...]
+    units: dict[str, str]
+    values: NDArray[np.float64]
+    pick: int
+    evaluations: int
+
+    def __len__(self) -> int:
+        return len(self.controllers)
+
+    def __iter__(self) -> Iterator[Controller]:
+        return iter(self.controllers)
+
+    @property
+    def picked(self) -> Controller:
+        """The controller at the knee."""
+        return self.controllers[self.pick]
+
+    def best(self, objective: str) -> Controller:
+        """The controller with the least value of one objective.
+
+        Raises
+        ------
+        SettingError
+            For what was no objective.
+        """
+        if objective not in self.objectives:
+            raise SettingError(f"expected one of {', '.join(self.objectives)}, got {objective!r}")
+        column = self.values[:, self.objectives.index(objective)]
+        return self.controllers[int(np.argmin(column))]
+
+    def table(self) -> dict[str, NDArray[np.float64]]:
+        """A column per objective and gain, for a file or a plot; `picked` is 1 at the knee."""
+        standard = [c.gains.to("standard") for c in self.controllers]
+        columns = {name: self.values[:, i] for i, name in enumerate(self.objectives)}
+        numbers = {
+            "Kp": [g.Kp for g in standard],
+            "Ti": [g.Ti for g in standard],
+            "Td": [g.Td for g in standard],
+            "alpha": [c.alpha for c in self.controllers],
+            "beta": [c.beta for c in self.controllers],
+            "N": [c.N for c in self.controllers],
+        }
+        columns |= {name: np.array(column) for name, column in numbers.items()}
+        columns["picked"] = (np.arange(len(self)) == self.pick).astype(np.float64)
+        return columns
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write `table` as CSV, .npz, .mat or Parquet by the ending, objectives with their units.
+
+        Raises
+        ------
+        SettingError, DataError
+            For an ending that stands for no format, or a file that cannot be written.
+        """
+        from .writers import write_table
+
+        gains = self.picked.gains
+        units = {**self.units, "Kp": f"{gains.u_unit}/{gains.y_unit}", "Ti": "s", "Td": "s"}
+        write_table(path, self.table(), units=units)
+
+    def plot(self, path: str | os.PathLike[str]) -> Path:
+        """Draw the front, every pair of objectives in a panel, as PNG, SVG or PDF by the ending.
+
+        Raises
+        ------
+        SettingError
+            Where matplotlib is not installed.
+        """
+        from .report.figures.front import draw
+
+        return draw(self, Path(path))
+
+    def __str__(self) -> str:
+        names = [f"{n} [{self.units[n]}]" if self.units[n] else n for n in self.objectives]
+        width = max(12, *(len(n) for n in names))
+        head = "  " + "".join(f"{n:>{width + 2}}" for n in names)
+        rows = [
+            f"{'*' if i == self.pick else ' '} " + "".join(f"{v:>{width + 2}.4g}" for v in row)
+            for i, row in enumerate(self.values)
+        ]
+        told = "* the knee: closest to the best of every objective, in shares of its range here"
+        return "\n".join([f"{len(self)} controllers", head, *rows, told])
+
+
+def pareto(
+    models: Models,
+    references: References = None,
+    *,
+    objectives: Sequence[str] = ("tracking", "chatter"),
+    start: Controller | None = None,
+    variables: Sequence[Wanted] | None = None,
+    cost: Cost | None = None,
+    aggregate: Aggregate = "mean",
+    constraints: Constraints | None = None,
+    variations: Sequence[tuple[float, int]] | None = None,
+    size: int = SIZE,
+    evaluations: int = EVALUATIONS,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> ParetoFront:
+    """The front of what can be had in several objectives at once (NSGA-II, Deb et al. 2002).
+
+    A quarter of the evaluations tunes one controller for `cost`, with which the population begins;
+    the rest spreads it along the front.
+
+    Parameters
+    ----------
+    models, references, start, variables, aggregate, constraints, variations, seed, threads
+        As in `tune`; without a start, that of `tune` with its default limits.
+    objectives : sequence of str
+        Two or more of tracking, chatter, effort, overshoot, rise, lag, saturation, cost, Ms.
+    cost : Cost, optional
+        What the objective ``cost`` is, and what the first controller is tuned for.
+    size : int
+        Controllers on the front, at most.
+    evaluations : int
+        Candidates tried.
+    progress : callable, optional
+        Called with (done, total, lowest cost).
+
+    Returns
+    -------
+    ParetoFront
+
+    Raises
+    ------
+    SettingError, DataError
+        For plants, references or settings that cannot be used.
+    FitError
+        Where no candidate stays bounded within the constraints.
+    Interrupted
+        After Ctrl-C; its `best` is the front so far, or the best controller where there is none.
+    """
+    total, names = whole("evaluations", evaluations), _checked(objectives)
+    settings: dict[str, Any] = {
+        "cost": cost,
+        "aggregate": aggregate,
+        "constraints": constraints,
+        "variations": variations,
+    }
+    first = max(1, int(_TUNED * total))
+    tuned = tune(
+        models,
+        references,
+        start=start,
+        variables=variables,
+        evaluations=first,
+        seed=seed,
+        threads=threads,
+        progress=_shifted(progress, 0, total),
+        **settings,
+    )
+    task = TuningTask.of(models, references, start=tuned.start, first={}, **settings)
+    found = _core.pareto(
+        task.cores,
+        task.references,
+        start=task.start.core(),
+        others=[tuned.controller.core()],
+        variables=task.variables(variables),
+        objectives=names,
+        size=whole("size", size),
+        evaluations=max(1, total - first),
+        seed=whole("seed", seed),
+        threads=threads_or_all(threads),
+        progress=_shifted(progress, first, total),
+        **task.keywords(ms="Ms" in names),
+    )
+    return _front(found, task, names, first, tuned.controller)
+
+
+def _checked(objectives: Sequence[str]) -> list[str]:
+    if isinstance(objectives, str) or not all(isinstance(o, str) for o in objectives):
+        raise SettingError(
+            f"expected a list of objectives, got {objectives!r}; for example ['tracking', 'effort']"
+        )
+    return list(objectives)
+
+
+def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
+    if progress is None:
+        return None
+    return lambda done, _, best: progress(before + done, total, best)
+
+
+def _front(
+    found: Any, task: TuningTask, objectives: list[str], before: int, tuned: Controller
+) -> ParetoFront:
+    interrupted = found["termination"] == "interrupted"
+    if interrupted and not found["controllers"]:
+        raise Interrupted(tuned)
+    names = [name for name, _, _ in found["variables"]]
+    notes = "on the front of " + ", ".join(objectives) + task.assumed
+    values = np.array(found["values"], dtype=np.float64)
+    front = ParetoFront(
+        controllers=tuple(
+            applied(dict(zip(names, row, strict=True)), task.start, notes)
+            for row in found["controllers"]
+        ),
+        objectives=tuple(objectives),
+        units=_units(objectives, task.start),
+        values=values,
+        pick=knee(values),
+        evaluations=before + int(found["evaluations"]),
+    )
+    if interrupted:
+        raise Interrupted(front)
+    return front
+
+
+def _units(objectives: Sequence[str], controller: Controller) -> dict[str, str]:
+    u, y = controller.gains.u_unit, controller.gains.y_unit
+    known = {
+        "cost": y,
+        "tracking": y,
+        "chatter": u,
+        "effort": u,
+        "overshoot": "%",
+        "rise": "ms",
+        "lag": "ms",
+    }
+    return {name: known.get(name, "") for name in objectives}
+
+
+def knee(values: NDArray[np.float64]) -> int:
+    """The row closest to the least of every column at once, columns in shares of their range."""
+    low, high = values.min(axis=0), values.max(axis=0)
+    shares = (values - low) / np.where(high > low, high - low, 1.0)
+    return int(np.argmin(np.sum(shares**2, axis=1)))

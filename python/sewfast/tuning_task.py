@@ -1,0 +1,150 @@
+"""What is tuned on what, as `tune`, `costs` and `pareto` hand it to the core."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .constraints import Constraints
+from .control import Controller
+from .cost import Cost
+from .errors import SettingError
+from .gains import real, whole
+from .loop import Plant, check_fits, reference_samples
+from .models import Ensemble
+from .plants import each_reference
+from .starting import assumed, first_controller
+from .variables import Wanted, wanted
+
+Progress: TypeAlias = Callable[[int, int, float], object]
+Aggregate: TypeAlias = Literal["mean", "worst"]
+Models: TypeAlias = Plant | Sequence[Plant]
+References: TypeAlias = str | ArrayLike | Sequence[str | ArrayLike] | None
+
+REFERENCES = ("trapezoid", "trapezoids", "random")
+"""References to tune on unless others are given."""
+GAINS = (0.8, 1.25)
+"""Plant gains beside the identified one that a controller has to bear, so that it transfers."""
+
+
+@dataclass(frozen=True)
+class TuningTask:
+    """Everything but the search itself."""
+
+    plants: list[Any]
+    references: list[Any]
+    start: Controller
+    variations: list[tuple[float, int]]
+    cost: Cost
+    aggregate: str
+    constraints: Constraints
+    assumed: str
+
+    @classmethod
+    def of(
+        cls,
+        models: Models,
+        references: References,
+        *,
+        start: Controller | None,
+        first: Mapping[str, Any],
+        cost: Cost | None,
+        aggregate: str,
+        constraints: Constraints | None,
+        variations: Sequence[tuple[float, int]] | None,
+    ) -> TuningTask:
+        """Checked; without a start, `first` are the settings of the first controller."""
+        given = list(models) if isinstance(models, Sequence) else [models]
+        if not given:
+            raise SettingError("expected at least one plant to tune on, got none")
+        if start is None:
+            start = first_controller(given[0], **first)
+        for plant in given:
+            check_fits(start, plant)
+        singles = [single for plant in given for single in _singles(plant)]
+        return cls(
+            plants=singles,
+            references=[
+                reference_samples(r, start) for r in each_reference(references, REFERENCES)
+            ],
+            start=start,
+            variations=_checked(default_variations(start) if variations is None else variations),
+            cost=_instance(cost, Cost, "Cost(chatter=5.0)"),
+            aggregate=aggregate,
+            constraints=_instance(constraints, Constraints, "Constraints(overshoot=2.0)"),
+            assumed=assumed(given[0]),
+        )
+
+    def keywords(self, *, ms: bool = False) -> dict[str, Any]:
+        """Of the core's functions, beside plants and references; `ms`: Ms is asked for anyway."""
+        loops = self._loops() if ms or self.constraints.Ms is not None else []
+        return {
+            "counts_per_unit": self.start.counts_per_unit,
+            "variations": self.variations,
+            "cost": self.cost.named(),
+            "aggregate": self.aggregate,
+            "limits": self.constraints.limits,
+            "loops": loops,
+        }
+
+    def _loops(self) -> list[Any]:
+        """The linear plants that Ms is taken on, as fractions."""
+        from .linear_plant import sampled
+
+        given = self.constraints.plant
+        if given is None:
+            plants = [p for p in self.plants if hasattr(p, "to_tf")]
+        else:
+            plants = list(given) if isinstance(given, (list, tuple)) else [given]
+        if not plants:
+            raise SettingError(
+                "expected a linear plant to take Ms on, got none among the plants; give "
+                "Constraints(plant=...), for example a linear model of the same drive"
+            )
+        return [sampled(plant, self.start.Ts, self.constraints.speed) for plant in plants]
+
+    @property
+    def cores(self) -> list[Any]:
+        """The compiled plants."""
+        return [plant.core for plant in self.plants]
+
+    def variables(self, names: Sequence[Wanted] | None) -> list[Any]:
+        """Names and bounds as the core takes them."""
+        return wanted(names, self.start)
+
+
+def threads_or_all(threads: int | None) -> int:
+    """The number of threads; all processors by default."""
+    return whole("threads", os.cpu_count() or 1 if threads is None else threads)
+
+
+def default_variations(controller: Controller) -> tuple[tuple[float, int], ...]:
+    """(gain, extra delay in samples) of the plants that a controller is tuned on; see `tune`."""
+    delay = max(1, controller.filter_samples // 4)
+    return ((1.0, 0), *((gain, delay) for gain in GAINS))
+
+
+def _singles(plant: Plant) -> list[Any]:
+    """A plant each: of an ensemble, every member."""
+    return list(plant.members) if isinstance(plant, Ensemble) else [plant]
+
+
+def _instance(given: Any, kind: type[Any], example: str) -> Any:
+    if not (given is None or isinstance(given, kind)):
+        raise SettingError(
+            f"expected a {kind.__name__}, got {type(given).__name__}; for example {example}"
+        )
+    return kind() if given is None else given
+
+
+def _checked(variations: Sequence[tuple[float, int]]) -> list[tuple[float, int]]:
+    if not variations or not all(np.shape(v) == (2,) for v in variations):
+        raise SettingError(
+            f"expected variations as pairs of a gain and a delay in samples, got {variations!r}"
+        )
+    return [(real("a variation's gain", g), whole("a variation's delay", d)) for g, d in variations]

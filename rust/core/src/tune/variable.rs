@@ -1,0 +1,312 @@
+//! What of a controller is searched: variables with their bounds and scales.
+
+use sewfast_control::{Design, Point, Schedule, Standard};
+
+use crate::{Error, Result};
+
+/// A number of a controller that can be searched.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[expect(
+    missing_docs,
+    reason = "the names are those of the controller's settings"
+)]
+pub enum Parameter {
+    Kp,
+    Ti,
+    Td,
+    Alpha,
+    Beta,
+    N,
+    Tt,
+    FilterSamples,
+    FilterTime,
+    ObserverTime,
+    RRate,
+    /// `Kp`, `Ti` and `Td` of a point of the gain schedule, counted from 0.
+    KpAt(usize),
+    TiAt(usize),
+    TdAt(usize),
+}
+
+const NAMES: [(&str, Parameter); 11] = [
+    ("Kp", Parameter::Kp),
+    ("Ti", Parameter::Ti),
+    ("Td", Parameter::Td),
+    ("alpha", Parameter::Alpha),
+    ("beta", Parameter::Beta),
+    ("N", Parameter::N),
+    ("Tt", Parameter::Tt),
+    ("filter_samples", Parameter::FilterSamples),
+    ("filter_time", Parameter::FilterTime),
+    ("observer_time", Parameter::ObserverTime),
+    ("r_rate", Parameter::RRate),
+];
+
+impl Parameter {
+    /// By its name; gains of a schedule's points are `Kp[0]`, `Ti[0]`, `Td[0]`, `Kp[1]` and so on.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for an unknown name.
+    pub fn named(name: &str) -> Result<Self> {
+        if let Some((_, parameter)) = NAMES.iter().find(|(known, _)| *known == name) {
+            return Ok(*parameter);
+        }
+        let point = |gain: &str| -> Option<usize> {
+            let inner = name.strip_prefix(gain)?.strip_prefix('[')?;
+            inner.strip_suffix(']')?.parse().ok()
+        };
+        match (point("Kp"), point("Ti"), point("Td")) {
+            (Some(k), _, _) => Ok(Self::KpAt(k)),
+            (_, Some(k), _) => Ok(Self::TiAt(k)),
+            (_, _, Some(k)) => Ok(Self::TdAt(k)),
+            _ => Err(Error::setting(format!(
+                "expected a variable named {} or Kp[0], Ti[0], Td[0] .. of a schedule's points, got '{name}'",
+                NAMES.map(|(known, _)| known).join(", ")
+            ))),
+        }
+    }
+
+    /// Its name.
+    pub fn name(self) -> String {
+        let known = NAMES.iter().find(|(_, parameter)| *parameter == self);
+        match (self, known) {
+            (_, Some((name, _))) => (*name).into(),
+            (Self::KpAt(k), _) => format!("Kp[{k}]"),
+            (Self::TiAt(k), _) => format!("Ti[{k}]"),
+            (Self::TdAt(k), _) => format!("Td[{k}]"),
+            _ => String::new(),
+        }
+    }
+
+    /// Its value in a design; NaN for a point that the schedule does not have.
+    pub fn of(self, design: &Design<f64>) -> f64 {
+        let point = |k: usize, gain: fn(&Standard<f64>) -> f64| {
+            let points = design.schedule.points();
+            points.get(k).map_or(f64::NAN, |point| gain(&point.gains))
+        };
+        match self {
+            Self::Kp => design.pid.gains.kp,
+            Self::Ti => design.pid.gains.ti,
+            Self::Td => design.pid.gains.td,
+            Self::Alpha => design.pid.alpha,
+            Self::Beta => design.pid.beta,
+            Self::N => design.pid.n,
+            Self::Tt => design.pid.tt,
+            Self::FilterSamples => design.filter_samples as f64,
+            Self::FilterTime => design.filter_time,
+            Self::ObserverTime => design.observer_time,
+            Self::RRate => design.r_rate,
+            Self::KpAt(k) => point(k, |g| g.kp),
+            Self::TiAt(k) => point(k, |g| g.ti),
+            Self::TdAt(k) => point(k, |g| g.td),
+        }
+    }
+
+    fn set(self, design: &mut Design<f64>, points: &mut [Point<f64>], value: f64) {
+        match self {
+            Self::Kp => design.pid.gains.kp = value,
+            Self::Ti => design.pid.gains.ti = value,
+            Self::Td => design.pid.gains.td = value,
+            Self::Alpha => design.pid.alpha = value,
+            Self::Beta => design.pid.beta = value,
+            Self::N => design.pid.n = value,
+            Self::Tt => design.pid.tt = value,
+            Self::FilterSamples => design.filter_samples = value.round() as usize,
+            Self::FilterTime => design.filter_time = value,
+            Self::ObserverTime => design.observer_time = value,
+            Self::RRate => design.r_rate = value,
+            Self::KpAt(k) => points[k].gains.kp = value,
+            Self::TiAt(k) => points[k].gains.ti = value,
+            Self::TdAt(k) => points[k].gains.td = value,
+        }
+    }
+
+    fn is_linear(self) -> bool {
+        matches!(self, Self::Alpha | Self::Beta | Self::FilterSamples)
+    }
+
+    /// Wide multiples of the start and of the sample time. A negative alpha or beta weights the reference by more than
+    /// 1: feedforward that a slow feedback leaves room for.
+    fn bounds(self, start: &Design<f64>) -> Option<(f64, f64)> {
+        let (ts, own) = (start.pid.ts, self.of(start));
+        match self {
+            Self::Kp | Self::KpAt(_) => Some((own / 50.0, own * 50.0)),
+            Self::Ti | Self::TiAt(_) => Some((4.0 * ts, 1e4 * ts)),
+            Self::Td | Self::TdAt(_) => Some((0.05 * ts, 200.0 * ts)),
+            Self::Alpha => Some((-0.5, 1.2)),
+            Self::Beta => Some((-8.0, 1.2)),
+            Self::N => Some((1.0, 50.0)),
+            Self::Tt => Some((2.0 * ts, 1e3 * ts)),
+            Self::FilterSamples => Some((1.0, 24.0)),
+            Self::FilterTime | Self::ObserverTime => Some((0.25 * ts, 30.0 * ts)),
+            Self::RRate if own.is_finite() => Some((own / 10.0, own * 10.0)),
+            Self::RRate => None,
+        }
+    }
+}
+
+/// A parameter between bounds.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Variable {
+    /// What is searched.
+    pub parameter: Parameter,
+    /// Least value.
+    pub low: f64,
+    /// Largest value.
+    pub high: f64,
+    /// Searched by its logarithm.
+    logarithmic: bool,
+    /// Whether the bounds were asked for.
+    given: bool,
+}
+
+impl Variable {
+    /// A variable of a controller like `start`, between `bounds` or else the usual ones.
+    ///
+    /// Times and gains are searched by their logarithm where the bounds have one sign, alpha, beta and samples linearly.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for bounds that are not finite or do not grow, a point that the schedule does not have, or no
+    /// bounds where there are no usual ones.
+    pub fn new(
+        parameter: Parameter,
+        bounds: Option<(f64, f64)>,
+        start: &Design<f64>,
+    ) -> Result<Self> {
+        let name = parameter.name();
+        if parameter.of(start).is_nan() {
+            return Err(Error::setting(format!(
+                "expected a variable of a controller with {} points in its schedule, got {name}; points count from 0",
+                start.schedule.points().len()
+            )));
+        }
+        let gain = matches!(parameter, Parameter::Kp | Parameter::Ti | Parameter::Td);
+        if gain && !start.schedule.is_empty() {
+            return Err(Error::setting(format!(
+                "expected gains of the schedule's points, which the controller uses, got {name}; search {name}[0], {name}[1] .."
+            )));
+        }
+        let Some((low, high)) = bounds.or(parameter.bounds(start)) else {
+            return Err(Error::setting(format!(
+                "expected bounds for {name}, as the start has none; give (\"{name}\", low, high)"
+            )));
+        };
+        let (low, high) = (low.min(high), low.max(high));
+        if !(low < high && (high - low).is_finite()) {
+            return Err(Error::setting(format!(
+                "expected finite bounds for {name} that differ, got {low} and {high}"
+            )));
+        }
+        if bounds.is_some() {
+            for value in [low, high] {
+                Self::probe(parameter, value, start)?;
+            }
+        }
+        Ok(Self {
+            parameter,
+            low,
+            high,
+            logarithmic: low * high > 0.0 && !parameter.is_linear(),
+            given: bounds.is_some(),
+        })
+    }
+
+    /// Refuses a bound that no controller can have.
+    fn probe(parameter: Parameter, value: f64, start: &Design<f64>) -> Result<()> {
+        let fixed = Self {
+            parameter,
+            low: value,
+            high: value,
+            logarithmic: false,
+            given: true,
+        };
+        designed(&[fixed], &[0.0], start)
+            .and_then(|design| Ok(sewfast_control::Controller::new(design)?))
+            .map(drop)
+    }
+
+    /// The usual variables of a controller: its gains, alpha and beta, and `N` where it has a derivative filter.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for a start without usual bounds.
+    pub fn usual(start: &Design<f64>) -> Result<Vec<Self>> {
+        let points = start.schedule.points().len();
+        let mut all = match points {
+            0 => vec![Parameter::Kp, Parameter::Ti, Parameter::Td],
+            _ => (0..points)
+                .flat_map(|k| [Parameter::KpAt(k), Parameter::TiAt(k), Parameter::TdAt(k)])
+                .collect(),
+        };
+        all.extend([Parameter::Alpha, Parameter::Beta]);
+        if start.pid.n.is_finite() {
+            all.push(Parameter::N);
+        }
+        all.into_iter()
+            .map(|parameter| Self::new(parameter, None, start))
+            .collect()
+    }
+
+    /// The value at a place between 0 and 1.
+    fn value(&self, place: f64) -> f64 {
+        if self.logarithmic {
+            let ratio = self.high / self.low;
+            self.low * ratio.powf(place)
+        } else {
+            self.low + place * (self.high - self.low)
+        }
+    }
+
+    /// The place of a value, moved to the bounds where it lies outside.
+    fn place(&self, value: f64) -> f64 {
+        let place = if self.logarithmic {
+            (value / self.low).ln() / (self.high / self.low).ln()
+        } else {
+            (value - self.low) / (self.high - self.low)
+        };
+        // A value of 0 or of the other sign has no logarithm; it is nearest to the smaller bound.
+        let smaller = if self.low.abs() < self.high.abs() {
+            0.0
+        } else {
+            1.0
+        };
+        if place.is_nan() {
+            smaller
+        } else {
+            place.clamp(0.0, 1.0)
+        }
+    }
+}
+
+/// Where a design lies in the box.
+pub(super) fn place(variables: &[Variable], design: &Design<f64>) -> Vec<f64> {
+    variables
+        .iter()
+        .map(|v| v.place(v.parameter.of(design)))
+        .collect()
+}
+
+/// A start moved to the bounds that were asked for, where it lies outside.
+pub(super) fn moved(variables: &[Variable], start: &Design<f64>) -> Result<Design<f64>> {
+    let outside = |v: &&Variable| {
+        let own = v.parameter.of(start);
+        v.given && !(v.low <= own && own <= v.high)
+    };
+    let outside: Vec<Variable> = variables.iter().filter(outside).copied().collect();
+    designed(&outside, &place(&outside, start), start)
+}
+
+/// The design at a point of the box; what is not searched is the start's.
+pub(super) fn designed(
+    variables: &[Variable],
+    point: &[f64],
+    start: &Design<f64>,
+) -> Result<Design<f64>> {
+    let mut design = *start;
+    let mut points = start.schedule.points().to_vec();
+    for (variable, place) in variables.iter().zip(point) {
+        let value = variable.value(*place);
+        variable.parameter.set(&mut design, &mut points, value);
+    }
+    design.schedule = Schedule::new(&points)?;
+    Ok(design)
+}
