@@ -20,8 +20,8 @@ class Constraints:
     Parameters
     ----------
     Ms : float, optional
-        Largest sensitivity of the linear loop (`sewfast.margins`), 1.4 to 2 for a robust one; with a
-        gain schedule at each of its points.
+        Largest sensitivity of the linear loop (`sewfast.margins`), 1.4 to 2 for a robust one; with
+        a gain schedule at each of its points.
     overshoot : float, optional
         Largest overshoot on steps and trapezoids [%], on every plant.
     u : float, optional
