@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sewfast import identification, signals, tuning
+from sewfast import commission, identification, signals
+from sewfast.commissioning import training
 from sewfast.control import Controller, Gains, load_controller
 from sewfast.errors import DataError, SettingError
 from sewfast.experiment import STAGES, folder, identified, loops, recordings, run_demo
@@ -33,7 +34,10 @@ def _short() -> Any:
     with pytest.MonkeyPatch.context() as patch:
         quick = functools.partial(identification.identify, iterations=3, starts=1)
         patch.setattr(identified, "identify", quick)
-        patch.setattr(loops, "tune", functools.partial(tuning.tune, evaluations=20))
+        able = functools.partial(identification.identify, iterations=15)
+        patch.setattr(training, "identify", able)
+        short = functools.partial(commission, members=2, evaluations=25)
+        patch.setattr(loops, "commission", short)
         yield
 
 
@@ -206,6 +210,19 @@ def test_the_plant_of_eq_8_is_the_printed_one() -> None:
     assert gain == pytest.approx((0.1228 + 0.1224) / (1 - 1.87 + 0.8705))
 
 
+def test_the_drive_is_commissioned_beside_the_papers_way(
+    demo: Path, results: dict[str, Any]
+) -> None:
+    told = results["commissioning"]
+    assert told["verdict"] == "verified"
+    saved = json.loads((demo / "commissioning" / "commissioning.json").read_text())
+    assert saved["references"] == told["references"]
+    for reference in ("trapezoid", "chirp_hi_lo", "chirp_lo_hi", "random"):
+        apart = results["control"][reference]["model_vs_machine_rmse_rpm"]
+        assert apart == pytest.approx(told["references"][reference]["apart_rmse_rpm"])
+    assert "commissioning/report.html" in (demo / "report.html").read_text()
+
+
 def test_the_papers_gains_track_on_their_plant_and_chatter_on_the_machine() -> None:
     with rig(VirtualMachine()) as bench:
         runs = loops.paper_runs(bench)
@@ -238,7 +255,9 @@ def test_the_closed_loop_recording_is_the_loop_itself() -> None:
 def test_the_experiment_went_over_the_link(results: dict[str, Any]) -> None:
     link = results["link"]
     # six open-loop records, the closed loop twice, four references, the paper's gains
-    assert link["samples"] == 3000 + 4 * 20_000 + 15_000 + 2 * 9350 + 2 * 1500 + 2 * 20_000 + 10_000
+    paper = 3000 + 4 * 20_000 + 15_000 + 2 * 9350 + 2 * 1500 + 2 * 20_000 + 10_000
+    commissioned = sum(results["commissioning"]["recordings"].values()) / 0.001
+    assert link["samples"] == paper + round(commissioned)
     assert link["missing"] == 0
     assert link["port"] in ("pty", "tcp")
 

@@ -64,15 +64,15 @@ def trapezoids(fopdt: Fopdt, demands: Demands, Ts: float) -> FloatArray:
 
 def levels(fopdt: Fopdt, demands: Demands, Ts: float, seed: int) -> FloatArray:
     """A reference of random levels over the working range, to judge models by [RPM]."""
-    T = fopdt.T
+    change = max(0.8 * fopdt.T, 4.0 * demands.speed / acceleration(fopdt, demands))
     return _core.random_steps(
-        duration=min(20.0 * T, LONGEST),
+        duration=min(25.0 * change, LONGEST),
         Ts=Ts,
         low=0.1 * demands.speed,
         high=demands.speed,
-        hold_min=T,
-        hold_max=3.0 * T,
-        smoothing=max(0.8 * T, 4.0 * demands.speed / acceleration(fopdt, demands)),
+        hold_min=1.25 * change,
+        hold_max=4.0 * change,
+        smoothing=change,
         seed=seed,
         start=0.0,
     )

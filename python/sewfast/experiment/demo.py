@@ -29,8 +29,8 @@ STAGES = (
     "default network",
     "scores",
     "report card",
-    "tuning",
-    "closed loops",
+    "commissioning",
+    "paper's gains",
     "writing",
 )
 
@@ -69,7 +69,7 @@ def run_demo(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Carry out the paper's experiment: excite, record, identify, validate, tune, run, report.
+    """Carry out the paper's experiment: excite, record, identify, validate, commission, report.
 
     The machine is behind a port and is talked to as to hardware (docs/PROTOCOL.md).
 
@@ -147,15 +147,18 @@ def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, An
     clock.enter("report card")
     check, drawings = identified.report_card(models["neural_oe"], recorded["random"])
 
-    clock.enter("tuning")
-    tuning = loops.tuned(models["neural_oe"], coarse, seed)
+    clock.enter("commissioning")
+    found = loops.commissioned(rig, seed)
+    runs = loops.commissioned_runs(found)
 
-    clock.enter("closed loops")
-    runs = loops.tuned_runs(tuning.controller, models["neural_oe"], rig, seed)
+    clock.enter("paper's gains")
     paper_runs = loops.paper_runs(rig)
 
     clock.enter("writing")
-    controllers = {"paper": paper_controller(), "coarse": coarse, "tuned": tuning.controller}
+    tuned, tuning = found.controller, found.tuning
+    assert tuned is not None
+    assert tuning is not None
+    controllers = {"paper": paper_controller(), "coarse": coarse, "tuned": tuned}
     identification = identified.identification_numbers(
         models, scored, speed["difference"]["cost_floor"]
     )
@@ -170,6 +173,7 @@ def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, An
         "identification": identification,
         "check": check,
         **_controller_numbers(fopdt, controllers, tuning),
+        "commissioning": found.numbers(),
         "control": loops.control_numbers(runs),
         "paper_gains": loops.paper_numbers(paper_runs) | {"readings": loops.readings()},
         "seconds": clock.seconds,
@@ -184,6 +188,7 @@ def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, An
         predictions=identified.predictions(scored),
         runs=runs | paper_runs,
         drawings=drawings,
+        commissioning=found,
     )
     report(target)
     clock.finish()

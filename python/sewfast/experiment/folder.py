@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import jsonfile
+from ..commissioning import Commissioning
 from ..control import Controller
 from ..errors import DataError, SettingError
 from ..loop import ClosedLoopRun
@@ -24,7 +25,7 @@ from ..report.artefacts import (
 )
 from ..writers import write_table
 
-_FOLDERS = ("recordings", "models", "controllers", "predictions", "runs", "check")
+_FOLDERS = ("recordings", "models", "controllers", "predictions", "runs", "check", "commissioning")
 
 
 def require_own(folder: Path, *, overwrite: bool) -> None:
@@ -87,6 +88,7 @@ def write(
     predictions: Mapping[str, Mapping[str, Any]],
     runs: Mapping[tuple[str, str], ClosedLoopRun],
     drawings: Mapping[str, str],
+    commissioning: Commissioning | None = None,
 ) -> None:
     """Put the artefacts in place of those of an earlier experiment.
 
@@ -109,4 +111,6 @@ def write(
         write_table(folder / run_file(*key), loop.columns())
     for name, svg in drawings.items():
         jsonfile.replace(folder / drawing_file(name), svg)
+    if commissioning is not None:
+        commissioning.save(folder / "commissioning", overwrite=True)
     jsonfile.write(folder / "results.json", FORMAT, VERSION, results)

@@ -1,4 +1,4 @@
-"""Closed loops of the experiment: the tuned controller, and the paper's gains."""
+"""Closed loops of the experiment: the commissioned controller, and the paper's gains."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from .. import _core
+from ..commissioning import Commissioning, commission
 from ..control import Controller, Gains, paper_controller
 from ..errors import FitError
 from ..loop import ClosedLoopRun, run
-from ..models import LinearOE, Model
+from ..models import LinearOE
 from ..report.artefacts import PLANTS, REFERENCES
-from ..tuning import TuningResult, tune
 from .rig import Rig
 
 Runs = dict[tuple[str, str], ClosedLoopRun]
@@ -23,15 +23,19 @@ PAPER_LIMIT = 10.0
 """Of the command under the paper's gains [V]."""
 
 
-def tuned(model: Model, start: Controller, seed: int) -> TuningResult:
-    """Fine tuning on the model, encoder and filter and limits in the loop."""
-    return tune(model, start=start, seed=seed)
+def commissioned(rig: Rig, seed: int) -> Commissioning:
+    """The drive, commissioned for the experiment's references."""
+    return commission(rig, references=REFERENCES, seed=seed)
 
 
-def tuned_runs(controller: Controller, model: Model, rig: Rig, seed: int) -> Runs:
-    """Every reference on the model and on the machine, which runs the controller itself."""
-    predicted = {(r, "model"): run(controller, model, r, seed=seed) for r in REFERENCES}
-    return predicted | {(r, "machine"): rig.run(controller, r, seed=seed) for r in REFERENCES}
+def commissioned_runs(found: Commissioning) -> Runs:
+    """Every reference as the ensemble predicted it, and on the machine."""
+    runs: Runs = {}
+    for c in found.comparisons:
+        runs[c.reference, "model"] = c.predicted
+        if c.measured is not None:
+            runs[c.reference, "machine"] = c.measured
+    return runs
 
 
 def paper_runs(rig: Rig) -> Runs:

@@ -12,6 +12,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..commissioning.bench import DriveBench, Followed
 from ..control import Controller
 from ..errors import LinkError
 from ..link import Drive, VirtualDevice, connect
@@ -54,6 +55,30 @@ class Rig:
     def counts_per_rev(self) -> float:
         """Encoder counts of one turn."""
         return self.drive.identity.counts_per_rev
+
+    @property
+    def name(self) -> str:
+        """Of the machine."""
+        return self.drive.identity.name
+
+    @property
+    def volt(self) -> float:
+        """Largest command [V]."""
+        return DriveBench(self.drive).volt
+
+    @property
+    def speed(self) -> float:
+        """Speed beyond which it trips [RPM]."""
+        return DriveBench(self.drive).speed
+
+    def excite(self, u: NDArray[np.float64], name: str) -> Recording:
+        """Excite the drive, as a bench of commissioning."""
+        return self.record(u, name)
+
+    def follow(self, controller: Controller, r: NDArray[np.float64], name: str) -> Followed:
+        """Run a controller on the drive, as a bench of commissioning."""
+        began = time.perf_counter()
+        return self._whole(DriveBench(self.drive).follow(controller, r, name), began)
 
     def record(self, u: NDArray[np.float64], name: str) -> Recording:
         """Excite the drive from rest; see `sewfast.recording.record`."""

@@ -62,6 +62,8 @@ def _context(artefacts: Artefacts) -> dict[str, Any]:
         "check": artefacts.results.get("check"),
         "analysed": analysed.section(artefacts.folder)
         or analysed.section(artefacts.folder / "commissioning"),
+        # nor those of before commissioning
+        "commissioning": artefacts.results.get("commissioning"),
     }
     # drawn last: where a number is missing nothing is drawn in vain
     with style():

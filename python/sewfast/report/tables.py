@@ -100,7 +100,7 @@ def control_table(artefacts: Artefacts) -> Table:
                 )
             )
     return Table(
-        "The tuned controller on the identified model and on the machine. Rise and overshoot are "
+        "The controller on the identified models and on the machine. Rise and overshoot are "
         "those of the true speed, smoothed over 5 ms.",
         (
             "reference, plant", "tracking error [RPM rms]", "10–90 % rise", "overshoot",
@@ -113,7 +113,7 @@ def control_table(artefacts: Artefacts) -> Table:
 def gains_table(artefacts: Artefacts) -> Table:
     """The three controllers in standard form."""
     names = {"paper": "the paper's, as per-sample gains", "coarse": "from Table 1",
-             "tuned": "tuned on the default network"}  # fmt: skip
+             "tuned": "commissioned"}  # fmt: skip
     rows = []
     for key, label in names.items():
         kp, ti, td, alpha, beta = (

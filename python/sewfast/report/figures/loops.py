@@ -55,12 +55,12 @@ def paper_gain_pictures(artefacts: Artefacts) -> list[Picture]:
 
 def _tuned(artefacts: Artefacts, number: str, reference: str) -> Picture:
     runs = {p: artefacts.runs[reference, p] for p in ("model", "machine")}
-    names = {"model": "on the identified model", "machine": "on the machine"}
+    names = {"model": "predicted", "machine": "on the machine"}
     title = f"Closed loop, {labels.REFERENCE[reference]} reference"
     key = f"fig-{number}"
     alt = f"{title}: reference, speed on model and machine, tracking error and command over time"
     caption = (
-        f"{_PURPOSE[reference]} The same controller code runs on the identified network "
+        f"{_PURPOSE[reference]} The same controller code runs on the identified networks "
         "(prediction) and on the virtual machine."
     )
     figure = _loop_figure(runs, names, magnified=reference == "trapezoid")
