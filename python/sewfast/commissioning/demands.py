@@ -28,6 +28,8 @@ class Demands:
         Top of the working range [RPM].
     references : mapping of name to array, or None
         What to verify on [RPM]; None for those of `references.standard`.
+    practice : mapping of name to array, or None
+        What to tune on [RPM]; None for the references, or shorter ones of the standard kind.
     members, evaluations : int
         Models in the ensemble; controllers that the search tries.
     seed, threads : int
@@ -36,6 +38,7 @@ class Demands:
     u_max: float
     speed: float
     references: Mapping[str, FloatArray] | None
+    practice: Mapping[str, FloatArray] | None
     members: int
     evaluations: int
     seed: int
@@ -53,6 +56,7 @@ def demands(
     u_max: float | None,
     speed: float | None,
     references: Mapping[str, FloatArray] | None,
+    practice: Mapping[str, FloatArray] | None = None,
     members: int,
     evaluations: int,
     seed: int,
@@ -71,7 +75,8 @@ def demands(
         raise SettingError(
             f"expected a u_max within the machine's limit of {bench.volt:g} V, got {volt:g}"
         )
-    named = max((float(r.max()) for r in references.values()), default=0.0) if references else None
+    asked = [*(references or {}).values(), *(practice or {}).values()]
+    named = max(float(r.max()) for r in asked) if asked else None
     top = real("speed", speed if speed is not None else named if named is not None else 2000.0)
     if not 0.0 < top < math.inf:
         raise SettingError(f"expected a top speed above 0 RPM, got {top:g}")
@@ -89,12 +94,17 @@ def demands(
     return Demands(
         volt,
         top,
-        None if references is None else MappingProxyType(dict(references)),
+        _fixed(references),
+        _fixed(practice),
         _at_least(1, "members", members),
         _at_least(1, "evaluations", evaluations),
         whole("seed", seed),
         _at_least(1, "threads", threads),
     )
+
+
+def _fixed(references: Mapping[str, FloatArray] | None) -> Mapping[str, FloatArray] | None:
+    return None if references is None else MappingProxyType(dict(references))
 
 
 def _at_least(least: int, name: str, value: int) -> int:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+from .. import _core
 from ..control import Controller, Fopdt, table_1
 from ..cost import Cost
 from ..dataset import FloatArray
-from ..errors import FitError
+from ..errors import DataError, FitError
 from ..machine import VirtualMachine
 from ..models import Ensemble
 from ..tuning import TuningResult, tune
@@ -40,19 +41,28 @@ def first_gains(fopdt: Fopdt, bench: Bench, demands: Demands) -> Controller:
     )
 
 
-def cost_of(demands: Demands) -> Cost:
+def cost_of(references: Mapping[str, FloatArray], Ts: float, demands: Demands) -> Cost:
     """Tracking, chatter and overshoot as the virtual machine's figures weigh them, to scale.
 
-    Of the four standard references one has an overshoot, and a mean is taken over all.
+    A cost is a mean over the references; the overshoot is to be that over those that have an edge.
     """
-    shared = 4.0 if demands.references is None else 1.0
+    edges = sum(_has_edge(r, Ts) for r in references.values())
+    size = demands.speed / 2000.0
     return Cost(
         tracking=1.0,
-        chatter=5.0 * (demands.speed / 2000.0) * (20.0 / demands.u_max),
-        overshoot=shared * 3.0 * demands.speed / 2000.0,
+        chatter=5.0 * size * (20.0 / demands.u_max),
+        overshoot=3.0 * size * len(references) / max(edges, 1),
         overshoot_limit=1.0,
         saturation=0.0,
     )
+
+
+def _has_edge(r: FloatArray, Ts: float) -> bool:
+    try:
+        _core.step_metrics(r, r, Ts=Ts, smoothing=Ts)
+    except DataError:
+        return False
+    return True
 
 
 def search(

@@ -45,6 +45,7 @@ def commission(
     u_max: float | None = None,
     speed: float | None = None,
     references: References | None = None,
+    practice: References | None = None,
     cost: Cost | None = None,
     members: int = MEMBERS,
     evaluations: int = EVALUATIONS,
@@ -70,12 +71,14 @@ def commission(
     speed : float, optional
         Top of the working range [RPM]: the largest reference, or 2,000. A quarter more is planned.
     references : mapping of name to array, or sequence of names, optional
-        What to tune for and to verify on [RPM] at the machine's sample time; names are those of
-        `sewfast.signals`. By default `sewfast.commissioning.references.standard`, of which shorter
-        ones are tuned on.
+        What to verify on [RPM] at the machine's sample time; names are those of `sewfast.signals`.
+        By default `sewfast.commissioning.references.standard`.
+    practice : mapping of name to array, or sequence of names, optional
+        What to tune on. By default the references; of the standard ones shorter kin.
     cost : Cost, optional
-        What counts how much; by default 1 per RPM of tracking error, 5 per volt of chatter and 3
-        per percent of overshoot beyond 1, to the scale of speed and u_max.
+        What counts how much; by default 1 per RPM of tracking error, 5 per volt of chatter and
+        3 per percent of overshoot beyond 1 of references with an edge, to the scale of speed and
+        u_max.
     members : int
         Networks in the ensemble.
     evaluations : int
@@ -109,15 +112,15 @@ def commission(
             u_max=u_max,
             speed=speed,
             references=_samples(references, bench, seed),
+            practice=_samples(practice, bench, seed),
             members=members,
             evaluations=evaluations,
             seed=seed,
             threads=os.cpu_count() or 1 if threads is None else threads,
         )
         journal = Journal(bench.name, progress)
-        journal.keep(cost=cost_of(asked) if cost is None else cost)
         try:
-            return _carry_out(NotedBench(bench, journal.note), asked, journal)
+            return _carry_out(NotedBench(bench, journal.note), asked, cost, journal)
         except Refusal as refusal:
             refusal.stage = journal.stage
             refusal.so_far = journal.result("refused", str(refusal))
@@ -129,7 +132,7 @@ def commission(
             raise Interrupted(journal.result("interrupted", "Ctrl-C")) from stop
 
 
-def _carry_out(bench: Bench, asked: Demands, journal: Journal) -> Commissioning:
+def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal) -> Commissioning:
     """The stages."""
     journal.enter("first motion")
     motion = first_motion(bench, asked)
@@ -153,8 +156,9 @@ def _carry_out(bench: Bench, asked: Demands, journal: Journal) -> Commissioning:
     journal.keep(models=trained.ensemble, rmse=trained.rmse)
 
     journal.enter("tuning")
-    weights: Cost = journal.result("").cost or cost_of(asked)
     verify, practice = _references(fopdt, asked, bench)
+    weights = cost_of(practice, bench.Ts, asked) if cost is None else cost
+    journal.keep(cost=weights)
     tuning = search(trained.ensemble, practice, first, asked, weights, journal.within)
     controller = replace(tuning.controller, notes="commissioned on an ensemble of networks")
     journal.keep(tuning=tuning, controller=controller)
@@ -174,10 +178,10 @@ def _references(
 ) -> tuple[Mapping[str, FloatArray], Mapping[str, FloatArray]]:
     """To verify on, and to tune on."""
     if asked.references is not None:
-        return asked.references, asked.references
+        return asked.references, asked.practice or asked.references
     return (
         standard(fopdt, asked, bench.Ts, short=False),
-        standard(fopdt, asked, bench.Ts, short=True),
+        asked.practice or standard(fopdt, asked, bench.Ts, short=True),
     )
 
 

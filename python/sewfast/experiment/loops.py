@@ -19,13 +19,15 @@ from .rig import Rig
 
 Runs = dict[tuple[str, str], ClosedLoopRun]
 
+PRACTICE = ("trapezoid", "trapezoids", "random")
+"""References to tune on, half as long as those to verify on."""
 PAPER_LIMIT = 10.0
 """Of the command under the paper's gains [V]."""
 
 
 def commissioned(rig: Rig, seed: int) -> Commissioning:
     """The drive, commissioned for the experiment's references."""
-    return commission(rig, references=REFERENCES, seed=seed)
+    return commission(rig, references=REFERENCES, practice=PRACTICE, seed=seed)
 
 
 def commissioned_runs(found: Commissioning) -> Runs:
