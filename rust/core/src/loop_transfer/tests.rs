@@ -1,6 +1,6 @@
 use super::*;
 use proptest::prelude::*;
-use sewfast_control::{Controller, Settings, Standard};
+use sewfast_control::{Controller, Design, Settings, Standard};
 
 use crate::Monitor;
 use crate::closed_loop::{LaggedPlant, Run};
@@ -22,13 +22,19 @@ fn margins_of(path: &Path, plant: &Plant) -> Margins {
     margins(&Loop::new(path, plant).unwrap())
 }
 
-/// The crate's own controller with the path's settings; `observer_time` is not in it here.
+/// The crate's own controller with the path's settings.
 fn controller(path: &Path) -> Controller<f64> {
     let settings = Settings {
         n: path.n,
         ..Settings::new(path.gains, path.ts)
     };
-    Controller::new(settings, path.filter_samples, path.filter_time).unwrap()
+    let design = Design {
+        filter_samples: path.filter_samples,
+        filter_time: path.filter_time,
+        observer_time: path.observer_time,
+        ..Design::new(settings)
+    };
+    Controller::new(design).unwrap()
 }
 
 /// Amplitude and phase of `x` at `omega` over whole periods at its end.
