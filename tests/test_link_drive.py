@@ -9,6 +9,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from link_device import ScriptedDevice
 from link_simulated import SimulatedPort, driven, linked, simulated
 from sewfast import Controller, Gains
 from sewfast.errors import LinkError, SettingError
-from sewfast.link import Drive, Plan, connect
+from sewfast.link import Drive, Plan, connect, terms
 
 SOAK = bool(os.environ.get("SEWFAST_SOAK"))
 U = 3.0 * np.sin(np.arange(400) / 20.0)
@@ -140,6 +141,30 @@ def test_a_controller_runs_on_the_device(device, drive):
     expected = (0.01, 0.1, 0.0, 0.1, 0.0, math.inf, 0.0, -8.0, 8.0, math.inf, 0.0, 1572 / 60)
     np.testing.assert_allclose(values, expected, rtol=1e-6)
     assert filter_samples == 4
+
+
+def test_a_device_that_does_not_know_a_part_is_not_sent_it(device, drive):
+    gains = Gains.standard(0.01, 0.1)
+    parts = {"observer_time": 0.004, "r_rate": 1000.0, "schedule": [(0.0, gains)]}
+    for name, value in parts.items():
+        controller = Controller(gains, u_min=-8.0, u_max=8.0, **{name: value})
+        with pytest.raises(SettingError, match=f"without {name} for this device"):
+            drive.set_controller(controller)
+    assert not [kind for kind, _ in device.executed if kind == script.GAINS]
+
+
+def test_a_device_that_knows_them_is_sent_the_whole_design(drive):
+    knowing = replace(drive.identity, capabilities=drive.identity.capabilities | 1 << 6)
+    points = [(0.0, Gains.standard(0.01, 0.1)), (900.0, Gains.parallel(0.02, 0.1))]
+    controller = Controller(
+        Gains.standard(0.01, 0.1), observer_time=0.004, r_rate=1000.0, schedule=points
+    )
+    body = terms.gains(controller, drive.channels, knowing)
+    assert len(body) == 49 + 9 + 2 * 16
+    told = struct.unpack("<12fB2fB8f", body)
+    assert told[13:16] == (np.float32(0.004), 1000.0, 2)
+    rows = (0.0, 0.01, 0.1, 0.0, 900.0, 0.02, 0.2, 0.0)
+    np.testing.assert_allclose(told[16:], rows, rtol=1e-6)
 
 
 def test_direct_commands_are_sent_as_their_time_comes(device, drive):

@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -75,6 +76,28 @@ def test_a_controller_on_the_device_does_what_it_does_here():
     here = loop.run(controller, VirtualMachine(), r)
     # single precision there, double here: an encoder step may fall into the next sample
     np.testing.assert_allclose(sink.column("speed_true"), here.y, rtol=0.0, atol=1.0)
+    one_count = 60_000.0 / 1572.0 / controller.filter_samples
+    np.testing.assert_allclose(
+        sink.column("feedback"), here.feedback, rtol=0.0, atol=1.5 * one_count
+    )
+
+
+def test_a_whole_design_on_the_device_does_what_it_does_here():
+    points = [(0.0, Gains.standard(0.006, 0.2)), (1500.0, Gains.standard(0.004, 0.13))]
+    controller = Controller(
+        Gains.parallel(0.004, 0.03, 0.0), u_min=-20.0, u_max=20.0, filter_samples=4,
+        observer_time=0.003, r_rate=4000.0, schedule=points,
+    )  # fmt: skip
+    r = signals.reference("trapezoid")
+    sink = Kept()
+    with VirtualDevice(fast=True) as device:
+        outcome = run(device, Plan("controller", r, controller, ("feedback", "speed_true")), sink)
+    assert outcome.is_complete
+    here = loop.run(controller, VirtualMachine(), r)
+    plain = loop.run(replace(controller, observer_time=0.0), VirtualMachine(), r)
+    assert np.max(np.abs(plain.y - here.y)) > 2.0
+    # single precision there, double here: an encoder step may fall into the next sample
+    np.testing.assert_allclose(sink.column("speed_true"), here.y, rtol=0.0, atol=2.0)
     one_count = 60_000.0 / 1572.0 / controller.filter_samples
     np.testing.assert_allclose(
         sink.column("feedback"), here.feedback, rtol=0.0, atol=1.5 * one_count

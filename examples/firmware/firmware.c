@@ -31,7 +31,7 @@ bool firmware_init(uint32_t boot_id) {
         "1.0",
         1000,    /* us */
         1572.0f, /* counts per turn */
-        SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE,
+        SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN,
         {20.0f, 4000.0f, 60000.0f, INFINITY}, /* what the machine bears */
         channels,
         sizeof channels / sizeof channels[0],

@@ -158,7 +158,7 @@ class Drive(Unique):
         SettingError
             Where sample time or units are not the device's.
         """
-        body = terms.gains(controller, self.channels, self.identity.counts_per_rev)
+        body = terms.gains(controller, self.channels, self.identity)
         self._link.ask(Kind.GAINS, body)
 
     def arm(self) -> None:

@@ -11,7 +11,7 @@ _FIELDS: dict[int, tuple[str, ...]] = {
     wire.Kind.ARM: ("watchdog",),
     wire.Kind.GAINS: (
         "Kp", "Ti", "Td", "alpha", "beta", "N", "Tt", "u_min", "u_max", "slew", "filter_time",
-        "counts per unit", "filter_samples",
+        "counts per unit", "filter_samples", "observer_time", "r_rate", "schedule",
     ),
     wire.Kind.START: ("mode", "watchdog", "at", "length", "mask", "batch"),
 }  # fmt: skip

@@ -11,7 +11,7 @@ from ..gains import Gains, real
 from ..units import counts_per_unit
 from . import wire
 from .connection import Connection
-from .wire import Channel, Kind
+from .wire import Channel, Identity, Kind
 
 
 def channels(link: Connection) -> tuple[Channel, ...]:
@@ -68,27 +68,30 @@ def fitting(controller: Controller, streamed: Sequence[Channel]) -> Gains:
     return gains
 
 
-def gains(controller: Controller, streamed: Sequence[Channel], counts_per_rev: float) -> bytes:
+def gains(controller: Controller, streamed: Sequence[Channel], identity: Identity) -> bytes:
     """Body of GAINS for a controller; the encoder is the device's own.
 
     Raises
     ------
     SettingError
-        Where its gains are not in the device's units.
+        Where its gains are not in the device's units, or the device does not know its parts.
     """
     g, c = fitting(controller, streamed), controller
     named = ("observer_time", bool(c.observer_time)), ("r_rate", c.r_rate != math.inf)
     further = [name for name, used in (*named, ("schedule", bool(c.schedule))) if used]
-    if further:
+    if further and not identity.capabilities & wire.DESIGN:
         raise SettingError(
             f"expected a controller without {' and '.join(further)} for this device, whose "
-            "firmware does not know them; leave them out or run it on the host"
+            "firmware does not know them; leave them out, or build the firmware with this sewfast"
         )
     values = (
         g.Kp, g.Ti, g.Td, c.alpha, c.beta, c.N, c.Tt, c.u_min, c.u_max, c.slew, c.filter_time,
-        counts_per_unit(counts_per_rev, g.y_unit),
+        counts_per_unit(identity.counts_per_rev, g.y_unit),
     )  # fmt: skip
-    return wire.gains(values, c.filter_samples)
+    body = wire.gains(values, c.filter_samples)
+    if not further:
+        return body
+    return body + wire.design(c.observer_time, c.r_rate, c.schedule_rows())
 
 
 def _require_units(given: str, device: str, what: str) -> None:

@@ -48,7 +48,7 @@ REASONS = (
 EVENTS = ("", "boot", "armed", "started", "finished", "stopped", "tripped", "cleared")
 MODES = {"commands": 0, "controller": 1, "direct": 2}
 
-PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED = (1 << bit for bit in range(6))
+PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED, DESIGN = (1 << bit for bit in range(7))
 """Capabilities of a device."""
 
 
@@ -357,6 +357,13 @@ def upload(table: int, offset: int, values: bytes) -> bytes:
 
 def gains(values: Sequence[float], filter_samples: int) -> bytes:
     return _GAINS.pack(*map(_single, values), filter_samples)
+
+
+def design(observer_time: float, r_rate: float, points: Sequence[Sequence[float]]) -> bytes:
+    """What follows the gains for a device that knows observer, ramp and schedule."""
+    rows = [struct.pack("<4f", *map(_single, point)) for point in points]
+    head = struct.pack("<ffB", _single(observer_time), _single(r_rate), len(rows))
+    return b"".join((head, *rows))
 
 
 def start(mode: int, us: int, at: int, length: int, mask: int, batch: int) -> bytes:

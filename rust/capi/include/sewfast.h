@@ -37,6 +37,7 @@ extern "C" {
 #define SEWFAST_CAN_CREDIT 8u   /* computed devices only: time advances by the host's credit */
 #define SEWFAST_CAN_CURRENT 16u /* measures the current */
 #define SEWFAST_COMPUTED 32u    /* computed devices only: ARM takes them back to their initial state */
+#define SEWFAST_CAN_DESIGN 64u  /* its PID has observer, reference ramp and gain schedule */
 
 /* How a channel's samples are written. */
 enum sewfast_encoding {
@@ -179,6 +180,17 @@ int32_t sewfast_device_reason(sewfast_device *device); /* enum sewfast_reason, o
 
 typedef struct sewfast_pid sewfast_pid;
 
+/* The most points of a gain schedule. */
+#define SEWFAST_PID_POINTS 8
+
+/* Gains at one size of the filtered output. */
+typedef struct sewfast_pid_point {
+    float speed; /* y, 0 or more, growing from point to point */
+    float kp;    /* u/y */
+    float ti;    /* s; INFINITY: no integral action */
+    float td;    /* s */
+} sewfast_pid_point;
+
 /* Two-degree-of-freedom PID in standard form with its feedback filter; INFINITY switches off what it limits. */
 typedef struct sewfast_pid_settings {
     float kp;          /*  1: u/y */
@@ -194,6 +206,10 @@ typedef struct sewfast_pid_settings {
     float ts;          /* 11: s, sample time */
     float filter_time; /* 12: s, lag of the feedback; 0: none */
     uint8_t filter_samples; /* 13: moving average of the feedback, 1 to 64; 1: none */
+    float observer_time;    /* 14: s, alpha-beta observer of the feedback; 0: none */
+    float r_rate;           /* 15: y/s, ramp of the reference; INFINITY: none */
+    uint8_t schedule_count; /* 16: points that are used; 0: the constant gains above */
+    sewfast_pid_point schedule[SEWFAST_PID_POINTS];
 } sewfast_pid_settings;
 
 /* Enough bytes on any target. */
@@ -208,7 +224,20 @@ sewfast_pid *sewfast_pid_init(void *storage, size_t size, const sewfast_pid_sett
 /* From reference and measured output to the command. A measurement that is not finite leaves the command as it was. */
 float sewfast_pid_step(sewfast_pid *pid, float r, float y);
 
-/* Back to rest. */
+/* The same with a command that is added before the limits. */
+float sewfast_pid_step_with(sewfast_pid *pid, float r, float y, float feedforward);
+
+/* Other settings from the next sample on, without a bump in the command; the sample time must stay. 0, or the number of the setting
+ * that is refused, or -1 for NULL; nothing is changed then. */
+int32_t sewfast_pid_change(sewfast_pid *pid, const sewfast_pid_settings *settings);
+
+/* From the next sample on the command is `u`, within the limits; false where `u` is not finite. */
+bool sewfast_pid_set_manual(sewfast_pid *pid, float u);
+
+/* The controller's command again, beginning where the operator's was. */
+void sewfast_pid_set_automatic(sewfast_pid *pid);
+
+/* Back to rest, in automatic. */
 void sewfast_pid_reset(sewfast_pid *pid);
 
 #ifdef __cplusplus

@@ -3,7 +3,21 @@
 use crate::{place, tell};
 use core::ffi::c_void;
 use core::ptr::null_mut;
-use sewfast_control::{Controller, Design, Settings, Standard};
+use sewfast_control::{Controller, Design, POINTS, Point, Refused, Schedule, Settings, Standard};
+
+/// `sewfast_pid_point`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct CPoint {
+    /// \[y\].
+    pub speed: f32,
+    /// \[u/y\].
+    pub kp: f32,
+    /// \[s\].
+    pub ti: f32,
+    /// \[s\].
+    pub td: f32,
+}
 
 /// `sewfast_pid_settings`.
 #[repr(C)]
@@ -35,6 +49,14 @@ pub struct CSettings {
     pub filter_time: f32,
     /// Moving average of the feedback.
     pub filter_samples: u8,
+    /// Observer of the feedback \[s\].
+    pub observer_time: f32,
+    /// Ramp of the reference \[y/s\].
+    pub r_rate: f32,
+    /// Points of the schedule that are used.
+    pub schedule_count: u8,
+    /// Gains over speed.
+    pub schedule: [CPoint; POINTS],
 }
 
 /// The number of the setting, in the header's order and from 1; 0 is none.
@@ -53,6 +75,9 @@ fn number(name: &str) -> i32 {
         "Ts",
         "filter_time",
         "filter_samples",
+        "observer_time",
+        "r_rate",
+        "schedule",
     ];
     let found = (1..).zip(names).find(|(_, known)| *known == name);
     found.map_or(-1, |(number, _)| number)
@@ -95,7 +120,33 @@ pub unsafe extern "C" fn sewfast_pid_init(
 
 impl CSettings {
     fn controller(&self) -> Result<Controller<f32>, i32> {
-        let settings = Settings {
+        let made = self.design().and_then(Controller::new);
+        made.map_err(|refused| number(refused.name))
+    }
+
+    fn schedule(&self) -> Result<Schedule<f32>, Refused> {
+        let mut points = [Point {
+            speed: 0.0,
+            gains: Standard {
+                kp: 0.0,
+                ti: 0.0,
+                td: 0.0,
+            },
+        }; POINTS + 1];
+        for (place, point) in points.iter_mut().zip(&self.schedule) {
+            let CPoint { speed, kp, ti, td } = *point;
+            *place = Point {
+                speed,
+                gains: Standard { kp, ti, td },
+            };
+        }
+        // a count beyond the array is one point too many, and refused
+        let named = points.get(..self.schedule_count.into());
+        Schedule::new(named.unwrap_or(&points))
+    }
+
+    fn design(&self) -> Result<Design<f32>, Refused> {
+        let pid = Settings {
             gains: Standard {
                 kp: self.kp,
                 ti: self.ti,
@@ -110,12 +161,14 @@ impl CSettings {
             slew: self.slew,
             ts: self.ts,
         };
-        let controller = Controller::new(Design {
+        Ok(Design {
+            pid,
             filter_samples: self.filter_samples.into(),
             filter_time: self.filter_time,
-            ..Design::new(settings)
-        });
-        controller.map_err(|refused| number(refused.name))
+            observer_time: self.observer_time,
+            r_rate: self.r_rate,
+            schedule: self.schedule()?,
+        })
     }
 }
 
@@ -128,6 +181,63 @@ pub unsafe extern "C" fn sewfast_pid_step(pid: *mut Controller<f32>, r: f32, y: 
     // SAFETY: by contract.
     let pid = unsafe { pid.as_mut() };
     pid.map_or(0.0, |pid| pid.step(r, y))
+}
+
+/// [`Controller::step_with`]; 0 where there is no controller.
+///
+/// # Safety
+/// As for [`sewfast_pid_step`].
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn sewfast_pid_step_with(
+    pid: *mut Controller<f32>,
+    r: f32,
+    y: f32,
+    feedforward: f32,
+) -> f32 {
+    // SAFETY: by contract.
+    let pid = unsafe { pid.as_mut() };
+    pid.map_or(0.0, |pid| pid.step_with(r, y, feedforward))
+}
+
+/// [`Controller::set_design`]; 0, the number of the setting that is refused, or -1 where something is null.
+///
+/// # Safety
+/// As for [`sewfast_pid_step`]; `settings` is null or can be read.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn sewfast_pid_change(
+    pid: *mut Controller<f32>,
+    settings: *const CSettings,
+) -> i32 {
+    // SAFETY: by contract.
+    let (Some(pid), Some(settings)) = (unsafe { pid.as_mut() }, unsafe { settings.as_ref() })
+    else {
+        return -1;
+    };
+    let done = settings.design().and_then(|design| pid.set_design(design));
+    done.map_or_else(|refused| number(refused.name), |()| 0)
+}
+
+/// [`Controller::set_manual`]; whether `u` is finite.
+///
+/// # Safety
+/// As for [`sewfast_pid_step`].
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn sewfast_pid_set_manual(pid: *mut Controller<f32>, u: f32) -> bool {
+    // SAFETY: by contract.
+    let pid = unsafe { pid.as_mut() };
+    pid.is_some_and(|pid| pid.set_manual(u).is_ok())
+}
+
+/// [`Controller::set_automatic`].
+///
+/// # Safety
+/// As for [`sewfast_pid_step`].
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn sewfast_pid_set_automatic(pid: *mut Controller<f32>) {
+    // SAFETY: by contract.
+    if let Some(pid) = unsafe { pid.as_mut() } {
+        pid.set_automatic();
+    }
 }
 
 /// [`Controller::reset`].

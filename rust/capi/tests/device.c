@@ -320,7 +320,8 @@ static void pid_is_its_equation(void) {
         unsigned char bytes[SEWFAST_PID_SIZE];
     } place;
     sewfast_pid_settings settings = {0.02f, 0.25f, 0.0f,     0.4f,  0.2f, INFINITY, 0.0f,
-                                     -20.0f, 20.0f, INFINITY, 0.001f, 0.0f, 1};
+                                     -20.0f, 20.0f, INFINITY, 0.001f, 0.0f, 1,     0.0f,
+                                     INFINITY, 0, {{0.0f, 0.0f, 0.0f, 0.0f}}};
     int32_t refusal = -1;
     CHECK(sewfast_pid_size() <= SEWFAST_PID_SIZE);
     sewfast_pid *pid = sewfast_pid_init(&place, sizeof place, &settings, &refusal);
@@ -330,6 +331,24 @@ static void pid_is_its_equation(void) {
     CHECK(sewfast_pid_step(pid, 1e6f, 0.0f) == 20.0f);
     sewfast_pid_reset(pid);
     CHECK(fabsf(sewfast_pid_step(pid, 100.0f, 0.0f) - expected) < 1e-6f);
+    sewfast_pid_reset(pid);
+    CHECK(fabsf(sewfast_pid_step_with(pid, 100.0f, 0.0f, 0.5f) - expected - 0.5f) < 1e-6f);
+    CHECK(sewfast_pid_set_manual(pid, -3.0f) && !sewfast_pid_set_manual(pid, NAN));
+    CHECK(sewfast_pid_step(pid, 100.0f, 0.0f) == -3.0f);
+    sewfast_pid_set_automatic(pid);
+    settings.schedule_count = 2;
+    settings.schedule[0] = (sewfast_pid_point){0.0f, 0.02f, INFINITY, 0.0f};
+    settings.schedule[1] = (sewfast_pid_point){2000.0f, 0.04f, INFINITY, 0.0f};
+    CHECK(sewfast_pid_change(pid, &settings) == 0);
+    CHECK(fabsf(sewfast_pid_step(pid, 100.0f, 0.0f) + 3.0f) < 1e-5f);
+    sewfast_pid_reset(pid);
+    CHECK(fabsf(sewfast_pid_step(pid, 1000.0f, 1000.0f) + 0.03f * 0.4f * 1000.0f) < 1e-5f);
+    settings.schedule_count = 9;
+    CHECK(sewfast_pid_change(pid, &settings) == 16 && sewfast_pid_change(NULL, &settings) == -1);
+    settings.schedule_count = 0;
+    settings.r_rate = 0.0f;
+    CHECK(sewfast_pid_change(pid, &settings) == 15);
+    settings.r_rate = INFINITY;
     settings.ti = 0.0f;
     CHECK(sewfast_pid_init(&place, sizeof place, &settings, &refusal) == NULL && refusal == 2);
     CHECK(sewfast_pid_init(&place, 8, &settings, &refusal) == NULL && refusal == -1);

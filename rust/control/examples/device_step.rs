@@ -50,7 +50,8 @@ impl Host {
             capabilities: capability::PROFILE
                 | capability::PID
                 | capability::DRIVE
-                | capability::CURRENT,
+                | capability::CURRENT
+                | capability::DESIGN,
             ceilings: Limits {
                 volt: 20.0,
                 speed: 4000.0,
@@ -107,8 +108,8 @@ impl Host {
         black_box(&out);
     }
 
-    /// Up to a run that only STOP ends, in mode 0, 1 or 2.
-    fn run(mode: u8) -> Self {
+    /// Up to a run that only STOP ends, in mode 0, 1 or 2; `whole`: with observer, ramp and a schedule of 8 points.
+    fn run(mode: u8, whole: bool) -> Self {
         let mut host = Self::new();
         (0..150).for_each(|_| host.period(0));
         host.say(0x01, Body::new().u8(2).u8(2).u32(1));
@@ -125,6 +126,16 @@ impl Host {
             gains.f32(value);
         }
         gains.f32(f32::INFINITY).f32(0.002).f32(26.2).u8(8);
+        if whole {
+            gains.f32(0.004).f32(50_000.0).u8(8);
+            for k in 0..8u8 {
+                gains
+                    .f32(200.0 * f32::from(k))
+                    .f32(0.02)
+                    .f32(0.25)
+                    .f32(0.004);
+            }
+        }
         host.say(0x09, &gains);
         host.say(0x08, Body::new().u8(mode & 1).u32(0).u32(0));
         host.say(0x05, Body::new().u32(50_000));
@@ -159,8 +170,14 @@ impl Host {
 }
 
 fn main() {
-    for (mode, what) in [(0, "open loop"), (1, "PID"), (2, "direct drive")] {
-        let mut host = Host::run(mode);
+    let runs = [
+        (0, false, "open loop"),
+        (1, false, "PID"),
+        (1, true, "whole design"),
+        (2, false, "direct drive"),
+    ];
+    for (mode, whole, what) in runs {
+        let mut host = Host::run(mode, whole);
         let clock = Instant::now();
         for sample in 0..SAMPLES {
             if mode != 2 && sample % 40 == 0 {

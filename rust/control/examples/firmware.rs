@@ -62,7 +62,10 @@ impl<B: Board> Firmware<B> {
             firmware: "1.0",
             period: 1000,
             counts_per_rev: 1572.0,
-            capabilities: capability::PROFILE | capability::PID | capability::DRIVE,
+            capabilities: capability::PROFILE
+                | capability::PID
+                | capability::DRIVE
+                | capability::DESIGN,
             ceilings: Limits {
                 volt: 20.0,
                 speed: 4000.0,

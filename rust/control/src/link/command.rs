@@ -3,7 +3,7 @@
 use super::Fields;
 use super::device::State;
 use super::identity::Limits;
-use crate::{Controller, Design, Refused, Settings, Standard};
+use crate::{Controller, Design, POINTS, Point, Refused, Schedule, Settings, Standard};
 
 /// Shortest and longest time of a watchdog \[us\].
 const WATCHDOG: core::ops::RangeInclusive<u32> = 1_000..=10_000_000;
@@ -78,9 +78,12 @@ pub(super) struct Upload<'a> {
 /// Gains and filter of the controller, and the unit of its feedback.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Gains {
-    settings: Settings<f32>,
-    filter_time: f32,
-    filter_samples: u8,
+    /// Without its sample time, which is the device's.
+    design: Design<f32>,
+    /// The schedule came and is none.
+    garbled: bool,
+    /// The body has the fields of a device that knows observer, ramp and schedule.
+    pub(super) long: bool,
     /// Counts per second of one unit of feedback.
     pub(super) counts_per_unit: f32,
 }
@@ -91,18 +94,17 @@ impl Gains {
     /// # Errors
     /// The first setting that is outside its range.
     pub(super) fn controller(&self, volt: f32, ts: f32) -> Result<Controller<f32>, Refused> {
-        let Settings { u_min, u_max, .. } = self.settings;
+        let Settings { u_min, u_max, .. } = self.design.pid;
         // not f32::max and f32::min, which would hide a NaN
         let clipped = Settings {
             u_min: if u_min < -volt { -volt } else { u_min },
             u_max: if u_max > volt { volt } else { u_max },
             ts,
-            ..self.settings
+            ..self.design.pid
         };
         Controller::new(Design {
-            filter_samples: self.filter_samples.into(),
-            filter_time: self.filter_time,
-            ..Design::new(clipped)
+            pid: clipped,
+            ..self.design
         })
     }
 
@@ -110,6 +112,7 @@ impl Gains {
     /// The field that is outside its range, or beyond the volt limit.
     pub(super) fn check(&self, volt: f32, ts: f32) -> Result<(), Refusal> {
         let field = |refused: Refused| index_of(refused.name);
+        Refusal::value(SCHEDULE).unless(!self.garbled)?;
         let free = self.controller(f32::INFINITY, ts);
         free.map_err(|refused| Refusal::value(field(refused)))?;
         let unit = self.counts_per_unit * ts;
@@ -121,6 +124,9 @@ impl Gains {
         Ok(())
     }
 }
+
+/// The index of the number of points, which stands for all of them.
+const SCHEDULE: u32 = 15;
 
 /// The index of a setting among the fields of GAINS.
 fn index_of(name: &str) -> u32 {
@@ -136,6 +142,9 @@ fn index_of(name: &str) -> u32 {
         "u_max" => 8,
         "slew" => 9,
         "filter_time" => 10,
+        "observer_time" => 13,
+        "r_rate" => 14,
+        "schedule" => SCHEDULE,
         _ => 12,
     }
 }
@@ -222,11 +231,7 @@ fn upload<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
 }
 
 fn gains<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
-    let gains = Standard {
-        kp: fields.f32()?,
-        ti: fields.f32()?,
-        td: fields.f32()?,
-    };
+    let gains = standard(fields)?;
     let settings = Settings {
         gains,
         alpha: fields.f32()?,
@@ -238,12 +243,58 @@ fn gains<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
         slew: fields.f32()?,
         ts: 0.0,
     };
-    Some(Command::Gains(Gains {
-        settings,
-        filter_time: fields.f32()?,
-        counts_per_unit: fields.f32()?,
-        filter_samples: fields.u8()?,
-    }))
+    let (filter_time, counts_per_unit) = (fields.f32()?, fields.f32()?);
+    let mut gains = Gains {
+        design: Design {
+            filter_time,
+            filter_samples: fields.u8()?.into(),
+            ..Design::new(settings)
+        },
+        garbled: false,
+        long: !fields.is_empty(),
+        counts_per_unit,
+    };
+    if gains.long {
+        gains.design.observer_time = fields.f32()?;
+        gains.design.r_rate = fields.f32()?;
+        match schedule(fields)? {
+            Ok(schedule) => gains.design.schedule = schedule,
+            Err(_) => gains.garbled = true,
+        }
+    }
+    Some(Command::Gains(gains))
+}
+
+fn standard(fields: &mut Fields<'_>) -> Option<Standard<f32>> {
+    Some(Standard {
+        kp: fields.f32()?,
+        ti: fields.f32()?,
+        td: fields.f32()?,
+    })
+}
+
+/// `None` where the body is too short for its points.
+fn schedule(fields: &mut Fields<'_>) -> Option<Result<Schedule<f32>, Refused>> {
+    let count = usize::from(fields.u8()?);
+    let blank = Point {
+        speed: 0.0,
+        gains: Standard {
+            kp: 0.0,
+            ti: 0.0,
+            td: 0.0,
+        },
+    };
+    // one more than a schedule may have is refused like any number above
+    let mut points = [blank; POINTS + 1];
+    for place in points.iter_mut().take(count) {
+        *place = Point {
+            speed: fields.f32()?,
+            gains: standard(fields)?,
+        };
+    }
+    fields.take(16 * count.saturating_sub(points.len()))?;
+    let named = points.get(..count).unwrap_or(&points);
+    Some(Schedule::new(named))
 }
 
 fn start<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {

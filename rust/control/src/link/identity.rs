@@ -26,6 +26,8 @@ pub mod capability {
     pub const CURRENT: u32 = 1 << 4;
     /// A computed machine, which ARM takes back to its initial state.
     pub const COMPUTED: u32 = 1 << 5;
+    /// Its PID has observer, reference ramp and gain schedule.
+    pub const DESIGN: u32 = 1 << 6;
 }
 
 /// How a channel's samples are written.

@@ -1,4 +1,4 @@
-//! A library that links only while no path through the link's frames can panic.
+//! A library that links only while no path through the link's frames and the controller can panic.
 //!
 //! The optimiser drops the panic handler where nothing calls it; the symbol that it asks for does not exist.
 
@@ -6,6 +6,7 @@
 
 use core::panic::PanicInfo;
 use sewfast_control::link::{Body, Deframer, Fields, Header, MAX_WIRE, encode};
+use sewfast_control::{Controller, Design, Point, Schedule};
 
 #[panic_handler]
 fn halt(_: &PanicInfo<'_>) -> ! {
@@ -40,4 +41,38 @@ pub fn receive(deframer: &mut Deframer, mut input: &[u8]) -> Option<f32> {
 pub fn write(body: &mut Body, text: &str, rest: &[u8]) -> Option<usize> {
     body.u8(1).u32(2).f32(3.0).text(text, 24).add(rest).add(rest);
     body.bytes().map(<[u8]>::len)
+}
+
+/// Any points.
+#[unsafe(no_mangle)]
+pub fn schedule(points: &[Point<f32>]) -> Option<Schedule<f32>> {
+    Schedule::new(points).ok()
+}
+
+/// Any design.
+#[unsafe(no_mangle)]
+pub fn make(design: &Design<f32>) -> Option<Controller<f32>> {
+    Controller::new(*design).ok()
+}
+
+/// Any signals.
+#[unsafe(no_mangle)]
+pub fn control(controller: &mut Controller<f32>, r: f32, y: f32, feedforward: f32) -> f32 {
+    controller.step_with(r, y, feedforward)
+}
+
+/// The same in double precision.
+#[unsafe(no_mangle)]
+pub fn control_double(controller: &mut Controller<f64>, r: f64, y: f64, feedforward: f64) -> f64 {
+    controller.step_with(r, y, feedforward)
+}
+
+/// Any change while it runs.
+#[unsafe(no_mangle)]
+pub fn change(controller: &mut Controller<f32>, design: &Design<f32>, u: f32) -> bool {
+    let changed = controller.set_design(*design).is_ok();
+    let manual = controller.set_manual(u).is_ok();
+    controller.set_automatic();
+    controller.reset();
+    changed && manual && controller.is_manual()
 }

@@ -16,7 +16,8 @@ const CAPABILITIES: u32 = capability::PROFILE
     | capability::PID
     | capability::DRIVE
     | capability::CURRENT
-    | capability::COMPUTED;
+    | capability::COMPUTED
+    | capability::DESIGN;
 
 const CHANNELS: [Channel; 6] = [
     channel("counts", "1", Encoding::Counts, 1, Source::Counts),

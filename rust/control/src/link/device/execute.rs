@@ -292,6 +292,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         // what a start was checked with does not change behind its back
         Refusal::state(self.state).unless(self.run.planned.is_none())?;
         Refusal::unsupported(0).unless(self.can(capability::PID))?;
+        Refusal::unsupported(13).unless(!gains.long || self.can(capability::DESIGN))?;
         gains.check(self.bounds().volt, self.ts)?;
         self.gains = Some(gains);
         Ok(())

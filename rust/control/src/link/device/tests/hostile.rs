@@ -54,7 +54,12 @@ fn body(dice: &mut Dice, kind: u8, now: u64) -> Vec<u8> {
             let good = [
                 0.02, 0.25, 0.0, 0.4, 0.2, INF, 0.0, -20.0, 20.0, INF, 0.0, 25.0,
             ];
-            gains(good, 8).bytes().unwrap().to_vec()
+            let points = [[0.0, 0.01, 0.2, 0.0], [900.0, 0.02, 0.2, 0.0]];
+            let body = match dice.below(2) {
+                0 => gains(good, 8),
+                _ => design(good, 8, 0.004, 5000.0, &points),
+            };
+            body.bytes().unwrap().to_vec()
         }
         0x0A => {
             let at = if dice.below(2) == 0 {

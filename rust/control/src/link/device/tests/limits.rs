@@ -222,6 +222,59 @@ fn gains_that_make_no_sense_are_refused_by_field() {
 }
 
 #[test]
+fn designs_that_make_no_sense_are_refused_by_field() {
+    let good = [
+        0.02, 0.25, 0.004, 0.4, 0.2, INF, 0.0, -20.0, 20.0, INF, 0.0, 25.0,
+    ];
+    let mut rig = Rig::ready();
+    let mut set = |observer, rate, points: &[[f32; 4]]| {
+        let body = design(good, 8, observer, rate, points);
+        let (result, body) = rig.command(0x09, body.bytes().unwrap());
+        (result, body.first().copied().unwrap_or(0))
+    };
+    let point = |i: usize| [100.0 * i as f32, 0.01, 0.2, 0.0];
+    let points: Vec<_> = (0..10).map(point).collect();
+    for count in 0..=8 {
+        assert_eq!(set(0.004, 5000.0, &points[..count]), (0, 0));
+    }
+    assert_eq!(set(0.0, INF, &points[..9]), (3, 15));
+    assert_eq!(set(0.0, INF, &points), (3, 15));
+    assert_eq!(
+        (set(-1.0, INF, &[]), set(INF, INF, &[])),
+        ((3, 13), (3, 13))
+    );
+    assert_eq!(
+        (set(0.0, 0.0, &[]), set(0.0, f32::NAN, &[])),
+        ((3, 14), (3, 14))
+    );
+    assert_eq!(set(0.0, INF, &[point(1), point(0)]), (3, 15));
+    assert_eq!(set(0.0, INF, &[[0.0, f32::NAN, 1.0, 0.0]]), (3, 15));
+    let whole = design(good, 8, 0.004, 5000.0, &points[..8]);
+    for length in 50..whole.len() {
+        let cut = rig.command(0x09, &whole.bytes().unwrap()[..length]);
+        assert_eq!(cut, (2, std::vec![length as u8, 0, 0, 0]));
+    }
+}
+
+#[test]
+fn a_device_without_them_refuses_observer_ramp_and_schedule() {
+    let capabilities = identity().capabilities & !crate::link::capability::DESIGN;
+    let mut rig = Rig::with(Identity {
+        capabilities,
+        ..identity()
+    });
+    rig.hello(77);
+    rig.samples(150);
+    let good = [
+        0.02, 0.25, 0.004, 0.4, 0.2, INF, 0.0, -20.0, 20.0, INF, 0.0, 25.0,
+    ];
+    let long = design(good, 8, 0.0, INF, &[]);
+    let answer = rig.command(0x09, long.bytes().unwrap());
+    assert_eq!(answer, (8, std::vec![13, 0, 0, 0]));
+    assert_eq!(rig.command(0x09, gains(good, 8).bytes().unwrap()).0, 0);
+}
+
+#[test]
 fn a_device_refuses_to_be_what_it_cannot_be() {
     let name = |identity: Identity| {
         let device = crate::link::Device::<8>::new(identity);

@@ -2,7 +2,7 @@
 
 use super::rig::*;
 use crate::link::{Fields, Reason, State};
-use crate::{Controller, Design, Settings, Standard};
+use crate::{Controller, Design, Point, Schedule, Settings, Standard};
 use proptest::prelude::*;
 use std::vec;
 use std::vec::Vec;
@@ -61,11 +61,21 @@ proptest! {
         moves in prop::collection::vec(-60i32..90, 60),
         filter in 1u8..20,
         kp in 0.001f32..0.05, ti in 0.01f32..1.0, td in 0f32..0.01, tt in prop_oneof![Just(0f32), 0.01f32..1.0],
+        observer in prop_oneof![Just(0f32), 0.001f32..0.02], rate in prop_oneof![Just(INF), 100f32..1e5],
+        kps in prop::collection::vec(0.001f32..0.05, 0..=8), long: bool,
     ) {
         let per_unit = 25.0;
         let values = [kp, ti, td, 0.4, 0.2, 10.0, tt, -20.0, 8.0, 2000.0, 0.002, per_unit];
         let mut rig = Rig::armed();
-        prop_assert_eq!(rig.command(0x09, gains(values, filter).bytes().unwrap()).0, 0);
+        let points: Vec<[f32; 4]> =
+            kps.iter().enumerate().map(|(i, &kp)| [400.0 * i as f32, kp, ti, td]).collect();
+        let (observer_time, r_rate, points) = if long { (observer, rate, points) } else { (0.0, INF, vec![]) };
+        let body = if long { design(values, filter, observer_time, r_rate, &points) } else { gains(values, filter) };
+        prop_assert_eq!(rig.command(0x09, body.bytes().unwrap()).0, 0);
+        let points: Vec<_> = points
+            .iter()
+            .map(|&[speed, kp, ti, td]| Point { speed, gains: Standard { kp, ti, td } })
+            .collect();
         prop_assert_eq!(rig.references(0, &references[..references.len().min(50)]).0, 0);
         if references.len() > 50 {
             prop_assert_eq!(rig.references(50, &references[50..]).0, 0);
@@ -76,7 +86,10 @@ proptest! {
             alpha: 0.4, beta: 0.2, n: 10.0, tt, u_min: -10.0, u_max: 8.0, slew: 2000.0,
             ..Settings::new(Standard { kp, ti, td }, 1e-3)
         };
-        let design = Design { filter_samples: filter.into(), filter_time: 0.002, ..Design::new(settings) };
+        let design = Design {
+            pid: settings, filter_samples: filter.into(), filter_time: 0.002, observer_time, r_rate,
+            schedule: Schedule::new(&points).unwrap(),
+        };
         let mut controller = Controller::<f32>::new(design).unwrap();
         let mut expected = Vec::new();
         for (&reference, &count) in references.iter().zip(&moves) {

@@ -42,7 +42,7 @@ pub fn identity() -> Identity {
         firmware: "test",
         period: PERIOD as u32,
         counts_per_rev: 1500.0,
-        capabilities: can::PROFILE | can::PID | can::DRIVE | can::CURRENT,
+        capabilities: can::PROFILE | can::PID | can::DRIVE | can::CURRENT | can::DESIGN,
         ceilings: Limits {
             volt: 20.0,
             speed: 5000.0,
@@ -329,6 +329,22 @@ pub fn gains(values: [f32; 12], samples: u8) -> Body {
         body.f32(value);
     }
     body.u8(samples);
+    body
+}
+
+/// [`gains`], then observer time, reference rate and points of speed, Kp, Ti, Td.
+pub fn design(
+    values: [f32; 12],
+    samples: u8,
+    observer: f32,
+    rate: f32,
+    points: &[[f32; 4]],
+) -> Body {
+    let mut body = gains(values, samples);
+    body.f32(observer).f32(rate).u8(points.len() as u8);
+    points.iter().flatten().for_each(|&value| {
+        body.f32(value);
+    });
     body
 }
 
