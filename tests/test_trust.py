@@ -3,12 +3,14 @@
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from cli import sewfast as command
 from loops import QUIET, drive
 from sewfast import Ensemble, VirtualMachine, identify, paper_controller, run, signals, tune
 from sewfast.control import Gains
@@ -200,3 +202,13 @@ def test_what_commission_found_brings_its_own_models() -> None:
     found: Any = SimpleNamespace(controller=QUIET, models=Ensemble.of([drive(), drive()]))
     assert len(judge(found, references="trapezoid").runs) == 2
     assert len(judge(found, drive(), "trapezoid").runs) == 1
+
+
+def test_a_run_on_the_command_line_tells_its_warnings(tmp_path: Path) -> None:
+    paper_controller().save(tmp_path / "paper.json")
+    QUIET.save(tmp_path / "quiet.json")
+    common = ("--on", "virtual", "--reference", "trapezoid", "-o", "run.csv")
+    assert "warning   limit cycle" in command(tmp_path, "run", "paper.json", *common).out
+    assert "warning" not in command(tmp_path, "run", "quiet.json", *common).out
+    told = command(tmp_path, "run", "paper.json", *common, "--json").json()
+    assert "limit cycle" in [line["name"] for line in told["warnings"]]

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from .arguments import Commands, add_command
+from .control import plant_of, reference_of
 from .output import print_json
 
 ANALYSE = """\
@@ -56,8 +57,6 @@ def add(commands: Commands) -> None:
 def analyse_command(args: argparse.Namespace) -> None:
     from ..analysis import analyse
     from ..control import load_controller
-    from .control import _plant as plant_of
-    from .control import reference_of
 
     controller = load_controller(args.controller)
     references = [

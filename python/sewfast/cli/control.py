@@ -23,6 +23,7 @@ from .output import write_columns
 if TYPE_CHECKING:
     from ..control import Controller
     from ..dataset import FloatArray
+    from ..evidence import Line
     from ..loop import ClosedLoopRun, Plant
 
 RUN = """\
@@ -77,9 +78,9 @@ def run_command(args: argparse.Namespace) -> int | None:
     controller = load_controller(args.controller)
     name = Path(args.reference).stem
     if not is_port(args.on):
-        plant = _plant(args.on)
+        plant = plant_of(args.on)
         reference = _wanted(args, controller)
-        _show_run(args, run(controller, plant, reference, name=name), None)
+        _show_run(args, run(controller, plant, reference, name=name), None, plant)
         return None
     place = recording_place(args.out, overwrite=args.overwrite)
     reference = _wanted(args, controller)
@@ -95,17 +96,30 @@ def run_command(args: argparse.Namespace) -> int | None:
     return None
 
 
-def _show_run(args: argparse.Namespace, found: ClosedLoopRun, place: Path | None) -> None:
+def _show_run(
+    args: argparse.Namespace, found: ClosedLoopRun, place: Path | None, plant: Plant | None = None
+) -> None:
     """The columns and what they say; `place` already holds those of a drive."""
+    warnings = _warnings(found, plant)
     summary: dict[str, Any] = {"plant": found.plant, "reference": found.reference}
     summary |= {"unit": found.units["y"], "n": len(found.t), "Ts": found.Ts, **found.metrics()}
+    summary["warnings"] = [line.to_json() for line in warnings]
+    lines = [f"  warning   {x.name}, {x.shown}: {x.meaning}" for x in warnings]
     write_columns(
-        args.out, found.columns(), found.units, summary, str(found).splitlines(),
+        args.out, found.columns(), found.units, summary, [*str(found).splitlines(), *lines],
         as_json=args.json, written=place,
     )  # fmt: skip
 
 
-def _plant(text: str) -> Plant:
+def _warnings(found: ClosedLoopRun, plant: Plant | None) -> tuple[Line, ...]:
+    """What speaks against a run; a model knows where it has been trained."""
+    from ..models import Model
+    from ..trust import judge
+
+    return judge(found, plant if isinstance(plant, Model) else None).warnings
+
+
+def plant_of(text: str) -> Plant:
     """`virtual`, `virtual:SEED`, else a model file."""
     from ..machine import VirtualMachine
     from ..models import load_model
