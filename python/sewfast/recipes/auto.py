@@ -12,8 +12,9 @@ from .. import _core
 from ..dataset import Dataset
 from ..errors import FitError, Interrupted
 from ..models import Ensemble, LinearOE, Model, NeuralSS
-from .finish import Finished, confirmed, finish
-from .holdout import LEAST_HELD_OUT, SHARE, split
+from .candidate import Candidate
+from .finish import ENOUGH_TO_CHOOSE_BY, Finished, finish, ratios
+from .holdout import LEAST_HELD_OUT, SHARE, folds
 from .linear import linear_model
 from .output import LINEAR
 from .plan import plan_of
@@ -24,6 +25,8 @@ from .task import Story, Task, arrays, bare, finite, told, with_story
 _NO_NETWORK = "too few samples for a network, or none stayed finite on data not trained on"
 AGREEMENT = 1 / 3
 """Part of the starts that has to come out about as good as the best and to pass the guard."""
+LEAST_AGREEING = 3
+"""So many of them where held-out data are too short to tell the best start."""
 WORTH_IT = 0.9
 """The network must bring the free-run error below this part of the linear model's."""
 
@@ -40,10 +43,10 @@ def neural_ss(task: Task) -> Model:
 
 def _found(task: Task, always_network: bool) -> Model:
     began = time.perf_counter()
-    parts = split(task.data, task.validation)
-    if parts is None or parts.scored == 0:
+    parts = folds(task.data, task.validation)
+    if not parts:
         return _without_held_out(task, began, always_network)
-    search = Search.of(task, plan_of(task, len(parts.fitted)), parts)
+    search = Search.of(task, plan_of(task, len(parts[0].fitted)), parts)
     order = 0
     try:
         order = search.linear_order()
@@ -53,26 +56,38 @@ def _found(task: Task, always_network: bool) -> Model:
 
 
 def _chosen(search: Search, order: int, began: float, always_network: bool) -> Model:
-    best = search.ladder(order)
+    best = search.ladder()
     if best is None:
         return _linear(search, order, began, {}, _NO_NETWORK)
-    ratio = 0.0
-    if order:
-        ratio, order = confirmed(search, best, order, WORTH_IT)
-    worth = ratio < WORTH_IT
-    rmse = {"oe": search.linear_errors.get(order), "neural_ss": best.error}
-    reason = (
-        f"free-run error of the network on data not trained on: {100 * ratio:.1f} % of the linear "
-        f"model's; the network is chosen below {100 * WORTH_IT:.0f} %"
-    )
+    found = ratios(search, best, order, WORTH_IT) if order else [0.0]
+    worth = max(found) < WORTH_IT
+    rmse = {"oe": search.linear_error(order), "neural_ss": best.error}
+    reason = _reason(found)
     if not worth and not always_network:
         return _linear(search, order, began, rmse, reason)
     finished = finish(search, best)
-    if finished.candidate.agreement < AGREEMENT and not always_network:
-        disagree = f"only {100 * finished.candidate.agreement:.0f} % of the network's starts agree"
+    if not always_network and not _is_fixed(search, finished.candidate):
+        agreeing, all_ = finished.candidate.agreeing, len(finished.candidate.starts)
+        disagree = f"only {agreeing} of the network's {all_} starts agree"
         return _linear(search, order, began, rmse, f"{disagree}: the data do not fix it")
     model = _network(search, finished, began, rmse, reason)
     return model if worth else told(model, {"notes": [f"{reason}; consider model oe"]})
+
+
+def _is_fixed(search: Search, candidate: Candidate) -> bool:
+    """Whether starts enough agree; more than two where held-out data do not tell the best one."""
+    is_told = search.split.scored >= ENOUGH_TO_CHOOSE_BY
+    least = 1 if is_told or search.task.starts is not None else LEAST_AGREEING
+    return candidate.agreement >= AGREEMENT and candidate.agreeing >= least
+
+
+def _reason(found: Sequence[float]) -> str:
+    shares = ", ".join(f"{100 * r:.1f} %" for r in found)
+    parts = "" if len(found) == 1 else f", on {len(found)} later parts in turn, the last first"
+    return (
+        f"free-run error of the network on data not trained on: {shares} of the linear model's"
+        f"{parts}; the network is chosen below {100 * WORTH_IT:.0f} %"
+    )
 
 
 # --- models -----------------------------------------------------------------------------------
@@ -135,16 +150,16 @@ def _best_so_far(search: Search, order: int, began: float, stopped: Stopped) -> 
     """What there is when Ctrl-C comes: the best candidate, else the linear model."""
     tried = [c for c in search.table.values() if math.isfinite(c.error)]
     best = min(tried, key=lambda c: c.error, default=None)
-    linear_error = search.linear_errors.get(order, math.inf)
+    linear_error = search.linear_error(order)
     if best is None or best.error >= WORTH_IT * linear_error:
-        core = search.linear.get((order, search.nk, LINEAR.name))
+        core = search.linear.get((order, search.nk, LINEAR.name, 0))
         if core is None:
             raise KeyboardInterrupt from stopped
         linear = bare(LinearOE, core, search.task.data)
         story = {"termination": "interrupted", "initial_state": "estimated"}
         return with_story(linear, search.task, began, story)
     finished = Finished(tuple(best.members), best, False)
-    rmse = {"oe": search.linear_errors.get(order), "neural_ss": best.error}
+    rmse = {"oe": linear_error, "neural_ss": best.error}
     model = _network(search, finished, began, rmse, "interrupted: the best candidate so far")
     return told(model, {"termination": "interrupted"})
 

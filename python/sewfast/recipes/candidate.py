@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -25,8 +26,22 @@ class Candidate:
 
     @property
     def agreement(self) -> float:
-        """Part of the starts that counts: where it is small, the data do not fix the network."""
-        return len(members(self.starts)) / len(self.starts) if self.starts else 0.0
+        """Part of the starts that passes the guard and is not far worse than the best.
+
+        Where it is small, the data do not fix the network.
+        """
+        return self.agreeing / len(self.starts) if self.starts else 0.0
+
+    @property
+    def agreeing(self) -> int:
+        """Number of those starts."""
+        return sum(s.is_sound for s in members(self.starts))
+
+    def is_better(self, other: Candidate, worth: float) -> bool:
+        """Whether the error is below that part of the other's; a start that is sound goes first."""
+        if (self.agreement > 0.0) != (other.agreement > 0.0):
+            return self.agreement > 0.0
+        return self.error < worth * other.error
 
     @property
     def members(self) -> list[_core.NeuralSS]:
@@ -53,5 +68,12 @@ def members(starts: Sequence[Start]) -> list[Start]:
 def judged(structure: Structure, starts: Sequence[Start], split: Split) -> Candidate:
     """The candidate with the error of its members' median."""
     kept = [s.model for s in members(starts)]
-    error = held_out_error(EnsembleCore(tuple(kept), "median"), split) if kept else float("inf")
+    error = held_out_error(EnsembleCore(tuple(kept), "median"), split) if kept else math.inf
     return Candidate(structure, tuple(starts), error)
+
+
+def pooled(errors: Sequence[float]) -> float:
+    """Geometric mean: a fold counts by its ratio to another model's error, not by its size."""
+    if not errors or not all(map(math.isfinite, errors)):
+        return math.inf
+    return math.exp(sum(math.log(max(e, 1e-300)) for e in errors) / len(errors))

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from .. import _core
 from ..models.ensemble import EnsembleCore
 from .candidate import Candidate, judged, members
-from .holdout import held_out_error, split
+from .holdout import held_out_error
 from .plan import FINAL_OPERATIONS
 from .search import Search
-from .structure import Start, Structure, Training, train
+from .structure import Structure, Training, train
 
 ENOUGH_TO_CHOOSE_BY = 2_000
 """Held-out samples from which on a single best start may be taken instead of the median."""
 ABOUT_AS_WELL = 1.1
 """More starts are taken although their error is this much larger: a short tail is noisy."""
-CLEARLY_BETTER = 0.25
-"""Below this part of the linear model's error the network needs no second opinion."""
+
+BY_FAR = 0.2
+"""Part of the linear model's error below which the network wins by far."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,13 @@ def _finally_trained(search: Search, best: Candidate) -> Candidate:
         return final
     begun = final.members[: plan.final_starts]
     everything = Training(
-        split_.fitted, split_.held, None, len(begun), plan.all_iterations, initial=begun
+        split_.fitted,
+        split_.held,
+        None,
+        len(begun),
+        plan.all_iterations,
+        initial=begun,
+        memory=search.memory(split_.fitted, best.structure.output),
     )
     everything = everything.affordable(best.structure, FINAL_OPERATIONS)
     whole = judged(best.structure, train(task, best.structure, everything), split_)
@@ -90,49 +96,40 @@ def _refitted(
     if search.split.is_given or task.clock.over():
         return []
     training = Training(
-        task.data, None, None, len(cores), search.plan.refit_iterations, initial=cores
+        task.data,
+        None,
+        None,
+        len(cores),
+        search.plan.refit_iterations,
+        initial=cores,
+        memory=search.memory(task.data, structure.output),
     )
     starts = train(task, structure, training)
-    if len(starts) < len(cores) or task.clock.over():
+    if len(starts) < len(cores) or task.clock.over() or not any(s.is_sound for s in starts):
         return []
     return [s.model for s in members(starts)]
 
 
-# --- a second opinion -----------------------------------------------------------------------------
+# --- the network against the linear model --------------------------------------------------------
 
 
-def confirmed(search: Search, best: Candidate, order: int, worth: float) -> tuple[float, int]:
-    """The network's error relative to the linear model's, and the order of that.
+def ratios(search: Search, best: Candidate, order: int, worth: float) -> list[float]:
+    """The network's error over the linear model's on every fold, the newest first.
 
-    Where the network does not win by far, both are fitted again without the last two fifths of
-    every experiment and compared on the fifth before the last as well. The linear order is then
-    the best of both parts together, and the worse of the two ratios counts.
+    Forward chaining: both are fitted again to what comes before each fold. A fold with too few
+    samples for the network says nothing. No other is asked where the network wins the newest by
+    far, and none after one that is lost (not below `worth`).
     """
-    linear = search.linear_errors
-    ratio = _ratio(best.error, linear[order])
-    if ratio < CLEARLY_BETTER or ratio >= worth or search.split.is_given:
-        return ratio, order
-    earlier = _earlier(search)
-    if earlier is None or search.task.clock.over():
-        return ratio, order
-    earlier.linear_order()
-    pooled = {o: linear[o] ** 2 + e**2 for o, e in earlier.linear_errors.items() if o in linear}
-    order = min(pooled, key=lambda o: pooled[o], default=order)
-    plan = search.plan
-    training = earlier.training(best.structure, plan.trial_starts, plan.trial_iterations)
-    starts: list[Start] = train(search.task, best.structure, training)
-    other = judged(best.structure, starts, earlier.trial)
-    again = earlier.linear_errors.get(order, math.inf)
-    return max(_ratio(best.error, linear[order]), _ratio(other.error, again)), order
+    linear = search.linear_errors[order]
+    found = [_ratio(best.error, linear[0])]
+    for fold in range(1, len(search.folds)):
+        if found[-1] >= worth or found[0] < BY_FAR or search.task.clock.over():
+            break
+        if search.is_affordable(best.structure, fold):
+            error = search.trial_on(best.structure, fold).error
+            found.append(_ratio(error, linear[fold]))
+    return found
 
 
 def _ratio(error: float, linear: float) -> float:
     return error / linear if linear > 0.0 else 1.0
-
-
-def _earlier(search: Search) -> Search | None:
-    """The same search one fifth earlier."""
-    found = split(search.task.data, skipped=0.2)
-    if found is None or found.scored == 0:
-        return None
-    return Search.of(search.task, search.plan, found)

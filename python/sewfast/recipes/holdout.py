@@ -17,6 +17,8 @@ SHARE = 0.2
 Blocks inside a record lie where the drive has been before and after, and favour a network that
 learns the record by heart; a later part is the honest question.
 """
+FOLDS = 3
+"""Later parts that models are judged on, each by what was learned from all before it."""
 LEAST_HELD_OUT = 2 * INIT
 BLOCKS = 4
 RUN_UP = 10 * INIT
@@ -48,24 +50,27 @@ class Split:
         """Samples that models are chosen by."""
         return sum(int(np.isfinite(e.y[INIT:]).sum()) for e in self.held.experiments)
 
+    @property
+    def spread(self) -> float:
+        """Error of a constant, the mean of what is fitted: the worst that counts."""
+        mean = float(np.nanmean(np.concatenate([e.y for e in self.fitted.experiments])))
+        parts = [e.y[e.initial_samples(INIT) :] for e in self.held.experiments]
+        return float(np.sqrt(np.nanmean((np.concatenate(parts) - mean) ** 2)))
+
     def shortened(self, fitted: int, held: int) -> Split:
         """About so many samples, of every experiment its proportional part."""
         return replace(self, fitted=_thinned(self.fitted, fitted), held=_shortened(self.held, held))
 
 
-def split(data: Dataset, validation: Dataset | None = None, skipped: float = 0.0) -> Split | None:
+def split(data: Dataset, skipped: float = 0.0) -> Split | None:
     """Hold out the end of every experiment; None where they are too short for that.
 
     Parameters
     ----------
     data : Dataset
-    validation : Dataset or None
-        Taken instead.
     skipped : float
         Part of every experiment, at its end, that is left out altogether.
     """
-    if validation is not None:
-        return Split(data, validation, is_given=True, sources=tuple(sources(validation)))
     fitted: list[Experiment] = []
     held: list[Experiment] = []
     parts: list[Experiment] = []
@@ -86,6 +91,18 @@ def split(data: Dataset, validation: Dataset | None = None, skipped: float = 0.0
     pieces = (replace(data, experiments=tuple(p)) for p in (fitted, held, parts))
     fitted_data, held_data, scored = pieces
     return Split(fitted_data, held_data, sources=tuple(sources(scored)))
+
+
+def folds(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]:
+    """Forward chaining: the last fifth by all before it, then the fifth before that, and so on.
+
+    The newest comes first; none where experiments are too short. Validation data are a fold of
+    their own, the only one.
+    """
+    if validation is not None:
+        return (Split(data, validation, is_given=True, sources=tuple(sources(validation))),)
+    found = (split(data, skipped=i * SHARE) for i in range(FOLDS))
+    return tuple(f for f in found if f is not None and f.scored)
 
 
 def _measured(y: FloatArray) -> int:

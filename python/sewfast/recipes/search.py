@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from .. import _core
+from ..dataset import Dataset
 from ..errors import FitError
-from .candidate import Candidate, judged
+from .candidate import Candidate, judged, pooled
 from .holdout import Split, held_out_error
+from .memory import Memory, Rectified, Simulator
 from .output import ABS, LINEAR, Output, named, rectified_start, rms_error, suggested
 from .plan import SEARCH_OPERATIONS, Plan
 from .structure import Stopped, Structure, Training, train
@@ -39,16 +41,24 @@ class Search:
     task: Task
     plan: Plan
     split: Split
-    trial: Split
-    linear: dict[tuple[int, int, str], _core.LinearModel | None] = field(default_factory=dict)
-    linear_errors: dict[int, float] = field(default_factory=dict)
+    folds: tuple[Split, ...]
+    linear: dict[tuple[int, int, str, int], _core.LinearModel | None] = field(default_factory=dict)
+    linear_errors: dict[int, tuple[float, ...]] = field(default_factory=dict)
+    order: int = 0
     table: dict[Structure, Candidate] = field(default_factory=dict)
+    memories: dict[tuple[int, str, int], Memory | None] = field(default_factory=dict)
     operations: float = 0.0
 
     @classmethod
-    def of(cls, task: Task, plan: Plan, split: Split) -> Search:
+    def of(cls, task: Task, plan: Plan, folds: Sequence[Split]) -> Search:
         """A search that has not begun."""
-        return cls(task, plan, split, split.shortened(plan.trial_samples, plan.held_samples))
+        trials = (f.shortened(plan.trial_samples, plan.held_samples) for f in folds)
+        return cls(task, plan, folds[0], tuple(trials))
+
+    @property
+    def trial(self) -> Split:
+        """The newest fold, as short as trials are."""
+        return self.folds[0]
 
     @property
     def nk(self) -> int:
@@ -57,11 +67,13 @@ class Search:
 
     # --- linear models --------------------------------------------------------------------------
 
-    def start_model(self, nx: int, nk: int, output: Output = LINEAR) -> _core.LinearModel | None:
-        """The linear model of that order, fitted once."""
-        key = (nx, nk, output.name)
+    def start_model(
+        self, nx: int, nk: int, output: Output = LINEAR, fold: int = 0
+    ) -> _core.LinearModel | None:
+        """The linear model of that order, fitted once to what the fold learns from."""
+        key = (nx, nk, output.name, fold)
         if key not in self.linear:
-            data = self.trial.fitted
+            data = self.folds[fold].fitted
             if output == ABS:
                 self.linear[key] = rectified_start(data, nx, nk)
             else:
@@ -69,25 +81,43 @@ class Search:
         return self.linear[key]
 
     def linear_order(self) -> int:
-        """The smallest order about as good in free run as the best; fills `linear_errors`."""
+        """The smallest order about as good on all folds as the best; fills `linear_errors`."""
         for order in LINEAR_ORDERS:
-            model = self.start_model(order, self.nk)
-            if model is not None:
-                self.linear_errors[order] = held_out_error(model, self.trial)
+            errors = tuple(self._linear_error(order, i) for i in range(len(self.folds)))
+            if self.start_model(order, self.nk) is not None:
+                self.linear_errors[order] = errors
+        self.order = self._smallest_order(pooled)
+        return self.order
+
+    def _smallest_order(self, error: Callable[[tuple[float, ...]], float]) -> int:
         chosen = min(self.linear_errors, default=0)
-        for order, error in self.linear_errors.items():
-            if error < WORTH_AN_ORDER * self.linear_errors[chosen]:
+        for order, errors in self.linear_errors.items():
+            if error(errors) < WORTH_AN_ORDER * error(self.linear_errors[chosen]):
                 chosen = order
         return chosen
 
+    def linear_error(self, order: int) -> float:
+        """On the newest fold; infinite where that order was not fitted."""
+        return self.linear_errors[order][0] if order in self.linear_errors else math.inf
+
+    def _linear_error(self, order: int, fold: int) -> float:
+        """No model counts for worse than a constant."""
+        model, held = self.start_model(order, self.nk, fold=fold), self.folds[fold]
+        return held.spread if model is None else min(held_out_error(model, held), held.spread)
+
     # --- networks -------------------------------------------------------------------------------
 
-    def ladder(self, order: int) -> Candidate | None:
-        """The best candidate after all steps; None where no network could be trained."""
+    def ladder(self) -> Candidate | None:
+        """The best candidate after all steps; None where no network could be trained.
+
+        It begins with as many states as the order of the linear model that the newest fold, where
+        networks are judged, asks for.
+        """
+        order = self._smallest_order(lambda errors: errors[0])
         nx = self.task.nx or min(max(order, LEAST_NX), LINEAR_ORDERS[-1])
         hidden = (USUAL_HIDDEN, 4, 2) if self.task.hidden is None else (self.task.hidden,)
         sizes = (Structure(nx, self.nk, h, self.plan.decay) for h in hidden)
-        base = next(filter(self._is_affordable, sizes), None)
+        base = next(filter(self.is_affordable, sizes), None)
         if base is None:
             return None
         best = self._best_of(replace(base, output=o) for o in self._outputs(nx))
@@ -176,7 +206,7 @@ class Search:
             tried = self._tried(structure)
             if tried is None:
                 continue
-            if best is None or tried.error < (worth or self.plan.worth_a_step) * best.error:
+            if best is None or tried.is_better(best, worth or self.plan.worth_a_step):
                 best = tried
         return best
 
@@ -184,40 +214,65 @@ class Search:
         """The candidate, from the table where it was tried before; None where it cannot be."""
         if structure in self.table:
             return self.table[structure]
-        if self._is_over() or not self._is_affordable(structure):
+        if self._is_over() or not self.is_affordable(structure):
             return None
+        self.table[structure] = self.trial_on(structure)
+        return self.table[structure]
+
+    def trial_on(self, structure: Structure, fold: int = 0) -> Candidate:
+        """The structure trained on what a fold learns from and judged on what it holds out."""
         plan = self.plan
-        training = self.training(structure, plan.trial_starts, plan.trial_iterations)
+        training = self.training(structure, plan.trial_starts, plan.trial_iterations, fold)
         starts = train(self.task, structure, training)
         self.operations += training.operations(structure)
-        self.table[structure] = judged(structure, starts, self.trial)
-        return self.table[structure]
+        return judged(structure, starts, self.folds[fold])
 
     def _is_over(self) -> bool:
         """Time or work is used up; the first candidate is always tried."""
         out_of_time = self.task.clock.over(SHARE_FOR_SEARCH)
         return bool(self.table) and (out_of_time or self.operations > SEARCH_OPERATIONS)
 
-    def training(self, structure: Structure, starts: int, iterations: int) -> Training:
-        """A training of the structure on the trial's part of the data."""
+    def training(
+        self, structure: Structure, starts: int, iterations: int, fold: int = 0
+    ) -> Training:
+        """A training of the structure on what the fold learns from."""
         return Training(
-            self.trial.fitted,
-            self.trial.held,
-            self.start_model(structure.nx, structure.nk, structure.output),
+            self.folds[fold].fitted,
+            self.folds[fold].held,
+            self.start_model(structure.nx, structure.nk, structure.output, fold),
             starts if self.task.starts is None else self.task.starts,
             _limited(iterations, self.task),
+            memory=self.memory(self.folds[fold].fitted, structure.output, fold),
         )
 
-    def _is_affordable(self, structure: Structure) -> bool:
+    def memory(self, data: Dataset, output: Output, fold: int = 0) -> Memory | None:
+        """The bound on a network's memory that linear models set; computed once."""
+        key = (id(data), output.name, fold)
+        if key not in self.memories:
+            self.memories[key] = self._memory(data, output, fold)
+        return self.memories[key]
+
+    def _memory(self, data: Dataset, output: Output, fold: int) -> Memory | None:
+        """Of the chosen order; behind a rectifier as well where the network is."""
+        outputs = [LINEAR, ABS] if output == ABS else [LINEAR]
+        known: list[Simulator] = []
+        for o in outputs:
+            linear = self.start_model(max(self.order, 1), self.nk, o, fold)
+            if linear is not None:
+                known.append(Rectified(linear) if o == ABS else linear)
+        return Memory.of(known, data) if known else None
+
+    def is_affordable(self, structure: Structure, fold: int = 0) -> bool:
+        """Whether the fold has samples enough for its parameters."""
         wanted = structure.parameters(self.task.data.n_inputs) * SAMPLES_PER_PARAMETER
         is_fixed = None not in (self.task.nx, self.task.hidden)
-        return is_fixed or wanted <= len(self.trial.fitted)
+        return is_fixed or wanted <= len(self.folds[fold].fitted)
 
     def rows(self) -> Iterator[Story]:
         """The table: linear models, then networks in the order of their trials."""
-        for order, error in self.linear_errors.items():
+        for order, errors in self.linear_errors.items():
             row: Story = {"kind": "oe", "na": order, "nb": order + 1, "nk": self.nk}
-            yield row | {"free_run_rmse": finite(error)}
+            yield row | {"free_run_rmse": finite(pooled(errors))}
         yield from (c.to_json() for c in self.table.values())
 
 

@@ -15,6 +15,7 @@ from ..dataset import Dataset
 from ..errors import FitError
 from ..workers import spread
 from .clock import stopping
+from .memory import Memory
 from .output import LINEAR, Output, scale_of
 from .task import Pairs, Story, Task, arrays
 
@@ -86,6 +87,7 @@ class Training:
     iterations: int
     first_start: int = 0
     initial: Sequence[_core.NeuralSS] = field(default=())
+    memory: Memory | None = None
 
     def operations(self, structure: Structure) -> float:
         """Multiplications, if every start takes all its iterations."""
@@ -100,7 +102,15 @@ class Training:
 
 def train(task: Task, structure: Structure, training: Training) -> list[Start]:
     """Starts with a finite free run, in their order; none where every one failed."""
-    job = _job(task, structure, training)
+    starts = _trained(task, _job(task, structure, training))
+    memory = training.memory
+    if memory is None:
+        return starts
+    return [replace(s, is_sound=s.is_sound and memory.allows(s.model)) for s in starts]
+
+
+def _trained(task: Task, job: Job) -> list[Start]:
+    """By threads of this process, or by the workers."""
     if task.workers is None:
         return _in_threads(task, job)
     jobs = [_part(job, i) for i in range(job.starts)]

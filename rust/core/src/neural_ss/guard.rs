@@ -1,17 +1,17 @@
-//! The runs by which a model is guarded: from states beside the training's, and over larger inputs.
+//! The runs by which a model is guarded: from states beside the training's, over larger inputs and in another order.
 
 use super::network::{Network, Scratch};
 use super::problem::{Experiment, FreeRun, Trajectory};
 use super::shape::Shape;
 use super::state::Statistics;
-use crate::guard::{Guard, enlarged};
+use crate::guard::{Guard, enlarged, rearranged};
 use crate::{Monitor, simd};
 
 /// Where a run that is to forget its state is started, in standard deviations of the training states.
 const BESIDE: f64 = 3.0;
 
-/// True where the free run forgets its initial state, unless that is integrated, and answers somewhat larger inputs
-/// with outputs of like size.
+/// True where the free run answers somewhat larger inputs with outputs of like size and, unless a state is integrated,
+/// forgets its initial state and stays near the training outputs when its inputs come in another order.
 pub(super) fn is_sound(
     network: &Network,
     experiments: &[Experiment],
@@ -52,9 +52,16 @@ pub(super) fn is_sound(
                     (0..outputs).all(|p| guards[p].meet(&of(p, usual), &of(p, &other)))
                 })
             };
+            let stays = || {
+                rearranged(&experiment.v, inputs).iter().all(|v| {
+                    run(network, v, state).is_some_and(|other| {
+                        (0..outputs).all(|p| guards[p].holds_at_home(&of(p, &other)))
+                    })
+                })
+            };
             let larger = run(network, &enlarged(&experiment.v, inputs), state);
             larger.is_some_and(|larger| (0..outputs).all(|p| guards[p].holds(&of(p, &larger))))
-                && (integrator || (forgets(1.0) && forgets(-1.0)))
+                && (integrator || (forgets(1.0) && forgets(-1.0) && stays()))
         })
 }
 
