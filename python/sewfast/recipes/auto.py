@@ -13,7 +13,7 @@ from ..dataset import Dataset
 from ..errors import FitError, Interrupted
 from ..models import Ensemble, LinearOE, Model, NeuralSS
 from .candidate import Candidate
-from .finish import ENOUGH_TO_CHOOSE_BY, Finished, finish, ratios
+from .finish import ENOUGH_TO_CHOOSE_BY, LEAST_AGREEING, Finished, finish, ratios
 from .holdout import LEAST_HELD_OUT, SHARE, folds
 from .linear import linear_model
 from .output import LINEAR
@@ -25,8 +25,6 @@ from .task import Story, Task, arrays, bare, finite, told, with_story
 _NO_NETWORK = "too few samples for a network, or none stayed finite on data not trained on"
 AGREEMENT = 1 / 3
 """Part of the starts that has to come out about as good as the best and to pass the guard."""
-LEAST_AGREEING = 3
-"""So many of them where held-out data are too short to tell the best start."""
 WORTH_IT = 0.9
 """The network must bring the free-run error below this part of the linear model's."""
 
@@ -58,18 +56,18 @@ def _found(task: Task, always_network: bool) -> Model:
 def _chosen(search: Search, order: int, began: float, always_network: bool) -> Model:
     best = search.ladder()
     if best is None:
-        return _linear(search, order, began, {}, _NO_NETWORK)
+        return _linear(search, began, {}, _NO_NETWORK)
     found = ratios(search, best, order, WORTH_IT) if order else [0.0]
     worth = max(found) < WORTH_IT
     rmse = {"oe": search.linear_error(order), "neural_ss": best.error}
     reason = _reason(found)
     if not worth and not always_network:
-        return _linear(search, order, began, rmse, reason)
+        return _linear(search, began, rmse, reason)
     finished = finish(search, best)
     if not always_network and not _is_fixed(search, finished.candidate):
         agreeing, all_ = finished.candidate.agreeing, len(finished.candidate.starts)
         disagree = f"only {agreeing} of the network's {all_} starts agree"
-        return _linear(search, order, began, rmse, f"{disagree}: the data do not fix it")
+        return _linear(search, began, rmse, f"{disagree}: the data do not fix it")
     model = _network(search, finished, began, rmse, reason)
     return model if worth else told(model, {"notes": [f"{reason}; consider model oe"]})
 
@@ -125,9 +123,9 @@ def _of_cores(cores: Sequence[_core.NeuralSS], data: Dataset, story: Story) -> M
     return models[0] if len(models) == 1 else Ensemble.of(models)
 
 
-def _linear(search: Search, order: int, began: float, rmse: Story, reason: str) -> Model:
-    """Output error in the chosen order on all data."""
-    task = search.task
+def _linear(search: Search, began: float, rmse: Story, reason: str) -> Model:
+    """Output error on all data, in the order best on all folds."""
+    task, order = search.task, search.best_order()
     orders = {"na": order, "nb": order + 1, "nk": search.nk}
     fit = _core.fit_oe(arrays(task.data), **task.fit_options(**orders))
     choice = _choice(search, "oe", rmse, reason)

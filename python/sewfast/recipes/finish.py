@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from .. import _core
 from ..models.ensemble import EnsembleCore
 from .candidate import Candidate, judged, members
-from .holdout import held_out_error
+from .holdout import Split, held_out_error
 from .plan import FINAL_OPERATIONS
 from .search import Search
 from .structure import Structure, Training, train
@@ -18,6 +18,8 @@ ENOUGH_TO_CHOOSE_BY = 2_000
 ABOUT_AS_WELL = 1.1
 """More starts are taken although their error is this much larger: a short tail is noisy."""
 
+LEAST_AGREEING = 3
+"""So many starts have to agree where held-out data are too short to tell the best one."""
 BY_FAR = 0.2
 """Part of the linear model's error below which the network wins by far."""
 
@@ -107,7 +109,8 @@ def _refitted(
     starts = train(task, structure, training)
     if len(starts) < len(cores) or task.clock.over() or not any(s.is_sound for s in starts):
         return []
-    return [s.model for s in members(starts)]
+    kept = members(starts)
+    return [] if len(kept) < min(len(cores), LEAST_AGREEING) else [s.model for s in kept]
 
 
 # --- the network against the linear model --------------------------------------------------------
@@ -116,19 +119,28 @@ def _refitted(
 def ratios(search: Search, best: Candidate, order: int, worth: float) -> list[float]:
     """The network's error over the linear model's on every fold, the newest first.
 
-    Forward chaining: both are fitted again to what comes before each fold. A fold with too few
-    samples for the network says nothing. No other is asked where the network wins the newest by
-    far, and none after one that is lost (not below `worth`).
+    Forward chaining: both are fitted again to what comes before each fold, and the worst of the
+    starts that count stands for the network, so that a win by luck of the start is none. A fold
+    with too few samples for the network says nothing. Where the median wins the newest fold by far
+    nothing else is asked, and nothing after a fold that is lost (not below `worth`).
     """
     linear = search.linear_errors[order]
-    found = [_ratio(best.error, linear[0])]
+    newest = _ratio(best.error, linear[0])
+    if newest < BY_FAR:
+        return [newest]
+    found = [_ratio(_worst(best, search.trial), linear[0])]
     for fold in range(1, len(search.folds)):
-        if found[-1] >= worth or found[0] < BY_FAR or search.task.clock.over():
+        if found[-1] >= worth or search.task.clock.over():
             break
         if search.is_affordable(best.structure, fold):
-            error = search.trial_on(best.structure, fold).error
-            found.append(_ratio(error, linear[fold]))
+            tried = search.trial_on(best.structure, fold)
+            found.append(_ratio(_worst(tried, search.folds[fold]), linear[fold]))
     return found
+
+
+def _worst(candidate: Candidate, fold: Split) -> float:
+    errors = (held_out_error(core, fold) for core in candidate.members)
+    return max(candidate.error, *errors, 0.0)
 
 
 def _ratio(error: float, linear: float) -> float:

@@ -96,6 +96,11 @@ class Search:
                 chosen = order
         return chosen
 
+    def best_order(self) -> int:
+        """The one best on all folds together: for a model that is linear in the end."""
+        errors = self.linear_errors
+        return min(errors, key=lambda o: pooled(errors[o]), default=self.order)
+
     def linear_error(self, order: int) -> float:
         """On the newest fold; infinite where that order was not fitted."""
         return self.linear_errors[order][0] if order in self.linear_errors else math.inf
