@@ -8,6 +8,8 @@ import pytest
 from loops import QUIET, drive
 from sewfast import VirtualMachine
 from sewfast.analysis import run_under_load
+from sewfast.analysis.loading import torque_of
+from sewfast.analysis.responses import RECOVERED
 from sewfast.analysis.systems import LinearLoop, simulate
 from sewfast.control import Controller, Gains
 from sewfast.dataset import FloatArray
@@ -21,7 +23,7 @@ F1 = [
 ]
 LATE = 4
 """Samples by which the feedback is late: half of one in the encoder, 3.5 in the mean of eight."""
-LOAD = 0.1
+LOAD = 0.3
 """Torque that comes on while the speed is held [N m]."""
 
 
@@ -90,7 +92,7 @@ def load_answer(controller: Controller, machine: VirtualMachine) -> FloatArray:
 def test_on_the_machine_f2_does_not_touch_the_answer_to_a_load(seed: int | None) -> None:
     machine = VirtualMachine(seed)
     one, other, firm = (load_answer(c, machine) for c in (QUIET, OTHER_F2, F1[1]))
-    assert np.abs(one).max() > 5.0
+    assert np.abs(one).max() > 15.0
     apart = float(np.sqrt(np.mean((one - other)[:400] ** 2)))
     retuned = float(np.sqrt(np.mean((one - firm)[:400] ** 2)))
     assert apart < 0.2 * retuned
@@ -109,3 +111,27 @@ def test_on_the_machine_f1_hardly_touches_a_followed_reference(seed: int | None)
         return float(max(np.sqrt(np.mean((y - runs[0]) ** 2)) for y in runs[1:]))
 
     assert apart(ahead) < 0.25 * apart(none)
+
+
+# what `sewfast.commission` found on the nominal machine, and Eq. 12 for the first-order model that
+# it had: 434 RPM/V, 249 ms, 14.4 ms with the delay of the feedback's filter
+COMMISSIONED = replace(
+    QUIET, gains=Gains.standard(0.0403954, 0.0159251, 0.0126455), alpha=0.228943, beta=-0.73736,
+    N=3.25153,
+)  # fmt: skip
+EQ_12 = replace(
+    QUIET, gains=Gains.standard(0.0480338, 0.0365296, 0.00583766), alpha=0.65186, beta=0.763266,
+    N=10,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", [None, 1, 2, 3, 4])
+def test_a_load_is_answered_no_slower_than_by_eq_12(seed: int | None) -> None:
+    """Peak, integral of the error, and recovery to 1 % of what the load would do uncontrolled."""
+    machine = VirtualMachine(seed)
+    free = LOAD / torque_of(machine, 1.0) * machine.linearise(1500.0)["gain"]
+    ours, theirs = (np.abs(load_answer(c, machine)) for c in (COMMISSIONED, EQ_12))
+    assert ours.max() < theirs.max() < 0.05 * free
+    assert ours.sum() < theirs.sum()
+    recovery = [int(np.flatnonzero(y > RECOVERED * free)[-1]) for y in (ours, theirs)]
+    assert recovery[0] <= recovery[1]
