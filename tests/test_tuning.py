@@ -19,6 +19,7 @@ from sewfast.identification import identify
 from sewfast.loop import run
 from sewfast.machine import VirtualMachine
 from sewfast.models import LinearOE
+from sewfast.robustness import margins
 from sewfast.tuning import costs, default_variations, first_controller, tune
 
 
@@ -126,6 +127,21 @@ def test_constraints_come_before_the_cost() -> None:
     assert "u <= " in str(bound)
     with pytest.raises(FitError, match="constraints"):
         tune(drive(), SHORT, constraints=Constraints(u=1e-6), evaluations=30, threads=1)
+
+
+def test_the_largest_sensitivity_is_that_of_the_margins() -> None:
+    settings: dict[str, Any] = {"evaluations": 300, "threads": 2, "variations": [(1.0, 0)]}
+    free = margins(tune(drive(), SHORT, **settings).controller, drive()).Ms
+    limit = 1.0 + 0.7 * (free - 1.0)
+    bound = tune(drive(), SHORT, constraints=Constraints(Ms=limit), **settings)
+    assert margins(bound.controller, drive()).Ms <= limit * (1.0 + 1e-9)
+    start = first_controller(drive())
+    plants = {"models": VirtualMachine(), "start": start}
+    with pytest.raises(SettingError, match=r"plant=\.\.\."):
+        tune(references=SHORT, constraints=Constraints(Ms=limit), **plants, **settings)
+    given = Constraints(Ms=limit, plant=drive())
+    found = tune(references=SHORT, constraints=given, **plants, **{**settings, "evaluations": 60})
+    assert margins(found.controller, drive()).Ms <= limit * (1.0 + 1e-9)
 
 
 def test_costs_compare_controllers_as_the_search_does() -> None:

@@ -30,6 +30,7 @@ from .variables import Wanted, applied
 
 EVALUATIONS = 3000
 SIZE = 40
+_WIDE = 10.0
 _TUNED = 0.25
 """Share of the evaluations for the tuned controller that the front begins with."""
 
@@ -50,7 +51,7 @@ class ParetoFront:
         In these units, over plants and references.
     pick : int
         The knee: the controller closest to the best of every objective at once, each in shares of
-        its range on the front.
+        its range on the front, of ranges wider than 1 to 10 by the logarithm.
     evaluations : int
         Controllers tried.
     """
@@ -249,11 +250,12 @@ def _front(
         raise Interrupted(tuned)
     names = [name for name, _, _ in found["variables"]]
     notes = "on the front of " + ", ".join(objectives) + task.assumed
-    values = np.array(found["values"], dtype=np.float64)
+    # different controllers with the same values are one choice; the rows stay in their order
+    values, rows = np.unique(np.array(found["values"]), axis=0, return_index=True)
     front = ParetoFront(
         controllers=tuple(
-            applied(dict(zip(names, row, strict=True)), task.start, notes)
-            for row in found["controllers"]
+            applied(dict(zip(names, found["controllers"][i], strict=True)), task.start, notes)
+            for i in rows
         ),
         objectives=tuple(objectives),
         units=_units(objectives, task.start),
@@ -280,8 +282,15 @@ def _units(objectives: Sequence[str], controller: Controller) -> dict[str, str]:
     return {name: known.get(name, "") for name in objectives}
 
 
+def wide(column: NDArray[np.float64]) -> bool:
+    """Whether values are so far apart that ratios say more than differences."""
+    return bool(column.min() > 0.0 and column.max() > _WIDE * column.min())
+
+
 def knee(values: NDArray[np.float64]) -> int:
-    """The row closest to the least of every column at once, columns in shares of their range."""
-    low, high = values.min(axis=0), values.max(axis=0)
-    shares = (values - low) / np.where(high > low, high - low, 1.0)
-    return int(np.argmin(np.sum(shares**2, axis=1)))
+    """The row closest to the least of every column at once, columns in shares of their range; of
+    wide ranges by the logarithm.
+    """
+    columns = [np.log(c) if wide(c) else c for c in values.T]
+    shares = [(c - c.min()) / (np.ptp(c) or 1.0) for c in columns]
+    return int(np.argmin(np.sum(np.square(shares), axis=0)))

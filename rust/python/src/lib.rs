@@ -9,6 +9,7 @@ mod link;
 mod loop_transfer;
 mod machine;
 mod models;
+mod search;
 mod signals;
 mod speed;
 mod watch;
@@ -21,6 +22,7 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     let level = simd::level().map_err(|error| arrays::raise(module.py(), error))?;
     module.add("cpu", level.name())?;
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    search::register(module)?;
     signals::register(module)?;
     machine::register(module)?;
     speed::register(module)?;

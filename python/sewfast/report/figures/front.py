@@ -67,6 +67,10 @@ def _panel(axis: Axes, front: ParetoFront, i: int, j: int) -> None:
         x[k], y[k], s=90, marker="D", facecolor="none", edgecolor="#D55E00", lw=1.8,
         label="the knee", zorder=3,
     )  # fmt: skip
+    from ...front import wide
+
+    axis.set_xscale("log" if wide(x) else "linear")
+    axis.set_yscale("log" if wide(y) else "linear")
     axis.set_xlabel(_label(front, i))
     axis.set_ylabel(_label(front, j))
 
