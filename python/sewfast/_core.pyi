@@ -407,15 +407,6 @@ def closed_loop(
     is a FitError.
     """
 
-def fit_fopdt(u: _F, y: _F, *, Ts: float) -> dict[str, float]:
-    """K, T [s], L [s], offset, u_low, u_high, fit_percent, from a step response (paper Eq. 10-11)."""
-
-def table_1(K: float, T: float, L: float, *, nearest: bool = False) -> dict[str, float]:
-    """Kp, Ti, Td, alpha, beta by the paper's Table 1, interpolated; L/T outside .1 to 1 is an error.
-
-    ``nearest`` takes the end row there instead.
-    """
-
 def cost_terms(
     reference: _F, u: _F, y: _F, *, u_min: float, u_max: float, Ts: float,
 ) -> dict[str, float]:
@@ -452,6 +443,31 @@ def pareto(
     evaluations: int, seed: int, threads: int, progress: _Progress = None,
 ) -> dict[str, Any]:
     """Returns controllers (values of the variables), values (of the objectives), variables, evaluations, termination."""
+
+# --- rules.rs ---------------------------------------------------------------------------------------------
+
+def fit_fopdt(u: _F, y: _F, *, Ts: float) -> dict[str, Any]:
+    """K, T [s], L [s], offset, u_low, u_high, fit_percent, from a step response (paper Eq. 10-11)."""
+
+def table_1(K: float, T: float, L: float, *, nearest: bool = False) -> dict[str, float]:
+    """Kp, Ti, Td, alpha, beta by the paper's Table 1, interpolated; L/T outside .1 to 1 is an error.
+
+    ``nearest`` takes the end row there instead.
+    """
+
+def eq_12(K: float, T: float, L: float, *, Ms: float) -> dict[str, float]:
+    """Kp, Ti, Td, alpha, beta of the least Eq. 12 with max |S| of at most Ms; disturbance_cost, reference_cost, Ms."""
+
+def eq_12_costs(
+    ratio: float, *, KpK: float, Ti: float, Td: float, alpha: float, beta: float,
+) -> dict[str, float]:
+    """disturbance_cost, reference_cost, Ms of gains for L/T = ratio with K = T = 1."""
+
+def simc(K: float, T: float, L: float, *, tau_c: float, derivative: bool) -> dict[str, float]:
+    """Kp, Ti, Td, alpha, beta (Skogestad 2003; the derivative by L/3)."""
+
+def amigo(K: float, T: float, L: float) -> dict[str, float]:
+    """Kp, Ti, Td, alpha, beta (Astrom and Hagglund 2004)."""
 
 # --- loop_transfer.rs -------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Controllers: `Controller` with its files, coarse tuning from a step response."""
+"""Controllers: `Controller` with its files."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
-
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from typing import Any
 
 from . import _core, jsonfile
-from .errors import DataError, ModelFileError, SettingError, SewfastError
-from .gains import Form, Gains, real, whole
+from .errors import ModelFileError, SettingError, SewfastError
+from .fopdt import Fopdt, fit_fopdt
+from .gains import Form, Gains, real, vector, whole
 from .models.fields import Fields
+from .rules import Rule, table_1
 from .units import counts_per_unit
 
 __all__ = [
@@ -27,6 +26,7 @@ __all__ = [
     "load_controller",
     "paper_controller",
     "table_1",
+    "vector",
 ]
 
 FORMAT = "sewfast.controller"
@@ -304,123 +304,3 @@ def paper_controller() -> Controller:
         counts_per_rev=1572.0,
         notes="gains of the paper, read as per-sample gains",
     )
-
-
-@dataclass(frozen=True)
-class Fopdt:
-    """First order plus dead time, `K e^(-sL) / (1 + sT)`, about a step (paper Eq. 10-11).
-
-    Parameters
-    ----------
-    K : float
-        Gain [y/u].
-    T, L : float
-        Time constant and dead time [s].
-    offset : float
-        The output settles at `K u + offset` [y].
-    u_low, u_high : float
-        Input before and after the step [u].
-    fit_percent : float
-        100 (1 - |y - model| / |y - mean(y)|) over the samples used.
-    u_unit, y_unit : str
-        Units of input and output.
-    """
-
-    K: float
-    T: float
-    L: float
-    offset: float = 0.0
-    u_low: float = 0.0
-    u_high: float = 1.0
-    fit_percent: float = math.nan
-    u_unit: str = "V"
-    y_unit: str = "RPM"
-
-    def response(self, t: ArrayLike) -> NDArray[np.float64]:
-        """The output at times `t` [s] after the step, shape as `t`; `t` may be negative."""
-        since = np.maximum(np.asarray(t, dtype=np.float64) - self.L, 0.0)
-        share = -np.expm1(-since / self.T)
-        return np.asarray(self.offset + self.K * (self.u_low + share * (self.u_high - self.u_low)))
-
-    def __str__(self) -> str:
-        return (
-            f"K {self.K:.6g} {self.y_unit}/{self.u_unit}, T {self.T:.6g} s, L {self.L:.6g} s "
-            f"(L/T {self.L / self.T:.3g}), fit {self.fit_percent:.2f} %"
-        )
-
-
-def fit_fopdt(
-    u: ArrayLike, y: ArrayLike, *, Ts: float, u_unit: str = "V", y_unit: str = "RPM"
-) -> Fopdt:
-    """First-order-plus-dead-time approximation of a measured step response.
-
-    Least squares over K, T, L and the level before the step. The record is used from its start to
-    the second step of the input; the first may be anywhere after some samples.
-
-    Parameters
-    ----------
-    u, y : array, shape (N,)
-        Input and output; a raw speed with its quantisation will do.
-    Ts : float
-        Sample time [s].
-
-    Raises
-    ------
-    DataError
-        Without a step, or where the response does not settle or drowns in noise.
-    SettingError
-        For a sample time that is not above 0.
-    """
-    found = _core.fit_fopdt(vector("u", u), vector("y", y), Ts=real("Ts", Ts))
-    return Fopdt(**found, u_unit=u_unit, y_unit=y_unit)
-
-
-@dataclass(frozen=True)
-class Rule:
-    """What a tuning rule gives: gains in standard form, alpha, beta."""
-
-    gains: Gains
-    alpha: float
-    beta: float
-
-
-def table_1(fopdt: Fopdt, *, outside: Literal["error", "nearest"] = "error") -> Rule:
-    """Coarse tuning by the paper's Table 1, interpolated in L/T.
-
-    Parameters
-    ----------
-    fopdt : Fopdt
-    outside : "error" or "nearest"
-        What to do where L/T is not in .1 to 1. The nearest row below .1 is the row for `L = .1 T`,
-        a longer dead time than the plant's: conservative. Above 1 it is not.
-
-    Raises
-    ------
-    SettingError
-        Where L/T is outside the table and no row is to be taken instead, or for K = 0 or T <= 0.
-    """
-    if outside not in ("error", "nearest"):
-        raise SettingError(f"expected outside='error' or 'nearest', got {outside!r}")
-    found = _core.table_1(fopdt.K, fopdt.T, fopdt.L, nearest=outside == "nearest")
-    units = {"u_unit": fopdt.u_unit, "y_unit": fopdt.y_unit}
-    gains = Gains.standard(found["Kp"], found["Ti"], found["Td"], **units)
-    return Rule(gains, found["alpha"], found["beta"])
-
-
-def vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """The values as float64, shape (N,), C-contiguous.
-
-    Raises
-    ------
-    DataError
-        For values that are not numbers or not one-dimensional.
-    """
-    try:
-        if np.iscomplexobj(values):
-            raise TypeError("complex ones; take their real part")
-        array = np.ascontiguousarray(values, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"expected numbers in {name}, got {error}") from error
-    if np.ndim(values) != 1:
-        raise DataError(f"expected {name} of shape (N,), got {np.shape(values)}; give one column")
-    return array

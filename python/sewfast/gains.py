@@ -6,8 +6,11 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from . import _core
-from .errors import SettingError
+from .errors import DataError, SettingError
 
 Form: TypeAlias = Literal["standard", "parallel", "per_sample"]
 
@@ -35,6 +38,25 @@ def whole(name: str, value: Any) -> int:
     if not (0 <= number < 2**63 and number.is_integer()):
         raise SettingError(f"expected a whole number of 0 or more for {name}, got {value!r}")
     return int(value)
+
+
+def vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """The values as float64, shape (N,), C-contiguous.
+
+    Raises
+    ------
+    DataError
+        For values that are not numbers or not one-dimensional.
+    """
+    try:
+        if np.iscomplexobj(values):
+            raise TypeError("complex ones; take their real part")
+        array = np.ascontiguousarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DataError(f"expected numbers in {name}, got {error}") from error
+    if np.ndim(values) != 1:
+        raise DataError(f"expected {name} of shape (N,), got {np.shape(values)}; give one column")
+    return array
 
 
 @dataclass(frozen=True)

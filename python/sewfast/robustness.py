@@ -176,8 +176,8 @@ def scheduled_gains(controller: Controller, speed: float | None) -> tuple[Gains,
         raise SettingError(
             "expected the speed at which the gain schedule is taken, received none; give speed"
         )
-    at = np.array([point[0] for point in schedule])
-    rows = [point[1].to("parallel") for point in schedule]
+    at = np.array([point[0] for point in controller.schedule])
+    rows = [point[1].to("parallel") for point in controller.schedule]
     size = abs(real("speed", speed))
     Kp, Ki, Kd = (
         float(np.interp(size, at, [getattr(g, name) for g in rows])) for name in ("Kp", "Ki", "Kd")

@@ -345,7 +345,7 @@ def _controller(controller: Controller) -> dict[str, Any]:
 
 def _show_gains(args: argparse.Namespace, controller: Controller) -> None:
     print("the same gains in every form:")
-    print_rows([_gain_row(g) for g in _forms(controller)])
+    print_rows([gain_row(g) for g in _forms(controller)])
     print(f"written to {args.out}; try it: sewfast run {args.out} --on MODEL.json|virtual "
           "--reference NAME")  # fmt: skip
 
@@ -354,7 +354,7 @@ def _forms(controller: Controller) -> list[Gains]:
     return [controller.gains.to(form, Ts=controller.Ts) for form in FORMS]  # type: ignore[arg-type]
 
 
-def _gain_row(gains: Gains) -> list[str]:
+def gain_row(gains: Gains) -> list[str]:
     """Form, then each number with its unit."""
     values = gains.to_dict()
     cells = [f"{name} = {values[name]:.6g} {unit}" for name, unit in gains.units.items()]

@@ -1,4 +1,11 @@
-//! Tuning rules from a first-order-plus-dead-time model: Table 1 of the paper.
+//! Tuning rules from a first-order-plus-dead-time model: Table 1 of the paper, Eq. 12 itself, SIMC and AMIGO.
+
+mod direct;
+mod eq_12;
+mod simplex;
+
+pub use direct::{amigo, simc};
+pub use eq_12::{Costs, costs, eq_12};
 
 use sewfast_control::Standard;
 
@@ -48,16 +55,12 @@ pub enum Outside {
 /// `ErrorKind::Setting` for a `K` of 0, a `T` that is not above 0, a negative `L`, or `L/T` outside .1 to 1 unless
 /// the nearest row is asked for.
 pub fn table_1(k: f64, t: f64, l: f64, outside: Outside) -> Result<Rule> {
-    if !(k != 0.0 && k.is_finite() && t > 0.0 && t.is_finite() && l >= 0.0 && l.is_finite()) {
-        return Err(Error::setting(format!(
-            "expected a gain K other than 0, T above 0 s and L of 0 s or more, got K = {k}, T = {t}, L = {l}"
-        )));
-    }
+    require_plant(k, t, l)?;
     let ratio = l / t;
     if outside == Outside::Error && !(0.1..=1.0).contains(&ratio) {
         return Err(Error::setting(format!(
             "expected L/T from .1 to 1 for Table 1, got {ratio:.4}; take the nearest row (outside = \"nearest\", which \
-             below .1 means L = .1 T and is conservative), or tune by simulation"
+             below .1 means L = .1 T and is conservative), or eq_12"
         )));
     }
     let [kp_k, ti, td, alpha, beta] = interpolate(ratio.clamp(0.1, 1.0));
@@ -67,6 +70,15 @@ pub fn table_1(k: f64, t: f64, l: f64, outside: Outside) -> Result<Rule> {
         td: td * t,
     };
     Ok(Rule { gains, alpha, beta })
+}
+
+fn require_plant(k: f64, t: f64, l: f64) -> Result<()> {
+    if !(k != 0.0 && k.is_finite() && t > 0.0 && t.is_finite() && l >= 0.0 && l.is_finite()) {
+        return Err(Error::setting(format!(
+            "expected a gain K other than 0, T above 0 s and L of 0 s or more, got K = {k}, T = {t}, L = {l}"
+        )));
+    }
+    Ok(())
 }
 
 fn interpolate(ratio: f64) -> [f64; 5] {

@@ -9,10 +9,8 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_control::{Parallel, PerSample, Refused, Standard};
 use sewfast_core::closed_loop::{self as looped, Outcome, Run, Signals};
-use sewfast_core::fopdt::fit_fopdt as fit;
 use sewfast_core::metrics::{self, Effort};
-use sewfast_core::rules::{self, Outside};
-use sewfast_core::{Error, Record, Result};
+use sewfast_core::{Error, Result};
 
 use crate::arrays::{array1, raise, slice};
 use crate::watch::watched;
@@ -26,8 +24,6 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Controller>()?;
     module.add_function(wrap_pyfunction!(convert_gains, module)?)?;
     module.add_function(wrap_pyfunction!(closed_loop, module)?)?;
-    module.add_function(wrap_pyfunction!(fit_fopdt, module)?)?;
-    module.add_function(wrap_pyfunction!(table_1, module)?)?;
     module.add_function(wrap_pyfunction!(step_metrics, module)?)?;
     module.add_function(wrap_pyfunction!(effort, module)?)?;
     tuning::register(module)
@@ -144,53 +140,6 @@ fn completed(run: Run, ts: f64) -> Result<Run> {
 }
 
 #[pyfunction]
-#[pyo3(signature = (u, y, *, Ts))]
-#[expect(non_snake_case, reason = "the field's name for the sample time")]
-fn fit_fopdt<'py>(
-    py: Python<'py>,
-    u: Values<'py>,
-    y: Values<'py>,
-    Ts: f64,
-) -> PyResult<Bound<'py, PyDict>> {
-    let record = Record::new(slice(&u, "u")?, 1, slice(&y, "y")?).map_err(|e| raise(py, e))?;
-    let found = watched(py, None, |_| fit(record, Ts))?;
-    named(
-        py,
-        [
-            ("K", found.k),
-            ("T", found.t),
-            ("L", found.l),
-            ("offset", found.offset),
-            ("u_low", found.u_low),
-            ("u_high", found.u_high),
-            ("fit_percent", found.fit_percent),
-        ],
-    )
-}
-
-#[pyfunction]
-#[pyo3(signature = (K, T, L, *, nearest=false))]
-#[expect(non_snake_case, reason = "the field's names")]
-fn table_1(py: Python<'_>, K: f64, T: f64, L: f64, nearest: bool) -> PyResult<Bound<'_, PyDict>> {
-    let outside = if nearest {
-        Outside::Nearest
-    } else {
-        Outside::Error
-    };
-    let rule = rules::table_1(K, T, L, outside).map_err(|e| raise(py, e))?;
-    named(
-        py,
-        [
-            ("Kp", rule.gains.kp),
-            ("Ti", rule.gains.ti),
-            ("Td", rule.gains.td),
-            ("alpha", rule.alpha),
-            ("beta", rule.beta),
-        ],
-    )
-}
-
-#[pyfunction]
 #[pyo3(signature = (y, reference, *, Ts, smoothing))]
 #[expect(non_snake_case, reason = "the field's name for the sample time")]
 fn step_metrics<'py>(
@@ -237,7 +186,7 @@ fn effort<'py>(
 }
 
 /// A dict of numbers by name.
-fn named<'py, const N: usize>(
+pub fn named<'py, const N: usize>(
     py: Python<'py>,
     values: [(&str, f64); N],
 ) -> PyResult<Bound<'py, PyDict>> {

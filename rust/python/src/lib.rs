@@ -9,6 +9,7 @@ mod link;
 mod loop_transfer;
 mod machine;
 mod models;
+mod rules;
 mod search;
 mod signals;
 mod speed;
@@ -31,6 +32,7 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     least_squares::register(module)?;
     control::register(module)?;
     loop_transfer::register(module)?;
+    rules::register(module)?;
     link::register(module)?;
     device::register(module)
 }

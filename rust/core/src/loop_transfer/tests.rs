@@ -52,6 +52,7 @@ fn phasor(x: &[f64], theta: f64) -> Complex<f64> {
 fn the_path_is_the_controllers() {
     let mut path = path(0.02, 0.1, 0.02);
     (path.n, path.filter_samples, path.filter_time) = (6.0, 8, 0.004);
+    path.observer_time = 0.003;
     for period in [10_usize, 40, 200] {
         let theta = std::f64::consts::TAU / period as f64;
         let mut controller = controller(&path);
@@ -111,6 +112,7 @@ fn a_sine_through_the_closed_loop_comes_out_as_the_formula_says() {
 fn noise_gain_is_that_of_the_impulse_response() {
     let mut path = path(0.01, 0.08, 0.012);
     (path.n, path.filter_samples, path.filter_time) = (8.0, 5, 0.002);
+    path.observer_time = 0.004;
     let plant = drive();
     let mut controller = controller(&path);
     let mut past = vec![0.0; plant.num.len()];

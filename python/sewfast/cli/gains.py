@@ -1,0 +1,185 @@
+"""`sewfast gains`: first gains by a tuning rule, in every form, with their margins."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from ..errors import SettingError
+from .arguments import Commands, add_columns, add_command, add_output, require_place
+from .data import read_training
+from .output import print_json, print_rows
+from .tune import FORMS, gain_row
+
+if TYPE_CHECKING:
+    from ..control import Controller, Fopdt
+    from ..robustness import Margins
+    from ..rules import Rule
+
+RULES = ("eq-12", "table-1", "simc", "simc-pid", "amigo")
+FILTER = 8
+N = 10.0
+
+TEXT = """\
+First gains for a drive, from a recorded step response or from K, T and L of K e^(-sL)/(1 + sT).
+
+A rule gives gains, alpha and beta; printed are the gains in all three forms and the margins of the
+sampled loop with hold, derivative filter, feedback filter and encoder in it. What hold, filter and
+encoder add to the dead time is added to L before the rule is asked.
+"""
+
+EXAMPLES = """\
+examples:
+  sewfast gains step.csv --input u --output y
+  sewfast gains step.mcap --rule amigo -o controller.json
+  sewfast gains --K 490 --T 0.25 --L 0.0075 --rule eq-12 --Ms 2
+  sewfast gains --K 490 --T 0.25 --L 0.0075 --rule simc --tau-c 0.02 --form per-sample
+"""
+
+
+def add(commands: Commands) -> None:
+    parser = add_command(
+        commands, "gains", gains_command,
+        summary="first gains by a tuning rule, with margins", text=TEXT, examples=EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument(
+        "data", nargs="?", metavar="DATA", help="recording of one step: FILE or FILE:IN:OUT"
+    )
+    for name, unit in (("K", "output/command"), ("T", "s"), ("L", "s")):
+        parser.add_argument(f"--{name}", type=float, metavar=name, help=f"of the plant [{unit}]")
+    parser.add_argument("--rule", choices=RULES, default="eq-12", help="tuning rule (eq-12)")
+    parser.add_argument(
+        "--Ms", type=float, metavar="MS",
+        help="eq-12: largest sensitivity that is allowed (2.0); inf: the paper's optimum",
+    )  # fmt: skip
+    parser.add_argument(
+        "--tau-c", type=float, metavar="S", help="simc: time constant of the closed loop [s]"
+    )
+    parser.add_argument(
+        "--nearest", action="store_true", help="table-1: the end row where L/T is outside .1 to 1"
+    )
+    parser.add_argument(
+        "--filter", type=int, default=FILTER, metavar="N",
+        help="moving average over N samples of the feedback (8); 1: none",
+    )  # fmt: skip
+    parser.add_argument(
+        "--N", type=float, default=N, metavar="N",
+        help="the derivative is filtered with Td/N (10); inf: not",
+    )  # fmt: skip
+    parser.add_argument("--u-min", type=float, default=-20.0, metavar="V", help="(-20)")
+    parser.add_argument("--u-max", type=float, default=20.0, metavar="V", help="(20)")
+    parser.add_argument(
+        "--form", choices=[f.replace("_", "-") for f in FORMS], default="standard",
+        help="form of the gains in the controller's file (standard)",
+    )  # fmt: skip
+    add_columns(parser, from_model=False)
+    add_output(parser, "CONTROLLER.json", "controller file to write")
+
+
+def gains_command(args: argparse.Namespace) -> None:
+    from ..robustness import margins
+
+    require_place(args.out, (".json",))
+    fopdt, Ts = _plant(args)
+    rule = _rule(args, _delayed(args, fopdt, Ts))
+    controller = _controller(args, rule, fopdt, Ts)
+    found = margins(controller, fopdt)
+    if args.out is not None:
+        controller.save(args.out)
+    if args.json:
+        print_json(_summary(args, fopdt, rule, controller, found))
+        return
+    _show(args, fopdt, rule, controller, found)
+
+
+def _plant(args: argparse.Namespace) -> tuple[Fopdt, float]:
+    """The first-order model and the sample time."""
+    from ..control import Fopdt, fit_fopdt
+
+    given = [args.K, args.T, args.L]
+    if (args.data is None) == (None in given):
+        raise SettingError("expected either a recording of a step, or --K, --T and --L")
+    if args.data is None:
+        return Fopdt(*given), 0.001 if args.ts is None else args.ts
+    data = read_training(argparse.Namespace(**{**vars(args), "data": [args.data]}))
+    step = data.experiments[0]
+    if len(data.experiments) != 1 or step.u.shape[1] != 1:
+        raise SettingError("expected one experiment with one input, a step")
+    units = {"u_unit": data.input_units[0] or "V", "y_unit": data.output_unit or "RPM"}
+    return fit_fopdt(step.u[:, 0], step.y, Ts=data.Ts, **units), data.Ts
+
+
+def _delayed(args: argparse.Namespace, fopdt: Fopdt, Ts: float) -> Fopdt:
+    """The plant with the delays of hold, feedback filter and encoder in its dead time."""
+    from dataclasses import replace
+
+    samples = 0.5 + (args.filter - 1) / 2 + (0.5 if args.counts_per_rev else 0.0)
+    return replace(fopdt, L=fopdt.L + samples * Ts)
+
+
+def _rule(args: argparse.Namespace, plant: Fopdt) -> Rule:
+    from .. import rules
+
+    for option, value, rule in (
+        ("--Ms", args.Ms, "eq-12"), ("--tau-c", args.tau_c, "simc"),
+        ("--nearest", args.nearest or None, "table-1"),
+    ):  # fmt: skip
+        if value is not None and not args.rule.startswith(rule):
+            raise SettingError(f"{option} belongs to the rule {rule}, received {args.rule}")
+    if args.rule == "eq-12":
+        return rules.eq_12(plant, Ms=2.0 if args.Ms is None else args.Ms)
+    if args.rule == "table-1":
+        return rules.table_1(plant, outside="nearest" if args.nearest else "error")
+    if args.rule == "amigo":
+        return rules.amigo(plant)
+    return rules.simc(plant, tau_c=args.tau_c, kind="PI" if args.rule == "simc" else "PID")
+
+
+def _controller(args: argparse.Namespace, rule: Rule, fopdt: Fopdt, Ts: float) -> Controller:
+    from ..control import Controller
+
+    form = args.form.replace("-", "_")
+    return Controller(
+        gains=rule.gains.to(form, Ts=Ts),
+        Ts=Ts,
+        alpha=rule.alpha,
+        beta=rule.beta,
+        N=args.N,
+        u_min=args.u_min,
+        u_max=args.u_max,
+        filter_samples=args.filter,
+        counts_per_rev=args.counts_per_rev,
+        notes=f"{rule.name} from K {fopdt.K:.6g}, T {fopdt.T:.6g} s, L {fopdt.L:.6g} s",
+    )
+
+
+def _forms(controller: Controller) -> list[Any]:
+    return [controller.gains.to(form, Ts=controller.Ts) for form in FORMS]  # type: ignore[arg-type]
+
+
+def _summary(
+    args: argparse.Namespace, fopdt: Fopdt, rule: Rule, controller: Controller, found: Margins
+) -> dict[str, Any]:
+    names = ("K", "T", "L", "K_se", "T_se", "L_se", "offset", "fit_percent", "limited", "moving")
+    return {
+        "file": None if args.out is None else str(args.out),
+        "plant": {name: getattr(fopdt, name) for name in names},
+        "rule": {"name": rule.name, "alpha": rule.alpha, "beta": rule.beta, **rule.costs},
+        "gains": {g.form: {**g.to_dict(), "units": g.units} for g in _forms(controller)},
+        "margins": found.to_dict(),
+        "controller": controller.to_dict(),
+    }
+
+
+def _show(
+    args: argparse.Namespace, fopdt: Fopdt, rule: Rule, controller: Controller, found: Margins
+) -> None:
+    print(f"plant    {fopdt}")
+    print(f"rule     {rule.name}: alpha {rule.alpha:.4g}, beta {rule.beta:.4g}")
+    print("gains")
+    print_rows([gain_row(g) for g in _forms(controller)])
+    print("margins")
+    print("\n".join(f"  {line}" for line in str(found).splitlines()))
+    if args.out is not None:
+        print(f"written to {args.out}; a controller that was tuned on a model follows the machine "
+              "better: sewfast tune")  # fmt: skip

@@ -1,0 +1,165 @@
+"""Tuning rules: gains, alpha and beta from a first-order model with dead time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from . import _core
+from .errors import SettingError
+from .fopdt import Fopdt
+from .gains import Gains, real
+
+__all__ = ["BY_NAME", "Rule", "amigo", "by_name", "eq_12", "simc", "table_1"]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a tuning rule gives.
+
+    Attributes
+    ----------
+    gains : Gains
+        In standard form.
+    alpha, beta : float
+        Shares of the reference taken out of the proportional and of the derivative term.
+    name : str
+        Of the rule.
+    costs : dict
+        Of Eq. 12 with `K = T = 1`: `disturbance_cost`, `reference_cost`, and `Ms` of the loop in
+        continuous time; empty for other rules.
+    """
+
+    gains: Gains
+    alpha: float
+    beta: float
+    name: str = ""
+    costs: dict[str, float] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{self.gains}, alpha {self.alpha:.4g}, beta {self.beta:.4g} ({self.name})"
+
+
+def table_1(fopdt: Fopdt, *, outside: Literal["error", "nearest"] = "error") -> Rule:
+    """Coarse tuning by the paper's Table 1, interpolated in L/T.
+
+    Parameters
+    ----------
+    fopdt : Fopdt
+    outside : "error" or "nearest"
+        What to do where L/T is not in .1 to 1. The nearest row below .1 is the row for `L = .1 T`,
+        a longer dead time than the plant's: conservative. Above 1 it is not.
+
+    Raises
+    ------
+    SettingError
+        Where L/T is outside the table and no row is to be taken instead, or for K = 0 or T <= 0.
+    """
+    if outside not in ("error", "nearest"):
+        raise SettingError(f"expected outside='error' or 'nearest', got {outside!r}")
+    found = _core.table_1(fopdt.K, fopdt.T, fopdt.L, nearest=outside == "nearest")
+    return _rule(fopdt, found, "table-1")
+
+
+def eq_12(fopdt: Fopdt, *, Ms: float = math.inf) -> Rule:
+    """Gains of the least Eq. 12 for any L/T from .01 to 2; Table 1 is its print at ten ratios.
+
+    The gains minimise the paper's integral after a step of the disturbance, alpha and beta that
+    after a step of the reference. Without a limit the loops are fragile: Ms is 2.3 to 3.5.
+
+    Parameters
+    ----------
+    fopdt : Fopdt
+    Ms : float
+        Largest |S| that is allowed, in continuous time; 1.4 to 2 is usual, inf for none.
+
+    Raises
+    ------
+    SettingError
+        Where L/T is outside .01 to 2, for K = 0 or T <= 0, or an Ms of 1.1 or less.
+    """
+    found = _core.eq_12(fopdt.K, fopdt.T, fopdt.L, Ms=real("Ms", Ms))
+    costs = {name: found[name] for name in ("disturbance_cost", "reference_cost", "Ms")}
+    limit = "" if math.isinf(Ms) else f", Ms <= {Ms:g}"
+    return replace(_rule(fopdt, found, f"eq-12{limit}"), costs=costs)
+
+
+def simc(fopdt: Fopdt, *, tau_c: float | None = None, kind: Literal["PI", "PID"] = "PI") -> Rule:
+    """SIMC: the closed loop is to be a lag of time constant `tau_c` behind the dead time.
+
+    Parameters
+    ----------
+    fopdt : Fopdt
+    tau_c : float, optional
+        [s]; smaller is faster and less robust. By default L for PI, and L/2 for PID, which gives
+        about the same Ms of 1.6 to 1.7.
+    kind : "PI" or "PID"
+        PID adds a derivative of L/3 on the output; from series to standard form exactly.
+
+    Raises
+    ------
+    SettingError
+        For K = 0, T <= 0, another kind, or a tau_c that is negative, or 0 where L is.
+
+    References
+    ----------
+    S. Skogestad, J. Process Control 13, 2003; C. Grimholt, S. Skogestad, J. Process Control 70,
+    2018 (the derivative).
+    """
+    if kind not in ("PI", "PID"):
+        raise SettingError(f"expected kind='PI' or 'PID', got {kind!r}")
+    usual = fopdt.L if kind == "PI" else fopdt.L / 2
+    tau = usual if tau_c is None else real("tau_c", tau_c)
+    found = _core.simc(fopdt.K, fopdt.T, fopdt.L, tau_c=tau, derivative=kind == "PID")
+    return _rule(fopdt, found, f"simc-{kind.lower()}, tau_c {tau:g} s")
+
+
+def amigo(fopdt: Fopdt) -> Rule:
+    """AMIGO: PID gains fitted to what is best for integral error with Ms and Mt of at most 1.4.
+
+    Raises
+    ------
+    SettingError
+        For K = 0, T <= 0 or L = 0.
+
+    References
+    ----------
+    K. J. Astrom, T. Hagglund, J. Process Control 14, 2004.
+    """
+    return _rule(fopdt, _core.amigo(fopdt.K, fopdt.T, fopdt.L), "amigo")
+
+
+def _simc_pid(fopdt: Fopdt) -> Rule:
+    return simc(fopdt, kind="PID")
+
+
+BY_NAME: dict[str, Callable[[Fopdt], Rule]] = {
+    "table-1": table_1,
+    "eq-12": eq_12,
+    "simc": simc,
+    "simc-pid": _simc_pid,
+    "amigo": amigo,
+}
+"""Every rule with its defaults."""
+
+
+def by_name(name: str) -> Callable[[Fopdt], Rule]:
+    """The rule of that name; `_` counts as `-`.
+
+    Raises
+    ------
+    SettingError
+        For another name.
+    """
+    rule = BY_NAME.get(str(name).replace("_", "-").lower())
+    if rule is None:
+        raise SettingError(f"expected a rule out of {', '.join(BY_NAME)}, got {name!r}")
+    return rule
+
+
+def _rule(fopdt: Fopdt, found: dict[str, Any], name: str) -> Rule:
+    units = {"u_unit": fopdt.u_unit, "y_unit": fopdt.y_unit}
+    gains = Gains.standard(found["Kp"], found["Ti"], found["Td"], **units)
+    return Rule(gains, found["alpha"], found["beta"], name)
