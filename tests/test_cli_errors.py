@@ -276,7 +276,24 @@ def test_reference_file_without_r_or_at_another_rate(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [("--u-min", 5, "--u-max", -5), ("--filter", 0), ("--counts-per-rev", -1)]
+    "options",
+    [
+        ("--u-min", 5, "--u-max", -5),
+        ("--filter", 0),
+        ("--counts-per-rev", -1),
+        ("--cost", "chater=1"),
+        ("--cost", "chatter"),
+        ("--cost", "chatter=-1"),
+        ("--constraint", "plant=1"),
+        ("--constraint", "Ms=0.5"),
+        ("--variables", "Kp=1"),
+        ("--variables", "Kq"),
+        ("--evaluations", 0),
+        ("--front", "front.csv"),
+        ("--pareto", "tracking"),
+        ("--pareto", "tracking,chatter", "--front", "front.txt"),
+        ("--pareto", "tracking,chatter", "--method", "cma-es"),
+    ],
 )
 def test_settings_of_tune(folder: Path, options: tuple[object, ...]) -> None:
     refused(folder, "tune", "drive.json", "-o", "new.json", *options)
