@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from . import signals, trust
+    from . import rules, signals, trust
     from ._core import __version__
     from .analysis import Analysis, analyse
     from .commissioning import Commissioning, commission
@@ -98,6 +98,7 @@ __all__ = [
     "read",
     "read_table",
     "record",
+    "rules",
     "run",
     "signals",
     "speed_from_counts",

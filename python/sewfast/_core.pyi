@@ -447,7 +447,10 @@ def pareto(
 # --- rules.rs ---------------------------------------------------------------------------------------------
 
 def fit_fopdt(u: _F, y: _F, *, Ts: float) -> dict[str, Any]:
-    """K, T [s], L [s], offset, u_low, u_high, fit_percent, from a step response (paper Eq. 10-11)."""
+    """K, T [s], L [s], offset, u_low, u_high, fit_percent, from a step response (paper Eq. 10-11).
+
+    K_se, T_se, L_se: standard errors; limited: samples on a limit of the output; moving: not from rest.
+    """
 
 def table_1(K: float, T: float, L: float, *, nearest: bool = False) -> dict[str, float]:
     """Kp, Ti, Td, alpha, beta by the paper's Table 1, interpolated; L/T outside .1 to 1 is an error.

@@ -12,7 +12,7 @@ from .errors import SettingError
 from .fopdt import Fopdt
 from .gains import Gains, real
 
-__all__ = ["BY_NAME", "Rule", "amigo", "by_name", "eq_12", "simc", "table_1"]
+__all__ = ["BY_NAME", "Fopdt", "Rule", "amigo", "by_name", "eq_12", "simc", "table_1"]
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def eq_12(fopdt: Fopdt, *, Ms: float = math.inf) -> Rule:
     """Gains of the least Eq. 12 for any L/T from .01 to 2; Table 1 is its print at ten ratios.
 
     The gains minimise the paper's integral after a step of the disturbance, alpha and beta that
-    after a step of the reference. Without a limit the loops are fragile: Ms is 2.3 to 3.5.
+    after a step of the reference. Without a limit the loops are fragile: Ms is 2 to 3.2.
 
     Parameters
     ----------

@@ -1,5 +1,9 @@
 //! First-order-plus-dead-time approximation (paper Eq. 10-11) of a measured step response.
 
+mod confidence;
+
+use nalgebra::{Matrix3, Vector3};
+
 use crate::{Error, Record, Result};
 
 /// `K e^(-sL) / (1 + sT)` about an operating point, with the story of its fit.
@@ -19,6 +23,12 @@ pub struct Fopdt {
     pub u_high: f64,
     /// `100 (1 - |y - model| / |y - mean(y)|)` over the samples used.
     pub fit_percent: f64,
+    /// Standard errors of `K`, `T` and `L`, for residuals of any colour.
+    pub errors: [f64; 3],
+    /// Samples on a limit of the output, which had no weight.
+    pub limited: usize,
+    /// Whether the machine was still moving before the step; its free response was fitted too.
+    pub moving: bool,
 }
 
 /// A change of the input by more than this share of its range is a step.
@@ -27,15 +37,23 @@ const STEP_SHARE: f64 = 0.05;
 const FEWEST: usize = 10;
 /// A response is settled once this share of it has passed.
 const SETTLED: f64 = 0.95;
+/// A free response must lower the squares to this share to be believed.
+const CLEARLY: f64 = 0.99;
+/// What a response must go beyond a limit by, as a share of its rise.
+const BEYOND: f64 = 0.005;
 /// Points of the search in each direction.
 const GRID: usize = 21;
+/// The same once the search is narrowed.
+const NARROWED: usize = 13;
 /// Times that the search is narrowed about the best point, each time to a half.
 const ROUNDS: usize = 26;
 
 /// Fits the response to the first step in a record with one input.
 ///
 /// `K` and the level before the step follow by linear least squares for each `T` and `L` of a search that is narrowed
-/// until its steps are below a millionth. The record is used from its start to the next step of the input.
+/// until its steps are below a millionth. The record is used from its start to the next step of the input. Where a response with
+/// the same `T` that began before the record lowers the squares by a percent, it is part of the fit. Samples at the largest
+/// output have no weight where the response without them would go on beyond: the output was limited there.
 ///
 /// # Errors
 /// `ErrorKind::Data` without a step, with too few samples after it or a response that does not settle or drowns in
@@ -47,10 +65,14 @@ pub fn fit_fopdt(record: Record<'_>, ts: f64) -> Result<Fopdt> {
             record.channels
         )));
     }
-    let step = Step::find(record)?;
-    let best = step.search();
+    let mut step = Step::find(record)?;
+    let mut best = step.best();
+    if let Some((used, beyond)) = step.without_limit(&best) {
+        (step.used, best) = (used, beyond);
+    }
     step.check(&best)?;
     let gain = best.rise / (step.u_high - step.u_low);
+    let [rise, t, l] = confidence::errors(&step, &best);
     Ok(Fopdt {
         k: gain,
         t: best.t * ts,
@@ -59,6 +81,9 @@ pub fn fit_fopdt(record: Record<'_>, ts: f64) -> Result<Fopdt> {
         u_low: step.u_low,
         u_high: step.u_high,
         fit_percent: 100.0 * (1.0 - (best.cost / step.spread()).sqrt()),
+        errors: [rise / (step.u_high - step.u_low).abs(), t * ts, l * ts],
+        limited: step.used.iter().filter(|used| !**used).count(),
+        moving: step.moving,
     })
 }
 
@@ -69,16 +94,37 @@ struct Step<'a> {
     at: usize,
     u_low: f64,
     u_high: f64,
+    /// Which samples have weight.
+    used: Vec<bool>,
+    /// Whether a free response is part of the fit.
+    moving: bool,
 }
 
-/// A candidate: `y(k) = level + rise (1 - exp(-(k - at - l)/t))`.
-#[derive(Clone, Copy)]
+/// A candidate: `y(k) = level + rise (1 - exp(-(k - at - l)/t)) + free exp(-k/t)`.
+#[derive(Clone, Copy, Debug)]
 struct Candidate {
     t: f64,
     l: f64,
     level: f64,
     rise: f64,
+    free: f64,
     cost: f64,
+}
+
+impl Candidate {
+    /// The response to the step, of size 1, at sample `k`.
+    fn share(&self, k: usize, at: usize) -> f64 {
+        let since = k as f64 - at as f64 - self.l;
+        if since > 0.0 {
+            -(-since / self.t).exp_m1()
+        } else {
+            0.0
+        }
+    }
+
+    fn output(&self, k: usize, at: usize) -> f64 {
+        self.level + self.rise * self.share(k, at) + self.free * (-(k as f64) / self.t).exp()
+    }
 }
 
 impl<'a> Step<'a> {
@@ -109,6 +155,8 @@ impl<'a> Step<'a> {
             at,
             u_low: mean(&u[..at]),
             u_high: mean(&u[at..end]),
+            used: vec![true; end],
+            moving: false,
         })
     }
 
@@ -117,9 +165,80 @@ impl<'a> Step<'a> {
         (self.y.len() - self.at) as f64
     }
 
+    /// Outputs with weight, and their places.
+    fn samples(&self) -> impl Iterator<Item = (usize, f64)> {
+        let with_weight = |(k, &y): (usize, &f64)| self.used[k].then_some((k, y));
+        self.y.iter().enumerate().filter_map(with_weight)
+    }
+
+    fn count(&self) -> usize {
+        self.samples().count()
+    }
+
     fn spread(&self) -> f64 {
-        let mean = self.y.iter().sum::<f64>() / self.y.len() as f64;
-        self.y.iter().map(|y| (y - mean).powi(2)).sum()
+        let mean = self.samples().map(|(_, y)| y).sum::<f64>() / self.count() as f64;
+        self.samples().map(|(_, y)| (y - mean).powi(2)).sum()
+    }
+
+    /// The best candidate from rest, or of a machine that still moved where that is clearly better.
+    fn best(&mut self) -> Candidate {
+        self.moving = false;
+        let from_rest = self.search();
+        let clearly = |other: &Candidate| {
+            other.cost < CLEARLY * from_rest.cost && from_rest.cost > self.rounding()
+        };
+        if self.at >= FEWEST {
+            let in_motion = Step {
+                used: self.used.clone(),
+                moving: true,
+                ..*self
+            };
+            // what helps at the best point of the other search is worth one of its own
+            if clearly(&in_motion.candidate(from_rest.t, from_rest.l)) {
+                let found = in_motion.search();
+                if clearly(&found) {
+                    self.moving = true;
+                    return found;
+                }
+            }
+        }
+        from_rest
+    }
+
+    /// Squares that are rounding errors of an exact response.
+    fn rounding(&self) -> f64 {
+        1e-10 * self.spread()
+    }
+
+    /// The samples before a limit of the output and the response that they speak of, where there is one: many samples share
+    /// the outermost value, and without them the response would go on beyond it.
+    fn without_limit(&mut self, all: &Candidate) -> Option<(Vec<bool>, Candidate)> {
+        let outward = all.rise.signum();
+        let edge = self
+            .y
+            .iter()
+            .map(|y| outward * y)
+            .fold(f64::NEG_INFINITY, f64::max);
+        let used: Vec<bool> = self.y.iter().map(|y| outward * y < edge).collect();
+        let on_edge = used.iter().filter(|used| !**used).count();
+        let before = used[self.at..].iter().filter(|used| **used).count();
+        if on_edge < FEWEST.max(self.y.len() / 50) || before < FEWEST {
+            return None;
+        }
+        let (kept, moving) = (std::mem::replace(&mut self.used, used), self.moving);
+        let beyond = self.best();
+        let noise = (beyond.cost / self.count() as f64).sqrt();
+        let excess = (0..self.y.len())
+            .filter(|&k| !self.used[k])
+            .map(|k| outward * beyond.output(k, self.at) - edge);
+        let excess = excess.sum::<f64>() / on_edge as f64;
+        // a share of the rise as well: an exact response settles on its last digit
+        let limited = excess > (3.0 * noise).max(BEYOND * beyond.rise.abs());
+        let used = std::mem::replace(&mut self.used, kept);
+        if !limited {
+            self.moving = moving;
+        }
+        limited.then_some((used, beyond))
     }
 
     /// The grid over `ln T` and `L`, narrowed about its best point until it is fine.
@@ -129,10 +248,11 @@ impl<'a> Step<'a> {
             (0.0, self.length() / 2.0),
         );
         let mut best = self.candidate(self.length() / 5.0, 0.0);
-        for _ in 0..ROUNDS {
-            for i in 0..GRID {
-                for j in 0..GRID {
-                    let found = self.candidate(at_share(ln_t, i).exp(), at_share(l, j));
+        for round in 0..ROUNDS {
+            let grid = if round == 0 { GRID } else { NARROWED };
+            for i in 0..grid {
+                for j in 0..grid {
+                    let found = self.candidate(at_share(ln_t, i, grid).exp(), at_share(l, j, grid));
                     if found.cost < best.cost {
                         best = found;
                     }
@@ -144,46 +264,65 @@ impl<'a> Step<'a> {
         best
     }
 
-    /// Level and rise by least squares for one `T` and `L`.
+    /// Level, rise and free response by least squares for one `T` and `L`.
     fn candidate(&self, t: f64, l: f64) -> Candidate {
         let first = self.at + l.floor() as usize + 1;
         let decay = (-1.0 / t).exp();
         let mut left = (-(first as f64 - self.at as f64 - l) / t).exp();
+        let mut free = if self.moving { 1.0 } else { 0.0 };
         // The sums of squares must not drown in a large level.
         let from = self.y[0];
-        let [mut p, mut pp, mut y, mut py, mut yy] = [0.0; 5];
-        for (k, &value) in self.y.iter().enumerate() {
+        let [mut n, mut p, mut pp, mut y, mut py, mut yy] = [0.0; 6];
+        let [mut f, mut ff, mut pf, mut fy] = [0.0; 4];
+        for (k, (&value, &used)) in self.y.iter().zip(&self.used).enumerate() {
             let phi = if k < first { 0.0 } else { 1.0 - left };
             if k >= first {
                 left *= decay;
             }
-            let value = value - from;
-            p += phi;
-            pp += phi * phi;
-            y += value;
-            py += phi * value;
-            yy += value * value;
+            if used {
+                let value = value - from;
+                n += 1.0;
+                p += phi;
+                pp += phi * phi;
+                y += value;
+                py += phi * value;
+                yy += value * value;
+                if self.moving {
+                    f += free;
+                    ff += free * free;
+                    pf += phi * free;
+                    fy += free * value;
+                }
+            }
+            free *= decay;
         }
-        let n = self.y.len() as f64;
-        let rise = (n * py - p * y) / (n * pp - p * p);
-        let level = (y - rise * p) / n;
-        let cost = (yy - level * y - rise * py).max(0.0);
-        let cost = if cost.is_finite() {
-            cost
+        let x = if self.moving {
+            let squares = Matrix3::new(n, p, f, p, pp, pf, f, pf, ff);
+            let solved = squares
+                .cholesky()
+                .map(|c| c.solve(&Vector3::new(y, py, fy)));
+            solved.unwrap_or_else(|| Vector3::repeat(f64::NAN))
         } else {
-            f64::INFINITY
+            let rise = (n * py - p * y) / (n * pp - p * p);
+            Vector3::new((y - rise * p) / n, rise, 0.0)
         };
+        let cost = yy - x.dot(&Vector3::new(y, py, fy));
         Candidate {
             t,
             l,
-            level: from + level,
-            rise,
-            cost,
+            level: from + x[0],
+            rise: x[1],
+            free: x[2],
+            cost: if cost.is_finite() {
+                cost.max(0.0)
+            } else {
+                f64::INFINITY
+            },
         }
     }
 
     fn check(&self, found: &Candidate) -> Result<()> {
-        let noise = (found.cost / self.y.len() as f64).sqrt();
+        let noise = (found.cost / self.count() as f64).sqrt();
         // A constant output leaves rounding errors as its rise.
         let least = (2.0 * noise).max(1e-9 * found.level.abs());
         let stands_out = found.rise.abs() > least && found.cost < 0.5 * self.spread();
@@ -207,8 +346,8 @@ impl<'a> Step<'a> {
     }
 }
 
-fn at_share((low, high): (f64, f64), i: usize) -> f64 {
-    low + (high - low) * i as f64 / (GRID - 1) as f64
+fn at_share((low, high): (f64, f64), i: usize, grid: usize) -> f64 {
+    low + (high - low) * i as f64 / (grid - 1) as f64
 }
 
 fn narrowed((low, high): (f64, f64), about: f64, least: f64) -> (f64, f64) {
@@ -217,110 +356,4 @@ fn narrowed((low, high): (f64, f64), about: f64, least: f64) -> (f64, f64) {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::random::Random;
-    use proptest::prelude::*;
-
-    const TS: f64 = 1e-3;
-
-    /// Inputs and outputs of a step from `u_low` to `u_high` at sample `at`.
-    fn response(plant: Fopdt, at: usize, n: usize) -> (Vec<f64>, Vec<f64>) {
-        let u: Vec<f64> = (0..n)
-            .map(|k| if k < at { plant.u_low } else { plant.u_high })
-            .collect();
-        let y = (0..n).map(|k| {
-            let since = (k as f64 - at as f64) * TS - plant.l;
-            let share = if since > 0.0 {
-                1.0 - (-since / plant.t).exp()
-            } else {
-                0.0
-            };
-            plant.offset + plant.k * (plant.u_low + share * (plant.u_high - plant.u_low))
-        });
-        (u.clone(), y.collect())
-    }
-
-    fn plant(k: f64, t: f64, l: f64, offset: f64) -> Fopdt {
-        Fopdt {
-            k,
-            t,
-            l,
-            offset,
-            u_low: 1.0,
-            u_high: 3.0,
-            fit_percent: 100.0,
-        }
-    }
-
-    fn fit(u: &[f64], y: &[f64]) -> Result<Fopdt> {
-        fit_fopdt(Record::new(u, 1, y).unwrap(), TS)
-    }
-
-    proptest! {
-        #![proptest_config(ProptestConfig::with_cases(48))]
-        #[test]
-        fn recovers_an_exact_response(
-            k in prop_oneof![1.0..1000.0, -1000.0..-1.0], t in 0.01..0.4, l in 0.0..0.2,
-            offset in -500.0..500.0, at in 1_usize..800,
-        ) {
-            let (u, y) = response(plant(k, t, l, offset), at, 3000);
-            let found = fit(&u, &y).unwrap();
-            prop_assert!((found.k / k - 1.0).abs() < 1e-4, "{found:?}");
-            prop_assert!((found.t - t).abs() < 1e-3 * t + 1e-6 && (found.l - l).abs() < 1e-5 + 1e-3 * t, "{found:?}");
-            prop_assert!((found.offset - offset).abs() < 1e-3 * (k.abs() + offset.abs()));
-            prop_assert!(found.fit_percent > 99.9);
-        }
-    }
-
-    #[test]
-    fn bears_noise_and_the_steps_of_raw_speed() {
-        let truth = plant(490.0, 0.25, 0.0075, 20.0);
-        let (u, y) = response(truth, 300, 2500);
-        let (mut random, count) = (Random::new(3), 38.168);
-        let raw: Vec<f64> = y
-            .iter()
-            .map(|y| ((y + 15.0 * random.normal()) / count).round() * count)
-            .collect();
-        let found = fit(&u, &raw).unwrap();
-        assert!((found.k / truth.k - 1.0).abs() < 0.005, "{found:?}");
-        assert!((found.t / truth.t - 1.0).abs() < 0.02 && (found.l - truth.l).abs() < 0.002);
-        assert!(found.fit_percent > 90.0 && found.fit_percent < 99.0);
-    }
-
-    #[test]
-    fn uses_the_first_step_of_several() {
-        let truth = plant(490.0, 0.1, 0.01, 0.0);
-        let (mut u, mut y) = response(truth, 100, 1000);
-        u.extend([0.0; 500]);
-        y.extend([0.0; 500]);
-        let found = fit(&u, &y).unwrap();
-        assert!(
-            (found.k / truth.k - 1.0).abs() < 1e-3 && found.u_high == 3.0,
-            "{found:?}"
-        );
-    }
-
-    #[test]
-    fn refuses_what_holds_no_settled_step() {
-        let truth = plant(490.0, 0.25, 0.01, 0.0);
-        let (u, y) = response(truth, 100, 400);
-        assert!(fit(&u, &y).unwrap_err().message.contains("settles"));
-        assert!(
-            fit(&[1.0; 500], &[0.0; 500])
-                .unwrap_err()
-                .message
-                .contains("a step")
-        );
-        assert!(fit(&[], &[]).is_err());
-        let ramp: Vec<f64> = (0..15).map(f64::from).collect();
-        assert!(fit(&ramp, &ramp).unwrap_err().message.contains("ramp"));
-        let (u, _) = response(truth, 100, 2000);
-        let mut random = Random::new(1);
-        let noise: Vec<f64> = (0..2000).map(|_| random.normal()).collect();
-        assert!(fit(&u, &noise).unwrap_err().message.contains("noise"));
-        assert!(fit(&u, &[7.3; 2000]).unwrap_err().message.contains("noise"));
-        assert!(fit_fopdt(Record::new(&[1.0, 2.0], 2, &[1.0]).unwrap(), TS).is_err());
-        assert!(fit_fopdt(Record::new(&u, 1, &noise).unwrap(), 0.0).is_err());
-    }
-}
+mod tests;

@@ -34,7 +34,7 @@ fn fit_fopdt<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let record = Record::new(slice(&u, "u")?, 1, slice(&y, "y")?).map_err(|e| raise(py, e))?;
     let found = watched(py, None, |_| fit(record, Ts))?;
-    named(
+    let dict = named(
         py,
         [
             ("K", found.k),
@@ -44,8 +44,14 @@ fn fit_fopdt<'py>(
             ("u_low", found.u_low),
             ("u_high", found.u_high),
             ("fit_percent", found.fit_percent),
+            ("K_se", found.errors[0]),
+            ("T_se", found.errors[1]),
+            ("L_se", found.errors[2]),
         ],
-    )
+    )?;
+    dict.set_item("limited", found.limited)?;
+    dict.set_item("moving", found.moving)?;
+    Ok(dict)
 }
 
 #[pyfunction]
