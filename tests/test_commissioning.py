@@ -20,10 +20,13 @@ from cli import sewfast
 from sewfast import (
     Commissioning,
     Controller,
+    Ensemble,
     Gains,
     Interrupted,
+    LinearOE,
     SettingError,
     VirtualMachine,
+    _core,
     commission,
     identification,
     load_controller,
@@ -31,7 +34,16 @@ from sewfast import (
     read_table,
     tuning,
 )
-from sewfast.commissioning import STAGES, Bench, Followed, Refusal, gains, procedure, training
+from sewfast.commissioning import (
+    STAGES,
+    Bench,
+    Followed,
+    Refusal,
+    agreement,
+    gains,
+    procedure,
+    training,
+)
 from sewfast.commissioning.bench import DriveBench, MachineBench, bench_of
 from sewfast.link import VirtualDevice, connect
 from sewfast.recording import Recording
@@ -378,3 +390,19 @@ def test_the_command_keeps_what_it_refused(tmp_path: Path) -> None:
     assert "lower speed" in told.err
     found = json.loads((tmp_path / "weak" / "commissioning.json").read_text())
     assert found["verdict"] == "refused"
+
+
+# --- members that part --------------------------------------------------------------------------
+
+
+def test_a_member_that_parts_from_the_others_is_left_out(whole: Commissioning) -> None:
+    assert whole.models is not None
+    assert whole.controller is not None
+    r = {"hold": np.concatenate([np.linspace(0.0, 900.0, 300), np.full(300, 900.0)])}
+    good = whole.models.members[0]
+    linear = _core.LinearModel(np.array([-0.9]), np.array([[0.5]]), 1, 0.0)
+    stuck = LinearOE(linear, good.Ts, good.input_names, good.output_name, ("V",), "RPM")
+    kept = agreement.agreeing(whole.controller, Ensemble.of([good, stuck, good]), r)
+    assert kept.members == (good, good)
+    with pytest.raises(Refusal, match="more than half of 2 networks"):
+        agreement.agreeing(whole.controller, Ensemble.of([good, stuck]), r)

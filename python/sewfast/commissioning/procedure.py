@@ -16,6 +16,7 @@ from ..dataset import FloatArray
 from ..errors import Interrupted, SettingError
 from ..machine import VirtualMachine
 from . import excitations
+from .agreement import agreeing
 from .bench import Bench, NotedBench, bench_of
 from .demands import Demands, demands
 from .first_order import step_response
@@ -160,11 +161,16 @@ def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal
     weights = cost_of(practice, bench.Ts, asked) if cost is None else cost
     journal.keep(cost=weights)
     tuning = search(trained.ensemble, practice, first, asked, weights, journal.within)
+    ensemble = agreeing(tuning.controller, trained.ensemble, practice)
+    if ensemble is not trained.ensemble:
+        # one that parts from the others has had its say in these gains
+        journal.keep(models=ensemble, rmse=trained.errors_of(ensemble))
+        tuning = search(ensemble, practice, first, asked, weights, journal.within)
     controller = replace(tuning.controller, notes="commissioned on an ensemble of networks")
     journal.keep(tuning=tuning, controller=controller)
 
     journal.enter("verification")
-    comparisons = predict(controller, trained.ensemble, verify)
+    comparisons = predict(controller, ensemble, verify)
     journal.keep(comparisons=comparisons)
     comparisons = measure(controller, bench, comparisons)
     journal.keep(comparisons=comparisons)

@@ -44,6 +44,11 @@ class Trained:
     fit_percent: float
     dropped: int
 
+    def errors_of(self, some: Ensemble) -> tuple[float, ...]:
+        """`rmse` of those members that are in `some`."""
+        pairs = zip(self.ensemble.members, self.rmse, strict=True)
+        return tuple(e for m, e in pairs if any(m is other for other in some.members))
+
 
 def train(
     recordings: Sequence[Recording],

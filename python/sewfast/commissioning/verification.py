@@ -12,13 +12,12 @@ from ..dataset import FloatArray
 from ..errors import FitError
 from ..loop import ClosedLoopRun, run
 from ..models import Ensemble
+from .agreement import DISAGREE
 from .bench import Bench
 from .refusal import Refusal, require
 
 APART = 0.05
 """Largest distance of measurement from prediction, rms over the reference's span."""
-DISAGREE = 0.05
-"""Largest distance of a member from the median of all, rms over the reference's span."""
 SATURATED = 0.5
 """Largest share of samples at a limit."""
 
