@@ -1,6 +1,6 @@
 //! Plants to close a loop around: identified models, variations for robust tuning.
 
-use super::{Plant, RUNAWAY};
+use super::Plant;
 use crate::encoder::Encoder;
 use crate::lagged::Lagged;
 use crate::neural_ss::{NeuralSS, Shape, Stepper};
@@ -16,14 +16,12 @@ pub struct LaggedPlant<'a, M> {
     inputs: Vec<f64>,
     na: usize,
     nk: usize,
-    /// Where the model rests.
-    rest: f64,
     position: f64,
     ts: f64,
 }
 
 impl<'a, M: Lagged> LaggedPlant<'a, M> {
-    /// `model` at rest: past inputs of zero, past outputs where it settles under them. `ts` \[s\] is the sample time it was identified at.
+    /// `model` at rest: zero past outputs and inputs. `ts` \[s\] is the sample time it was identified at.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for a model with several inputs or without delay, or an unusable sample time.
@@ -46,50 +44,21 @@ impl<'a, M: Lagged> LaggedPlant<'a, M> {
                 "expected a sample time above 0, got {ts}"
             )));
         }
-        let mut plant = Self {
+        Ok(Self {
             model,
             phi: vec![0.0; lags.regressors()],
             inputs: vec![0.0; lags.nk + lags.nb - 1],
             na: lags.na,
             nk: lags.nk,
-            rest: 0.0,
             position: 0.0,
             ts,
-        };
-        plant.rest = plant.settled();
-        plant.reset();
-        Ok(plant)
-    }
-
-    /// The output at which the model comes to rest under an input of zero; 0 where it does not.
-    fn settled(&mut self) -> f64 {
-        let (mut last, mut resting) = (0.0, 0);
-        for _ in 0..SETTLING {
-            self.advance(0.0);
-            let now = self.output();
-            let rests = f64::abs(now - last) <= RESTS * now.abs();
-            resting = if rests { resting + 1 } else { 0 };
-            if resting > self.na {
-                return now;
-            }
-            last = now;
-            if now.is_nan() || now.abs() >= RUNAWAY {
-                break;
-            }
-        }
-        0.0
+        })
     }
 }
-
-/// Samples within which a model must have come to rest: seven time constants of one of 25,000 samples.
-const SETTLING: usize = 200_000;
-/// Largest change between the samples of a model at rest, in parts of its output.
-const RESTS: f64 = 1e-12;
 
 impl<M: Lagged> Plant for LaggedPlant<'_, M> {
     fn reset(&mut self) {
         self.phi.fill(0.0);
-        self.phi[..self.na].fill(self.rest);
         self.inputs.fill(0.0);
         self.position = 0.0;
     }
