@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sewfast.rules import eq_12
 
 from sewfast import Controller, Gains, VirtualMachine, commission
 from sewfast.analysis import run_under_load
@@ -26,6 +25,7 @@ from sewfast.analysis.loading import torque_of
 from sewfast.analysis.responses import RECOVERED
 from sewfast.control import Fopdt
 from sewfast.dataset import FloatArray
+from sewfast.rules import eq_12
 
 LOAD = 0.3
 """[N m]"""
