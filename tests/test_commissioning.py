@@ -20,6 +20,7 @@ from cli import sewfast
 from sewfast import (
     Commissioning,
     Controller,
+    DataError,
     Ensemble,
     Gains,
     Interrupted,
@@ -292,6 +293,14 @@ def test_demands_that_contradict_are_refused_before_anything_moves(
     bench = bent()
     with pytest.raises(SettingError, match=match):
         commission(bench, **options)
+    assert bench.played == 0
+
+
+@pytest.mark.parametrize("samples", [[], [1.0, float("nan")]])
+def test_a_reference_that_cannot_be_run_is_refused(samples: list[float]) -> None:
+    bench = bent()
+    with pytest.raises(DataError, match="finite samples in the reference 'mine'"):
+        commission(bench, references={"mine": samples})
     assert bench.played == 0
 
 

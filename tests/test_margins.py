@@ -168,6 +168,8 @@ def test_what_is_no_plant_is_refused() -> None:
             margins(PID, plant)
     with pytest.raises(SettingError, match="omega"):
         loop_response(PID, DRIVE, [0.0])
+    with pytest.raises(SettingError, match=r"the order is margins\(controller, plant\)"):
+        margins(DRIVE, PID)  # type: ignore[arg-type]
 
 
 def test_margins_print_and_do_not_change() -> None:

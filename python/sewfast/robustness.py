@@ -14,6 +14,7 @@ from .control import Controller
 from .errors import SettingError
 from .gains import Gains, real
 from .linear_plant import sampled
+from .loop import require_controller
 
 __all__ = ["Margins", "loop_path", "loop_response", "margins"]
 
@@ -110,6 +111,7 @@ def margins(controller: Controller, plant: Any, *, speed: float | None = None) -
         Without a speed where one is needed, for several inputs, another sample time, or a plant
         that answers within the same sample.
     """
+    require_controller(controller, plant, "margins(controller, plant)")
     found = _core.margins(loop_path(controller, speed=speed), *sampled(plant, controller.Ts, speed))
     for name in ("gain_crossovers", "phase_crossovers"):
         found[name] = tuple(found[name])
@@ -124,6 +126,7 @@ def loop_response(
 
     Parameters as in `margins`.
     """
+    require_controller(controller, plant, "loop_response(controller, plant, omega)")
     w = np.ascontiguousarray(np.atleast_1d(np.asarray(omega, dtype=np.float64)))
     nyquist = math.pi / controller.Ts
     if not (w.ndim == 1 and np.all((w > 0.0) & (w <= nyquist * (1 + 1e-12)))):

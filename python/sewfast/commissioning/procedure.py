@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import signals
 from ..control import Controller, vector
 from ..cost import Cost
 from ..dataset import FloatArray
-from ..errors import Interrupted, SettingError
+from ..errors import DataError, Interrupted, SettingError
 from ..machine import VirtualMachine
 from . import excitations
 from .agreement import agreeing
@@ -202,10 +203,21 @@ def _samples(
             f"names, got {references!r}; leave it out for the standard ones"
         )
     if isinstance(references, Mapping):
-        return {str(name): vector(str(name), r).copy() for name, r in references.items()}
+        return {str(name): _whole(str(name), r) for name, r in references.items()}
     if abs(bench.Ts - signals.TS) > 1e-9:
         raise SettingError(
             f"expected a machine at {signals.TS} s for references by name, this one has "
             f"{bench.Ts:g} s; give references as samples"
         )
     return {name: signals.reference(name, seed) for name in references}
+
+
+def _whole(name: str, reference: ArrayLike) -> FloatArray:
+    """A reference with samples that are numbers."""
+    samples = vector(name, reference).copy()
+    if not (len(samples) and np.all(np.isfinite(samples))):
+        raise DataError(
+            f"expected finite samples in the reference {name!r}, got "
+            + ("none" if not len(samples) else "NaN or infinity")
+        )
+    return samples

@@ -43,8 +43,6 @@ const CLEARLY: f64 = 0.99;
 const BEYOND: f64 = 0.005;
 /// Points of the search in each direction.
 const GRID: usize = 21;
-/// The same once the search is narrowed.
-const NARROWED: usize = 13;
 /// Times that the search is narrowed about the best point, each time to a half.
 const ROUNDS: usize = 26;
 
@@ -248,11 +246,10 @@ impl<'a> Step<'a> {
             (0.0, self.length() / 2.0),
         );
         let mut best = self.candidate(self.length() / 5.0, 0.0);
-        for round in 0..ROUNDS {
-            let grid = if round == 0 { GRID } else { NARROWED };
-            for i in 0..grid {
-                for j in 0..grid {
-                    let found = self.candidate(at_share(ln_t, i, grid).exp(), at_share(l, j, grid));
+        for _ in 0..ROUNDS {
+            for i in 0..GRID {
+                for j in 0..GRID {
+                    let found = self.candidate(at_share(ln_t, i).exp(), at_share(l, j));
                     if found.cost < best.cost {
                         best = found;
                     }
@@ -346,8 +343,8 @@ impl<'a> Step<'a> {
     }
 }
 
-fn at_share((low, high): (f64, f64), i: usize, grid: usize) -> f64 {
-    low + (high - low) * i as f64 / (grid - 1) as f64
+fn at_share((low, high): (f64, f64), i: usize) -> f64 {
+    low + (high - low) * i as f64 / (GRID - 1) as f64
 }
 
 fn narrowed((low, high): (f64, f64), about: f64, least: f64) -> (f64, f64) {

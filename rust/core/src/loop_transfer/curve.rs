@@ -41,7 +41,7 @@ impl Curve {
         let count = ((PI / last.theta).log10() * DENSITY).ceil().max(2.0) as usize;
         let ratio = (PI / last.theta).powf(1.0 / count as f64);
         points.push(last);
-        let (mut turned, mut resolved) = (0.0, true);
+        let (mut turned, mut resolved) = (from_rest(closed, last.l), true);
         for i in 1..=count {
             let theta = if i == count {
                 PI
@@ -96,12 +96,26 @@ fn lowest(closed: &Loop<'_>) -> f64 {
         .chain([path.ts / path.gains.ti.max(path.ts), 1.0])
         .filter(|c| *c > 0.0);
     let mut theta = 0.01 * slowest.fold(1.0, f64::min);
-    if integrators(closed) > 0 {
-        while closed.at(&Place::at(theta)).norm() < 30.0 && theta > 1e-12 {
-            theta *= 0.1;
+    // a closed-loop pole near 1 turns 1 + L below every corner of the open loop
+    let unsettled = |theta: f64| {
+        let l = closed.at(&Place::at(theta));
+        match integrators(closed) {
+            0 => from_rest(closed, l).abs() > TURN,
+            _ => l.norm() < 30.0,
         }
+    };
+    while unsettled(theta) && theta > 1e-12 {
+        theta *= 0.1;
     }
     theta
+}
+
+/// How far `1 + L` has turned since frequency 0; with integrators there is no such turn.
+fn from_rest(closed: &Loop<'_>, l: Complex<f64>) -> f64 {
+    if integrators(closed) > 0 {
+        return 0.0;
+    }
+    ((l + 1.0) / (closed.at(&Place::at(0.0)) + 1.0)).arg()
 }
 
 fn integrators(closed: &Loop<'_>) -> usize {
