@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from loops import QUIET, drive
 from sewfast import _core, signals
 from sewfast.control import Controller, Gains, paper_controller
 from sewfast.errors import DataError, FitError, SettingError
@@ -19,23 +20,7 @@ def linear(a: list[float], b: list[float], Ts: float = 0.001, unit: str = "RPM")
     return LinearOE(core, Ts, ("u",), "y", ("V",), unit)
 
 
-def drive() -> LinearOE:
-    """490 RPM/V with time constants of 252 and 7.4 ms."""
-    p, q = math.exp(-0.001 / 0.252), math.exp(-0.001 / 0.0074)
-    gain = 490 * (1 - p) * (1 - q) / 2
-    return linear([-p - q, p * q], [gain, gain])
-
-
 EQ_8 = linear([-1.87, 0.8705], [0.1228, 0.1224])
-TUNED = Controller(
-    Gains.standard(0.02, 0.05, 0.003),
-    alpha=0.3,
-    N=5,
-    u_min=-20,
-    u_max=20,
-    filter_samples=8,
-    counts_per_rev=1572,
-)
 
 
 def test_the_papers_gains_track_on_the_papers_plant_read_per_sample() -> None:
@@ -75,7 +60,7 @@ def test_the_papers_gains_reach_the_level_on_the_virtual_machine_as_a_limit_cycl
 
 
 def test_a_run_has_its_columns_units_and_conventions() -> None:
-    told = run(TUNED, drive(), "trapezoid")
+    told = run(QUIET, drive(), "trapezoid")
     columns = told.columns()
     assert list(columns) == ["t", "r", "u", "y", "feedback"] == list(told.units)
     assert {len(c) for c in columns.values()} == {len(signals.reference("trapezoid"))}
@@ -94,16 +79,16 @@ def test_a_run_repeats_and_leaves_its_plant_and_reference_alone() -> None:
     machine, r = VirtualMachine(), np.full(200, 500.0)
     machine.step(3.0)
     before = (machine.counts, machine.speed_rpm)
-    first, second = run(TUNED, machine, r), run(TUNED, machine, r)
+    first, second = run(QUIET, machine, r), run(QUIET, machine, r)
     assert np.array_equal(first.y, second.y)
     assert (machine.counts, machine.speed_rpm) == before
     assert first.r is not r
 
 
 def test_the_loop_is_the_machine_stepped_by_hand() -> None:
-    machine, core = VirtualMachine(), TUNED.core()
+    machine, core = VirtualMachine(), QUIET.core()
     r = signals.reference("trapezoid")[:600]
-    told = run(TUNED, VirtualMachine(), r)
+    told = run(QUIET, VirtualMachine(), r)
     counts, speed = machine.counts, machine.speed_rpm
     before = counts
     for k, reference in enumerate(r):
@@ -115,10 +100,10 @@ def test_the_loop_is_the_machine_stepped_by_hand() -> None:
 
 
 def test_metrics_without_a_step_are_none() -> None:
-    told = run(TUNED, drive(), np.sin(np.arange(500) / 30.0) * 100).metrics()
+    told = run(QUIET, drive(), np.sin(np.arange(500) / 30.0) * 100).metrics()
     assert told["rise_time_ms"] is None
     assert told["overshoot_percent"] is None
-    slow = replace(TUNED, gains=Gains.standard(1e-4, 10.0))
+    slow = replace(QUIET, gains=Gains.standard(1e-4, 10.0))
     late = run(slow, drive(), "trapezoid").metrics()
     assert late["rise_time_ms"] is None
     assert late["overshoot_percent"] == 0.0
@@ -127,7 +112,7 @@ def test_metrics_without_a_step_are_none() -> None:
 def test_a_loop_that_diverges_is_an_error_that_says_when() -> None:
     unstable = linear([-3.0], [1.0])
     with pytest.raises(FitError, match=r"diverged at 0\.\d+ s"):
-        run(TUNED, unstable, "trapezoid")
+        run(QUIET, unstable, "trapezoid")
 
 
 def test_plants_and_references_that_do_not_fit_are_refused() -> None:
@@ -140,19 +125,19 @@ def test_plants_and_references_that_do_not_fit_are_refused() -> None:
         "RPM",
     )
     refused = [
-        (TUNED, two, "trapezoid", "one input"),
-        (TUNED, linear([-0.9], [1.0], Ts=0.01), "trapezoid", "sample time"),
-        (TUNED, linear([-0.9], [1.0], unit="rad/s"), "trapezoid", "unit"),
-        (TUNED, drive(), "unheard", "unheard"),
-        (replace(TUNED, Ts=0.01), VirtualMachine(), "trapezoid", "one sample time|0.001 s"),
-        (TUNED, "model.json", "trapezoid", "load_model"),
+        (QUIET, two, "trapezoid", "one input"),
+        (QUIET, linear([-0.9], [1.0], Ts=0.01), "trapezoid", "sample time"),
+        (QUIET, linear([-0.9], [1.0], unit="rad/s"), "trapezoid", "unit"),
+        (QUIET, drive(), "unheard", "unheard"),
+        (replace(QUIET, Ts=0.01), VirtualMachine(), "trapezoid", "one sample time|0.001 s"),
+        (QUIET, "model.json", "trapezoid", "load_model"),
     ]
     for controller, plant, reference, says in refused:
         with pytest.raises(SettingError, match=says):
             run(controller, plant, reference)
     for bad in ([], [1.0, math.nan], np.ones((3, 2)), ["a", "b"]):
         with pytest.raises(DataError, match="reference"):
-            run(TUNED, drive(), bad)
+            run(QUIET, drive(), bad)
 
 
 def test_named_references_need_rpm_at_a_millisecond() -> None:
@@ -164,30 +149,30 @@ def test_named_references_need_rpm_at_a_millisecond() -> None:
 def test_feedforward_and_disturbance_are_what_the_core_makes_of_them() -> None:
     r = np.full(300, 500.0)
     feedforward, disturbance = r / 490.0, np.where(np.arange(300) < 150, 0.0, -1.0)
-    told = run(TUNED, drive(), r, feedforward=feedforward, disturbance=disturbance)
-    core = TUNED.core()
+    told = run(QUIET, drive(), r, feedforward=feedforward, disturbance=disturbance)
+    core = QUIET.core()
     core.step(r[0], told.feedback[0], feedforward[0])
-    plain = run(TUNED, drive(), r)
+    plain = run(QUIET, drive(), r)
     assert told.u[0] == pytest.approx(plain.u[0] + feedforward[0])
-    assert np.array_equal(told.y[:150], run(TUNED, drive(), r, feedforward=feedforward).y[:150])
-    assert np.min(told.y[150:]) < np.min(run(TUNED, drive(), r, feedforward=feedforward).y[150:])
-    ahead = run(TUNED, VirtualMachine(), r, feedforward=feedforward)
+    assert np.array_equal(told.y[:150], run(QUIET, drive(), r, feedforward=feedforward).y[:150])
+    assert np.min(told.y[150:]) < np.min(run(QUIET, drive(), r, feedforward=feedforward).y[150:])
+    ahead = run(QUIET, VirtualMachine(), r, feedforward=feedforward)
     assert ahead.u[0] == pytest.approx(plain.u[0] + feedforward[0])
 
 
 def test_signals_that_a_plant_cannot_take_are_refused() -> None:
     r = np.full(10, 500.0)
     with pytest.raises(SettingError, match="set_load"):
-        run(TUNED, VirtualMachine(), r, disturbance=r)
+        run(QUIET, VirtualMachine(), r, disturbance=r)
     for bad in (r[:5], np.full(10, math.nan), np.ones((10, 2)), "none"):
         with pytest.raises(DataError, match="feedforward"):
-            run(TUNED, drive(), r, feedforward=bad)
+            run(QUIET, drive(), r, feedforward=bad)
 
 
 def test_a_model_begins_at_standstill_wherever_it_would_settle() -> None:
     core = _core.LinearModel(np.array([-0.9]), np.array([[10.0]]), 1, -5.0)
     model = LinearOE(core, 0.001, ("u",), "y", ("V",), "RPM")
-    ideal = replace(TUNED, alpha=0.0, counts_per_rev=None)
+    ideal = replace(QUIET, alpha=0.0, counts_per_rev=None)
     told = run(ideal, model, np.zeros(50))
     # it would settle at -50
     assert tuple(told.y[:2]) == (0.0, -5.0)

@@ -17,12 +17,11 @@ from .control import Controller
 from .cost import Cost
 from .errors import Interrupted, SettingError
 from .gains import whole
+from .plants import Plants, References
 from .tuning import tune
 from .tuning_task import (
     Aggregate,
-    Models,
     Progress,
-    References,
     TuningTask,
     threads_or_all,
 )
@@ -142,7 +141,7 @@ class ParetoFront:
 
 
 def pareto(
-    models: Models,
+    models: Plants,
     references: References = None,
     *,
     objectives: Sequence[str] = ("tracking", "chatter"),

@@ -15,12 +15,11 @@ from .control import Controller
 from .cost import Cost
 from .errors import Interrupted, SettingError
 from .gains import whole
+from .plants import Plants, References
 from .starting import first_controller
 from .tuning_task import (
     Aggregate,
-    Models,
     Progress,
-    References,
     TuningTask,
     default_variations,
     threads_or_all,
@@ -93,7 +92,7 @@ class TuningResult:
 
 
 def tune(
-    models: Models,
+    models: Plants,
     references: References = None,
     *,
     u_min: float = -20.0,
@@ -205,7 +204,7 @@ def tune(
 
 def costs(
     controllers: Controller | Sequence[Controller],
-    models: Models,
+    models: Plants,
     references: References = None,
     *,
     cost: Cost | None = None,

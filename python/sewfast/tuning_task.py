@@ -8,23 +8,19 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .constraints import Constraints
 from .control import Controller
 from .cost import Cost
 from .errors import SettingError
 from .gains import real, whole
-from .loop import Plant, check_fits, reference_samples
-from .models import Ensemble
-from .plants import each_reference
+from .loop import check_fits, reference_samples
+from .plants import Plants, References, each_plant, each_reference
 from .starting import assumed, first_controller
 from .variables import Wanted, wanted
 
 Progress: TypeAlias = Callable[[int, int, float], object]
 Aggregate: TypeAlias = Literal["mean", "worst"]
-Models: TypeAlias = Plant | Sequence[Plant]
-References: TypeAlias = str | ArrayLike | Sequence[str | ArrayLike] | None
 
 REFERENCES = ("trapezoid", "trapezoids", "random")
 """References to tune on unless others are given."""
@@ -48,7 +44,7 @@ class TuningTask:
     @classmethod
     def of(
         cls,
-        models: Models,
+        models: Plants,
         references: References,
         *,
         start: Controller | None,
@@ -66,9 +62,8 @@ class TuningTask:
             start = first_controller(given[0], **first)
         for plant in given:
             check_fits(start, plant)
-        singles = [single for plant in given for single in _singles(plant)]
         return cls(
-            plants=singles,
+            plants=each_plant(given),
             references=[
                 reference_samples(r, start) for r in each_reference(references, REFERENCES)
             ],
@@ -127,11 +122,6 @@ def default_variations(controller: Controller) -> tuple[tuple[float, int], ...]:
     """(gain, extra delay in samples) of the plants that a controller is tuned on; see `tune`."""
     delay = max(1, controller.filter_samples // 4)
     return ((1.0, 0), *((gain, delay) for gain in GAINS))
-
-
-def _singles(plant: Plant) -> list[Any]:
-    """A plant each: of an ensemble, every member."""
-    return list(plant.members) if isinstance(plant, Ensemble) else [plant]
 
 
 def _instance(given: Any, kind: type[Any], example: str) -> Any:

@@ -9,7 +9,7 @@ from ..errors import SettingError
 from .arguments import Commands, add_columns, add_command, add_output, require_place
 from .data import read_training
 from .output import print_json, print_rows
-from .tune import FORMS, gain_row
+from .tune import FORMS, forms_of, gain_row
 
 if TYPE_CHECKING:
     from ..control import Controller, Fopdt
@@ -153,10 +153,6 @@ def _controller(args: argparse.Namespace, rule: Rule, fopdt: Fopdt, Ts: float) -
     )
 
 
-def _forms(controller: Controller) -> list[Any]:
-    return [controller.gains.to(form, Ts=controller.Ts) for form in FORMS]  # type: ignore[arg-type]
-
-
 def _summary(
     args: argparse.Namespace, fopdt: Fopdt, rule: Rule, controller: Controller, found: Margins
 ) -> dict[str, Any]:
@@ -165,7 +161,7 @@ def _summary(
         "file": None if args.out is None else str(args.out),
         "plant": {name: getattr(fopdt, name) for name in names},
         "rule": {"name": rule.name, "alpha": rule.alpha, "beta": rule.beta, **rule.costs},
-        "gains": {g.form: {**g.to_dict(), "units": g.units} for g in _forms(controller)},
+        "gains": {g.form: {**g.to_dict(), "units": g.units} for g in forms_of(controller)},
         "margins": found.to_dict(),
         "controller": controller.to_dict(),
     }
@@ -177,7 +173,7 @@ def _show(
     print(f"plant    {fopdt}")
     print(f"rule     {rule.name}: alpha {rule.alpha:.4g}, beta {rule.beta:.4g}")
     print("gains")
-    print_rows([gain_row(g) for g in _forms(controller)])
+    print_rows([gain_row(g) for g in forms_of(controller)])
     print("margins")
     print("\n".join(f"  {line}" for line in str(found).splitlines()))
     if args.out is not None:

@@ -336,7 +336,7 @@ def _show_front(args: argparse.Namespace, front: ParetoFront) -> None:
 
 
 def _controller(controller: Controller) -> dict[str, Any]:
-    forms = _forms(controller)
+    forms = forms_of(controller)
     return {
         "gains": {g.form: {**g.to_dict(), "units": g.units} for g in forms},
         "controller": controller.to_dict(),
@@ -345,12 +345,13 @@ def _controller(controller: Controller) -> dict[str, Any]:
 
 def _show_gains(args: argparse.Namespace, controller: Controller) -> None:
     print("the same gains in every form:")
-    print_rows([gain_row(g) for g in _forms(controller)])
+    print_rows([gain_row(g) for g in forms_of(controller)])
     print(f"written to {args.out}; try it: sewfast run {args.out} --on MODEL.json|virtual "
           "--reference NAME")  # fmt: skip
 
 
-def _forms(controller: Controller) -> list[Gains]:
+def forms_of(controller: Controller) -> list[Gains]:
+    """The gains in every form."""
     return [controller.gains.to(form, Ts=controller.Ts) for form in FORMS]  # type: ignore[arg-type]
 
 

@@ -100,7 +100,7 @@ class MachineBench:
         return Followed(found, record(self.machine, found.u, name=name))
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class DriveBench:
     """A drive behind a port, whose limits have been set."""
 

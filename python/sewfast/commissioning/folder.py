@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .. import __version__, jsonfile
 from ..analysis.filing import NUMBERS as ANALYSIS
@@ -31,26 +32,36 @@ def require_own(folder: Path, *, overwrite: bool) -> None:
     """
     if overwrite or _may_be_replaced(folder):
         return
-    for name in (*_FOLDERS, NUMBERS, "results.json", "report.html"):
+    place = first_taken(folder, (*_FOLDERS, NUMBERS, "results.json", "report.html"))
+    if place is not None:
+        raise SettingError(
+            f"{place}: expected a folder without such files, or one of a virtual machine's "
+            "commissioning, which can be repeated; choose another folder, or overwrite them "
+            "(--overwrite)"
+        )
+
+
+def first_taken(folder: Path, names: Iterable[str]) -> Path | None:
+    """The first of these that is a file, or a folder with something in it."""
+    for name in names:
         place = folder / name
         if place.is_file() or (place.is_dir() and any(place.iterdir())):
-            raise SettingError(
-                f"{place}: expected a folder without such files, or one of a virtual machine's "
-                "commissioning, which can be repeated; choose another folder, or overwrite them "
-                "(--overwrite)"
-            )
+            return place
+    return None
 
 
 def _may_be_replaced(folder: Path) -> bool:
+    found = numbers_in(folder / NUMBERS)
+    return found.get("format") == FORMAT and str(found.get("machine", "")).startswith("virtual")
+
+
+def numbers_in(file: Path) -> dict[str, Any]:
+    """What a file of results says, as far as it is one: nothing where it is damaged or missing."""
     try:
-        found = json.loads((folder / NUMBERS).read_bytes())
+        found = json.loads(file.read_bytes())
     except (OSError, ValueError):
-        return False
-    return (
-        isinstance(found, dict)
-        and found.get("format") == FORMAT
-        and str(found.get("machine", "")).startswith("virtual")
-    )
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def prepare(folder: Path) -> None:

@@ -54,14 +54,15 @@ def _gains(controller: Controller) -> dict[str, Any]:
 
 def _comparison(c: Comparison) -> dict[str, Any]:
     return {
-        "predicted": _run(c.predicted),
-        "measured": None if c.measured is None else _run(c.measured),
+        "predicted": run_numbers(c.predicted),
+        "measured": None if c.measured is None else run_numbers(c.measured),
         "apart_rmse_rpm": c.apart,
         "disagreement_rmse_rpm": c.disagreement,
     }
 
 
-def _run(found: ClosedLoopRun) -> dict[str, float | None]:
+def run_numbers(found: ClosedLoopRun) -> dict[str, float | None]:
+    """What a run's metrics are called in result files."""
     told = found.metrics()
     return {
         "rmse_rpm": told["rmse"],

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from .. import __version__
+from ..commissioning.folder import prepare
 from ..control import Controller, Fopdt, paper_controller
 from ..machine import VirtualMachine
 from ..report import report
@@ -107,7 +108,7 @@ def run_demo(
     excitation("random", seed)  # refuses a seed that is none before the folder is made
     target = Path(out)
     folder.require_own(target, overwrite=overwrite)
-    folder.prepare(target)
+    prepare(target)
     try:
         with rig(plant) as bench:
             return _carry_out(target, bench, seed, _Clock(progress))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -10,8 +9,9 @@ from typing import Any
 
 from .. import jsonfile
 from ..commissioning import Commissioning
+from ..commissioning.folder import first_taken, numbers_in
 from ..control import Controller
-from ..errors import DataError, SettingError
+from ..errors import SettingError
 from ..loop import ClosedLoopRun
 from ..models import Model
 from ..recording import Recording
@@ -37,39 +37,18 @@ def require_own(folder: Path, *, overwrite: bool) -> None:
     """
     if overwrite or _is_result(folder):
         return
-    for name in (*_FOLDERS, "results.json", "report.html"):
-        place = folder / name
-        if place.is_file() or (place.is_dir() and any(place.iterdir())):
-            raise SettingError(
-                f"{place}: expected a folder of an earlier experiment or one without such files, "
-                "there are some and no results.json; choose another folder, or overwrite them "
-                "(--overwrite)"
-            )
+    place = first_taken(folder, (*_FOLDERS, "results.json", "report.html"))
+    if place is not None:
+        raise SettingError(
+            f"{place}: expected a folder of an earlier experiment or one without such files, "
+            "there are some and no results.json; choose another folder, or overwrite them "
+            "(--overwrite)"
+        )
 
 
 def _is_result(folder: Path) -> bool:
-    try:
-        found = json.loads((folder / "results.json").read_bytes())
-    except (OSError, ValueError):
-        return False
     # of any version: what an older one has left is replaced as well
-    return isinstance(found, dict) and found.get("format") == FORMAT
-
-
-def prepare(folder: Path) -> None:
-    """Make the folder itself, so that one that cannot be made is refused before a minute's work.
-
-    Raises
-    ------
-    DataError
-        Where it cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(
-            f"{folder}: cannot be made ({error.strerror}); choose a folder that is writable"
-        ) from error
+    return numbers_in(folder / "results.json").get("format") == FORMAT
 
 
 def abandon(folder: Path) -> None:

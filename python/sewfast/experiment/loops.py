@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import _core
 from ..commissioning import Commissioning, commission
+from ..commissioning.numbers import run_numbers
 from ..control import Controller, Gains, paper_controller
 from ..errors import FitError
 from ..loop import ClosedLoopRun, run
@@ -69,7 +70,7 @@ def readings() -> dict[str, dict[str, float | None]]:
 def _tried(controller: Controller) -> dict[str, float | None]:
     names = ("rmse_rpm", "rise_time_ms", "overshoot_percent")
     try:
-        numbers = _numbers(run(controller, eq8(), "trapezoid"))
+        numbers = run_numbers(run(controller, eq8(), "trapezoid"))
     except FitError:
         return dict.fromkeys(names)
     return {name: numbers[name] for name in names}
@@ -88,26 +89,13 @@ def control_numbers(runs: Mapping[tuple[str, str], ClosedLoopRun]) -> dict[str, 
 
 def paper_numbers(runs: Mapping[tuple[str, str], ClosedLoopRun]) -> dict[str, dict[str, Any]]:
     """`paper_gains` of `results.json`."""
-    return {plant: _numbers(r) for (_, plant), r in runs.items()}
+    return {plant: run_numbers(r) for (_, plant), r in runs.items()}
 
 
 def _pair(runs: Mapping[str, ClosedLoopRun]) -> dict[str, Any]:
     apart = runs["model"].y - runs["machine"].y
     return {
-        **{plant: _numbers(r) for plant, r in runs.items()},
+        **{plant: run_numbers(r) for plant, r in runs.items()},
         "model_vs_machine_rmse_rpm": float(np.sqrt(np.mean(apart**2))),
         "reference_rise_time_ms": runs["machine"].metrics()["reference_rise_time_ms"],
-    }
-
-
-def _numbers(loop: ClosedLoopRun) -> dict[str, float | None]:
-    found = loop.metrics()
-    return {
-        "rmse_rpm": found["rmse"],
-        "max_abs_rpm": found["max_abs"],
-        "rise_time_ms": found["rise_time_ms"],
-        "overshoot_percent": found["overshoot_percent"],
-        "effort_v": found["u_rms"],
-        "chatter_v": found["du_rms"],
-        "saturated": found["saturated"],
     }

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..commissioning.bench import DriveBench, Followed
 from ..control import Controller
 from ..errors import LinkError
-from ..link import Drive, VirtualDevice, connect
+from ..link import VirtualDevice, connect
 from ..loop import ClosedLoopRun, run
 from ..machine import VirtualMachine
 from ..recording import Recording, record
@@ -23,8 +23,8 @@ from ..recording import Recording, record
 T = TypeVar("T")
 
 
-@dataclass
-class Rig:
+@dataclass(eq=False)
+class Rig(DriveBench):
     """A drive, and what went over its link so far.
 
     Attributes
@@ -40,36 +40,10 @@ class Rig:
         That the runs took.
     """
 
-    drive: Drive
     machine: VirtualMachine
     port: str
     samples: int = 0
     seconds: float = 0.0
-
-    @property
-    def Ts(self) -> float:
-        """Sample time [s]."""
-        return self.drive.identity.Ts
-
-    @property
-    def counts_per_rev(self) -> float:
-        """Encoder counts of one turn."""
-        return self.drive.identity.counts_per_rev
-
-    @property
-    def name(self) -> str:
-        """Of the machine."""
-        return self.drive.identity.name
-
-    @property
-    def volt(self) -> float:
-        """Largest command [V]."""
-        return DriveBench(self.drive).volt
-
-    @property
-    def speed(self) -> float:
-        """Speed beyond which it trips [RPM]."""
-        return DriveBench(self.drive).speed
 
     def excite(self, u: NDArray[np.float64], name: str) -> Recording:
         """Excite the drive, as a bench of commissioning."""
@@ -78,12 +52,12 @@ class Rig:
     def follow(self, controller: Controller, r: NDArray[np.float64], name: str) -> Followed:
         """Run a controller on the drive, as a bench of commissioning."""
         began = time.perf_counter()
-        return self._whole(DriveBench(self.drive).follow(controller, r, name), began)
+        return self._counted(super().follow(controller, r, name), began)
 
     def record(self, u: NDArray[np.float64], name: str) -> Recording:
         """Excite the drive from rest; see `sewfast.recording.record`."""
         began = time.perf_counter()
-        return self._whole(record(self.drive, u, name=name), began)
+        return self._counted(record(self.drive, u, name=name), began)
 
     def run(
         self, controller: Controller, reference: str, *, seed: int = 0, volt: float | None = None
@@ -94,9 +68,9 @@ class Rig:
         self.drive.set_limits(volt=volt)
         found = run(controller, self.drive, reference, seed=seed)
         self.drive.set_limits(volt=before)
-        return self._whole(found, began)
+        return self._counted(found, began)
 
-    def _whole(self, found: T, began: float) -> T:
+    def _counted(self, found: T, began: float) -> T:
         """What came, once it is known that nothing is missing."""
         outcome = self.drive.outcome
         if outcome is None or not outcome.is_complete:

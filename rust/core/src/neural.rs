@@ -15,7 +15,6 @@ pub use network::{Network, Shape};
 pub use scaling::Scaling;
 pub use train::{InitialState, NeuralFit, Settings, fit};
 
-use free_run::FreeRun;
 use sensitivities::{Recursion, Rows};
 
 use crate::gram::Gram;
@@ -103,7 +102,7 @@ impl NeuralOE {
     ) -> Result<(Vec<f64>, Vec<f64>)> {
         let samples = self.lags().check(u, channels, y_past)?;
         let (u, state) = (self.scaling.inputs(u), self.scaled_state(y_past));
-        let scaled = self.free_run(&u, &state, samples);
+        let scaled = free_run::outputs(&self.network, &u, 0, &state, samples);
         let (shape, na) = (self.shape(), self.lags().na);
         let mut rows = Recording::of(self, samples);
         for i in 0..na {
@@ -127,24 +126,6 @@ impl NeuralOE {
 
     fn scaled_state(&self, y_past: &[f64]) -> Vec<f64> {
         y_past.iter().map(|y| self.scaling.output(*y)).collect()
-    }
-
-    /// The free run in scaled units; NaN from where on it leaves the finite numbers.
-    fn free_run(&self, u: &[f64], state: &[f64], samples: usize) -> Vec<f64> {
-        let mut run = vec![f64::NAN; samples];
-        let free = FreeRun {
-            network: &self.network,
-            u,
-            first: 0,
-            state,
-            run: &mut run,
-            hidden: &mut [],
-            bound: f64::INFINITY,
-            monitor: None,
-        };
-        // where it ends early, NaN says so
-        let _ = free.go();
-        run
     }
 
     fn restored(&self, mut run: Vec<f64>) -> Vec<f64> {
@@ -219,7 +200,7 @@ impl Lagged for NeuralOE {
     fn simulate(&self, u: &[f64], channels: usize, y_past: &[f64]) -> Result<Vec<f64>> {
         let samples = self.lags().check(u, channels, y_past)?;
         let (u, state) = (self.scaling.inputs(u), self.scaled_state(y_past));
-        finite(self.restored(self.free_run(&u, &state, samples)))
+        finite(self.restored(free_run::outputs(&self.network, &u, 0, &state, samples)))
     }
 }
 

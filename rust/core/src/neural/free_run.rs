@@ -77,3 +77,27 @@ impl Kernel for FreeRun<'_> {
         Some(())
     }
 }
+
+/// The outputs of `samples` from `first` on; NaN from where on the run leaves the finite numbers.
+pub(super) fn outputs(
+    network: &Network,
+    u: &[f64],
+    first: usize,
+    state: &[f64],
+    samples: usize,
+) -> Vec<f64> {
+    let mut run = vec![f64::NAN; samples];
+    let free = FreeRun {
+        network,
+        u,
+        first,
+        state,
+        run: &mut run,
+        hidden: &mut [],
+        bound: f64::INFINITY,
+        monitor: None,
+    };
+    // where it ends early, NaN says so
+    let _ = free.go();
+    run
+}

@@ -1,6 +1,6 @@
 //! The runs by which a network is guarded: from past outputs beside the data's, and over larger inputs.
 
-use super::free_run::FreeRun;
+use super::free_run;
 use super::network::Network;
 use super::problem::Experiment;
 use crate::guard::{Guard, enlarged};
@@ -32,20 +32,7 @@ pub(super) fn is_sound(network: &Network, experiments: &[Experiment]) -> bool {
 /// The free run; NaN from where on it leaves the finite numbers.
 fn run(network: &Network, u: &[f64], first: usize, state: &[f64]) -> Vec<f64> {
     let samples = u.len() / network.lags().channels;
-    let mut run = vec![f64::NAN; samples - first];
-    let free = FreeRun {
-        network,
-        u,
-        first,
-        state,
-        run: &mut run,
-        hidden: &mut [],
-        bound: f64::INFINITY,
-        monitor: None,
-    };
-    // where it ends early, NaN says so
-    let _ = free.go();
-    run
+    free_run::outputs(network, u, first, state, samples - first)
 }
 
 #[cfg(test)]
