@@ -47,6 +47,20 @@ pub(crate) trait Eight: Copy {
     fn at_most(self, limit: f64) -> Self;
     /// The larger of `self` and `limit`; NaN stays NaN.
     fn at_least(self, limit: f64) -> Self;
+    /// The smaller of `self` and `limits`, one by one; NaN in `self` stays NaN.
+    fn at_most_each(self, limits: Self) -> Self;
+    /// The larger of `self` and `limits`, one by one; NaN in `self` stays NaN.
+    fn at_least_each(self, limits: Self) -> Self;
+    /// `|self|`.
+    fn size(self) -> Self;
+    /// The largest integers that are not above `self`.
+    fn floor(self) -> Self;
+    /// `yes` where `self < other`, else `no`.
+    fn if_less(self, other: Self, yes: Self, no: Self) -> Self;
+    /// `yes` where `self == other`, else `no`.
+    fn if_equal(self, other: Self, yes: Self, no: Self) -> Self;
+    /// Where `self < other`, one bit each, the first lowest.
+    fn are_less(self, other: Self) -> u8;
     /// `2^n` for numbers that hold the integer `n` in their low bits.
     fn power_of_two(self) -> Self;
 
@@ -129,6 +143,13 @@ mod tests {
                 a.size_up_to(2.5),
                 a.at_most(2.5).at_least(-1.5),
                 V::splat(f64::from_bits(3)).power_of_two(),
+                a.at_most_each(b),
+                a.at_least_each(b),
+                a.size(),
+                a.floor(),
+                a.if_less(b, a, b),
+                a.if_equal(V::splat(0.5), b, a),
+                V::splat(f64::from(a.are_less(b))),
             ];
             let stored = |v: V| {
                 let mut values = [0.0; LANES];
@@ -153,9 +174,21 @@ mod tests {
             }
             assert_eq!(values[8][0], 8.0);
             assert_eq!(values[7][..3], [1.0, -1.5, 2.5]);
+            let smaller = [-4.0, -2.0, -0.5, -0.0, 1.0, -1.0, 2.0, -7.25];
+            assert_eq!((values[9], values[13]), (smaller, smaller));
+            assert_eq!(values[10][..3], [1.0, 2.0, 3.5]);
+            assert_eq!(
+                values[12],
+                [1.0, -2.0, 3.0, -0.0, 1e300, 0.0, f64::INFINITY, -8.0]
+            );
+            assert_eq!(values[12][3].to_bits(), 1 << 63);
+            assert_eq!((values[14][5], values[14][0]), (-1.0, 1.0));
+            assert_eq!(values[15], [f64::from(0b1000_1010_u8); LANES]);
         }
         for (_, values) in run_everywhere(|| All([f64::NAN; LANES], b)) {
-            assert!(values[6][0].is_nan() && values[7][0].is_nan());
+            let nan = [6, 7, 9, 10, 11, 12].map(|operation| values[operation][0].is_nan());
+            assert_eq!(nan, [true; 6]);
+            assert_eq!((values[13], values[15][0]), (b, 0.0));
         }
     }
 }

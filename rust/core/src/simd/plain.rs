@@ -85,8 +85,74 @@ impl Eight for Plain {
     }
 
     #[inline(always)]
+    fn at_most_each(self, limits: Self) -> Self {
+        self.with(limits, |v, limit| if v > limit { limit } else { v })
+    }
+
+    #[inline(always)]
+    fn at_least_each(self, limits: Self) -> Self {
+        self.with(limits, |v, limit| if v < limit { limit } else { v })
+    }
+
+    #[inline(always)]
+    fn size(self) -> Self {
+        Self(self.0.map(f64::abs))
+    }
+
+    #[inline(always)]
+    fn floor(self) -> Self {
+        Self(self.0.map(floor))
+    }
+
+    #[inline(always)]
+    fn if_less(self, other: Self, yes: Self, no: Self) -> Self {
+        let one = |i: usize| {
+            if self.0[i] < other.0[i] {
+                yes.0[i]
+            } else {
+                no.0[i]
+            }
+        };
+        Self(std::array::from_fn(one))
+    }
+
+    #[inline(always)]
+    fn if_equal(self, other: Self, yes: Self, no: Self) -> Self {
+        let one = |i: usize| {
+            if self.0[i] == other.0[i] {
+                yes.0[i]
+            } else {
+                no.0[i]
+            }
+        };
+        Self(std::array::from_fn(one))
+    }
+
+    #[inline(always)]
+    fn are_less(self, other: Self) -> u8 {
+        (0..LANES).fold(0, |bits, i| bits | u8::from(self.0[i] < other.0[i]) << i)
+    }
+
+    #[inline(always)]
     fn power_of_two(self) -> Self {
         let power = |v: f64| f64::from_bits((v.to_bits() << 52).wrapping_add(1023 << 52));
         Self(self.0.map(power))
+    }
+}
+
+/// From here on every number is an integer.
+const WHOLE: f64 = 4_503_599_627_370_496.0;
+
+/// The standard library's `floor` is a call where the baseline has no instruction for it.
+#[inline(always)]
+fn floor(v: f64) -> f64 {
+    let shift = WHOLE.copysign(v);
+    let nearest = (v + shift) - shift;
+    let below = if nearest > v { nearest - 1.0 } else { nearest };
+    // 0 keeps the sign of what it came from
+    if v.abs() < WHOLE {
+        below.copysign(v)
+    } else {
+        v
     }
 }

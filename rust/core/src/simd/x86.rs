@@ -6,6 +6,9 @@ use std::arch::x86_64::*;
 
 use super::{Eight, Kernel, LANES};
 
+/// Rounding to the integer below.
+const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
+
 /// Runs a kernel in AVX-512 registers.
 #[target_feature(enable = "avx512f,avx2,fma")]
 pub(super) fn wide<K: Kernel>(kernel: K) -> K::Output {
@@ -101,6 +104,54 @@ impl Eight for Wide {
     fn at_least(self, limit: f64) -> Self {
         // SAFETY: as `at_most`.
         unsafe { Self(_mm512_max_pd(_mm512_set1_pd(limit), self.0)) }
+    }
+
+    #[inline(always)]
+    fn at_most_each(self, limits: Self) -> Self {
+        // SAFETY: as `at_most`.
+        unsafe { Self(_mm512_min_pd(limits.0, self.0)) }
+    }
+
+    #[inline(always)]
+    fn at_least_each(self, limits: Self) -> Self {
+        // SAFETY: as `at_most`.
+        unsafe { Self(_mm512_max_pd(limits.0, self.0)) }
+    }
+
+    #[inline(always)]
+    fn size(self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_abs_pd(self.0)) }
+    }
+
+    #[inline(always)]
+    fn floor(self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_roundscale_pd::<DOWN>(self.0)) }
+    }
+
+    #[inline(always)]
+    fn if_less(self, other: Self, yes: Self, no: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            let less = _mm512_cmp_pd_mask::<_CMP_LT_OQ>(self.0, other.0);
+            Self(_mm512_mask_blend_pd(less, no.0, yes.0))
+        }
+    }
+
+    #[inline(always)]
+    fn if_equal(self, other: Self, yes: Self, no: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            let equal = _mm512_cmp_pd_mask::<_CMP_EQ_OQ>(self.0, other.0);
+            Self(_mm512_mask_blend_pd(equal, no.0, yes.0))
+        }
+    }
+
+    #[inline(always)]
+    fn are_less(self, other: Self) -> u8 {
+        // SAFETY: as `splat`.
+        unsafe { _mm512_cmp_pd_mask::<_CMP_LT_OQ>(self.0, other.0) }
     }
 
     #[inline(always)]
@@ -228,6 +279,73 @@ impl Eight for Halves {
         // SAFETY: as `at_most`.
         let one = |v: __m256d| unsafe { _mm256_max_pd(_mm256_set1_pd(limit), v) };
         Self(one(self.0), one(self.1))
+    }
+
+    #[inline(always)]
+    fn at_most_each(self, limits: Self) -> Self {
+        // SAFETY: as `at_most`.
+        unsafe {
+            Self(
+                _mm256_min_pd(limits.0, self.0),
+                _mm256_min_pd(limits.1, self.1),
+            )
+        }
+    }
+
+    #[inline(always)]
+    fn at_least_each(self, limits: Self) -> Self {
+        // SAFETY: as `at_most`.
+        unsafe {
+            Self(
+                _mm256_max_pd(limits.0, self.0),
+                _mm256_max_pd(limits.1, self.1),
+            )
+        }
+    }
+
+    #[inline(always)]
+    fn size(self) -> Self {
+        // SAFETY: as `splat`.
+        let one = |v: __m256d| unsafe { _mm256_andnot_pd(_mm256_set1_pd(-0.0), v) };
+        Self(one(self.0), one(self.1))
+    }
+
+    #[inline(always)]
+    fn floor(self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm256_floor_pd(self.0), _mm256_floor_pd(self.1)) }
+    }
+
+    #[inline(always)]
+    fn if_less(self, other: Self, yes: Self, no: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            Self(
+                _mm256_blendv_pd(no.0, yes.0, _mm256_cmp_pd::<_CMP_LT_OQ>(self.0, other.0)),
+                _mm256_blendv_pd(no.1, yes.1, _mm256_cmp_pd::<_CMP_LT_OQ>(self.1, other.1)),
+            )
+        }
+    }
+
+    #[inline(always)]
+    fn if_equal(self, other: Self, yes: Self, no: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            Self(
+                _mm256_blendv_pd(no.0, yes.0, _mm256_cmp_pd::<_CMP_EQ_OQ>(self.0, other.0)),
+                _mm256_blendv_pd(no.1, yes.1, _mm256_cmp_pd::<_CMP_EQ_OQ>(self.1, other.1)),
+            )
+        }
+    }
+
+    #[inline(always)]
+    fn are_less(self, other: Self) -> u8 {
+        // SAFETY: as `splat`.
+        unsafe {
+            let low = _mm256_movemask_pd(_mm256_cmp_pd::<_CMP_LT_OQ>(self.0, other.0));
+            let high = _mm256_movemask_pd(_mm256_cmp_pd::<_CMP_LT_OQ>(self.1, other.1));
+            (low | high << 4) as u8
+        }
     }
 
     #[inline(always)]
