@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from .front import ParetoFront, pareto
     from .identification import identify
     from .leastsquares import LeastSquaresResult, least_squares
+    from .load_step import LoadStep
     from .loop import ClosedLoopRun, run
     from .machine import VirtualMachine
     from .models import ARX, IV, Ensemble, LinearOE, Model, NeuralOE, NeuralSS, load_model
@@ -67,6 +68,7 @@ __all__ = [
     "LeastSquaresResult",
     "LinearOE",
     "LinkError",
+    "LoadStep",
     "Margins",
     "Model",
     "ModelFileError",
@@ -115,6 +117,7 @@ _HOMES = {
     "commissioning": "Commissioning commission",
     "analysis": "Analysis analyse",
     "constraints": "Constraints",
+    "load_step": "LoadStep",
     "control": "Controller Gains fit_fopdt load_controller paper_controller table_1",
     "cost": "Cost",
     "dataset": "Dataset Experiment",

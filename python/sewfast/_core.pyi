@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, final
+from typing import Any, Literal, TypeAlias, TypedDict, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -413,34 +413,54 @@ def cost_terms(
     """tracking, chatter, effort, overshoot [%], rise [ms], lag [ms], saturation, u_max of a run."""
 
 _Variable: TypeAlias = tuple[str, tuple[float, float] | None]
-_Limits: TypeAlias = tuple[float | None, float | None, float | None]
+
+class _Limits(TypedDict):
+    """Ms of the linear plants, overshoot [%], |u|, recovery [ms], load [y]; a controller stands for what it does on each plant."""
+
+    Ms: float | None
+    overshoot: float | None
+    u: float | None
+    recovery: float | Controller | None
+    load: float | Controller | None
+
+class _Task(TypedDict):
+    """What is tuned on what.
+
+    Every plant is taken in every variation (gain, extra delay in samples). Load steps are (reference, disturbance, band [y],
+    samples of the mean). ``variables`` are (name, bounds or None); none at all stands for the usual ones. Weights left out of ``cost``
+    keep their defaults. ``linear_plants`` are (num, den) in powers of z^-1.
+    """
+
+    plants: Sequence[_Plant]
+    references: Sequence[_F]
+    load_steps: Sequence[tuple[_F, _F, float, int]]
+    start: Controller
+    counts_per_unit: float
+    variations: Sequence[tuple[float, int]]
+    variables: Sequence[_Variable]
+    cost: Mapping[str, float]
+    aggregate: str
+    limits: _Limits
+    linear_plants: Sequence[tuple[_F, _F]]
 
 def tune(
-    plants: Sequence[_Plant], references: Sequence[_F], *, start: Controller, counts_per_unit: float,
-    variations: Sequence[tuple[float, int]], variables: Sequence[_Variable], cost: Mapping[str, float],
-    aggregate: str, limits: _Limits, loops: Sequence[tuple[_F, _F]], method: str, evaluations: int, seed: int, threads: int,
-    progress: _Progress = None,
+    task: _Task, *, method: str, evaluations: int, seed: int, threads: int, progress: _Progress = None
 ) -> dict[str, Any]:
-    """Search ``variables`` (name, bounds or None), or the usual ones where there are none.
-
-    Every plant is taken in every variation (gain, extra delay in samples). Weights left out of ``cost`` keep
-    their defaults; ``limits`` are Ms, overshoot [%], |u|; Ms is that of ``loops`` (num, den in powers of z^-1). Returns cost, violation, start_cost, variables (name,
-    low, high), values, start (the values it began with), moved (whether the start
-    lay outside bounds), trace, termination, weights.
+    """Returns cost, violation, start_cost, variables (name, low, high), values, start (the values it began with), moved (whether
+    the start lay outside bounds), trace, termination, weights.
     """
 
 def tuning_costs(
-    plants: Sequence[_Plant], references: Sequence[_F], controllers: Sequence[Controller], *,
-    counts_per_unit: float, variations: Sequence[tuple[float, int]], cost: Mapping[str, float],
-    aggregate: str, limits: _Limits, loops: Sequence[tuple[_F, _F]], threads: int, progress: _Progress = None,
+    task: _Task, controllers: Sequence[Controller], *, threads: int, progress: _Progress = None
 ) -> list[tuple[float, float]]:
     """Cost and violation of each controller."""
 
+def tuning_loads(task: _Task) -> list[tuple[float, float]]:
+    """Recovery [ms] and rms deviation [y] of the start on each plant in each variation, the worst over the load steps."""
+
 def pareto(
-    plants: Sequence[_Plant], references: Sequence[_F], *, start: Controller, others: Sequence[Controller],
-    counts_per_unit: float, variations: Sequence[tuple[float, int]], variables: Sequence[_Variable],
-    cost: Mapping[str, float], aggregate: str, limits: _Limits, loops: Sequence[tuple[_F, _F]], objectives: Sequence[str], size: int,
-    evaluations: int, seed: int, threads: int, progress: _Progress = None,
+    task: _Task, *, others: Sequence[Controller], objectives: Sequence[str], size: int, evaluations: int, seed: int, threads: int,
+    progress: _Progress = None,
 ) -> dict[str, Any]:
     """Returns controllers (values of the variables), values (of the objectives), variables, evaluations, termination."""
 

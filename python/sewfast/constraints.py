@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
+from . import _core
+from .control import Controller
 from .errors import SettingError
 from .gains import real
 
@@ -26,6 +28,11 @@ class Constraints:
         Largest overshoot on steps and trapezoids [%], on every plant.
     u : float, optional
         Largest \\|u\\| in every run [u].
+    recovery : float or Controller, optional
+        Longest recovery from any load step, on every plant [ms]; of a controller what it takes on
+        each plant itself, at least one sample: no plant may recover later than under it.
+    load : float or Controller, optional
+        Largest rms deviation under any load step [y], likewise.
     plant : linear plant or list of them, optional
         Where Ms is taken: whatever `sewfast.margins` takes. By default the linear models among the
         plants that are tuned on.
@@ -41,13 +48,15 @@ class Constraints:
     Ms: float | None = None
     overshoot: float | None = None
     u: float | None = None
+    recovery: float | Controller | None = None
+    load: float | Controller | None = None
     plant: Any = None
     speed: float | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("Ms", 1.0), ("overshoot", 0.0), ("u", 0.0)):
-            value = getattr(self, name)
-            if value is None:
+        for name in LIMITS:
+            value, least = getattr(self, name), 1.0 if name == "Ms" else 0.0
+            if value is None or (name in BY_RIVAL and isinstance(value, Controller)):
                 continue
             limit = real(name, value)
             if not (limit > least and math.isfinite(limit)):
@@ -59,11 +68,23 @@ class Constraints:
             object.__setattr__(self, "speed", real("speed", self.speed))
 
     @property
-    def limits(self) -> tuple[float | None, float | None, float | None]:
-        """Ms, overshoot [%], \\|u\\| [u]."""
-        return self.Ms, self.overshoot, self.u
+    def limits(self) -> _core._Limits:
+        """By name, as the core takes them."""
+        values = {name: getattr(self, name) for name in LIMITS}
+        cores = {n: v.core() if isinstance(v, Controller) else v for n, v in values.items()}
+        return cast("_core._Limits", cores)
 
     def __str__(self) -> str:
-        names = {"Ms": "", "overshoot": " %", "u": ""}
-        given = {n: getattr(self, n) for n in names if getattr(self, n) is not None}
-        return ", ".join(f"{n} <= {v:g}{names[n]}" for n, v in given.items()) or "none"
+        given = {n: getattr(self, n) for n in LIMITS if getattr(self, n) is not None}
+        return ", ".join(_told(n, v) for n, v in given.items()) or "none"
+
+
+LIMITS = {"Ms": "", "overshoot": " %", "u": "", "recovery": " ms", "load": ""}
+"""Every limit with its unit."""
+BY_RIVAL = ("recovery", "load")
+
+
+def _told(name: str, limit: float | Controller) -> str:
+    if isinstance(limit, Controller):
+        return f"{name} no larger than under {limit.notes or 'another controller'}"
+    return f"{name} <= {limit:g}{LIMITS[name]}"

@@ -44,6 +44,10 @@ class Cost:
         Of the shift of the output against the reference with the least rms difference [ms].
     saturation : float or None
         Of the share of samples at a limit; .02 R.
+    recovery : float
+        Of the time until a load step is fought down [ms] (`LoadStep`), the mean over these.
+    load : float
+        Of the rms deviation under a load step [y].
 
     Raises
     ------
@@ -59,6 +63,8 @@ class Cost:
     rise: float = 0.0
     lag: float = 0.0
     saturation: float | None = None
+    recovery: float = 0.0
+    load: float = 0.0
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -91,6 +97,8 @@ class Cost:
     def of(self, runs: ClosedLoopRun | Sequence[ClosedLoopRun]) -> float:
         """What runs cost: the mean over them, as in `sewfast.tune` over references.
 
+        Runs along references are meant: recovery and load do not count.
+
         Raises
         ------
         DataError
@@ -107,8 +115,7 @@ class Cost:
     def _of(self, terms: dict[str, float]) -> float:
         above = {**terms, "overshoot": max(terms["overshoot"] - self.overshoot_limit, 0.0)}
         weights = self.named()
-        del weights["overshoot_limit"]
-        return sum(weight * above[name] for name, weight in weights.items())
+        return sum(weights[name] * value for name, value in above.items() if name in weights)
 
 
 def terms(run: ClosedLoopRun) -> dict[str, float]:

@@ -17,6 +17,7 @@ from .control import Controller
 from .cost import Cost
 from .errors import Interrupted, SettingError
 from .gains import whole
+from .load_step import LoadStep
 from .plants import Plants, References
 from .tuning import tune
 from .tuning_task import (
@@ -151,6 +152,7 @@ def pareto(
     aggregate: Aggregate = "mean",
     constraints: Constraints | None = None,
     variations: Sequence[tuple[float, int]] | None = None,
+    loads: Sequence[LoadStep] = (),
     size: int = SIZE,
     evaluations: int = EVALUATIONS,
     seed: int = 0,
@@ -164,10 +166,11 @@ def pareto(
 
     Parameters
     ----------
-    models, references, start, variables, aggregate, constraints, variations, seed, threads
+    models, references, start, variables, aggregate, constraints, variations, loads, seed, threads
         As in `tune`; without a start, that of `tune` with its default limits.
     objectives : sequence of str
-        Two or more of tracking, chatter, effort, overshoot, rise, lag, saturation, cost, Ms.
+        Two or more of tracking, chatter, effort, overshoot, rise, lag, saturation, recovery, load,
+        cost, Ms.
     cost : Cost, optional
         What the objective ``cost`` is, and what the first controller is tuned for.
     size : int
@@ -196,6 +199,7 @@ def pareto(
         "aggregate": aggregate,
         "constraints": constraints,
         "variations": variations,
+        "loads": loads,
     }
     first = max(1, int(_TUNED * total))
     tuned = tune(
@@ -211,18 +215,14 @@ def pareto(
     )
     task = TuningTask.of(models, references, start=tuned.start, first={}, **settings)
     found = _core.pareto(
-        task.cores,
-        task.references,
-        start=task.start.core(),
+        task.core(variables, ms="Ms" in names),
         others=[tuned.controller.core()],
-        variables=task.variables(variables),
         objectives=names,
         size=whole("size", size),
         evaluations=max(1, total - first),
         seed=whole("seed", seed),
         threads=threads_or_all(threads),
         progress=_shifted(progress, first, total),
-        **task.keywords(ms="Ms" in names),
     )
     return _front(found, task, names, first, tuned.controller)
 
@@ -277,6 +277,8 @@ def _units(objectives: Sequence[str], controller: Controller) -> dict[str, str]:
         "overshoot": "%",
         "rise": "ms",
         "lag": "ms",
+        "recovery": "ms",
+        "load": y,
     }
     return {name: known.get(name, "") for name in objectives}
 

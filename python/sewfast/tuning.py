@@ -15,6 +15,7 @@ from .control import Controller
 from .cost import Cost
 from .errors import Interrupted, SettingError
 from .gains import whole
+from .load_step import LoadStep
 from .plants import Plants, References
 from .starting import first_controller
 from .tuning_task import (
@@ -26,7 +27,7 @@ from .tuning_task import (
 )
 from .variables import Variable, Wanted, applied
 
-__all__ = ["TuningResult", "costs", "default_variations", "first_controller", "tune"]
+__all__ = ["TuningResult", "costs", "default_variations", "first_controller", "recoveries", "tune"]
 
 Method: TypeAlias = Literal["genetic", "cma-es"]
 
@@ -105,6 +106,7 @@ def tune(
     aggregate: Aggregate = "mean",
     constraints: Constraints | None = None,
     variations: Sequence[tuple[float, int]] | None = None,
+    loads: Sequence[LoadStep] = (),
     method: Method = "genetic",
     evaluations: int = EVALUATIONS,
     seed: int = 0,
@@ -148,6 +150,9 @@ def tune(
         Output gain and extra input delay in samples, applied to every plant. By default the plant
         as it is, and with the gains .8 and 1.25 and a delay of a quarter of the moving average, at
         least one sample: dynamics that identification missed must not upset the loop.
+    loads : sequence of LoadStep
+        Load steps that every candidate has to bear as well; what recovery and load of `cost` and
+        `constraints` are taken on. Their runs count for nothing else.
     method : "genetic" or "cma-es"
         A genetic algorithm with local refinement, or CMA-ES with restarts.
     evaluations : int
@@ -183,18 +188,15 @@ def tune(
         aggregate=aggregate,
         constraints=constraints,
         variations=variations,
+        loads=loads,
     )
     found = _core.tune(
-        task.cores,
-        task.references,
-        start=task.start.core(),
-        variables=task.variables(variables),
+        task.core(variables),
         method=method,
         evaluations=whole("evaluations", evaluations),
         seed=whole("seed", seed),
         threads=threads_or_all(threads),
         progress=progress,
-        **task.keywords(),
     )
     result = _result(found, task, method)
     if result.termination == "interrupted":
@@ -210,6 +212,7 @@ def costs(
     cost: Cost | None = None,
     aggregate: Aggregate = "mean",
     variations: Sequence[tuple[float, int]] | None = None,
+    loads: Sequence[LoadStep] = (),
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> NDArray[np.float64]:
@@ -239,16 +242,48 @@ def costs(
         aggregate=aggregate,
         constraints=None,
         variations=variations,
+        loads=loads,
     )
     judged = _core.tuning_costs(
-        task.cores,
-        task.references,
+        task.core(),
         [c.core() for c in given],
         threads=threads_or_all(threads),
         progress=progress,
-        **task.keywords(),
     )
     return np.array([cost for cost, _ in judged])
+
+
+def recoveries(
+    controller: Controller,
+    models: Plants,
+    loads: Sequence[LoadStep],
+    *,
+    variations: Sequence[tuple[float, int]] | None = None,
+) -> NDArray[np.float64]:
+    """Recovery [ms] and rms deviation [y] under the load steps, the worst; shape (plants, 2).
+
+    A row per plant in each variation: the first plant in all of them, then the next. Parameters are
+    those of `tune`.
+
+    Raises
+    ------
+    SettingError, DataError
+        For a controller, plants or load steps that cannot be used.
+    FitError
+        Where a loop runs away.
+    """
+    task = TuningTask.of(
+        models,
+        [np.zeros(1)],
+        start=controller,
+        first={},
+        cost=None,
+        aggregate="mean",
+        constraints=None,
+        variations=variations,
+        loads=loads,
+    )
+    return np.array(_core.tuning_loads(task.core()))
 
 
 def _result(found: Mapping[str, Any], task: TuningTask, method: str) -> TuningResult:

@@ -9,11 +9,13 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from . import _core
 from .constraints import Constraints
 from .control import Controller
 from .cost import Cost
 from .errors import SettingError
 from .gains import real, whole
+from .load_step import LoadStep
 from .loop import check_fits, reference_samples
 from .plants import Plants, References, each_plant, each_reference
 from .starting import assumed, first_controller
@@ -34,6 +36,7 @@ class TuningTask:
 
     plants: list[Any]
     references: list[Any]
+    loads: list[LoadStep]
     start: Controller
     variations: list[tuple[float, int]]
     cost: Cost
@@ -53,6 +56,7 @@ class TuningTask:
         aggregate: str,
         constraints: Constraints | None,
         variations: Sequence[tuple[float, int]] | None,
+        loads: Sequence[LoadStep] = (),
     ) -> TuningTask:
         """Checked; without a start, `first` are the settings of the first controller."""
         given = list(models) if isinstance(models, Sequence) else [models]
@@ -67,6 +71,7 @@ class TuningTask:
             references=[
                 reference_samples(r, start) for r in each_reference(references, REFERENCES)
             ],
+            loads=_load_steps(loads),
             start=start,
             variations=_checked(default_variations(start) if variations is None else variations),
             cost=_instance(cost, Cost, "Cost(chatter=5.0)"),
@@ -75,16 +80,21 @@ class TuningTask:
             assumed=assumed(given[0]),
         )
 
-    def keywords(self, *, ms: bool = False) -> dict[str, Any]:
-        """Of the core's functions, beside plants and references; `ms`: Ms is asked for anyway."""
+    def core(self, names: Sequence[Wanted] | None = None, *, ms: bool = False) -> _core._Task:
+        """As the core takes it, with variables by name; `ms`: Ms is asked for anyway."""
         loops = self._loops() if ms or self.constraints.Ms is not None else []
         return {
+            "plants": [plant.core for plant in self.plants],
+            "references": self.references,
+            "load_steps": [step.samples(self.start.Ts) for step in self.loads],
+            "start": self.start.core(),
             "counts_per_unit": self.start.counts_per_unit,
             "variations": self.variations,
+            "variables": wanted(names, self.start),
             "cost": self.cost.named(),
             "aggregate": self.aggregate,
             "limits": self.constraints.limits,
-            "loops": loops,
+            "linear_plants": loops,
         }
 
     def _loops(self) -> list[Any]:
@@ -102,15 +112,6 @@ class TuningTask:
                 "Constraints(plant=...), for example a linear model of the same drive"
             )
         return [sampled(plant, self.start.Ts, self.constraints.speed) for plant in plants]
-
-    @property
-    def cores(self) -> list[Any]:
-        """The compiled plants."""
-        return [plant.core for plant in self.plants]
-
-    def variables(self, names: Sequence[Wanted] | None) -> list[Any]:
-        """Names and bounds as the core takes them."""
-        return wanted(names, self.start)
 
 
 def threads_or_all(threads: int | None) -> int:
@@ -130,6 +131,11 @@ def _instance(given: Any, kind: type[Any], example: str) -> Any:
             f"expected a {kind.__name__}, got {type(given).__name__}; for example {example}"
         )
     return kind() if given is None else given
+
+
+def _load_steps(given: Sequence[LoadStep]) -> list[LoadStep]:
+    steps = [given] if isinstance(given, LoadStep) else list(given)
+    return [_instance(step, LoadStep, "LoadStep(1500.0, -2.0)") for step in steps]
 
 
 def _checked(variations: Sequence[tuple[float, int]]) -> list[tuple[float, int]]:

@@ -224,7 +224,9 @@ def _constraints(given: list[str] | None) -> Constraints:
     from ..constraints import Constraints
 
     pairs = _pairs(given, "--constraint")
-    return Constraints(**_known(pairs, "--constraint", ("Ms", "overshoot", "u")))
+    return Constraints(
+        **_known(pairs, "--constraint", ("Ms", "overshoot", "u", "recovery", "load"))
+    )
 
 
 def _known(pairs: dict[str, float], option: str, names: tuple[str, ...]) -> dict[str, Any]:

@@ -7,16 +7,18 @@ mod bench;
 mod constraint;
 mod cost;
 mod front;
+mod load;
 mod variable;
 
 pub use constraint::{Constraints, Sensitivity};
 pub use cost::{Cost, Terms, Weights, terms};
 pub use front::{Front, Objective, pareto};
+pub use load::{LoadLimit, LoadStep};
 pub use variable::{Parameter, Variable};
 
 use sewfast_control::{Controller, Design, Settings};
 
-use crate::closed_loop::{Plant, check_reference};
+use crate::closed_loop::{Plant, Signals, check_reference};
 use crate::encoder::Encoder;
 use crate::search::{Judgement, Options, Problem, Termination, cma_es, each, genetic};
 use crate::{Error, Monitor, Result};
@@ -30,6 +32,8 @@ pub struct Task<'a, P> {
     pub plants: &'a [P],
     /// References that it has to follow, each with the same weight.
     pub references: &'a [&'a [f64]],
+    /// Load steps that it has to bear, each with the same weight; of their runs only recovery, deviation and `|u|` count.
+    pub loads: &'a [LoadStep<'a>],
     /// The encoder of plants that bring none; `None` for ideal feedback.
     pub encoder: Option<Encoder>,
     /// The controller to begin with; what is not searched is kept.
@@ -166,6 +170,24 @@ pub fn costs<P: Plant + Clone + Send + Sync>(
     }))
 }
 
+/// What each plant does at worst under the task's load steps with a design: what others may be measured by.
+///
+/// # Errors
+/// As [`tune`]; `ErrorKind::Fit` where a run diverges or on a stop.
+pub fn loaded<P: Plant + Clone>(
+    task: &Task<'_, P>,
+    design: &Design<f64>,
+    monitor: &Monitor,
+) -> Result<Vec<LoadLimit>> {
+    task.check()?;
+    Bench::new(task)?.loaded(task, design, monitor).ok_or_else(|| {
+        Error::fit(
+            "expected a controller that bears the load steps on every plant, with this one a run diverges; take smaller \
+             gains",
+        )
+    })
+}
+
 impl Tuned {
     fn checked(self) -> Result<Self> {
         let tried = self.trace.len();
@@ -187,7 +209,30 @@ impl Tuned {
     }
 }
 
-impl<P> Task<'_, P> {
+impl<'a, P> Task<'a, P> {
+    /// Runs on each plant: the load steps, which are short and tell early what is of no use, then the references.
+    fn runs(&self) -> usize {
+        self.loads.len() + self.references.len()
+    }
+
+    /// What acts on a run from outside.
+    fn signals(&self, run: usize) -> Signals<'a> {
+        self.loads.get(run).map_or_else(
+            || Signals::new(self.references[run - self.loads.len()]),
+            LoadStep::signals,
+        )
+    }
+
+    /// How many runs of its kind share the weight of one.
+    fn alike(&self, run: usize) -> f64 {
+        let several = if run < self.loads.len() {
+            self.loads.len()
+        } else {
+            self.references.len()
+        };
+        several as f64
+    }
+
     fn check(&self) -> Result<()> {
         let controller = Controller::new(self.start)?;
         let Settings {
@@ -215,7 +260,18 @@ impl<P> Task<'_, P> {
         }
         self.check_variables()?;
         self.constraints.check()?;
+        self.check_loads()?;
         self.references.iter().try_for_each(|r| check_reference(r))
+    }
+
+    fn check_loads(&self) -> Result<()> {
+        let weighed = self.cost.recovery > 0.0 || self.cost.load > 0.0;
+        if self.loads.is_empty() && (weighed || !self.constraints.loads.is_empty()) {
+            return Err(Error::setting(
+                "expected a load step to take recovery and load on, got none; give loads",
+            ));
+        }
+        self.loads.iter().try_for_each(LoadStep::check)
     }
 
     fn check_variables(&self) -> Result<()> {

@@ -3,7 +3,7 @@
 use sewfast_control::{Controller, Design, Settings};
 
 use super::cost::{Measure, Terms, Weights};
-use super::{Aggregate, Task};
+use super::{Aggregate, LoadLimit, Task};
 use crate::closed_loop::{Outcome, Plant, Run};
 use crate::search::Judgement;
 use crate::{Monitor, Result};
@@ -26,7 +26,8 @@ impl<P: Plant + Clone> Bench<P> {
     pub(super) fn new(task: &Task<'_, P>) -> Result<Self> {
         let Settings { u_min, u_max, .. } = task.start.pid;
         let weights = task.cost.weights(span(task.references), u_max - u_min)?;
-        let longest = task.references.iter().map(|r| r.len()).max().unwrap_or(0);
+        let longest = (0..task.runs()).map(|k| task.signals(k).reference.len());
+        let longest = longest.max().unwrap_or(0);
         let measure = |r: &&[f64]| {
             let measure = Measure::needed(r, &weights);
             match task.constraints.overshoot {
@@ -66,17 +67,18 @@ impl<P: Plant + Clone> Bench<P> {
             return Judgement::HOPELESS;
         };
         let loops = task.constraints.of_loops(design);
-        let references = task.references.len() as f64;
         let (mut total, mut largest) = (Total::default(), Terms::default());
+        let mut late = 0.0;
         for plant in 0..self.plants.len() {
-            for reference in 0..task.references.len() {
-                let Some(terms) = self.run(task, plant, reference, &mut controller, monitor) else {
+            for run in 0..task.runs() {
+                let Some(terms) = self.run(task, plant, run, &mut controller, monitor) else {
                     return Judgement::HOPELESS;
                 };
                 largest = largest.max(&terms);
-                total.add(self.weights.of(&terms) / references);
+                late = f64::max(late, task.constraints.of_load(plant, &terms));
+                total.add(self.weights.of(&terms) / task.alike(run));
                 let least = Judgement {
-                    violation: loops + task.constraints.of_runs(&largest),
+                    violation: loops + late + task.constraints.of_runs(&largest),
                     cost: total.lower_bound(task),
                 };
                 // Later runs can only add to either.
@@ -87,7 +89,7 @@ impl<P: Plant + Clone> Bench<P> {
             total.next_plant();
         }
         Judgement {
-            violation: loops + task.constraints.of_runs(&largest),
+            violation: loops + late + task.constraints.of_runs(&largest),
             cost: total.lower_bound(task),
         }
     }
@@ -101,20 +103,21 @@ impl<P: Plant + Clone> Bench<P> {
         monitor: &Monitor,
     ) -> Option<(Terms, f64)> {
         let mut controller = Controller::new(*design).ok()?;
-        let share = 1.0 / task.references.len() as f64;
         let (mut sum, mut worst) = (Terms::default(), Terms::default());
-        let mut largest = Terms::default();
+        let (mut largest, mut late) = (Terms::default(), 0.0);
         for plant in 0..self.plants.len() {
             let mut own = Terms::default();
-            for reference in 0..task.references.len() {
-                let terms = self.run(task, plant, reference, &mut controller, monitor)?;
+            for run in 0..task.runs() {
+                let terms = self.run(task, plant, run, &mut controller, monitor)?;
                 largest = largest.max(&terms);
-                own = own.plus(&terms, share);
+                late = f64::max(late, task.constraints.of_load(plant, &terms));
+                own = own.plus(&terms, 1.0 / task.alike(run));
             }
             sum = sum.plus(&own, 1.0 / self.plants.len() as f64);
             worst = worst.max(&own);
         }
-        let violation = task.constraints.of_loops(design) + task.constraints.of_runs(&largest);
+        let violation =
+            task.constraints.of_loops(design) + late + task.constraints.of_runs(&largest);
         let terms = match task.aggregate {
             Aggregate::Mean => sum,
             Aggregate::Worst => worst,
@@ -122,25 +125,52 @@ impl<P: Plant + Clone> Bench<P> {
         Some((terms, violation))
     }
 
+    /// What each plant does under the load steps, the worst of all of them; `None` where a run diverges or on a stop.
+    pub(super) fn loaded(
+        &mut self,
+        task: &Task<'_, P>,
+        design: &Design<f64>,
+        monitor: &Monitor,
+    ) -> Option<Vec<LoadLimit>> {
+        let mut controller = Controller::new(*design).ok()?;
+        let mut all = Vec::with_capacity(self.plants.len());
+        for plant in 0..self.plants.len() {
+            let mut worst = Terms::default();
+            for run in 0..task.loads.len() {
+                worst = worst.max(&self.run(task, plant, run, &mut controller, monitor)?);
+            }
+            all.push(LoadLimit {
+                recovery: worst.recovery,
+                load: worst.load,
+            });
+        }
+        Some(all)
+    }
+
+    /// The terms of one run on one plant; `None` where it diverges or on a stop.
     fn run(
         &mut self,
         task: &Task<'_, P>,
         plant: usize,
-        reference: usize,
+        run: usize,
         controller: &mut Controller<f64>,
         monitor: &Monitor,
     ) -> Option<Terms> {
-        let r = task.references[reference];
-        let plant = &mut self.plants[plant];
+        let signals = task.signals(run);
+        let (plant, encoder) = (&mut self.plants[plant], task.encoder.as_ref());
         self.run
-            .record(plant, controller, r, task.encoder.as_ref(), monitor);
+            .record_with(plant, controller, signals, encoder, monitor);
         if self.run.outcome != Outcome::Completed || monitor.stopped() {
             return None;
         }
         let Settings {
             u_min, u_max, ts, ..
         } = *controller.settings();
-        Some(self.measures[reference].of(r, &self.run, (u_min, u_max), ts))
+        if let Some(load) = task.loads.get(run) {
+            return Some(load.terms(&self.run, ts));
+        }
+        let measure = &self.measures[run - task.loads.len()];
+        Some(measure.of(signals.reference, &self.run, (u_min, u_max), ts))
     }
 }
 

@@ -4,6 +4,7 @@ use std::fmt;
 
 use sewfast_control::Design;
 
+use super::LoadLimit;
 use super::cost::Terms;
 use crate::{Error, Result};
 
@@ -20,6 +21,8 @@ pub struct Constraints<'a> {
     pub overshoot: Option<f64>,
     /// Largest `|u|` \[u\].
     pub u: Option<f64>,
+    /// What each plant may do under the load steps; empty for anything.
+    pub loads: &'a [LoadLimit],
 }
 
 impl fmt::Debug for Constraints<'_> {
@@ -28,6 +31,7 @@ impl fmt::Debug for Constraints<'_> {
             .field("ms", &self.ms.map(|(limit, _)| limit))
             .field("overshoot", &self.overshoot)
             .field("u", &self.u)
+            .field("loads", &self.loads)
             .finish()
     }
 }
@@ -39,7 +43,12 @@ impl Constraints<'_> {
             ("overshoot", self.overshoot, 0.0),
             ("u", self.u, 0.0),
         ];
-        for (name, limit, least) in limits {
+        let loads = self.loads.iter();
+        let loads = loads.flat_map(|l| [("recovery", l.recovery), ("load", l.load)]);
+        // An infinite limit of a plant's load step is none.
+        let loads = loads.filter(|(_, limit)| *limit != f64::INFINITY);
+        let loads = loads.map(|(name, limit)| (name, Some(limit), 0.0));
+        for (name, limit, least) in limits.into_iter().chain(loads) {
             if limit.is_some_and(|limit| !(limit > least && limit.is_finite())) {
                 return Err(Error::setting(format!(
                     "expected a finite limit above {least} for {name}, got {}",
@@ -57,6 +66,13 @@ impl Constraints<'_> {
         })
     }
 
+    /// Sum of a plant's relative violations by a run under a load step.
+    pub(super) fn of_load(&self, plant: usize, terms: &Terms) -> f64 {
+        self.loads.get(plant).map_or(0.0, |limit| {
+            excess(terms.recovery, limit.recovery) + excess(terms.load, limit.load)
+        })
+    }
+
     /// Sum of the relative violations by what was the largest of all runs.
     pub(super) fn of_runs(&self, largest: &Terms) -> f64 {
         let over = |limit: Option<f64>, value| limit.map_or(0.0, |limit| excess(value, limit));
@@ -67,6 +83,8 @@ impl Constraints<'_> {
 fn excess(value: f64, limit: f64) -> f64 {
     if value.is_nan() {
         f64::INFINITY
+    } else if limit == f64::INFINITY {
+        0.0
     } else {
         ((value - limit) / limit).max(0.0)
     }

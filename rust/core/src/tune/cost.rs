@@ -25,6 +25,10 @@ pub struct Cost {
     pub lag: f64,
     /// Per share 1 of samples at a limit; `.02 R`.
     pub saturation: Option<f64>,
+    /// Per millisecond of recovery from a load step.
+    pub recovery: f64,
+    /// Per unit of the rms deviation under a load step \[y\].
+    pub load: f64,
 }
 
 impl Default for Cost {
@@ -38,6 +42,8 @@ impl Default for Cost {
             rise: 0.0,
             lag: 0.0,
             saturation: None,
+            recovery: 0.0,
+            load: 0.0,
         }
     }
 }
@@ -57,6 +63,8 @@ impl Cost {
             rise: self.rise,
             lag: self.lag,
             saturation: self.saturation.unwrap_or(0.02 * span),
+            recovery: self.recovery,
+            load: self.load,
         };
         match weights
             .named()
@@ -83,11 +91,13 @@ pub struct Weights {
     pub rise: f64,
     pub lag: f64,
     pub saturation: f64,
+    pub recovery: f64,
+    pub load: f64,
 }
 
 impl Weights {
     /// Every weight by its name.
-    pub fn named(&self) -> [(&'static str, f64); 8] {
+    pub fn named(&self) -> [(&'static str, f64); 10] {
         [
             ("tracking", self.tracking),
             ("chatter", self.chatter),
@@ -97,6 +107,8 @@ impl Weights {
             ("rise", self.rise),
             ("lag", self.lag),
             ("saturation", self.saturation),
+            ("recovery", self.recovery),
+            ("load", self.load),
         ]
     }
 
@@ -109,6 +121,8 @@ impl Weights {
             + self.rise * terms.rise
             + self.lag * terms.lag
             + self.saturation * terms.saturation
+            + self.recovery * terms.recovery
+            + self.load * terms.load
     }
 }
 
@@ -129,6 +143,10 @@ pub struct Terms {
     pub lag: f64,
     /// Share of samples at a limit.
     pub saturation: f64,
+    /// Time after a load step until the deviation stays within its band \[ms\].
+    pub recovery: f64,
+    /// Rms deviation from a load step on \[y\].
+    pub load: f64,
     /// Largest `|u|` \[u\].
     pub u_max: f64,
 }
@@ -153,6 +171,8 @@ impl Terms {
             rise: of(self.rise, other.rise),
             lag: of(self.lag, other.lag),
             saturation: of(self.saturation, other.saturation),
+            recovery: of(self.recovery, other.recovery),
+            load: of(self.load, other.load),
             u_max: of(self.u_max, other.u_max),
         }
     }

@@ -23,6 +23,8 @@ pub enum Objective {
     Rise,
     Lag,
     Saturation,
+    Recovery,
+    Load,
     /// The largest sensitivity of the linear loops.
     Ms,
 }
@@ -42,10 +44,12 @@ impl Objective {
             "rise" => Ok(Self::Rise),
             "lag" => Ok(Self::Lag),
             "saturation" => Ok(Self::Saturation),
+            "recovery" => Ok(Self::Recovery),
+            "load" => Ok(Self::Load),
             "Ms" => Ok(Self::Ms),
             _ => Err(Error::setting(format!(
-                "expected objectives among cost, tracking, chatter, effort, overshoot, rise, lag, saturation and Ms, got \
-                 '{name}'"
+                "expected objectives among cost, tracking, chatter, effort, overshoot, rise, lag, saturation, recovery, load \
+                 and Ms, got '{name}'"
             ))),
         }
     }
@@ -127,6 +131,12 @@ fn check<P>(task: &Task<'_, P>, objectives: &[Objective]) -> Result<()> {
             objectives[i]
         )));
     }
+    let of_load = |o: &Objective| matches!(o, Objective::Recovery | Objective::Load);
+    if objectives.iter().any(of_load) && task.loads.is_empty() {
+        return Err(Error::setting(
+            "expected a load step for the objectives recovery and load, got none; give loads",
+        ));
+    }
     if objectives.contains(&Objective::Ms) && task.constraints.ms.is_none() {
         return Err(Error::setting(
             "expected a linear plant for the objective Ms, got none; give one with the constraints",
@@ -152,6 +162,8 @@ impl<P: Plant + Clone + Send + Sync> Several<'_, P> {
             Objective::Rise => terms.rise,
             Objective::Lag => terms.lag,
             Objective::Saturation => terms.saturation,
+            Objective::Recovery => terms.recovery,
+            Objective::Load => terms.load,
             Objective::Ms => self
                 .task
                 .constraints

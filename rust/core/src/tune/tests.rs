@@ -50,6 +50,7 @@ fn with_task<T>(
     work(&Task {
         plants: &plants,
         references: &[&r],
+        loads: &[],
         encoder: Some(Encoder::new(26.2, 0.5)),
         start,
         variables: &Variable::usual(&start).unwrap_or(vec![usual]),
@@ -328,6 +329,82 @@ fn constraints_are_kept_and_what_cannot_be_kept_is_said() {
 }
 
 #[test]
+fn a_load_step_counts_and_binds_only_where_it_is_asked_for() {
+    with_task(start(), |plain| {
+        let (reference, disturbance) = held();
+        let step = LoadStep {
+            reference: &reference,
+            disturbance: &disturbance,
+            band: 10.0,
+            mean: 1,
+        };
+        let loads = [step];
+        let loaded_task = Task {
+            loads: &loads,
+            ..plain.clone()
+        };
+        let search = |task: &Task<'_, _>, evaluations| {
+            tune(
+                task,
+                Method::Genetic,
+                options(evaluations, 2),
+                &Monitor::default(),
+            )
+        };
+        let free = search(&loaded_task, 300).unwrap();
+        assert_eq!(free.design, search(plain, 300).unwrap().design);
+        let did = |design| loaded(&loaded_task, &design, &Monitor::default()).unwrap();
+        let halved = did(free.design).into_iter().map(|did| LoadLimit {
+            recovery: 0.7 * did.recovery,
+            load: f64::INFINITY,
+        });
+        let limits: Vec<_> = halved.collect();
+        let bound = Task {
+            constraints: Constraints {
+                loads: &limits,
+                ..Constraints::default()
+            },
+            ..loaded_task.clone()
+        };
+        let quick = search(&bound, 600).unwrap();
+        let kept = did(quick.design).into_iter().zip(&limits);
+        assert!(quick.violation == 0.0 && kept.clone().count() == 3);
+        for (did, limit) in kept {
+            assert!(did.recovery <= limit.recovery, "{did:?} {limit:?}");
+        }
+        let weighed = Task {
+            cost: Cost {
+                load: 20.0,
+                ..Cost::default()
+            },
+            ..loaded_task.clone()
+        };
+        let stiff = search(&weighed, 300).unwrap();
+        assert!(did(stiff.design)[1].load < did(free.design)[1].load);
+        let mean = did(weighed.start).iter().map(|d| d.load).sum::<f64>() / 3.0;
+        let expected = cost(plain, &weighed.start) + 20.0 * mean;
+        assert!((cost(&weighed, &weighed.start) - expected).abs() < 1e-9 * expected);
+        let without = Task {
+            loads: &[],
+            ..bound.clone()
+        };
+        assert!(
+            search(&without, 2)
+                .unwrap_err()
+                .message
+                .contains("load step")
+        );
+    });
+}
+
+/// A ramp to 1,500 RPM, and 2 V less from .8 s on.
+fn held() -> (Vec<f64>, Vec<f64>) {
+    let at = |k: i32| (f64::from(k) / 300.0).min(1.0) * 1500.0;
+    let on = |k: i32| if k < 800 { 0.0 } else { -2.0 };
+    ((0..1300).map(at).collect(), (0..1300).map(on).collect())
+}
+
+#[test]
 fn a_front_trades_tracking_for_calm() {
     with_task(start(), |task| {
         let objectives = [Objective::Tracking, Objective::Chatter];
@@ -383,7 +460,9 @@ fn variables_that_make_no_sense_are_refused() {
             .unwrap_err()
             .message
     };
-    assert!(refused(Parameter::Kp, Some((0.1, 0.1))).contains("differ"));
+    for bounds in [(0.1, 0.1), (0.2, 0.1), (f64::NAN, 1.0)] {
+        assert!(refused(Parameter::Kp, Some(bounds)).contains("lower one first"));
+    }
     assert!(refused(Parameter::Ti, Some((-1.0, 1.0))).contains("Ti"));
     assert!(refused(Parameter::FilterSamples, Some((1.0, 100.0))).contains("filter_samples"));
     assert!(refused(Parameter::RRate, None).contains("r_rate"));

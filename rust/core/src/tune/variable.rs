@@ -130,7 +130,7 @@ impl Parameter {
     fn bounds(self, start: &Design<f64>) -> Option<(f64, f64)> {
         let (ts, own) = (start.pid.ts, self.of(start));
         match self {
-            Self::Kp | Self::KpAt(_) => Some((own / 50.0, own * 50.0)),
+            Self::Kp | Self::KpAt(_) => Some(ordered(own / 50.0, own * 50.0)),
             Self::Ti | Self::TiAt(_) => Some((4.0 * ts, 1e4 * ts)),
             Self::Td | Self::TdAt(_) => Some((0.05 * ts, 200.0 * ts)),
             Self::Alpha => Some((-0.5, 1.2)),
@@ -143,6 +143,11 @@ impl Parameter {
             Self::RRate => None,
         }
     }
+}
+
+/// The bounds of a gain that may be negative.
+fn ordered(one: f64, other: f64) -> (f64, f64) {
+    (one.min(other), one.max(other))
 }
 
 /// A parameter between bounds.
@@ -191,10 +196,9 @@ impl Variable {
                 "expected bounds for {name}, as the start has none; give (\"{name}\", low, high)"
             )));
         };
-        let (low, high) = (low.min(high), low.max(high));
         if !(low < high && (high - low).is_finite()) {
             return Err(Error::setting(format!(
-                "expected finite bounds for {name} that differ, got {low} and {high}"
+                "expected finite bounds for {name}, the lower one first, got {low} and {high}"
             )));
         }
         if bounds.is_some() {

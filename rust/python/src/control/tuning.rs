@@ -9,8 +9,8 @@ use sewfast_core::closed_loop::{Run, Varied, encoder};
 use sewfast_core::loop_transfer as linear;
 use sewfast_core::search::Options;
 use sewfast_core::tune::{
-    self as tuning, Aggregate, Constraints, Cost, Method, Objective, Parameter, Sensitivity, Task,
-    Tuned, Variable, terms,
+    self as tuning, Aggregate, Constraints, Cost, LoadLimit, LoadStep, Method, Objective,
+    Parameter, Sensitivity, Task, Tuned, Variable, terms,
 };
 use sewfast_core::{Error, Monitor, Result};
 
@@ -23,6 +23,7 @@ use crate::watch::watched;
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(cost_terms, module)?)?;
     module.add_function(wrap_pyfunction!(tuning_costs, module)?)?;
+    module.add_function(wrap_pyfunction!(tuning_loads, module)?)?;
     module.add_function(wrap_pyfunction!(pareto, module)?)?;
     module.add_function(wrap_pyfunction!(tune, module)?)
 }
@@ -40,10 +41,12 @@ fn cost(changes: &BTreeMap<String, f64>) -> Result<Cost> {
             "rise" => cost.rise = value,
             "lag" => cost.lag = value,
             "saturation" => cost.saturation = Some(value),
+            "recovery" => cost.recovery = value,
+            "load" => cost.load = value,
             _ => {
                 return Err(Error::setting(format!(
-                    "expected a term of the cost, tracking, chatter, effort, overshoot, overshoot_limit, rise, lag or \
-                     saturation, got '{name}'"
+                    "expected a term of the cost, tracking, chatter, effort, overshoot, overshoot_limit, rise, lag, \
+                     saturation, recovery or load, got '{name}'"
                 )));
             }
         }
@@ -98,21 +101,103 @@ fn cost_terms<'py>(
 
 /// A variable by its name, with its bounds unless they are the usual ones.
 type Wanted = (String, Option<(f64, f64)>);
-/// Limits of Ms, overshoot [%] and |u|.
-type Limits = (Option<f64>, Option<f64>, Option<f64>);
+/// Reference, disturbance, band and samples of the mean of a load step.
+type Load<'py> = (Values<'py>, Values<'py>, f64, usize);
 
-/// What tuning, comparing and the front have in common, owned.
+/// A limit in numbers, or what another controller does on each plant.
+#[derive(FromPyObject)]
+enum Most<'py> {
+    Number(f64),
+    Rival(Bound<'py, Controller>),
+}
+
+/// The limits by name.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+struct Limits<'py> {
+    #[pyo3(item("Ms"))]
+    ms: Option<f64>,
+    overshoot: Option<f64>,
+    u: Option<f64>,
+    recovery: Option<Most<'py>>,
+    load: Option<Most<'py>>,
+}
+
+/// What tuning, comparing and the front have in common, as Python gives it.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+struct Asked<'py> {
+    plants: Vec<Bound<'py, PyAny>>,
+    references: Vec<Values<'py>>,
+    load_steps: Vec<Load<'py>>,
+    start: Bound<'py, Controller>,
+    counts_per_unit: f64,
+    variations: Vec<(f64, usize)>,
+    variables: Vec<Wanted>,
+    cost: BTreeMap<String, f64>,
+    aggregate: String,
+    limits: Limits<'py>,
+    linear_plants: Vec<Fraction<'py>>,
+}
+
+/// The same, owned.
 struct Given {
     models: Vec<Model>,
     references: Vec<Vec<f64>>,
+    load_steps: Vec<OwnedLoad>,
     variations: Vec<(f64, usize)>,
     counts_per_unit: f64,
     start: Design<f64>,
     variables: Vec<Variable>,
     cost: Cost,
     aggregate: Aggregate,
-    limits: Limits,
+    ms: Option<f64>,
+    overshoot: Option<f64>,
+    u: Option<f64>,
+    recovery: Option<OwnedMost>,
+    load: Option<OwnedMost>,
     loops: Vec<linear::Plant>,
+}
+
+struct OwnedLoad {
+    reference: Vec<f64>,
+    disturbance: Vec<f64>,
+    band: f64,
+    mean: usize,
+}
+
+impl OwnedLoad {
+    fn new((reference, disturbance, band, mean): &Load<'_>) -> PyResult<Self> {
+        Ok(Self {
+            reference: slice(reference, "reference")?.to_vec(),
+            disturbance: slice(disturbance, "disturbance")?.to_vec(),
+            band: *band,
+            mean: *mean,
+        })
+    }
+
+    fn step(&self) -> LoadStep<'_> {
+        LoadStep {
+            reference: &self.reference,
+            disturbance: &self.disturbance,
+            band: self.band,
+            mean: self.mean,
+        }
+    }
+}
+
+enum OwnedMost {
+    Number(f64),
+    Rival(Box<Design<f64>>),
+}
+
+impl OwnedMost {
+    fn new(most: &Most<'_>) -> Self {
+        match most {
+            Most::Number(limit) => Self::Number(*limit),
+            Most::Rival(rival) => Self::Rival(Box::new(*rival.borrow().core.design())),
+        }
+    }
 }
 
 /// Numerator and denominator in powers of `z^-1`.
@@ -127,47 +212,52 @@ fn loops(given: &[Fraction<'_>]) -> PyResult<Vec<linear::Plant>> {
 }
 
 impl Given {
-    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
-    fn new(
-        plants: &[Bound<'_, PyAny>],
-        references: &[Values<'_>],
-        start: &Bound<'_, Controller>,
-        counts_per_unit: f64,
-        variations: Vec<(f64, usize)>,
-        variables: &[Wanted],
-        cost: &BTreeMap<String, f64>,
-        aggregate: &str,
-        limits: Limits,
-        loops: &[Fraction<'_>],
-    ) -> PyResult<Self> {
-        let py = start.py();
+    fn new(py: Python<'_>, asked: &Asked<'_>) -> PyResult<Self> {
         let refused = |e| raise(py, e);
-        let start = *start.borrow().core.design();
-        let models = plants.iter().map(Model::of).collect::<PyResult<_>>()?;
+        let start = *asked.start.borrow().core.design();
         let samples = |r: &Values<'_>| slice(r, "references").map(<[f64]>::to_vec);
+        let limits = &asked.limits;
         Ok(Self {
-            models,
-            references: references.iter().map(samples).collect::<PyResult<_>>()?,
-            variations,
-            counts_per_unit,
+            models: asked
+                .plants
+                .iter()
+                .map(Model::of)
+                .collect::<PyResult<_>>()?,
+            references: asked
+                .references
+                .iter()
+                .map(samples)
+                .collect::<PyResult<_>>()?,
+            load_steps: asked
+                .load_steps
+                .iter()
+                .map(OwnedLoad::new)
+                .collect::<PyResult<_>>()?,
+            variations: asked.variations.clone(),
+            counts_per_unit: asked.counts_per_unit,
             start,
-            variables: self::variables(variables, &start).map_err(refused)?,
-            cost: self::cost(cost).map_err(refused)?,
-            aggregate: self::aggregate(aggregate).map_err(refused)?,
-            limits,
-            loops: self::loops(loops)?,
+            variables: variables(&asked.variables, &start).map_err(refused)?,
+            cost: cost(&asked.cost).map_err(refused)?,
+            aggregate: aggregate(&asked.aggregate).map_err(refused)?,
+            ms: limits.ms,
+            overshoot: limits.overshoot,
+            u: limits.u,
+            recovery: limits.recovery.as_ref().map(OwnedMost::new),
+            load: limits.load.as_ref().map(OwnedMost::new),
+            loops: loops(&asked.linear_plants)?,
         })
     }
 
     /// Does `work` with the task.
     fn with<T>(
         &self,
+        monitor: &Monitor,
         work: impl FnOnce(&Task<'_, Varied<AnyPlant<'_>>>) -> Result<T>,
     ) -> Result<T> {
         let plants = varied(&self.models, &self.variations, self.start.pid.ts)?;
         let references: Vec<&[f64]> = self.references.iter().map(Vec::as_slice).collect();
-        let (ms, overshoot, u) = self.limits;
-        if ms.is_some() && self.loops.is_empty() {
+        let load_steps: Vec<LoadStep<'_>> = self.load_steps.iter().map(OwnedLoad::step).collect();
+        if self.ms.is_some() && self.loops.is_empty() {
             return Err(Error::setting(
                 "expected a linear plant to take Ms on, got none; give Constraints(plant=...)",
             ));
@@ -180,20 +270,59 @@ impl Given {
         };
         let sensitivity: &Sensitivity<'_> = &sensitivity;
         // Without a limit Ms may still be an objective.
-        let ms = match ms {
+        let ms = match self.ms {
             None if self.loops.is_empty() => None,
             limit => Some((limit.unwrap_or(f64::MAX), sensitivity)),
         };
-        work(&Task {
+        let mut task = Task {
             plants: &plants,
             references: &references,
+            loads: &load_steps,
             encoder,
             start: self.start,
             variables: &self.variables,
             cost: self.cost,
             aggregate: self.aggregate,
-            constraints: Constraints { ms, overshoot, u },
-        })
+            constraints: Constraints {
+                ms,
+                overshoot: self.overshoot,
+                u: self.u,
+                loads: &[],
+            },
+        };
+        let limits = self.load_limits(&task, monitor)?;
+        task.constraints.loads = &limits;
+        work(&task)
+    }
+
+    /// What each plant may do under the load steps.
+    fn load_limits(
+        &self,
+        task: &Task<'_, Varied<AnyPlant<'_>>>,
+        monitor: &Monitor,
+    ) -> Result<Vec<LoadLimit>> {
+        if self.recovery.is_none() && self.load.is_none() {
+            return Ok(Vec::new());
+        }
+        let of = |most: &Option<OwnedMost>, told: fn(&LoadLimit) -> f64| -> Result<Vec<f64>> {
+            match most {
+                None => Ok(vec![f64::INFINITY; task.plants.len()]),
+                Some(OwnedMost::Number(limit)) => Ok(vec![*limit; task.plants.len()]),
+                Some(OwnedMost::Rival(design)) => {
+                    let did = tuning::loaded(task, design, monitor)?;
+                    Ok(did.iter().map(told).collect())
+                }
+            }
+        };
+        // One that is never beyond the band has recovered within a sample.
+        let least = 1e3 * self.start.pid.ts;
+        let recovery = of(&self.recovery, |did| did.recovery)?;
+        let load = of(&self.load, |did| did.load)?;
+        let limit = |(recovery, load): (&f64, &f64)| LoadLimit {
+            recovery: recovery.max(least),
+            load: *load,
+        };
+        Ok(recovery.iter().zip(&load).map(limit).collect())
     }
 }
 
@@ -244,43 +373,24 @@ fn options(evaluations: usize, seed: u64, threads: usize) -> Options {
     }
 }
 
+/// The best controller, and the story of its search.
 #[pyfunction]
-#[pyo3(signature = (plants, references, *, start, counts_per_unit, variations, variables, cost, aggregate, limits, loops, method, evaluations, seed, threads, progress=None))]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+#[pyo3(signature = (task, *, method, evaluations, seed, threads, progress=None))]
 fn tune<'py>(
     py: Python<'py>,
-    plants: Vec<Bound<'py, PyAny>>,
-    references: Vec<Values<'py>>,
-    start: &Bound<'py, Controller>,
-    counts_per_unit: f64,
-    variations: Vec<(f64, usize)>,
-    variables: Vec<Wanted>,
-    cost: BTreeMap<String, f64>,
-    aggregate: &str,
-    limits: Limits,
-    loops: Vec<Fraction<'py>>,
+    task: Asked<'py>,
     method: &str,
     evaluations: usize,
     seed: u64,
     threads: usize,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let given = Given::new(
-        &plants,
-        &references,
-        start,
-        counts_per_unit,
-        variations,
-        &variables,
-        &cost,
-        aggregate,
-        limits,
-        &loops,
-    )?;
+    let given = Given::new(py, &task)?;
     let method = self::method(method).map_err(|e| raise(py, e))?;
     let options = options(evaluations, seed, threads);
-    let work = |monitor: &Monitor| given.with(|task| tuning::tune(task, method, options, monitor));
-    let tuned = watched(py, progress, work)?;
+    let tuned = watched(py, progress, |monitor| {
+        given.with(monitor, |task| tuning::tune(task, method, options, monitor))
+    })?;
     told(py, &given, tuned)
 }
 
@@ -315,43 +425,20 @@ fn values(variables: &[Variable], design: &Design<f64>) -> Vec<f64> {
 
 /// What controllers cost, and by how much they violate the constraints.
 #[pyfunction]
-#[pyo3(signature = (plants, references, controllers, *, counts_per_unit, variations, cost, aggregate, limits, loops, threads, progress=None))]
-#[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+#[pyo3(signature = (task, controllers, *, threads, progress=None))]
 fn tuning_costs<'py>(
     py: Python<'py>,
-    plants: Vec<Bound<'py, PyAny>>,
-    references: Vec<Values<'py>>,
+    task: Asked<'py>,
     controllers: Vec<Bound<'py, Controller>>,
-    counts_per_unit: f64,
-    variations: Vec<(f64, usize)>,
-    cost: BTreeMap<String, f64>,
-    aggregate: &str,
-    limits: Limits,
-    loops: Vec<Fraction<'py>>,
     threads: usize,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Vec<(f64, f64)>> {
-    let Some(first) = controllers.first() else {
-        return Ok(Vec::new());
-    };
-    let given = Given::new(
-        &plants,
-        &references,
-        first,
-        counts_per_unit,
-        variations,
-        &[],
-        &cost,
-        aggregate,
-        limits,
-        &loops,
-    )?;
-    let designs: Vec<_> = controllers
-        .iter()
-        .map(|c| *c.borrow().core.design())
-        .collect();
+    let given = Given::new(py, &task)?;
+    let designs = designs(&controllers);
     let judged = watched(py, progress, |monitor| {
-        let judged = given.with(|task| tuning::costs(task, &designs, threads, monitor))?;
+        let judged = given.with(monitor, |task| {
+            tuning::costs(task, &designs, threads, monitor)
+        })?;
         if monitor.stopped() {
             return Err(Error::fit("the comparison was interrupted"));
         }
@@ -360,22 +447,29 @@ fn tuning_costs<'py>(
     Ok(judged.iter().map(|j| (j.cost, j.violation)).collect())
 }
 
+fn designs(controllers: &[Bound<'_, Controller>]) -> Vec<Design<f64>> {
+    let design = |c: &Bound<'_, Controller>| *c.borrow().core.design();
+    controllers.iter().map(design).collect()
+}
+
+/// Recovery [ms] and rms deviation [y] of each plant in each variation under the load steps, the worst of these.
 #[pyfunction]
-#[pyo3(signature = (plants, references, *, start, others, counts_per_unit, variations, variables, cost, aggregate, limits, loops, objectives, size, evaluations, seed, threads, progress=None))]
+fn tuning_loads<'py>(py: Python<'py>, task: Asked<'py>) -> PyResult<Vec<(f64, f64)>> {
+    let given = Given::new(py, &task)?;
+    let did = watched(py, None, |monitor| {
+        given.with(monitor, |task| tuning::loaded(task, &task.start, monitor))
+    })?;
+    Ok(did.iter().map(|did| (did.recovery, did.load)).collect())
+}
+
+/// Controllers of which none is better than another in everything.
+#[pyfunction]
+#[pyo3(signature = (task, *, others, objectives, size, evaluations, seed, threads, progress=None))]
 #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
 fn pareto<'py>(
     py: Python<'py>,
-    plants: Vec<Bound<'py, PyAny>>,
-    references: Vec<Values<'py>>,
-    start: &Bound<'py, Controller>,
+    task: Asked<'py>,
     others: Vec<Bound<'py, Controller>>,
-    counts_per_unit: f64,
-    variations: Vec<(f64, usize)>,
-    variables: Vec<Wanted>,
-    cost: BTreeMap<String, f64>,
-    aggregate: &str,
-    limits: Limits,
-    loops: Vec<Fraction<'py>>,
     objectives: Vec<String>,
     size: usize,
     evaluations: usize,
@@ -383,28 +477,19 @@ fn pareto<'py>(
     threads: usize,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let given = Given::new(
-        &plants,
-        &references,
-        start,
-        counts_per_unit,
-        variations,
-        &variables,
-        &cost,
-        aggregate,
-        limits,
-        &loops,
-    )?;
+    let given = Given::new(py, &task)?;
     let objectives: Vec<Objective> = objectives
         .iter()
         .map(|name| Objective::named(name))
         .collect::<Result<_>>()
         .map_err(|e| raise(py, e))?;
     let mut starts = vec![given.start];
-    starts.extend(others.iter().map(|c| *c.borrow().core.design()));
+    starts.extend(designs(&others));
     let options = options(evaluations, seed, threads);
     let front = watched(py, progress, |monitor| {
-        given.with(|task| tuning::pareto(task, &objectives, &starts, size, options, monitor))
+        given.with(monitor, |task| {
+            tuning::pareto(task, &objectives, &starts, size, options, monitor)
+        })
     })?;
     let dict = PyDict::new(py);
     let controllers = front.designs.iter().map(|d| values(&given.variables, d));

@@ -1,0 +1,123 @@
+"""Load steps in tuning: what they are, that they bind, what is refused."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from loops import QUIET, drive
+from sewfast import Constraints, Cost, LoadStep, SettingError, pareto, signals, tune
+from sewfast.loop import run
+from sewfast.tuning import costs, recoveries
+
+STEP = LoadStep(1500.0, -2.0)
+SHORT = signals.reference("trapezoid")[:900]
+AS_IT_IS = ((1.0, 0),)
+
+
+def test_a_load_step_is_a_ramp_a_hold_and_a_command_behind_the_limits() -> None:
+    r, d, band, mean = LoadStep(1500.0, -2.0, ramp=0.1, settle=0.2, look=0.3, mean=0.04).samples(
+        0.001
+    )
+    assert (len(r), len(d), band, mean) == (600, 600, 15.0, 40)
+    assert (r[0], r[50], r[100], r[-1]) == (0.0, 750.0, 1500.0, 1500.0)
+    assert np.all(d[:300] == 0.0)
+    assert np.all(d[300:] == -2.0)
+    assert LoadStep(-800.0, 1.0).band == 8.0
+    assert LoadStep(800.0, 1.0, ramp=0.0).samples(0.001)[0][0] == 800.0
+
+
+def test_recoveries_are_those_of_the_run() -> None:
+    r, d, band, _ = STEP.samples(QUIET.Ts)
+    off = run(QUIET, drive(), r, disturbance=d).y[800:] - 1500.0
+    (row,) = recoveries(QUIET, drive(), [STEP], variations=AS_IT_IS)
+    outside = np.flatnonzero(np.abs(off) > band)
+    assert row[0] == pytest.approx(outside[-1] + 1.0)
+    assert row[1] == pytest.approx(np.sqrt(np.mean(off**2)))
+    assert recoveries(QUIET, [drive(), drive()], [STEP]).shape == (6, 2)
+
+
+def test_without_weight_or_limit_a_load_step_changes_nothing() -> None:
+    plain = tune(drive(), [SHORT], start=QUIET, evaluations=60, threads=2)
+    told = tune(drive(), [SHORT], start=QUIET, loads=[STEP], evaluations=60, threads=2)
+    assert plain.controller == told.controller
+    assert plain.cost == told.cost
+
+
+def test_a_weight_on_the_load_is_paid_for_in_tracking() -> None:
+    settings: dict[str, Any] = {"start": QUIET, "loads": [STEP], "evaluations": 250, "threads": 2}
+    free = tune(drive(), [SHORT], **settings)
+    stiff = tune(drive(), [SHORT], cost=Cost(load=50.0), **settings)
+    of = [recoveries(found.controller, drive(), [STEP])[:, 1].max() for found in (free, stiff)]
+    assert of[1] < of[0]
+    (expected,) = costs(stiff.controller, drive(), [SHORT])
+    mean = recoveries(stiff.controller, drive(), [STEP])[:, 1].mean()
+    assert stiff.cost == pytest.approx(expected + 50.0 * mean)
+
+
+def test_no_plant_recovers_later_than_under_the_rival() -> None:
+    quick = tune(
+        drive(), [SHORT], start=QUIET, loads=[STEP], cost=Cost(recovery=10.0), evaluations=250,
+        threads=2,
+    ).controller  # fmt: skip
+    allowed = recoveries(quick, drive(), [STEP])[:, 0]
+    plain = tune(drive(), [SHORT], start=QUIET, evaluations=300, threads=2).controller
+    assert np.any(recoveries(plain, drive(), [STEP])[:, 0] > allowed)
+    found = tune(
+        drive(), [SHORT], start=quick, loads=[STEP], constraints=Constraints(recovery=quick),
+        evaluations=300, threads=2,
+    )  # fmt: skip
+    assert np.all(recoveries(found.controller, drive(), [STEP])[:, 0] <= allowed)
+    assert "recovery no larger" in str(found)
+    limit = float(allowed.max())
+    found = tune(
+        drive(), [SHORT], start=quick, loads=[STEP], constraints=Constraints(recovery=limit),
+        evaluations=100, threads=2,
+    )  # fmt: skip
+    assert recoveries(found.controller, drive(), [STEP])[:, 0].max() <= limit
+    assert f"recovery <= {limit:g} ms" in str(found)
+
+
+def test_recovery_may_be_an_objective() -> None:
+    front = pareto(
+        drive(), [SHORT], objectives=["tracking", "recovery"], start=QUIET, loads=[STEP],
+        evaluations=240, size=16, threads=2,
+    )  # fmt: skip
+    assert front.units == {"tracking": "RPM", "recovery": "ms"}
+    best = front.best("recovery")
+    of = [recoveries(c, drive(), [STEP])[:, 0].mean() for c in (best, front.best("tracking"))]
+    assert of[0] <= of[1]
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"disturbance": 0.0}, "disturbance of a load step other than 0"),
+        ({"band": 0.0}, "band of a load step other than 0"),
+        ({"look": 0.0}, "look of a load step other than 0"),
+        ({"level": float("nan")}, "a number for level"),
+        ({"settle": -1.0}, "settle of a load step of 0 or more"),
+        ({"band": "wide"}, "band"),
+    ],
+)
+def test_load_steps_that_make_no_sense_are_refused(settings: dict[str, Any], says: str) -> None:
+    with pytest.raises(SettingError, match=says):
+        replace(STEP, **settings)
+
+
+def test_what_needs_a_load_step_says_so() -> None:
+    for settings in ({"cost": Cost(load=1.0)}, {"constraints": Constraints(recovery=50.0)}):
+        with pytest.raises(SettingError, match="load step"):
+            tune(drive(), [SHORT], start=QUIET, evaluations=5, **settings)  # type: ignore[arg-type]
+    with pytest.raises(SettingError, match="load step"):
+        pareto(drive(), [SHORT], objectives=["tracking", "load"], start=QUIET, evaluations=50)
+    with pytest.raises(SettingError, match="LoadStep"):
+        tune(drive(), [SHORT], start=QUIET, loads=[1500.0], evaluations=5)  # type: ignore[list-item]
+    with pytest.raises(SettingError, match="recovery"):
+        Constraints(recovery=-1.0)
+
+
+def test_bounds_the_wrong_way_round_are_refused() -> None:
+    with pytest.raises(SettingError, match="lower one first"):
+        tune(drive(), [SHORT], start=QUIET, variables=[("Ti", 0.5, 0.02)], evaluations=5)
