@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo accuracy commissioning bench bench-device clean $(MARKED)
+.PHONY: help demo accuracy commissioning bench bench-parts bench-device clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -94,7 +94,10 @@ package: $(DEV) ## source archive -> wheel -> import in a clean environment
 	target/package/venv/bin/pip install --quiet target/package/wheels/sewfast-*.whl
 	cd target/package/venv && bin/python -I $(CURDIR)/tests/clean_import.py
 
-bench: $(VENV)/bench.stamp ## end-to-end benchmarks beside their rivals
+bench: $(VENV)/bench.stamp ## sewfast and its rivals in one run; writes docs/PERFORMANCE.md (QUICK=1, ONLY=word)
+	$(BIN)/python benches/performance.py $(if $(QUICK),--quick) $(if $(ONLY),--only $(ONLY))
+
+bench-parts: $(VENV)/bench.stamp ## every benchmark by itself, with its spread (pytest-benchmark)
 	$(BIN)/python -m pytest benches --benchmark-enable --benchmark-only -o python_files='bench_*.py' -s
 
 accuracy: $(DEV) ## accuracy of the default configuration on public records, beside published figures (SEWFAST_DATA)

@@ -38,7 +38,7 @@ def _exp2x(x):
     return n, p
 
 
-@numba.njit(fastmath=True)
+@numba.njit(fastmath=True, cache=True)
 def simulate(theta, u, out):
     """Free run from rest into ``out``."""
     a, b = theta[0:32:4].copy(), theta[1:32:4].copy()
@@ -61,7 +61,7 @@ def simulate(theta, u, out):
     return out
 
 
-@numba.njit(fastmath=True)
+@numba.njit(fastmath=True, cache=True)
 def cost(theta, u, y, out):
     """J of the free run."""
     simulate(theta, u, out)
@@ -71,7 +71,7 @@ def cost(theta, u, y, out):
     return 0.5 * total / y.shape[0]
 
 
-@numba.njit(fastmath=True)
+@numba.njit(fastmath=True, cache=True)
 def residuals_and_jacobian(theta, u, y, error, jacobian):
     """Free-run errors and forward sensitivities; columns grouped by regressor."""
     a, b = theta[0:32:4].copy(), theta[1:32:4].copy()
