@@ -1,10 +1,14 @@
 //! ARX by least squares: one-step errors, normal equations with scaled columns, QR where they are near singular.
 
-use nalgebra::{DMatrix, DVector};
+mod shifts;
 
+use nalgebra::{DMatrix, DVector, DVectorViewMut};
+
+use crate::data::Samples;
 use crate::lagged::Lags;
 use crate::linear::LinearModel;
 use crate::{Error, Record, Result};
+use shifts::Shifts;
 
 /// A pivot of the scaled Gram matrix below this leaves fewer than five digits: QR then keeps them.
 const SMALL_PIVOT: f64 = 1e-10;
@@ -50,16 +54,72 @@ pub fn fit(
         Some(solution) => solution,
         None => by_qr(records, &lags, columns, rows)?,
     };
-    let (a, rest) = solution.as_slice().split_at(na);
-    let (b, offset) = rest.split_at(nb * lags.channels);
+    model(&lags, &solution)
+}
+
+/// As [`fit`], on samples whose values nobody has looked at yet: every pass over a long recording costs as much as the fit.
+///
+/// # Errors
+/// As [`fit`], and as [`Record::with_gaps`].
+pub fn fit_samples(
+    samples: &[Samples],
+    na: usize,
+    nb: usize,
+    nk: usize,
+    offset: bool,
+) -> Result<LinearModel> {
+    if let Some(model) = fit_unseen(samples, na, nb, nk, offset) {
+        return Ok(model);
+    }
+    let records: Result<Vec<Record>> = samples.iter().map(|s| s.record()).collect();
+    fit(&records?, na, nb, nk, offset)
+}
+
+/// The fit where nothing is out of the ordinary; its sums tell whether all values are finite.
+fn fit_unseen(
+    samples: &[Samples],
+    na: usize,
+    nb: usize,
+    nk: usize,
+    offset: bool,
+) -> Option<LinearModel> {
+    let records: Vec<Record> = samples.iter().map(Samples::unseen).collect();
+    let lags = check(&records, na, nb, nk).ok()?;
+    let columns = lags.regressors() + usize::from(offset);
+    let shifts = Shifts::new(&lags, columns);
+    let ordinary = records
+        .iter()
+        .all(|r| shifts.suit(r) && has_finite_ends(r, &lags));
+    if !ordinary || usable(&records, &lags) < columns {
+        return None;
+    }
+    let (gram, moment) = normal_equations(&records, &lags, columns);
+    if !gram.diagonal().sum().is_finite() {
+        return None;
+    }
+    model(&lags, &by_cholesky(&gram, &moment)?).ok()
+}
+
+/// Whether the values that stand in no column of the regressors are finite: they are at the ends.
+fn has_finite_ends(record: &Record, lags: &Lags) -> bool {
+    let (first, last) = (lags.first_whole(), lags.nk.max(1));
+    let finite = |values: &[f64], width: usize| {
+        let ends = [
+            &values[..first * width],
+            &values[values.len() - last * width..],
+        ];
+        ends.iter().all(|end| end.iter().all(|v| v.is_finite()))
+    };
+    finite(record.y, 1) && finite(record.u, record.channels)
+}
+
+/// The model from the coefficients of its regressors.
+fn model(lags: &Lags, solution: &DVector<f64>) -> Result<LinearModel> {
+    let (a, rest) = solution.as_slice().split_at(lags.na);
+    let (b, offset) = rest.split_at(lags.nb * lags.channels);
+    let offset = offset.first().copied().unwrap_or(0.0);
     let a = a.iter().map(|a| -a).collect();
-    LinearModel::new(
-        a,
-        b.to_vec(),
-        lags.channels,
-        nk,
-        offset.first().copied().unwrap_or(0.0),
-    )
+    LinearModel::new(a, b.to_vec(), lags.channels, lags.nk, offset)
 }
 
 /// The orders, once the records have been found fit for identification.
@@ -103,7 +163,10 @@ fn changes<'a>(mut values: impl Iterator<Item = &'a f64>, name: &str) -> Result<
 }
 
 fn usable(records: &[Record], lags: &Lags) -> usize {
-    let whole = |r: &Record| whole_rows(r, lags).count();
+    let whole = |r: &Record| match r.unmeasured {
+        0 => r.len().saturating_sub(lags.first_whole()),
+        _ => whole_rows(r, lags).count(),
+    };
     records.iter().map(whole).sum()
 }
 
@@ -114,17 +177,15 @@ fn whole_rows<'r>(record: &'r Record<'r>, lags: &Lags) -> impl Iterator<Item = u
         .filter(move |&k| complete || record.y[k - na..=k].iter().all(|y| !y.is_nan()))
 }
 
-/// Calls `each(row, y)` for every sample with a whole regressor; a last column is 1.
-fn each_row(records: &[Record], lags: &Lags, columns: usize, mut each: impl FnMut(&[f64], f64)) {
+/// Calls `each(row, y)` for every sample of a record with a whole regressor; a last column is 1.
+fn each_row(record: &Record, lags: &Lags, columns: usize, mut each: impl FnMut(&[f64], f64)) {
     let mut row = vec![1.0; columns];
-    for record in records {
-        for k in whole_rows(record, lags) {
-            for (i, past) in row[..lags.na].iter_mut().enumerate() {
-                *past = record.y[k - 1 - i];
-            }
-            lags.write_inputs(record.u, k, &mut row[lags.na..lags.regressors()]);
-            each(&row, record.y[k]);
+    for k in whole_rows(record, lags) {
+        for (i, past) in row[..lags.na].iter_mut().enumerate() {
+            *past = record.y[k - 1 - i];
         }
+        lags.write_inputs(record.u, k, &mut row[lags.na..lags.regressors()]);
+        each(&row, record.y[k]);
     }
 }
 
@@ -133,25 +194,43 @@ fn normal_equations(
     lags: &Lags,
     columns: usize,
 ) -> (DMatrix<f64>, DVector<f64>) {
-    let mut gram = DMatrix::zeros(columns, columns);
-    let mut moment = DVector::zeros(columns);
-    each_row(records, lags, columns, |row, y| {
+    let shifts = Shifts::new(lags, columns);
+    let mut system = DMatrix::zeros(columns + 1, columns + 1);
+    for record in records {
+        match shifts.suit(record) {
+            true => shifts.add(record, &mut system),
+            false => add_rows(record, lags, &mut system),
+        }
+    }
+    system.fill_upper_triangle_with_lower_triangle();
+    let moment = system.view((0, columns), (columns, 1)).column(0).into();
+    (system.view((0, 0), (columns, columns)).into(), moment)
+}
+
+/// Adds the record's rows, one by one, to the lower triangle of the system.
+fn add_rows(record: &Record, lags: &Lags, system: &mut DMatrix<f64>) {
+    let columns = system.ncols() - 1;
+    each_row(record, lags, columns, |row, y| {
         for j in 0..columns {
-            moment[j] += row[j] * y;
+            system[(columns, j)] += row[j] * y;
             for i in j..columns {
-                gram[(i, j)] += row[i] * row[j];
+                system[(i, j)] += row[i] * row[j];
             }
         }
     });
-    gram.fill_upper_triangle_with_lower_triangle();
-    (gram, moment)
 }
 
-/// Solution of the normal equations with columns scaled to length 1; none where a pivot is small.
+/// Squared lengths below this have lost digits to underflow, or will in products with others.
+const LEAST_SQUARE: f64 = 1e-280;
+
+/// Solution of the normal equations with columns scaled to length 1; none where a pivot is small, or products leave the
+/// range of the numbers.
 fn by_cholesky(gram: &DMatrix<f64>, moment: &DVector<f64>) -> Option<DVector<f64>> {
-    let scale = gram
-        .diagonal()
-        .map(|d| if d > 0.0 { 1.0 / d.sqrt() } else { 0.0 });
+    let in_range = |d: &f64| *d > LEAST_SQUARE && d.is_finite();
+    if !gram.diagonal().iter().all(in_range) {
+        return None;
+    }
+    let scale = gram.diagonal().map(|d| 1.0 / d.sqrt());
     let scaled = DMatrix::from_fn(gram.nrows(), gram.ncols(), |i, j| {
         gram[(i, j)] * scale[i] * scale[j]
     });
@@ -171,15 +250,14 @@ fn by_cholesky(gram: &DMatrix<f64>, moment: &DVector<f64>) -> Option<DVector<f64
 fn by_qr(records: &[Record], lags: &Lags, columns: usize, rows: usize) -> Result<DVector<f64>> {
     let mut values = Vec::with_capacity(rows * columns);
     let mut outputs = Vec::with_capacity(rows);
-    each_row(records, lags, columns, |row, y| {
-        values.extend_from_slice(row);
-        outputs.push(y);
-    });
-    let mut matrix = DMatrix::from_row_slice(rows, columns, &values);
-    let lengths: Vec<f64> = matrix.column_iter().map(|c| c.norm()).collect();
-    for (mut column, length) in matrix.column_iter_mut().zip(&lengths) {
-        column /= length.max(f64::MIN_POSITIVE);
+    for record in records {
+        each_row(record, lags, columns, |row, y| {
+            values.extend_from_slice(row);
+            outputs.push(y);
+        });
     }
+    let mut matrix = DMatrix::from_row_slice(rows, columns, &values);
+    let lengths: Vec<f64> = matrix.column_iter_mut().map(normalise).collect();
     let factor = matrix.qr();
     let mut right = DVector::from_vec(outputs);
     factor.q_tr_mul(&mut right);
@@ -200,6 +278,15 @@ fn by_qr(records: &[Record], lags: &Lags, columns: usize, rows: usize) -> Result
         *value /= length;
     }
     Ok(solution)
+}
+
+/// Scales a column to length 1 and gives its length, whose square need not be a number.
+fn normalise(mut column: DVectorViewMut<f64>) -> f64 {
+    let largest = column.amax().max(f64::MIN_POSITIVE);
+    column /= largest;
+    let length = column.norm().max(f64::MIN_POSITIVE);
+    column /= length;
+    largest * length
 }
 
 #[cfg(test)]
@@ -271,6 +358,50 @@ mod tests {
         let record = Record::with_gaps(&u, 1, &every_other).unwrap();
         let message = fit(&[record], 2, 2, 1, true).unwrap_err().message;
         assert!(message.contains("output error"), "{message}");
+    }
+
+    #[test]
+    fn takes_samples_unseen_as_it_takes_checked_records() {
+        let (u, y) = (noise(3000, 1), noise(3000, 2));
+        let long = |u: &[f64], y: &[f64]| {
+            let samples = [Samples::new(u, 1, y).unwrap()];
+            fit_samples(&samples, 2, 2, 3, true)
+        };
+        let seen = fit(&[Record::new(&u, 1, &y).unwrap()], 2, 2, 3, true).unwrap();
+        assert_eq!(long(&u, &y).unwrap().a(), seen.a());
+        for at in [0, 1, 2, 1500, 2997, 2998, 2999] {
+            for wrong in [f64::NAN, f64::INFINITY] {
+                let mut bad = u.clone();
+                bad[at] = wrong;
+                let message = long(&bad, &y).unwrap_err().message;
+                assert!(message.contains(&format!("sample {at};")), "{message}");
+                let mut bad = y.clone();
+                bad[at] = wrong;
+                let found = long(&u, &bad);
+                let expected =
+                    Record::with_gaps(&u, 1, &bad).and_then(|record| fit(&[record], 2, 2, 3, true));
+                match (found, expected) {
+                    (Ok(found), Ok(expected)) => assert_eq!(found.b(), expected.b()),
+                    (found, expected) => assert_eq!(found.err(), expected.err()),
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn survives_values_whose_squares_are_no_numbers() {
+        let truth = LinearModel::new(vec![-0.5], vec![1.0], 1, 1, 0.0).unwrap();
+        for scale in [1e200, 1e-158, 1e-200] {
+            let u: Vec<f64> = noise(500, 1).iter().map(|u| u * scale).collect();
+            let y = truth.simulate(&u, 1, &[0.0]).unwrap();
+            let samples = [Samples::new(&u, 1, &y).unwrap()];
+            let model = fit_samples(&samples, 1, 1, 1, false).unwrap();
+            assert!(
+                worst(model.a(), truth.a()) < 1e-10,
+                "{scale}: {:?}",
+                model.a()
+            );
+        }
     }
 
     #[test]

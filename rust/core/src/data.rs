@@ -1,6 +1,116 @@
 //! Records as the core sees them: borrowed slices with their shape.
 
+use crate::simd::{self, Eight, Kernel, LANES};
 use crate::{Error, Result};
+
+/// One experiment of which only the shape has been checked.
+#[derive(Clone, Copy, Debug)]
+pub struct Samples<'a> {
+    u: &'a [f64],
+    channels: usize,
+    y: &'a [f64],
+}
+
+impl<'a> Samples<'a> {
+    /// Inputs row by row, and an output for each row.
+    ///
+    /// # Errors
+    /// `ErrorKind::Data` for lengths that do not match.
+    pub fn new(u: &'a [f64], channels: usize, y: &'a [f64]) -> Result<Self> {
+        if channels == 0 || u.len() != y.len() * channels {
+            return Err(Error::data(format!(
+                "expected {} x {channels} inputs for {} outputs, got {} values; give u and y the same number of samples",
+                y.len(),
+                y.len(),
+                u.len()
+            )));
+        }
+        Ok(Self { u, channels, y })
+    }
+
+    /// The record, once its values have been found usable; outputs may be NaN where not measured.
+    ///
+    /// # Errors
+    /// As [`Record::with_gaps`], but for lengths.
+    pub fn record(&self) -> Result<Record<'a>> {
+        let Self { u, channels, y } = *self;
+        if let Some(i) = first_not_finite(u) {
+            return Err(Error::data(format!(
+                "expected finite values in u, got {} at sample {}; a simulation needs every input: cut the recording there, or fill what is missing",
+                u[i],
+                i / channels
+            )));
+        }
+        let unmeasured = unmeasured(y)?;
+        Ok(Record {
+            unmeasured,
+            ..self.unseen()
+        })
+    }
+
+    /// The record as it is where all values are finite.
+    pub(crate) fn unseen(&self) -> Record<'a> {
+        Record {
+            u: self.u,
+            channels: self.channels,
+            y: self.y,
+            unmeasured: 0,
+        }
+    }
+}
+
+/// Number of outputs that are NaN, not all and none infinite.
+fn unmeasured(y: &[f64]) -> Result<usize> {
+    if first_not_finite(y).is_none() {
+        return Ok(0);
+    }
+    if let Some(k) = y.iter().position(|v| v.is_infinite()) {
+        return Err(Error::data(format!(
+            "expected finite values in y, or NaN where it was not measured, got {} at sample {k}; set it to NaN",
+            y[k]
+        )));
+    }
+    let unmeasured = y.iter().filter(|v| v.is_nan()).count();
+    if unmeasured == y.len() {
+        return Err(Error::data(
+            "expected a measured output, got NaN throughout; leave that experiment out",
+        ));
+    }
+    Ok(unmeasured)
+}
+
+/// Where the first value stands that is NaN or infinite.
+fn first_not_finite(values: &[f64]) -> Option<usize> {
+    let not_finite = |v: &f64| !v.is_finite();
+    match simd::run(Finite(values)) {
+        true => None,
+        false => values.iter().position(not_finite),
+    }
+}
+
+/// Whether all values are finite: only then `0 v` is 0 for each of them.
+struct Finite<'a>(&'a [f64]);
+
+impl Kernel for Finite<'_> {
+    type Output = bool;
+
+    #[inline(always)]
+    fn run<V: Eight>(self) -> bool {
+        let (groups, rest) = self.0.as_chunks::<LANES>();
+        let (pairs, single) = groups.as_chunks::<2>();
+        let zero = V::splat(0.0);
+        let mut sums = [zero; 2];
+        for pair in pairs {
+            for (sum, group) in sums.iter_mut().zip(pair) {
+                *sum = sum.add_product(zero, V::load(group));
+            }
+        }
+        for group in single {
+            sums[0] = sums[0].add_product(zero, V::load(group));
+        }
+        sums[0].add(sums[1]).sum() == 0.0 && rest.iter().all(|v| v.is_finite())
+    }
+}
 
 /// One experiment: inputs row by row (time first, `channels` values per sample) and the measured output, NaN where it was
 /// not measured.
@@ -37,39 +147,7 @@ impl<'a> Record<'a> {
     /// `ErrorKind::Data` for lengths that do not match, inputs that are not finite, infinite outputs, or outputs of which
     /// none was measured.
     pub fn with_gaps(u: &'a [f64], channels: usize, y: &'a [f64]) -> Result<Self> {
-        if channels == 0 || u.len() != y.len() * channels {
-            return Err(Error::data(format!(
-                "expected {} x {channels} inputs for {} outputs, got {} values; give u and y the same number of samples",
-                y.len(),
-                y.len(),
-                u.len()
-            )));
-        }
-        if let Some(i) = u.iter().position(|v| !v.is_finite()) {
-            return Err(Error::data(format!(
-                "expected finite values in u, got {} at sample {}; a simulation needs every input: cut the recording there, or fill what is missing",
-                u[i],
-                i / channels
-            )));
-        }
-        if let Some(k) = y.iter().position(|v| v.is_infinite()) {
-            return Err(Error::data(format!(
-                "expected finite values in y, or NaN where it was not measured, got {} at sample {k}; set it to NaN",
-                y[k]
-            )));
-        }
-        let unmeasured = y.iter().filter(|v| v.is_nan()).count();
-        if unmeasured > 0 && unmeasured == y.len() {
-            return Err(Error::data(
-                "expected a measured output, got NaN throughout; leave that experiment out",
-            ));
-        }
-        Ok(Self {
-            u,
-            channels,
-            y,
-            unmeasured,
-        })
+        Samples::new(u, channels, y)?.record()
     }
 
     /// Number of samples whose output was measured.

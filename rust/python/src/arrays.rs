@@ -3,6 +3,7 @@
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyType;
+use sewfast_core::data::Samples;
 use sewfast_core::{Error, ErrorKind, Record};
 
 /// Turns a core error into the exception class of `sewfast.errors` that stands for its kind.
@@ -53,13 +54,19 @@ fn not_contiguous(py: Python<'_>, name: &str) -> PyErr {
 /// Borrowed experiments as Python hands them over: a list of `(u, y)`.
 pub type Experiments<'py> = Vec<(PyReadonlyArray2<'py, f64>, PyReadonlyArray1<'py, f64>)>;
 
+/// The experiments with their shapes checked, their values not looked at.
+pub fn samples<'a>(py: Python<'_>, experiments: &'a Experiments<'_>) -> PyResult<Vec<Samples<'a>>> {
+    let samples = |(u, y): &'a (PyReadonlyArray2<'_, f64>, PyReadonlyArray1<'_, f64>)| {
+        let (u, channels) = rows(u, "u")?;
+        Samples::new(u, channels, slice(y, "y")?).map_err(|e| raise(py, e))
+    };
+    experiments.iter().map(samples).collect()
+}
+
 /// The experiments as the core's records.
 pub fn records<'a>(py: Python<'_>, experiments: &'a Experiments<'_>) -> PyResult<Vec<Record<'a>>> {
-    let record = |(u, y): &'a (PyReadonlyArray2<'_, f64>, PyReadonlyArray1<'_, f64>)| {
-        let (u, channels) = rows(u, "u")?;
-        Record::with_gaps(u, channels, slice(y, "y")?).map_err(|e| raise(py, e))
-    };
-    experiments.iter().map(record).collect()
+    let record = |samples: Samples<'a>| samples.record().map_err(|e| raise(py, e));
+    samples(py, experiments)?.into_iter().map(record).collect()
 }
 
 /// A new one-dimensional array that owns `values`.

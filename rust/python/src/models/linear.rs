@@ -6,7 +6,7 @@ use sewfast_core::lagged::Lagged;
 use sewfast_core::{arx, iv, linear, linear_fit, oe};
 
 use super::{Rows, RunAndJacobian, Values};
-use crate::arrays::{Experiments, array1, array2, raise, records, rows, slice};
+use crate::arrays::{Experiments, array1, array2, raise, records, rows, samples, slice};
 use crate::watch::watched;
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -168,8 +168,8 @@ fn fit_arx(
     nk: usize,
     offset: bool,
 ) -> PyResult<LinearModel> {
-    let records = records(py, &experiments)?;
-    let inner = super::released(py, || arx::fit(&records, na, nb, nk, offset))?;
+    let samples = samples(py, &experiments)?;
+    let inner = super::released(py, || arx::fit_samples(&samples, na, nb, nk, offset))?;
     Ok(LinearModel { inner })
 }
 
