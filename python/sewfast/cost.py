@@ -102,9 +102,17 @@ class Cost:
         Raises
         ------
         DataError
-            Where there is no run, or one has samples missing.
+            Where there is no run, or what is none, or one has samples missing.
         """
+        from .loop import ClosedLoopRun
+
         several = list(runs) if isinstance(runs, Sequence) else [runs]
+        for one in several:
+            if not isinstance(one, ClosedLoopRun):
+                raise DataError(
+                    f"expected closed-loop runs to take the cost of, got {type(one).__name__}; "
+                    "run(controller, plant, reference) gives one"
+                )
         if not several:
             raise DataError("expected at least one run to take the cost of, got none")
         r = np.concatenate([run.r for run in several])

@@ -63,11 +63,23 @@ def titles(plants: Sequence[Plant]) -> list[str]:
 
 
 def each_reference(references: Any, default: Sequence[str]) -> list[Any]:
-    """The references one by one: a name or a vector is one, a sequence of those is several."""
+    """The references one by one: a name or a vector is one, a sequence of those is several.
+
+    Raises
+    ------
+    SettingError
+        For what is none of these.
+    """
     if references is None:
         return list(default)
     if isinstance(references, str):
         return [references]
+    try:
+        iter(references)
+    except TypeError:
+        raise SettingError(
+            f"expected references as names or samples, got {references!r}; for example 'trapezoid'"
+        ) from None
     several = not isinstance(references, np.ndarray) and any(
         isinstance(r, str) or np.ndim(r) for r in references
     )

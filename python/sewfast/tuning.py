@@ -16,6 +16,7 @@ from .cost import Cost
 from .errors import Interrupted, SettingError
 from .gains import whole
 from .load_step import LoadStep
+from .loop import check_fits
 from .plants import Plants, References
 from .starting import first_controller
 from .tuning_task import (
@@ -179,6 +180,8 @@ def tune(
         "counts_per_rev": counts_per_rev,
         "filter_samples": filter_samples,
     }
+    if not isinstance(method, str):
+        raise SettingError(f"expected method 'genetic' or 'cma-es', got {method!r}")
     task = TuningTask.of(
         models,
         references,
@@ -226,8 +229,9 @@ def costs(
     SettingError, DataError
         For controllers, plants or references that cannot be used.
     """
-    given = [controllers] if isinstance(controllers, Controller) else list(controllers)
-    if not given or not all(isinstance(c, Controller) for c in given):
+    given = [controllers] if isinstance(controllers, Controller) else controllers
+    several = isinstance(given, Sequence) and all(isinstance(c, Controller) for c in given)
+    if not (several and given):
         raise SettingError(f"expected controllers to compare, got {controllers!r}")
     if len({c.counts_per_unit for c in given}) > 1:
         raise SettingError(
@@ -244,6 +248,9 @@ def costs(
         variations=variations,
         loads=loads,
     )
+    for controller in given:
+        for plant in task.plants:
+            check_fits(controller, plant)
     judged = _core.tuning_costs(
         task.core(),
         [c.core() for c in given],

@@ -62,12 +62,18 @@ class TuningTask:
         given = list(models) if isinstance(models, Sequence) else [models]
         if not given:
             raise SettingError("expected at least one plant to tune on, got none")
+        plants = each_plant(given)
+        if not (start is None or isinstance(start, Controller)):
+            raise SettingError(
+                f"expected a Controller to start from, got {type(start).__name__}; read a file "
+                "with load_controller"
+            )
         if start is None:
             start = first_controller(given[0], **first)
         for plant in given:
             check_fits(start, plant)
         return cls(
-            plants=each_plant(given),
+            plants=plants,
             references=[
                 reference_samples(r, start) for r in each_reference(references, REFERENCES)
             ],
@@ -139,7 +145,8 @@ def _load_steps(given: Sequence[LoadStep]) -> list[LoadStep]:
 
 
 def _checked(variations: Sequence[tuple[float, int]]) -> list[tuple[float, int]]:
-    if not variations or not all(np.shape(v) == (2,) for v in variations):
+    pairs = isinstance(variations, Sequence) and all(np.shape(v) == (2,) for v in variations)
+    if not (pairs and variations):
         raise SettingError(
             f"expected variations as pairs of a gain and a delay in samples, got {variations!r}"
         )

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import Interrupted
+from ..errors import Interrupted, SettingError
 from .arguments import Commands, add_command, add_overwrite
 from .drive import add_drive, is_port, opened
 from .output import print_json
@@ -109,4 +109,8 @@ def _commissioned(args: argparse.Namespace) -> Commissioning:
         if is_port(args.on):
             with opened(args) as drive:
                 return commission(drive, **options)
+        if args.limits is not None:
+            raise SettingError(
+                f"--limits belongs to a drive behind a port, received --on {args.on}; leave it out"
+            )
         return commission(VirtualMachine.from_name(args.on), **options)
