@@ -161,7 +161,6 @@ def test_what_is_no_plant_is_refused() -> None:
         (two, "one input"),
         (linear([1.0], [1.0, -0.5]), "nk = 1"),
         (LinearOE.from_tf([0.0, 1.0], [1.0, -0.5], 0.002), "sample time"),
-        (Fopdt(1.0, -1.0, 0.0), "T above 0"),
         ("drive", "received str"),
     ]:
         with pytest.raises(SettingError, match=says):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 from pathlib import Path
@@ -13,9 +14,14 @@ def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
     Raises
     ------
     OSError
-        Where the folder does not exist or cannot be written to; nothing is left behind.
+        Where the folder does not exist or cannot be written to, or what is there is no file but a
+        device or a pipe, which must not be replaced; nothing is left behind.
     """
+    if "\0" in os.fspath(path):
+        raise OSError(errno.EINVAL, "a name cannot hold the character 0")
     target = Path(path).resolve()
+    if target.exists() and not (target.is_file() or target.is_dir()):
+        raise OSError(errno.EINVAL, "what has that name is no file")
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("xb") as file:

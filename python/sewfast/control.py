@@ -111,6 +111,11 @@ class Controller:
     def __post_init__(self) -> None:
         for name in _REALS:
             object.__setattr__(self, name, real(name, getattr(self, name)))
+        if not isinstance(self.gains, Gains):
+            raise SettingError(
+                f"expected Gains, got {self.gains!r}; make them with Gains.standard, "
+                "Gains.parallel or Gains.per_sample"
+            )
         object.__setattr__(self, "schedule", _points(self.schedule))
         self._check_gains(self.gains)
         for _, gains in self.schedule:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import _core
+from .errors import SettingError
 from .gains import real, vector
 
 
@@ -36,6 +37,11 @@ class Fopdt:
         Samples on a limit of the output, which had no weight.
     moving : bool
         Whether the machine was not at rest before the step: its free response was fitted as well.
+
+    Raises
+    ------
+    SettingError
+        For a K that is not finite, a T that is not above 0 s or an L below 0 s.
     """
 
     K: float
@@ -52,6 +58,15 @@ class Fopdt:
     L_se: float = math.nan
     limited: int = 0
     moving: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("K", "T", "L", "offset", "u_low", "u_high"):
+            object.__setattr__(self, name, real(name, getattr(self, name)))
+        if not (math.isfinite(self.K) and 0.0 < self.T < math.inf and 0.0 <= self.L < math.inf):
+            raise SettingError(
+                "expected a finite gain K, T above 0 s and L of 0 s or more, got "
+                f"K = {self.K:g} {self.y_unit}/{self.u_unit}, T = {self.T:g} s, L = {self.L:g} s"
+            )
 
     def response(self, t: ArrayLike) -> NDArray[np.float64]:
         """The output at times `t` [s] after the step, shape as `t`; `t` may be negative."""

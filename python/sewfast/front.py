@@ -194,6 +194,10 @@ def pareto(
         After Ctrl-C; its `best` is the front so far, or the best controller where there is none.
     """
     total, names = whole("evaluations", evaluations), _checked(objectives)
+    if total < 2:
+        raise SettingError(
+            f"expected 2 evaluations or more, got {total}; {EVALUATIONS:,} are usual"
+        )
     settings: dict[str, Any] = {
         "cost": cost,
         "aggregate": aggregate,
@@ -232,6 +236,9 @@ def _checked(objectives: Sequence[str]) -> list[str]:
         raise SettingError(
             f"expected a list of objectives, got {objectives!r}; for example ['tracking', 'effort']"
         )
+    twice = [o for i, o in enumerate(objectives) if o in objectives[:i]]
+    if twice:
+        raise SettingError(f"expected each objective once, got {twice[0]!r} twice")
     return list(objectives)
 
 

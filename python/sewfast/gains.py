@@ -59,6 +59,11 @@ def vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
     return array
 
 
+def _require_form(form: Any) -> None:
+    if not (isinstance(form, str) and form in _FIELDS):
+        raise SettingError(f"expected one of {', '.join(_FIELDS)} for form, got {form!r}")
+
+
 @dataclass(frozen=True)
 class Gains:
     """Gains of a PID in one of three forms that must not be mixed (docs/CONVENTIONS.md, Control).
@@ -95,8 +100,13 @@ class Gains:
     y_unit: str = "RPM"
 
     def __post_init__(self) -> None:
-        if self.form not in _FIELDS:
-            raise SettingError(f"expected one of {', '.join(_FIELDS)} for form, got {self.form!r}")
+        _require_form(self.form)
+        for name in ("u_unit", "y_unit"):
+            if not isinstance(getattr(self, name), str):
+                raise SettingError(
+                    f"expected a unit as text for {name}, got {getattr(self, name)!r}; for example "
+                    "'V', or '' for none"
+                )
         for field, name in zip(("Kp", "integral", "derivative"), _FIELDS[self.form], strict=False):
             object.__setattr__(self, field, real(name, getattr(self, field)))
         if (self.form == "per_sample") != (self.Ts is not None):
@@ -150,8 +160,7 @@ class Gains:
         SettingError
             For an unknown form, or per-sample gains without a sample time.
         """
-        if form not in _FIELDS:
-            raise SettingError(f"expected one of {', '.join(_FIELDS)} for form, got {form!r}")
+        _require_form(form)
         units = (self.u_unit, self.y_unit)
         if form != "per_sample":
             return Gains(form, *self._converted(form, self.Ts), None, *units)

@@ -99,10 +99,10 @@ def _text(path: str | os.PathLike[str]) -> str:
     try:
         with Path(path).open("rb") as file:
             data = file.read(LARGEST_FILE + 1)
-    except OSError as error:
-        raise ModelFileError(
-            f"{path}: cannot be read ({error.strerror}); check the name"
-        ) from error
+    except (OSError, ValueError) as error:
+        # a name with the character 0 is a ValueError
+        reason = getattr(error, "strerror", error)
+        raise ModelFileError(f"{path!s}: cannot be read ({reason}); check the name") from error
     if len(data) > LARGEST_FILE:
         raise ModelFileError(f"{path}: expected a file of at most 16 MB, got a larger one")
     try:

@@ -115,7 +115,17 @@ def _of_system(system: Any, Ts: float) -> tuple[FloatArray, FloatArray]:
             "expected an Fopdt, a model, an operating point or a system of python-control or "
             f"scipy.signal, received {type(system).__name__}"
         )
-    num, den, _ = polynomials_of(_discrete(system, Ts), Ts)
+    inputs, outputs = (getattr(system, name, 1) for name in ("ninputs", "noutputs"))
+    _require(inputs or 1, Ts, Ts)
+    if (outputs or 1) != 1:
+        raise SettingError(f"expected one output, received {outputs}; take one of them")
+    try:
+        discrete = _discrete(system, Ts)
+    except (ValueError, NotImplementedError) as error:
+        raise SettingError(
+            f"expected a proper linear system to sample under a zero-order hold, received {error}"
+        ) from error
+    num, den, _ = polynomials_of(discrete, Ts)
     _require(len(num), Ts, Ts)
     return np.ascontiguousarray(num[0]), np.ascontiguousarray(den)
 

@@ -13,6 +13,7 @@ from typing import Any, Literal, TypeAlias
 from .control import Controller
 from .errors import SettingError
 from .gains import Gains, real
+from .loop import require_controller
 
 Object: TypeAlias = Literal["pid", "pid2", "pidstd", "pidstd2"]
 
@@ -41,6 +42,7 @@ def to_matlab(controller: Controller, form: Object = "pid2") -> dict[str, Any]:
     SettingError
         For another form, weights that it cannot hold, or a gain schedule.
     """
+    require_controller(controller, None, "to_matlab(controller, form)")
     _require_form(form)
     if controller.schedule:
         raise SettingError(
@@ -153,6 +155,7 @@ def to_control(controller: Controller) -> Any:
     from .analysis.systems import beside, gain, measurement, pid, series
     from .models.toolboxes import require_control
 
+    require_controller(controller, None, "to_control(controller)")
     if controller.schedule:
         raise SettingError("expected constant gains, received a gain schedule: it is not linear")
     inputs = beside(gain(1.0), measurement(controller, encoder=False))
@@ -161,7 +164,7 @@ def to_control(controller: Controller) -> Any:
 
 
 def _require_form(form: str) -> None:
-    if form not in _NAMES:
+    if not (isinstance(form, str) and form in _NAMES):
         raise SettingError(f"expected a form out of {', '.join(_NAMES)}, received {form!r}")
 
 

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import _core
-from .control import Controller
+from .control import Controller, Fopdt
 from .errors import SettingError
-from .gains import Gains, real
+from .gains import Gains, real, vector
 from .linear_plant import sampled
 from .loop import require_controller
+from .models import Model
 
 __all__ = ["Margins", "loop_path", "loop_response", "margins"]
 
@@ -74,15 +75,15 @@ class Margins:
         if not self.stable:
             known = not math.isnan(self.largest_pole)
             return "unstable" + (f", largest pole {self.largest_pole:.6g}" if known else "")
-        crossing = ", ".join(f"{w / (2 * math.pi):.4g}" for w in self.gain_crossovers) or "nowhere"
+        hertz = ", ".join(f"{w / (2 * math.pi):.4g}" for w in self.gain_crossovers)
+        crossing = f"{hertz} Hz" if hertz else "nowhere"
         less = f", down to {self.gain_reduction:.3g}" if self.gain_reduction else ""
         return "\n".join(
             [
-                f"Ms {self.Ms:.3f} at {_hertz(self.Ms_omega)}, Mt {self.Mt:.3f} at "
-                f"{_hertz(self.Mt_omega)}",
+                f"Ms {self.Ms:.3f}{_at(self.Ms_omega)}, Mt {self.Mt:.3f}{_at(self.Mt_omega)}",
                 f"gain margin {self.gain_margin:.3g}{less}, phase margin "
                 f"{self.phase_margin_deg:.1f} deg, delay margin {1e3 * self.delay_margin_s:.3g} ms",
-                f"crossover {crossing} Hz, noise gain {self.noise_gain:.4g} "
+                f"crossover {crossing}, noise gain {self.noise_gain:.4g} "
                 f"{self.u_unit}/{self.y_unit}",
             ]
         )
@@ -108,10 +109,11 @@ def margins(controller: Controller, plant: Any, *, speed: float | None = None) -
     Raises
     ------
     SettingError
-        Without a speed where one is needed, for several inputs, another sample time, or a plant
-        that answers within the same sample.
+        Without a speed where one is needed, for several inputs, another sample time, other units,
+        or a plant that answers within the same sample.
     """
     require_controller(controller, plant, "margins(controller, plant)")
+    _require_units(controller.gains, plant)
     found = _core.margins(loop_path(controller, speed=speed), *sampled(plant, controller.Ts, speed))
     for name in ("gain_crossovers", "phase_crossovers"):
         found[name] = tuple(found[name])
@@ -127,15 +129,40 @@ def loop_response(
     Parameters as in `margins`.
     """
     require_controller(controller, plant, "loop_response(controller, plant, omega)")
-    w = np.ascontiguousarray(np.atleast_1d(np.asarray(omega, dtype=np.float64)))
+    _require_units(controller.gains, plant)
+    w = vector("omega", np.atleast_1d(np.asarray(omega)))
     nyquist = math.pi / controller.Ts
-    if not (w.ndim == 1 and np.all((w > 0.0) & (w <= nyquist * (1 + 1e-12)))):
+    if not np.all((w > 0.0) & (w <= nyquist * (1 + 1e-12))):
         raise SettingError(
             f"omega: expected frequencies above 0 and up to half the sample rate, {nyquist:.6g} "
             f"rad/s, received {omega!r}"
         )
     path = loop_path(controller, speed=speed)
     return _core.loop_response(path, *sampled(plant, controller.Ts, speed), w)
+
+
+def _require_units(gains: Gains, plant: Any) -> None:
+    """Refuse a first-order model or a model whose units are others; toolboxes' systems have none.
+
+    Raises
+    ------
+    SettingError
+        Naming both.
+    """
+    if isinstance(plant, Fopdt):
+        theirs = (plant.u_unit, plant.y_unit)
+    elif isinstance(plant, Model):
+        theirs = (plant.input_units[0], plant.output_unit)
+    else:
+        return
+    for what, own, other in zip(
+        ("input", "output"), (gains.u_unit, gains.y_unit), theirs, strict=True
+    ):
+        if own and other and own.lower() != other.lower():
+            raise SettingError(
+                f"expected the plant's {what} in the controller's unit {own!r}, got {other!r}; "
+                "give the gains in the plant's units"
+            )
 
 
 def loop_path(controller: Controller, *, speed: float | None = None) -> _core.LoopPath:
@@ -195,5 +222,5 @@ def scheduled_gains(controller: Controller, speed: float | None) -> tuple[Gains,
     return Gains.standard(Kp, Ti, Td, **units), slope
 
 
-def _hertz(omega: float) -> str:
-    return f"{omega / (2 * math.pi):.4g} Hz"
+def _at(omega: float) -> str:
+    return "" if math.isnan(omega) else f" at {omega / (2 * math.pi):.4g} Hz"

@@ -36,7 +36,7 @@ class Rule:
     alpha: float
     beta: float
     name: str = ""
-    costs: dict[str, float] = field(default_factory=dict)
+    costs: dict[str, float] = field(default_factory=dict, hash=False)
 
     def __str__(self) -> str:
         return f"{self.gains}, alpha {self.alpha:.4g}, beta {self.beta:.4g} ({self.name})"
@@ -59,6 +59,7 @@ def table_1(fopdt: Fopdt, *, outside: Literal["error", "nearest"] = "error") -> 
     """
     if outside not in ("error", "nearest"):
         raise SettingError(f"expected outside='error' or 'nearest', got {outside!r}")
+    _require(fopdt)
     found = _core.table_1(fopdt.K, fopdt.T, fopdt.L, nearest=outside == "nearest")
     return _rule(fopdt, found, "table-1")
 
@@ -80,6 +81,7 @@ def eq_12(fopdt: Fopdt, *, Ms: float = math.inf) -> Rule:
     SettingError
         Where L/T is outside .01 to 2, for K = 0 or T <= 0, or an Ms of 1.1 or less.
     """
+    _require(fopdt)
     found = _core.eq_12(fopdt.K, fopdt.T, fopdt.L, Ms=real("Ms", Ms))
     costs = {name: found[name] for name in ("disturbance_cost", "reference_cost", "Ms")}
     limit = "" if math.isinf(Ms) else f", Ms <= {Ms:g}"
@@ -110,6 +112,7 @@ def simc(fopdt: Fopdt, *, tau_c: float | None = None, kind: Literal["PI", "PID"]
     """
     if kind not in ("PI", "PID"):
         raise SettingError(f"expected kind='PI' or 'PID', got {kind!r}")
+    _require(fopdt)
     usual = fopdt.L if kind == "PI" else fopdt.L / 2
     tau = usual if tau_c is None else real("tau_c", tau_c)
     found = _core.simc(fopdt.K, fopdt.T, fopdt.L, tau_c=tau, derivative=kind == "PID")
@@ -128,6 +131,7 @@ def amigo(fopdt: Fopdt) -> Rule:
     ----------
     K. J. Astrom, T. Hagglund, J. Process Control 14, 2004.
     """
+    _require(fopdt)
     return _rule(fopdt, _core.amigo(fopdt.K, fopdt.T, fopdt.L), "amigo")
 
 
@@ -157,6 +161,14 @@ def by_name(name: str) -> Callable[[Fopdt], Rule]:
     if rule is None:
         raise SettingError(f"expected a rule out of {', '.join(BY_NAME)}, got {name!r}")
     return rule
+
+
+def _require(fopdt: Any) -> None:
+    if not isinstance(fopdt, Fopdt):
+        raise SettingError(
+            f"expected an Fopdt, got {type(fopdt).__name__}; fit one to a recorded step with "
+            "fit_fopdt, or give Fopdt(K, T, L)"
+        )
 
 
 def _rule(fopdt: Fopdt, found: dict[str, Any], name: str) -> Rule:

@@ -72,7 +72,12 @@ def wanted(
 
 def _one(given: Any, start: Controller) -> list[tuple[str, tuple[float, float] | None]]:
     if given == "schedule":
-        points = len(getattr(start, "schedule", ()))
+        points = len(start.schedule)
+        if not points:
+            raise SettingError(
+                "expected a start with a gain schedule for the variable 'schedule', got one with "
+                "constant gains; search 'Kp', 'Ti', 'Td'"
+            )
         return [(f"{gain}[{k}]", None) for k in range(points) for gain in GAINS]
     if isinstance(given, str):
         return [(given, None)]

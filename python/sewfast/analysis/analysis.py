@@ -18,6 +18,7 @@ from ..errors import FitError, SettingError
 from ..loop import check_fits, require_controller
 from ..plants import Plants, References, each_plant, each_reference, titles
 from ..trust import Judgement, Limits, judge
+from .arguments import each_change, finite_each, required
 from .bode import LoopBode, loop_bodes
 from .changes import Change
 from .points import PlantPoint, plant_points
@@ -80,8 +81,20 @@ class Analysis:
         """The linear loop about an operating point (the main one): L, S, T as state space.
 
         `linear().to_control("S")` and `.to_scipy("S")` give the toolboxes' objects.
+
+        Raises
+        ------
+        SettingError
+            For a point or a plant that is not there.
         """
-        row = self.loops[self.main if point is None else point].points
+        point = self.main if point is None else point
+        if not 0 <= point < len(self.loops):
+            raise SettingError(
+                f"expected one of {len(self.loops)} operating points, counted from 0, got {point}"
+            )
+        row = self.loops[point].points
+        if not 0 <= plant < len(row):
+            raise SettingError(f"expected one of {len(row)} plants, counted from 0, got {plant}")
         return LinearLoop.of(self.controller, row[plant].system, speed=row[plant].y)
 
     def figures(self) -> dict[str, Figure]:
@@ -202,11 +215,15 @@ def analyse(
     ------
     SettingError
         For plants whose sample time or units are not the controller's, or that cannot rest at any
-        of `speeds`.
+        of `speeds`; for steps of size 0, or times that are not above 0.
     DataError
         For a reference that cannot be used.
     """
     require_controller(controller, on, "analyse(controller, plants)")
+    cost = required("cost", cost, Cost)
+    limits = required("limits", limits, Limits)
+    changes = each_change(changes)
+    speeds = None if speeds is None else finite_each("speeds", speeds)
     plants = each_plant(on)
     if not plants:
         raise SettingError("expected at least one plant to analyse on, got none")
@@ -223,7 +240,7 @@ def analyse(
     wanted = each_reference(references, _default_references(controller, steps))
     task = Task(
         tuple(plants[:MOST]), tuple(names[:MOST]), points[main][:MOST], tuple(wanted),
-        cost or Cost(), seed,
+        cost, seed,
     )  # fmt: skip
     return Analysis(
         controller=controller,

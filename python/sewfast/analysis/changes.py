@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from .. import _core
 from ..errors import SettingError
+from ..gains import real, whole
 from ..loop import Plant
 from ..machine import VirtualMachine
 from ..models import Model, NeuralSS
@@ -35,11 +37,13 @@ class Change:
 
 def gain(factor: float) -> Change:
     """The output of a model times a factor."""
+    factor = _positive("factor", factor)
     return Change(f"gain x {factor:g}", lambda plant: with_gain(_model(plant), factor))
 
 
 def time_constants(factor: float) -> Change:
     """Every time constant of a model times a factor, as more or less inertia would do."""
+    factor = _positive("factor", factor)
     return Change(
         f"time constants x {factor:g}", lambda plant: with_time_constants(_model(plant), factor)
     )
@@ -47,6 +51,7 @@ def time_constants(factor: float) -> Change:
 
 def delay(samples: int) -> Change:
     """The input of a model acts some samples later."""
+    samples = whole("samples", samples)
     plural = "s" if samples != 1 else ""
     return Change(
         f"delay + {samples} sample{plural}", lambda plant: with_delay(_model(plant), samples)
@@ -55,6 +60,11 @@ def delay(samples: int) -> Change:
 
 def parameters(name: str, **factors: float) -> Change:
     """Parameters of a virtual machine, each times its factor."""
+    known = VirtualMachine().parameters
+    for one, factor in factors.items():
+        if one not in known:
+            raise SettingError(f"expected a parameter out of {', '.join(known)}, got {one!r}")
+        _positive(one, factor, zero=True)
 
     def apply(plant: Plant) -> Plant:
         machine = _machine(plant)
@@ -66,6 +76,9 @@ def parameters(name: str, **factors: float) -> Change:
 
 def load(torque: float) -> Change:
     """A constant load torque on the shaft of a virtual machine [N m]."""
+    torque = real("torque", torque)
+    if not math.isfinite(torque):
+        raise SettingError(f"expected a finite torque [N m], got {torque}")
 
     def apply(plant: Plant) -> Plant:
         machine = VirtualMachine(parameters=_machine(plant).parameters)
@@ -89,6 +102,16 @@ def inertia(factor: float) -> Change:
 def crank_load(factor: float) -> Change:
     """The load that varies over the turn of a virtual machine times a factor."""
     return parameters(f"crank load x {factor:g}", load_first=factor, load_second=factor)
+
+
+def _positive(name: str, value: Any, *, zero: bool = False) -> float:
+    factor = real(name, value)
+    if not (0.0 <= factor < math.inf and (zero or factor)):
+        raise SettingError(
+            f"expected a finite factor {'of 0 or more' if zero else 'above 0'} for {name}, got "
+            f"{factor:g}"
+        )
+    return factor
 
 
 ON_MODELS = (

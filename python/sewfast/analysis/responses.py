@@ -11,8 +11,10 @@ import numpy as np
 
 from ..control import Controller
 from ..dataset import FloatArray
+from ..errors import SettingError
 from ..loop import ClosedLoopRun, Plant, run
 from ..machine import VirtualMachine
+from .arguments import finite
 from .loading import run_under_load, torque_of
 from .points import PlantPoint
 
@@ -217,7 +219,18 @@ def default_steps(
         Time constant of the slowest closed-loop pole [s].
     level, step, disturbance, seconds : float or None
         Instead of the defaults.
+
+    Raises
+    ------
+    SettingError
+        For what is not finite, a step of 0, or seconds that are not above 0.
     """
+    given = {"level": level, "step": step, "disturbance": disturbance, "seconds": seconds}
+    checked = {name: finite(name, v) for name, v in given.items() if v is not None}
+    if checked.get("step", 1.0) == 0.0 or checked.get("disturbance", 1.0) == 0.0:
+        raise SettingError("expected a step and a disturbance other than 0, got 0; leave it out")
+    if checked.get("seconds", 1.0) <= 0.0:
+        raise SettingError(f"expected seconds above 0, got {seconds:g}")
     level = points[0].y if level is None else level
     gains = [abs(p.gain) for p in points if math.isfinite(p.gain) and p.gain]
     gain = float(np.median(gains)) if gains else math.inf

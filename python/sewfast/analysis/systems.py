@@ -14,9 +14,14 @@ from numpy.typing import NDArray
 
 from ..control import Controller
 from ..dataset import FloatArray
+from ..errors import DataError, SettingError
+from ..loop import require_controller
 from ..models.conversion import StateSpace
 from ..models.toolboxes import require_control, require_scipy_signal
 from ..robustness import scheduled_gains
+
+SYSTEMS = ("L", "S", "T", "closed", "tracking", "disturbance", "plant", "measurement", "pid")
+"""What a `LinearLoop` hands to toolboxes by name."""
 
 
 def gain(D: Any) -> StateSpace:
@@ -155,7 +160,19 @@ class LinearLoop:
         speed: float = 0.0,
     ) -> LinearLoop:
         """Close the loop; `encoder` as the controller has one unless told, a schedule's gains at
-        `speed`."""
+        `speed`.
+
+        Raises
+        ------
+        SettingError
+            For what is no Controller or no StateSpace, such as that of `model.to_ss()`.
+        """
+        require_controller(controller, plant, "LinearLoop.of(controller, plant)")
+        if not isinstance(plant, StateSpace):
+            raise SettingError(
+                f"expected the plant as a StateSpace, got {type(plant).__name__}; a linear model "
+                "has to_ss()"
+            )
         if encoder is None:
             encoder = controller.counts_per_rev is not None
         return cls(
@@ -221,9 +238,9 @@ class LinearLoop:
         Raises
         ------
         SettingError
-            Where python-control is not installed.
+            Where python-control is not installed, or for another name.
         """
-        return require_control().ss(*getattr(self, name), self.Ts)
+        return require_control().ss(*self._named(name), self.Ts)
 
     def to_scipy(self, name: str = "T") -> Any:
         """The same as `scipy.signal.dlti`.
@@ -233,7 +250,13 @@ class LinearLoop:
         SettingError
             Where scipy is not installed.
         """
-        return require_scipy_signal().dlti(*getattr(self, name), dt=self.Ts)
+        return require_scipy_signal().dlti(*self._named(name), dt=self.Ts)
+
+    def _named(self, name: str) -> StateSpace:
+        if name not in SYSTEMS:
+            raise SettingError(f"expected one of {', '.join(SYSTEMS)}, got {name!r}")
+        found: StateSpace = getattr(self, name)
+        return found
 
 
 def response(system: StateSpace, hertz: FloatArray, Ts: float) -> NDArray[np.complex128]:
@@ -247,8 +270,17 @@ def response(system: StateSpace, hertz: FloatArray, Ts: float) -> NDArray[np.com
 
 
 def simulate(system: StateSpace, u: FloatArray) -> FloatArray:
-    """The output from rest for inputs (N, inputs), shape (N, outputs)."""
+    """The output from rest for inputs (N, inputs), shape (N, outputs).
+
+    Raises
+    ------
+    DataError
+        For inputs of another shape.
+    """
     A, B, C, D = system
+    u = np.asarray(u, dtype=np.float64)
+    if u.ndim != 2 or u.shape[1] != B.shape[1]:
+        raise DataError(f"expected inputs of shape (N, {B.shape[1]}), got {u.shape}")
     x, found = np.zeros(len(A)), np.empty((len(u), len(C)))
     for k, v in enumerate(u):
         found[k] = C @ x + D @ v

@@ -80,6 +80,10 @@ def gains_command(args: argparse.Namespace) -> None:
     from ..robustness import margins
 
     require_place(args.out, (".json",))
+    if args.filter < 1:
+        raise SettingError(f"--filter: expected 1 sample or more, received {args.filter}")
+    if args.ts is not None and not args.ts > 0.0:
+        raise SettingError(f"--ts: expected a sample time above 0 s, received {args.ts:g}")
     fopdt, Ts = _plant(args)
     rule = _rule(args, _delayed(args, fopdt, Ts))
     controller = _controller(args, rule, fopdt, Ts)

@@ -12,7 +12,7 @@ from ..control import Controller
 from ..dataset import Dataset
 from ..errors import FitError, SettingError, SewfastError
 from ..evidence.region import placed
-from ..loop import ClosedLoopRun, Plant
+from ..loop import ClosedLoopRun, Plant, check_fits
 from ..models import Model
 from ..plants import Plants, References, each_plant, each_reference, titles, trial
 from . import questions
@@ -77,8 +77,13 @@ def judge(
     FitError
         Where members of an ensemble disagree by more than the bound, or one runs away.
     SettingError
-        For arguments that are none of these, or a controller without plants.
+        For arguments that are none of these, a controller without plants, or models whose sample
+        time or units are not the runs'.
     """
+    if not (limits is None or isinstance(limits, Limits)):
+        raise SettingError(
+            f"expected Limits, got {type(limits).__name__}; for example Limits(saturated=0.02)"
+        )
     limits = limits or Limits()
     models = each_plant(getattr(what, "models", None) if on is None else on)
     runs = _runs(what, models, references, seed)
@@ -144,6 +149,7 @@ def _outside(found: ClosedLoopRun, model: Model | None) -> tuple[float, float]:
     """Share of samples outside, farthest distance; NaN where no region is known."""
     if model is None or not len(found.u):
         return math.nan, math.nan
+    check_fits(found.controller, model)
     known = np.isfinite(found.u)
     u = np.interp(np.arange(len(known)), np.flatnonzero(known), found.u[known])
     data = Dataset.from_arrays(

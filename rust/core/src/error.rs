@@ -51,6 +51,15 @@ impl Error {
     }
 }
 
+/// A number for a message: four decimals, or as a power of ten where these would say nothing.
+pub(crate) fn shown(x: f64) -> String {
+    if x == 0.0 || (1e-3..1e6).contains(&x.abs()) {
+        format!("{x:.4}")
+    } else {
+        format!("{x:.3e}")
+    }
+}
+
 impl fmt::Display for Error {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.message)
@@ -58,3 +67,17 @@ impl fmt::Display for Error {
 }
 
 impl std::error::Error for Error {}
+
+#[cfg(test)]
+mod tests {
+    use super::shown;
+
+    #[test]
+    fn numbers_in_messages_keep_their_size() {
+        let shown: Vec<String> = [0.0, 0.03, -12.5, 1e-7, -4e300].map(shown).into();
+        assert_eq!(
+            shown,
+            ["0.0000", "0.0300", "-12.5000", "1.000e-7", "-4.000e300"]
+        );
+    }
+}

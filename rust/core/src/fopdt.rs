@@ -4,6 +4,7 @@ mod confidence;
 
 use nalgebra::{Matrix3, Vector3};
 
+use crate::error::shown;
 use crate::{Error, Record, Result};
 
 /// `K e^(-sL) / (1 + sT)` about an operating point, with the story of its fit.
@@ -325,9 +326,10 @@ impl<'a> Step<'a> {
         let stands_out = found.rise.abs() > least && found.cost < 0.5 * self.spread();
         if !stands_out {
             return Err(Error::data(format!(
-                "expected a response that stands out of the noise, got a rise of {:.4} over a residual of {noise:.4} \
-                 rms; use a larger step, or check that u and y belong together",
-                found.rise
+                "expected a response that stands out of the noise, got a rise of {} over a residual of {} rms; use a \
+                 larger step, or check that u and y belong together",
+                shown(found.rise),
+                shown(noise)
             )));
         }
         let passed = 1.0 - (-(self.length() - found.l) / found.t).exp();

@@ -9,6 +9,7 @@ pub use eq_12::{Costs, costs, eq_12};
 
 use sewfast_control::Standard;
 
+use crate::error::shown;
 use crate::{Error, Result};
 
 /// `L/T`, `Kp K`, `TI/T`, `TD/T`, alpha, beta; the print heads the third and fourth column K_I/T and K_D/T.
@@ -59,8 +60,9 @@ pub fn table_1(k: f64, t: f64, l: f64, outside: Outside) -> Result<Rule> {
     let ratio = l / t;
     if outside == Outside::Error && !(0.1..=1.0).contains(&ratio) {
         return Err(Error::setting(format!(
-            "expected L/T from .1 to 1 for Table 1, got {ratio:.4}; take the nearest row (outside = \"nearest\", which \
-             below .1 means L = .1 T and is conservative), or eq_12"
+            "expected L/T from .1 to 1 for Table 1, got {}; take the nearest row (outside = \"nearest\", which below .1 \
+             means L = .1 T and is conservative), or eq_12",
+            shown(ratio)
         )));
     }
     let [kp_k, ti, td, alpha, beta] = interpolate(ratio.clamp(0.1, 1.0));

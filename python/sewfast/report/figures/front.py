@@ -37,7 +37,7 @@ def draw(front: ParetoFront, path: Path) -> Path:
     Raises
     ------
     SettingError
-        For an ending that is no format of figures.
+        For an ending that is no format of figures, or a file that cannot be written.
     """
     canvas.require()
     if path.suffix.lower() not in (".png", ".svg", ".pdf"):
@@ -52,7 +52,13 @@ def draw(front: ParetoFront, path: Path) -> Path:
         for axis in axes.flat[len(pairs) :]:
             axis.set_visible(False)
         axes.flat[0].legend()
-        figure.savefig(path, dpi=150)
+        try:
+            figure.savefig(path, dpi=150)
+        except OSError as error:
+            raise SettingError(
+                f"{path}: cannot be written ({error.strerror}); choose a folder that exists and is "
+                "writable"
+            ) from error
     return path
 
 

@@ -16,6 +16,7 @@ use std::f64::consts::PI;
 
 use super::Rule;
 use super::simplex::minimised;
+use crate::error::shown;
 use crate::{Error, Result};
 use sewfast_control::Standard;
 
@@ -55,8 +56,8 @@ pub fn eq_12(k: f64, t: f64, l: f64, ms: f64) -> Result<(Rule, Costs)> {
     let ratio = l / t;
     if !(RATIOS.0 * (1.0 - 1e-12)..=RATIOS.1 * (1.0 + 1e-12)).contains(&ratio) {
         return Err(Error::setting(format!(
-            "expected L/T from .01 to 2 for Eq. 12, got {ratio:.4}; add the feedback filter's delay to L, or take simc or \
-             amigo"
+            "expected L/T from .01 to 2 for Eq. 12, got {}; add the feedback filter's delay to L, or take simc or amigo",
+            shown(ratio)
         )));
     }
     // NaN is refused as well
