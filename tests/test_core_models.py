@@ -236,6 +236,16 @@ def test_training_starts_exactly_at_the_linear_model() -> None:
     assert fit.trace[0] == pytest.approx(linear.cost / scale**2, rel=1e-4)
 
 
+def test_training_goes_on_from_given_parameters() -> None:
+    u, _, y = _drive(800, 9)
+    first = _fit([(u, y)], [], starts=1, max_iterations=5, weight_decay=0.0, initial_state="zero")
+    theta = first.model.theta
+    on = _fit([(u, y)], [], starts=1, weight_decay=0.0, initial_state="zero", initial_theta=theta)
+    assert on.trace[0] == pytest.approx(first.cost, rel=1e-12)
+    assert on.cost < first.cost
+    assert on.trials >= len(on.trace) - 1 > 0
+
+
 @pytest.mark.parametrize("initial_state", ["zero", "measured", "estimated"])
 def test_a_seed_gives_the_same_bits_at_any_number_of_threads(initial_state: str) -> None:
     u, _, y = _drive(800, 4)
@@ -292,6 +302,9 @@ def test_two_inputs_and_long_delays_are_learnt() -> None:
             "per input",
         ),
         ({"na": 3, "linear": "second order"}, "same na"),
+        ({"initial_theta": np.zeros(3), "starts": 1}, "25 finite numbers"),
+        ({"initial_theta": np.full(25, np.nan), "starts": 1}, "0 are finite"),
+        ({"initial_theta": np.zeros(25)}, "leave initial_theta out"),
     ],
 )
 def test_wrong_settings_are_refused_with_a_remedy(changes: dict[str, Any], words: str) -> None:

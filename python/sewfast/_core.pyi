@@ -234,6 +234,9 @@ class NeuralFit:
     @property
     def iterations(self) -> int: ...
     @property
+    def trials(self) -> int:
+        """Steps that the chosen start tried."""
+    @property
     def termination(self) -> str: ...
     @property
     def remedy(self) -> str:
@@ -322,7 +325,7 @@ def fit_neural_oe(
     linear: LinearModel | None, u_mean: _F | None, u_scale: _F | None, y_mean: float | None,
     y_scale: float | None, saturate: float | None, initial_state: Literal["zero", "measured", "estimated"],
     weight_decay: float, max_iterations: int, starts: int, seed: int, threads: int,
-    progress: _Progress = None,
+    initial_theta: _F | None = None, progress: _Progress = None,
 ) -> NeuralFit:
     """Train in free run; chosen by J on ``validation``, without it by J on the training data.
 
@@ -330,6 +333,7 @@ def fit_neural_oe(
     weights and no bypass. ``saturate`` widens the training output's range by that fraction (half at each end) and
     clips the output there, without slope outside; None leaves it linear. ``threads = 0`` takes all; the bits do not
     depend on it. ``initial_state`` 'measured' starts each run after its first na samples.
+    ``initial_theta``, in scaled units, is where a single start begins instead of a draw, (n_theta,).
     """
 
 def fit_neural_ss(

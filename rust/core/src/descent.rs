@@ -97,6 +97,8 @@ pub struct Outcome {
     pub cost: f64,
     /// Jacobians taken by the loop.
     pub iterations: usize,
+    /// Steps that were tried, accepted or not.
+    pub trials: usize,
     /// How it ended.
     pub termination: Termination,
     /// Cost at the start and after each accepted step.
@@ -160,6 +162,7 @@ pub(crate) fn descend(
         cost: f64::INFINITY,
         theta: start,
         iterations: 0,
+        trials: 0,
         termination: Termination::NotFinite,
         trace: Vec::with_capacity(max_iterations.min(1000) + 1),
     };
@@ -230,6 +233,7 @@ fn improve(
             Proposal::End(end) => return Some(end),
             Proposal::Trial => {}
         }
+        outcome.trials += 1;
         let cost = method.cost(trial);
         match method.judge(outcome.cost, cost) {
             Verdict::Rejected => {}

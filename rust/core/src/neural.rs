@@ -311,6 +311,7 @@ mod tests {
             weight_decay: 0.0,
             max_iterations: 100_000,
             starts: 3,
+            initial_theta: None,
             seed: 0,
             threads: 1,
         };

@@ -181,6 +181,7 @@ fn refined(
                 theta,
                 cost,
                 iterations: 0,
+                trials: 0,
                 termination: Termination::Interrupted,
                 trace: vec![cost],
             });

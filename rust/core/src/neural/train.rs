@@ -47,6 +47,8 @@ pub struct Settings {
     pub max_iterations: usize,
     /// Number of starts.
     pub starts: usize,
+    /// Parameters in scaled units from which a single start begins; drawn where there are none.
+    pub initial_theta: Option<Vec<f64>>,
     /// Seed of the starts; start `i` draws from stream `i`.
     pub seed: u64,
     /// Threads; 0 takes as many as the machine has. The result does not depend on it.
@@ -64,6 +66,8 @@ pub struct NeuralFit {
     pub validation_cost: Option<f64>,
     /// Iterations of the chosen start.
     pub iterations: usize,
+    /// Steps that it tried.
+    pub trials: usize,
     /// How the chosen start ended.
     pub termination: Termination,
     /// J of the chosen start, at its beginning and after each accepted step.
@@ -148,6 +152,7 @@ impl<'a> Training<'a> {
         let lags = arx::check(records, settings.na, settings.nb, settings.nk)?;
         check(settings)?;
         let shape = Shape::new(lags, settings.hidden, settings.linear.is_some())?;
+        check_initial(settings, shape)?;
         check_records(records, validation, shape)?;
         let scaling = settings
             .scaling
@@ -187,6 +192,11 @@ impl<'a> Training<'a> {
 
     /// Trains one start, drawn again while it is dead.
     fn run(&self, start: usize) -> Option<Trained> {
+        if let Some(theta) = &self.settings.initial_theta {
+            let mut problem = self.problem();
+            let theta = problem.start(theta);
+            return self.train(&mut problem, theta);
+        }
         let mut random = Random::stream(self.settings.seed, start as u64);
         let train = || {
             let mut problem = self.problem();
@@ -297,6 +307,7 @@ impl<'a> Training<'a> {
             cost: best.cost,
             validation_cost: best.validation_cost,
             iterations: best.outcome.iterations,
+            trials: best.outcome.trials,
             termination: if stopped {
                 Termination::Interrupted
             } else {
@@ -369,6 +380,28 @@ fn check(settings: &Settings) -> Result<()> {
         ))),
         _ => Ok(()),
     }
+}
+
+/// Refuses parameters to start from that are not those of the shape, or not for one start.
+fn check_initial(settings: &Settings, shape: Shape) -> Result<()> {
+    let Some(theta) = &settings.initial_theta else {
+        return Ok(());
+    };
+    if settings.starts != 1 {
+        return Err(Error::setting(format!(
+            "expected 1 start with initial_theta, got {}; leave initial_theta out to draw them",
+            settings.starts
+        )));
+    }
+    let finite = theta.iter().filter(|t| t.is_finite()).count();
+    if theta.len() != finite || finite != shape.parameters() {
+        return Err(Error::setting(format!(
+            "expected an initial_theta of {} finite numbers for this shape, got {} of which {finite} are finite; take them from the theta of a model of the same orders",
+            shape.parameters(),
+            theta.len()
+        )));
+    }
+    Ok(())
 }
 
 fn check_records(records: &[Record], validation: &[Record], shape: Shape) -> Result<()> {

@@ -164,6 +164,11 @@ started_fit_methods!(NeuralFit {
     }
 
     #[getter]
+    fn trials(&self) -> usize {
+        self.inner.trials
+    }
+
+    #[getter]
     fn initial_states<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let states = self.inner.initial_states.concat();
         array2(py, states, self.inner.model.lags().na)
@@ -173,7 +178,8 @@ started_fit_methods!(NeuralFit {
 #[pyfunction]
 #[pyo3(signature = (
     experiments, validation, *, na, nb, nk, hidden, linear, u_mean, u_scale, y_mean, y_scale, saturate,
-    initial_state, weight_decay, max_iterations, starts, seed, threads, progress = None
+    initial_state, weight_decay, max_iterations, starts, seed, threads, initial_theta = None,
+    progress = None
 ))]
 #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
 fn fit_neural_oe(
@@ -196,6 +202,7 @@ fn fit_neural_oe(
     starts: usize,
     seed: u64,
     threads: usize,
+    initial_theta: Option<Values<'_>>,
     progress: Option<Bound<'_, PyAny>>,
 ) -> PyResult<NeuralFit> {
     let scaling = match (u_mean, u_scale, y_mean, y_scale) {
@@ -220,6 +227,9 @@ fn fit_neural_oe(
         weight_decay,
         max_iterations,
         starts,
+        initial_theta: initial_theta
+            .map(|theta| slice(&theta, "initial_theta").map(<[f64]>::to_vec))
+            .transpose()?,
         seed,
         threads,
     };
