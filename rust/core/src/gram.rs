@@ -7,6 +7,10 @@ use crate::simd::{self, Eight, Kernel, LANES};
 
 /// Rows per block: with 64 parameters a block is 32 kB and stays in the first-level cache.
 const BLOCK: usize = 64;
+/// Rows per block of wider rows, of which only a panel stays there: the sums are fetched half as often.
+const WIDE_BLOCK: usize = 128;
+/// Numbers in a row from which it is wide.
+const WIDE: usize = 96;
 
 /// `X'X` over rows that may depend linearly on the rows before them.
 #[derive(Debug)]
@@ -15,6 +19,8 @@ pub(crate) struct Gram {
     groups: usize,
     /// Numbers from one row to the next.
     width: usize,
+    /// Rows per block.
+    block: usize,
     memory: usize,
     filled: usize,
     /// Where the first row begins: on a cache line.
@@ -36,10 +42,12 @@ impl Gram {
         let groups = columns.div_ceil(LANES);
         // An odd number of cache lines: rows apart by a power of two would share the same few places of a cache.
         let width = (room.div_ceil(LANES) | 1) * LANES;
-        let rows = vec![0.0; (memory + BLOCK) * width + LANES];
+        let block = if width < WIDE { BLOCK } else { WIDE_BLOCK };
+        let rows = vec![0.0; (memory + block) * width + LANES];
         Self {
             groups,
             width,
+            block,
             memory,
             filled: 0,
             base: rows
@@ -48,7 +56,7 @@ impl Gram {
                 .min(LANES),
             rows,
             sums: vec![0.0; width * width],
-            weightless: Vec::with_capacity(BLOCK),
+            weightless: Vec::with_capacity(block),
         }
     }
 
@@ -105,7 +113,7 @@ impl Gram {
             self.weightless.push(self.filled);
         }
         self.filled += 1;
-        if self.filled == BLOCK {
+        if self.filled == self.block {
             self.fold();
         }
     }
@@ -113,7 +121,7 @@ impl Gram {
     /// Room for `count` rows, at most 64, that come with old values; [`Gram::keep`] appends them.
     #[inline(always)]
     pub fn room(&mut self, count: usize) -> &mut [f64] {
-        if self.filled + count > BLOCK {
+        if self.filled + count > self.block {
             self.fold();
         }
         let start = self.base + (self.memory + self.filled) * self.width;
