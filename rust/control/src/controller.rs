@@ -1,7 +1,26 @@
 //! The whole controller of the paper's Fig. 16: feedback filter, reference ramp, then two-degree-of-freedom PID.
 
+use crate::pid::Terms;
 use crate::schedule::Table;
 use crate::{Design, Feedback, Pid, Ramp, Real, Refused, Settings};
+
+/// What the step of a controller with constant gains computes with: for code that steps many controllers at once with
+/// the same operations in the same order.
+#[derive(Clone, Copy, Debug)]
+pub struct Numbers<T> {
+    /// Gains of the PID.
+    pub terms: Terms<T>,
+    /// Share of the excess taken from the integral in one sample; see [`Settings::tracking`].
+    pub tracking: T,
+    /// Samples of the moving average.
+    pub samples: usize,
+    /// Weight of a new sample in the first-order lag.
+    pub lag: T,
+    /// `1 - a` and `b` of the observer; `None` where it passes its input through.
+    pub observer: Option<(T, T)>,
+    /// Largest change of the reference in one sample \[y\].
+    pub ramp: T,
+}
 
 /// Feedback filter, reference ramp, gain schedule and PID behind one step.
 #[derive(Clone, Debug)]
@@ -121,6 +140,19 @@ impl<T: Real> Controller<T> {
     /// What it is made from.
     pub fn design(&self) -> &Design<T> {
         &self.design
+    }
+
+    /// What a step computes with; `None` where the gains follow a schedule.
+    pub fn numbers(&self) -> Option<Numbers<T>> {
+        let (samples, lag, observer) = self.filter.parts();
+        self.table.is_none().then(|| Numbers {
+            terms: self.pid.terms(),
+            tracking: self.settings().tracking(),
+            samples,
+            lag,
+            observer: observer.weights(),
+            ramp: self.ramp.change(),
+        })
     }
 
     /// The settings of the PID.

@@ -152,6 +152,11 @@ impl<T: Real> Feedback<T> {
         self.observer.step(self.lag.step(self.average.step(x)))
     }
 
+    /// Samples of the average, weight of the lag, observer.
+    pub(crate) fn parts(&self) -> (usize, T, &Observer<T>) {
+        (self.average.length, self.lag.weight, &self.observer)
+    }
+
     /// These settings with the memory of `other`, so that a constant output goes on where that one's was.
     pub(crate) fn after(self, other: &Self) -> Self {
         Self {

@@ -31,12 +31,12 @@ pub mod real;
 pub mod refused;
 pub mod schedule;
 
-pub use controller::Controller;
+pub use controller::{Controller, Numbers};
 pub use design::Design;
 pub use filter::{CAPACITY, Feedback};
 pub use gains::{Parallel, PerSample, Standard};
 pub use observer::Observer;
-pub use pid::{Pid, Settings};
+pub use pid::{Pid, Settings, Terms};
 pub use ramp::Ramp;
 pub use real::Real;
 pub use refused::Refused;

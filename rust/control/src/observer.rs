@@ -82,6 +82,11 @@ impl<T: Real> Observer<T> {
         self.speed
     }
 
+    /// `1 - a` and `b`; `None` where it passes its input through.
+    pub(crate) fn weights(&self) -> Option<(T, T)> {
+        self.on.then_some((self.keep, self.gain))
+    }
+
     /// This observer's settings with the memory of `other`, so that its output goes on where that one's was.
     pub(crate) fn after(mut self, other: &Self) -> Self {
         self.speed = other.speed;

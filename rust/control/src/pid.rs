@@ -43,7 +43,7 @@ impl<T: Real> Settings<T> {
     }
 
     /// `Ts/Tt`; 0 for conditional integration, which does not track.
-    fn tracking(&self) -> T {
+    pub fn tracking(&self) -> T {
         if self.tt == T::ZERO {
             T::ZERO
         } else {
@@ -82,15 +82,15 @@ impl<T: Real> Settings<T> {
 
 /// The gains of one sample in the form in which the step uses them.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Terms<T> {
+pub struct Terms<T> {
     /// Proportional gain.
-    kp: T,
+    pub kp: T,
     /// Integral gain per sample, `Kp Ts/Ti`.
-    ki: T,
+    pub ki: T,
     /// Gain on the difference of the derivative's input, `Kp Td/(Td/N + Ts)`.
-    kd: T,
+    pub kd: T,
     /// Pole of the derivative's filter, `(Td/N)/(Td/N + Ts)`.
-    pole: T,
+    pub pole: T,
     /// Gain on the rate, `Kp Td`.
     rate: T,
 }
@@ -266,7 +266,7 @@ impl<T: Real> Pid<T> {
     }
 
     /// The gains of the last sample; the constant ones where no other came.
-    pub(crate) fn terms(&self) -> Terms<T> {
+    pub fn terms(&self) -> Terms<T> {
         self.terms
     }
 

@@ -47,6 +47,11 @@ impl<T: Real> Ramp<T> {
         moved
     }
 
+    /// Largest change in one sample \[y\].
+    pub(crate) fn change(&self) -> T {
+        self.change
+    }
+
     /// This ramp's rate with the memory of `other`.
     pub(crate) fn after(mut self, other: &Self) -> Self {
         self.r = other.r;
