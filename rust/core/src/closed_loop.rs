@@ -1,14 +1,18 @@
 //! A controller and a plant in closed loop, with encoder, feedback filter and limits inside the loop.
 
+mod known;
+pub(crate) mod lanes;
 mod plants;
 mod signals;
 
+pub use known::Known;
 pub use plants::{LaggedPlant, StatePlant, Varied};
 pub use signals::Signals;
 
 use sewfast_control::{Controller, Refused};
 
 use crate::encoder::Encoder;
+use crate::simd::{self, Eight, Kernel};
 use crate::{Error, Monitor, Result};
 
 /// What a controller can be closed around: one input, one output, stepped sample by sample.
@@ -23,6 +27,10 @@ pub trait Plant {
     fn advance(&mut self, u: f64);
     /// The encoder that the plant brings along; `None` where it has none.
     fn encoder(&self) -> Option<&Encoder> {
+        None
+    }
+    /// The plant as kernels know it; `None` for one that only steps itself.
+    fn known(&self) -> Option<Known<'_>> {
         None
     }
 }
@@ -43,16 +51,13 @@ pub fn encoder(counts_per_unit: f64, phase: f64) -> Result<Option<Encoder>> {
     Ok((counts_per_unit > 0.0).then(|| Encoder::new(counts_per_unit, phase)))
 }
 
-/// The counter of the plant's encoder, or else of the loop's, a time `since` from now at the present output, and its scale;
-/// `None` without an encoder.
-fn counts(
-    plant: &(impl Plant + ?Sized),
-    encoder: Option<&Encoder>,
-    since: f64,
-) -> Option<(f64, f64)> {
+/// The counter of the plant's encoder, or else of the loop's, a time `since` from now at the present output; `None`
+/// without an encoder.
+#[inline(always)]
+fn counts(plant: &(impl Plant + ?Sized), encoder: Option<&Encoder>, since: f64) -> Option<f64> {
     let encoder = plant.encoder().or(encoder)?;
     let position = plant.position() + since * plant.output();
-    Some((encoder.count(position), encoder.counts_per_unit()))
+    Some(encoder.count(position))
 }
 
 /// How a run ended.
@@ -122,15 +127,39 @@ impl Run {
         encoder: Option<&Encoder>,
         monitor: &Monitor,
     ) {
+        match plant.known() {
+            Some(known) => simd::run(Alone {
+                run: self,
+                known,
+                controller,
+                signals,
+                encoder,
+                monitor,
+            }),
+            None => self.fill(plant, controller, signals, encoder, monitor),
+        }
+    }
+
+    #[inline(always)]
+    fn fill(
+        &mut self,
+        plant: &mut (impl Plant + ?Sized),
+        controller: &mut Controller<f64>,
+        signals: Signals<'_>,
+        encoder: Option<&Encoder>,
+        monitor: &Monitor,
+    ) {
         self.clear();
         plant.reset();
         controller.reset();
         let ts = controller.settings().ts;
+        let scale = plant.encoder().or(encoder).map(Encoder::counts_per_unit);
+        let per_speed = ts * scale.unwrap_or(1.0);
         let mut before = counts(plant, encoder, -ts);
         for (k, &r) in signals.reference.iter().enumerate() {
             let (y, now) = (plant.output(), counts(plant, encoder, 0.0));
             let measured = match (before, now) {
-                (Some((before, _)), Some((now, scale))) => (now - before) / (ts * scale),
+                (Some(before), Some(now)) => (now - before) / per_speed,
                 _ => y,
             };
             before = now;
@@ -142,11 +171,14 @@ impl Run {
                 self.outcome = Outcome::Interrupted(k);
                 return;
             }
-            let u = signals.command(controller, k, r, measured);
+            let u = match signals.feedforward_at(k) {
+                None => controller.step(r, measured),
+                Some(added) => controller.step_with(r, measured, added),
+            };
             self.u.push(u);
             self.y.push(y);
             self.feedback.push(controller.filtered());
-            plant.advance(signals.disturbed(k, u));
+            plant.advance(signals.disturbance_at(k).map_or(u, |added| u + added));
         }
     }
 
@@ -155,6 +187,31 @@ impl Run {
         self.y.clear();
         self.feedback.clear();
         self.outcome = Outcome::Completed;
+    }
+}
+
+/// A loop around a plant that kernels know: all of it is compiled for one processor.
+struct Alone<'a> {
+    run: &'a mut Run,
+    known: Known<'a>,
+    controller: &'a mut Controller<f64>,
+    signals: Signals<'a>,
+    encoder: Option<&'a Encoder>,
+    monitor: &'a Monitor,
+}
+
+impl Kernel for Alone<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<V: Eight>(self) {
+        let mut plant = known::Alone::<V>::new(self.known);
+        let mut controller = self.controller.clone();
+        let (signals, encoder) = (self.signals, self.encoder);
+        let monitor = self.monitor;
+        self.run
+            .fill(&mut plant, &mut controller, signals, encoder, monitor);
+        *self.controller = controller;
     }
 }
 

@@ -1,5 +1,7 @@
 //! An incremental encoder: position to counts.
 
+use crate::simd::Eight;
+
 /// An encoder whose counter stands at zero, `phase` of a count past the last edge, where the position is zero.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Encoder {
@@ -36,6 +38,14 @@ impl Encoder {
     #[inline]
     pub fn count(&self, position: f64) -> f64 {
         let exact = position * self.counts_per_unit + self.phase;
+        if self.quantised { exact.floor() } else { exact }
+    }
+
+    /// The counters at eight positions.
+    #[inline(always)]
+    pub(crate) fn counts<V: Eight>(&self, positions: V) -> V {
+        let scaled = positions.mul(V::splat(self.counts_per_unit));
+        let exact = scaled.add(V::splat(self.phase));
         if self.quantised { exact.floor() } else { exact }
     }
 }

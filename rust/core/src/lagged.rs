@@ -1,5 +1,7 @@
 //! What every model with lagged inputs and outputs shares: its regressor, free run, k-step prediction, initial state.
 
+use crate::linear::LinearModel;
+use crate::neural::Network;
 use crate::{Error, Result};
 
 /// Samples from which an unknown initial state is estimated, as in a score's default (docs/CONVENTIONS.md, `init`).
@@ -97,6 +99,25 @@ impl Lags {
     }
 }
 
+/// A model in a form that kernels step without leaving their registers, in the data's units.
+#[derive(Clone, Debug)]
+pub enum Form {
+    /// A difference equation.
+    Linear(LinearModel),
+    /// A network that takes and gives the data's units.
+    Network(Network),
+}
+
+impl Form {
+    /// The output that follows from the regressor `phi`.
+    pub fn output(&self, phi: &[f64]) -> f64 {
+        match self {
+            Self::Linear(model) => model.output(phi),
+            Self::Network(network) => network.output(phi),
+        }
+    }
+}
+
 /// A model whose next output is a function of its regressor, in the data's units.
 pub trait Lagged {
     /// The model's orders.
@@ -107,6 +128,11 @@ pub trait Lagged {
 
     /// The output and its derivatives by the past outputs in `phi`, into `slope`.
     fn output_and_slope(&self, phi: &[f64], slope: &mut [f64]) -> f64;
+
+    /// The form in which kernels step the model, in the data's units; `None` where they do not know its kind.
+    fn form(&self) -> Option<Form> {
+        None
+    }
 
     /// Free run: the regressor holds the model's own outputs.
     ///

@@ -2,7 +2,8 @@
 
 use nalgebra::{Complex, DMatrix};
 
-use crate::lagged::{Lagged, Lags, push_past};
+use crate::lagged::{Form, Lagged, Lags, push_past};
+use crate::simd::{Eight, Group};
 use crate::{Error, Result};
 
 /// `y(k) = -sum_i a[i] y(k-1-i) + sum_j sum_i b[j nb + i] u_j(k-nk-i) + offset`, in the data's units.
@@ -124,6 +125,23 @@ impl LinearModel {
     }
 }
 
+impl LinearModel {
+    /// The outputs for eight regressors, lane by lane; each to the bit what [`Lagged::output`] gives for it.
+    #[inline(always)]
+    pub(crate) fn beside<V: Eight>(&self, phi: &[Group]) -> V {
+        let (past, inputs) = phi.split_at(self.lags.na);
+        let product = |c: &f64, value: &Group| V::splat(*c).mul(V::load(&value.0));
+        let mut sum = V::splat(self.offset);
+        for (b, u) in self.b.iter().zip(inputs) {
+            sum = sum.add(product(b, u));
+        }
+        for (a, y) in self.a.iter().zip(past) {
+            sum = sum.sub(product(a, y));
+        }
+        sum
+    }
+}
+
 impl Lagged for LinearModel {
     fn lags(&self) -> Lags {
         self.lags
@@ -140,6 +158,10 @@ impl Lagged for LinearModel {
             .iter()
             .zip(past)
             .fold(moved, |sum, (a, y)| sum - a * y)
+    }
+
+    fn form(&self) -> Option<Form> {
+        Some(Form::Linear(self.clone()))
     }
 
     fn output_and_slope(&self, phi: &[f64], slope: &mut [f64]) -> f64 {

@@ -1,5 +1,6 @@
 //! The network output-error model: a free-running network with its scaling.
 
+mod data_units;
 mod draw;
 mod free_run;
 mod guard;
@@ -18,7 +19,7 @@ pub use train::{InitialState, NeuralFit, Settings, fit};
 use sensitivities::{Recursion, Rows};
 
 use crate::gram::Gram;
-use crate::lagged::{Lagged, Lags, finite};
+use crate::lagged::{Form, Lagged, Lags, finite};
 use crate::{Error, Result};
 
 /// `f = w2 . tanh(W1 phi + b1) + b2 [+ linear . phi]` in scaled units, clipped to the limits (docs/CONVENTIONS.md).
@@ -195,6 +196,10 @@ impl Lagged for NeuralOE {
         self.scaling.regressor(phi, na, nb, scaled);
         self.scaling
             .restored(self.network.output_and_slope(scaled, slope))
+    }
+
+    fn form(&self) -> Option<Form> {
+        Some(Form::Network(self.in_data_units()))
     }
 
     fn simulate(&self, u: &[f64], channels: usize, y_past: &[f64]) -> Result<Vec<f64>> {

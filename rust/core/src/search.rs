@@ -8,7 +8,7 @@ pub mod cma_es;
 pub mod genetic;
 pub mod nsga2;
 
-pub(crate) use batch::each;
+pub(crate) use batch::several;
 
 use std::cmp::Ordering;
 
@@ -62,14 +62,19 @@ pub trait Problem: Sync {
     /// Fresh memory for a thread.
     fn memory(&self) -> Self::Memory;
 
-    /// How good `point` is; the work may end as soon as it cannot beat `to_beat` any more, or on a stop.
+    /// How many candidates are best judged at once.
+    fn together(&self) -> usize {
+        1
+    }
+
+    /// How good each candidate is, whatever the others are; the work on one may end as soon as it cannot beat what it has
+    /// to any more, or on a stop.
     fn judge(
         &self,
         memory: &mut Self::Memory,
-        point: &[f64],
-        to_beat: &Judgement,
+        candidates: &[Candidate],
         monitor: &Monitor,
-    ) -> Judgement;
+    ) -> Vec<Judgement>;
 }
 
 /// How a search runs.
@@ -134,9 +139,11 @@ pub struct Found {
 
 /// A point to be judged, and what it has to beat to be of any use.
 #[derive(Clone, Debug)]
-struct Candidate {
-    point: Vec<f64>,
-    to_beat: Judgement,
+pub struct Candidate {
+    /// Where it is.
+    pub point: Vec<f64>,
+    /// What it has to beat.
+    pub to_beat: Judgement,
 }
 
 /// A way to search: it is asked for candidates and told how good they are.
@@ -168,10 +175,11 @@ fn run<P: Problem>(
             break Termination::Converged;
         }
         let candidates = strategy.ask(options.evaluations - trace.len());
-        let judgements = each(&mut memories, &candidates, |memory, candidate| {
-            let judged = problem.judge(memory, &candidate.point, &candidate.to_beat, monitor);
-            monitor.advance(1);
-            if judged.violation == 0.0 {
+        let together = problem.together();
+        let judgements = several(&mut memories, &candidates, together, |memory, some| {
+            let judged = problem.judge(memory, some, monitor);
+            monitor.advance(some.len() as u64);
+            for judged in judged.iter().filter(|j| j.violation == 0.0) {
                 monitor.report_cost(judged.cost);
             }
             judged

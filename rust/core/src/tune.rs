@@ -4,6 +4,7 @@
 //! [`search`](crate::search) finds the least, or the front of what can be had ([`pareto`]).
 
 mod bench;
+mod beside;
 mod constraint;
 mod cost;
 mod front;
@@ -20,9 +21,11 @@ use sewfast_control::{Controller, Design, Settings};
 
 use crate::closed_loop::{Plant, Signals, check_reference};
 use crate::encoder::Encoder;
-use crate::search::{Judgement, Options, Problem, Termination, cma_es, each, genetic};
+use crate::search::{
+    Candidate, Judgement, Options, Problem, Termination, cma_es, genetic, several,
+};
 use crate::{Error, Monitor, Result};
-use bench::Bench;
+use bench::{Bench, TOGETHER};
 use variable::{designed, moved, place};
 
 /// What is tuned, on what.
@@ -114,7 +117,7 @@ pub fn tune<P: Plant + Clone + Send + Sync>(
         bench: bench.clone(),
     };
     let first = moved(task.variables, &task.start)?;
-    let start = bench.judge(task, &first, &Judgement::HOPELESS, monitor);
+    let start = bench.judge_one(task, &first, monitor);
     monitor.advance(1);
     monitor.report_cost(start.cost);
     let mut tuned = Tuned {
@@ -163,9 +166,10 @@ pub fn costs<P: Plant + Clone + Send + Sync>(
     monitor.set_total(designs.len() as u64);
     let bench = Bench::new(task)?;
     let mut benches = vec![bench; threads.clamp(1, designs.len().max(1))];
-    Ok(each(&mut benches, designs, |bench, design| {
-        let judged = bench.judge(task, design, &Judgement::HOPELESS, monitor);
-        monitor.advance(1);
+    Ok(several(&mut benches, designs, TOGETHER, |bench, some| {
+        let trials: Vec<_> = some.iter().map(|d| (*d, Judgement::HOPELESS)).collect();
+        let judged = bench.judge(task, &trials, monitor);
+        monitor.advance(some.len() as u64);
         judged
     }))
 }
@@ -308,17 +312,28 @@ impl<P: Plant + Clone + Send + Sync> Problem for Searched<'_, P> {
         self.bench.clone()
     }
 
+    fn together(&self) -> usize {
+        TOGETHER
+    }
+
     fn judge(
         &self,
         bench: &mut Bench<P>,
-        point: &[f64],
-        to_beat: &Judgement,
+        candidates: &[Candidate],
         monitor: &Monitor,
-    ) -> Judgement {
-        match designed(self.task.variables, point, &self.task.start) {
-            Ok(design) => bench.judge(self.task, &design, to_beat, monitor),
-            Err(_) => Judgement::HOPELESS,
-        }
+    ) -> Vec<Judgement> {
+        let trial = |candidate: &Candidate| {
+            let design = designed(self.task.variables, &candidate.point, &self.task.start);
+            Some((design.ok()?, candidate.to_beat))
+        };
+        let trials: Vec<_> = candidates.iter().map(trial).collect();
+        let known: Vec<_> = trials.iter().copied().flatten().collect();
+        let mut judged = bench.judge(self.task, &known, monitor).into_iter();
+        let judgement = |trial: &Option<_>| trial.and_then(|_| judged.next());
+        let judgements = trials.iter().map(judgement);
+        judgements
+            .map(|j| j.unwrap_or(Judgement::HOPELESS))
+            .collect()
     }
 }
 

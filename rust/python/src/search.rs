@@ -5,7 +5,7 @@ use std::sync::Mutex;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_core::search::nsga2::{self, Objectives, Values};
-use sewfast_core::search::{Judgement, Options, Problem, cma_es, genetic};
+use sewfast_core::search::{Candidate, Judgement, Options, Problem, cma_es, genetic};
 use sewfast_core::{Error, Monitor};
 
 use crate::arrays::{array1, raise};
@@ -67,7 +67,14 @@ impl Problem for Function {
 
     fn memory(&self) {}
 
-    fn judge(&self, (): &mut (), point: &[f64], _: &Judgement, monitor: &Monitor) -> Judgement {
+    fn judge(&self, (): &mut (), candidates: &[Candidate], monitor: &Monitor) -> Vec<Judgement> {
+        let judged = candidates.iter().map(|c| self.judge_one(&c.point, monitor));
+        judged.collect()
+    }
+}
+
+impl Function {
+    fn judge_one(&self, point: &[f64], monitor: &Monitor) -> Judgement {
         self.at(point, monitor, |value| value.extract::<f64>())
             .map_or(Judgement::HOPELESS, Judgement::feasible)
     }
@@ -82,7 +89,16 @@ impl Objectives for Function {
 
     fn memory(&self) {}
 
-    fn judge(&self, (): &mut (), point: &[f64], monitor: &Monitor) -> Values {
+    fn judge(&self, (): &mut (), points: &[Vec<f64>], monitor: &Monitor) -> Vec<Values> {
+        points
+            .iter()
+            .map(|point| self.values_of(point, monitor))
+            .collect()
+    }
+}
+
+impl Function {
+    fn values_of(&self, point: &[f64], monitor: &Monitor) -> Values {
         let values = self.at(point, monitor, |value| value.extract::<Vec<f64>>());
         Values {
             violation: if values.is_some() { 0.0 } else { f64::INFINITY },

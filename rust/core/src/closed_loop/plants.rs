@@ -1,8 +1,8 @@
 //! Plants to close a loop around: identified models, variations for robust tuning.
 
-use super::Plant;
+use super::{Known, Plant};
 use crate::encoder::Encoder;
-use crate::lagged::Lagged;
+use crate::lagged::{Form, Lagged, Lags};
 use crate::neural_ss::{NeuralSS, Shape, Stepper};
 use crate::{Error, Result};
 
@@ -10,12 +10,12 @@ use crate::{Error, Result};
 #[derive(Clone, Debug)]
 pub struct LaggedPlant<'a, M> {
     model: &'a M,
+    form: Option<Form>,
     /// Past outputs, newest first, then the inputs of the regressor.
     phi: Vec<f64>,
     /// Past inputs, newest first.
     inputs: Vec<f64>,
-    na: usize,
-    nk: usize,
+    lags: Lags,
     position: f64,
     ts: f64,
 }
@@ -46,10 +46,10 @@ impl<'a, M: Lagged> LaggedPlant<'a, M> {
         }
         Ok(Self {
             model,
+            form: model.form(),
             phi: vec![0.0; lags.regressors()],
             inputs: vec![0.0; lags.nk + lags.nb - 1],
-            na: lags.na,
-            nk: lags.nk,
+            lags,
             position: 0.0,
             ts,
         })
@@ -72,12 +72,26 @@ impl<M: Lagged> Plant for LaggedPlant<'_, M> {
     }
 
     fn advance(&mut self, u: f64) {
+        let Lags { na, nk, .. } = self.lags;
         push(&mut self.inputs, u);
-        self.phi[self.na..].copy_from_slice(&self.inputs[self.nk - 1..]);
-        let y = self.model.output(&self.phi);
+        self.phi[na..].copy_from_slice(&self.inputs[nk - 1..]);
+        let y = match &self.form {
+            Some(form) => form.output(&self.phi),
+            None => self.model.output(&self.phi),
+        };
         // Between samples the output runs straight, so an encoder sees the mean of both ends.
         self.position += self.ts * (self.phi[0] + y) / 2.0;
-        push(&mut self.phi[..self.na], y);
+        push(&mut self.phi[..na], y);
+    }
+
+    fn known(&self) -> Option<Known<'_>> {
+        Some(Known {
+            form: self.form.as_ref()?,
+            lags: self.lags,
+            ts: self.ts,
+            gain: 1.0,
+            delay: 0,
+        })
     }
 }
 
@@ -209,5 +223,15 @@ impl<P: Plant> Plant for Varied<P> {
 
     fn encoder(&self) -> Option<&Encoder> {
         self.plant.encoder()
+    }
+
+    /// Of a plant that is itself varied or held back, the product of the gains and the sum of the delays.
+    fn known(&self) -> Option<Known<'_>> {
+        let known = self.plant.known()?;
+        Some(Known {
+            gain: self.gain * known.gain,
+            delay: self.delay + known.delay,
+            ..known
+        })
     }
 }

@@ -1,7 +1,5 @@
 //! What acts on a loop from outside.
 
-use sewfast_control::Controller;
-
 use super::check_reference;
 use crate::{Error, Result};
 
@@ -48,26 +46,20 @@ impl<'a> Signals<'a> {
         Ok(())
     }
 
-    /// The controller's command at sample `k`.
-    pub(super) fn command(
-        &self,
-        controller: &mut Controller<f64>,
-        k: usize,
-        r: f64,
-        y: f64,
-    ) -> f64 {
-        match self.feedforward {
-            None => controller.step(r, y),
-            Some(added) => controller.step_with(r, y, at(added, k)),
-        }
+    /// The command that is added at sample `k` before the limits.
+    #[inline(always)]
+    pub(super) fn feedforward_at(&self, k: usize) -> Option<f64> {
+        self.feedforward.map(|added| at(added, k))
     }
 
-    /// What reaches the plant of a command.
-    pub(super) fn disturbed(&self, k: usize, u: f64) -> f64 {
-        self.disturbance.map_or(u, |added| u + at(added, k))
+    /// The command that is added at sample `k` behind the limits.
+    #[inline(always)]
+    pub(super) fn disturbance_at(&self, k: usize) -> Option<f64> {
+        self.disturbance.map(|added| at(added, k))
     }
 }
 
+#[inline(always)]
 fn at(signal: &[f64], k: usize) -> f64 {
     signal.get(k).copied().unwrap_or(0.0)
 }

@@ -1,5 +1,7 @@
 //! The network in scaled units: weights in groups of eight hidden units, one step and its slopes.
 
+mod beside;
+
 use crate::gram::Gram;
 use crate::lagged::{Lagged, Lags};
 use crate::simd::tanh::{rise, tanh};
@@ -159,7 +161,7 @@ impl Network {
     /// The output for the regressor whose first entry is `newest`, the others those of `phi`; `hidden` receives the
     /// outputs of each group of hidden units.
     #[inline(always)]
-    pub(super) fn step<V: Eight>(
+    pub(crate) fn step<V: Eight>(
         &self,
         newest: f64,
         phi: &[f64],

@@ -3,6 +3,20 @@
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
+/// `work` on the items, up to `together` at once and no more than leave something for every memory; the results are in
+/// the items' order.
+pub(crate) fn several<M: Send, I: Sync, R: Send>(
+    memories: &mut [M],
+    items: &[I],
+    together: usize,
+    work: impl Fn(&mut M, &[I]) -> Vec<R> + Sync,
+) -> Vec<R> {
+    let share = items.len().div_ceil(memories.len().max(1));
+    let some: Vec<&[I]> = items.chunks(together.min(share).max(1)).collect();
+    let results = each(memories, &some, |memory, some| work(memory, some));
+    results.into_iter().flatten().collect()
+}
+
 /// `work` on every item; the results are in the items' order, whichever thread computed them.
 pub(crate) fn each<M: Send, I: Sync, R: Send>(
     memories: &mut [M],

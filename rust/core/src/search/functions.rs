@@ -3,7 +3,7 @@
 use std::f64::consts::PI;
 
 use super::nsga2::{Objectives, Values};
-use super::{Judgement, Problem};
+use super::{Candidate, Judgement, Problem};
 use crate::Monitor;
 
 /// A function of `n` variables between `low` and `high`.
@@ -42,7 +42,16 @@ impl Problem for Function {
 
     fn memory(&self) {}
 
-    fn judge(&self, (): &mut (), point: &[f64], _: &Judgement, _: &Monitor) -> Judgement {
+    fn judge(&self, (): &mut (), candidates: &[Candidate], _: &Monitor) -> Vec<Judgement> {
+        candidates
+            .iter()
+            .map(|c| self.judge_one(&c.point))
+            .collect()
+    }
+}
+
+impl Function {
+    fn judge_one(&self, point: &[f64]) -> Judgement {
         assert!(point.iter().all(|x| (0.0..=1.0).contains(x)), "{point:?}");
         let x = self.at(point);
         Judgement {
@@ -115,7 +124,13 @@ impl Objectives for Zdt {
 
     fn memory(&self) {}
 
-    fn judge(&self, (): &mut (), x: &[f64], _: &Monitor) -> Values {
+    fn judge(&self, (): &mut (), points: &[Vec<f64>], _: &Monitor) -> Vec<Values> {
+        points.iter().map(|x| self.values(x)).collect()
+    }
+}
+
+impl Zdt {
+    fn values(self, x: &[f64]) -> Values {
         assert!(x.iter().all(|x| (0.0..=1.0).contains(x)), "{x:?}");
         let rest = x[1..].iter().sum::<f64>() / (x.len() - 1) as f64;
         let g = match self {

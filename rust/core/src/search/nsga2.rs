@@ -4,7 +4,7 @@
 use std::cmp::Ordering;
 
 use super::genetic::{JITTER, jittered, stratified};
-use super::{Options, Termination, each};
+use super::{Options, Termination, several};
 use crate::random::Random;
 use crate::{Error, Monitor, Result};
 
@@ -19,8 +19,18 @@ pub trait Objectives: Sync {
     /// Fresh memory for a thread.
     fn memory(&self) -> Self::Memory;
 
-    /// The values at `point`.
-    fn judge(&self, memory: &mut Self::Memory, point: &[f64], monitor: &Monitor) -> Values;
+    /// How many candidates are best judged at once.
+    fn together(&self) -> usize {
+        1
+    }
+
+    /// The values at each point, whatever the others are.
+    fn judge(
+        &self,
+        memory: &mut Self::Memory,
+        points: &[Vec<f64>],
+        monitor: &Monitor,
+    ) -> Vec<Values>;
 }
 
 /// The values of a candidate.
@@ -104,9 +114,10 @@ pub fn search<P: Objectives>(
         } else {
             offspring(&parents, count, &mut random)
         };
-        let values = each(&mut memories, &points, |memory, point| {
-            let values = problem.judge(memory, point, monitor);
-            monitor.advance(1);
+        let together = problem.together();
+        let values = several(&mut memories, &points, together, |memory, some| {
+            let values = problem.judge(memory, some, monitor);
+            monitor.advance(some.len() as u64);
             values
         });
         used += points.len();

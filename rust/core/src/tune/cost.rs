@@ -179,7 +179,7 @@ impl Terms {
 }
 
 /// Smoothing of the true output before its overshoot is taken [s]; docs/CONVENTIONS.md.
-const SMOOTHING: f64 = 5e-3;
+pub(super) const SMOOTHING: f64 = 5e-3;
 
 /// Terms of the runs over one reference; terms that nobody asks for are not computed.
 #[derive(Clone, Copy, Debug)]
@@ -223,7 +223,7 @@ impl Measure {
     /// The terms of a run over the reference, under limits `low` and `high`.
     pub fn of(&self, reference: &[f64], run: &Run, (low, high): (f64, f64), ts: f64) -> Terms {
         let effort = Effort::of(&run.u, low, high);
-        let mut terms = Terms {
+        let terms = Terms {
             tracking: rmse(reference, &run.y),
             chatter: effort.du_rms,
             effort: effort.u_rms,
@@ -231,16 +231,42 @@ impl Measure {
             u_max: run.u.iter().fold(0.0, |most, u| f64::max(most, u.abs())),
             ..Terms::default()
         };
+        self.shaped(terms, reference, &run.y, ts)
+    }
+
+    /// The terms with those that only the course of the output tells.
+    pub fn shaped(&self, mut terms: Terms, reference: &[f64], y: &[f64], ts: f64) -> Terms {
         if let (Some(edge), true) = (self.edge, self.overshoot || self.rise) {
-            let y = smooth(&run.y, ts, SMOOTHING);
+            let y = smooth(y, ts, SMOOTHING);
             terms.overshoot = edge.overshoot_percent(&y);
             terms.rise = 1e3 * ts * rise(&edge, reference, &y);
         }
         if self.lag {
-            terms.lag = 1e3 * ts * lag(reference, &run.y, (LONGEST_LAG / ts) as usize);
+            terms.lag = 1e3 * ts * lag(reference, y, (LONGEST_LAG / ts) as usize);
         }
         terms
     }
+
+    /// What of the course of the output is asked for.
+    pub fn course(&self) -> Course {
+        match self.edge {
+            _ if self.lag => Course::All,
+            Some(_) if self.rise => Course::All,
+            Some(edge) if self.overshoot => Course::Overshoot(edge),
+            _ => Course::Nothing,
+        }
+    }
+}
+
+/// What of the course of an output is asked for.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Course {
+    /// Nothing.
+    Nothing,
+    /// Only the overshoot at this edge, after [`SMOOTHING`].
+    Overshoot(Edge),
+    /// More than that.
+    All,
 }
 
 /// The terms of a run that was recorded elsewhere, under limits `low` and `high`.

@@ -2,7 +2,7 @@
 
 use sewfast_control::Design;
 
-use super::bench::Bench;
+use super::bench::{Bench, TOGETHER};
 use super::variable::{designed, place};
 use super::{Task, Terms};
 use crate::closed_loop::Plant;
@@ -184,23 +184,38 @@ impl<P: Plant + Clone + Send + Sync> Objectives for Several<'_, P> {
         self.bench.clone()
     }
 
-    fn judge(&self, bench: &mut Bench<P>, point: &[f64], monitor: &Monitor) -> Values {
-        let judged = designed(self.task.variables, point, &self.task.start)
-            .ok()
-            .and_then(|design| Some((design, bench.terms(self.task, &design, monitor)?)));
-        match judged {
-            Some((design, (terms, violation))) => Values {
-                violation,
-                objectives: self
-                    .objectives
-                    .iter()
-                    .map(|o| self.value(*o, &terms, &design))
-                    .collect(),
-            },
-            None => Values {
-                violation: f64::INFINITY,
-                objectives: vec![f64::INFINITY; self.objectives.len()],
-            },
+    fn together(&self) -> usize {
+        TOGETHER
+    }
+
+    fn judge(&self, bench: &mut Bench<P>, points: &[Vec<f64>], monitor: &Monitor) -> Vec<Values> {
+        let design = |point: &Vec<f64>| designed(self.task.variables, point, &self.task.start);
+        let designs: Vec<_> = points.iter().map(|point| design(point).ok()).collect();
+        let known: Vec<_> = designs.iter().copied().flatten().collect();
+        let mut judged = bench.terms(self.task, &known, monitor).into_iter();
+        let values = |design: &Option<_>| {
+            let judged = design.and_then(|design| Some((design, judged.next()??)));
+            judged.map_or_else(|| self.hopeless(), |judged| self.values(judged))
+        };
+        designs.iter().map(values).collect()
+    }
+}
+
+impl<P: Plant + Clone + Send + Sync> Several<'_, P> {
+    fn values(&self, (design, (terms, violation)): (Design<f64>, (Terms, f64))) -> Values {
+        let objectives = self.objectives.iter();
+        Values {
+            violation,
+            objectives: objectives
+                .map(|o| self.value(*o, &terms, &design))
+                .collect(),
+        }
+    }
+
+    fn hopeless(&self) -> Values {
+        Values {
+            violation: f64::INFINITY,
+            objectives: vec![f64::INFINITY; self.objectives.len()],
         }
     }
 }

@@ -64,15 +64,21 @@ impl<'a> LoadStep<'a> {
         on.unwrap_or(self.disturbance.len())
     }
 
-    /// Recovery, rms deviation and largest command of a run; recovery is the last time that the deviation was beyond the
-    /// band, all the time there was where it stays there.
+    /// Recovery, rms deviation and largest command of a run.
     pub(super) fn terms(&self, run: &Run, ts: f64) -> Terms {
+        let u_max = run.u.iter().fold(0.0, |most, u| f64::max(most, u.abs()));
+        self.of(&run.y, u_max, ts)
+    }
+
+    /// The same from the outputs and the largest `|u|`; recovery is the last time that the deviation was beyond the band,
+    /// all the time there was where it stays there.
+    pub(super) fn of(&self, y: &[f64], u_max: f64, ts: f64) -> Terms {
         let begin = self.begin();
-        let off = |k: usize| run.y[k] - self.reference[k];
+        let off = |k: usize| y[k] - self.reference[k];
         let first = (begin + 1).saturating_sub(self.mean);
         let mut sum: f64 = (first..begin).map(off).sum();
         let (mut squares, mut last) = (0.0, begin);
-        for k in begin..run.y.len() {
+        for k in begin..y.len() {
             sum += off(k);
             let several = self.mean.min(k + 1);
             let mean = sum / several as f64;
@@ -86,8 +92,8 @@ impl<'a> LoadStep<'a> {
         }
         Terms {
             recovery: 1e3 * ts * (last - begin) as f64,
-            load: (squares / (run.y.len() - begin) as f64).sqrt(),
-            u_max: run.u.iter().fold(0.0, |most, u| f64::max(most, u.abs())),
+            load: (squares / (y.len() - begin) as f64).sqrt(),
+            u_max,
             ..Terms::default()
         }
     }

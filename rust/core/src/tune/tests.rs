@@ -1,5 +1,7 @@
 //! The search on plants with known answers, its determinism, its outcomes.
 
+mod beside;
+
 use super::*;
 use crate::closed_loop::{LaggedPlant, Varied};
 use crate::linear::LinearModel;

@@ -2,7 +2,7 @@
 
 use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
-use sewfast_core::closed_loop::{LaggedPlant, Plant, StatePlant};
+use sewfast_core::closed_loop::{Known, LaggedPlant, Plant, StatePlant};
 use sewfast_core::encoder::Encoder;
 use sewfast_core::machine::{self, SAMPLE_TIME};
 use sewfast_core::{Error, Result, linear, neural, neural_ss};
@@ -100,5 +100,9 @@ impl Plant for AnyPlant<'_> {
             AnyPlant::States(plant) => plant.encoder(),
             AnyPlant::Machine(plant) => Plant::encoder(plant.as_ref()),
         }
+    }
+
+    fn known(&self) -> Option<Known<'_>> {
+        each!(self, plant => plant.known())
     }
 }

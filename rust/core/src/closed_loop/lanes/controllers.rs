@@ -1,0 +1,183 @@
+//! Controllers, one in each lane.
+
+use sewfast_control::{Controller, Numbers};
+
+use super::average::Averages;
+use crate::simd::{Eight, LANES};
+
+/// Eight of [`Controller`] with constant gains: the same operations in the same order.
+pub(super) struct Controllers<V> {
+    average: Averages<V>,
+    lag: V,
+    /// `1 - a`, `b`, and 1 where there is an observer; `None` where no lane has one.
+    observer: Option<[V; 3]>,
+    /// Largest change of the reference in one sample; `None` where no lane has a ramp.
+    ramp: Option<V>,
+    kp: V,
+    ki: V,
+    kd: V,
+    pole: V,
+    alpha: V,
+    beta: V,
+    tracking: V,
+    /// 1 in lanes with conditional integration.
+    conditional: V,
+    low: V,
+    high: V,
+    /// Largest change of the command in one sample; `None` where no lane has a limit.
+    change: Option<V>,
+    lagged: V,
+    observed: V,
+    innovation: V,
+    r: V,
+    /// The derivative's input at the last sample; NaN before the first.
+    input: V,
+    derivative: V,
+    integral: V,
+    u: V,
+    /// The feedback after its filter, at the last step.
+    pub filtered: V,
+}
+
+impl<V: Eight> Controllers<V> {
+    /// The first eight of `controllers`, at rest; missing ones are the first again.
+    #[inline(always)]
+    pub fn new(controllers: &[&Controller<f64>]) -> Self {
+        let lane = |i: usize| *controllers.get(i).unwrap_or(&controllers[0]);
+        let number = |i: usize| lane(i).numbers();
+        let each = |of: &dyn Fn(Numbers<f64>) -> f64| {
+            V::load(&std::array::from_fn(|i| number(i).map_or(f64::NAN, of)))
+        };
+        let setting = |of: &dyn Fn(&Controller<f64>) -> f64| {
+            V::load(&std::array::from_fn::<_, LANES, _>(|i| of(lane(i))))
+        };
+        let any = |of: &dyn Fn(&Controller<f64>) -> bool| (0..LANES).any(|i| of(lane(i)));
+        let observer = [
+            each(&|n| n.observer.map_or(0.0, |(keep, _)| keep)),
+            each(&|n| n.observer.map_or(0.0, |(_, gain)| gain)),
+            each(&|n| f64::from(u8::from(n.observer.is_some()))),
+        ];
+        let (zero, nan) = (V::splat(0.0), V::splat(f64::NAN));
+        let (low, high) = (
+            setting(&|c| c.settings().u_min),
+            setting(&|c| c.settings().u_max),
+        );
+        Self {
+            average: Averages::new(std::array::from_fn(|i| number(i).map_or(1, |n| n.samples))),
+            lag: each(&|n| n.lag),
+            observer: any(&|c| c.design().observer_time > 0.0).then_some(observer),
+            ramp: any(&|c| c.design().r_rate < f64::INFINITY).then_some(each(&|n| n.ramp)),
+            kp: each(&|n| n.terms.kp),
+            ki: each(&|n| n.terms.ki),
+            kd: each(&|n| n.terms.kd),
+            pole: each(&|n| n.terms.pole),
+            alpha: setting(&|c| c.settings().alpha),
+            beta: setting(&|c| c.settings().beta),
+            tracking: each(&|n| n.tracking),
+            conditional: setting(&|c| f64::from(u8::from(c.settings().tt == 0.0))),
+            low,
+            high,
+            change: any(&|c| c.settings().slew < f64::INFINITY)
+                .then_some(setting(&|c| c.settings().slew * c.settings().ts)),
+            lagged: zero,
+            observed: zero,
+            innovation: zero,
+            r: zero,
+            input: nan,
+            derivative: zero,
+            integral: zero,
+            u: zero.at_least_each(low).at_most_each(high),
+            filtered: zero,
+        }
+    }
+
+    /// From reference and measured outputs to the commands.
+    #[inline(always)]
+    pub fn step(&mut self, first: bool, r: f64, measured: V, feedforward: Option<f64>) -> V {
+        self.filtered = self.filter(first, measured);
+        let r = self.reference(first, r);
+        self.control(r, self.filtered, feedforward)
+    }
+
+    #[inline(always)]
+    fn filter(&mut self, first: bool, x: V) -> V {
+        let x = self.average.step(first, x);
+        let from = if first { x } else { self.lagged };
+        self.lagged = from.add(self.lag.mul(x.sub(from)));
+        let Some([keep, gain, on]) = self.observer else {
+            return self.lagged;
+        };
+        let y = self.lagged;
+        let (from, left) = if first {
+            (y, V::splat(0.0))
+        } else {
+            (self.observed, self.innovation)
+        };
+        let innovation = keep.mul(left).add(y.sub(from));
+        let speed = from.add(gain.mul(innovation));
+        self.observed = on.if_equal(V::splat(1.0), speed, y);
+        self.innovation = on.if_equal(V::splat(1.0), innovation, V::splat(0.0));
+        self.observed
+    }
+
+    #[inline(always)]
+    fn reference(&mut self, first: bool, r: f64) -> V {
+        let r = V::splat(r);
+        let Some(change) = self.ramp else {
+            return r;
+        };
+        let from = if first { self.filtered } else { self.r };
+        self.r = limited(r, from.sub(change), from.add(change));
+        self.r
+    }
+
+    #[inline(always)]
+    fn control(&mut self, r: V, y: V, feedforward: Option<f64>) -> V {
+        let zero = V::splat(0.0);
+        let e = r.sub(y);
+        let input = e.sub(self.beta.mul(r));
+        let change = input.sub(self.input);
+        let change = self.input.if_equal(self.input, change, zero);
+        let derivative = self.pole.mul(self.derivative).add(self.kd.mul(change));
+        let integral = self.integral.add(self.ki.mul(e));
+        let proportional = self.kp.mul(e.sub(self.alpha.mul(r)));
+        let wanted = proportional.add(integral).add(derivative);
+        let wanted = match feedforward {
+            None => wanted,
+            Some(added) => wanted.add(V::splat(added)),
+        };
+        let mut u = limited(wanted, self.low, self.high);
+        if let Some(change) = self.change {
+            u = limited(u, self.u.sub(change), self.u.add(change));
+        }
+        let new = [u, self.kept(integral, u.sub(wanted)), derivative, input];
+        // 0 where both are finite, else NaN
+        let sound = wanted.mul(zero).add(input.mul(zero));
+        let old = [self.u, self.integral, self.derivative, self.input];
+        [self.u, self.integral, self.derivative, self.input] =
+            if sound.size().are_less(V::splat(1.0)) == u8::MAX {
+                new
+            } else {
+                std::array::from_fn(|i| sound.if_equal(zero, new[i], old[i]))
+            };
+        self.u
+    }
+
+    /// The integral to keep when the limits moved the command by `excess`.
+    #[inline(always)]
+    fn kept(&self, integral: V, excess: V) -> V {
+        let zero = V::splat(0.0);
+        let pushes_on = integral.sub(self.integral).mul(excess);
+        let held = pushes_on.if_less(zero, self.integral, integral);
+        let tracked = integral.add(self.tracking.mul(excess));
+        let kept = self.conditional.if_equal(V::splat(1.0), held, tracked);
+        let kept = excess.if_equal(zero, integral, kept);
+        self.ki.if_equal(zero, integral, kept)
+    }
+}
+
+/// The nearest value in `[low, high]`; NaN stays NaN.
+#[inline(always)]
+fn limited<V: Eight>(value: V, low: V, high: V) -> V {
+    value.at_least_each(low).at_most_each(high)
+}

@@ -1,0 +1,314 @@
+//! Loops in lanes against loops that run alone.
+
+use proptest::prelude::*;
+use sewfast_control::{Design, Settings, Standard};
+
+use super::*;
+use crate::closed_loop::{LaggedPlant, Plant, Run, Varied, encoder};
+use crate::lagged::Lags;
+use crate::linear::LinearModel;
+use crate::neural::{NeuralOE, Scaling, Shape};
+use crate::random::Random;
+use crate::simd::{Group, Level, run_everywhere};
+
+const TS: f64 = 1e-3;
+
+/// Everything that eight runs wrote down.
+#[derive(Default)]
+struct Records([Vec<Group>; 3]);
+
+impl Notes for Records {
+    #[inline(always)]
+    fn put<V: Eight>(&mut self, _k: usize, _r: f64, u: V, y: V, feedback: V) {
+        for (record, value) in self.0.iter_mut().zip([u, y, feedback]) {
+            let mut group = Group::ZERO;
+            value.store(&mut group.0);
+            record.push(group);
+        }
+    }
+}
+
+fn network(seed: u64, lags: Lags, hidden: usize, bypass: bool, limit: f64) -> NeuralOE {
+    let mut random = Random::new(seed);
+    let shape = Shape::new(lags, hidden, bypass).unwrap();
+    let theta = (0..shape.parameters())
+        .map(|_| random.between(-0.5, 0.5))
+        .collect();
+    let scaling = Scaling {
+        u_mean: vec![1.5],
+        u_scale: vec![8.0],
+        y_mean: 300.0,
+        y_scale: 700.0,
+    };
+    NeuralOE::new(shape, theta, scaling, (-limit, limit)).unwrap()
+}
+
+prop_compose! {
+    fn designs()(
+        kp in -2e-3..0.05, ti in prop_oneof![0.01..0.5, Just(f64::INFINITY)], td in prop_oneof![Just(0.0), 1e-4..0.02],
+        (alpha, beta) in (-0.5..1.0, -1.0..1.0), n in prop_oneof![Just(f64::INFINITY), 1.0..20.0],
+        tt in prop_oneof![Just(0.0), TS..0.2, Just(f64::INFINITY)],
+        slew in prop_oneof![Just(f64::INFINITY), 100.0..5e3],
+        high in 1.0..25.0,
+        (samples, lag, observer) in (1_usize..9, prop_oneof![Just(0.0), 1e-3..0.01], prop_oneof![Just(0.0), 1e-3..0.01]),
+        r_rate in prop_oneof![Just(f64::INFINITY), 1e3..1e5],
+    ) -> Design<f64> {
+        let gains = Standard { kp, ti, td };
+        let pid = Settings { alpha, beta, n, tt, slew, u_min: -0.6 * high, u_max: high, ..Settings::new(gains, TS) };
+        Design { filter_samples: samples, filter_time: lag, observer_time: observer, r_rate, ..Design::new(pid) }
+    }
+}
+
+fn references(seed: u64, samples: usize) -> Vec<f64> {
+    let mut random = Random::new(seed);
+    let mut level = 0.0;
+    (0..samples)
+        .map(|k| {
+            if k % 50 == 20 {
+                level = random.between(-2000.0, 3000.0);
+            }
+            level
+        })
+        .collect()
+}
+
+/// A kernel that runs lanes, and each controller alone, on one level.
+struct Both<'a> {
+    known: Known<'a>,
+    controllers: &'a [&'a Controller<f64>],
+    signals: Signals<'a>,
+    encoder: Option<&'a Encoder>,
+}
+
+type Recorded = (Outcome, [Vec<f64>; 3]);
+
+impl Kernel for Both<'_> {
+    type Output = (Vec<Recorded>, Vec<Recorded>, Tallied);
+
+    #[inline(always)]
+    fn run<V: Eight>(self) -> Self::Output {
+        let monitor = Monitor::default();
+        let lanes = || Lanes {
+            known: self.known,
+            controllers: self.controllers,
+            signals: self.signals,
+            encoder: self.encoder,
+            monitor: &monitor,
+        };
+        let (mut one, mut other) = (Records::default(), Records::default());
+        let (mut first, mut second) = (Tally::default(), Tally::default());
+        first.begin(self.controllers, 0);
+        let two = self.controllers.len() > LANES;
+        if two {
+            second.begin(&self.controllers[LANES..], 0);
+        }
+        let outcomes = if two {
+            Grouped::<_, 2, 0>(lanes(), [&mut first, &mut second]).run::<V>();
+            Grouped::<_, 2, 0>(lanes(), [&mut one, &mut other]).run::<V>()
+        } else {
+            Grouped::<_, 1, 0>(lanes(), [&mut first]).run::<V>();
+            Grouped::<_, 1, 0>(lanes(), [&mut one]).run::<V>()
+        };
+        let records = [one, other];
+        let together = (0..self.controllers.len()).map(|i| {
+            let end = ended(outcomes[i], self.signals.reference.len());
+            let of = |record: &Vec<Group>| record[..end].iter().map(|g| g.0[i % LANES]).collect();
+            (outcomes[i], records[i / LANES].0.each_ref().map(of))
+        });
+        let alone = self.controllers.iter().map(|controller| {
+            let mut run = Run::default();
+            let mut plant = crate::closed_loop::known::Alone::<V>::new(self.known);
+            let mut controller = Controller::clone(controller);
+            run.fill(
+                &mut plant,
+                &mut controller,
+                self.signals,
+                self.encoder,
+                &monitor,
+            );
+            (run.outcome, [run.u, run.y, run.feedback])
+        });
+        let tallies = [first, second];
+        let sums = (0..self.controllers.len()).map(|i| tallies[i / LANES].sums(i % LANES));
+        (together.collect(), alone.collect(), sums.collect())
+    }
+}
+
+type Tallied = Vec<Sums>;
+
+fn ended(outcome: Outcome, samples: usize) -> usize {
+    match outcome {
+        Outcome::Completed => samples,
+        Outcome::Diverged(k) | Outcome::Interrupted(k) => k,
+    }
+}
+
+fn bits(record: &Recorded) -> (Outcome, Vec<u64>) {
+    let all = record.1.iter().flatten().map(|v| v.to_bits());
+    (record.0, all.collect())
+}
+
+fn check(
+    plant: &impl Plant,
+    designs: &[Design<f64>],
+    signals: Signals<'_>,
+    encoder: Option<&Encoder>,
+) -> Vec<(Level, Vec<Recorded>)> {
+    let controllers: Vec<_> = designs
+        .iter()
+        .map(|d| Controller::new(*d).unwrap())
+        .collect();
+    let controllers: Vec<_> = controllers.iter().collect();
+    let all = run_everywhere(|| Both {
+        known: plant.known().unwrap(),
+        controllers: &controllers,
+        signals,
+        encoder,
+    });
+    all.into_iter()
+        .map(|(level, (together, alone, sums))| {
+            for (i, (lane, alone)) in together.iter().zip(&alone).enumerate() {
+                assert!(
+                    bits(lane) == bits(alone),
+                    "{level:?}, lane {i}: {lane:?} {alone:?}"
+                );
+                if lane.0 == Outcome::Completed {
+                    assert_eq!(sums[i], summed(alone, signals.reference, &designs[i]));
+                }
+            }
+            (level, together)
+        })
+        .collect()
+}
+
+/// What a tally has to say of a run.
+fn summed((_, [u, y, _]): &Recorded, reference: &[f64], design: &Design<f64>) -> Sums {
+    let (low, high) = (design.pid.u_min, design.pid.u_max);
+    Sums {
+        error: reference.iter().zip(y).map(|(r, y)| (r - y).powi(2)).sum(),
+        command: u.iter().map(|u| u * u).sum(),
+        change: u.windows(2).map(|p| (p[1] - p[0]).powi(2)).sum(),
+        inside: u.iter().filter(|&&u| low < u && u < high).count() as f64,
+        largest: u.iter().fold(0.0, |most, u| f64::max(most, u.abs())),
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(60))]
+    #[test]
+    fn a_lane_is_its_loop_to_the_bit(
+        designs in prop::collection::vec(designs(), 1..17),
+        seed in any::<u64>(),
+        (na, nb, nk, hidden) in (1_usize..4, 1_usize..4, 1_usize..4, 1_usize..18),
+        bypass in any::<bool>(),
+        limit in prop_oneof![Just(f64::INFINITY), 0.3..3.0],
+        (gain, delay) in (0.5..1.5, 0_usize..5),
+        counts in prop_oneof![Just(0.0), Just(26.2)],
+        (pushed, fed) in any::<(bool, bool)>(),
+    ) {
+        let model = network(seed, Lags::new(na, nb, nk, 1).unwrap(), hidden, bypass, limit);
+        let plant = Varied::new(LaggedPlant::new(&model, TS).unwrap(), gain, delay).unwrap();
+        let reference = references(seed, 200);
+        let beside: Vec<f64> = (0..200).map(|k| if k > 90 { -2.5 } else { 0.25 }).collect();
+        let signals = Signals {
+            disturbance: pushed.then_some(&beside),
+            feedforward: fed.then_some(&beside[..150]),
+            ..Signals::new(&reference)
+        };
+        check(&plant, &designs, signals, encoder(counts, 0.5).unwrap().as_ref());
+    }
+
+    #[test]
+    fn a_lane_around_a_difference_equation_is_its_loop(
+        designs in prop::collection::vec(designs(), 1..17),
+        seed in any::<u64>(), nk in 1_usize..3, counts in prop_oneof![Just(0.0), Just(26.2)],
+    ) {
+        let model = LinearModel::new(vec![-1.6, 0.63], vec![3.0, 2.0], 1, nk, 1.0).unwrap();
+        let plant = LaggedPlant::new(&model, TS).unwrap();
+        let reference = references(seed, 200);
+        check(&plant, &designs, Signals::new(&reference), encoder(counts, 0.25).unwrap().as_ref());
+    }
+}
+
+#[test]
+fn a_lane_that_runs_away_leaves_the_others_alone() {
+    let model = LinearModel::new(vec![-0.98], vec![9.8], 1, 1, 0.0).unwrap();
+    let plant = LaggedPlant::new(&model, TS).unwrap();
+    let calm = Settings::new(
+        Standard {
+            kp: 2e-3,
+            ti: 0.05,
+            td: 0.0,
+        },
+        TS,
+    );
+    let wild = |kp| {
+        let gains = Standard { kp, ..calm.gains };
+        Settings { gains, ..calm }
+    };
+    // the third is too large for its command to be a number at all, and so holds
+    let kp = [2e-3, 10.0, 1e308, 3e-3, 0.5, 1e-3, -1.0, 2e-3, 4e-3];
+    let designs = kp.map(|kp| Design::new(wild(kp)));
+    let reference = [1000.0; 400];
+    for (_, records) in check(&plant, &designs, Signals::new(&reference), None) {
+        let diverged = records
+            .iter()
+            .map(|(outcome, _)| matches!(outcome, Outcome::Diverged(_)));
+        let expected = [false, true, false, false, true, false, true, false, false];
+        assert_eq!(diverged.collect::<Vec<_>>(), expected);
+        assert_eq!(records[2].1[0], vec![0.0; 400]);
+    }
+}
+
+#[test]
+fn all_lanes_end_on_a_stop() {
+    let model = network(1, Lags::new(2, 2, 1, 1).unwrap(), 8, false, f64::INFINITY);
+    let plant = LaggedPlant::new(&model, TS).unwrap();
+    let gains = Standard {
+        kp: 1e-3,
+        ti: 0.1,
+        td: 0.0,
+    };
+    let controller = Controller::new(Design::new(Settings::new(gains, TS))).unwrap();
+    let monitor = Monitor::default();
+    monitor.request_stop();
+    let lanes = Lanes {
+        known: plant.known().unwrap(),
+        controllers: &[&controller; 3],
+        signals: Signals::new(&[1.0; 10]),
+        encoder: None,
+        monitor: &monitor,
+    };
+    let outcomes = lanes.run(&mut [Tally::default()]);
+    assert_eq!(outcomes[..3], [Outcome::Interrupted(0); 3]);
+}
+
+#[test]
+fn levels_differ_by_rounding_only() {
+    let model = network(7, Lags::new(2, 2, 1, 1).unwrap(), 8, false, f64::INFINITY);
+    let plant = LaggedPlant::new(&model, TS).unwrap();
+    let gains = Standard {
+        kp: 2e-3,
+        ti: 0.1,
+        td: 1e-3,
+    };
+    let pid = Settings {
+        n: 8.0,
+        u_min: -20.0,
+        u_max: 20.0,
+        ..Settings::new(gains, TS)
+    };
+    let reference = references(3, 1000);
+    let all = check(
+        &plant,
+        &[Design::new(pid); 2],
+        Signals::new(&reference),
+        None,
+    );
+    for (level, records) in &all {
+        for (a, b) in records[0].1[1].iter().zip(&all[0].1[0].1[1]) {
+            // what is forgotten at once by this plant is some units in the last place of the outputs' range
+            assert!((a - b).abs() <= 1e-12 * 2000.0, "{level:?}: {a} {b}");
+        }
+    }
+}
