@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-PAGE, RESULTS, COUNTS = DOCS / "PERFORMANCE.md", DOCS / "performance.json", DOCS / "counts.json"
+PAGE, RESULTS = DOCS / "PERFORMANCE.md", DOCS / "performance.json"
+COUNTS = Path(__file__).with_name("counts.json")
 FIGURES = ("free_run", "training", "neural_ss", "closed_loop", "arx", "machine_speed", "threads")
 
 Results = dict[str, Any]
@@ -170,7 +171,7 @@ def counts() -> str:
         for kernel, levels in kept["kernels"].items()
     ]
     head = ["kernel", "avx2", "baseline"]
-    return f"Instructions per sample, rustc {kept['rustc']}.\n\n{table(head, lines)}"
+    return f"Instructions per sample, rustc {kept['versions']['rustc']}.\n\n{table(head, lines)}"
 
 
 def write(results: Results) -> None:
