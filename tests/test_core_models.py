@@ -240,7 +240,9 @@ def test_training_goes_on_from_given_parameters() -> None:
     u, _, y = _drive(800, 9)
     first = _fit([(u, y)], [], starts=1, max_iterations=5, weight_decay=0.0, initial_state="zero")
     theta = first.model.theta
-    on = _fit([(u, y)], [], starts=1, weight_decay=0.0, initial_state="zero", initial_theta=theta)
+    on = _fit(
+        [(u, y)], [], starts=1, weight_decay=0.0, initial_state="zero", initial_theta=theta[None]
+    )
     assert on.trace[0] == pytest.approx(first.cost, rel=1e-12)
     assert on.cost < first.cost
     assert on.trials >= len(on.trace) - 1 > 0
@@ -302,9 +304,12 @@ def test_two_inputs_and_long_delays_are_learnt() -> None:
             "per input",
         ),
         ({"na": 3, "linear": "second order"}, "same na"),
-        ({"initial_theta": np.zeros(3), "starts": 1}, "25 finite numbers"),
-        ({"initial_theta": np.full(25, np.nan), "starts": 1}, "0 are finite"),
-        ({"initial_theta": np.zeros(25)}, "leave initial_theta out"),
+        ({"initial_theta": np.zeros((1, 3)), "starts": 1}, "25 finite numbers"),
+        ({"initial_theta": np.full((1, 25), np.nan), "starts": 1}, "0 are finite"),
+        (
+            {"initial_theta": np.zeros((1, 25)), "starts": 2},
+            "expected an initial_theta of 2 starts",
+        ),
     ],
 )
 def test_wrong_settings_are_refused_with_a_remedy(changes: dict[str, Any], words: str) -> None:

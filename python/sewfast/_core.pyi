@@ -333,7 +333,7 @@ def fit_neural_oe(
     weights and no bypass. ``saturate`` widens the training output's range by that fraction (half at each end) and
     clips the output there, without slope outside; None leaves it linear. ``threads = 0`` takes all; the bits do not
     depend on it. ``initial_state`` 'measured' starts each run after its first na samples.
-    ``initial_theta``, in scaled units, is where a single start begins instead of a draw, (n_theta,).
+    ``initial_theta``, in scaled units, is where the starts begin instead of a draw, (starts, n_theta).
     """
 
 def fit_neural_ss(

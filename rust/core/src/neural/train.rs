@@ -47,7 +47,7 @@ pub struct Settings {
     pub max_iterations: usize,
     /// Number of starts.
     pub starts: usize,
-    /// Parameters in scaled units from which a single start begins; drawn where there are none.
+    /// Parameters in scaled units from which the starts begin, one after the other; drawn where there are none.
     pub initial_theta: Option<Vec<f64>>,
     /// Seed of the starts; start `i` draws from stream `i`.
     pub seed: u64,
@@ -194,7 +194,8 @@ impl<'a> Training<'a> {
     fn run(&self, start: usize) -> Option<Trained> {
         if let Some(theta) = &self.settings.initial_theta {
             let mut problem = self.problem();
-            let theta = problem.start(theta);
+            let parameters = self.shape.parameters();
+            let theta = problem.start(&theta[start * parameters..][..parameters]);
             return self.train(&mut problem, theta);
         }
         let mut random = Random::stream(self.settings.seed, start as u64);
@@ -382,21 +383,16 @@ fn check(settings: &Settings) -> Result<()> {
     }
 }
 
-/// Refuses parameters to start from that are not those of the shape, or not for one start.
+/// Refuses parameters to start from that are not those of the shape and of every start.
 fn check_initial(settings: &Settings, shape: Shape) -> Result<()> {
     let Some(theta) = &settings.initial_theta else {
         return Ok(());
     };
-    if settings.starts != 1 {
-        return Err(Error::setting(format!(
-            "expected 1 start with initial_theta, got {}; leave initial_theta out to draw them",
-            settings.starts
-        )));
-    }
     let finite = theta.iter().filter(|t| t.is_finite()).count();
-    if theta.len() != finite || finite != shape.parameters() {
+    if theta.len() != finite || finite != settings.starts * shape.parameters() {
         return Err(Error::setting(format!(
-            "expected an initial_theta of {} finite numbers for this shape, got {} of which {finite} are finite; take them from the theta of a model of the same orders",
+            "expected an initial_theta of {} starts with {} finite numbers each for this shape, got {} numbers of which {finite} are finite; take them from the theta of models of the same orders",
+            settings.starts,
             shape.parameters(),
             theta.len()
         )));

@@ -202,7 +202,7 @@ fn fit_neural_oe(
     starts: usize,
     seed: u64,
     threads: usize,
-    initial_theta: Option<Values<'_>>,
+    initial_theta: Option<Rows<'_>>,
     progress: Option<Bound<'_, PyAny>>,
 ) -> PyResult<NeuralFit> {
     let scaling = match (u_mean, u_scale, y_mean, y_scale) {
@@ -228,7 +228,7 @@ fn fit_neural_oe(
         max_iterations,
         starts,
         initial_theta: initial_theta
-            .map(|theta| slice(&theta, "initial_theta").map(<[f64]>::to_vec))
+            .map(|theta| rows(&theta, "initial_theta").map(|(theta, _)| theta.to_vec()))
             .transpose()?,
         seed,
         threads,
