@@ -135,8 +135,8 @@ def main() -> int:
         return 0
     if grown:
         print(
-            f"more than {TOLERANCE:.0%} more instructions: {'; '.join(grown)}. If that is meant, keep "
-            "them: python benches/counts.py --keep",
+            f"more than {TOLERANCE:.0%} more instructions: {'; '.join(grown)}. If that is meant, "
+            "keep them: python benches/counts.py --keep",
             file=sys.stderr,
         )
     else:

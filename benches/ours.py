@@ -13,8 +13,10 @@ import sewfast
 import state_space
 from sewfast import _core
 from sewfast.tuning import costs
+from sewfast.tuning_task import TuningTask
 
 Work = Callable[[], dict[str, Any]]
+TRACKING = sewfast.Cost(chatter=0.0, overshoot=0.0, saturation=0.0)
 
 
 def network(hidden: int = problem.HIDDEN, *, scaled: bool = True) -> _core.NeuralOE:
@@ -72,7 +74,7 @@ def trained(
 
 def training(iterations: int) -> Work:
     """Levenberg-Marquardt from the common start."""
-    fit = trained(iterations, initial_theta=[problem.start()])
+    fit = trained(iterations, initial_theta=problem.start()[None])
 
     def work() -> dict[str, Any]:
         found = fit()
@@ -84,7 +86,7 @@ def training(iterations: int) -> Work:
 
 def several_starts(starts: int, iterations: int, threads: int) -> Work:
     """From the common starts."""
-    thetas = [problem.start(seed) for seed in range(starts)]
+    thetas = np.stack([problem.start(seed) for seed in range(starts)])
     fit = trained(iterations, starts=starts, threads=threads, initial_theta=thetas)
     return lambda: {"costs": sorted(fit().start_costs.tolist())}
 
@@ -135,23 +137,21 @@ def _reached(costs: np.ndarray) -> dict[str, Any]:
 
 
 def _candidates(number: int, encoded: bool, threads: int) -> Work:
-    cores = [controller(row, encoded=encoded).core() for row in problem.gains(number)]
-    plants, r = [network(scaled=False)], [problem.Y_SCALE * problem.reference()]
-    weights = {"tracking": 1.0, "chatter": 0.0, "overshoot": 0.0, "saturation": 0.0}
+    controllers = [controller(row, encoded=encoded) for row in problem.gains(number)]
+    task = TuningTask.of(
+        model(),
+        problem.Y_SCALE * problem.reference(),
+        start=controllers[0],
+        first={},
+        cost=TRACKING,
+        aggregate="mean",
+        constraints=None,
+        variations=[(1.0, 0)],
+    ).core()
+    cores = [c.core() for c in controllers]
 
     def work() -> dict[str, Any]:
-        found = _core.tuning_costs(
-            plants,
-            r,
-            cores,
-            counts_per_unit=problem.COUNTS_PER_REV / 60.0 if encoded else 0.0,
-            variations=[(1.0, 0)],
-            cost=weights,
-            aggregate="mean",
-            limits=(None, None, None),
-            loops=[],
-            threads=threads,
-        )
+        found = _core.tuning_costs(task, cores, threads=threads)
         return _reached(np.array([cost for cost, _ in found]))
 
     return work
@@ -183,10 +183,9 @@ def public_candidates(number: int) -> Work:
     """The same as `candidates` by the public function."""
     controllers = [controller(row) for row in problem.gains(number)]
     plant, r = model(), problem.Y_SCALE * problem.reference()
-    cost = sewfast.Cost(chatter=0.0, overshoot=0.0, saturation=0.0)
 
     def work() -> dict[str, Any]:
-        found = costs(controllers, plant, r, cost=cost, variations=[(1.0, 0)], threads=1)
+        found = costs(controllers, plant, r, cost=TRACKING, variations=[(1.0, 0)], threads=1)
         return _reached(found)
 
     return work

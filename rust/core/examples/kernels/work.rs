@@ -132,6 +132,7 @@ fn training(max_iterations: usize) -> Call {
         weight_decay: 0.0,
         max_iterations,
         starts: 1,
+        initial_theta: None,
         seed: 0,
         threads: 1,
     };
