@@ -12,6 +12,7 @@ mod referee;
 mod scaling;
 mod sensitivities;
 mod shape;
+mod single;
 mod state;
 mod stepper;
 mod train;

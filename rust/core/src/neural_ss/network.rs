@@ -202,11 +202,14 @@ impl Network {
         let width = states.len() + inputs.len();
         // The states come last: everything else is ready before they are known.
         let (of_states, of_inputs) = self.first[group * width..][..width].split_at(states.len());
-        let sum = |sum: V, (weights, value): (&Group, &f64)| {
-            sum.add_product(V::load(&weights.0), V::splat(*value))
-        };
-        let z = of_inputs.iter().zip(inputs).fold(V::splat(0.0), sum);
-        of_states.iter().zip(states).fold(z, sum)
+        let mut z = V::splat(0.0);
+        for (weights, value) in of_inputs.iter().zip(inputs) {
+            z = z.add_product(V::load(&weights.0), V::splat(*value));
+        }
+        for (weights, value) in of_states.iter().zip(states) {
+            z = z.add_product(V::load(&weights.0), V::splat(*value));
+        }
+        z
     }
 
     /// `1 - h^2` to its last digits, for `[x, v, 1]`; [`rises_of`] is faster, and less exact in saturation.

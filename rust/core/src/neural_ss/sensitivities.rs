@@ -19,13 +19,13 @@ const LOOK: usize = 64;
 pub(super) struct Columns {
     shape: Shape,
     /// First column of G.
-    direct: usize,
+    pub direct: usize,
     /// First column of `[A B]`.
-    linear: usize,
+    pub linear: usize,
     /// First column of the initial state.
     pub state: usize,
     /// First column of `[C D c]`.
-    sums: usize,
+    pub sums: usize,
     /// Column of the error.
     pub error: usize,
     /// Numbers that a row must have room for: some are written beyond its end.
@@ -110,18 +110,18 @@ impl Rows for Gram {
 /// The recursion with its buffers.
 #[derive(Clone, Debug)]
 pub(super) struct Sensitivities {
-    columns: Columns,
+    pub(super) columns: Columns,
     /// `X` in groups of columns: for each group the rows of all states.
-    states: Vec<Group>,
+    pub(super) states: Vec<Group>,
     /// `dx+/d[A B x0]`, in groups as `states`.
-    linear: Vec<Group>,
+    pub(super) linear: Vec<Group>,
     /// `[E; f' G] diag(1 - h^2)`.
-    weighted: Vec<Group>,
+    pub(super) weighted: Vec<Group>,
     /// `f' ds/dx` of the outputs that are known.
-    outward: Vec<f64>,
+    pub(super) outward: Vec<f64>,
     /// Room for one group of columns of the states.
     moved: Vec<Group>,
-    scratch: Scratch,
+    pub(super) scratch: Scratch,
     /// Outputs of a sample that are known: which, slope of the output function, error.
     known: Vec<(usize, f64, f64)>,
 }
@@ -217,8 +217,20 @@ impl<R: Rows> Recursion<'_, R> {
             buffers.scratch.set(x, v);
             buffers.prepare::<V>(network, h, (s, y), exact);
             let count = buffers.known.len();
-            let width = rows.width();
-            buffers.advance::<V, NX>(network, h, rows.room(count), width);
+            if outputs == 1 && (1..=4).contains(&NX) {
+                let known = buffers.known.first();
+                let known = known.map_or((0.0, 0.0), |&(_, slope, error)| (slope, error));
+                let row = rows.room(1);
+                match NX {
+                    1 => buffers.advance_single::<V, 1>(network, h, known, row),
+                    2 => buffers.advance_single::<V, 2>(network, h, known, row),
+                    3 => buffers.advance_single::<V, 3>(network, h, known, row),
+                    _ => buffers.advance_single::<V, 4>(network, h, known, row),
+                }
+            } else {
+                let width = rows.width();
+                buffers.advance::<V, NX>(network, h, rows.room(count), width);
+            }
             rows.keep(count);
         }
     }
