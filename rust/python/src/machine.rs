@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyDict, PyType};
 use sewfast_core::machine::{Machine as Core, Parameters};
 use sewfast_core::{Error, Monitor, Result};
 
@@ -99,6 +99,20 @@ impl Machine {
         })?;
         self.core = machine;
         Ok((array1(py, counts), array1(py, speed)))
+    }
+
+    /// What pickle and copy make another of: the parameters, and the memory.
+    #[expect(clippy::type_complexity, reason = "the protocol's own tuple")]
+    fn __reduce__<'py>(
+        slf: PyRef<'py, Self>,
+        py: Python<'py>,
+    ) -> PyResult<(Bound<'py, PyType>, (Bound<'py, PyDict>,), [f64; 8])> {
+        let parameters = named(py, slf.core.parameters().values())?;
+        Ok((py.get_type::<Self>(), (parameters,), slf.core.memory()))
+    }
+
+    fn __setstate__(&mut self, py: Python<'_>, memory: [f64; 8]) -> PyResult<()> {
+        self.core.recall(memory).map_err(|e| raise(py, e))
     }
 
     fn linearise<'py>(&self, py: Python<'py>, speed_rpm: f64) -> PyResult<Bound<'py, PyDict>> {

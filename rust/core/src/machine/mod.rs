@@ -130,6 +130,40 @@ impl Machine {
         Ok(())
     }
 
+    /// All that changes from sample to sample, and the load; [`Machine::recall`] takes it up again.
+    pub fn memory(&self) -> [f64; 8] {
+        let State {
+            current,
+            speed,
+            angle,
+        } = self.state;
+        let Regime { motion, limited } = self.regime;
+        let (turns, voltage, load) = (self.turns, self.voltage, self.dynamics.load);
+        [current, speed, angle, turns, motion, limited, voltage, load]
+    }
+
+    /// Goes on where a machine with the same parameters had this [`Machine::memory`].
+    ///
+    /// # Errors
+    /// A setting error where a value is not finite.
+    pub fn recall(&mut self, memory: [f64; 8]) -> Result<()> {
+        if let Some(value) = memory.iter().find(|value| !value.is_finite()) {
+            return Err(Error::setting(format!(
+                "expected a machine's memory of finite values, got {value}; take it from Machine::memory"
+            )));
+        }
+        let [current, speed, angle, turns, motion, limited, voltage, load] = memory;
+        self.state = State {
+            current,
+            speed,
+            angle,
+        };
+        self.regime = Regime { motion, limited };
+        (self.turns, self.voltage) = (turns, voltage);
+        self.dynamics.load = load;
+        Ok(())
+    }
+
     /// True speed [RPM].
     pub fn speed_rpm(&self) -> f64 {
         self.state.speed * RPM

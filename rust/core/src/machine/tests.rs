@@ -329,3 +329,15 @@ fn no_load_changes_no_bit() {
     let u = random(5, 4000, 40, 20.0);
     assert_eq!(one.run(&u).unwrap(), other.run(&u).unwrap());
 }
+
+#[test]
+fn goes_on_from_its_memory_to_the_last_bit() {
+    let mut first = nominal();
+    first.set_load(0.02).unwrap();
+    let u = random(5, 4000, 20, 15.0);
+    first.run(&u[..2000]).unwrap();
+    let mut second = nominal();
+    second.recall(first.memory()).unwrap();
+    assert_eq!(first.run(&u[2000..]), second.run(&u[2000..]));
+    assert!(second.recall([f64::NAN; 8]).is_err());
+}
