@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -13,7 +13,7 @@ from . import _core
 from .constraints import Constraints
 from .control import Controller
 from .cost import Cost
-from .errors import Interrupted, SettingError
+from .errors import FitError, Interrupted, SettingError
 from .gains import whole
 from .load_step import LoadStep
 from .loop import check_fits
@@ -21,8 +21,10 @@ from .plants import Plants, References
 from .starting import first_controller
 from .tuning_task import (
     Aggregate,
+    Deadline,
     Progress,
     TuningTask,
+    budget,
     default_variations,
     threads_or_all,
 )
@@ -53,7 +55,7 @@ class TuningResult:
     trace : array, shape (evaluations,)
         The cost of the best controller so far after each evaluation, the start's first.
     termination : str
-        ``evaluations`` or ``interrupted``.
+        ``evaluations``, ``time`` or ``interrupted``.
     weights : Cost
         What counted how much, every weight a number.
     aggregate : str
@@ -110,6 +112,7 @@ def tune(
     loads: Sequence[LoadStep] = (),
     method: Method = "genetic",
     evaluations: int = EVALUATIONS,
+    time_budget: float | None = None,
     seed: int = 0,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -158,6 +161,9 @@ def tune(
         A genetic algorithm with local refinement, or CMA-ES with restarts.
     evaluations : int
         Candidates tried.
+    time_budget : float, optional
+        Time of the search [s], after which the best so far is the result (`termination` is
+        ``time``). A seed then no longer gives the same bits.
     seed : int
         Seed of the search.
     threads : int, optional
@@ -193,18 +199,31 @@ def tune(
         variations=variations,
         loads=loads,
     )
+    deadline = Deadline(None if time_budget is None else budget(time_budget), progress)
     found = _core.tune(
         task.core(variables),
         method=method,
         evaluations=whole("evaluations", evaluations),
         seed=whole("seed", seed),
         threads=threads_or_all(threads),
-        progress=progress,
+        progress=deadline,
     )
     result = _result(found, task, method)
+    if deadline.passed and result.termination == "interrupted":
+        return _in_time(result, found["violation"])
     if result.termination == "interrupted":
         raise Interrupted(result.controller)
     return result
+
+
+def _in_time(result: TuningResult, violation: float) -> TuningResult:
+    if violation > 0.0:
+        raise FitError(
+            "expected a controller that keeps to the constraints within the time_budget, the best "
+            f"of {result.evaluations} exceeds them by {violation:.3g} of their limits in sum; give "
+            "more time, or relax them"
+        )
+    return replace(result, termination="time")
 
 
 def costs(

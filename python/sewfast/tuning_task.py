@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
@@ -137,6 +139,45 @@ def _instance(given: Any, kind: type[Any], example: str) -> Any:
             f"expected a {kind.__name__}, got {type(given).__name__}; for example {example}"
         )
     return kind() if given is None else given
+
+
+def budget(seconds: Any) -> float:
+    """A time in which a search has to end [s].
+
+    Raises
+    ------
+    SettingError
+        For what is no number above 0.
+    """
+    time = real("time_budget", seconds)
+    if not 0.0 < time < math.inf:
+        raise SettingError(f"expected a time_budget above 0 s, got {time:g}; None for none")
+    return time
+
+
+class TimeUp(KeyboardInterrupt):
+    """Asks the core to stop and hand over its best."""
+
+
+@dataclass
+class Deadline:
+    """Progress that ends a search after a time."""
+
+    seconds: float | None
+    inner: Progress | None
+
+    def __post_init__(self) -> None:
+        self._began = time.monotonic()
+        self.passed = False
+
+    def __call__(self, done: int, total: int, best: float) -> None:
+        if self.inner is not None:
+            self.inner(done, total, best)
+        # before the first gains are known there is nothing to hand over
+        if self.seconds is not None and math.isfinite(best) and done > 0:
+            self.passed = time.monotonic() - self._began > self.seconds
+            if self.passed:
+                raise TimeUp
 
 
 def _load_steps(given: Sequence[LoadStep]) -> list[LoadStep]:

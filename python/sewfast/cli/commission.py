@@ -61,6 +61,17 @@ def add(commands: Commands) -> None:
         "--evaluations", type=int, default=600, metavar="N", help="controllers tried (600)"
     )
     parser.add_argument(
+        "--load", type=float, metavar="V",
+        help="load in volts of command that the loop is to bear no worse than Eq. 12's "
+        "(a tenth of --u-max; 0: not asked for)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--Ms", type=float, default=2.0, metavar="MS", help="largest sensitivity allowed (2)"
+    )
+    parser.add_argument(
+        "--time-budget", type=float, metavar="S", help="time of the search for gains (no limit)"
+    )
+    parser.add_argument(
         "--seed", type=int, default=0, metavar="N",
         help="of the random signals, the networks and the search (0)",
     )  # fmt: skip
@@ -103,6 +114,9 @@ def _commissioned(args: argparse.Namespace) -> Commissioning:
             "references": args.reference,
             "members": args.members,
             "evaluations": args.evaluations,
+            "load": args.load,
+            "Ms": args.Ms,
+            "time_budget": args.time_budget,
             "seed": args.seed,
             "progress": lambda done, total, stage: progress.say(stage),
         }

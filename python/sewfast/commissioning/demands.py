@@ -7,11 +7,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from ..constraints import Constraints
 from ..dataset import FloatArray
 from ..errors import SettingError
 from ..gains import real, whole
+from ..tuning_task import budget
 from .bench import Bench
 
+MS = 2.0
+"""Largest sensitivity unless said otherwise."""
 OVER = 1.25
 """Training reaches this many times the top of the working range: the loop overshoots it."""
 
@@ -33,6 +37,12 @@ class Demands:
     members, evaluations : int
         Models in the ensemble; controllers that the search tries.
     seed, threads : int
+    load : float or None
+        What the load step takes [V]; None for a share of `u_max`, 0 for no such requirement.
+    Ms : float or None
+        Largest sensitivity on the members, linearised; None for no such requirement.
+    time_budget : float or None
+        Of the search [s].
     """
 
     u_max: float
@@ -43,6 +53,9 @@ class Demands:
     evaluations: int
     seed: int
     threads: int
+    load: float | None = None
+    Ms: float | None = MS
+    time_budget: float | None = None
 
     @property
     def top(self) -> float:
@@ -61,6 +74,9 @@ def demands(
     evaluations: int,
     seed: int,
     threads: int,
+    load: float | None = None,
+    Ms: float | None = MS,
+    time_budget: float | None = None,
 ) -> Demands:
     """The demands, checked against what the bench allows.
 
@@ -100,7 +116,21 @@ def demands(
         _at_least(1, "evaluations", evaluations),
         whole("seed", seed),
         _at_least(1, "threads", threads),
+        _load(load, volt),
+        None if Ms is None else Constraints(Ms=Ms).Ms,
+        None if time_budget is None else budget(time_budget),
     )
+
+
+def _load(load: float | None, volt: float) -> float | None:
+    if load is None:
+        return None
+    size = real("load", load)
+    if not 0.0 <= size < volt:
+        raise SettingError(
+            f"expected a load from 0 V to below u_max = {volt:g} V, got {size:g}; 0 for none"
+        )
+    return size
 
 
 def _fixed(references: Mapping[str, FloatArray] | None) -> Mapping[str, FloatArray] | None:

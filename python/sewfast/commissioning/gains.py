@@ -2,31 +2,42 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
+
+import numpy as np
 
 from .. import _core
-from ..control import Controller, Fopdt, table_1
+from ..control import Controller, Fopdt
 from ..cost import Cost
 from ..dataset import FloatArray
 from ..errors import DataError, FitError
 from ..machine import VirtualMachine
 from ..models import Ensemble
-from ..tuning import TuningResult, tune
+from ..rules import Rule, eq_12, simc
+from ..tuning import TuningResult, costs, tune
 from .bench import Bench
 from .demands import Demands
 from .refusal import Refusal
+from .requirements import Requirements
 
 FILTER = 8e-3
 """Of the feedback's moving average [s]: one count a millisecond of 1,572 a turn is 38 RPM."""
 DERIVATIVE_FILTER = 10.0
+FIRST_MS = 1.8
+"""Of the first gains, which meet a machine that only a step response tells of."""
+ALPHAS, BETAS = (0.0, 0.1, 0.2, 0.4), (-1.0, 0.0, 0.5)
+"""Among which the search's start is chosen."""
+RATIOS = (0.01, 2.0)
+"""L/T between which Eq. 12 is solved."""
 
 
 def first_gains(fopdt: Fopdt, bench: Bench, demands: Demands) -> Controller:
-    """Gains by Table 1, nearest row; the delay of the feedback's filter counts as dead time."""
+    """Gains by Eq. 12 with a limit of Ms; the feedback filter's delay counts as dead time."""
     samples = max(1, min(64, round(FILTER / bench.Ts)))
-    delayed = replace(fopdt, L=fopdt.L + (samples - 1) / 2 * bench.Ts)
-    rule = table_1(delayed, outside="nearest")
+    rule = _rule(fopdt, (samples - 1) / 2 * bench.Ts, FIRST_MS)
     return Controller(
         gains=rule.gains,
         Ts=bench.Ts,
@@ -37,8 +48,44 @@ def first_gains(fopdt: Fopdt, bench: Bench, demands: Demands) -> Controller:
         u_max=demands.u_max,
         filter_samples=samples,
         counts_per_rev=bench.counts_per_rev,
-        notes="Table 1 on the recorded step response",
+        notes=f"{rule.name} on the recorded step response",
     )
+
+
+def ruled(fopdt: Fopdt, like: Controller) -> Controller:
+    """Eq. 12's gains without a limit of Ms, in the surroundings of another controller."""
+    rule = _rule(fopdt, (like.filter_samples - 1) / 2 * like.Ts + like.filter_time, math.inf)
+    return replace(
+        like, gains=rule.gains, alpha=rule.alpha, beta=rule.beta, schedule=(),
+        notes=f"{rule.name} on the recorded step response",
+    )  # fmt: skip
+
+
+def _rule(fopdt: Fopdt, late: float, Ms: float) -> Rule:
+    """Eq. 12 for a feedback that is late.
+
+    Below its least ratio of dead time to time constant that one is taken, which is a longer dead
+    time than the plant's: conservative. Beyond its largest SIMC's PI stands for it.
+    """
+    L = max(fopdt.L + late, min(RATIOS) * fopdt.T)
+    if L / fopdt.T > max(RATIOS):
+        return simc(replace(fopdt, L=L))
+    return eq_12(replace(fopdt, L=L), Ms=Ms)
+
+
+def start_of(
+    rule: Controller,
+    models: Ensemble | VirtualMachine,
+    references: Mapping[str, FloatArray],
+    cost: Cost,
+    threads: int,
+) -> Controller:
+    """Where the search begins: the rule's loop with the alpha and beta of a coarse grid that cost
+    least. The rule's own are for a step of the reference, far from what a slow one asks for.
+    """
+    tried = [replace(rule, alpha=a, beta=b) for a, b in product(ALPHAS, BETAS)]
+    found = costs([rule, *tried], models, list(references.values()), cost=cost, threads=threads)
+    return [rule, *tried][int(np.argmin(found))]
 
 
 def cost_of(references: Mapping[str, FloatArray], Ts: float, demands: Demands) -> Cost:
@@ -72,6 +119,8 @@ def search(
     demands: Demands,
     cost: Cost,
     progress: Callable[[int, int], object],
+    *,
+    requirements: Requirements | None = None,
     variations: Sequence[tuple[float, int]] | None = None,
 ) -> TuningResult:
     """The gains of least cost over all members, each with the usual gain spread and delay.
@@ -79,24 +128,28 @@ def search(
     Raises
     ------
     Refusal
-        Where every loop tried diverges.
+        Where every loop tried diverges, or none meets the requirements.
     Interrupted
         On Ctrl-C; its `best` is the best controller so far.
     """
+    asked = requirements or Requirements()
     try:
         return tune(
             models,
             list(references.values()),
             start=start,
             cost=cost,
+            constraints=asked.constraints,
+            loads=asked.loads,
             variations=variations,
             evaluations=demands.evaluations,
             seed=demands.seed,
             threads=demands.threads,
+            time_budget=demands.time_budget,
             progress=lambda done, total, best: progress(done, total),
         )
     except FitError as error:
         raise Refusal(
-            f"expected gains under which no member of the ensemble runs away ({error}); record "
-            "longer, or verify the first gains by hand"
+            f"expected gains under which every member of the ensemble does what is required "
+            f"({error}); record longer, raise evaluations, or ask for less: a larger Ms, load=0"
         ) from error

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
+from ..control import Controller, Fopdt
 from ..recording import Recording
 from .result import Commissioning
 
@@ -36,6 +37,18 @@ class Journal:
         self._progress = progress
         self._began: list[tuple[str, float]] = []
         self._values: dict[str, Any] = {"machine": machine, "recordings": {}}
+
+    @property
+    def fopdt(self) -> Fopdt:
+        """Of the step response."""
+        found: Fopdt = self._values["fopdt"]
+        return found
+
+    @property
+    def first(self) -> Controller:
+        """The first gains."""
+        found: Controller = self._values["first"]
+        return found
 
     @property
     def stage(self) -> str:

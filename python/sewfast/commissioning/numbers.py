@@ -39,8 +39,15 @@ def numbers(c: Commissioning) -> dict[str, Any]:
             "cost": c.tuning.cost,
             "start_cost": c.tuning.start_cost,
             "termination": c.tuning.termination,
+            "constraints": str(c.tuning.constraints),
         },
         "cost": None if c.cost is None else dict(vars(c.cost)),
+        "met": None if c.met is None else dict(c.met),
+        "evidence": {
+            name: {"verdict": judged.verdict, "lines": [x.to_json() for x in judged.lines]}
+            for name, judged in (("report card", c.card), ("closed loops", c.judgement))
+            if judged is not None
+        },
         "predicted_cost": c.predicted_cost,
         "measured_cost": c.measured_cost,
         "references": {x.reference: _comparison(x) for x in c.comparisons},

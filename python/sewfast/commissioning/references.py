@@ -14,6 +14,11 @@ SHORT = 0.35
 """Length of the sweeps to tune on, in shares of those to verify on."""
 
 
+def pace_of(fopdt: Fopdt, demands: Demands) -> float:
+    """How many times longer everything lasts than on a machine that is fast enough."""
+    return max(1.0, demands.speed / 0.4 / (GENTLE * acceleration(fopdt, demands)))
+
+
 def standard(fopdt: Fopdt, demands: Demands, Ts: float, *, short: bool) -> dict[str, FloatArray]:
     """Trapezoid, chirps of shrinking and of growing amplitude, random levels [RPM].
 
@@ -26,7 +31,7 @@ def standard(fopdt: Fopdt, demands: Demands, Ts: float, *, short: bool) -> dict[
     short : bool
         Whether to tune on: shorter sweeps, other random levels.
     """
-    pace = max(1.0, demands.speed / 0.4 / (GENTLE * acceleration(fopdt, demands)))
+    pace = pace_of(fopdt, demands)
     size = demands.speed / 2000.0
     share = SHORT if short else 1.0
     return {

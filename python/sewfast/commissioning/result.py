@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ..control import Controller, Fopdt
 from ..cost import Cost
+from ..evidence import Line, ReportCard
 from ..models import Ensemble
 from ..recording import Recording
+from ..trust import Judgement
 from ..tuning import TuningResult
 from .motion import Motion
 from .verification import Comparison
@@ -47,6 +49,13 @@ class Commissioning:
     tuning : TuningResult or None
     cost : Cost or None
         What counted how much.
+    met : mapping or None
+        What the gains do of what was required beside the cost: `Ms` of the members linearised,
+        `recovery_ms` of each member under the load step, tuned and with the rule's gains.
+    card : ReportCard or None
+        How far the best member can be trusted, on the recording `levels`.
+    judgement : Judgement or None
+        What speaks against the loops as predicted.
     comparisons : tuple of Comparison
         Predicted and measured, per reference.
     """
@@ -65,6 +74,9 @@ class Commissioning:
     controller: Controller | None = None
     tuning: TuningResult | None = None
     cost: Cost | None = None
+    met: Mapping[str, Any] | None = None
+    card: ReportCard | None = None
+    judgement: Judgement | None = None
     comparisons: tuple[Comparison, ...] = ()
 
     @property
@@ -131,6 +143,7 @@ class Commissioning:
                 f"  models         {len(self.models.members)}, free run on data not trained on "
                 f"{worst} RPM rms"
             )
+        lines += _evidence(self)
         lines += [_told(c) for c in self.comparisons]
         if self.measured_cost is not None and self.predicted_cost is not None:
             lines.append(
@@ -141,6 +154,31 @@ class Commissioning:
             lines.append(str(self.controller))
         lines.append(f"  {sum(self.seconds.values()):.1f} s")
         return "\n".join(lines)
+
+
+def _evidence(c: Commissioning) -> list[str]:
+    """Report card, judgement and what was required beside the cost, a line each."""
+    lines = []
+    if c.card is not None:
+        lines.append(f"  report card    {c.card.verdict}{_named(c.card.lines)}")
+    if c.met is not None and c.met["Ms"]:
+        lines.append(f"  Ms             {max(c.met['Ms']):.3g} at most over the networks")
+    if c.met is not None and c.met["load"] is not None:
+        tuned, rule = (max(c.met["recovery_ms"][n]) for n in ("tuned", "rule"))
+        volt = abs(c.met["load"]["disturbance"])
+        lines.append(
+            f"  load of {volt:.3g} V   recovery {tuned:.0f} ms at most, by Eq. 12 {rule:.0f} ms"
+        )
+    if c.judgement is not None:
+        lines.append(f"  loops          {c.judgement.verdict}{_named(c.judgement.lines)}")
+    return lines
+
+
+def _named(lines: Sequence[Line]) -> str:
+    """The first two questions that were not passed, and how many others."""
+    names = [x.name for x in lines if x.verdict in ("warn", "fail")]
+    more = f" and {len(names) - 2} more" if len(names) > 2 else ""
+    return ": " + ", ".join(names[:2]) + more if names else ""
 
 
 def _told(c: Comparison) -> str:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from ..dataset import Dataset
 from ..errors import FitError
+from ..evidence import ReportCard, check
 from ..identification import identify
 from ..models import Ensemble, Model
 from ..recording import Recording
@@ -37,12 +38,15 @@ class Trained:
         Of the best one.
     dropped : int
         Members that were left out.
+    card : ReportCard
+        Of the best one on that recording.
     """
 
     ensemble: Ensemble
     rmse: tuple[float, ...]
     fit_percent: float
     dropped: int
+    card: ReportCard
 
     def errors_of(self, some: Ensemble) -> tuple[float, ...]:
         """`rmse` of those members that are in `some`."""
@@ -95,6 +99,7 @@ def train(
         tuple(scores[i][0] for i in kept),
         fit,
         len(members) - len(kept),
+        check(members[min(kept, key=lambda i: scores[i][0])], held_out),
     )
 
 

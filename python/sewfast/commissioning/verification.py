@@ -12,6 +12,7 @@ from ..dataset import FloatArray
 from ..errors import FitError
 from ..loop import ClosedLoopRun, run
 from ..models import Ensemble
+from ..trust import Judgement, judge
 from .agreement import DISAGREE
 from .bench import Bench
 from .refusal import Refusal, require
@@ -107,6 +108,15 @@ def measure(
         replace(c, measured=bench.follow(controller, c.predicted.r, c.reference).run)
         for c in predicted
     )
+
+
+def judged(predicted: tuple[Comparison, ...], ensemble: Ensemble) -> Judgement:
+    """What speaks against the loops: of the first member on every reference, of all members on the
+    shortest. That all agree on all of them has been required.
+    """
+    shortest = min(predicted, key=lambda c: len(c.predicted.r))
+    runs = [m for c in predicted for m in (c.members if c is shortest else c.members[:1])]
+    return judge(runs, ensemble, refuse=False)
 
 
 def require_alike(comparisons: tuple[Comparison, ...]) -> None:

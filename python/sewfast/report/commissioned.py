@@ -55,6 +55,8 @@ def context(folder: Path) -> dict[str, Any]:
                 "found": found,
                 "stages": _stages(found),
                 "gains": _gains(found),
+                "met": _met(found),
+                "evidence": [_judged(*item) for item in found.get("evidence", {}).items()],
                 "verified": _verified(found),
                 "analysed": analysed.section(folder),
                 "loops": [_picture(folder, name, n) for name, n in found["references"].items()],
@@ -87,6 +89,33 @@ def _gains(found: Mapping[str, Any]) -> Table:
     )
     header = ("controller", "Kp [V/RPM]", "Ti [ms]", "Td [ms]", "α", "β", "N")
     return Table("Gains in standard form.", header, rows)
+
+
+def _met(found: Mapping[str, Any]) -> Table | None:
+    """What the gains do of what was required beside the cost."""
+    met = found.get("met")
+    if not met or not (met["Ms"] or met["load"]):
+        return None
+    rows = []
+    if met["Ms"]:
+        rows.append(
+            ("largest sensitivity Ms of the networks", significant(max(met["Ms"])),
+             significant(met["Ms_limit"])),
+        )  # fmt: skip
+    if met["load"]:
+        volt, level = abs(met["load"]["disturbance"]), met["load"]["level"]
+        tuned, rule = (milliseconds(max(met["recovery_ms"][n])) for n in ("tuned", "rule"))
+        what = f"slowest recovery from a load of {significant(volt)} V at {significant(level)} RPM"
+        rows.append((what, tuned, f"{rule}, under Eq. 12's gains"))
+    return Table("Required beside the cost.", ("what", "found", "allowed"), tuple(rows))
+
+
+def _judged(name: str, judged: Mapping[str, Any]) -> Table:
+    rows = tuple(
+        (x["name"], x["shown"], x["limit"], x["verdict"], x["meaning"]) for x in judged["lines"]
+    )
+    header = ("question", "found", "limit", "verdict", "what it says")
+    return Table(f"{name.capitalize()}: {judged['verdict']}.", header, rows)
 
 
 def _ms(seconds: float | None) -> float | None:

@@ -1,0 +1,113 @@
+"""`Requirements`: what tuned gains must bear whatever they cost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..constraints import Constraints
+from ..control import Controller, Fopdt
+from ..errors import FitError, SettingError
+from ..linear_plant import sampled
+from ..load_step import LoadStep
+from ..models import Ensemble, Model
+from ..robustness import margins
+from ..tuning import recoveries
+from .demands import Demands
+from .references import pace_of
+
+LOAD = 0.1
+"""Of the largest command: the load that comes on unless another is asked for."""
+LEVEL = 0.75
+"""Of the top speed, where it comes on and where networks are linearised."""
+RECOVERED = 0.01
+"""Of what the load would do to the speed without control."""
+AS_IT_IS = ((1.0, 0),)
+
+
+@dataclass(frozen=True)
+class Requirements:
+    """A load step that no plant recovers from later than under the rule's gains; a largest Ms.
+
+    Attributes
+    ----------
+    loads : tuple of LoadStep
+        Empty where none is required.
+    rival : Controller or None
+        The rule's gains; None where a member runs away under these.
+    constraints : Constraints
+    """
+
+    loads: tuple[LoadStep, ...] = ()
+    rival: Controller | None = None
+    constraints: Constraints = field(default_factory=Constraints)
+
+    @classmethod
+    def of(
+        cls, ensemble: Ensemble, fopdt: Fopdt, rival: Controller, demands: Demands
+    ) -> Requirements:
+        """What is required of gains for these members."""
+        loads = _load_steps(fopdt, demands, rival.Ts)
+        bears = bool(loads) and _bears(rival, ensemble, loads)
+        linear = _linear(ensemble.members, demands, rival.Ts) if demands.Ms is not None else []
+        constraints = Constraints(
+            Ms=demands.Ms if linear else None,
+            recovery=rival if bears else None,
+            plant=linear or None,
+            speed=LEVEL * demands.speed,
+        )
+        return cls(loads if bears else (), rival if bears else None, constraints)
+
+    def met(self, controller: Controller, ensemble: Ensemble) -> dict[str, Any]:
+        """What a controller does of it on the members as they are, as JSON values."""
+        members = self.constraints.plant or ()
+        told: dict[str, Any] = {
+            "Ms_limit": self.constraints.Ms,
+            "Ms": [margins(controller, m, speed=self.constraints.speed).Ms for m in members],
+        }
+        if self.rival is None:
+            return told | {"load": None}
+        step = self.loads[0]
+        of = {"tuned": controller, "rule": self.rival}
+        recovery = {
+            name: recoveries(c, ensemble, self.loads, variations=AS_IT_IS)[:, 0].tolist()
+            for name, c in of.items()
+        }
+        load = {"level": step.level, "disturbance": step.disturbance, "band": step.band}
+        return told | {"load": load, "recovery_ms": recovery}
+
+
+def _load_steps(fopdt: Fopdt, demands: Demands, Ts: float) -> tuple[LoadStep, ...]:
+    """One that brakes, at three quarters of the top speed."""
+    volt = LOAD * demands.u_max if demands.load is None else demands.load
+    if volt == 0.0:
+        return ()
+    pace = pace_of(fopdt, demands)
+    return (
+        LoadStep(
+            LEVEL * demands.speed, -volt, band=RECOVERED * volt * fopdt.K,
+            ramp=0.3 * pace, settle=0.5 * pace, look=0.5 * pace,
+        ),
+    )  # fmt: skip
+
+
+def _bears(rival: Controller, ensemble: Ensemble, loads: Sequence[LoadStep]) -> bool:
+    """Whether the rule's gains can be measured by: no member runs away under them."""
+    try:
+        return bool(np.isfinite(recoveries(rival, ensemble, loads)).all())
+    except FitError:
+        return False
+
+
+def _linear(members: Sequence[Model], demands: Demands, Ts: float) -> list[Model]:
+    """Members that can be linearised where the load comes on."""
+    found = []
+    for member in members:
+        with suppress(SettingError):
+            sampled(member, Ts, LEVEL * demands.speed)
+            found.append(member)
+    return found
