@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bench_tuning import genetic
 from sewfast import (
     Commissioning,
     Controller,
@@ -30,22 +31,32 @@ from sewfast import (
 )
 from sewfast.commissioning.bench import MachineBench
 from sewfast.commissioning.demands import Demands, demands
-from sewfast.commissioning.gains import search
+from sewfast.commissioning.gains import ruled, search, start_of
 from sewfast.commissioning.references import standard
 from sewfast.loop import ClosedLoopRun
+from sewfast.rules import eq_12
+from two_degrees import answer, eq_12_controller
 
 MACHINES = ("virtual", "virtual:1", "virtual:2", "virtual:3", "virtual:4")
 WEIGHTS = Cost(tracking=1.0, chatter=5.0, overshoot=0.0, saturation=0.0)
 OVERSHOOT = 3.0
 FRICTION = ("coulomb_torque", "stribeck_torque", "viscous_friction")
+INF = float("inf")
 GOALS = {
     "oracle": (1.4, 1.15, "cost against the oracle's"),
-    "rule": (0.5, 0.35, "cost against the rule's gains"),
+    "rule": (0.5, 0.35, "cost against that of Eq. 12's gains, the filter's delay counted"),
+    "rule_bare": (0.5, 0.35, "the same, the filter's delay not counted"),
+    "rule_ms": (0.5, 0.35, "the same with Ms of at most 2"),
+    "first": (INF, INF, "cost against that of the first gains (Ms of at most 1.8)"),
     "prediction": (10.0, 5.0, "prediction against machine, worst reference [RPM rms]"),
     "edge": (60.0, 20.0, "unseen edge, 0 to 2,000 RPM in 80 ms [RPM rms]"),
     "worst": (1.5, 1.1, "worst of 18 altered machines against the oracle's worst"),
+    "load": (1.0, 1.0, "recovery from a load of .3 N m at 1,500 RPM, against Eq. 12's"),
+    "load_ms": (INF, INF, "the same [ms]"),
+    "load_rule_ms": (INF, INF, "the same, Eq. 12's [ms]"),
+    "Ms": (INF, INF, "Ms of the networks at 1,500 RPM, the largest"),
     "seconds": (40.0, 15.0, "whole commissioning, wall [s]"),
-    "user": (float("inf"), float("inf"), "whole commissioning, processor time [s]"),
+    "user": (INF, INF, "whole commissioning, processor time [s]"),
 }
 
 
@@ -56,7 +67,6 @@ class Figures:
     machine: str
     cost: float
     oracle_cost: float
-    rule_cost: float
     ratios: Mapping[str, float]
     notes: str
 
@@ -71,6 +81,7 @@ def main() -> int:
     parser.add_argument("--members", type=int)
     parser.add_argument("--evaluations", type=int)
     parser.add_argument("--oracle-seeds", type=int, default=1, help="the best of so many searches")
+    parser.add_argument("--genetic", type=int, default=20, help="seeds of the search (0: none)")
     parser.add_argument("-o", dest="out", type=Path, help="JSON to write")
     args = parser.parse_args()
     effort = {k: v for k, v in vars(args).items() if k in ("members", "evaluations") and v}
@@ -81,9 +92,11 @@ def main() -> int:
         found.append(_figures(name, args.seed, args.oracle_seeds, effort))
         print(_line(found[-1]), flush=True)
     print("\n" + _table(found))
+    if args.genetic:
+        print("\n" + genetic(args.genetic))
     if args.out is not None:
         args.out.write_text(json.dumps([vars(f) for f in found], default=dict, indent=1))
-    return 0 if all(_met(found, key) for key in GOALS if key not in ("seconds",)) else 1
+    return 0 if all(_met(found, key) for key in GOALS if key != "seconds") else 1
 
 
 def _figures(name: str, seed: int, oracle_seeds: int, effort: Mapping[str, int]) -> Figures:
@@ -100,7 +113,7 @@ def _figures(name: str, seed: int, oracle_seeds: int, effort: Mapping[str, int])
     costs = {
         key: _cost(controller, machine, references)
         for key, controller in (
-            ("own", found.controller), ("oracle", oracle), ("rule", found.first),
+            ("own", found.controller), ("oracle", oracle), *_rules(found).items(),
         )
     }  # fmt: skip
     apart = [c.apart for c in found.comparisons if c.apart is not None]
@@ -110,15 +123,42 @@ def _figures(name: str, seed: int, oracle_seeds: int, effort: Mapping[str, int])
     }
     ratios = {
         "oracle": costs["own"] / costs["oracle"],
-        "rule": costs["own"] / costs["rule"],
+        **{key: costs["own"] / costs[key] for key in _rules(found)},
         "prediction": max(apart),
         "edge": _edge(found, machine),
         "worst": worst["own"] / worst["oracle"],
+        **_load(found, machine),
         "seconds": seconds,
         "user": user,
     }
     notes = f"worst {worst['own']:.2f} (oracle's {worst['oracle']:.2f})"
-    return Figures(name, costs["own"], costs["oracle"], costs["rule"], ratios, notes)
+    return Figures(name, costs["own"], costs["oracle"], ratios, notes)
+
+
+def _rules(found: Commissioning) -> dict[str, Controller]:
+    """Eq. 12's gains on the same step response, and the first ones."""
+    assert found.fopdt is not None
+    assert found.first is not None
+    like = found.first
+    bare = eq_12(found.fopdt)
+    limited = eq_12(found.fopdt, Ms=2.0)
+    return {
+        "rule": eq_12_controller(found.fopdt, like),
+        "rule_bare": replace(like, gains=bare.gains, alpha=bare.alpha, beta=bare.beta),
+        "rule_ms": replace(like, gains=limited.gains, alpha=limited.alpha, beta=limited.beta),
+        "first": like,
+    }
+
+
+def _load(found: Commissioning, machine: VirtualMachine) -> dict[str, float]:
+    """Recovery from a load that tuning has not seen, in torque, beside Eq. 12's [ms]."""
+    assert found.controller is not None
+    assert found.met is not None
+    own = answer(found.controller, machine)["recovery_ms"]
+    rule = answer(_rules(found)["rule"], machine)["recovery_ms"]
+    return {
+        "load": own / rule, "load_ms": own, "load_rule_ms": rule, "Ms": max(found.met["Ms"]),
+    }  # fmt: skip
 
 
 def _asked(machine: VirtualMachine, seed: int, found: Commissioning) -> Demands:
@@ -141,12 +181,13 @@ def _oracle(
     assert found.first is not None
     assert found.cost is not None
     practice = standard(found.fopdt, asked, machine.Ts, short=True)
+    assert found.fopdt is not None
+    rule = ruled(found.fopdt, found.first)
+    start = start_of(rule, machine, practice, found.cost, asked.threads)
     tried = []
     for seed in range(seeds):
         again = replace(asked, seed=seed, evaluations=ORACLE_EVALUATIONS)
-        result = search(
-            machine, practice, found.first, again, found.cost, _quiet, variations=((1.0, 0),)
-        )
+        result = search(machine, practice, start, again, found.cost, _quiet, variations=((1.0, 0),))
         tried.append(result.controller)
     return min(tried, key=lambda c: _cost(c, machine, references))
 
@@ -202,10 +243,7 @@ def _edge(found: Commissioning, machine: VirtualMachine) -> float:
 
 def _line(f: Figures) -> str:
     shown = ", ".join(f"{key} {value:.2f}" for key, value in f.ratios.items())
-    return (
-        f"{f.machine}: cost {f.cost:.2f}, oracle's {f.oracle_cost:.2f}, rule's {f.rule_cost:.1f}; "
-        f"{shown}; {f.notes}"
-    )
+    return f"{f.machine}: cost {f.cost:.2f}, oracle's {f.oracle_cost:.2f}; {shown}; {f.notes}"
 
 
 def _met(found: Sequence[Figures], key: str) -> bool:

@@ -68,7 +68,7 @@ def _rule(fopdt: Fopdt, late: float, Ms: float) -> Rule:
     time than the plant's: conservative. Beyond its largest SIMC's PI stands for it.
     """
     L = max(fopdt.L + late, min(RATIOS) * fopdt.T)
-    if L / fopdt.T > max(RATIOS):
+    if max(RATIOS) < L / fopdt.T:
         return simc(replace(fopdt, L=L))
     return eq_12(replace(fopdt, L=L), Ms=Ms)
 
