@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo accuracy commissioning bench bench-parts bench-device clean $(MARKED)
+.PHONY: help demo accuracy commissioning bench bench-parts counts bench-device clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -112,6 +112,9 @@ SOAKED := tests/test_soak.py tests/test_watchdog.py tests/test_recordfile_kill.p
 soak: $(DEV) ## the link's figures at full count: hours of faults, kills, flips, hostile bytes (docs/RESULTS.md)
 	SEWFAST_SOAK=1 cargo test --package sewfast-control --package sewfast-link --release --quiet
 	SEWFAST_SOAK=1 $(BIN)/python -m pytest -s $(SOAKED)
+
+counts: $(DEV) ## instructions of the kernels beside those kept in benches/counts.json (valgrind; Linux)
+	$(BIN)/python benches/counts.py
 
 bench-device: ## what a control period of the device costs on this machine
 	cargo run --release --quiet --package sewfast-control --example device_step

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Mapping
 from typing import Literal, TypeAlias
 
@@ -16,6 +15,7 @@ from .models.base import INIT
 from .recipes import Clock, Progress, Task
 from .recipes.output import OUTPUTS
 from .recipes.structure import Structure
+from .threads import available
 from .workers import Workers, require_workers
 
 Kind: TypeAlias = Literal[
@@ -99,7 +99,7 @@ def identify(
         Data to select on, from which nothing is learned. None holds out the last fifth of every
         experiment (two of eight blocks for `neural_oe`).
     threads : int or None
-        None uses every core.
+        None uses every core, or as many as the environment variable SEWFAST_THREADS allows.
     workers : executor or None
         Where the starts of `auto` and `neural_ss` are trained: a `concurrent.futures.Executor`, a
         Dask client, or anything with `map(function, jobs)`. None: threads of this process.
@@ -157,7 +157,7 @@ def identify(
         starts=starts,
         seed=seed,
         iterations=iterations,
-        threads=_cores() if threads is None else threads,
+        threads=available() if threads is None else threads,
         progress=progress,
         workers=workers,
         clock=Clock(time_budget),
@@ -270,9 +270,3 @@ def _sizes(task: Task, kind: str) -> tuple[int, int]:
     if kind in ("neural_oe", "paper"):
         parameters += task.hidden_or_usual * (regressors + 2)
     return lag, parameters
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from .load_step import LoadStep
 from .loop import check_fits, reference_samples
 from .plants import Plants, References, each_plant, each_reference
 from .starting import assumed, first_controller
+from .threads import available
 from .variables import Wanted, wanted
 
 Progress: TypeAlias = Callable[[int, int, float], object]
@@ -123,8 +123,8 @@ class TuningTask:
 
 
 def threads_or_all(threads: int | None) -> int:
-    """The number of threads; all processors by default."""
-    return whole("threads", os.cpu_count() or 1 if threads is None else threads)
+    """The number of threads; by default all that are available."""
+    return whole("threads", available() if threads is None else threads)
 
 
 def default_variations(controller: Controller) -> tuple[tuple[float, int], ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ from ..cost import Cost, terms
 from ..errors import FitError, SettingError
 from ..loop import Plant, run
 from ..robustness import margins
+from ..threads import available
 from .points import PlantPoint, plant_points
 
 J = TypeVar("J")
@@ -101,5 +101,5 @@ class Task:
 
 def each(function: Callable[[J], R], jobs: Sequence[J], threads: int | None) -> list[R]:
     """In the order of the jobs, on threads: the compiled runs release the interpreter."""
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(threads or available()) as pool:
         return list(pool.map(function, jobs))

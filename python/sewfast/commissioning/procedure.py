@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -17,6 +16,7 @@ from ..dataset import FloatArray
 from ..errors import DataError, Interrupted, SettingError
 from ..machine import VirtualMachine
 from ..models import Ensemble
+from ..threads import available
 from ..tuning import TuningResult
 from . import excitations
 from .agreement import agreeing
@@ -133,7 +133,7 @@ def commission(
             members=members,
             evaluations=evaluations,
             seed=seed,
-            threads=os.cpu_count() or 1 if threads is None else threads,
+            threads=available() if threads is None else threads,
             load=load,
             Ms=Ms,
             time_budget=time_budget,

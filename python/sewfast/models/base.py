@@ -19,7 +19,7 @@ from ..dataset import (
     require_dataset,
     require_same_units,
 )
-from ..errors import DataError, SettingError
+from ..errors import DataError, SettingError, SewfastError
 from .choice import choice_lines
 
 if TYPE_CHECKING:
@@ -137,8 +137,12 @@ class Model(ABC):
             Where the model is unstable on this input.
         """
         self._require_match(data)
-        data.require_inputs()
-        return [self.core.simulate(e.u, self.initial_state(e, init)) for e in data.experiments]
+        try:
+            return [self.core.simulate(e.u, self.initial_state(e, init)) for e in data.experiments]
+        except SewfastError:
+            # the core looks at every input, too, but does not know where it came from
+            data.require_inputs()
+            raise
 
     def predict(self, data: Dataset, horizon: int = 1, *, init: int = INIT) -> list[FloatArray]:
         """Outputs `horizon` steps ahead of the measured ones.
@@ -211,7 +215,8 @@ class Model(ABC):
         return state
 
     def _require_match(self, data: Dataset) -> None:
-        require_dataset(data, "data")
+        if not isinstance(data, Dataset):
+            require_dataset(data, "data")
         if data.n_inputs != len(self.input_names):
             raise DataError(
                 f"{data.source}: expected {len(self.input_names)} inputs "

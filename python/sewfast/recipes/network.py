@@ -59,6 +59,7 @@ def paper(task: Task) -> Model:
         starts=_starts(task),
         seed=task.seed,
         threads=task.threads,
+        initial_theta=None,
         progress=task.progress,
     )
     story = {"preset": "paper", "initial_state": "measured"}
@@ -121,6 +122,7 @@ def _network_fit(
         starts=_starts(task),
         seed=task.seed,
         threads=task.threads,
+        initial_theta=None,
         progress=task.progress,
     )
     if fit.termination == "interrupted":
