@@ -11,13 +11,13 @@
 //! makes the output jump, and the integral of `E_r` then grows with the logarithm of its upper limit: it is taken up to
 //! `1000/L`, where alpha and beta agree best with Table 1. The integral of `E_d` converges.
 
-use nalgebra::Complex;
-use std::f64::consts::PI;
+mod locus;
+mod search;
 
 use super::Rule;
-use super::simplex::minimised;
 use crate::error::shown;
 use crate::{Error, Result};
+use locus::Locus;
 use sewfast_control::Standard;
 
 /// The range of `L/T` that the rule is made for.
@@ -26,15 +26,8 @@ const RATIOS: (f64, f64) = (0.01, 2.0);
 const TOP: (f64, f64) = (100.0, 1000.0);
 /// The same while searching: gains change by less than 1e-4.
 const SEARCHED: f64 = 25.0;
-/// Nodes and weights of Gauss and Legendre from -1 to 1.
-const GAUSS: [(f64, f64); 6] = [
-    (-0.932_469_514_203_152, 0.171_324_492_379_170_35),
-    (-0.661_209_386_466_264_5, 0.360_761_573_048_138_6),
-    (-0.238_619_186_083_196_93, 0.467_913_934_572_691_05),
-    (0.238_619_186_083_196_93, 0.467_913_934_572_691_05),
-    (0.661_209_386_466_264_5, 0.360_761_573_048_138_6),
-    (0.932_469_514_203_152, 0.171_324_492_379_170_35),
-];
+/// No loop of the least cost without a limit has a smaller `max |S|`, at any ratio.
+const FREE: f64 = 1.9;
 
 /// What a set of gains costs, with `K = T = 1`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -54,6 +47,20 @@ pub struct Costs {
 pub fn eq_12(k: f64, t: f64, l: f64, ms: f64) -> Result<(Rule, Costs)> {
     super::require_plant(k, t, l)?;
     let ratio = l / t;
+    check(ratio, ms)?;
+    let (locus, reference) = (Locus::up_to(ratio, TOP.0), Locus::up_to(ratio, TOP.1));
+    let best = least(&Locus::up_to(ratio, SEARCHED), ms)?;
+    let (alpha, beta) = reference.weights(best);
+    let costs = locus.costs(&reference, best, alpha, beta);
+    let gains = Standard {
+        kp: best.kp / k,
+        ti: best.ti * t,
+        td: best.td * t,
+    };
+    Ok((Rule { gains, alpha, beta }, costs))
+}
+
+fn check(ratio: f64, ms: f64) -> Result<()> {
     if !(RATIOS.0 * (1.0 - 1e-12)..=RATIOS.1 * (1.0 + 1e-12)).contains(&ratio) {
         return Err(Error::setting(format!(
             "expected L/T from .01 to 2 for Eq. 12, got {}; add the feedback filter's delay to L, or take simc or amigo",
@@ -66,20 +73,21 @@ pub fn eq_12(k: f64, t: f64, l: f64, ms: f64) -> Result<(Rule, Costs)> {
             "expected a limit of Ms above 1.1, or inf, got {ms}; 1.4 to 2 is usual"
         )));
     }
-    let (locus, searched) = (Locus::up_to(ratio, TOP.0), Locus::up_to(ratio, SEARCHED));
-    let mut best = searched.free();
-    if searched.peak(best) > ms {
-        best = searched.bounded(best, ms)?;
+    Ok(())
+}
+
+fn least(locus: &Locus, ms: f64) -> Result<Standard<f64>> {
+    if ms > FREE {
+        let free = locus.free();
+        if locus.peak(free) <= ms {
+            return Ok(free);
+        }
     }
-    let reference = Locus::up_to(ratio, TOP.1);
-    let (alpha, beta) = reference.weights(best);
-    let costs = locus.costs(&reference, best, alpha, beta);
-    let gains = Standard {
-        kp: best.kp / k,
-        ti: best.ti * t,
-        td: best.td * t,
-    };
-    Ok((Rule { gains, alpha, beta }, costs))
+    locus.bounded(ms).ok_or_else(|| {
+        Error::fit(format!(
+            "expected gains with Ms of at most {ms}, found none; allow a larger Ms"
+        ))
+    })
 }
 
 /// What gains for `L/T` cost with `K = T = 1`: `kp` is `Kp K`, `ti` and `td` are in units of `T`.
@@ -96,255 +104,6 @@ pub fn costs(ratio: f64, gains: Standard<f64>, alpha: f64, beta: f64) -> Result<
     }
     let (locus, reference) = (Locus::up_to(ratio, TOP.0), Locus::up_to(ratio, TOP.1));
     Ok(locus.costs(&reference, gains, alpha, beta))
-}
-
-/// A frequency with what does not depend on the gains.
-struct Node {
-    omega: f64,
-    /// Of the quadrature, times the frequency.
-    weight: f64,
-    /// `e^(sL)`, and `P e^(sL)` with its two derivatives.
-    turn: Complex<f64>,
-    p: [Complex<f64>; 3],
-}
-
-impl Node {
-    fn at(omega: f64, weight: f64, l: f64) -> Self {
-        let s = Complex::new(0.0, omega);
-        let turn = (s * l).exp();
-        let (p, first) = (s + s * s, s * 2.0 + 1.0);
-        let p = [
-            p,
-            first + p * l,
-            Complex::new(2.0, 0.0) + first * (2.0 * l) + p * (l * l),
-        ]
-        .map(|x| x * turn);
-        Self {
-            omega,
-            weight: weight * omega,
-            turn,
-            p,
-        }
-    }
-
-    /// `Q` and its two derivatives.
-    fn q(&self, g: Standard<f64>) -> [Complex<f64>; 3] {
-        let (s, kp) = (Complex::new(0.0, self.omega), g.kp);
-        let terms = [
-            s + s * s * g.td + 1.0 / g.ti,
-            s * (2.0 * g.td) + 1.0,
-            Complex::new(2.0 * g.td, 0.0),
-        ];
-        std::array::from_fn(|i| self.p[i] + terms[i] * kp)
-    }
-
-    /// `E_d` and its two derivatives.
-    fn error(&self, g: Standard<f64>) -> [Complex<f64>; 3] {
-        let [q, first, second] = self.q(g);
-        let e = q.inv();
-        let e2 = e * e;
-        [e, -first * e2, first * first * e2 * e * 2.0 - second * e2]
-    }
-
-    /// `1 + F_1 G`, the inverse of `S`.
-    fn return_difference(&self, g: Standard<f64>) -> Complex<f64> {
-        self.q(g)[0] / self.p[0]
-    }
-}
-
-struct Locus {
-    l: f64,
-    nodes: Vec<Node>,
-}
-
-impl Locus {
-    fn up_to(l: f64, top: f64) -> Self {
-        let mut edges = vec![0.0];
-        let (low, high): (f64, f64) = (1e-3, 1.0 / l);
-        edges.extend((0..=40).map(|i| low * (high / low).powf(f64::from(i) / 40.0)));
-        let steps = (2.0 * (top - 1.0)) as usize;
-        edges.extend((1..=steps).map(|i| (1.0 + 0.5 * i as f64) / l));
-        let mut nodes = Vec::with_capacity(6 * edges.len());
-        for pair in edges.windows(2) {
-            let (middle, half) = (0.5 * (pair[0] + pair[1]), 0.5 * (pair[1] - pair[0]));
-            nodes.extend(
-                GAUSS
-                    .iter()
-                    .map(|(x, w)| Node::at(middle + half * x, half * w, l)),
-            );
-        }
-        Self { l, nodes }
-    }
-
-    /// Eq. 12 after a step of the disturbance.
-    fn disturbance(&self, g: Standard<f64>) -> f64 {
-        if !self.is_stable(g) {
-            return f64::INFINITY;
-        }
-        self.nodes
-            .iter()
-            .map(|n| n.weight * n.error(g)[2].norm_sqr())
-            .sum()
-    }
-
-    /// By the argument principle: `1 + F_1 G` turns by a quarter from the integrator's phase, and at high frequencies
-    /// circles 1 with radius `Kp Td`.
-    fn is_stable(&self, g: Standard<f64>) -> bool {
-        if g.kp * g.td >= 1.0 {
-            return false;
-        }
-        let mut last = self.nodes[0].return_difference(g);
-        let mut turned = 0.0;
-        for node in &self.nodes[1..] {
-            let next = node.return_difference(g);
-            turned += (next * last.conj()).arg();
-            last = next;
-        }
-        turned > 0.0 && turned < PI
-    }
-
-    /// `max |S|`; infinite where the loop is unstable.
-    fn peak(&self, g: Standard<f64>) -> f64 {
-        if !self.is_stable(g) {
-            return f64::INFINITY;
-        }
-        let distance = |n: &Node| n.return_difference(g).norm_sqr();
-        let nearest = self.nodes.iter().enumerate().map(|(i, n)| (i, distance(n)));
-        let (i, _) = nearest.fold((0, f64::INFINITY), |a, b| if b.1 < a.1 { b } else { a });
-        let end = self.nodes.len() - 1;
-        let (mut low, mut high) = (
-            self.nodes[i.saturating_sub(1)].omega,
-            self.nodes[(i + 1).min(end)].omega,
-        );
-        let at = |omega: f64| distance(&Node::at(omega, 0.0, self.l));
-        for _ in 0..40 {
-            let third = (high - low) / 3.0;
-            if at(low + third) < at(high - third) {
-                high -= third
-            } else {
-                low += third
-            }
-        }
-        let limit = 1.0 / (1.0 - g.kp * g.td);
-        (1.0 / at(0.5 * (low + high)).sqrt()).max(limit)
-    }
-
-    /// The gains of the least cost.
-    fn free(&self) -> Standard<f64> {
-        let l = self.l;
-        let start = [
-            1.22 / l,
-            2.6 * l / (1.0 + 0.92 * l),
-            0.41 * l / (1.0 + 0.15 * l),
-        ]
-        .map(f64::ln);
-        let gains = |x: &[f64; 3]| Standard {
-            kp: x[0].exp(),
-            ti: x[1].exp(),
-            td: x[2].exp(),
-        };
-        gains(&minimised(start, 0.1, |x| self.disturbance(gains(x)).ln()))
-    }
-
-    /// The gains of the least cost on the boundary `max |S| = ms`, from gains beyond it.
-    fn bounded(&self, from: Standard<f64>, ms: f64) -> Result<Standard<f64>> {
-        let gains = |x: &[f64; 2]| {
-            let times = Standard {
-                kp: 0.0,
-                ti: x[0].exp(),
-                td: x[1].exp(),
-            };
-            self.largest(times, ms)
-        };
-        let start = [from.ti.ln(), (0.8 * from.td).ln()];
-        let best = minimised(start, 0.2, |x| {
-            gains(x).map_or(f64::INFINITY, |g| self.disturbance(g).ln())
-        });
-        gains(&best).ok_or_else(|| {
-            Error::fit(format!(
-                "expected gains with Ms of at most {ms}, found none; allow a larger Ms"
-            ))
-        })
-    }
-
-    /// The largest `Kp` up to which `max |S|` keeps below `ms`; none where only nothing does.
-    fn largest(&self, times: Standard<f64>, ms: f64) -> Option<Standard<f64>> {
-        let with = |kp: f64| Standard { kp, ..times };
-        let allowed = |kp: f64| self.peak(with(kp)) <= ms;
-        let (mut low, mut high) = (0.0, 0.99 / times.td.max(0.4 * self.l));
-        for _ in 0..20 {
-            let middle = 0.5 * (low + high);
-            if allowed(middle) {
-                low = middle
-            } else {
-                high = middle
-            }
-        }
-        (low > 0.0).then(|| with(low))
-    }
-
-    /// Second derivatives of the error after a step of the reference: without weights, by alpha and by beta.
-    fn by_weights(&self, n: &Node, g: Standard<f64>) -> [Complex<f64>; 3] {
-        let (s, l) = (Complex::new(0.0, n.omega), self.l);
-        let [e, first, second] = n.error(g);
-        let a = s + 1.0;
-        let a = [a, a * l + 1.0, a * (l * l) + 2.0 * l].map(|x| x * n.turn);
-        let plain = a[2] * e + a[1] * first * 2.0 + a[0] * second;
-        [
-            plain,
-            second * g.kp,
-            (first * 2.0 + s * second) * (g.kp * g.td),
-        ]
-    }
-
-    /// Alpha and beta of the least cost after a step of the reference.
-    fn weights(&self, g: Standard<f64>) -> (f64, f64) {
-        let mut m = [0.0; 5];
-        for n in &self.nodes {
-            let [plain, a, b] = self.by_weights(n, g);
-            let dot = |x: Complex<f64>, y: Complex<f64>| n.weight * (x.conj() * y).re;
-            for (sum, more) in m.iter_mut().zip([
-                dot(a, a),
-                dot(a, b),
-                dot(b, b),
-                dot(a, plain),
-                dot(b, plain),
-            ]) {
-                *sum += more;
-            }
-        }
-        let [aa, ab, bb, ap, bp] = m;
-        let determinant = aa * bb - ab * ab;
-        if g.td == 0.0 || determinant == 0.0 {
-            return (-ap / aa, 0.0);
-        }
-        (
-            (ab * bp - bb * ap) / determinant,
-            (ab * ap - aa * bp) / determinant,
-        )
-    }
-
-    fn reference(&self, g: Standard<f64>, alpha: f64, beta: f64) -> f64 {
-        let cost = |n: &Node| {
-            let [plain, a, b] = self.by_weights(n, g);
-            n.weight * (plain + a * alpha + b * beta).norm_sqr()
-        };
-        self.nodes.iter().map(cost).sum()
-    }
-
-    fn costs(&self, wide: &Self, g: Standard<f64>, alpha: f64, beta: f64) -> Costs {
-        let disturbance = self.disturbance(g);
-        let reference = if disturbance.is_finite() {
-            wide.reference(g, alpha, beta)
-        } else {
-            f64::INFINITY
-        };
-        Costs {
-            disturbance,
-            reference,
-            ms: self.peak(g),
-        }
-    }
 }
 
 #[cfg(test)]
@@ -432,6 +191,35 @@ mod tests {
         );
         assert!((large.gains.kp / (small.gains.kp / -4.0) - 1.0).abs() < 1e-6);
         assert!((large.gains.ti / (small.gains.ti * 0.5) - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn no_loop_without_a_limit_is_calmer_than_where_one_is_searched_for() {
+        for i in 0..12 {
+            let ratio = 0.01 * 200.0_f64.powf(f64::from(i) / 11.0);
+            assert!(solved(ratio, f64::INFINITY).1.ms > FREE, "{ratio}");
+        }
+    }
+
+    /// The largest gain is that of the quadratic of every frequency, not only of those at the nodes.
+    #[test]
+    fn the_largest_gain_is_where_the_peak_reaches_the_limit() {
+        for (ratio, ti, td) in [
+            (0.05, 0.2, 0.0),
+            (0.1, 0.25, 0.04),
+            (0.1, 0.25, 0.2),
+            (0.7, 1.0, 0.2),
+            (2.0, 2.0, 0.6),
+        ] {
+            let locus = Locus::up_to(ratio, SEARCHED);
+            for ms in [1.2, 1.7, 2.5] {
+                let g = locus.largest(ti, td, ms).unwrap();
+                assert!(
+                    (locus.peak(g) / ms - 1.0).abs() < 1e-6,
+                    "{ratio} {ms} {g:?}"
+                );
+            }
+        }
     }
 
     #[test]
