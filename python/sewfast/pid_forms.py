@@ -1,4 +1,4 @@
-"""A controller's PID as MATLAB's objects and python-control's, and back from MATLAB's.
+"""A controller's PID as MATLAB's objects and python-control's, and back from them.
 
 MATLAB's discrete PID with both formulas `BackwardEuler` is this package's, term by term:
 
@@ -14,6 +14,9 @@ from .control import Controller
 from .errors import SettingError
 from .gains import Gains, real
 from .loop import require_controller
+from .pid_fractions import from_control
+
+__all__ = ["from_control", "from_matlab", "matlab_code", "to_control", "to_matlab"]
 
 Object: TypeAlias = Literal["pid", "pid2", "pidstd", "pidstd2"]
 
@@ -145,7 +148,8 @@ def to_control(controller: Controller) -> Any:
     """`control.StateSpace` from `[r, y]` to `u`, feedback filters included, dt = Ts.
 
     Equal to the controller itself where no limit, ramp or schedule acts and the run begins at
-    zero. `control.tf(...)` of it is a pair of transfer functions.
+    zero. `control.tf(...)` of it is a pair of transfer functions; `from_control` reads it back
+    where there is no feedback filter.
 
     Raises
     ------
