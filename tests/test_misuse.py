@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+import signal
 import stat
 from collections.abc import Callable
 from dataclasses import replace
@@ -231,3 +232,21 @@ def test_limits_of_a_virtual_machine_are_not_passed_over(tmp_path: Path) -> None
         tmp_path, "commission", "--on", "virtual", "--out", "x", "--limits", "a=1", done=2
     )
     assert "--limits" in done.err
+
+
+def test_ctrl_c_is_heard_by_work_that_has_no_result_yet() -> None:
+    """It was lost where work ended without having looked: the next stage went on."""
+    u = np.repeat([0.0, 1.0], [1000, 60_000])
+    y = PLANT.response((np.arange(len(u)) - 1000) * 0.001)
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.05)
+        with pytest.raises(KeyboardInterrupt):
+            fit_fopdt(u, y, Ts=0.001)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)

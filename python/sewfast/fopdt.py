@@ -100,7 +100,8 @@ def fit_fopdt(
     Least squares over K, T, L and the level before the step. The record is used from its start to
     the second step of the input; the first may be anywhere after some samples. Samples on a limit
     of the output have no weight, and a machine that was not at rest is fitted with its free
-    response. Standard errors are in sandwich form (Andrews 1991), as residuals are coloured.
+    response where that is three of its standard errors. Standard errors hold for residuals of any
+    colour, which are whitened by an autoregression (Andrews, Monahan 1992).
 
     Parameters
     ----------

@@ -5,7 +5,7 @@ mod confidence;
 use nalgebra::{Matrix3, Vector3};
 
 use crate::error::shown;
-use crate::{Error, Record, Result};
+use crate::{Error, Monitor, Record, Result};
 
 /// `K e^(-sL) / (1 + sT)` about an operating point, with the story of its fit.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -51,23 +51,26 @@ const ROUNDS: usize = 26;
 ///
 /// `K` and the level before the step follow by linear least squares for each `T` and `L` of a search that is narrowed
 /// until its steps are below a millionth. The record is used from its start to the next step of the input. Where a response with
-/// the same `T` that began before the record lowers the squares by a percent, it is part of the fit. Samples at the largest
+/// the same `T` that began before the record lowers the squares by a percent and is three of its standard errors, it is part of the fit. Samples at the largest
 /// output have no weight where the response without them would go on beyond: the output was limited there.
 ///
 /// # Errors
 /// `ErrorKind::Data` without a step, with too few samples after it or a response that does not settle or drowns in
-/// noise; `ErrorKind::Setting` for several inputs or an unusable sample time.
-pub fn fit_fopdt(record: Record<'_>, ts: f64) -> Result<Fopdt> {
+/// noise; `ErrorKind::Setting` for several inputs or an unusable sample time; `ErrorKind::Fit` on a stop.
+pub fn fit_fopdt(record: Record<'_>, ts: f64, monitor: &Monitor) -> Result<Fopdt> {
     if record.channels != 1 || !(ts > 0.0 && ts.is_finite()) {
         return Err(Error::setting(format!(
             "expected one input and a sample time above 0 s, got {} inputs and {ts} s",
             record.channels
         )));
     }
-    let mut step = Step::find(record)?;
+    let mut step = Step::find(record, monitor)?;
     let mut best = step.best();
     if let Some((used, beyond)) = step.without_limit(&best) {
         (step.used, best) = (used, beyond);
+    }
+    if monitor.stopped() {
+        return Err(Error::fit("expected time to search, got a stop"));
     }
     step.check(&best)?;
     let gain = best.rise / (step.u_high - step.u_low);
@@ -97,6 +100,7 @@ struct Step<'a> {
     used: Vec<bool>,
     /// Whether a free response is part of the fit.
     moving: bool,
+    monitor: &'a Monitor,
 }
 
 /// A candidate: `y(k) = level + rise (1 - exp(-(k - at - l)/t)) + free exp(-k/t)`.
@@ -127,7 +131,7 @@ impl Candidate {
 }
 
 impl<'a> Step<'a> {
-    fn find(record: Record<'a>) -> Result<Self> {
+    fn find(record: Record<'a>, monitor: &'a Monitor) -> Result<Self> {
         let u = record.u;
         let fold = |f: fn(f64, f64) -> f64| u.iter().copied().reduce(f).unwrap_or(0.0);
         let threshold = STEP_SHARE * (fold(f64::max) - fold(f64::min));
@@ -156,6 +160,7 @@ impl<'a> Step<'a> {
             u_high: mean(&u[at..end]),
             used: vec![true; end],
             moving: false,
+            monitor,
         })
     }
 
@@ -195,7 +200,7 @@ impl<'a> Step<'a> {
             // what helps at the best point of the other search is worth one of its own
             if clearly(&in_motion.candidate(from_rest.t, from_rest.l)) {
                 let found = in_motion.search();
-                if clearly(&found) {
+                if clearly(&found) && confidence::moves(&in_motion, &found) {
                     self.moving = true;
                     return found;
                 }
@@ -249,6 +254,9 @@ impl<'a> Step<'a> {
         let mut best = self.candidate(self.length() / 5.0, 0.0);
         for _ in 0..ROUNDS {
             for i in 0..GRID {
+                if self.monitor.stopped() {
+                    return best;
+                }
                 for j in 0..GRID {
                     let found = self.candidate(at_share(ln_t, i).exp(), at_share(l, j));
                     if found.cost < best.cost {

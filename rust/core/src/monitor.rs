@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 #[derive(Debug)]
 pub struct Monitor {
     stop: AtomicBool,
+    heard: AtomicBool,
     done: AtomicU64,
     total: AtomicU64,
     best: AtomicU64,
@@ -15,6 +16,7 @@ impl Default for Monitor {
     fn default() -> Self {
         Self {
             stop: AtomicBool::new(false),
+            heard: AtomicBool::new(false),
             done: AtomicU64::new(0),
             total: AtomicU64::new(0),
             best: AtomicU64::new(f64::INFINITY.to_bits()),
@@ -30,7 +32,16 @@ impl Monitor {
 
     /// True once a stop has been requested; long loops ask at least every 10 ms.
     pub fn stopped(&self) -> bool {
-        self.stop.load(Ordering::Relaxed)
+        let stopped = self.stop.load(Ordering::Relaxed);
+        if stopped {
+            self.heard.store(true, Ordering::Relaxed);
+        }
+        stopped
+    }
+
+    /// True once the computation has learned of a stop request: its result is then marked as interrupted.
+    pub fn heard(&self) -> bool {
+        self.heard.load(Ordering::Relaxed)
     }
 
     /// Announces how many steps the work has.
@@ -82,6 +93,6 @@ mod tests {
         let monitor = Monitor::default();
         assert!(!monitor.stopped());
         monitor.request_stop();
-        assert!(monitor.stopped());
+        assert!(!monitor.heard() && monitor.stopped() && monitor.heard());
     }
 }

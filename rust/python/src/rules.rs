@@ -33,7 +33,7 @@ fn fit_fopdt<'py>(
     Ts: f64,
 ) -> PyResult<Bound<'py, PyDict>> {
     let record = Record::new(slice(&u, "u")?, 1, slice(&y, "y")?).map_err(|e| raise(py, e))?;
-    let found = watched(py, None, |_| fit(record, Ts))?;
+    let found = watched(py, None, |monitor| fit(record, Ts, monitor))?;
     let dict = named(
         py,
         [

@@ -16,7 +16,7 @@ const PERIOD: Duration = Duration::from_millis(20);
 /// Runs `work` on a thread of its own, calls `progress(done, total, best_cost)` meanwhile and forwards Ctrl-C.
 ///
 /// After Ctrl-C the work is asked to stop and its best result so far is returned, marked as interrupted by
-/// the work itself; where it has none, `KeyboardInterrupt` is raised. Any other exception, of a signal handler
+/// the work itself; where it has none, or was done before it heard, `KeyboardInterrupt` is raised. Any other exception, of a signal handler
 /// or of `progress`, stops the work and is raised.
 pub fn watched<T: Send>(
     py: Python<'_>,
@@ -47,7 +47,7 @@ pub fn watched<T: Send>(
         let result = outcome.unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         match raised {
             Some(error) if !error.is_instance_of::<PyKeyboardInterrupt>(py) => Err(error),
-            Some(interrupt) => result.map_err(|_| interrupt),
+            Some(interrupt) => result.ok().filter(|_| monitor.heard()).ok_or(interrupt),
             None => result.map_err(|e| raise(py, e)),
         }
     })
