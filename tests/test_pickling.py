@@ -1,4 +1,4 @@
-"""Public values that are no live connection can be pickled, copied and handed to other processes."""
+"""Public values that are no live connection can be pickled, copied and sent to processes."""
 
 from __future__ import annotations
 
