@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import functools
 import json
+import signal
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +23,9 @@ from sewfast import (
     Commissioning,
     Controller,
     DataError,
+    Dataset,
     Ensemble,
+    FitError,
     Gains,
     Interrupted,
     LinearOE,
@@ -328,6 +332,37 @@ def test_an_interruption_keeps_what_there_is(stage: str, tmp_path: Path) -> None
     told = json.loads((tmp_path / "out" / "commissioning.json").read_text())
     assert told["verdict"] == "interrupted"
     assert load_controller(tmp_path / "out" / "controllers" / "tuned.json") == best.controller
+
+
+def test_ctrl_c_does_not_wait_for_what_cannot_be_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a member is told of itself after its training takes seconds and looks at no request."""
+    begun, over = threading.Event(), threading.Event()
+    waited: list[bool] = []
+
+    def deaf(data: Dataset, **options: Any) -> Any:
+        begun.set()
+        waited.append(not over.wait(60.0))
+        raise FitError("not trained")
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+
+    def alarm() -> None:
+        begun.wait()
+        signal.setitimer(signal.ITIMER_REAL, 0.05)
+
+    threading.Thread(target=alarm).start()
+    monkeypatch.setattr(training, "identify", deaf)
+    try:
+        with pytest.raises(Interrupted) as caught:
+            commission(VirtualMachine(), **SMALL)
+        assert not waited
+    finally:
+        over.set()
+        signal.signal(signal.SIGALRM, before)
+    assert caught.value.best.stage == "training"
 
 
 def test_an_interrupted_search_keeps_its_best_gains(

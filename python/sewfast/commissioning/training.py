@@ -131,13 +131,15 @@ def _members(
         except (FitError, InterruptedError):
             return
 
-    with ThreadPoolExecutor(min(demands.threads, demands.members)) as pool:
-        try:
-            for i, future in enumerate([pool.submit(one, i) for i in range(demands.members)]):
-                future.result()
-                progress(i + 1, demands.members)
-        except BaseException:
-            stopped.set()
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
+    pool = ThreadPoolExecutor(min(demands.threads, demands.members))
+    try:
+        for i, future in enumerate([pool.submit(one, i) for i in range(demands.members)]):
+            future.result()
+            progress(i + 1, demands.members)
+    except BaseException:
+        stopped.set()
+        # the evidence that follows a training cannot be stopped, nor is it waited for
+        pool.shutdown(wait=False, cancel_futures=True)
+        raise
+    pool.shutdown()
     return [m for m in done if m is not None]
