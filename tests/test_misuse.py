@@ -39,6 +39,7 @@ from sewfast.atomic import replace_file
 from sewfast.control import Fopdt
 from sewfast.errors import DataError, ModelFileError, SettingError, SewfastError
 from sewfast.pid_forms import to_control, to_matlab
+from sewfast.report.figures.front import NAMES
 from sewfast.robustness import loop_response
 from sewfast.trust import Limits, judge
 from sewfast.tuning import costs
@@ -250,3 +251,11 @@ def test_ctrl_c_is_heard_by_work_that_has_no_result_yet() -> None:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
+
+
+def test_every_objective_has_a_name_in_the_figure_of_a_front() -> None:
+    with pytest.raises(SettingError, match="objectives among") as refused:
+        pareto(drive(), EDGE, objectives=["tracking", "beauty"], evaluations=10)
+    told = str(refused.value).partition("among ")[2].partition(r",\ got")[0].partition(", got")[0]
+    known = told.replace(" and ", ", ").split(", ")
+    assert {"tracking", "recovery", "Ms"} <= set(known) <= set(NAMES)

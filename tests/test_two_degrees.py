@@ -1,6 +1,8 @@
 """Two degrees of freedom: tracking and the answer to a load are tuned one without the other."""
 
+import runpy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,32 +23,13 @@ F1 = [
     replace(FOLLOWING, gains=Gains.standard(0.04, 0.05, 0.003)),
     replace(FOLLOWING, gains=Gains.standard(0.02, 0.12, 0.006)),
 ]
+BENCH = runpy.run_path(str(Path(__file__).parents[1] / "benches" / "two_degrees.py"))
+model_following = BENCH["model_following"]
+"""A reference through a model of the wanted answer, and the command that is needed for it."""
 LATE = 4
 """Samples by which the feedback is late: half of one in the encoder, 3.5 in the mean of eight."""
 LOAD = 0.3
 """Torque that comes on while the speed is held [N m]."""
-
-
-def model_following(machine: VirtualMachine) -> tuple[FloatArray, FloatArray]:
-    """A reference through a model of the wanted answer, and the command that is needed for it.
-
-    The model is 1/(20 ms s + 1)^3, whose output can be differentiated twice.
-    """
-    wanted = np.interp(np.arange(1500), [100, 500, 1100, 1500], [0.0, 2000.0, 2000.0, 200.0])
-    pole = np.exp(-0.001 / 0.02)
-    r = wanted
-    for _ in range(3):
-        lagged = np.zeros(len(r))
-        for k in range(1, len(r)):
-            lagged[k] = pole * lagged[k - 1] + (1 - pole) * r[k - 1]
-        r = lagged
-    small = machine.linearise(1500.0)
-    rate = np.gradient(r, 0.001)
-    bend = np.gradient(rate, 0.001)
-    T1, T2 = small["T1"], small["T2"]
-    friction = small["command"] - 1500.0 / small["gain"]
-    u = (r + (T1 + T2) * rate + T1 * T2 * bend) / small["gain"] + friction * (r > 1.0)
-    return r, u
 
 
 # --- on a linear plant: exactly -------------------------------------------------------------------

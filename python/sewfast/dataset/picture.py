@@ -36,14 +36,9 @@ def save(data: Dataset, path: str | os.PathLike[str]) -> None:
     SettingError
         Where matplotlib is not installed or the file cannot be written.
     """
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as e:
-        raise SettingError(
-            'a picture needs matplotlib, which is not installed: pip install "sewfast[report]"'
-        ) from e
-    from ..report.canvas import style
+    from ..report.canvas import require_matplotlib, style
 
+    require_matplotlib()
     with style():
         drawn = figure(data)
         try:

@@ -8,6 +8,7 @@ import itertools
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -68,24 +69,22 @@ _STYLE: dict[str, Any] = {
 
 def require() -> None:
     """Refuse with a remedy where matplotlib or Jinja2 is not installed."""
-    try:
-        import jinja2  # noqa: F401
-        import matplotlib  # noqa: F401
-    except ImportError as e:
-        raise SettingError(
-            f"the report needs {e.name}, which is not installed: pip install "
-            '"sewfast[report]", then `sewfast report DIR`'
-        ) from e
+    _require("the report needs", "matplotlib", "jinja2")
 
 
 def require_matplotlib() -> None:
     """Refuse with a remedy where matplotlib is not installed."""
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as e:
-        raise SettingError(
-            'figures need matplotlib, which is not installed: pip install "sewfast[report]"'
-        ) from e
+    _require("figures need", "matplotlib")
+
+
+def _require(what: str, *modules: str) -> None:
+    for name in modules:
+        try:
+            import_module(name)
+        except ImportError as e:
+            raise SettingError(
+                f'{what} {name}, which is not installed: pip install "sewfast[report]"'
+            ) from e
 
 
 @contextlib.contextmanager

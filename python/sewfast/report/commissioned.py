@@ -70,7 +70,9 @@ def context(folder: Path) -> dict[str, Any]:
 
 def _stages(found: Mapping[str, Any]) -> Table:
     rows = tuple((s, _HOW.get(s, ""), f"{t:.2f}") for s, t in found["seconds"].items())
-    return Table("What was done, and how long it took.", ("stage", "what", "seconds"), rows)
+    return Table(
+        "What was done, and how long it took.", ("stage", "what", "seconds"), rows, words=True
+    )
 
 
 def _gains(found: Mapping[str, Any]) -> Table:
@@ -107,7 +109,7 @@ def _met(found: Mapping[str, Any]) -> Table | None:
         tuned, rule = (milliseconds(max(met["recovery_ms"][n])) for n in ("tuned", "rule"))
         what = f"slowest recovery from a load of {significant(volt)} V at {significant(level)} RPM"
         rows.append((what, tuned, f"{rule}, under Eq. 12's gains"))
-    return Table("Required beside the cost.", ("what", "found", "allowed"), tuple(rows))
+    return Table("Required beside the cost.", ("what", "found", "allowed"), tuple(rows), words=True)
 
 
 def _judged(name: str, judged: Mapping[str, Any]) -> Table:
@@ -115,7 +117,7 @@ def _judged(name: str, judged: Mapping[str, Any]) -> Table:
         (x["name"], x["shown"], x["limit"], x["verdict"], x["meaning"]) for x in judged["lines"]
     )
     header = ("question", "found", "limit", "verdict", "what it says")
-    return Table(f"{name.capitalize()}: {judged['verdict']}.", header, rows)
+    return Table(f"{name.capitalize()}: {judged['verdict']}.", header, rows, words=True)
 
 
 def _ms(seconds: float | None) -> float | None:

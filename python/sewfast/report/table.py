@@ -17,9 +17,12 @@ class Table:
     rows : tuple of tuple of str
     best : frozenset of (row, column)
         Cells to set in bold.
+    words : bool
+        Whether its cells hold words rather than numbers, which begin at the left.
     """
 
     caption: str
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     best: frozenset[tuple[int, int]] = frozenset()
+    words: bool = False

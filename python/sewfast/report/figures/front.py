@@ -25,6 +25,8 @@ NAMES = {
     "rise": "rise time beyond the reference's",
     "lag": "lag",
     "saturation": "share of samples at a limit",
+    "recovery": "recovery from a load",
+    "load": "deviation under a load",
     "Ms": "largest sensitivity Ms",
 }
 HEIGHT = 3.6
@@ -39,7 +41,7 @@ def draw(front: ParetoFront, path: Path) -> Path:
     SettingError
         For an ending that is no format of figures, or a file that cannot be written.
     """
-    canvas.require()
+    canvas.require_matplotlib()
     if path.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise SettingError(f"expected a figure ending in .png, .svg or .pdf, got {path.name!r}")
     pairs = list(itertools.combinations(range(len(front.objectives)), 2))
