@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...atomic import replace_file
 from ...errors import SettingError
 from .. import canvas
 
@@ -54,13 +56,15 @@ def draw(front: ParetoFront, path: Path) -> Path:
         for axis in axes.flat[len(pairs) :]:
             axis.set_visible(False)
         axes.flat[0].legend()
-        try:
-            figure.savefig(path, dpi=150)
-        except OSError as error:
-            raise SettingError(
-                f"{path}: cannot be written ({error.strerror}); choose a folder that exists and is "
-                "writable"
-            ) from error
+        drawn = io.BytesIO()
+        figure.savefig(drawn, format=path.suffix[1:].lower(), dpi=150)
+    try:
+        replace_file(path, drawn.getvalue())
+    except OSError as error:
+        raise SettingError(
+            f"{path}: cannot be written ({error.strerror}); choose a folder that exists and is "
+            "writable"
+        ) from error
     return path
 
 
