@@ -50,6 +50,8 @@ from sewfast.commissioning import (
     training,
 )
 from sewfast.commissioning.bench import DriveBench, MachineBench, bench_of
+from sewfast.commissioning.demands import demands
+from sewfast.commissioning.requirements import Requirements
 from sewfast.link import VirtualDevice, connect
 from sewfast.recording import Recording
 from sewfast.report import report
@@ -143,6 +145,55 @@ def test_the_tuned_gains_are_better_than_the_first_on_the_machine(whole: Commiss
     first = [bench.follow(whole.first, c.predicted.r, c.reference).run for c in whole.comparisons]
     assert whole.measured_cost is not None
     assert whole.measured_cost < 0.5 * whole.cost.of(first)
+
+
+def test_the_gains_bear_what_is_required_beside_the_cost(whole: Commissioning) -> None:
+    assert whole.met is not None
+    assert max(whole.met["Ms"]) <= whole.met["Ms_limit"] == 2.0
+    load, recovery = whole.met["load"], whole.met["recovery_ms"]
+    assert (load["level"], load["disturbance"]) == (1500.0, -2.0)
+    assert len(recovery["tuned"]) == 2
+    assert all(t <= r for t, r in zip(recovery["tuned"], recovery["rule"], strict=True))
+    assert whole.first is not None
+    assert "eq-12, Ms <= 1.8" in whole.first.notes
+    assert "recovery" in str(whole)
+
+
+def test_report_card_and_judgement_are_evidence(whole: Commissioning, tmp_path: Path) -> None:
+    assert whole.card is not None
+    assert whole.card.data.startswith("levels")
+    assert whole.judgement is not None
+    assert {r.run.reference for r in whole.judgement.runs} == {
+        c.reference for c in whole.comparisons
+    }
+    told = whole.numbers()["evidence"]
+    assert told["report card"]["verdict"] == whole.card.verdict
+    page = whole.save(tmp_path / "out").read_text()
+    assert "training region" in page
+    assert "Required beside the cost" in page
+
+
+def test_without_a_load_or_ms_nothing_is_required() -> None:
+    found = commission(VirtualMachine(2), load=0.0, Ms=None, time_budget=1e6, **SMALL)
+    assert found.met == {"Ms_limit": None, "Ms": [], "load": None}
+    assert found.tuning is not None
+    assert str(found.tuning.constraints) == "none"
+
+
+def test_a_rule_that_no_member_bears_is_no_measure(whole: Commissioning) -> None:
+    assert whole.fopdt is not None
+    assert whole.first is not None
+    assert whole.models is not None
+    asked = demands(
+        MachineBench(VirtualMachine()), u_max=None, speed=None, references=None, members=1,
+        evaluations=1, seed=0, threads=1,
+    )  # fmt: skip
+    wild = replace(whole.first, gains=Gains.standard(50.0, 1e-3), u_min=-1e9, u_max=1e9)
+    runaway = _core.LinearModel(np.array([-2.0]), np.array([[500.0]]), 1, 0.0)
+    good = whole.models.members[0]
+    unstable = LinearOE(runaway, good.Ts, good.input_names, good.output_name, ("V",), "RPM")
+    found = Requirements.of(Ensemble.of([unstable]), whole.fopdt, wild, asked)
+    assert (found.loads, found.rival, found.constraints.recovery) == ((), None, None)
 
 
 def test_nothing_is_learned_from_the_true_speed_or_the_recording_judged_by(
@@ -286,6 +337,10 @@ def test_a_machine_that_changed_is_not_verified() -> None:
         ({"speed": -1.0}, "top speed above 0"),
         ({"members": 0}, "members of 1"),
         ({"evaluations": 0}, "evaluations of 1"),
+        ({"load": -1.0}, "load from 0 V"),
+        ({"load": 20.0}, "load from 0 V to below u_max"),
+        ({"Ms": 0.9}, "above 1 for Ms"),
+        ({"time_budget": 0.0}, "time_budget above 0"),
         ({"references": "trapezoid"}, "references by name"),
         ({"references": ["nonsense"]}, "known ones"),
         ({"references": ["trapezoid"], "speed": 500.0}, "raise speed"),

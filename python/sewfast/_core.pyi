@@ -421,7 +421,7 @@ def cost_terms(
 _Variable: TypeAlias = tuple[str, tuple[float, float] | None]
 
 class _Limits(TypedDict):
-    """Ms of the linear plants, overshoot [%], |u|, recovery [ms], load [y]; a controller stands for what it does on each plant."""
+    """Ms of the linear plants, overshoot [%], |u|, recovery [ms], load [y]; a controller stands for what it does on each plant as it is."""
 
     Ms: float | None
     overshoot: float | None

@@ -29,8 +29,9 @@ class Constraints:
     u : float, optional
         Largest \\|u\\| in every run [u].
     recovery : float or Controller, optional
-        Longest recovery from any load step, on every plant [ms]; of a controller what it takes on
-        each plant itself, at least one sample: no plant may recover later than under it.
+        Longest recovery from any load step, on every plant in every variation [ms]. Of a
+        controller what it takes on each plant itself, at least one sample: no plant may recover
+        later than under it, as it is, or in every variation where none leaves it as it is.
     load : float or Controller, optional
         Largest rms deviation under any load step [y], likewise.
     plant : linear plant or list of them, optional

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ..control import Controller, Gains
     from ..cost import Cost
     from ..front import ParetoFront
+    from ..load_step import LoadStep
     from ..tuning import TuningResult
     from ..variables import Wanted
 
@@ -33,9 +34,10 @@ A reference is a named one (`sewfast signals`) or a CSV with columns t [s], r [o
 Named ones are in RPM at 1 ms. Several references are tuned for together.
 
 The cost of a run is a weighted sum of tracking [y], chatter [u], effort [u], overshoot [%], rise
-[ms], lag [ms], saturation (a share); --cost NAME=WEIGHT sets the weight of one, overshoot_limit
-what overshoot is free. --constraint sets limits that come first: Ms, overshoot, u. --pareto
-OBJECTIVES searches for the front of what can be had instead, and takes its knee.
+[ms], lag [ms], saturation (a share), and under load steps (--load) recovery [ms] and load (rms
+deviation); --cost NAME=WEIGHT sets the weight of one, overshoot_limit what overshoot is free.
+--constraint sets limits that come first: Ms, overshoot, u, recovery, load. --pareto OBJECTIVES
+searches for the front of what can be had instead, and takes its knee.
 """
 
 TUNE_EXAMPLES = """\
@@ -44,6 +46,7 @@ examples:
   sewfast tune drive.json --reference trapezoid --reference random -o controller.json
   sewfast tune drive.json --reference cycle.csv --u-min -10 --u-max 10 --filter 4 -o controller.json
   sewfast tune drive.json --cost chatter=50 --constraint overshoot=2 -o calm.json
+  sewfast tune drive.json --load 1500:-2 --constraint recovery=70 -o firm.json
   sewfast tune one.json two.json --aggregate worst --variables Kp,Ti,alpha -o controller.json
   sewfast tune drive.json --pareto tracking,chatter --front front.png -o controller.json
 """
@@ -90,7 +93,12 @@ def _add_search(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--constraint", action="append", metavar="NAME=LIMIT",
-        help="limit of Ms, overshoot [%%] or u; may repeat",
+        help="limit of Ms, overshoot [%%], u, recovery [ms] or load; may repeat",
+    )  # fmt: skip
+    parser.add_argument(
+        "--load", action="append", metavar="LEVEL:COMMAND",
+        help="a load step to bear: a level that is held and a command behind the limits that comes "
+        "on, as in 1500:-2; may repeat",
     )  # fmt: skip
     parser.add_argument(
         "--aggregate", choices=("mean", "worst"), default="mean", help="over the plants (mean)"
@@ -103,11 +111,15 @@ def _add_search(parser: argparse.ArgumentParser) -> None:
         "--evaluations", type=int, metavar="N",
         help="controllers tried (1500; 3000 with --pareto)",
     )  # fmt: skip
+    parser.add_argument(
+        "--time-budget", type=float, metavar="S",
+        help="time of the search, after which the best so far is taken (no limit)",
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the search (0)")
     parser.add_argument(
         "--pareto", metavar="NAME,NAME",
         help="objectives of a front: tracking, chatter, effort, overshoot, rise, lag, saturation, "
-        "cost, Ms; -o is its knee",
+        "recovery, load, cost, Ms; -o is its knee",
     )  # fmt: skip
     parser.add_argument(
         "--front", type=Path, metavar="FILE",
@@ -121,6 +133,10 @@ def tune_command(args: argparse.Namespace) -> int | None:
     require_place(args.out, (".json",))
     if args.front is not None and args.pareto is None:
         raise SettingError("--front: expected --pareto with the objectives of the front as well")
+    if args.pareto is not None and args.time_budget is not None:
+        raise SettingError(
+            "--time-budget: a front has no best so far to end with; leave it or --pareto out"
+        )
     if args.pareto is not None and args.method != "genetic":
         raise SettingError(
             "--method: a front is searched by NSGA-II; leave --method or --pareto out"
@@ -154,6 +170,7 @@ def _settings(args: argparse.Namespace) -> dict[str, Any]:
         "variables": _variables(args.variables),
         "cost": _cost(args.cost),
         "constraints": _constraints(args.constraint),
+        "loads": _loads(args.load),
         "aggregate": args.aggregate,
         "seed": args.seed,
     }
@@ -182,7 +199,7 @@ def _tuned(
     with Progress("tune") as progress:
         return tune(
             models, references, **_loop(args, models[0]), **settings, method=args.method,
-            progress=progress,
+            time_budget=args.time_budget, progress=progress,
         )  # fmt: skip
 
 
@@ -227,6 +244,21 @@ def _constraints(given: list[str] | None) -> Constraints:
     return Constraints(
         **_known(pairs, "--constraint", ("Ms", "overshoot", "u", "recovery", "load"))
     )
+
+
+def _loads(given: list[str] | None) -> list[LoadStep]:
+    from ..load_step import LoadStep
+
+    steps = []
+    for text in given or ():
+        try:
+            level, disturbance = (float(number) for number in text.split(":"))
+        except ValueError:
+            raise SettingError(
+                f"--load {text}: expected LEVEL:COMMAND, as in --load=1500:-2"
+            ) from None
+        steps.append(LoadStep(level, disturbance))
+    return steps
 
 
 def _known(pairs: dict[str, float], option: str, names: tuple[str, ...]) -> dict[str, Any]:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 __all__ = ["STAGES", "commission"]
 
 MEMBERS = 4
-EVALUATIONS = 600
+EVALUATIONS = 1500
 
 References = Mapping[str, ArrayLike] | Sequence[str]
 
@@ -93,10 +93,11 @@ def commission(
         Controllers that the search tries.
     load : float, optional
         A load that brakes, in volts of command [V]: under the tuned gains no member of the
-        ensemble, at no gain and delay that is tuned for, recovers later from it than under Eq. 12's
-        gains. By default a tenth of `u_max`; 0 for no such requirement.
+        ensemble recovers later from it than under Eq. 12's. By default a tenth of `u_max`; 0 for no
+        such requirement.
     Ms : float or None
-        Largest sensitivity, on every member linearised at three quarters of the top speed.
+        Largest sensitivity, on every member linearised at three quarters of the top speed; that of
+        Eq. 12's gains where it is larger and a load is required.
     time_budget : float, optional
         Time of the search [s], after which the best gains so far are taken. A seed then no longer
         gives the same gains again.

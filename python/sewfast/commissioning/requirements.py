@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -26,12 +27,13 @@ LEVEL = 0.75
 """Of the top speed, where it comes on and where networks are linearised."""
 RECOVERED = 0.01
 """Of what the load would do to the speed without control."""
+HAIR = 1.001
 AS_IT_IS = ((1.0, 0),)
 
 
 @dataclass(frozen=True)
 class Requirements:
-    """A load step that no plant recovers from later than under the rule's gains; a largest Ms.
+    """A load step that no member recovers from later than under the rule's gains; a largest Ms.
 
     Attributes
     ----------
@@ -54,11 +56,14 @@ class Requirements:
         loads = _load_steps(fopdt, demands, rival.Ts)
         bears = bool(loads) and _bears(rival, ensemble, loads)
         linear = _linear(ensemble.members, demands, rival.Ts) if demands.Ms is not None else []
+        speed = LEVEL * demands.speed
+        own = [margins(rival, m, speed=speed).Ms for m in linear] if bears else []
         constraints = Constraints(
-            Ms=demands.Ms if linear else None,
+            # gains that are no slower than the rule's are hardly less sensitive
+            Ms=_limit(demands.Ms, own) if linear else None,
             recovery=rival if bears else None,
             plant=linear or None,
-            speed=LEVEL * demands.speed,
+            speed=speed,
         )
         return cls(loads if bears else (), rival if bears else None, constraints)
 
@@ -79,6 +84,13 @@ class Requirements:
         }
         load = {"level": step.level, "disturbance": step.disturbance, "band": step.band}
         return told | {"load": load, "recovery_ms": recovery}
+
+
+def _limit(asked: float | None, own: Sequence[float]) -> float | None:
+    """The limit of Ms that was asked for, or a hair above the rule's own where that is larger."""
+    if asked is None:
+        return None
+    return max([asked, *(HAIR * x for x in own if math.isfinite(x))])
 
 
 def _load_steps(fopdt: Fopdt, demands: Demands, Ts: float) -> tuple[LoadStep, ...]:

@@ -295,6 +295,13 @@ impl Given {
         work(&task)
     }
 
+    /// Whether a rival is a measure on plant `k`: on plants as they are, where these are among the variations.
+    fn is_compared(&self, k: usize) -> bool {
+        let as_it_is = (1.0, 0);
+        let own = self.variations[k % self.variations.len()];
+        own == as_it_is || !self.variations.contains(&as_it_is)
+    }
+
     /// What each plant may do under the load steps.
     fn load_limits(
         &self,
@@ -310,7 +317,14 @@ impl Given {
                 Some(OwnedMost::Number(limit)) => Ok(vec![*limit; task.plants.len()]),
                 Some(OwnedMost::Rival(design)) => {
                     let did = tuning::loaded(task, design, monitor)?;
-                    Ok(did.iter().map(told).collect())
+                    let told = |(k, did)| {
+                        if self.is_compared(k) {
+                            told(did)
+                        } else {
+                            f64::INFINITY
+                        }
+                    };
+                    Ok(did.iter().enumerate().map(told).collect())
                 }
             }
         };
