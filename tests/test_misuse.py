@@ -80,6 +80,10 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: tune(drive(), EDGE, variables=["schedule"], evaluations=5),
         "gain schedule",
     ),
+    "no whole number of samples": (
+        lambda: tune(drive(), EDGE, variables=[("filter_samples", 2.2, 2.8)]),
+        "whole number",
+    ),
     "a front of one evaluation": (lambda: pareto(drive(), EDGE, evaluations=1), "2 evaluations"),
     "an objective twice": (
         lambda: pareto(drive(), EDGE, objectives=["chatter", "chatter"]),

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from .control import Controller
 from .errors import SettingError
 from .gains import Gains, real
@@ -86,8 +88,14 @@ def _one(given: Any, start: Controller) -> list[tuple[str, tuple[float, float] |
             f"expected a variable as a name or (name, low, high), got {given!r}; for example "
             "('Ti', 0.02, 0.5)"
         )
-    name, low, high = given
-    return [(name, (real(f"the bounds of {name}", low), real(f"the bounds of {name}", high)))]
+    name, *bounds = given
+    low, high = (real(f"the bounds of {name}", bound) for bound in bounds)
+    if name == "filter_samples" and low < high and np.ceil(low) > np.floor(high):
+        raise SettingError(
+            f"expected bounds of filter_samples with a whole number between them, got {low:g} and "
+            f"{high:g}"
+        )
+    return [(name, (low, high))]
 
 
 def applied(values: Mapping[str, float], start: Controller, notes: str) -> Controller:
