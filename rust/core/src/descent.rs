@@ -130,6 +130,11 @@ pub(crate) trait Method {
     /// Cost at `theta`; none where it is not finite, not allowed or a stop was requested.
     fn cost(&mut self, theta: &[f64]) -> Option<f64>;
 
+    /// Cost at `theta`, where it is below `before`; none may be told as soon as it cannot be.
+    fn trial_cost(&mut self, theta: &[f64], _before: f64) -> Option<f64> {
+        self.cost(theta)
+    }
+
     /// The point of the last cost becomes the present one.
     fn keep(&mut self) {}
 
@@ -234,7 +239,7 @@ fn improve(
             Proposal::Trial => {}
         }
         outcome.trials += 1;
-        let cost = method.cost(trial);
+        let cost = method.trial_cost(trial, outcome.cost);
         match method.judge(outcome.cost, cost) {
             Verdict::Rejected => {}
             Verdict::End(end) => return Some(end),

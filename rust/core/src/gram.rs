@@ -6,7 +6,7 @@
 use crate::simd::{self, Eight, Kernel, LANES};
 
 /// Rows per block: with 64 parameters a block is 32 kB and stays in the first-level cache.
-const BLOCK: usize = 64;
+pub(crate) const BLOCK: usize = 64;
 /// Rows per block of wider rows, of which only a panel stays there: the sums are fetched half as often.
 const WIDE_BLOCK: usize = 128;
 /// Numbers in a row from which it is wide.
@@ -15,8 +15,8 @@ const WIDE: usize = 96;
 /// `X'X` over rows that may depend linearly on the rows before them.
 #[derive(Debug)]
 pub(crate) struct Gram {
-    /// Groups of eight columns that are summed.
-    groups: usize,
+    /// Columns that are summed.
+    columns: usize,
     /// Numbers from one row to the next.
     width: usize,
     /// Rows per block.
@@ -39,13 +39,12 @@ impl Gram {
 
     /// As [`Gram::new`], where rows are written up to `room` values, of which only `columns` count.
     pub fn with_room(columns: usize, room: usize, memory: usize) -> Self {
-        let groups = columns.div_ceil(LANES);
         // An odd number of cache lines: rows apart by a power of two would share the same few places of a cache.
         let width = (room.div_ceil(LANES) | 1) * LANES;
         let block = if width < WIDE { BLOCK } else { WIDE_BLOCK };
         let rows = vec![0.0; (memory + block) * width + LANES];
         Self {
-            groups,
+            columns,
             width,
             block,
             memory,
@@ -118,6 +117,24 @@ impl Gram {
         }
     }
 
+    /// The rows before the next one, the oldest first, and behind them room for `count` rows, at most 64, that come with
+    /// old values; [`Gram::keep_all`] appends them.
+    pub fn ahead(&mut self, count: usize) -> &mut [f64] {
+        if self.filled + count > self.block {
+            self.fold();
+        }
+        let start = self.base + self.filled * self.width;
+        &mut self.rows[start..start + (self.memory + count) * self.width]
+    }
+
+    /// Appends the rows that were written into [`Gram::ahead`]. Those whose value is NaN are part of the recursion alone.
+    pub fn keep_all(&mut self, values: &[f64]) {
+        let unmeasured = values.iter().enumerate().filter(|(_, v)| v.is_nan());
+        self.weightless
+            .extend(unmeasured.map(|(i, _)| self.filled + i));
+        self.filled += values.len();
+    }
+
     /// Room for `count` rows, at most 64, that come with old values; [`Gram::keep`] appends them.
     #[inline(always)]
     pub fn room(&mut self, count: usize) -> &mut [f64] {
@@ -155,7 +172,7 @@ impl Gram {
         simd::run(Fold {
             block: &self.rows[start..end],
             width,
-            groups: self.groups,
+            columns: self.columns,
             sums: &mut self.sums,
         });
         self.filled = 0;
@@ -177,7 +194,7 @@ pub(crate) fn forget(value: &mut f64) {
 struct Fold<'a> {
     block: &'a [f64],
     width: usize,
-    groups: usize,
+    columns: usize,
     sums: &'a mut [f64],
 }
 
@@ -187,28 +204,105 @@ impl Kernel for Fold<'_> {
     #[inline(always)]
     fn run<V: Eight>(mut self) {
         match V::TILE {
-            (8, _) => self.panels::<V, 8>(),
-            (4, _) => self.panels::<V, 4>(),
-            _ => self.panels::<V, 2>(),
+            (8, _) => self.wide::<V>(),
+            (4, _) => self.narrow::<V, 6>(),
+            _ => self.narrow::<V, 2>(),
         }
     }
 }
 
 impl Fold<'_> {
-    /// Panels of columns, which stay in the first-level cache while the rows of `X'` pass by.
+    /// Panels of three groups of columns, which stay in the first-level cache while the rows of `X'` pass by; then the
+    /// rows that fill no group.
     #[inline(always)]
-    fn panels<V: Eight, const ROWS: usize>(&mut self) {
-        let (_, wide) = V::TILE;
-        for first in (0..self.groups).step_by(wide) {
-            for i in (first * LANES..self.groups * LANES).step_by(ROWS) {
-                // As far as the diagonal.
-                match (i / LANES + 1 - first).min(wide) {
-                    1 => self.tile::<V, ROWS, 1>(i, first * LANES),
-                    2 => self.tile::<V, ROWS, 2>(i, first * LANES),
-                    _ => self.tile::<V, ROWS, 3>(i, first * LANES),
+    fn wide<V: Eight>(&mut self) {
+        let whole = self.columns / LANES;
+        for first in (0..whole).step_by(3) {
+            let below = match whole - first {
+                1 => {
+                    self.tile::<V, 8, 1>(first * LANES, first * LANES);
+                    first + 1
+                }
+                _ => {
+                    self.corner::<V>(first * LANES);
+                    first + 2
+                }
+            };
+            for group in below..whole {
+                self.tile::<V, 8, 3>(group * LANES, first * LANES);
+            }
+        }
+        let mut row = whole * LANES;
+        row = self.strip::<V, 4, 6>(row);
+        row = self.strip::<V, 2, 7>(row);
+        self.strip::<V, 1, 7>(row);
+    }
+
+    /// Rows on their own, with as many groups at once as registers hold; the row behind them.
+    #[inline(always)]
+    fn strip<V: Eight, const ROWS: usize, const MOST: usize>(&mut self, row: usize) -> usize {
+        if (self.columns - row) & ROWS == 0 {
+            return row;
+        }
+        let groups = self.columns.div_ceil(LANES);
+        for first in (0..groups).step_by(MOST) {
+            let column = first * LANES;
+            match (groups - first).min(MOST) {
+                1 => self.tile::<V, ROWS, 1>(row, column),
+                2 => self.tile::<V, ROWS, 2>(row, column),
+                3 => self.tile::<V, ROWS, 3>(row, column),
+                4 => self.tile::<V, ROWS, 4>(row, column),
+                5 => self.tile::<V, ROWS, 5>(row, column),
+                6 => self.tile::<V, ROWS, 6>(row, column),
+                _ => self.tile::<V, ROWS, 7>(row, column),
+            }
+        }
+        row + ROWS
+    }
+
+    /// One group of columns after the other.
+    #[inline(always)]
+    fn narrow<V: Eight, const ROWS: usize>(&mut self) {
+        for column in (0..self.columns).step_by(LANES) {
+            let mut row = column;
+            while row + ROWS <= self.columns {
+                self.tile::<V, ROWS, 1>(row, column);
+                row += ROWS;
+            }
+            if row + 4 <= self.columns {
+                self.tile::<V, 4, 1>(row, column);
+                row += 4;
+            }
+            if row + 2 <= self.columns {
+                self.tile::<V, 2, 1>(row, column);
+                row += 2;
+            }
+            if row < self.columns {
+                self.tile::<V, 1, 1>(row, column);
+            }
+        }
+    }
+
+    /// Sixteen rows from the diagonal on: one group for the upper eight, two for the lower.
+    #[inline(always)]
+    fn corner<V: Eight>(&mut self, at: usize) {
+        let mut upper = [[V::splat(0.0)]; LANES];
+        let mut lower = [[V::splat(0.0); 2]; LANES];
+        for row in self.block.chunks_exact(self.width) {
+            let Some(own) = row[at..].first_chunk::<{ 2 * LANES }>() else {
+                return;
+            };
+            let right = [V::first(own), V::first(&own[LANES..])];
+            for r in 0..LANES {
+                upper[r][0] = upper[r][0].add_product(V::splat(own[r]), right[0]);
+                let left = V::splat(own[LANES + r]);
+                for g in 0..2 {
+                    lower[r][g] = lower[r][g].add_product(left, right[g]);
                 }
             }
         }
+        self.add(at, at, upper);
+        self.add(at + LANES, at, lower);
     }
 
     /// `ROWS` times `GROUPS` groups of sums, which stay in registers.
@@ -217,16 +311,30 @@ impl Fold<'_> {
         let mut sums = [[V::splat(0.0); GROUPS]; ROWS];
         for row in self.block.chunks_exact(self.width) {
             let right = &row[j..j + GROUPS * LANES];
-            let right: [V; GROUPS] = std::array::from_fn(|g| V::first(&right[g * LANES..]));
+            let mut groups = [V::splat(0.0); GROUPS];
+            for (group, right) in groups.iter_mut().zip(right.as_chunks().0) {
+                *group = V::load(right);
+            }
             let left = &row[i..i + ROWS];
             for (sums, left) in sums.iter_mut().zip(left) {
                 let left = V::splat(*left);
-                for (sum, right) in sums.iter_mut().zip(right) {
+                for (sum, right) in sums.iter_mut().zip(groups) {
                     *sum = sum.add_product(left, right);
                 }
             }
         }
-        for (r, sums) in sums.iter().enumerate() {
+        self.add(i, j, sums);
+    }
+
+    /// Adds a tile to the sums whose first row is `i` and whose first column `j`.
+    #[inline(always)]
+    fn add<V: Eight, const ROWS: usize, const GROUPS: usize>(
+        &mut self,
+        i: usize,
+        j: usize,
+        tile: [[V; GROUPS]; ROWS],
+    ) {
+        for (r, sums) in tile.iter().enumerate() {
             let totals = &mut self.sums[(i + r) * self.width + j..][..GROUPS * LANES];
             for (g, sum) in sums.iter().enumerate() {
                 let total = &mut totals[g * LANES..];

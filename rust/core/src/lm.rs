@@ -18,6 +18,22 @@ pub trait Problem {
     /// Cost at `theta`; none where the simulation diverges, leaves its constraints or is stopped.
     fn cost(&mut self, theta: &[f64]) -> Option<f64>;
 
+    /// Cost at `theta`, where it is below `limit`; none may be told as soon as it cannot be.
+    fn cost_below(&mut self, theta: &[f64], limit: f64) -> Option<f64> {
+        let _ = limit;
+        self.cost(theta)
+    }
+
+    /// Whether two costs at once take hardly longer than one.
+    fn takes_two(&self) -> bool {
+        false
+    }
+
+    /// [`Problem::cost_below`] at two points; `normal_equations` may follow at either.
+    fn costs_below(&mut self, thetas: [&[f64]; 2], limit: f64) -> [Option<f64>; 2] {
+        thetas.map(|theta| self.cost_below(theta, limit))
+    }
+
     /// Fills `J'J` (row by row, the lower triangle is enough) and `J'e` at `theta`, scaled as the cost is.
     fn normal_equations(&mut self, theta: &[f64], jtj: &mut [f64], jte: &mut [f64]);
 }
@@ -65,6 +81,8 @@ impl Default for Settings {
 const PATIENCE: usize = 5;
 /// Rejected trials in a row that count as stalled: `mu` has then grown by more than 1e18.
 const MOST_REJECTIONS: usize = 30;
+/// What a rejected trial multiplies the damping by.
+const RAISE: f64 = 4.0;
 /// Damping never falls below this, so that a singular system stays solvable.
 const LEAST_MU: f64 = 1e-14;
 
@@ -78,6 +96,10 @@ pub fn minimize(
 ) -> Outcome {
     let mut method = Marquardt {
         system: System::new(problem.parameters()),
+        next: Next {
+            two: problem.takes_two(),
+            ..Next::default()
+        },
         problem,
         settings,
         mu: settings.mu,
@@ -93,10 +115,26 @@ pub fn minimize(
     )
 }
 
+/// The step that follows a rejection: where two costs at once take hardly longer than one, it is tried beside the one
+/// before it.
+#[derive(Default)]
+struct Next {
+    two: bool,
+    /// Its damping; 0 where there is none.
+    mu: f64,
+    step: Vec<f64>,
+    theta: Vec<f64>,
+    /// Its cost, where that has been taken.
+    cost: Option<Option<f64>>,
+    /// The cost of the trial at hand, where it was tried beside the last one.
+    known: Option<Option<f64>>,
+}
+
 /// Normal equations whose damping follows success and failure by fixed factors.
 struct Marquardt<'a, P> {
     problem: &'a mut P,
     system: System,
+    next: Next,
     settings: &'a Settings,
     mu: f64,
     /// Iterations in a row that gained nothing.
@@ -114,7 +152,20 @@ impl<P: Problem> Method for Marquardt<'_, P> {
         self.problem.cost(theta)
     }
 
+    fn trial_cost(&mut self, theta: &[f64], before: f64) -> Option<f64> {
+        if let Some(cost) = self.next.known.take() {
+            return cost;
+        }
+        if self.next.mu == 0.0 {
+            return self.problem.cost_below(theta, before);
+        }
+        let [cost, next] = self.problem.costs_below([theta, &self.next.theta], before);
+        self.next.cost = Some(next);
+        cost
+    }
+
     fn linearise(&mut self, theta: &[f64]) -> bool {
+        self.next.mu = 0.0;
         let system = &mut self.system;
         self.problem
             .normal_equations(theta, &mut system.jtj, &mut system.jte);
@@ -128,7 +179,11 @@ impl<P: Problem> Method for Marquardt<'_, P> {
     }
 
     fn propose(&mut self, theta: &[f64], trial: &mut [f64]) -> Proposal {
-        if !self.system.solve(self.mu, self.settings.damping) {
+        self.next.known = self.next.cost.take().filter(|_| self.next.mu == self.mu);
+        self.next.mu = 0.0;
+        if self.next.known.is_some() {
+            self.system.step.copy_from_slice(&self.next.step);
+        } else if !self.system.solve(self.mu, self.settings.damping) {
             return match self.reject() {
                 Verdict::End(end) => Proposal::End(end),
                 _ => Proposal::Again,
@@ -140,6 +195,9 @@ impl<P: Problem> Method for Marquardt<'_, P> {
         }
         for ((trial, theta), step) in trial.iter_mut().zip(theta).zip(&self.system.step) {
             *trial = theta + step;
+        }
+        if self.next.two && self.next.known.is_none() {
+            self.prepare_next(theta);
         }
         Proposal::Trial
     }
@@ -160,8 +218,23 @@ impl<P: Problem> Method for Marquardt<'_, P> {
 }
 
 impl<P> Marquardt<'_, P> {
+    /// Solves for the step that follows if the one at hand is rejected.
+    fn prepare_next(&mut self, theta: &[f64]) {
+        let mu = RAISE * self.mu;
+        if !self.system.solve(mu, self.settings.damping) {
+            return;
+        }
+        let Next {
+            step, theta: next, ..
+        } = &mut self.next;
+        step.clone_from(&self.system.step);
+        next.clear();
+        next.extend(theta.iter().zip(step).map(|(theta, step)| theta + *step));
+        self.next.mu = mu;
+    }
+
     fn reject(&mut self) -> Verdict {
-        self.mu *= 4.0;
+        self.mu *= RAISE;
         self.rejections += 1;
         if self.rejections == MOST_REJECTIONS {
             return Verdict::End(Termination::Stalled);

@@ -7,6 +7,7 @@ mod guard;
 mod network;
 mod problem;
 mod referee;
+mod regressor;
 mod scaling;
 mod sensitivities;
 mod train;
@@ -148,9 +149,9 @@ struct Recording {
 impl Recording {
     fn of(model: &NeuralOE, samples: usize) -> Self {
         let (shape, columns) = (model.shape(), model.shape().columns());
-        let states = shape.state_column()..shape.error_column();
+        let states = shape.state_column()..shape.state_column() + shape.lags.na;
         Self {
-            gram: shape.gram(),
+            gram: shape.gram(true),
             y_scale: model.scaling.y_scale,
             rows: Vec::with_capacity(samples * (columns.len() + states.len())),
             columns,
@@ -160,16 +161,18 @@ impl Recording {
 }
 
 impl Rows for Recording {
-    fn place(&mut self) -> (&[f64], &mut [f64]) {
-        self.gram.place()
+    fn ahead(&mut self, count: usize) -> &mut [f64] {
+        self.gram.ahead(count)
     }
 
-    fn keep(&mut self, error: f64) {
-        self.gram.keep_weighed(error);
-        let row = self.gram.past_mut(1);
-        let scaled = self.columns.iter().map(|&c| row[c] * self.y_scale);
-        self.rows.extend(scaled);
-        self.rows.extend_from_slice(&row[self.states.clone()]);
+    fn keep(&mut self, errors: &[f64]) {
+        self.gram.keep_all(errors);
+        for back in (1..=errors.len()).rev() {
+            let row = self.gram.past_mut(back);
+            let scaled = self.columns.iter().map(|&c| row[c] * self.y_scale);
+            self.rows.extend(scaled);
+            self.rows.extend_from_slice(&row[self.states.clone()]);
+        }
     }
 }
 

@@ -1,81 +1,337 @@
-//! The free run of a network in scaled units.
+//! Free runs of networks in scaled units, one or two side by side.
+//!
+//! A run waits for itself: each output needs the one before. What does not depend on it, the inputs' share of the hidden
+//! units' arguments, is computed for a block of samples beforehand, and a second run fits into the waiting.
 
 use super::network::Network;
+use super::regressor;
 use crate::Monitor;
-use crate::simd::{self, Eight, Group, Kernel};
+use crate::simd::{self, Eight, Group, Kernel, LANES};
 
-/// Samples between two looks at the monitor.
-pub(super) const LOOK: usize = 4096;
+/// Samples whose inputs are prepared at once.
+const BLOCK: usize = 64;
+/// Blocks between two looks at the monitor.
+const LOOK: usize = 64;
 
-/// A free run over scaled inputs; what it leaves behind goes where its caller says.
-pub(super) struct FreeRun<'a> {
+/// One network's run; what it leaves behind goes where its caller says.
+pub(super) struct Run<'a> {
     pub network: &'a Network,
+    /// Past outputs before the first sample, newest first.
+    pub state: &'a [f64],
+    /// Outputs, one for each sample simulated.
+    pub outputs: &'a mut [f64],
+    /// Room for the hidden outputs of all samples, or of none.
+    pub hidden: &'a mut [Group],
+    /// None where it has already failed elsewhere.
+    pub limit: Option<Limit>,
+}
+
+/// The cost that a run has to stay below: `(before + sum)/(2 samples) + penalty`.
+#[derive(Clone, Copy)]
+pub(super) struct Limit {
+    pub before: f64,
+    pub samples: f64,
+    pub penalty: f64,
+    pub limit: f64,
+}
+
+impl Limit {
+    /// For a run that nothing is asked of.
+    pub const NONE: Self = Self {
+        before: 0.0,
+        samples: 1.0,
+        penalty: 0.0,
+        limit: f64::INFINITY,
+    };
+
+    /// The cost with this sum of squares; it grows with the sum, rounding included.
+    pub fn cost(&self, sum: f64) -> f64 {
+        0.5 * (self.before + sum) / self.samples + self.penalty
+    }
+
+    /// What is left after a run with this sum.
+    pub fn after(self, sum: f64) -> Self {
+        Self {
+            before: self.before + sum,
+            ..self
+        }
+    }
+
+    fn is_reached(&self, sum: f64) -> bool {
+        self.cost(sum) >= self.limit
+    }
+}
+
+/// Free runs of networks of one shape over the same scaled inputs.
+pub(super) struct FreeRuns<'a, const RUNS: usize> {
+    pub runs: [Run<'a>; RUNS],
     /// Inputs of the whole experiment.
     pub u: &'a [f64],
     /// The first sample that is simulated.
     pub first: usize,
-    /// Past outputs before it, newest first.
-    pub state: &'a [f64],
-    /// Outputs, one for each sample simulated.
-    pub run: &'a mut [f64],
-    /// Room for the hidden outputs of all samples, or of none.
-    pub hidden: &'a mut [Group],
+    /// Measured outputs of the simulated samples, NaN where there is none; empty where nothing is measured.
+    pub y: &'a [f64],
     /// An output of this size has diverged.
     pub bound: f64,
     /// Asked whether to stop.
     pub monitor: Option<&'a Monitor>,
 }
 
-impl FreeRun<'_> {
-    /// Runs it; `None` where it diverges or is stopped.
-    pub fn go(self) -> Option<()> {
+impl<const RUNS: usize> FreeRuns<'_, RUNS> {
+    /// Sums of squared errors, 0 without a measure; none where a run diverges, is stopped, or can no longer stay below
+    /// its limit.
+    pub fn go(self) -> [Option<f64>; RUNS] {
         simd::run(self)
     }
 }
 
-impl Kernel for FreeRun<'_> {
-    type Output = Option<()>;
+impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
+    type Output = [Option<f64>; RUNS];
 
     #[inline(always)]
-    fn run<V: Eight>(self) -> Option<()> {
+    fn run<V: Eight>(self) -> Self::Output {
         let Self {
-            network,
+            runs,
             u,
             first,
-            state,
-            run,
-            hidden,
+            y,
             bound,
             monitor,
         } = self;
-        let lags = network.shape.lags;
-        let groups = network.shape.groups();
-        let mut phi = vec![0.0; lags.regressors()];
-        phi[..lags.na].copy_from_slice(state);
-        let mut newest = state[0];
-        let mut kept = hidden.chunks_exact_mut(groups);
-        for (i, out) in run.iter_mut().enumerate() {
-            lags.write_inputs(u, first + i, &mut phi[lags.na..]);
-            let y = match kept.next() {
-                Some(kept) => network.step::<V>(newest, &phi, |g, h| h.store(&mut kept[g].0)),
-                None => network.step::<V>(newest, &phi, |_, _| ()),
-            };
-            // NaN is no number below the bound either.
-            let sound = y.abs() < bound;
-            if !sound || (i % LOOK == 0 && monitor.is_some_and(Monitor::stopped)) {
-                return None;
+        let samples = runs[0].outputs.len();
+        let lags = runs[0].network.shape.lags;
+        let mut chains = runs.map(Chain::new);
+        let mut inputs = vec![[0.0; BLOCK]; lags.regressors() - lags.na];
+        for start in (0..samples).step_by(BLOCK) {
+            let count = BLOCK.min(samples - start);
+            if start % (BLOCK * LOOK) == 0 && monitor.is_some_and(Monitor::stopped) {
+                return [None; RUNS];
             }
-            // The newest output stays in its register.
-            for m in (2..lags.na).rev() {
-                phi[m] = phi[m - 1];
+            for (entry, values) in inputs.iter_mut().enumerate() {
+                regressor::inputs(lags, u, first + start, entry, &mut values[..count]);
             }
-            if lags.na > 1 {
-                phi[1] = newest;
+            for chain in chains.iter_mut().filter(|chain| chain.runs) {
+                chain.drive::<V>(&inputs, count);
             }
-            (newest, *out) = (y, y);
+            advance::<V, RUNS>(&mut chains, start, count);
+            for chain in chains.iter_mut().filter(|chain| chain.runs) {
+                let measured = y.get(start..start + count).unwrap_or_default();
+                chain.conclude::<V>(start, measured, count, bound);
+            }
+            if chains.iter().all(|chain| !chain.runs) {
+                break;
+            }
         }
-        Some(())
+        chains.map(|chain| chain.runs.then_some(chain.sum))
     }
+}
+
+/// One block of all runs that have not ended.
+#[inline(always)]
+fn advance<V: Eight, const RUNS: usize>(chains: &mut [Chain; RUNS], start: usize, count: usize) {
+    let shape = chains[0].run.network.shape;
+    let na = if shape.groups() == 1 {
+        shape.lags.na
+    } else {
+        0
+    };
+    if let [one, two] = &mut chains[..]
+        && one.runs
+        && two.runs
+    {
+        match na {
+            1 => return together::<V, 1, 2>([one, two], start, count),
+            2 => return together::<V, 2, 2>([one, two], start, count),
+            _ => (),
+        }
+    }
+    for chain in chains.iter_mut().filter(|chain| chain.runs) {
+        match na {
+            1 => together::<V, 1, 1>([chain], start, count),
+            2 => together::<V, 2, 1>([chain], start, count),
+            3 => together::<V, 3, 1>([chain], start, count),
+            4 => together::<V, 4, 1>([chain], start, count),
+            _ => chain.alone::<V>(start, count),
+        }
+    }
+}
+
+/// A run on its way.
+struct Chain<'a> {
+    run: Run<'a>,
+    /// The inputs' share of each group's arguments, and last of the direct way to the output.
+    driven: Vec<[Group; BLOCK]>,
+    /// The last outputs, the oldest first, and behind them those of the block.
+    outputs: Vec<f64>,
+    /// Squared errors, every eighth.
+    sums: Group,
+    sum: f64,
+    limit: Limit,
+    runs: bool,
+}
+
+impl<'a> Chain<'a> {
+    fn new(run: Run<'a>) -> Self {
+        let past = run.state.iter().rev().copied();
+        Self {
+            driven: vec![[Group::ZERO; BLOCK]; run.network.shape.groups() + 1],
+            outputs: past.chain([0.0; BLOCK]).collect(),
+            sums: Group::ZERO,
+            sum: 0.0,
+            limit: run.limit.unwrap_or(Limit::NONE),
+            runs: run.limit.is_some(),
+            run,
+        }
+    }
+
+    /// The inputs' share of a block.
+    #[inline(always)]
+    fn drive<V: Eight>(&mut self, inputs: &[[f64; BLOCK]], count: usize) {
+        let network = self.run.network;
+        let n_phi = network.shape.lags.regressors();
+        for (group, driven) in self.driven.iter_mut().enumerate() {
+            let bias = V::load(&network.bias[group].0);
+            let weights = &network.first[group * n_phi..][..n_phi];
+            let weights = &weights[n_phi - inputs.len()..];
+            for (k, driven) in driven.iter_mut().enumerate().take(count) {
+                let mut sum = bias;
+                for (w, values) in weights.iter().zip(inputs).rev() {
+                    sum = sum.add_product(V::load(&w.0), V::splat(values[k]));
+                }
+                sum.store(&mut driven.0);
+            }
+        }
+    }
+
+    /// A block of a network of any shape.
+    #[inline(always)]
+    fn alone<V: Eight>(&mut self, start: usize, count: usize) {
+        let network = self.run.network;
+        let (shape, na) = (network.shape, network.shape.lags.na);
+        let (groups, n_phi) = (shape.groups(), shape.lags.regressors());
+        let (units, direct) = self.driven.split_at(groups);
+        let mut newest = V::splat(self.outputs[na - 1]);
+        for k in 0..count {
+            let (past, next) = self.outputs.split_at_mut(na + k);
+            let older = &past[k..na + k - 1];
+            let weights = &network.first[groups * n_phi..][..na];
+            let mut sum = argument(V::load(&direct[0][k].0), weights, older, newest);
+            for (group, driven) in units.iter().enumerate() {
+                let weights = &network.first[group * n_phi..][..na];
+                let z = argument(V::load(&driven[k].0), weights, older, newest);
+                let h = simd::tanh::tanh(z);
+                sum = sum.add_product(V::load(&network.second[group].0), h);
+                if let Some(hidden) = self.run.hidden.get_mut((start + k) * groups + group) {
+                    h.store(&mut hidden.0);
+                }
+            }
+            let y = network.limited(sum.sum());
+            newest = V::splat(y);
+            next[0] = y;
+        }
+    }
+
+    /// Hands the block's outputs on and measures them.
+    #[inline(always)]
+    fn conclude<V: Eight>(&mut self, start: usize, measured: &[f64], count: usize, bound: f64) {
+        let na = self.run.state.len();
+        let outputs = &self.outputs[na..na + count];
+        self.run.outputs[start..start + count].copy_from_slice(outputs);
+        // NaN is no number below the bound either.
+        let sound = outputs
+            .iter()
+            .fold(true, |sound, y| sound & (y.abs() < bound));
+        self.runs = sound;
+        self.sum = squared_errors_on::<V>(&mut self.sums, measured, outputs);
+        self.runs &= !self.limit.is_reached(self.sum);
+        self.outputs.copy_within(count..count + na, 0);
+    }
+}
+
+/// The argument of a group: the inputs' share, then the outputs', the newest last as everything else is ready before it
+/// is known. `older` has the oldest first.
+#[inline(always)]
+fn argument<V: Eight>(driven: V, weights: &[Group], older: &[f64], newest: V) -> V {
+    let mut sum = driven;
+    for (w, y) in weights[1..].iter().rev().zip(older) {
+        sum = sum.add_product(V::load(&w.0), V::splat(*y));
+    }
+    sum.add_product(V::load(&weights[0].0), newest)
+}
+
+/// A block of networks of one group of hidden units and `NA` past outputs, side by side.
+#[inline(always)]
+fn together<V: Eight, const NA: usize, const RUNS: usize>(
+    chains: [&mut Chain; RUNS],
+    start: usize,
+    count: usize,
+) {
+    let mut weights = [[V::splat(0.0); NA]; RUNS];
+    let mut direct = [[V::splat(0.0); NA]; RUNS];
+    let mut second = [V::splat(0.0); RUNS];
+    let mut past = [[V::splat(0.0); NA]; RUNS];
+    for (r, chain) in chains.iter().enumerate() {
+        let network = chain.run.network;
+        let n_phi = network.shape.lags.regressors();
+        second[r] = V::load(&network.second[0].0);
+        for m in 0..NA {
+            weights[r][m] = V::load(&network.first[m].0);
+            direct[r][m] = V::load(&network.first[n_phi + m].0);
+            past[r][m] = V::splat(chain.outputs[NA - 1 - m]);
+        }
+    }
+    let limited = chains[0].run.network.saturates();
+    let kept = !chains[0].run.hidden.is_empty();
+    for k in 0..count.min(BLOCK) {
+        for r in 0..RUNS {
+            let chain = &mut *chains[r];
+            let mut z = V::load(&chain.driven[0][k].0);
+            let mut sum = V::load(&chain.driven[1][k].0);
+            for m in (0..NA).rev() {
+                z = z.add_product(weights[r][m], past[r][m]);
+                sum = sum.add_product(direct[r][m], past[r][m]);
+            }
+            let h = simd::tanh::tanh(z);
+            if kept {
+                h.store(&mut chain.run.hidden[start + k].0);
+            }
+            let mut y = sum.add_product(second[r], h).sum();
+            if limited {
+                y = chain.run.network.limited(y);
+            }
+            for m in (1..NA).rev() {
+                past[r][m] = past[r][m - 1];
+            }
+            past[r][0] = V::splat(y);
+            chain.outputs[NA + k] = y;
+        }
+    }
+}
+
+/// Adds the squared errors of the samples that were measured; the sum of all so far.
+#[inline(always)]
+fn squared_errors_on<V: Eight>(sums: &mut Group, y: &[f64], run: &[f64]) -> f64 {
+    let mut sum = V::load(&sums.0);
+    let ((y, y_rest), (run, run_rest)) = (y.as_chunks(), run.as_chunks());
+    for (y, run) in y.iter().zip(run) {
+        sum = square(sum, V::load(y).sub(V::load(run)));
+    }
+    if !y_rest.is_empty() {
+        let mut errors = [0.0; LANES];
+        for (error, (y, run)) in errors.iter_mut().zip(y_rest.iter().zip(run_rest)) {
+            *error = y - run;
+        }
+        sum = square(sum, V::load(&errors));
+    }
+    sum.store(&mut sums.0);
+    sum.sum()
+}
+
+/// Adds squares; what was not measured is NaN and adds nothing.
+#[inline(always)]
+fn square<V: Eight>(sum: V, error: V) -> V {
+    let error = error.if_equal(error, error, V::splat(0.0));
+    sum.add_product(error, error)
 }
 
 /// The outputs of `samples` from `first` on; NaN from where on the run leaves the finite numbers.
@@ -86,18 +342,25 @@ pub(super) fn outputs(
     state: &[f64],
     samples: usize,
 ) -> Vec<f64> {
-    let mut run = vec![f64::NAN; samples];
-    let free = FreeRun {
+    let mut outputs = vec![f64::NAN; samples];
+    let run = Run {
         network,
+        state,
+        outputs: &mut outputs,
+        hidden: &mut [],
+        limit: Some(Limit::NONE),
+    };
+    let whole = FreeRuns {
+        runs: [run],
         u,
         first,
-        state,
-        run: &mut run,
-        hidden: &mut [],
+        y: &[],
         bound: f64::INFINITY,
         monitor: None,
     };
-    // where it ends early, NaN says so
-    let _ = free.go();
-    run
+    if whole.go()[0].is_none() {
+        let end = outputs.iter().position(|y| !y.is_finite());
+        outputs[end.unwrap_or(0)..].fill(f64::NAN);
+    }
+    outputs
 }

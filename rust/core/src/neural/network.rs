@@ -63,11 +63,11 @@ impl Shape {
     }
 
     /// For each entry of theta its column in a sensitivity row. A row holds, for each regressor, then for `b1`, then
-    /// for `w2`, all hidden units, then `b2`, `linear`, the past outputs and the error.
+    /// for `w2`, all hidden units, then `b2`, `linear`, the error and the past outputs.
     pub(super) fn columns(&self) -> Vec<usize> {
         let (n_phi, hidden) = (self.lags.regressors(), self.hidden);
         let first = (0..hidden).flat_map(|i| (0..n_phi).map(move |c| c * hidden + i));
-        let others = n_phi * hidden..self.state_column();
+        let others = n_phi * hidden..self.error_column();
         first.chain(others).collect()
     }
 
@@ -76,21 +76,32 @@ impl Shape {
         (self.lags.regressors() + 2) * self.hidden
     }
 
-    /// Column of the first past output.
-    pub(super) fn state_column(&self) -> usize {
+    /// Column of the error.
+    pub(super) fn error_column(&self) -> usize {
         self.parameters()
     }
 
-    /// Column of the error.
-    pub(super) fn error_column(&self) -> usize {
-        self.state_column() + self.lags.na
+    /// Column of the first past output.
+    pub(super) fn state_column(&self) -> usize {
+        self.error_column() + 1
     }
 
-    /// A buffer for sensitivity rows of this shape, which are written in whole groups.
-    pub(super) fn gram(&self) -> Gram {
-        let written = self.tail() + (self.error_column() + 1 - self.tail()).next_multiple_of(LANES);
+    /// Groups from column `b2` to the last one.
+    pub(super) fn tail_groups(&self) -> usize {
+        (self.state_column() + self.lags.na - self.tail()).div_ceil(LANES)
+    }
+
+    /// A buffer for sensitivity rows of this shape, which are written in whole groups; past outputs take part in its
+    /// sums where they are `estimated`.
+    pub(super) fn gram(&self, estimated: bool) -> Gram {
+        let states = if estimated { self.lags.na } else { 0 };
+        let written = self.tail() + self.tail_groups() * LANES;
         let units = (self.lags.regressors() + 1) * self.hidden + self.groups() * LANES;
-        Gram::with_room(self.error_column() + 1, written.max(units), self.lags.na)
+        Gram::with_room(
+            self.state_column() + states,
+            written.max(units),
+            self.lags.na,
+        )
     }
 }
 
@@ -102,11 +113,11 @@ pub struct Network {
     /// Lowest and highest output, infinite where it does not saturate.
     pub limits: (f64, f64),
     saturates: bool,
-    /// For each group its weights for the regressor.
+    /// For each group its weights for the regressor; behind the last one, in the first lane, those of the direct way to
+    /// the output, whose bias is the constant.
     pub(super) first: Vec<Group>,
-    bias: Vec<Group>,
+    pub(super) bias: Vec<Group>,
     pub(super) second: Vec<Group>,
-    constant: f64,
     pub(super) linear: Vec<f64>,
 }
 
@@ -118,10 +129,9 @@ impl Network {
             shape,
             limits,
             saturates: limits.0 > f64::NEG_INFINITY || limits.1 < f64::INFINITY,
-            first: vec![Group::ZERO; groups * n_phi],
-            bias: vec![Group::ZERO; groups],
+            first: vec![Group::ZERO; (groups + 1) * n_phi],
+            bias: vec![Group::ZERO; groups + 1],
             second: vec![Group::ZERO; groups],
-            constant: 0.0,
             linear: vec![0.0; n_phi],
         }
     }
@@ -138,9 +148,14 @@ impl Network {
             self.bias[group].0[lane] = theta[bias + i];
             self.second[group].0[lane] = theta[second + i];
         }
-        self.constant = theta[constant];
+        let groups = self.shape.groups();
+        self.bias[groups].0[0] = theta[constant];
         if self.shape.bypass {
             self.linear.copy_from_slice(&theta[linear..linear + n_phi]);
+            let direct = &mut self.first[groups * n_phi..];
+            for (direct, linear) in direct.iter_mut().zip(&self.linear) {
+                direct.0[0] = *linear;
+            }
         }
     }
 
@@ -167,19 +182,18 @@ impl Network {
         phi: &[f64],
         mut hidden: impl FnMut(usize, V),
     ) -> f64 {
-        let mut sum = V::splat(0.0);
+        let mut sum = self.argument::<V>(self.second.len(), newest, phi);
         for (group, second) in self.second.iter().enumerate() {
             let h = tanh(self.argument::<V>(group, newest, phi));
             sum = sum.add_product(V::load(&second.0), h);
             hidden(group, h);
         }
-        let mut direct = self.constant;
-        if self.shape.bypass {
-            let older = self.linear.iter().zip(phi).skip(1).rev();
-            direct = older.fold(direct, |sum, (w, value)| sum + w * value);
-            direct += self.linear[0] * newest;
-        }
-        let output = direct + sum.sum();
+        self.limited(sum.sum())
+    }
+
+    /// The output, held to its limits.
+    #[inline(always)]
+    pub(super) fn limited(&self, output: f64) -> f64 {
         if self.saturates {
             output.clamp(self.limits.0, self.limits.1)
         } else {
@@ -193,10 +207,16 @@ impl Network {
         output <= self.limits.0 || output >= self.limits.1
     }
 
-    /// `1 - h^2` of a group to its last digits.
+    /// Whether the output has a limit.
+    pub(super) fn saturates(&self) -> bool {
+        self.saturates
+    }
+
+    /// A group's outputs `h` and `1 - h^2` to its last digits.
     #[inline(always)]
-    pub(super) fn rise<V: Eight>(&self, group: usize, phi: &[f64]) -> V {
-        rise(self.argument::<V>(group, phi[0], phi))
+    pub(super) fn unit<V: Eight>(&self, group: usize, phi: &[f64]) -> (V, V) {
+        let argument = self.argument::<V>(group, phi[0], phi);
+        (tanh(argument), rise(argument))
     }
 
     /// The outputs of all hidden units for the regressor `phi`.
@@ -241,7 +261,7 @@ impl Kernel for Once<'_> {
         if !slope.is_empty() {
             slope.copy_from_slice(&network.linear[..slope.len()]);
             for (group, second) in network.second.iter().enumerate() {
-                let steep = V::load(&second.0).mul(network.rise::<V>(group, phi));
+                let steep = V::load(&second.0).mul(network.unit::<V>(group, phi).1);
                 let weights = &network.first[group * phi.len()..];
                 for (slope, w) in slope.iter_mut().zip(weights) {
                     *slope += steep.mul(V::load(&w.0)).sum();

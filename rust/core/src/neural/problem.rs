@@ -1,13 +1,13 @@
 //! The network's free run as a least-squares problem.
 
-use super::free_run;
+use super::free_run::{FreeRuns, Limit, Run};
 use super::network::{Network, Shape};
 use super::scaling::Scaling;
 use super::sensitivities::Recursion;
 use super::train::InitialState;
 use crate::gram::Gram;
 use crate::lm::Problem;
-use crate::simd::{Group, LANES};
+use crate::simd::{self, Group, LANES};
 use crate::{Monitor, Record};
 
 /// A free run beyond this many scales has diverged.
@@ -93,18 +93,52 @@ fn first_level(y: &[f64]) -> f64 {
     first().sum::<f64>() / first().count() as f64
 }
 
+/// Samples up to which hidden outputs of a second run, 64 bytes a sample, are worth their memory.
+const MOST_TOGETHER: usize = 1_000_000;
+
+/// Whether a second run beside the first takes hardly any time of its own: where the first one's chain of dependent
+/// operations leaves the processor waiting.
+fn pays(shape: Shape, experiments: &[Experiment]) -> bool {
+    let samples: usize = experiments.iter().map(Experiment::samples).sum();
+    let short = shape.groups() == 1 && shape.lags.na <= 2 && samples <= MOST_TOGETHER;
+    short && simd::level() != Ok(simd::Level::Baseline)
+}
+
+/// A simulation, with what the Jacobian pass takes from it.
+struct Attempt {
+    theta: Vec<f64>,
+    network: Network,
+    /// Outputs and hidden outputs, experiment by experiment.
+    runs: Vec<Vec<f64>>,
+    hidden: Vec<Vec<Group>>,
+}
+
+impl Attempt {
+    fn new(network: Network, experiments: &[Experiment]) -> Self {
+        let groups = network.shape.groups();
+        let all = || experiments.iter().map(Experiment::samples);
+        Self {
+            theta: Vec::new(),
+            network,
+            runs: all().map(|samples| vec![0.0; samples]).collect(),
+            hidden: all()
+                .map(|samples| vec![Group::ZERO; samples * groups])
+                .collect(),
+        }
+    }
+}
+
 /// Parameters: theta, then, where they are estimated, the past outputs of each experiment.
 pub(super) struct FreeRun<'a> {
     experiments: &'a [Experiment],
     monitor: &'a Monitor,
-    network: Network,
+    shape: Shape,
     estimated: bool,
     decay: f64,
     /// Measured samples.
     samples: f64,
-    /// Outputs and hidden outputs of the last simulation, experiment by experiment.
-    runs: Vec<Vec<f64>>,
-    hidden: Vec<Vec<Group>>,
+    /// The last simulations: one, and the one beside it where two at once pay.
+    attempts: Vec<Attempt>,
     gram: Gram,
     columns: Vec<usize>,
 }
@@ -118,25 +152,24 @@ impl<'a> FreeRun<'a> {
         monitor: &'a Monitor,
     ) -> Self {
         let shape = network.shape;
+        let attempts = if pays(shape, experiments) { 2 } else { 1 };
         Self {
             experiments,
             monitor,
             estimated,
             decay,
             samples: experiments.iter().map(Experiment::measured).sum::<usize>() as f64,
-            runs: experiments.iter().map(|e| vec![0.0; e.samples()]).collect(),
-            hidden: experiments
-                .iter()
-                .map(|e| vec![Group::ZERO; e.samples() * shape.groups()])
+            attempts: (0..attempts)
+                .map(|_| Attempt::new(network.clone(), experiments))
                 .collect(),
-            gram: shape.gram(),
+            gram: shape.gram(estimated),
             columns: shape.columns(),
-            network,
+            shape,
         }
     }
 
     pub fn shape(&self) -> Shape {
-        self.network.shape
+        self.shape
     }
 
     /// `theta` followed by the experiments' own states where those are parameters.
@@ -168,33 +201,57 @@ impl<'a> FreeRun<'a> {
 
     /// Share of the last simulation's samples on a limit.
     pub fn clipped_share(&self) -> f64 {
-        let clipped = self
-            .runs
-            .iter()
-            .flatten()
-            .filter(|&&y| self.network.is_clipped(y))
-            .count();
-        clipped as f64 / self.runs.iter().map(Vec::len).sum::<usize>() as f64
+        let Attempt { network, runs, .. } = &self.attempts[0];
+        let outputs = runs.iter().flatten();
+        let clipped = outputs.filter(|&&y| network.is_clipped(y)).count();
+        clipped as f64 / runs.iter().map(Vec::len).sum::<usize>() as f64
     }
 
-    /// Sum of squared errors of the free run, whose outputs are stored.
-    fn simulate(&mut self, theta: &[f64], experiment: usize) -> Option<f64> {
-        let data = &self.experiments[experiment];
-        free_run::FreeRun {
-            network: &self.network,
-            u: &data.u,
-            first: data.first,
-            state: data.state_in(theta, self.state_at(experiment)),
-            run: &mut self.runs[experiment],
-            hidden: &mut self.hidden[experiment],
-            bound: DIVERGED,
-            monitor: Some(self.monitor),
+    /// Costs below `limit` of the free runs at several points, whose outputs are stored.
+    fn simulate<const RUNS: usize>(
+        &mut self,
+        thetas: [&[f64]; RUNS],
+        limit: f64,
+    ) -> [Option<f64>; RUNS] {
+        let mut limits = thetas.map(|theta| {
+            Some(Limit {
+                before: 0.0,
+                samples: self.samples,
+                penalty: self.penalty(theta),
+                limit,
+            })
+        });
+        for (attempt, theta) in self.attempts.iter_mut().zip(thetas) {
+            attempt.network.load(theta);
+            attempt.theta.clear();
+            attempt.theta.extend_from_slice(theta);
         }
-        .go()?;
-        Some(squared_errors(
-            &data.y[data.first..],
-            &self.runs[experiment],
-        ))
+        for (experiment, data) in self.experiments.iter().enumerate() {
+            let place = self.state_at(experiment);
+            let Some(attempts) = self.attempts.first_chunk_mut::<RUNS>() else {
+                return [None; RUNS];
+            };
+            let mut left = limits.into_iter();
+            let sums = FreeRuns {
+                runs: attempts.each_mut().map(|attempt| Run {
+                    network: &attempt.network,
+                    state: data.state_in(&attempt.theta, place),
+                    outputs: &mut attempt.runs[experiment],
+                    hidden: &mut attempt.hidden[experiment],
+                    limit: left.next().flatten(),
+                }),
+                u: &data.u,
+                first: data.first,
+                y: &data.y[data.first..],
+                bound: DIVERGED,
+                monitor: Some(self.monitor),
+            }
+            .go();
+            for (limit, sum) in limits.iter_mut().zip(sums) {
+                *limit = limit.zip(sum).map(|(limit, sum)| limit.after(sum));
+            }
+        }
+        limits.map(|limit| limit.map(|limit| limit.cost(0.0)))
     }
 
     /// Where an experiment's own state begins among the parameters.
@@ -206,6 +263,10 @@ impl<'a> FreeRun<'a> {
 
     fn sensitivities(&mut self, theta: &[f64], experiment: usize) {
         let (shape, data) = (self.shape(), &self.experiments[experiment]);
+        let place = self.state_at(experiment);
+        let attempts = &self.attempts;
+        let same = attempts.iter().find(|attempt| attempt.theta == theta);
+        let attempt = same.unwrap_or(&attempts[0]);
         self.gram.clear();
         if self.estimated {
             for i in 0..shape.lags.na {
@@ -213,12 +274,12 @@ impl<'a> FreeRun<'a> {
             }
         }
         Recursion {
-            network: &self.network,
+            network: &attempt.network,
             u: &data.u,
             first: data.first,
-            state: data.state_in(theta, self.state_at(experiment)),
-            run: &self.runs[experiment],
-            hidden: Some(&self.hidden[experiment]),
+            state: data.state_in(theta, place),
+            run: &attempt.runs[experiment],
+            hidden: Some(&attempt.hidden[experiment]),
             y: &data.y[data.first..],
             rows: &mut self.gram,
             monitor: Some(self.monitor),
@@ -230,6 +291,7 @@ impl<'a> FreeRun<'a> {
     fn scatter(&mut self, experiment: usize, jtj: &mut [f64], jte: &mut [f64]) {
         let (shape, n) = (self.shape(), jte.len());
         let (na, first_state) = (shape.lags.na, shape.state_column());
+        let error = shape.error_column();
         let states = if self.estimated { na } else { 0 };
         let own = shape.parameters();
         let column = |i: usize| {
@@ -244,7 +306,7 @@ impl<'a> FreeRun<'a> {
         let scale = 1.0 / self.samples;
         for i in 0..own + states {
             let a = column(i);
-            jte[place(i)] += sums[(first_state + na) * width + a] * scale;
+            jte[place(i)] += sums[a.max(error) * width + a.min(error)] * scale;
             for j in 0..=i {
                 let b = column(j);
                 jtj[place(i) * n + place(j)] += sums[a.max(b) * width + a.min(b)] * scale;
@@ -264,16 +326,23 @@ impl Problem for FreeRun<'_> {
     }
 
     fn cost(&mut self, theta: &[f64]) -> Option<f64> {
-        self.network.load(theta);
-        let mut sum = 0.0;
-        for experiment in 0..self.experiments.len() {
-            sum += self.simulate(theta, experiment)?;
-        }
-        Some(0.5 * sum / self.samples + self.penalty(theta))
+        self.cost_below(theta, f64::INFINITY)
+    }
+
+    fn cost_below(&mut self, theta: &[f64], limit: f64) -> Option<f64> {
+        let [cost] = self.simulate([theta], limit);
+        cost
+    }
+
+    fn takes_two(&self) -> bool {
+        self.attempts.len() == 2
+    }
+
+    fn costs_below(&mut self, thetas: [&[f64]; 2], limit: f64) -> [Option<f64>; 2] {
+        self.simulate(thetas, limit)
     }
 
     fn normal_equations(&mut self, theta: &[f64], jtj: &mut [f64], jte: &mut [f64]) {
-        self.network.load(theta);
         jtj.fill(0.0);
         jte.fill(0.0);
         for experiment in 0..self.experiments.len() {

@@ -1,6 +1,6 @@
 //! Which iterate of a start is kept: the best on the validation data, else the best on the training data.
 
-use super::free_run::FreeRun;
+use super::free_run;
 use super::network::Network;
 use super::problem::{Experiment, squared_errors};
 use super::train::{InitialState, Training};
@@ -64,18 +64,9 @@ impl<'t> Referee<'t> {
         let Ok(state) = state else {
             return (f64::INFINITY, 1);
         };
-        let mut run = vec![0.0; experiment.y.len() - first];
-        let whole = FreeRun {
-            network: &self.network,
-            u: &experiment.u,
-            first,
-            state: &state,
-            run: &mut run,
-            hidden: &mut [],
-            bound: f64::INFINITY,
-            monitor: None,
-        };
-        if whole.go().is_none() {
+        let samples = experiment.y.len() - first;
+        let run = free_run::outputs(&self.network, &experiment.u, first, &state, samples);
+        if run.last().is_none_or(|y| y.is_nan()) {
             return (f64::INFINITY, 1);
         }
         let judged = &experiment.y[skipped..];

@@ -1,31 +1,31 @@
-//! Exact derivatives of the free run by the forward recursion, eight columns at a time.
+//! Exact derivatives of the free run by the forward recursion, a block of samples at a time.
 //!
 //! `d yhat(k)/d theta = d f/d theta + sum_m (d f/d phi_m) d yhat(k-m)/d theta`, zero where the output is clipped.
+//!
+//! The free run is known, so that slopes and gains of a block are computed first, each sample for itself; then a few
+//! groups of columns run through the block with their last rows in registers.
 
-use super::free_run::LOOK;
-use super::network::Network;
+use super::network::{Network, Shape};
+use super::regressor;
 use crate::Monitor;
-use crate::gram::Gram;
-use crate::lagged::push_past;
+use crate::gram::{BLOCK, Gram};
 use crate::simd::{self, Eight, Group, Kernel, LANES};
 
 /// What takes the rows and holds the ones before.
 pub(super) trait Rows {
-    /// The last `na` rows, the oldest first, and room for the next one.
-    fn place(&mut self) -> (&[f64], &mut [f64]);
-    /// The next row has been written; its error is NaN where the output was not measured.
-    fn keep(&mut self, error: f64);
+    /// The last `na` rows, the oldest first, and behind them room for the next `count`.
+    fn ahead(&mut self, count: usize) -> &mut [f64];
+    /// The next rows have been written; the error is NaN where the output was not measured.
+    fn keep(&mut self, errors: &[f64]);
 }
 
 impl Rows for Gram {
-    #[inline(always)]
-    fn place(&mut self) -> (&[f64], &mut [f64]) {
-        Gram::place(self)
+    fn ahead(&mut self, count: usize) -> &mut [f64] {
+        Gram::ahead(self, count)
     }
 
-    #[inline(always)]
-    fn keep(&mut self, error: f64) {
-        Gram::keep_weighed(self, error);
+    fn keep(&mut self, errors: &[f64]) {
+        Gram::keep_all(self, errors);
     }
 }
 
@@ -46,172 +46,269 @@ pub(super) struct Recursion<'a, R> {
     pub monitor: Option<&'a Monitor>,
 }
 
+/// Blocks between two looks at the monitor.
+const LOOK: usize = 64;
+
 impl<R: Rows> Recursion<'_, R> {
     /// Runs it.
     pub fn go(self) {
-        simd::run(self);
-    }
-}
-
-/// What all columns of a row have in common.
-struct Sample {
-    phi: Vec<f64>,
-    hidden: Vec<Group>,
-    /// Slopes of the output by each hidden unit's argument.
-    slopes: Vec<Group>,
-    /// Slopes of the output by each past output.
-    gains: Vec<f64>,
-    /// `[1, linear's regressor, 0 ..]`: the row's own part behind the hidden units.
-    tail: Vec<f64>,
-}
-
-impl<R: Rows> Kernel for Recursion<'_, R> {
-    type Output = ();
-
-    #[inline(always)]
-    fn run<V: Eight>(self) {
-        match self.network.shape.lags.na {
-            1 => self.samples::<V, 1>(),
-            2 => self.samples::<V, 2>(),
-            _ => self.samples::<V, 0>(),
-        }
-    }
-}
-
-impl<R: Rows> Recursion<'_, R> {
-    /// `NA` past outputs; 0 stands for any number.
-    #[inline(always)]
-    fn samples<V: Eight, const NA: usize>(self) {
-        let shape = self.network.shape;
-        let (lags, groups) = (shape.lags, shape.groups());
-        let mut sample = Sample {
-            phi: vec![0.0; lags.regressors()],
-            hidden: vec![Group::ZERO; groups],
-            slopes: vec![Group::ZERO; groups],
-            gains: vec![0.0; lags.na],
-            tail: vec![0.0; (shape.error_column() + 1 - shape.tail()).next_multiple_of(LANES)],
-        };
-        sample.tail[0] = 1.0;
-        sample.phi[..lags.na].copy_from_slice(self.state);
-        for (i, (&y, &measured)) in self.run.iter().zip(self.y).enumerate() {
+        let mut block = Block::new(self.network.shape);
+        for (i, measured) in self.y.chunks(BLOCK).enumerate() {
             if i % LOOK == 0 && self.monitor.is_some_and(Monitor::stopped) {
                 return;
             }
-            lags.write_inputs(self.u, self.first + i, &mut sample.phi[lags.na..]);
-            let error = measured - y;
-            let (past, row) = self.rows.place();
-            if self.network.is_clipped(y) {
-                row.fill(0.0);
-            } else {
-                let hidden = self.hidden.map(|all| &all[i * groups..][..groups]);
-                sample.slope::<V>(self.network, hidden);
-                sample.write::<V, NA>(self.network, hidden, past, row);
+            let (start, count) = (i * BLOCK, measured.len());
+            block.fill(&self, start, count);
+            for (k, measured) in measured.iter().enumerate() {
+                block.errors[k] = measured - self.run[start + k];
             }
-            row[shape.error_column()] = error;
-            self.rows.keep(error);
-            push_past(&mut sample.phi[..lags.na], y);
+            simd::run(Advance {
+                recursion: Step {
+                    network: self.network,
+                    run: &self.run[start..start + count],
+                    hidden: self.hidden.map(|all| &all[start * block.groups..]),
+                },
+                block: &mut block,
+                rows: self.rows.ahead(count),
+            });
+            self.rows.keep(&block.errors[..count]);
         }
     }
 }
 
-impl Sample {
-    /// The slopes, from stored hidden outputs or else to their last digits.
+/// Eight columns of a row before the past rows are added: a source, times a scale.
+#[derive(Clone, Copy)]
+struct Column {
+    at: usize,
+    source: usize,
+    scale: usize,
+}
+
+/// What the rows of a block are made of, each over the samples of the block.
+struct Block {
+    shape: Shape,
+    groups: usize,
+    columns: Vec<Column>,
+    /// Entries of the regressor, then ones.
+    scales: Vec<[f64; BLOCK]>,
+    /// Slopes of the output by each hidden unit's argument, hidden outputs, and
+    /// `[1, linear's regressor, 0 ..]`: the rows' own part behind the hidden units.
+    sources: Vec<[Group; BLOCK]>,
+    /// Slopes of the output by each past output.
+    gains: Vec<[f64; BLOCK]>,
+    errors: [f64; BLOCK],
+}
+
+impl Block {
+    fn new(shape: Shape) -> Self {
+        let (groups, n_phi, units) = (shape.groups(), shape.lags.regressors(), shape.hidden);
+        let parts = (0..=n_phi).map(|c| (c * units, 0, c));
+        let parts = parts.chain([((n_phi + 1) * units, groups, n_phi)]);
+        let units = parts.flat_map(|(at, source, scale)| {
+            (0..groups).map(move |g| (at + g * LANES, source + g, scale))
+        });
+        let tail =
+            (0..shape.tail_groups()).map(|g| (shape.tail() + g * LANES, 2 * groups + g, n_phi));
+        let column = |(at, source, scale)| Column { at, source, scale };
+        Self {
+            shape,
+            groups,
+            columns: units.chain(tail).map(column).collect(),
+            scales: vec![[1.0; BLOCK]; n_phi + 1],
+            sources: vec![[Group::ZERO; BLOCK]; 2 * groups + shape.tail_groups()],
+            gains: vec![[0.0; BLOCK]; shape.lags.na],
+            errors: [0.0; BLOCK],
+        }
+    }
+
+    /// The regressors of a block, and what of them reaches the output directly.
+    fn fill<R>(&mut self, recursion: &Recursion<'_, R>, start: usize, count: usize) {
+        let (lags, n_phi) = (self.shape.lags, self.shape.lags.regressors());
+        for (c, entry) in self.scales[..n_phi].iter_mut().enumerate() {
+            let entry = &mut entry[..count];
+            if c < lags.na {
+                regressor::outputs(recursion.run, recursion.state, start, c + 1, entry);
+            } else {
+                let start = recursion.first + start;
+                regressor::inputs(lags, recursion.u, start, c - lags.na, entry);
+            }
+        }
+        let direct = if self.shape.bypass { n_phi } else { 0 };
+        for tail in 0..=direct {
+            let source = &mut self.sources[2 * self.groups + tail / LANES];
+            let entry = if tail == 0 { n_phi } else { tail - 1 };
+            for (own, value) in source[..count].iter_mut().zip(&self.scales[entry]) {
+                own.0[tail % LANES] = *value;
+            }
+        }
+    }
+}
+
+/// What is known of a block from its free run.
+struct Step<'a> {
+    network: &'a Network,
+    run: &'a [f64],
+    hidden: Option<&'a [Group]>,
+}
+
+/// One block of the recursion.
+struct Advance<'a> {
+    recursion: Step<'a>,
+    block: &'a mut Block,
+    /// The past rows and those of the block.
+    rows: &'a mut [f64],
+}
+
+impl Kernel for Advance<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<V: Eight>(mut self) {
+        match self.block.shape.lags.na {
+            1 => self.advance::<V, 1>(),
+            2 => self.advance::<V, 2>(),
+            3 => self.advance::<V, 3>(),
+            _ => self.advance::<V, 0>(),
+        }
+        let width = self.rows.len() / (self.block.shape.lags.na + self.recursion.run.len());
+        let (na, error) = (self.block.shape.lags.na, self.block.shape.error_column());
+        let rows = self.rows.chunks_exact_mut(width).skip(na);
+        for (row, value) in rows.zip(&self.block.errors) {
+            row[error] = *value;
+        }
+    }
+}
+
+impl Advance<'_> {
+    /// `NA` past outputs; 0 stands for any number.
+    #[inline(always)]
+    fn advance<V: Eight, const NA: usize>(&mut self) {
+        for group in 0..self.block.groups {
+            self.slopes::<V>(group);
+        }
+        self.gains::<V>();
+        self.clip();
+        let mut next = 0;
+        while next < self.block.columns.len() {
+            next += match (V::TILE.0, self.block.columns.len() - next) {
+                (8, 1) | (2, _) => self.columns::<V, NA, 1>(next),
+                (4, 1) => self.columns::<V, NA, 1>(next),
+                (4, _) | (_, 2) => self.columns::<V, NA, 2>(next),
+                (_, 3 | 6) => self.columns::<V, NA, 3>(next),
+                _ => self.columns::<V, NA, 4>(next),
+            };
+        }
+    }
+
+    /// Slopes and hidden outputs of a group, from stored hidden outputs or else to their last digits.
     ///
     /// What `1 - h^2` loses where a unit saturates is far below what a sum of squares shows.
     #[inline(always)]
-    fn slope<V: Eight>(&mut self, network: &Network, hidden: Option<&[Group]>) {
-        let n_phi = self.phi.len();
-        let na = self.gains.len();
-        self.gains.copy_from_slice(&network.linear[..na]);
-        for (group, (slope, second)) in self.slopes.iter_mut().zip(&network.second).enumerate() {
-            let rise = match hidden {
-                Some(hidden) => {
-                    let h = V::load(&hidden[group].0);
-                    V::splat(1.0).sub(h.mul(h))
+    fn slopes<V: Eight>(&mut self, group: usize) {
+        let network = self.recursion.network;
+        let (groups, block) = (self.block.groups, &mut *self.block);
+        let second = V::load(&network.second[group].0);
+        let (slopes, outputs) = block.sources.split_at_mut(groups);
+        let samples = slopes[group].iter_mut().zip(&mut outputs[group]);
+        let samples = samples.take(self.recursion.run.len()).enumerate();
+        match self.recursion.hidden {
+            Some(hidden) => {
+                let stored = hidden[group..].iter().step_by(groups);
+                for ((_, (slope, output)), stored) in samples.zip(stored) {
+                    let h = V::load(&stored.0);
+                    h.store(&mut output.0);
+                    let rise = V::splat(1.0).sub(h.mul(h));
+                    second.mul(rise).store(&mut slope.0);
                 }
-                None => network.rise::<V>(group, &self.phi),
-            };
-            let steep = V::load(&second.0).mul(rise);
-            steep.store(&mut slope.0);
-            let weights = &network.first[group * n_phi..][..na];
-            for (gain, w) in self.gains.iter_mut().zip(weights) {
-                *gain += steep.mul(V::load(&w.0)).sum();
             }
-        }
-        if hidden.is_none() {
-            let all = &mut self.hidden;
-            network.step::<V>(self.phi[0], &self.phi, |group, h| {
-                h.store(&mut all[group].0)
-            });
+            None => {
+                let mut phi = vec![0.0; block.shape.lags.regressors()];
+                for (k, (slope, output)) in samples {
+                    for (phi, entry) in phi.iter_mut().zip(&block.scales) {
+                        *phi = entry[k];
+                    }
+                    let (h, rise) = network.unit::<V>(group, &phi);
+                    h.store(&mut output.0);
+                    second.mul(rise).store(&mut slope.0);
+                }
+            }
         }
     }
 
-    /// The row: the sample's own slopes, and what the past outputs pass on.
+    /// The slopes of the output by each past output.
     #[inline(always)]
-    fn write<V: Eight, const NA: usize>(
-        &mut self,
-        network: &Network,
-        hidden: Option<&[Group]>,
-        past: &[f64],
-        row: &mut [f64],
-    ) {
-        let Self {
-            phi,
-            slopes,
-            gains,
-            tail,
-            ..
-        } = self;
-        let (n_phi, units) = (phi.len(), network.shape.hidden);
-        let onward = Onward::<V, NA> {
-            gain: std::array::from_fn(|m| V::splat(gains[m])),
-            gains,
-            past,
-        };
-        for (c, value) in phi.iter().enumerate() {
-            let value = V::splat(*value);
-            for (group, slope) in slopes.iter().enumerate() {
-                onward.write(row, c * units + group * LANES, V::load(&slope.0).mul(value));
+    fn gains<V: Eight>(&mut self) {
+        let (network, groups) = (self.recursion.network, self.block.groups);
+        let n_phi = self.block.shape.lags.regressors();
+        let count = self.recursion.run.len().min(BLOCK);
+        for (m, gains) in self.block.gains.iter_mut().enumerate() {
+            gains.fill(network.linear[m]);
+            for (group, slopes) in self.block.sources[..groups].iter().enumerate() {
+                let weights = V::load(&network.first[group * n_phi + m].0);
+                for k in 0..count {
+                    gains[k] += V::load(&slopes[k].0).mul(weights).sum();
+                }
             }
-        }
-        for (group, slope) in slopes.iter().enumerate() {
-            onward.write(row, n_phi * units + group * LANES, V::load(&slope.0));
-        }
-        for (group, h) in hidden.unwrap_or(&self.hidden).iter().enumerate() {
-            onward.write(row, (n_phi + 1) * units + group * LANES, V::load(&h.0));
-        }
-        if network.shape.bypass {
-            tail[1..1 + n_phi].copy_from_slice(phi);
-        }
-        for (group, own) in tail.chunks_exact(LANES).enumerate() {
-            onward.write(row, network.shape.tail() + group * LANES, V::first(own));
         }
     }
-}
 
-/// What the past outputs pass on, by their slopes; `NA` of them, where 0 stands for any number.
-struct Onward<'a, V, const NA: usize> {
-    gain: [V; NA],
-    gains: &'a [f64],
-    past: &'a [f64],
-}
-
-impl<V: Eight, const NA: usize> Onward<'_, V, NA> {
-    /// Writes eight columns of the row from `at` on.
+    /// Where the output lies on a limit nothing has a slope.
     #[inline(always)]
-    fn write(&self, row: &mut [f64], at: usize, own: V) {
-        let mut value = own;
-        let width = row.len();
-        if NA == 0 {
-            for (gain, old) in self.gains.iter().zip(self.past.rchunks_exact(width)) {
-                value = value.add_product(V::splat(*gain), V::first(&old[at..]));
-            }
-        } else {
-            for (m, gain) in self.gain.iter().enumerate() {
-                let old = &self.past[(NA - 1 - m) * width + at..];
-                value = value.add_product(*gain, V::first(old));
+    fn clip(&mut self) {
+        let Step { network, run, .. } = self.recursion;
+        if !network.saturates() {
+            return;
+        }
+        let block = &mut *self.block;
+        for (k, _) in run
+            .iter()
+            .enumerate()
+            .filter(|(_, y)| network.is_clipped(**y))
+        {
+            block.gains.iter_mut().for_each(|gains| gains[k] = 0.0);
+            let sources = block.sources.iter_mut();
+            sources.for_each(|source| source[k] = Group::ZERO);
+        }
+    }
+
+    /// `COUNT` groups of columns from the plan's `next` on, through the block; how many they were.
+    #[inline(always)]
+    fn columns<V: Eight, const NA: usize, const COUNT: usize>(&mut self, next: usize) -> usize {
+        let (block, count) = (&*self.block, self.recursion.run.len());
+        let na = block.shape.lags.na;
+        let width = self.rows.len() / (na + count);
+        let plan: [Column; COUNT] = std::array::from_fn(|c| block.columns[next + c]);
+        let sources = plan.map(|column| &block.sources[column.source]);
+        let scales = plan.map(|column| &block.scales[column.scale]);
+        let gains: [&[f64; BLOCK]; NA] = std::array::from_fn(|m| &block.gains[m]);
+        let mut old = [[V::splat(0.0); COUNT]; NA];
+        for (m, old) in old.iter_mut().enumerate() {
+            let row = &self.rows[(NA - 1 - m) * width..];
+            for (old, column) in old.iter_mut().zip(&plan) {
+                *old = V::first(&row[column.at..]);
             }
         }
-        value.write(&mut row[at..]);
+        for k in 0..count.min(BLOCK) {
+            let (past, row) = self.rows.split_at_mut((na + k) * width);
+            for (c, column) in plan.iter().enumerate() {
+                let mut value = V::load(&sources[c][k].0).mul(V::splat(scales[c][k]));
+                if NA == 0 {
+                    for (gains, old) in block.gains.iter().zip(past.rchunks_exact(width)) {
+                        value = value.add_product(V::splat(gains[k]), V::first(&old[column.at..]));
+                    }
+                }
+                for m in (0..NA).rev() {
+                    value = value.add_product(V::splat(gains[m][k]), old[m][c]);
+                }
+                for m in (1..NA).rev() {
+                    old[m][c] = old[m - 1][c];
+                }
+                if NA > 0 {
+                    old[0][c] = value;
+                }
+                value.write(&mut row[column.at..]);
+            }
+        }
+        COUNT
     }
 }
