@@ -164,6 +164,9 @@ impl Kernel for Advance<'_> {
 
     #[inline(always)]
     fn run<V: Eight>(mut self) {
+        if V::TILE.0 == 8 && self.is_usual() {
+            return self.usual::<V>();
+        }
         match self.block.shape.lags.na {
             1 => self.advance::<V, 1>(),
             2 => self.advance::<V, 2>(),
@@ -209,29 +212,24 @@ impl Advance<'_> {
         let (groups, block) = (self.block.groups, &mut *self.block);
         let second = V::load(&network.second[group].0);
         let (slopes, outputs) = block.sources.split_at_mut(groups);
-        let samples = slopes[group].iter_mut().zip(&mut outputs[group]);
-        let samples = samples.take(self.recursion.run.len()).enumerate();
-        match self.recursion.hidden {
-            Some(hidden) => {
-                let stored = hidden[group..].iter().step_by(groups);
-                for ((_, (slope, output)), stored) in samples.zip(stored) {
-                    let h = V::load(&stored.0);
-                    h.store(&mut output.0);
-                    let rise = V::splat(1.0).sub(h.mul(h));
-                    second.mul(rise).store(&mut slope.0);
+        let (slopes, outputs) = (&mut slopes[group], &mut outputs[group]);
+        let count = self.recursion.run.len().min(BLOCK);
+        let Some(hidden) = self.recursion.hidden else {
+            let mut phi = vec![0.0; block.shape.lags.regressors()];
+            for k in 0..count {
+                for (phi, entry) in phi.iter_mut().zip(&block.scales) {
+                    *phi = entry[k];
                 }
+                let (h, rise) = network.unit::<V>(group, &phi);
+                h.store(&mut outputs[k].0);
+                second.mul(rise).store(&mut slopes[k].0);
             }
-            None => {
-                let mut phi = vec![0.0; block.shape.lags.regressors()];
-                for (k, (slope, output)) in samples {
-                    for (phi, entry) in phi.iter_mut().zip(&block.scales) {
-                        *phi = entry[k];
-                    }
-                    let (h, rise) = network.unit::<V>(group, &phi);
-                    h.store(&mut output.0);
-                    second.mul(rise).store(&mut slope.0);
-                }
-            }
+            return;
+        };
+        for (k, stored) in hidden.chunks_exact(groups).enumerate().take(count) {
+            let h = V::load(&stored[group].0);
+            h.store(&mut outputs[k].0);
+            steep(second, h).store(&mut slopes[k].0);
         }
     }
 
@@ -310,5 +308,73 @@ impl Advance<'_> {
             }
         }
         COUNT
+    }
+}
+
+/// `w2 (1 - h^2)`.
+#[inline(always)]
+fn steep<V: Eight>(second: V, h: V) -> V {
+    second.mul(V::splat(1.0).sub(h.mul(h)))
+}
+
+/// Past outputs, regressors and hidden units of the usual shape.
+const PAST: usize = 2;
+const REGRESSORS: usize = 4;
+/// Its groups of columns: for each regressor, `b1`, `w2`, and what is behind.
+const GROUPS: usize = REGRESSORS + 3;
+
+impl Advance<'_> {
+    /// Whether all past rows of the block's shape fit into registers.
+    fn is_usual(&self) -> bool {
+        let shape = self.block.shape;
+        (shape.lags.na, shape.lags.regressors()) == (PAST, REGRESSORS)
+            && (shape.hidden, shape.tail_groups()) == (LANES, 1)
+            && self.recursion.hidden.is_some()
+            && !self.recursion.network.saturates()
+    }
+
+    /// A block of the usual shape: slopes, gains and rows in one pass.
+    #[inline(always)]
+    fn usual<V: Eight>(&mut self) {
+        let (network, block) = (self.recursion.network, &*self.block);
+        let width = self.rows.len() / (PAST + self.recursion.run.len());
+        let second = V::load(&network.second[0].0);
+        let weights = [V::load(&network.first[0].0), V::load(&network.first[1].0)];
+        let linear = [network.linear[0], network.linear[1]];
+        let mut old = [[V::splat(0.0); GROUPS]; PAST];
+        for (m, old) in old.iter_mut().enumerate() {
+            let row = &self.rows[(PAST - 1 - m) * width..];
+            for (old, row) in old.iter_mut().zip(row.as_chunks().0) {
+                *old = V::load(row);
+            }
+        }
+        let (tail, error) = (&block.sources[2], block.shape.error_column());
+        let scales: [&[f64; BLOCK]; REGRESSORS] = std::array::from_fn(|c| &block.scales[c]);
+        let hidden = self.recursion.hidden.unwrap_or_default();
+        let count = self.recursion.run.len().min(hidden.len()).min(BLOCK);
+        let rows = &mut self.rows[PAST * width..];
+        for k in 0..count {
+            let Some(row) = rows[k * width..].first_chunk_mut::<{ GROUPS * LANES }>() else {
+                return;
+            };
+            let h = V::load(&hidden[k].0);
+            let slope = steep(second, h);
+            let newest = V::splat(linear[0] + slope.mul(weights[0]).sum());
+            let older = V::splat(linear[1] + slope.mul(weights[1]).sum());
+            let mut own = [slope; GROUPS];
+            for c in 0..REGRESSORS {
+                own[c] = slope.mul(V::splat(scales[c][k]));
+            }
+            own[GROUPS - 2] = h;
+            own[GROUPS - 1] = V::load(&tail[k].0);
+            for c in 0..GROUPS {
+                let value = own[c].add_product(older, old[1][c]);
+                let value = value.add_product(newest, old[0][c]);
+                old[1][c] = old[0][c];
+                old[0][c] = value;
+                value.write(&mut row[c * LANES..]);
+            }
+            row[error] = block.errors[k];
+        }
     }
 }

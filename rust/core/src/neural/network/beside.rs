@@ -13,6 +13,7 @@ impl Network {
         let n = if N == 0 { phi.len() } else { N };
         let phi = &phi[..n];
         let mut sums = [V::splat(0.0); LANES];
+        sums[0] = self.direct::<V>(phi);
         for (group, (bias, second)) in self.bias.iter().zip(&self.second).enumerate() {
             let weights = &self.first[group * n..][..n];
             let units = (self.shape.hidden - group * LANES).min(LANES);
@@ -21,7 +22,7 @@ impl Network {
                 *sum = sum.add_product(V::splat(second.0[unit]), tanh(z));
             }
         }
-        let output = self.direct::<V>(phi).add(in_halves(sums));
+        let output = in_halves(sums);
         if self.saturates {
             output.at_least(self.limits.0).at_most(self.limits.1)
         } else {
@@ -32,13 +33,13 @@ impl Network {
     /// What reaches the output past the hidden units.
     #[inline(always)]
     fn direct<V: Eight>(&self, phi: &[Group]) -> V {
-        let constant = V::splat(self.constant);
+        let constant = V::splat(self.bias[self.second.len()].0[0]);
         if !self.shape.bypass {
             return constant;
         }
         let mut sum = constant;
         for c in (1..phi.len()).rev().chain([0]) {
-            sum = sum.add(V::splat(self.linear[c]).mul(V::load(&phi[c].0)));
+            sum = sum.add_product(V::splat(self.linear[c]), V::load(&phi[c].0));
         }
         sum
     }
