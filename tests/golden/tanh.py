@@ -1,6 +1,7 @@
 """The coefficients of `rust/core/src/simd/tanh.rs`: `python tests/golden/tanh.py`; needs mpmath.
 
-Remez's algorithm for tanh(x)/x = P(s)/Q(s), s = x^2, with the least relative error up to x = 19.1.
+Remez's algorithm for tanh(x)/x = P(s)/Q(s), s = x^2, with the least relative error: up to where
+tanh is 1 to the last bit, and, of lower degree, up to 8.
 """
 
 from __future__ import annotations
@@ -10,9 +11,7 @@ import sys
 import mpmath as mp
 
 mp.mp.dps = 60
-DEGREE = 10
-END = mp.mpf("19.1") ** 2
-UNKNOWNS = 2 * DEGREE + 2
+QUOTIENTS = ((10, mp.mpf("19.1")), (7, mp.mpf(8)))
 GRID = 1500
 
 
@@ -21,34 +20,37 @@ def target(s: mp.mpf) -> mp.mpf:
     return mp.tanh(x) / x if x > mp.mpf(10) ** -25 else 1 - s / 3
 
 
-def placed(t: mp.mpf) -> mp.mpf:
-    """Points from 0 to END, dense near 0."""
-    return END * t**4
+def placed(t: mp.mpf, end: mp.mpf) -> mp.mpf:
+    """Points from 0 to end, dense near 0."""
+    return end * t**4
 
 
-def solved(points: list[mp.mpf], error: mp.mpf) -> tuple[list[mp.mpf], list[mp.mpf], mp.mpf]:
+def solved(
+    points: list[mp.mpf], error: mp.mpf, degree: int, end: mp.mpf
+) -> tuple[list[mp.mpf], list[mp.mpf], mp.mpf]:
     """P, Q and the error that alternates over the points; the error enters its own equation."""
+    unknowns = 2 * degree + 2
     for _ in range(8):
-        left, right = mp.matrix(UNKNOWNS, UNKNOWNS), mp.matrix(UNKNOWNS, 1)
+        left, right = mp.matrix(unknowns, unknowns), mp.matrix(unknowns, 1)
         for i, s in enumerate(points):
-            sign, wanted, share = (-1) ** i, target(s), s / END
-            for j in range(DEGREE + 1):
+            sign, wanted, share = (-1) ** i, target(s), s / end
+            for j in range(degree + 1):
                 left[i, j] = share**j
-            for j in range(1, DEGREE + 1):
-                left[i, DEGREE + j] = -wanted * share**j * (1 + sign * error)
-            left[i, UNKNOWNS - 1] = -wanted * sign
+            for j in range(1, degree + 1):
+                left[i, degree + j] = -wanted * share**j * (1 + sign * error)
+            left[i, unknowns - 1] = -wanted * sign
             right[i] = wanted
         found = mp.lu_solve(left, right)
-        settled = abs(found[UNKNOWNS - 1] - error) < abs(error) * mp.mpf(10) ** -15
-        error = found[UNKNOWNS - 1]
+        settled = abs(found[unknowns - 1] - error) < abs(error) * mp.mpf(10) ** -15
+        error = found[unknowns - 1]
         if settled:
             break
-    numerator = [found[j] for j in range(DEGREE + 1)]
-    denominator = [mp.mpf(1)] + [found[DEGREE + j] for j in range(1, DEGREE + 1)]
+    numerator = [found[j] for j in range(degree + 1)]
+    denominator = [mp.mpf(1)] + [found[degree + j] for j in range(1, degree + 1)]
     return numerator, denominator, error
 
 
-def extremes(values: list[mp.mpf]) -> list[int]:
+def extremes(values: list[mp.mpf], unknowns: int) -> list[int]:
     """Where the error is largest between its changes of sign."""
     best: list[int] = []
     for i, value in enumerate(values):
@@ -57,31 +59,40 @@ def extremes(values: list[mp.mpf]) -> list[int]:
                 best[-1] = i
         else:
             best.append(i)
-    while len(best) > UNKNOWNS:
+    while len(best) > unknowns:
         best.pop(0 if abs(values[best[0]]) < abs(values[best[-1]]) else -1)
     return best
 
 
-def main() -> None:
-    turns = range(UNKNOWNS)
-    points = [placed((1 - mp.cos(mp.pi * (2 * i + 1) / (2 * UNKNOWNS))) / 2) for i in turns]
-    grid = [placed(mp.mpf(i) / GRID) for i in range(GRID + 1)]
-    best, error = None, mp.mpf(0)
+def quotient(degree: int, end: mp.mpf) -> tuple[mp.mpf, list[mp.mpf], list[mp.mpf]]:
+    """The largest relative error, P and Q of s/end up to end."""
+    unknowns = 2 * degree + 2
+    turns = [(1 - mp.cos(mp.pi * (2 * i + 1) / (2 * unknowns))) / 2 for i in range(unknowns)]
+    points = [placed(t, end) for t in turns]
+    grid = [placed(mp.mpf(i) / GRID, end) for i in range(GRID + 1)]
+    best: tuple[mp.mpf, list[mp.mpf], list[mp.mpf]] = (mp.inf, [], [])
+    error = mp.mpf(0)
     for _ in range(6):
-        p, q, error = solved(points, error)
-        quotient = [mp.polyval(p[::-1], s / END) / mp.polyval(q[::-1], s / END) for s in grid]
-        errors = [value / target(s) - 1 for value, s in zip(quotient, grid, strict=True)]
+        p, q, error = solved(points, error, degree, end)
+        values = [mp.polyval(p[::-1], s / end) / mp.polyval(q[::-1], s / end) for s in grid]
+        errors = [value / target(s) - 1 for value, s in zip(values, grid, strict=True)]
         largest = max(abs(e) for e in errors)
-        if best is None or largest < best[0]:
+        if largest < best[0]:
             best = (largest, p, q)
-        chosen = extremes(errors)
-        if len(chosen) < UNKNOWNS:
+        chosen = extremes(errors, unknowns)
+        if len(chosen) < unknowns:
             break
         points = [grid[i] for i in chosen]
-    largest, p, q = best
-    for name, values in (("P", p), ("Q", q)):
-        sys.stdout.write(f"{name} {[float(v / END**j) for j, v in enumerate(values)]}\n")
-    sys.stdout.write(f"relative error {mp.nstr(largest, 3)}\n")
+    return best
+
+
+def main() -> None:
+    for degree, limit in QUOTIENTS:
+        end = limit**2
+        largest, p, q = quotient(degree, end)
+        for name, values in (("P", p), ("Q", q)):
+            sys.stdout.write(f"{name} {[float(v / end**j) for j, v in enumerate(values)]}\n")
+        sys.stdout.write(f"relative error {mp.nstr(largest, 3)}\n")
 
 
 if __name__ == "__main__":

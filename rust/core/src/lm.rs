@@ -421,6 +421,51 @@ mod tests {
         );
     }
 
+    /// The valley, two costs at once; it tells only those below the limit and counts the calls.
+    struct Twice(usize);
+
+    impl Problem for Twice {
+        fn parameters(&self) -> usize {
+            2
+        }
+
+        fn cost(&mut self, t: &[f64]) -> Option<f64> {
+            self.0 += 1;
+            Valley.cost(t)
+        }
+
+        fn takes_two(&self) -> bool {
+            true
+        }
+
+        fn costs_below(&mut self, thetas: [&[f64]; 2], limit: f64) -> [Option<f64>; 2] {
+            self.0 += 1;
+            thetas.map(|t| Valley.cost(t).filter(|cost| *cost < limit))
+        }
+
+        fn normal_equations(&mut self, t: &[f64], jtj: &mut [f64], jte: &mut [f64]) {
+            Valley.normal_equations(t, jtj, jte);
+        }
+    }
+
+    #[test]
+    fn two_costs_at_once_change_nothing_but_the_number_of_calls() {
+        for damping in [Damping::Identity, Damping::Diagonal] {
+            let one = run(damping, 200);
+            let settings = Settings {
+                damping,
+                max_iterations: 200,
+                ..Settings::default()
+            };
+            let mut twice = Twice(0);
+            let start = vec![-1.2, 1.0];
+            let two = minimize(&mut twice, start, &settings, &Monitor::default(), |_, _| {});
+            assert_eq!((&one.theta, &one.trace), (&two.theta, &two.trace));
+            assert_eq!((one.trials, one.termination), (two.trials, two.termination));
+            assert!(twice.0 < one.trials + 1, "{} {}", twice.0, one.trials);
+        }
+    }
+
     #[test]
     fn names_a_start_without_a_cost_and_a_stop() {
         let settings = Settings::default();

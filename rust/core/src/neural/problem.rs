@@ -93,8 +93,8 @@ fn first_level(y: &[f64]) -> f64 {
     first().sum::<f64>() / first().count() as f64
 }
 
-/// Samples up to which hidden outputs of a second run, 64 bytes a sample, are worth their memory.
-const MOST_TOGETHER: usize = 1_000_000;
+/// Samples up to which a second run, 72 bytes a sample, is worth its memory.
+const MOST_TOGETHER: usize = 16_000_000;
 
 /// Whether a second run beside the first takes hardly any time of its own: where the first one's chain of dependent
 /// operations leaves the processor waiting.
