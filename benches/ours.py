@@ -78,7 +78,8 @@ def training(iterations: int) -> Work:
 
     def work() -> dict[str, Any]:
         found = fit()
-        reached = {"cost": found.cost, "iterations": found.iterations}
+        reached = {"first_cost": float(found.trace[0]), "cost": found.cost}
+        reached["iterations"] = found.iterations
         return reached | {"trials": found.trials}
 
     return work

@@ -48,21 +48,20 @@ def require_agreement(row: Row, taken: dict[str, list[Turn]]) -> None:
 
 def told(row: Row, taken: dict[str, list[Turn]]) -> dict[str, Any]:
     """The row's results, in its unit."""
-    scale = row.unit[1] / row.parts
 
     def times(name: str, clock: str) -> list[float]:
         return [getattr(turn, clock) for turn in taken[name]]
 
-    contenders = {}
+    contenders, parts = {}, {c.name: c.parts for c in row.contenders}
     for name, turns in taken.items():
         if not turns or name in row.less.values():
             continue
         off = row.less.get(name)
+        scale = row.unit[1] / (row.parts * parts[name])
         entry: dict[str, Any] = {"turns": len(turns), "reached": turns[-1].reached}
         for clock in ("cpu", "wall"):
             for which, of in (("least", min), ("median", statistics.median)):
                 less = of(times(off, clock)) if off else 0.0
-                # rivals of pieces of work that are parts of theirs alone
                 entry[f"{clock}_{which}"] = (of(times(name, clock)) - less) * scale
         contenders[name] = entry
     return {
@@ -96,7 +95,11 @@ def chosen(words: list[str], quick: bool) -> list[Row]:
     """The rows that are asked for."""
     rows = all_rows()
     if words:
-        return [row for row in rows if any(word in row.key for word in words)]
+        # a whole name is that row alone
+        names = {row.key for row in rows}
+        return [
+            r for r in rows if any(w == r.key or (w not in names and w in r.key) for w in words)
+        ]
     return [row for row in rows if row.quick or not quick]
 
 
@@ -110,6 +113,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="below two minutes")
     parser.add_argument("--only", nargs="*", default=[], help="rows with a word in their names")
+    parser.add_argument("--turns", type=int, help="of every contender, at most")
     parser.add_argument("--dry", action="store_true", help="print, and leave the page as it is")
     given = parser.parse_args()
     CACHE.mkdir(parents=True, exist_ok=True)
@@ -118,7 +122,8 @@ def main() -> int:
     rows, wrong = results.setdefault("rows", {}), []
     for row in chosen(given.only, given.quick):
         try:
-            rows[row.key] = measured(row, min(row.turns, 3) if given.quick else row.turns)
+            most = given.turns or (3 if given.quick else row.turns)
+            rows[row.key] = measured(row, min(row.turns, most))
             print(line(rows[row.key]), flush=True)
         except (Disagreement, subprocess.SubprocessError) as refused:
             wrong.append(f"{row.key}: {refused}")

@@ -89,7 +89,7 @@ def _jacobian(results: Results) -> list[list[str]]:
     run = rows["free_run"]["contenders"]["sewfast"]["cpu_least"]
     spent = 1e6 * own["cpu_least"] / 20_000
     left = (spent - trials * run) / iterations
-    title = "Jacobian pass and solution (training less its trials, by iteration)"
+    title = "Jacobian pass, sum and solution: training less its trials, per iteration"
     return [[title, f"**{number(left)}** ns/sample", "", "", "", "30 ns", "25.9 ns"]]
 
 

@@ -20,7 +20,10 @@ class Failed(Exception):
 
 @dataclass(frozen=True)
 class Contender:
-    """Who works: `module.work(**arguments)` of `benches/works`, under an environment of its own."""
+    """Who works: `module.work(**arguments)`, under an environment of its own.
+
+    `parts` is into how many pieces its work falls beside those of the row.
+    """
 
     name: str
     module: str
@@ -29,6 +32,7 @@ class Contender:
     environment: dict[str, str] = field(default_factory=dict)
     threads: int = 1
     turns: int | None = None
+    parts: int = 1
 
     def environ(self) -> dict[str, str]:
         own = dict(_ONE_THREAD, XLA_FLAGS=_XLA) if self.threads == 1 else {}

@@ -44,9 +44,8 @@ def pyrenn_training(iterations: int) -> Work:
     u, y = problem.drive()
     inputs, outputs = u[None], y[None]
     net = pyrenn.CreateNN([1, problem.HIDDEN, 1], dIn=[1, 2], dIntern=[], dOut=[1, 2])
-    # the package divides the outputs by their largest value where that is above 1
-    scale = max(np.abs(y).max(), 1.0)
-    net["w"] = _pyrenn_weights(problem.start(), scale)
+    _, net = pyrenn.prepare_data(inputs, outputs, net)
+    net["w"] = _pyrenn_weights(problem.start(), float(net["normY"][0]))
     run = pyrenn.NNOut(inputs, net)
     cost = 0.5 * float(np.mean((y - run) ** 2))
 
