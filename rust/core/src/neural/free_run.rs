@@ -364,3 +364,6 @@ pub(super) fn outputs(
     }
     outputs
 }
+
+#[cfg(test)]
+mod tests;
