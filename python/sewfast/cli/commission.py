@@ -58,7 +58,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument("--members", type=int, default=4, metavar="N", help="networks (4)")
     parser.add_argument(
-        "--evaluations", type=int, default=1500, metavar="N", help="controllers tried (1500)"
+        "--evaluations", type=int, default=3000, metavar="N", help="controllers tried (3000)"
     )
     parser.add_argument(
         "--load", type=float, metavar="V",

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 __all__ = ["STAGES", "commission"]
 
 MEMBERS = 4
-EVALUATIONS = 1500
+EVALUATIONS = 3000
 
 References = Mapping[str, ArrayLike] | Sequence[str]
 
