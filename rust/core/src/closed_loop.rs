@@ -1,5 +1,6 @@
 //! A controller and a plant in closed loop, with encoder, feedback filter and limits inside the loop.
 
+mod alone;
 mod known;
 pub(crate) mod lanes;
 mod plants;
@@ -14,6 +15,8 @@ use sewfast_control::{Controller, Refused};
 use crate::encoder::Encoder;
 use crate::simd::{self, Eight, Kernel};
 use crate::{Error, Monitor, Result};
+use alone::{Constant, Decides};
+use lanes::Lanes;
 
 /// What a controller can be closed around: one input, one output, stepped sample by sample.
 pub trait Plant {
@@ -104,7 +107,8 @@ impl Run {
 
     /// Runs the loop from rest over `reference` into this record, whose memory is used again.
     ///
-    /// The output is measured by the plant's encoder, else by `encoder`, else ideally.
+    /// The output is measured by the plant's encoder, else by `encoder`, else ideally. Where kernels know the plant, it and the
+    /// controller stay as they were.
     /// Order at a sample: measure, filter, control, limit, apply.
     pub fn record(
         &mut self,
@@ -144,7 +148,7 @@ impl Run {
     fn fill(
         &mut self,
         plant: &mut (impl Plant + ?Sized),
-        controller: &mut Controller<f64>,
+        controller: &mut impl Decides,
         signals: Signals<'_>,
         encoder: Option<&Encoder>,
         monitor: &Monitor,
@@ -152,7 +156,7 @@ impl Run {
         self.clear();
         plant.reset();
         controller.reset();
-        let ts = controller.settings().ts;
+        let ts = controller.ts();
         let scale = plant.encoder().or(encoder).map(Encoder::counts_per_unit);
         let per_speed = ts * scale.unwrap_or(1.0);
         let mut before = counts(plant, encoder, -ts);
@@ -171,10 +175,7 @@ impl Run {
                 self.outcome = Outcome::Interrupted(k);
                 return;
             }
-            let u = match signals.feedforward_at(k) {
-                None => controller.step(r, measured),
-                Some(added) => controller.step_with(r, measured, added),
-            };
+            let u = controller.decide(k == 0, r, measured, signals.feedforward_at(k));
             self.u.push(u);
             self.y.push(y);
             self.feedback.push(controller.filtered());
@@ -194,7 +195,7 @@ impl Run {
 struct Alone<'a> {
     run: &'a mut Run,
     known: Known<'a>,
-    controller: &'a mut Controller<f64>,
+    controller: &'a Controller<f64>,
     signals: Signals<'a>,
     encoder: Option<&'a Encoder>,
     monitor: &'a Monitor,
@@ -205,13 +206,27 @@ impl Kernel for Alone<'_> {
 
     #[inline(always)]
     fn run<V: Eight>(self) {
-        let mut plant = known::Alone::<V>::new(self.known);
-        let mut controller = self.controller.clone();
+        let usual = self.known.lags.regressors() == 4;
+        let controller = self.controller;
+        if !Lanes::take(controller) {
+            let plant = known::Alone::<V, 0>::new(self.known);
+            self.around(plant, &mut controller.clone());
+        } else if usual {
+            let plant = known::Alone::<V, 4>::new(self.known);
+            self.around(plant, &mut Constant::new(controller));
+        } else {
+            let plant = known::Alone::<V, 0>::new(self.known);
+            self.around(plant, &mut Constant::new(controller));
+        }
+    }
+}
+
+impl Alone<'_> {
+    #[inline(always)]
+    fn around(self, mut plant: impl Plant, controller: &mut impl Decides) {
         let (signals, encoder) = (self.signals, self.encoder);
-        let monitor = self.monitor;
         self.run
-            .fill(&mut plant, &mut controller, signals, encoder, monitor);
-        *self.controller = controller;
+            .fill(&mut plant, controller, signals, encoder, self.monitor);
     }
 }
 

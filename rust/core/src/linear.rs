@@ -126,17 +126,32 @@ impl LinearModel {
 }
 
 impl LinearModel {
+    /// [`Lagged::output`] in loops that stay in registers.
+    #[inline(always)]
+    pub(crate) fn next(&self, phi: &[f64]) -> f64 {
+        let (past, inputs) = phi.split_at(self.lags.na);
+        let (a, b) = (&self.a[..past.len()], &self.b[..inputs.len()]);
+        let mut sum = self.offset;
+        for i in 0..inputs.len() {
+            sum += b[i] * inputs[i];
+        }
+        for i in 0..past.len() {
+            sum -= a[i] * past[i];
+        }
+        sum
+    }
+
     /// The outputs for eight regressors, lane by lane; each to the bit what [`Lagged::output`] gives for it.
     #[inline(always)]
     pub(crate) fn beside<V: Eight>(&self, phi: &[Group]) -> V {
         let (past, inputs) = phi.split_at(self.lags.na);
-        let product = |c: &f64, value: &Group| V::splat(*c).mul(V::load(&value.0));
+        let (a, b) = (&self.a[..past.len()], &self.b[..inputs.len()]);
         let mut sum = V::splat(self.offset);
-        for (b, u) in self.b.iter().zip(inputs) {
-            sum = sum.add(product(b, u));
+        for i in 0..inputs.len() {
+            sum = sum.add(V::splat(b[i]).mul(V::load(&inputs[i].0)));
         }
-        for (a, y) in self.a.iter().zip(past) {
-            sum = sum.sub(product(a, y));
+        for i in 0..past.len() {
+            sum = sum.sub(V::splat(a[i]).mul(V::load(&past[i].0)));
         }
         sum
     }

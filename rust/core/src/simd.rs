@@ -5,6 +5,7 @@
 //! the same order and differ only in the rounding of products that are added at once: on one level a kernel has one answer.
 
 mod level;
+mod one;
 mod plain;
 pub(crate) mod tanh;
 #[cfg(target_arch = "x86_64")]
@@ -25,13 +26,8 @@ impl Group {
     pub const ZERO: Self = Self([0.0; LANES]);
 }
 
-/// Eight numbers in registers.
-pub(crate) trait Eight: Copy {
-    /// Sums that stay in registers: rows of a tile, and groups of columns, of which there are at most three.
-    const TILE: (usize, usize);
-
-    fn load(values: &[f64; LANES]) -> Self;
-    fn store(self, values: &mut [f64; LANES]);
+/// Numbers that are computed with side by side, each for itself.
+pub(crate) trait Arithmetic: Copy {
     fn splat(value: f64) -> Self;
     fn add(self, other: Self) -> Self;
     fn sub(self, other: Self) -> Self;
@@ -39,14 +35,19 @@ pub(crate) trait Eight: Copy {
     fn div(self, other: Self) -> Self;
     /// `self + a b`, rounded once where the processor can.
     fn add_product(self, a: Self, b: Self) -> Self;
-    /// The sum of all eight, in halves.
-    fn sum(self) -> f64;
-    /// `|self|`, but `limit` where that is larger; NaN stays NaN.
-    fn size_up_to(self, limit: f64) -> Self;
     /// The smaller of `self` and `limit`; NaN stays NaN.
     fn at_most(self, limit: f64) -> Self;
     /// The larger of `self` and `limit`; NaN stays NaN.
     fn at_least(self, limit: f64) -> Self;
+}
+
+/// Numbers that are compared and chosen, each for itself; at most eight.
+pub(crate) trait Choice: Arithmetic {
+    /// What [`are_less`](Self::are_less) gives where all are.
+    const ALL: u8;
+
+    /// As many of the values as there is room for.
+    fn load(values: &[f64; LANES]) -> Self;
     /// The smaller of `self` and `limits`, one by one; NaN in `self` stays NaN.
     fn at_most_each(self, limits: Self) -> Self;
     /// The larger of `self` and `limits`, one by one; NaN in `self` stays NaN.
@@ -61,6 +62,18 @@ pub(crate) trait Eight: Copy {
     fn if_equal(self, other: Self, yes: Self, no: Self) -> Self;
     /// Where `self < other`, one bit each, the first lowest.
     fn are_less(self, other: Self) -> u8;
+}
+
+/// Eight numbers in registers.
+pub(crate) trait Eight: Choice {
+    /// Sums that stay in registers: rows of a tile, and groups of columns, of which there are at most three.
+    const TILE: (usize, usize);
+
+    fn store(self, values: &mut [f64; LANES]);
+    /// The sum of all eight, in halves.
+    fn sum(self) -> f64;
+    /// `|self|`, but `limit` where that is larger; NaN stays NaN.
+    fn size_up_to(self, limit: f64) -> Self;
     /// `2^n` for numbers that hold the integer `n` in their low bits.
     fn power_of_two(self) -> Self;
 

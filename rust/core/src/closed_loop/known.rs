@@ -3,7 +3,7 @@
 use std::marker::PhantomData;
 
 use super::Plant;
-use crate::lagged::{Form, Lagged, Lags};
+use crate::lagged::{Form, Lags};
 use crate::simd::{Eight, Group};
 
 /// A plant whose equations kernels know: a lagged model, its output multiplied, its input held back.
@@ -24,8 +24,8 @@ impl Known<'_> {
     }
 }
 
-/// One plant inside a kernel, where the whole loop is compiled for one processor.
-pub(super) struct Alone<'a, V> {
+/// One plant inside a kernel, where the whole loop is compiled for one processor; `N` is the number of regressors, 0 for any.
+pub(super) struct Alone<'a, V, const N: usize> {
     known: Known<'a>,
     /// Past outputs, newest first, then the inputs of the regressor.
     phi: Vec<f64>,
@@ -35,7 +35,7 @@ pub(super) struct Alone<'a, V> {
     level: PhantomData<V>,
 }
 
-impl<'a, V: Eight> Alone<'a, V> {
+impl<'a, V: Eight, const N: usize> Alone<'a, V, N> {
     #[inline(always)]
     pub fn new(known: Known<'a>) -> Self {
         Self {
@@ -48,7 +48,7 @@ impl<'a, V: Eight> Alone<'a, V> {
     }
 }
 
-impl<V: Eight> Plant for Alone<'_, V> {
+impl<V: Eight, const N: usize> Plant for Alone<'_, V, N> {
     #[inline(always)]
     fn reset(&mut self) {
         self.phi.fill(0.0);
@@ -71,13 +71,17 @@ impl<V: Eight> Plant for Alone<'_, V> {
         let (na, lead) = (self.known.lags.na, self.known.lead());
         shift(&mut self.inputs, u);
         let (outputs, inputs) = self.phi.split_at_mut(na);
-        for (phi, u) in inputs.iter_mut().zip(&self.inputs[lead..]) {
-            *phi = *u;
+        let due = &self.inputs[lead..][..inputs.len()];
+        // not a call to copy a few numbers
+        let mut i = due.len();
+        while i > 0 {
+            i -= 1;
+            inputs[i] = due[i];
         }
         let newest = outputs[0];
         let y = match self.known.form {
-            Form::Linear(model) => model.output(&self.phi),
-            Form::Network(network) => network.step::<V>(newest, &self.phi, |_, _| ()),
+            Form::Linear(model) => model.next(&self.phi),
+            Form::Network(network) => network.next::<V, N>(&self.phi),
         };
         self.position += self.known.ts * (newest + y) / 2.0;
         shift(&mut self.phi[..na], y);
@@ -86,13 +90,13 @@ impl<V: Eight> Plant for Alone<'_, V> {
 
 /// Puts a value in front of a few others.
 #[inline(always)]
-fn shift<T: Copy>(newest_first: &mut [T], value: T) {
-    for i in (1..newest_first.len()).rev() {
+fn shift(newest_first: &mut [f64], value: f64) {
+    let mut i = newest_first.len();
+    while i > 1 {
+        i -= 1;
         newest_first[i] = newest_first[i - 1];
     }
-    if let Some(newest) = newest_first.first_mut() {
-        *newest = value;
-    }
+    newest_first[0] = value;
 }
 
 /// Eight runs of one plant, side by side.
@@ -165,11 +169,11 @@ impl<'a> Beside<'a> {
 
 #[inline(always)]
 fn push_eight<V: Eight>(newest_first: &mut [Group], value: V) {
-    for i in (1..newest_first.len()).rev() {
+    let mut i = newest_first.len();
+    while i > 1 {
+        i -= 1;
         let older = V::load(&newest_first[i - 1].0);
         older.store(&mut newest_first[i].0);
     }
-    if let Some(newest) = newest_first.first_mut() {
-        value.store(&mut newest.0);
-    }
+    value.store(&mut newest_first[0].0);
 }

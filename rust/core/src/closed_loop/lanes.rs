@@ -16,7 +16,7 @@ use super::{Outcome, RUNAWAY, Signals, WATCHED};
 use crate::Monitor;
 use crate::encoder::Encoder;
 use crate::simd::{self, Eight, Kernel, LANES};
-use controllers::Controllers;
+pub(super) use controllers::Controllers;
 pub(crate) use tally::{Sums, Tally};
 
 /// Loops that run side by side at most: two groups, of which one computes while the other waits for its results.

@@ -1,6 +1,6 @@
 //! Eight numbers as the baseline of any processor has them.
 
-use super::{Eight, LANES};
+use super::{Arithmetic, Choice, Eight, LANES};
 
 #[derive(Clone, Copy)]
 pub(super) struct Plain([f64; LANES]);
@@ -12,19 +12,7 @@ impl Plain {
     }
 }
 
-impl Eight for Plain {
-    const TILE: (usize, usize) = (2, 1);
-
-    #[inline(always)]
-    fn load(values: &[f64; LANES]) -> Self {
-        Self(*values)
-    }
-
-    #[inline(always)]
-    fn store(self, values: &mut [f64; LANES]) {
-        *values = self.0;
-    }
-
+impl Arithmetic for Plain {
     #[inline(always)]
     fn splat(value: f64) -> Self {
         Self([value; LANES])
@@ -60,21 +48,6 @@ impl Eight for Plain {
     }
 
     #[inline(always)]
-    fn sum(self) -> f64 {
-        let v = self.0;
-        ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7]))
-    }
-
-    #[inline(always)]
-    fn size_up_to(self, limit: f64) -> Self {
-        // A comparison rather than `min`, which would turn NaN into a number.
-        Self(
-            self.0
-                .map(|v| if v.abs() > limit { limit } else { v.abs() }),
-        )
-    }
-
-    #[inline(always)]
     fn at_most(self, limit: f64) -> Self {
         Self(self.0.map(|v| if v > limit { limit } else { v }))
     }
@@ -82,6 +55,15 @@ impl Eight for Plain {
     #[inline(always)]
     fn at_least(self, limit: f64) -> Self {
         Self(self.0.map(|v| if v < limit { limit } else { v }))
+    }
+}
+
+impl Choice for Plain {
+    const ALL: u8 = u8::MAX;
+
+    #[inline(always)]
+    fn load(values: &[f64; LANES]) -> Self {
+        Self(*values)
     }
 
     #[inline(always)]
@@ -131,6 +113,30 @@ impl Eight for Plain {
     #[inline(always)]
     fn are_less(self, other: Self) -> u8 {
         (0..LANES).fold(0, |bits, i| bits | u8::from(self.0[i] < other.0[i]) << i)
+    }
+}
+
+impl Eight for Plain {
+    const TILE: (usize, usize) = (2, 1);
+
+    #[inline(always)]
+    fn store(self, values: &mut [f64; LANES]) {
+        *values = self.0;
+    }
+
+    #[inline(always)]
+    fn sum(self) -> f64 {
+        let v = self.0;
+        ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7]))
+    }
+
+    #[inline(always)]
+    fn size_up_to(self, limit: f64) -> Self {
+        // A comparison rather than `min`, which would turn NaN into a number.
+        Self(
+            self.0
+                .map(|v| if v.abs() > limit { limit } else { v.abs() }),
+        )
     }
 
     #[inline(always)]

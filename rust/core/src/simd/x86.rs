@@ -4,7 +4,7 @@
 
 use std::arch::x86_64::*;
 
-use super::{Eight, Kernel, LANES};
+use super::{Arithmetic, Choice, Eight, Kernel, LANES};
 
 /// Rounding to the integer below.
 const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
@@ -24,21 +24,7 @@ pub(super) fn half<K: Kernel>(kernel: K) -> K::Output {
 #[derive(Clone, Copy)]
 pub(super) struct Wide(__m512d);
 
-impl Eight for Wide {
-    const TILE: (usize, usize) = (8, 3);
-
-    #[inline(always)]
-    fn load(values: &[f64; LANES]) -> Self {
-        // SAFETY: eight readable numbers; only run where the processor has AVX-512.
-        unsafe { Self(_mm512_loadu_pd(values.as_ptr())) }
-    }
-
-    #[inline(always)]
-    fn store(self, values: &mut [f64; LANES]) {
-        // SAFETY: room for eight numbers; only run where the processor has AVX-512.
-        unsafe { _mm512_storeu_pd(values.as_mut_ptr(), self.0) }
-    }
-
+impl Arithmetic for Wide {
     #[inline(always)]
     fn splat(value: f64) -> Self {
         // SAFETY: only run where the processor has AVX-512, here and below.
@@ -76,25 +62,6 @@ impl Eight for Wide {
     }
 
     #[inline(always)]
-    fn sum(self) -> f64 {
-        // SAFETY: as `splat`.
-        unsafe {
-            let low = _mm512_castpd512_pd256(self.0);
-            sum(_mm256_add_pd(low, _mm512_extractf64x4_pd::<1>(self.0)))
-        }
-    }
-
-    #[inline(always)]
-    fn size_up_to(self, limit: f64) -> Self {
-        // SAFETY: as `splat`.
-        unsafe {
-            let (size, limit) = (_mm512_abs_pd(self.0), _mm512_set1_pd(limit));
-            let larger = _mm512_cmp_pd_mask::<_CMP_GT_OQ>(size, limit);
-            Self(_mm512_mask_blend_pd(larger, size, limit))
-        }
-    }
-
-    #[inline(always)]
     fn at_most(self, limit: f64) -> Self {
         // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand.
         unsafe { Self(_mm512_min_pd(_mm512_set1_pd(limit), self.0)) }
@@ -104,6 +71,16 @@ impl Eight for Wide {
     fn at_least(self, limit: f64) -> Self {
         // SAFETY: as `at_most`.
         unsafe { Self(_mm512_max_pd(_mm512_set1_pd(limit), self.0)) }
+    }
+}
+
+impl Choice for Wide {
+    const ALL: u8 = u8::MAX;
+
+    #[inline(always)]
+    fn load(values: &[f64; LANES]) -> Self {
+        // SAFETY: eight readable numbers; only run where the processor has AVX-512.
+        unsafe { Self(_mm512_loadu_pd(values.as_ptr())) }
     }
 
     #[inline(always)]
@@ -153,6 +130,35 @@ impl Eight for Wide {
         // SAFETY: as `splat`.
         unsafe { _mm512_cmp_pd_mask::<_CMP_LT_OQ>(self.0, other.0) }
     }
+}
+
+impl Eight for Wide {
+    const TILE: (usize, usize) = (8, 3);
+
+    #[inline(always)]
+    fn store(self, values: &mut [f64; LANES]) {
+        // SAFETY: room for eight numbers; only run where the processor has AVX-512.
+        unsafe { _mm512_storeu_pd(values.as_mut_ptr(), self.0) }
+    }
+
+    #[inline(always)]
+    fn sum(self) -> f64 {
+        // SAFETY: as `splat`.
+        unsafe {
+            let low = _mm512_castpd512_pd256(self.0);
+            sum(_mm256_add_pd(low, _mm512_extractf64x4_pd::<1>(self.0)))
+        }
+    }
+
+    #[inline(always)]
+    fn size_up_to(self, limit: f64) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            let (size, limit) = (_mm512_abs_pd(self.0), _mm512_set1_pd(limit));
+            let larger = _mm512_cmp_pd_mask::<_CMP_GT_OQ>(size, limit);
+            Self(_mm512_mask_blend_pd(larger, size, limit))
+        }
+    }
 
     #[inline(always)]
     fn power_of_two(self) -> Self {
@@ -168,26 +174,7 @@ impl Eight for Wide {
 #[derive(Clone, Copy)]
 pub(super) struct Halves(__m256d, __m256d);
 
-impl Eight for Halves {
-    const TILE: (usize, usize) = (4, 1);
-
-    #[inline(always)]
-    fn load(values: &[f64; LANES]) -> Self {
-        let start = values.as_ptr();
-        // SAFETY: eight readable numbers; only run where the processor has AVX2 and FMA.
-        unsafe { Self(_mm256_loadu_pd(start), _mm256_loadu_pd(start.add(4))) }
-    }
-
-    #[inline(always)]
-    fn store(self, values: &mut [f64; LANES]) {
-        let start = values.as_mut_ptr();
-        // SAFETY: room for eight numbers; only run where the processor has AVX2 and FMA.
-        unsafe {
-            _mm256_storeu_pd(start, self.0);
-            _mm256_storeu_pd(start.add(4), self.1);
-        }
-    }
-
+impl Arithmetic for Halves {
     #[inline(always)]
     fn splat(value: f64) -> Self {
         // SAFETY: only run where the processor has AVX2 and FMA, here and below.
@@ -251,23 +238,6 @@ impl Eight for Halves {
     }
 
     #[inline(always)]
-    fn sum(self) -> f64 {
-        // SAFETY: as `splat`.
-        unsafe { sum(_mm256_add_pd(self.0, self.1)) }
-    }
-
-    #[inline(always)]
-    fn size_up_to(self, limit: f64) -> Self {
-        // SAFETY: as `splat`.
-        let one = |v: __m256d| unsafe {
-            let size = _mm256_andnot_pd(_mm256_set1_pd(-0.0), v);
-            let limit = _mm256_set1_pd(limit);
-            _mm256_blendv_pd(size, limit, _mm256_cmp_pd::<_CMP_GT_OQ>(size, limit))
-        };
-        Self(one(self.0), one(self.1))
-    }
-
-    #[inline(always)]
     fn at_most(self, limit: f64) -> Self {
         // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand.
         let one = |v: __m256d| unsafe { _mm256_min_pd(_mm256_set1_pd(limit), v) };
@@ -279,6 +249,17 @@ impl Eight for Halves {
         // SAFETY: as `at_most`.
         let one = |v: __m256d| unsafe { _mm256_max_pd(_mm256_set1_pd(limit), v) };
         Self(one(self.0), one(self.1))
+    }
+}
+
+impl Choice for Halves {
+    const ALL: u8 = u8::MAX;
+
+    #[inline(always)]
+    fn load(values: &[f64; LANES]) -> Self {
+        let start = values.as_ptr();
+        // SAFETY: eight readable numbers; only run where the processor has AVX2 and FMA.
+        unsafe { Self(_mm256_loadu_pd(start), _mm256_loadu_pd(start.add(4))) }
     }
 
     #[inline(always)]
@@ -346,6 +327,37 @@ impl Eight for Halves {
             let high = _mm256_movemask_pd(_mm256_cmp_pd::<_CMP_LT_OQ>(self.1, other.1));
             (low | high << 4) as u8
         }
+    }
+}
+
+impl Eight for Halves {
+    const TILE: (usize, usize) = (4, 1);
+
+    #[inline(always)]
+    fn store(self, values: &mut [f64; LANES]) {
+        let start = values.as_mut_ptr();
+        // SAFETY: room for eight numbers; only run where the processor has AVX2 and FMA.
+        unsafe {
+            _mm256_storeu_pd(start, self.0);
+            _mm256_storeu_pd(start.add(4), self.1);
+        }
+    }
+
+    #[inline(always)]
+    fn sum(self) -> f64 {
+        // SAFETY: as `splat`.
+        unsafe { sum(_mm256_add_pd(self.0, self.1)) }
+    }
+
+    #[inline(always)]
+    fn size_up_to(self, limit: f64) -> Self {
+        // SAFETY: as `splat`.
+        let one = |v: __m256d| unsafe {
+            let size = _mm256_andnot_pd(_mm256_set1_pd(-0.0), v);
+            let limit = _mm256_set1_pd(limit);
+            _mm256_blendv_pd(size, limit, _mm256_cmp_pd::<_CMP_GT_OQ>(size, limit))
+        };
+        Self(one(self.0), one(self.1))
     }
 
     #[inline(always)]

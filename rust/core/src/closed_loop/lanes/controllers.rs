@@ -1,12 +1,16 @@
-//! Controllers, one in each lane.
+//! Controllers, one in each lane; or a single one.
 
 use sewfast_control::{Controller, Numbers};
 
 use super::average::Averages;
-use crate::simd::{Eight, LANES};
+use crate::simd::{Choice, LANES};
+
+/// A derivative term below this is nothing: in a loop at rest it would fade on for ever among numbers so small that processors
+/// take a hundred times as long over them.
+const FADED: f64 = 1e-280;
 
 /// Eight of [`Controller`] with constant gains: the same operations in the same order.
-pub(super) struct Controllers<V> {
+pub(in crate::closed_loop) struct Controllers<V> {
     average: Averages<V>,
     lag: V,
     /// `1 - a`, `b`, and 1 where there is an observer; `None` where no lane has one.
@@ -39,7 +43,7 @@ pub(super) struct Controllers<V> {
     pub filtered: V,
 }
 
-impl<V: Eight> Controllers<V> {
+impl<V: Choice> Controllers<V> {
     /// The first eight of `controllers`, at rest; missing ones are the first again.
     #[inline(always)]
     pub fn new(controllers: &[&Controller<f64>]) -> Self {
@@ -150,15 +154,21 @@ impl<V: Eight> Controllers<V> {
         if let Some(change) = self.change {
             u = limited(u, self.u.sub(change), self.u.add(change));
         }
-        let new = [u, self.kept(integral, u.sub(wanted)), derivative, input];
+        let fading = derivative.size().if_less(V::splat(FADED), zero, derivative);
+        let new = [u, self.kept(integral, u.sub(wanted)), fading, input];
         // 0 where both are finite, else NaN
         let sound = wanted.mul(zero).add(input.mul(zero));
         let old = [self.u, self.integral, self.derivative, self.input];
         [self.u, self.integral, self.derivative, self.input] =
-            if sound.size().are_less(V::splat(1.0)) == u8::MAX {
+            if sound.size().are_less(V::splat(1.0)) == V::ALL {
                 new
             } else {
-                std::array::from_fn(|i| sound.if_equal(zero, new[i], old[i]))
+                [
+                    sound.if_equal(zero, new[0], old[0]),
+                    sound.if_equal(zero, new[1], old[1]),
+                    sound.if_equal(zero, new[2], old[2]),
+                    sound.if_equal(zero, new[3], old[3]),
+                ]
             };
         self.u
     }
@@ -178,6 +188,6 @@ impl<V: Eight> Controllers<V> {
 
 /// The nearest value in `[low, high]`; NaN stays NaN.
 #[inline(always)]
-fn limited<V: Eight>(value: V, low: V, high: V) -> V {
+fn limited<V: Choice>(value: V, low: V, high: V) -> V {
     value.at_least_each(low).at_most_each(high)
 }

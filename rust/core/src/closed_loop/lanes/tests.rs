@@ -4,6 +4,7 @@ use proptest::prelude::*;
 use sewfast_control::{Design, Settings, Standard};
 
 use super::*;
+use crate::closed_loop::alone::Constant;
 use crate::closed_loop::{LaggedPlant, Plant, Run, Varied, encoder};
 use crate::lagged::Lags;
 use crate::linear::LinearModel;
@@ -117,7 +118,16 @@ impl Kernel for Both<'_> {
         });
         let alone = self.controllers.iter().map(|controller| {
             let mut run = Run::default();
-            let mut plant = crate::closed_loop::known::Alone::<V>::new(self.known);
+            let mut plant = crate::closed_loop::known::Alone::<V, 0>::new(self.known);
+            let mut constant = Constant::new(controller);
+            let mut again = Run::default();
+            again.fill(
+                &mut plant,
+                &mut constant,
+                self.signals,
+                self.encoder,
+                &monitor,
+            );
             let mut controller = Controller::clone(controller);
             run.fill(
                 &mut plant,
@@ -126,6 +136,7 @@ impl Kernel for Both<'_> {
                 self.encoder,
                 &monitor,
             );
+            assert_eq!(run, again);
             (run.outcome, [run.u, run.y, run.feedback])
         });
         let tallies = [first, second];

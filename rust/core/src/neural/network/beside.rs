@@ -1,4 +1,6 @@
-//! The network for eight regressors side by side.
+//! The network in a loop: for eight regressors side by side, and for one.
+//!
+//! Loops count by hand: the calls of an iterator that the compiler leaves would empty the wide registers.
 
 use super::Network;
 use crate::simd::tanh::tanh;
@@ -14,12 +16,13 @@ impl Network {
         let phi = &phi[..n];
         let mut sums = [V::splat(0.0); LANES];
         sums[0] = self.direct::<V>(phi);
-        for (group, (bias, second)) in self.bias.iter().zip(&self.second).enumerate() {
+        for group in 0..self.second.len() {
             let weights = &self.first[group * n..][..n];
+            let (bias, second) = (&self.bias[group].0, &self.second[group].0);
             let units = (self.shape.hidden - group * LANES).min(LANES);
-            for (unit, sum) in sums.iter_mut().enumerate().take(units) {
-                let z = argument::<V>(bias.0[unit], weights, unit, phi);
-                *sum = sum.add_product(V::splat(second.0[unit]), tanh(z));
+            for unit in 0..units {
+                let h = tanh(argument::<V>(bias[unit], weights, unit, phi));
+                sums[unit] = sums[unit].add_product(V::splat(second[unit]), h);
             }
         }
         let output = in_halves(sums);
@@ -30,27 +33,55 @@ impl Network {
         }
     }
 
+    /// The output for the regressor `phi` alone, to the bit that of [`step`](Self::step).
+    ///
+    /// `N` is the number of regressors, 0 for any.
+    #[inline(always)]
+    pub(crate) fn next<V: Eight, const N: usize>(&self, phi: &[f64]) -> f64 {
+        let n = if N == 0 { phi.len() } else { N };
+        let (phi, groups) = (&phi[..n], self.second.len());
+        let mut sum = V::load(&self.bias[groups].0);
+        if self.shape.bypass {
+            sum = together::<V>(sum, &self.first[groups * n..][..n], phi);
+        }
+        for group in 0..groups {
+            let z = V::load(&self.bias[group].0);
+            let z = together::<V>(z, &self.first[group * n..][..n], phi);
+            sum = sum.add_product(V::load(&self.second[group].0), tanh(z));
+        }
+        self.limited(sum.sum())
+    }
+
     /// What reaches the output past the hidden units.
     #[inline(always)]
     fn direct<V: Eight>(&self, phi: &[Group]) -> V {
-        let constant = V::splat(self.bias[self.second.len()].0[0]);
+        let groups = self.second.len();
         if !self.shape.bypass {
-            return constant;
+            return V::splat(self.bias[groups].0[0]);
         }
-        let mut sum = constant;
-        for c in (1..phi.len()).rev().chain([0]) {
-            sum = sum.add_product(V::splat(self.linear[c]), V::load(&phi[c].0));
-        }
-        sum
+        let weights = &self.first[groups * phi.len()..][..phi.len()];
+        argument(self.bias[groups].0[0], weights, 0, phi)
     }
 }
 
-/// The argument of one hidden unit, the newest output last.
+/// The argument of one hidden unit for eight regressors, the newest output last.
 #[inline(always)]
 fn argument<V: Eight>(bias: f64, weights: &[Group], unit: usize, phi: &[Group]) -> V {
-    let mut z = V::splat(bias);
-    for c in (1..phi.len()).rev().chain([0]) {
+    let (mut z, mut c) = (V::splat(bias), phi.len());
+    while c > 0 {
+        c -= 1;
         z = z.add_product(V::splat(weights[c].0[unit]), V::load(&phi[c].0));
+    }
+    z
+}
+
+/// The arguments of eight hidden units for one regressor, the newest output last.
+#[inline(always)]
+fn together<V: Eight>(bias: V, weights: &[Group], phi: &[f64]) -> V {
+    let (mut z, mut c) = (bias, phi.len());
+    while c > 0 {
+        c -= 1;
+        z = z.add_product(V::load(&weights[c].0), V::splat(phi[c]));
     }
     z
 }
