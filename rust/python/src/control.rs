@@ -13,7 +13,7 @@ use sewfast_core::metrics::{self, Effort};
 use sewfast_core::{Error, Result};
 
 use crate::arrays::{array1, raise, slice};
-use crate::watch::watched;
+use crate::watch::watched_over;
 pub use controller::Controller;
 use plant::Model;
 
@@ -112,7 +112,7 @@ fn closed_loop<'py>(
         feedforward: feedforward.as_deref(),
         disturbance: disturbance.as_deref(),
     };
-    let run = watched(py, None, |monitor| {
+    let run = watched_over(py, signals.reference.len(), |monitor| {
         let encoder = looped::encoder(counts_per_unit, encoder_phase)?;
         let ts = controller.settings().ts;
         let mut plant = model.plant(ts)?;

@@ -9,7 +9,7 @@ use sewfast_core::machine::{Machine as Core, Parameters};
 use sewfast_core::{Error, Monitor, Result};
 
 use crate::arrays::{array1, raise, slice};
-use crate::watch::watched;
+use crate::watch::watched_over;
 
 /// Samples between two looks at a stop request, a few milliseconds of work.
 const CHUNK: usize = 4096;
@@ -93,7 +93,7 @@ impl Machine {
     fn run<'py>(&mut self, py: Python<'py>, u: PyReadonlyArray1<'py, f64>) -> PyResult<Pair<'py>> {
         let u = slice(&u, "u")?;
         let mut machine = self.core.clone();
-        let (machine, (counts, speed)) = watched(py, None, |monitor| {
+        let (machine, (counts, speed)) = watched_over(py, u.len(), |monitor| {
             let run = run(&mut machine, u, monitor)?;
             Ok((machine, run))
         })?;

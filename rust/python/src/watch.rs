@@ -53,6 +53,23 @@ pub fn watched<T: Send>(
     })
 }
 
+/// So many samples of one loop or machine take a few milliseconds, in which nobody misses Ctrl-C.
+const BRIEF: usize = 5_000;
+
+/// [`watched`] for work over so many samples of a loop or a machine; brief work is done where it was asked for, since a
+/// thread of its own would take longer than some of it.
+pub fn watched_over<T: Send>(
+    py: Python<'_>,
+    samples: usize,
+    work: impl FnOnce(&Monitor) -> Result<T> + Send,
+) -> PyResult<T> {
+    if samples > BRIEF {
+        return watched(py, None, work);
+    }
+    py.detach(|| work(&Monitor::default()))
+        .map_err(|e| raise(py, e))
+}
+
 fn look(py: Python<'_>, progress: Option<&Bound<'_, PyAny>>, monitor: &Monitor) -> PyResult<()> {
     py.check_signals()?;
     progress.map_or(Ok(()), |callback| {
