@@ -7,7 +7,7 @@ from typing import Any
 
 from problem import LOOP_SAMPLES, SAMPLES
 from state_space import FIRST, STEPS
-from turns import Contender
+from turns import ONE_THREAD, Contender
 
 MU = 1.0
 """First damping of sewfast's trainings; the rivals take the same."""
@@ -311,7 +311,8 @@ def threads() -> list[Row]:
             "10 starts x 100 iterations, 2 cores",
             (
                 starts(10, 2, "sewfast"),
-                both(numba("several_starts", **rivals)),
+                # two processes: each with a BLAS of one thread, or four would share two cores
+                replace(both(numba("several_starts", **rivals)), environment=ONE_THREAD),
                 both(jax("several_starts", **rivals)),
             ),
             unit=("s", 1.0),

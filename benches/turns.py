@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-_ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _XLA = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 
@@ -35,7 +35,7 @@ class Contender:
     parts: int = 1
 
     def environ(self) -> dict[str, str]:
-        own = dict(_ONE_THREAD, XLA_FLAGS=_XLA) if self.threads == 1 else {}
+        own = dict(ONE_THREAD, XLA_FLAGS=_XLA) if self.threads == 1 else {}
         return {**os.environ, **own, "JAX_PLATFORMS": "cpu", **self.environment}
 
 
