@@ -58,7 +58,6 @@ def figures(results: Results) -> str:
     for section in (*FIGURES, "levels"):
         for row in _of(results, section):
             lines += _lines(row)
-    lines += _jacobian(results)
     head = ["what", "sewfast", "rival", "takes", "times as long", "to reach", "counted limit"]
     return table(head, lines)
 
@@ -77,20 +76,6 @@ def _lines(row: Results) -> list[list[str]]:
         wanted = ", ".join(filter(None, (row["wanted"], _bar(row, name))))
         lines.append([row["title"], own, name, taken, f"**{number(ratio)}**", wanted, row["limit"]])
     return lines
-
-
-def _jacobian(results: Results) -> list[list[str]]:
-    """What is left of a training without its trials, each of which is a free run."""
-    rows = results["rows"]
-    if not {"training", "free_run"} <= rows.keys():
-        return []
-    own = rows["training"]["contenders"]["sewfast"]
-    iterations, trials = own["reached"]["iterations"], own["reached"]["trials"]
-    run = rows["free_run"]["contenders"]["sewfast"]["cpu_least"]
-    spent = 1e6 * own["cpu_least"] / 20_000
-    left = (spent - trials * run) / iterations
-    title = "Jacobian pass, sum and solution: training less its trials, per iteration"
-    return [[title, f"**{number(left)}** ns/sample", "", "", "", "30 ns", "25.9 ns"]]
 
 
 def _of(results: Results, section: str) -> list[Results]:
