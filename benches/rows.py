@@ -395,7 +395,7 @@ def growth() -> list[Row]:
                 quick=False,
             ),
         ]
-    for hidden in (4, 8, 16, 32, 64):
+    for hidden in (8, 16, 32, 64):
         arguments = {"samples": SAMPLES, "hidden": hidden}
         rows += [
             Row(
