@@ -10,49 +10,19 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 import link_device as script
 from link_device import ScriptedDevice
+from link_kept import LONG, Kept, U, once
 from link_simulated import SimulatedPort, driven, linked, simulated
 from sewfast import Controller, Gains
 from sewfast.errors import LinkError, SettingError
 from sewfast.link import Drive, Plan, connect, terms
 
 SOAK = bool(os.environ.get("SEWFAST_SOAK"))
-U = 3.0 * np.sin(np.arange(400) / 20.0)
-LONG = np.tile(U, 20)
-"""For what is to happen before the end, however busy the machine is."""
-
-
-class Kept:
-    """A sink that keeps everything; `on_samples` may do more."""
-
-    def __init__(self, on_samples: Callable[[int], object] = lambda first: None) -> None:
-        self.blocks: list[tuple[int, dict[str, np.ndarray]]] = []
-        self.events: list[tuple[str, int, dict[str, Any]]] = []
-        self._on_samples = on_samples
-
-    def samples(self, first, columns):
-        self._on_samples(first)
-        self.blocks.append((first, {name: c.copy() for name, c in columns.items()}))
-
-    def event(self, kind, index, **detail):
-        self.events.append((kind, index, detail))
-
-    @property
-    def kinds(self) -> list[str]:
-        return [kind for kind, _, _ in self.events]
-
-    def indexes(self) -> np.ndarray:
-        return np.concatenate([f + np.arange(len(c["u"])) for f, c in self.blocks])
-
-    def column(self, name: str) -> np.ndarray:
-        return np.concatenate([c[name] for _, c in self.blocks])
 
 
 @pytest.fixture
@@ -83,17 +53,6 @@ def served(tmp_path) -> Iterator[ScriptedDevice]:
 
 def stops(device: ScriptedDevice) -> list[float]:
     return [at for at, kind in device.arrived if kind == script.STOP]
-
-
-def once(action: Callable[[], object], at: int = 100) -> Callable[[int], None]:
-    done: list[int] = []
-
-    def act(first: int) -> None:
-        if first >= at and not done:
-            done.append(first)
-            action()
-
-    return act
 
 
 def starts(device: ScriptedDevice) -> list[bytes]:
@@ -481,79 +440,3 @@ def test_leaving_the_block_stops_the_motor(served):
         drive.arm()
         assert drive.status().state == "armed"
     assert served.state == script.IDLE
-
-
-# --- a port that comes and goes -----------------------------------------------------------------
-
-
-def replug(device: ScriptedDevice, away: float) -> None:
-    """Pull the cable now and plug it in again after a while; the device goes on meanwhile."""
-    device.wire.unplug()
-    if away < 10.0:
-        threading.Timer(away, lambda: device.do(device.wire.plug)).start()
-
-
-@pytest.mark.parametrize("kind", ["pty", "tcp"])
-def test_a_run_goes_on_after_the_port_was_away(tmp_path, kind):
-    with (
-        ScriptedDevice(tmp_path, kind) as device,
-        connect(device.url, watchdog=10.0, resume=10.0) as drive,
-    ):
-        drive.set_limits(volt=10.0)
-        sink = Kept(once(lambda: device.do(lambda: replug(device, 0.15))))
-        outcome = drive.stream(Plan("commands", np.tile(U, 2)), sink)
-    assert outcome.reason == "finished"
-    assert outcome.taken == 800
-    assert outcome.received == len(sink.indexes())
-    assert outcome.received + sum(n for _, n in outcome.gaps) == 800
-    assert [k for k in sink.kinds if k in ("port_lost", "resumed")] == ["port_lost", "resumed"]
-
-
-def test_a_run_that_tripped_meanwhile_says_so(served):
-    served.capacity = len(LONG)
-    with connect(served.url, watchdog=1.0, resume=10.0) as drive:
-        drive.set_limits(volt=10.0)
-        sink = Kept(once(lambda: served.do(lambda: replug(served, 1.5))))
-        with pytest.raises(LinkError, match=r"the device had tripped: watchdog"):
-            drive.stream(Plan("commands", LONG), sink)
-        assert drive.outcome is not None
-        assert drive.outcome.state == "tripped"
-        assert drive.outcome.taken is not None
-        assert drive.outcome.taken < len(LONG)
-
-
-def test_a_device_that_was_reset_meanwhile_says_so(served):
-    def lose() -> None:
-        replug(served, 0.1)
-        served.reset()
-
-    with connect(served.url, watchdog=10.0, resume=10.0) as drive:
-        drive.set_limits(volt=10.0)
-        sink = Kept(once(lambda: served.do(lose)))
-        with pytest.raises(LinkError, match=r"came back, but the device has been reset"):
-            drive.stream(Plan("commands", LONG), sink)
-
-
-def test_a_stop_still_reaches_a_device_whose_port_comes_back_late(served):
-    served.capacity = len(LONG)
-    drive = connect(served.url, watchdog=5.0, resume=0.1)
-    drive.set_limits(volt=10.0)
-    sink = Kept(once(lambda: served.do(lambda: replug(served, 1.2))))
-    with pytest.raises(LinkError, match=r"did not come back within 0\.1 s: the device stops its"):
-        drive.stream(Plan("commands", LONG), sink)
-    assert served.state == script.IDLE
-    assert drive.outcome is not None
-    assert drive.outcome.state == "idle"
-    assert drive.outcome.received + sum(n for _, n in drive.outcome.gaps) == drive.outcome.taken
-    drive.close()
-
-
-def test_a_port_that_stays_away(served):
-    sink = Kept(once(lambda: served.do(lambda: replug(served, math.inf))))
-    drive = connect(served.url, watchdog=1.0, resume=0.2)
-    drive.set_limits(volt=10.0)
-    with pytest.raises(LinkError, match=r"vanished .*did not come back within 0\.2 s"):
-        drive.stream(Plan("commands", LONG), sink)
-    drive.close()
-    assert sink.kinds[-1] == "stop_unconfirmed"
-    assert Path(served.url).exists() is False

@@ -1,0 +1,345 @@
+//! What is to be tuned, as Python gives it and as the core takes it.
+
+use std::collections::BTreeMap;
+
+use pyo3::prelude::*;
+use sewfast_control::Design;
+use sewfast_core::closed_loop::{Varied, encoder};
+use sewfast_core::loop_transfer as linear;
+use sewfast_core::tune::{
+    self as tuning, Aggregate, Constraints, Cost, LoadLimit, LoadStep, Parameter, Sensitivity,
+    Task, Variable,
+};
+use sewfast_core::{Error, Monitor, Result};
+
+use super::super::Values;
+use super::super::controller::Controller;
+use super::super::plant::{AnyPlant, Model};
+use crate::arrays::{raise, slice};
+
+/// A variable by its name, with its bounds unless they are the usual ones.
+type Wanted = (String, Option<(f64, f64)>);
+/// Reference, disturbance, band and samples of the mean of a load step.
+type Load<'py> = (Values<'py>, Values<'py>, f64, usize);
+
+/// A limit in numbers, or what another controller does on each plant.
+#[derive(FromPyObject)]
+enum Most<'py> {
+    Number(f64),
+    Rival(Bound<'py, Controller>),
+}
+
+/// The limits by name.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+struct Limits<'py> {
+    #[pyo3(item("Ms"))]
+    ms: Option<f64>,
+    overshoot: Option<f64>,
+    u: Option<f64>,
+    recovery: Option<Most<'py>>,
+    load: Option<Most<'py>>,
+}
+
+/// What tuning, comparing and the front have in common, as Python gives it.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub struct Asked<'py> {
+    plants: Vec<Bound<'py, PyAny>>,
+    references: Vec<Values<'py>>,
+    load_steps: Vec<Load<'py>>,
+    start: Bound<'py, Controller>,
+    counts_per_unit: f64,
+    variations: Vec<(f64, usize)>,
+    variables: Vec<Wanted>,
+    cost: BTreeMap<String, f64>,
+    aggregate: String,
+    limits: Limits<'py>,
+    linear_plants: Vec<Fraction<'py>>,
+}
+
+/// The same, owned.
+pub struct Given {
+    models: Vec<Model>,
+    references: Vec<Vec<f64>>,
+    load_steps: Vec<OwnedLoad>,
+    variations: Vec<(f64, usize)>,
+    counts_per_unit: f64,
+    pub start: Design<f64>,
+    pub variables: Vec<Variable>,
+    cost: Cost,
+    aggregate: Aggregate,
+    ms: Option<f64>,
+    overshoot: Option<f64>,
+    u: Option<f64>,
+    recovery: Option<OwnedMost>,
+    load: Option<OwnedMost>,
+    loops: Vec<linear::Plant>,
+}
+
+struct OwnedLoad {
+    reference: Vec<f64>,
+    disturbance: Vec<f64>,
+    band: f64,
+    mean: usize,
+}
+
+impl OwnedLoad {
+    fn new((reference, disturbance, band, mean): &Load<'_>) -> PyResult<Self> {
+        Ok(Self {
+            reference: slice(reference, "reference")?.to_vec(),
+            disturbance: slice(disturbance, "disturbance")?.to_vec(),
+            band: *band,
+            mean: *mean,
+        })
+    }
+
+    fn step(&self) -> LoadStep<'_> {
+        LoadStep {
+            reference: &self.reference,
+            disturbance: &self.disturbance,
+            band: self.band,
+            mean: self.mean,
+        }
+    }
+}
+
+enum OwnedMost {
+    Number(f64),
+    Rival(Box<Design<f64>>),
+}
+
+impl OwnedMost {
+    fn new(most: &Most<'_>) -> Self {
+        match most {
+            Most::Number(limit) => Self::Number(*limit),
+            Most::Rival(rival) => Self::Rival(Box::new(*rival.borrow().core.design())),
+        }
+    }
+
+    fn rival(&self) -> Option<&Design<f64>> {
+        match self {
+            Self::Number(_) => None,
+            Self::Rival(design) => Some(design),
+        }
+    }
+
+    /// The limit in numbers, where a rival did `did` on a plant that it is a measure on.
+    fn limit(most: &Option<Self>, did: Option<f64>) -> f64 {
+        match most {
+            Some(Self::Number(limit)) => *limit,
+            Some(Self::Rival(_)) => did.unwrap_or(f64::INFINITY),
+            None => f64::INFINITY,
+        }
+    }
+}
+
+/// Numerator and denominator in powers of `z^-1`.
+type Fraction<'py> = (Values<'py>, Values<'py>);
+
+fn loops(given: &[Fraction<'_>]) -> PyResult<Vec<linear::Plant>> {
+    let plant = |(num, den): &Fraction<'_>| {
+        let (num, den) = (slice(num, "num")?, slice(den, "den")?);
+        linear::Plant::new(num, den).map_err(|e| raise(given[0].0.py(), e))
+    };
+    given.iter().map(plant).collect()
+}
+
+impl Given {
+    pub fn new(py: Python<'_>, asked: &Asked<'_>) -> PyResult<Self> {
+        let refused = |e| raise(py, e);
+        let start = *asked.start.borrow().core.design();
+        let samples = |r: &Values<'_>| slice(r, "references").map(<[f64]>::to_vec);
+        let limits = &asked.limits;
+        Ok(Self {
+            models: asked
+                .plants
+                .iter()
+                .map(Model::of)
+                .collect::<PyResult<_>>()?,
+            references: asked
+                .references
+                .iter()
+                .map(samples)
+                .collect::<PyResult<_>>()?,
+            load_steps: asked
+                .load_steps
+                .iter()
+                .map(OwnedLoad::new)
+                .collect::<PyResult<_>>()?,
+            variations: asked.variations.clone(),
+            counts_per_unit: asked.counts_per_unit,
+            start,
+            variables: variables(&asked.variables, &start).map_err(refused)?,
+            cost: cost(&asked.cost).map_err(refused)?,
+            aggregate: aggregate(&asked.aggregate).map_err(refused)?,
+            ms: limits.ms,
+            overshoot: limits.overshoot,
+            u: limits.u,
+            recovery: limits.recovery.as_ref().map(OwnedMost::new),
+            load: limits.load.as_ref().map(OwnedMost::new),
+            loops: loops(&asked.linear_plants)?,
+        })
+    }
+
+    /// Does `work` with the task.
+    pub fn with<T>(
+        &self,
+        monitor: &Monitor,
+        work: impl FnOnce(&Task<'_, Varied<AnyPlant<'_>>>) -> Result<T>,
+    ) -> Result<T> {
+        let plants = varied(&self.models, &self.variations, self.start.pid.ts)?;
+        let references: Vec<&[f64]> = self.references.iter().map(Vec::as_slice).collect();
+        let load_steps: Vec<LoadStep<'_>> = self.load_steps.iter().map(OwnedLoad::step).collect();
+        if self.ms.is_some() && self.loops.is_empty() {
+            return Err(Error::setting(
+                "expected a linear plant to take Ms on, got none; give Constraints(plant=...)",
+            ));
+        }
+        let encoder = encoder(self.counts_per_unit, 0.5)?;
+        let sensitivity = |design: &Design<f64>| {
+            let all = self.loops.iter();
+            let of = |plant| peak_sensitivity(design, encoder.is_some(), plant);
+            all.map(of).fold(1.0, f64::max)
+        };
+        let sensitivity: &Sensitivity<'_> = &sensitivity;
+        // Without a limit Ms may still be an objective.
+        let ms = match self.ms {
+            None if self.loops.is_empty() => None,
+            limit => Some((limit.unwrap_or(f64::MAX), sensitivity)),
+        };
+        let mut task = Task {
+            plants: &plants,
+            references: &references,
+            loads: &load_steps,
+            encoder,
+            start: self.start,
+            variables: &self.variables,
+            cost: self.cost,
+            aggregate: self.aggregate,
+            constraints: Constraints {
+                ms,
+                overshoot: self.overshoot,
+                u: self.u,
+                loads: &[],
+            },
+        };
+        let limits = self.load_limits(&task, monitor)?;
+        task.constraints.loads = &limits;
+        work(&task)
+    }
+
+    /// Whether a rival is a measure on plant `k`: on plants as they are, where these are among the variations.
+    fn is_compared(&self, k: usize) -> bool {
+        let as_it_is = (1.0, 0);
+        let own = self.variations[k % self.variations.len()];
+        own == as_it_is || !self.variations.contains(&as_it_is)
+    }
+
+    /// What each plant may do under the load steps.
+    fn load_limits(
+        &self,
+        task: &Task<'_, Varied<AnyPlant<'_>>>,
+        monitor: &Monitor,
+    ) -> Result<Vec<LoadLimit>> {
+        if self.recovery.is_none() && self.load.is_none() {
+            return Ok(Vec::new());
+        }
+        let of = |rival| tuning::loaded(task, rival, monitor);
+        let [first, second] =
+            [&self.recovery, &self.load].map(|most| most.as_ref().and_then(OwnedMost::rival));
+        let did = first.map(of).transpose()?;
+        let other = match second {
+            Some(rival) if Some(rival) != first => Some(of(rival)?),
+            _ => None,
+        };
+        let least = 1e3 * self.start.pid.ts;
+        let limit = |k: usize| {
+            let compared = |did: &Vec<LoadLimit>| self.is_compared(k).then(|| did[k]);
+            let recovery = did.as_ref().and_then(compared);
+            let load = other.as_ref().or(did.as_ref()).and_then(compared);
+            LoadLimit {
+                // One that is never beyond the band has recovered within a sample.
+                recovery: OwnedMost::limit(&self.recovery, recovery.map(|r| r.recovery)).max(least),
+                load: OwnedMost::limit(&self.load, load.map(|l| l.load)),
+            }
+        };
+        Ok((0..task.plants.len()).map(limit).collect())
+    }
+}
+
+/// `Ms` of a design around a linear plant, of a schedule that of its worst point; infinite where there is no loop.
+fn peak_sensitivity(design: &Design<f64>, encoder: bool, plant: &linear::Plant) -> f64 {
+    let points = design.schedule.points();
+    let constant = points.is_empty().then_some(design.pid.gains);
+    let all = points.iter().map(|p| p.gains).chain(constant);
+    let of = |gains| {
+        let path = linear::Path {
+            n: design.pid.n,
+            filter_samples: design.filter_samples,
+            filter_time: design.filter_time,
+            observer_time: design.observer_time,
+            encoder,
+            ..linear::Path::new(gains, design.pid.ts)
+        };
+        linear::Loop::new(&path, plant)
+            .map_or(f64::INFINITY, |closed| linear::peak_sensitivity(&closed))
+    };
+    all.map(of).fold(1.0, f64::max)
+}
+
+fn variables(wanted: &[Wanted], start: &Design<f64>) -> Result<Vec<Variable>> {
+    if wanted.is_empty() {
+        return Variable::usual(start);
+    }
+    let variable = |(name, bounds): &Wanted| Variable::new(Parameter::named(name)?, *bounds, start);
+    wanted.iter().map(variable).collect()
+}
+
+/// A cost from its weights by name; those left out keep their defaults.
+fn cost(changes: &BTreeMap<String, f64>) -> Result<Cost> {
+    let mut cost = Cost::default();
+    for (name, &value) in changes {
+        match name.as_str() {
+            "tracking" => cost.tracking = value,
+            "chatter" => cost.chatter = Some(value),
+            "effort" => cost.effort = value,
+            "overshoot" => cost.overshoot = Some(value),
+            "overshoot_limit" => cost.overshoot_limit = value,
+            "rise" => cost.rise = value,
+            "lag" => cost.lag = value,
+            "saturation" => cost.saturation = Some(value),
+            "recovery" => cost.recovery = value,
+            "load" => cost.load = value,
+            _ => {
+                return Err(Error::setting(format!(
+                    "expected a term of the cost, tracking, chatter, effort, overshoot, overshoot_limit, rise, lag, \
+                     saturation, recovery or load, got '{name}'"
+                )));
+            }
+        }
+    }
+    Ok(cost)
+}
+
+fn aggregate(name: &str) -> Result<Aggregate> {
+    match name {
+        "mean" => Ok(Aggregate::Mean),
+        "worst" => Ok(Aggregate::Worst),
+        _ => Err(Error::setting(format!(
+            "expected aggregate 'mean' or 'worst', got '{name}'"
+        ))),
+    }
+}
+
+fn varied<'a>(
+    models: &'a [Model],
+    variations: &[(f64, usize)],
+    ts: f64,
+) -> Result<Vec<Varied<AnyPlant<'a>>>> {
+    models
+        .iter()
+        .flat_map(|model| variations.iter().map(move |variation| (model, *variation)))
+        .map(|(model, (gain, delay))| Varied::new(model.plant(ts)?, gain, delay))
+        .collect()
+}
