@@ -6,6 +6,7 @@
 mod batch;
 pub mod cma_es;
 pub mod genetic;
+mod model;
 pub mod nsga2;
 
 pub(crate) use batch::several;

@@ -1,9 +1,13 @@
 //! CMA-ES with restarts: the covariance matrix adapts to the landscape (Hansen, arXiv 1604.00772), and a search that
 //! has come to its end begins anew with a larger or with a smaller population (BIPOP, Hansen 2009).
+//!
+//! The least of a quadratic model of the points judged so far takes part in each generation (Hansen, arXiv 1110.4181, on
+//! injected candidates): in smooth valleys that saves most of the evaluations.
 
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
 use super::genetic::inside;
+use super::model::{Archive, Ellipsoid, Model};
 use super::{Candidate, Found, Judgement, Options, Problem, Strategy, run};
 use crate::random::Random;
 use crate::{Monitor, Result};
@@ -16,6 +20,11 @@ const SMALLEST_STEP: f64 = 1e-11;
 const WORST_CONDITION: f64 = 1e14;
 /// A candidate dearer than this many times the last generation's median is not judged to its end.
 const ABANDONED: f64 = 3.0;
+/// Radii within which a model's least is looked for, in standard deviations: about the length of samples' steps in few
+/// dimensions, so that none need clipping.
+const TRUST: [f64; 2] = [1.5, 3.0];
+/// Most generations without a model's least after all of one's were infeasible.
+const PAUSE: usize = 16;
 
 /// Searches the box, beginning about `start` where there is one.
 ///
@@ -38,6 +47,7 @@ struct Restarts {
     options: Options,
     dimensions: usize,
     now: Evolution,
+    archive: Archive,
     /// How often the large population was doubled.
     doublings: u32,
     large: bool,
@@ -53,6 +63,7 @@ impl Restarts {
             options,
             dimensions,
             now: Evolution::new(mean, step, population(dimensions)),
+            archive: Archive::default(),
             doublings: 0,
             large: true,
             used: [0; 2],
@@ -74,6 +85,8 @@ impl Restarts {
         let random = &mut self.random;
         let mean = (0..self.dimensions).map(|_| random.uniform()).collect();
         self.now = Evolution::new(mean, step, size as usize);
+        // What an earlier run knows would draw this one to where that has ended.
+        self.archive = Archive::default();
     }
 }
 
@@ -87,11 +100,12 @@ impl Strategy for Restarts {
         if self.now.ended(self.options.tolerance) {
             self.restart();
         }
-        self.now.ask(limit, &mut self.random)
+        self.now.ask(limit, &mut self.random, &self.archive)
     }
 
     fn tell(&mut self, candidates: Vec<Candidate>, judgements: &[Judgement]) {
         self.used[usize::from(self.large)] += candidates.len();
+        self.archive.keep(&candidates, judgements);
         self.now.adapt(judgements);
     }
 
@@ -161,6 +175,10 @@ pub(super) struct Evolution {
     /// Best of each generation.
     history: Vec<Judgement>,
     last: Vec<Judgement>,
+    /// How many of this generation, its first, are a model's.
+    promising: usize,
+    /// Generations that a model pauses for, and how many of them are left.
+    pause: (usize, usize),
 }
 
 impl Evolution {
@@ -179,6 +197,8 @@ impl Evolution {
             steps: Vec::new(),
             history: Vec::new(),
             last: Vec::new(),
+            promising: 0,
+            pause: (0, 0),
         }
     }
 
@@ -191,15 +211,45 @@ impl Evolution {
         new
     }
 
-    /// A generation, or what of it is left to be judged.
-    pub(super) fn ask(&mut self, limit: usize, random: &mut Random) -> Vec<Candidate> {
+    /// A generation, or what of it is left to be judged: what a model of known points takes for the best, and samples.
+    pub(super) fn ask(
+        &mut self,
+        limit: usize,
+        random: &mut Random,
+        known: &Archive,
+    ) -> Vec<Candidate> {
         let to_beat = self.to_beat();
-        (0..self.weights.size.min(limit))
-            .map(|_| Candidate {
-                point: self.sample(random),
-                to_beat,
-            })
-            .collect()
+        let size = self.weights.size.min(limit);
+        let mut points = match self.pause.1.checked_sub(1) {
+            Some(left) => {
+                self.pause.1 = left;
+                Vec::new()
+            }
+            None => self.promising(known),
+        };
+        points.truncate(size);
+        self.promising = points.len();
+        let step = |point: &DVector<f64>| (point - &self.mean) / self.sigma;
+        self.steps = points.iter().map(step).collect();
+        let mut points: Vec<Vec<f64>> = points.iter().map(|p| p.as_slice().to_vec()).collect();
+        points.resize_with(size, || self.sample(random));
+        let candidate = |point| Candidate { point, to_beat };
+        points.into_iter().map(candidate).collect()
+    }
+
+    /// The least of a model of known points, within each radius of trust.
+    fn promising(&self, known: &Archive) -> Vec<DVector<f64>> {
+        let lengths = &self.lengths * self.sigma;
+        let about = Ellipsoid {
+            centre: &self.mean,
+            axes: &self.axes,
+            lengths: &lengths,
+        };
+        let model = Model::fit(known, about);
+        let least = |radius| model.as_ref()?.least(radius);
+        let mut points: Vec<_> = TRUST.into_iter().filter_map(least).collect();
+        points.dedup();
+        points
     }
 
     fn sample(&mut self, random: &mut Random) -> Vec<f64> {
@@ -224,6 +274,7 @@ impl Evolution {
 
     /// The mean moves to the best, the paths remember where to, step size and matrix follow (Hansen 2016, Fig. 6).
     pub(super) fn adapt(&mut self, judgements: &[Judgement]) {
+        self.consider(&judgements[..self.promising]);
         let mut order: Vec<usize> = (0..judgements.len()).collect();
         order.sort_by(|&a, &b| judgements[a].order(&judgements[b]));
         let steps = std::mem::take(&mut self.steps);
@@ -270,7 +321,38 @@ impl Evolution {
         self.sigma *= ((w.c_sigma / w.damping) * (length / w.length - 1.0))
             .min(1.0)
             .exp();
+        self.fold();
         self.decompose();
+    }
+
+    /// Moves a mean that has left the box back into it, where known points are its neighbours; mirrored likewise, the
+    /// distribution stays the same.
+    fn fold(&mut self) {
+        for i in 0..self.mean.len() {
+            let mirrored = self.mean[i].floor().rem_euclid(2.0) == 1.0;
+            self.mean[i] = inside(self.mean[i]);
+            if mirrored {
+                self.path_sigma[i] *= -1.0;
+                self.path_c[i] *= -1.0;
+                self.covariance.row_mut(i).neg_mut();
+                self.covariance.column_mut(i).neg_mut();
+            }
+        }
+    }
+
+    /// A model knows nothing of constraints: where its least violates them, it pauses for longer and longer. What runs away
+    /// is no constraint's matter.
+    fn consider(&mut self, promising: &[Judgement]) {
+        let violates = |j: &Judgement| j.violation > 0.0 && j.violation.is_finite();
+        if !promising.is_empty() {
+            let misled = promising.iter().all(violates);
+            let pause = if misled {
+                (2 * self.pause.0).clamp(1, PAUSE)
+            } else {
+                0
+            };
+            self.pause = (pause, pause);
+        }
     }
 
     fn decompose(&mut self) {

@@ -2,12 +2,13 @@
 //!
 //! Breeding: children come from tournament winners by blend crossover (Eshelman and Schaffer 1993, BLX-.5) and a
 //! mutation that narrows from generation to generation; the best of parents and children survive. Refinement: the best
-//! member moves on in a normal distribution that begins as that of the best quarter and adapts (`cma_es`). When that has come to
-//! its end, a new population is bred around the best so far.
+//! member moves on in a normal distribution that begins as that of the best quarter and adapts (`cma_es`), helped by a quadratic
+//! model of all that was judged (`model`). When that has come to its end, a new population is bred around the best so far.
 
 use nalgebra::{DMatrix, DVector};
 
 use super::cma_es::Evolution;
+use super::model::Archive;
 use super::{Candidate, Found, Judgement, Options, Problem, Strategy, run};
 use crate::random::Random;
 use crate::{Monitor, Result};
@@ -69,6 +70,8 @@ struct Genetic {
     bred: usize,
     refinement: Option<Evolution>,
     best: Option<Member>,
+    /// What the refinement's model is made of.
+    archive: Archive,
     options: Options,
 }
 
@@ -83,6 +86,7 @@ impl Genetic {
             bred: 0,
             refinement: None,
             best: None,
+            archive: Archive::default(),
             options,
         };
         new.unborn.extend(start.map(<[f64]>::to_vec));
@@ -185,7 +189,7 @@ impl Strategy for Genetic {
             self.refinement = Some(self.refine());
         }
         match &mut self.refinement {
-            Some(evolution) => evolution.ask(limit, &mut self.random),
+            Some(evolution) => evolution.ask(limit, &mut self.random, &self.archive),
             None => self.breed(limit),
         }
     }
@@ -194,6 +198,7 @@ impl Strategy for Genetic {
         if let Some(evolution) = &mut self.refinement {
             evolution.adapt(judgements);
         }
+        self.archive.keep(&candidates, judgements);
         let told = candidates.into_iter().zip(judgements);
         let born = told.map(|(candidate, judgement)| Member {
             point: candidate.point,
