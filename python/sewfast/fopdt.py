@@ -37,6 +37,9 @@ class Fopdt:
         Samples on a limit of the output, which had no weight.
     moving : bool
         Whether the machine was not at rest before the step: its free response was fitted as well.
+    overshoot_percent : float
+        How far the response goes beyond where it settles, in percent of its rise; 0 where that does
+        not stand out of the noise. Such a response is of no first order.
 
     Raises
     ------
@@ -58,6 +61,7 @@ class Fopdt:
     L_se: float = math.nan
     limited: int = 0
     moving: bool = False
+    overshoot_percent: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("K", "T", "L", "offset", "u_low", "u_high"):
@@ -67,6 +71,16 @@ class Fopdt:
                 "expected a finite gain K, T above 0 s and L of 0 s or more, got "
                 f"K = {self.K:g} {self.y_unit}/{self.u_unit}, T = {self.T:g} s, L = {self.L:g} s"
             )
+
+    @property
+    def warning(self) -> str:
+        """What speaks against gains from these numbers; empty where nothing does."""
+        if not self.overshoot_percent:
+            return ""
+        return (
+            f"overshoots by {self.overshoot_percent:.0f} %, which no first order with dead time "
+            "does: do not trust gains from these numbers, identify a model of second order or more"
+        )
 
     def response(self, t: ArrayLike) -> NDArray[np.float64]:
         """The output at times `t` [s] after the step, shape as `t`; `t` may be negative."""
@@ -89,6 +103,8 @@ class Fopdt:
             parts.append(f"{self.limited} samples on a limit left out")
         if self.moving:
             parts.append("not from rest")
+        if self.warning:
+            parts.append(f"warning: {self.warning}")
         return ", ".join(parts)
 
 
@@ -101,7 +117,8 @@ def fit_fopdt(
     the second step of the input; the first may be anywhere after some samples. Samples on a limit
     of the output have no weight, and a machine that was not at rest is fitted with its free
     response where that is three of its standard errors. Standard errors hold for residuals of any
-    colour, which are whitened by an autoregression (Andrews, Monahan 1992).
+    colour, which are whitened by an autoregression (Andrews, Monahan 1992). An overshoot beyond
+    what the noise explains is told (`Fopdt.warning`): the response is then of no first order.
 
     Parameters
     ----------

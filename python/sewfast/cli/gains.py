@@ -153,17 +153,22 @@ def _controller(args: argparse.Namespace, rule: Rule, fopdt: Fopdt, Ts: float) -
         u_max=args.u_max,
         filter_samples=args.filter,
         counts_per_rev=args.counts_per_rev,
-        notes=f"{rule.name} from K {fopdt.K:.6g}, T {fopdt.T:.6g} s, L {fopdt.L:.6g} s",
+        notes=f"{rule.name} from K {fopdt.K:.6g}, T {fopdt.T:.6g} s, L {fopdt.L:.6g} s"
+        + (f"; {fopdt.warning}" if fopdt.warning else ""),
     )
 
 
 def _summary(
     args: argparse.Namespace, fopdt: Fopdt, rule: Rule, controller: Controller, found: Margins
 ) -> dict[str, Any]:
-    names = ("K", "T", "L", "K_se", "T_se", "L_se", "offset", "fit_percent", "limited", "moving")
+    names = (
+        "K", "T", "L", "K_se", "T_se", "L_se", "offset", "fit_percent", "limited", "moving",
+        "overshoot_percent",
+    )  # fmt: skip
     return {
         "file": None if args.out is None else str(args.out),
         "plant": {name: getattr(fopdt, name) for name in names},
+        "warnings": [fopdt.warning] if fopdt.warning else [],
         "rule": {"name": rule.name, "alpha": rule.alpha, "beta": rule.beta, **rule.costs},
         "gains": {g.form: {**g.to_dict(), "units": g.units} for g in forms_of(controller)},
         "margins": found.to_dict(),

@@ -1,6 +1,7 @@
 //! First-order-plus-dead-time approximation (paper Eq. 10-11) of a measured step response.
 
 mod confidence;
+mod overshoot;
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -30,6 +31,9 @@ pub struct Fopdt {
     pub limited: usize,
     /// Whether the machine was still moving before the step; its free response was fitted too.
     pub moving: bool,
+    /// How far the response goes beyond where it settles, as a share of its rise, where that stands out of the noise: it is
+    /// then of no first order.
+    pub overshoot: f64,
 }
 
 /// A change of the input by more than this share of its range is a step.
@@ -86,6 +90,7 @@ pub fn fit_fopdt(record: Record<'_>, ts: f64, monitor: &Monitor) -> Result<Fopdt
         errors: [rise / (step.u_high - step.u_low).abs(), t * ts, l * ts],
         limited: step.used.iter().filter(|used| !**used).count(),
         moving: step.moving,
+        overshoot: overshoot::overshoot(&step, &best),
     })
 }
 

@@ -47,6 +47,7 @@ fn fit_fopdt<'py>(
             ("K_se", found.errors[0]),
             ("T_se", found.errors[1]),
             ("L_se", found.errors[2]),
+            ("overshoot_percent", 100.0 * found.overshoot),
         ],
     )?;
     dict.set_item("limited", found.limited)?;

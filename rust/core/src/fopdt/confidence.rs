@@ -71,7 +71,7 @@ fn slopes(step: &Step<'_>, found: &Candidate) -> (DMatrix<f64>, DVector<f64>) {
 }
 
 /// The autoregression of residuals, of as many terms as Akaike's criterion asks for.
-struct Colour {
+pub(super) struct Colour {
     a: Vec<f64>,
     /// Power of the whitened residuals, as a share of their own.
     white: f64,
@@ -79,7 +79,7 @@ struct Colour {
 
 impl Colour {
     /// By Levinson's recursion on the sample autocovariance, which always gives a stable autoregression.
-    fn of(e: &[f64]) -> Self {
+    pub fn of(e: &[f64]) -> Self {
         let n = e.len();
         let most = TERMS.min(n / SAMPLES_PER_TERM);
         let covariance: Vec<f64> = (0..=most)
@@ -135,7 +135,7 @@ impl Colour {
     }
 
     /// How many independent samples have as sure a mean as `n` of these.
-    fn independent(&self, n: usize) -> f64 {
+    pub fn independent(&self, n: usize) -> f64 {
         let slow = (1.0 - self.a.iter().sum::<f64>()).powi(2) / self.white;
         n as f64 * slow.min(1.0)
     }

@@ -33,6 +33,7 @@ fn plant(k: f64, t: f64, l: f64, offset: f64) -> Fopdt {
         errors: [0.0; 3],
         limited: 0,
         moving: false,
+        overshoot: 0.0,
     }
 }
 
@@ -210,4 +211,53 @@ fn a_stop_ends_the_search() {
     monitor.request_stop();
     let stopped = fit_fopdt(Record::new(&u, 1, &y).unwrap(), TS, &monitor);
     assert!(stopped.unwrap_err().message.contains("stop"));
+}
+
+/// Outputs of a second order of damping `zeta` after a step at `at`.
+fn oscillating(zeta: f64, at: usize, n: usize) -> (Vec<f64>, Vec<f64>) {
+    let (u, _) = response(plant(1.0, 1.0, 0.0, 0.0), at, n);
+    let (omega, damped) = (60.0, (1.0 - zeta * zeta).sqrt());
+    let y = (0..n).map(|k| {
+        let t = omega * TS * k.saturating_sub(at) as f64;
+        let (sin, cos) = (damped * t).sin_cos();
+        500.0 - 200.0 * (-zeta * t).exp() * (cos + zeta / damped * sin)
+    });
+    (u, y.collect())
+}
+
+#[test]
+fn an_overshoot_beyond_the_noise_is_told() {
+    for (zeta, n) in [(0.1, 1000), (0.2, 600), (0.3, 600), (0.5, 800)] {
+        let (u, y) = oscillating(zeta, 100, n);
+        let peak = (-std::f64::consts::PI * zeta / (1.0 - zeta * zeta).sqrt()).exp();
+        let found = fit(&u, &y).unwrap().overshoot;
+        assert!((found - peak).abs() < 0.07, "{zeta}: {found}, {peak}");
+        let mirrored: Vec<f64> = y.iter().map(|y| -y).collect();
+        assert!((fit(&u, &mirrored).unwrap().overshoot - found).abs() < 1e-6);
+        let mut random = Random::new(7);
+        let noisy: Vec<f64> = y.iter().map(|y| y + 6.0 * random.normal()).collect();
+        assert!(fit(&u, &noisy).unwrap().overshoot > 0.8 * peak);
+    }
+}
+
+#[test]
+fn noise_on_a_first_order_is_no_overshoot() {
+    for (t, colour) in [(0.02, 0.0), (0.02, 0.95), (0.1, 0.0), (0.1, 0.9)] {
+        let (u, y) = response(plant(100.0, t, 0.005, 20.0), 150, 900);
+        for seed in 0..25 {
+            let (mut random, mut noise) = (Random::new(seed), 0.0);
+            let noisy: Vec<f64> = y
+                .iter()
+                .map(|y| {
+                    noise = colour * noise + random.normal();
+                    y + 20.0 * (1.0 - colour * colour).sqrt() * noise
+                })
+                .collect();
+            assert_eq!(
+                fit(&u, &noisy).unwrap().overshoot,
+                0.0,
+                "{t} {colour} {seed}"
+            );
+        }
+    }
 }
