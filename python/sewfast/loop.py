@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import _core, signals
 from .control import Controller, vector
 from .errors import DataError, SettingError
+from .gains import Gains
 from .machine import VirtualMachine
 from .models import Ensemble, Model
 from .speed import speed_or_nan
@@ -350,10 +351,19 @@ def check_fits(controller: Controller, plant: Any) -> None:
             f"expected plant and controller at one sample time, got {plant.Ts} s and "
             f"{controller.Ts} s; tune a controller for this plant"
         )
-    for what, theirs, ours in (
-        ("input", plant_units(plant)[0], controller.gains.u_unit),
-        ("output", plant_units(plant)[1], controller.gains.y_unit),
-    ):
+    require_units(controller.gains, plant_units(plant))
+
+
+def require_units(gains: Gains, units: tuple[str, str]) -> None:
+    """Refuse gains in other units than those of a plant's input and output; empty is unknown.
+
+    Raises
+    ------
+    SettingError
+        Naming both.
+    """
+    own = (gains.u_unit, gains.y_unit)
+    for what, theirs, ours in zip(("input", "output"), units, own, strict=True):
         if theirs and ours and theirs.lower() != ours.lower():
             raise SettingError(
                 f"expected the plant's {what} in the controller's unit {ours!r}, got {theirs!r}; "

@@ -14,7 +14,7 @@ from .control import Controller, Fopdt
 from .errors import SettingError
 from .gains import Gains, real, vector
 from .linear_plant import sampled
-from .loop import require_controller
+from .loop import plant_units, require_controller, require_units
 from .models import Model
 
 __all__ = ["Margins", "loop_path", "loop_response", "margins"]
@@ -150,19 +150,9 @@ def _require_units(gains: Gains, plant: Any) -> None:
         Naming both.
     """
     if isinstance(plant, Fopdt):
-        theirs = (plant.u_unit, plant.y_unit)
+        require_units(gains, (plant.u_unit, plant.y_unit))
     elif isinstance(plant, Model):
-        theirs = (plant.input_units[0], plant.output_unit)
-    else:
-        return
-    for what, own, other in zip(
-        ("input", "output"), (gains.u_unit, gains.y_unit), theirs, strict=True
-    ):
-        if own and other and own.lower() != other.lower():
-            raise SettingError(
-                f"expected the plant's {what} in the controller's unit {own!r}, got {other!r}; "
-                "give the gains in the plant's units"
-            )
+        require_units(gains, plant_units(plant))
 
 
 def loop_path(controller: Controller, *, speed: float | None = None) -> _core.LoopPath:
