@@ -12,7 +12,7 @@
 //! the equations are smooth, so that a step keeps its order. [`super::Machine`] changes regimes at events.
 
 use super::parameters::Parameters;
-use super::trigonometry::{sin_cos, turned_by};
+use super::trigonometry::{sin_cos, turn, turned};
 
 /// Current [A], speed [rad/s] and crank angle [rad].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -20,6 +20,19 @@ pub struct State {
     pub current: f64,
     pub speed: f64,
     pub angle: f64,
+    /// Sine and cosine of the angle, turned on from step to step.
+    direction: (f64, f64),
+}
+
+impl State {
+    pub fn new(current: f64, speed: f64, angle: f64) -> Self {
+        Self {
+            current,
+            speed,
+            angle,
+            direction: sin_cos(angle),
+        }
+    }
 }
 
 /// Which of the smooth pieces of the physics holds.
@@ -44,11 +57,37 @@ pub struct Crank {
     pub load: f64,
 }
 
+impl Crank {
+    /// A little further on, by a turn whose square is nothing.
+    #[inline(always)]
+    fn turned((at, slopes): &(Self, Self), e: f64) -> Self {
+        Self {
+            motor_constant: at.motor_constant + e * slopes.motor_constant,
+            inertia: at.inertia + e * slopes.inertia,
+            half_slope: at.half_slope + e * slopes.half_slope,
+            load: at.load + e * slopes.load,
+        }
+    }
+}
+
+/// What stays the same within a step.
+struct Held {
+    voltage: f64,
+    /// 0 where the drive holds the current.
+    per_inductance: f64,
+    /// The dead-time voltage over the inductance.
+    dead: f64,
+    /// 0 at standstill, else 1.
+    moves: f64,
+    coulomb: f64,
+    stribeck: f64,
+}
+
 /// The equations' constants, worked out once.
 #[derive(Clone, Copy, Debug)]
 pub struct Dynamics {
-    pub dead_voltage: f64,
-    per_ripple: f64,
+    dead_voltage: f64,
+    ripple_squared: f64,
     pub resistance: f64,
     per_inductance: f64,
     pub current_limit: f64,
@@ -61,8 +100,8 @@ pub struct Dynamics {
     /// Load torque beside that of the crank \[N m\].
     pub load: f64,
     coulomb_torque: f64,
-    stribeck_torque: f64,
-    per_stribeck_squared: f64,
+    /// Stribeck torque times the square of its speed, and that square.
+    stribeck: [f64; 2],
     viscous_friction: f64,
 }
 
@@ -79,7 +118,7 @@ impl Dynamics {
         let ripple = varying * p.motor_constant * p.torque_ripple;
         Self {
             dead_voltage: p.dead_time * p.pwm_frequency * p.bus_voltage,
-            per_ripple: 1.0 / p.ripple_current,
+            ripple_squared: p.ripple_current.powi(2),
             resistance: p.resistance,
             per_inductance: 1.0 / p.inductance,
             current_limit: p.current_limit,
@@ -91,106 +130,132 @@ impl Dynamics {
             load_second: wave(varying * p.load_second, 2.0, p.load_second_angle),
             load: 0.0,
             coulomb_torque: p.coulomb_torque,
-            stribeck_torque: p.stribeck_torque,
-            per_stribeck_squared: p.stribeck_speed.powi(-2),
+            stribeck: [
+                p.stribeck_torque * p.stribeck_speed.powi(2),
+                p.stribeck_speed.powi(2),
+            ],
             viscous_friction: p.viscous_friction,
         }
     }
 
     /// What depends on the angle.
     #[inline(always)]
-    pub fn crank(&self, angle: f64) -> Crank {
-        self.crank_at(sin_cos(angle))
+    pub fn crank(&self, x: &State) -> Crank {
+        self.crank_with_slopes(x.direction).0
     }
 
-    /// What depends on the angle with this sine and cosine; the harmonics 2 and 4 come from them by doubling.
+    /// What depends on the angle with this sine and cosine, and how it changes with the angle; the harmonics 2 and 4
+    /// come from the first by doubling.
     #[inline(always)]
-    fn crank_at(&self, (s1, c1): (f64, f64)) -> Crank {
+    fn crank_with_slopes(&self, (s1, c1): (f64, f64)) -> (Crank, Crank) {
         let (s2, c2) = (2.0 * s1 * c1, (c1 - s1) * (c1 + s1));
         let (s4, c4) = (2.0 * s2 * c2, (c2 - s2) * (c2 + s2));
-        let [jc, js] = self.inertia_wave;
-        Crank {
-            motor_constant: self.motor_constant
-                + self.ripple_wave[0] * c4
-                + self.ripple_wave[1] * s4,
-            inertia: self.inertia + jc * c2 + js * s2,
-            half_slope: js * c2 - jc * s2,
-            load: (self.load_first[0] * c1 + self.load_first[1] * s1)
-                + (self.load_second[0] * c2 + self.load_second[1] * s2)
-                + self.load,
-        }
+        let ([kc, ks], [jc, js]) = (self.ripple_wave, self.inertia_wave);
+        let ([c, s], [cc, ss]) = (self.load_first, self.load_second);
+        let (wave, half_slope) = (jc * c2 + js * s2, js * c2 - jc * s2);
+        (
+            Crank {
+                motor_constant: self.motor_constant + kc * c4 + ks * s4,
+                inertia: self.inertia + wave,
+                half_slope,
+                load: (c * c1 + s * s1) + (cc * c2 + ss * s2) + self.load,
+            },
+            Crank {
+                motor_constant: 4.0 * (ks * c4 - kc * s4),
+                inertia: 2.0 * half_slope,
+                half_slope: -2.0 * wave,
+                load: (s * c1 - c * s1) + 2.0 * (ss * c2 - cc * s2),
+            },
+        )
     }
 
     /// Voltage that drives the current up: mean inverter voltage less dead time, resistance and back-EMF.
-    #[inline(always)]
     pub fn driving_voltage(&self, crank: &Crank, current: f64, speed: f64, voltage: f64) -> f64 {
-        let x = current * self.per_ripple;
-        let sign = x / (1.0 + x * x).sqrt();
-        (voltage - crank.motor_constant * speed)
-            - (self.resistance * current + self.dead_voltage * sign)
+        (voltage - crank.motor_constant * speed) - self.voltage_drop(current)
+    }
+
+    /// What resistance and dead time take from the mean inverter voltage.
+    pub fn voltage_drop(&self, current: f64) -> f64 {
+        self.resistance * current + self.dead_time(self.dead_voltage, current)
+    }
+
+    /// `most s(current / i_ripple)`, of two halves that do not wait for each other.
+    #[inline(always)]
+    fn dead_time(&self, most: f64, current: f64) -> f64 {
+        let square = self.ripple_squared + current * current;
+        square.sqrt() * (most * current / square)
     }
 
     /// Dry friction at `speed`, without its sign.
-    #[inline(always)]
     pub fn dry_friction(&self, speed: f64) -> f64 {
-        self.coulomb_torque
-            + self.stribeck_torque / (1.0 + speed * speed * self.per_stribeck_squared)
+        self.coulomb_torque + self.stribeck[0] / (self.stribeck[1] + speed * speed)
     }
 
-    /// `(di/dt, dw/dt)`.
+    /// What stays the same within a step.
     #[inline(always)]
-    fn rates(
-        &self,
-        crank: &Crank,
-        current: f64,
-        speed: f64,
-        voltage: f64,
-        regime: Regime,
-    ) -> (f64, f64) {
-        let drive = self.driving_voltage(crank, current, speed, voltage);
-        let friction = regime.motion * self.dry_friction(speed) + self.viscous_friction * speed;
-        let torque = crank.motor_constant * current
-            - crank.load
-            - crank.half_slope * speed * speed
-            - friction;
+    fn held(&self, voltage: f64, Regime { motion, limited }: Regime) -> Held {
+        let per_inductance = (1.0 - limited.abs()) * self.per_inductance;
+        Held {
+            voltage,
+            per_inductance,
+            dead: self.dead_voltage * per_inductance,
+            moves: motion.abs(),
+            coulomb: motion * self.coulomb_torque,
+            stribeck: motion * self.stribeck[0],
+        }
+    }
+
+    /// `(di/dt, dw/dt)`, so ordered that what current and speed have to go through last comes last.
+    #[inline(always)]
+    fn rates(&self, held: &Held, crank: &Crank, current: f64, speed: f64) -> (f64, f64) {
+        let driven = (held.voltage - crank.motor_constant * speed) - self.resistance * current;
+        let square = speed * speed;
+        let torque = (crank.motor_constant * current - crank.load)
+            - (self.viscous_friction * speed + held.coulomb)
+            - crank.half_slope * square;
         (
-            drive * ((1.0 - regime.limited.abs()) * self.per_inductance),
-            regime.motion.abs() * torque / crank.inertia,
+            driven * held.per_inductance - self.dead_time(held.dead, current),
+            (torque - held.stribeck / (self.stribeck[1] + square)) * (held.moves / crank.inertia),
         )
     }
 
     /// One step of Nystroem's fourth-order method for `y'' = f(y, y')` with `y' = (i, w)`.
     ///
     /// Against the classical Runge-Kutta method it shares one angle between its two middle stages
-    /// (Hairer, Norsett and Wanner 1993, II.14). All three angles are known at once but for the little that the
-    /// acceleration turns them by: their sines need not wait for each other.
+    /// (Hairer, Norsett and Wanner 1993, II.14). All three angles are known at once but for what the acceleration turns
+    /// them by: that turn is of second order in `h`, and its square may be left out without a loss of order.
     #[inline(always)]
     pub fn step(&self, x: &State, h: f64, voltage: f64, regime: Regime) -> State {
         let (i, w, half) = (x.current, x.speed, 0.5 * h);
-        let rates = |crank: &Crank, i: f64, w: f64| self.rates(crank, i, w, voltage, regime);
-        let (near, far) = (x.angle + half * w, x.angle + h * w);
-        let (at_near, at_far) = (sin_cos(near), sin_cos(far));
-        let (i1, w1) = rates(&self.crank(x.angle), i, w);
-        let middle = self.crank_at(turned_by(at_near, near, 0.25 * h * half * w1));
+        let held = self.held(voltage, regime);
+        let rates = |crank: &Crank, i: f64, w: f64| self.rates(&held, crank, i, w);
+        let onward = turn(half * w);
+        let near = turned(x.direction, onward);
+        let far = turned(near, onward);
+        let (at_near, at_far) = (self.crank_with_slopes(near), self.crank_with_slopes(far));
+        let (i1, w1) = rates(&self.crank(x), i, w);
+        let middle = Crank::turned(&at_near, 0.25 * h * half * w1);
         let (i2, w2) = rates(&middle, i + half * i1, w + half * w1);
         let (i3, w3) = rates(&middle, i + half * i2, w + half * w2);
-        let end = self.crank_at(turned_by(at_far, far, h * half * w3));
+        let end = Crank::turned(&at_far, h * half * w3);
         let (i4, w4) = rates(&end, i + h * i3, w + h * w3);
         let sixth = h / 6.0;
+        let further = h * sixth * ((w1 + w2) + w3);
         State {
-            current: i + sixth * (i1 + 2.0 * (i2 + i3) + i4),
-            speed: w + sixth * (w1 + 2.0 * (w2 + w3) + w4),
-            angle: x.angle + h * (w + sixth * (w1 + w2 + w3)),
+            current: i + sixth * ((i1 + i4) + 2.0 * (i2 + i3)),
+            speed: w + sixth * ((w1 + w4) + 2.0 * (w2 + w3)),
+            angle: x.angle + (h * w + further),
+            direction: turned(far, turn(further)),
         }
     }
 
     /// The slope of the dead-time voltage over the current [ohm], and of dry friction over the speed [N m s/rad].
     pub fn slopes(&self, current: f64, speed: f64) -> (f64, f64) {
-        let x = current * self.per_ripple;
-        let fall = 1.0 + speed * speed * self.per_stribeck_squared;
+        let square = self.ripple_squared + current * current;
+        let [stribeck, speed_squared] = self.stribeck;
         (
-            self.dead_voltage * self.per_ripple / (1.0 + x * x).powf(1.5),
-            -2.0 * self.stribeck_torque * speed.abs() * self.per_stribeck_squared / (fall * fall),
+            self.dead_voltage * self.ripple_squared / square.powf(1.5),
+            -2.0 * stribeck * speed.abs() / (speed_squared + speed * speed).powi(2),
         )
     }
 }

@@ -34,9 +34,7 @@ impl Machine {
         let speed = speed_rpm / RPM;
         let friction = d.dry_friction(speed) * speed.signum() + p.viscous_friction * speed;
         let current = friction / p.motor_constant;
-        let x = current / p.ripple_current;
-        let dead = d.dead_voltage * x / (1.0 + x * x).sqrt();
-        let voltage = p.resistance * current + p.motor_constant * speed + dead;
+        let voltage = p.motor_constant * speed + d.voltage_drop(current);
         let command = voltage / p.amplifier_gain;
         let reachable = command.abs() <= p.u_limit && voltage.abs() <= p.bus_voltage;
         if speed == 0.0 || !reachable || current.abs() > p.current_limit || !command.is_finite() {

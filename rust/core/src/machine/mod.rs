@@ -75,11 +75,7 @@ impl Machine {
                 false => Encoder::ideal(counts_per_unit),
             },
             steps: STEPS,
-            state: State {
-                current: 0.0,
-                speed: 0.0,
-                angle: 0.0,
-            },
+            state: State::new(0.0, 0.0, 0.0),
             turns: 0.0,
             regime: Regime {
                 motion: 0.0,
@@ -99,11 +95,7 @@ impl Machine {
     /// Back to rest at the initial crank angle, counter at zero.
     pub fn reset(&mut self) {
         let angle = self.parameters.initial_angle;
-        self.state = State {
-            current: 0.0,
-            speed: 0.0,
-            angle,
-        };
+        self.state = State::new(0.0, 0.0, angle);
         self.turns = 0.0;
         self.voltage = 0.0;
         self.regime = Regime {
@@ -136,6 +128,7 @@ impl Machine {
             current,
             speed,
             angle,
+            ..
         } = self.state;
         let Regime { motion, limited } = self.regime;
         let (turns, voltage, load) = (self.turns, self.voltage, self.dynamics.load);
@@ -153,11 +146,7 @@ impl Machine {
             )));
         }
         let [current, speed, angle, turns, motion, limited, voltage, load] = memory;
-        self.state = State {
-            current,
-            speed,
-            angle,
-        };
+        self.state = State::new(current, speed, angle);
         self.regime = Regime { motion, limited };
         (self.turns, self.voltage) = (turns, voltage);
         self.dynamics.load = load;
@@ -224,13 +213,20 @@ impl Machine {
         Ok(u.iter().map(sample).unzip())
     }
 
-    /// Moves whole turns out of the angle, so that it keeps its precision.
+    /// Moves whole turns out of the angle, so that it keeps its precision, and takes its sine and cosine anew.
     fn unwind(&mut self) {
-        if self.state.angle.abs() > 16.0 {
-            let turns = (self.state.angle / TAU).floor();
+        let State {
+            current,
+            speed,
+            mut angle,
+            ..
+        } = self.state;
+        if angle.abs() > 16.0 {
+            let turns = (angle / TAU).floor();
             self.turns += turns;
-            self.state.angle -= turns * TAU;
+            angle -= turns * TAU;
         }
+        self.state = State::new(current, speed, angle);
     }
 
     #[inline(always)]
@@ -284,7 +280,7 @@ impl Machine {
         if motion != 0.0 && limited == 0.0 {
             return (motion * x.speed).min(d.current_limit - x.current.abs());
         }
-        let crank = d.crank(x.angle);
+        let crank = d.crank(x);
         let motion_left = match motion == 0.0 {
             true => d.dry_friction(0.0) - (crank.motor_constant * x.current - crank.load).abs(),
             false => motion * x.speed,
@@ -320,7 +316,7 @@ impl Machine {
     /// Puts the state onto the boundary that it has passed and chooses the regime that holds from there.
     fn settle(&mut self) {
         let (d, x) = (&self.dynamics, &mut self.state);
-        let crank = d.crank(x.angle);
+        let crank = d.crank(x);
         if self.regime.limited == 0.0 && x.current.abs() >= d.current_limit {
             x.current = d.current_limit.copysign(x.current);
             self.regime.limited = x.current.signum();

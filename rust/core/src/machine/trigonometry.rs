@@ -21,19 +21,26 @@ pub fn sin_cos(x: f64) -> (f64, f64) {
     (negate(s, quadrant), negate(c, quadrant.wrapping_add(1)))
 }
 
-/// The largest turn whose series below is exact to rounding: the next terms are `e^7/5040` and `e^6/720`.
-const SMALL_TURN: f64 = 0.004;
+/// The largest turn whose series below are exact to rounding: the next terms are `e^9/9!` and `e^10/10!`.
+const SMALL_TURN: f64 = 0.07;
 
-/// `(sin(x + e), cos(x + e))` from `turned = (sin x, cos x)`: for a small `e` in a third of the time, so that a stage of
-/// a step whose angle is all but known need not wait for the rest of it.
+/// Sine and versine `1 - cos e` of a turn, of a small one in a third of the time that [`sin_cos`] takes.
 #[inline(always)]
-pub fn turned_by((s, c): (f64, f64), x: f64, e: f64) -> (f64, f64) {
+pub fn turn(e: f64) -> (f64, f64) {
     if e.abs() > SMALL_TURN {
-        return sin_cos(x + e);
+        let (sine, cosine) = sin_cos(e);
+        return (sine, 1.0 - cosine);
     }
     let e2 = e * e;
-    let sine = e - e * e2 * (1.0 / 6.0 - e2 * (1.0 / 120.0));
-    let versine = e2 * (0.5 - e2 * (1.0 / 24.0));
+    let e4 = e2 * e2;
+    let sine = (1.0 - e2 * (1.0 / 6.0)) + e4 * (1.0 / 120.0 - e2 * (1.0 / 5_040.0));
+    let versine = (0.5 - e2 * (1.0 / 24.0)) + e4 * (1.0 / 720.0 - e2 * (1.0 / 40_320.0));
+    (e * sine, e2 * versine)
+}
+
+/// `(sin(x + e), cos(x + e))` from `(sin x, cos x)` and the [`turn`] by `e`.
+#[inline(always)]
+pub fn turned((s, c): (f64, f64), (sine, versine): (f64, f64)) -> (f64, f64) {
     (s + (c * sine - s * versine), c - (s * sine + c * versine))
 }
 
@@ -64,8 +71,8 @@ mod tests {
     #[test]
     fn turns_by_any_angle() {
         for k in -4_000..4_000 {
-            let (x, e) = (f64::from(k) * 0.003_7, f64::from(k % 97) * 1e-4);
-            let (s, c) = turned_by(sin_cos(x), x, e);
+            let (x, e) = (f64::from(k) * 0.003_7, f64::from(k % 97) * 1e-3);
+            let (s, c) = turned(sin_cos(x), turn(e));
             assert!(
                 (s - (x + e).sin()).abs() < 1e-15 && (c - (x + e).cos()).abs() < 1e-15,
                 "{e} from {x}"
