@@ -217,9 +217,11 @@ def arx(samples: int) -> Work:
     return work
 
 
-def neural_ss(iterations: int) -> Work:
+def neural_ss(
+    iterations: int, samples: int = state_space.SAMPLES, hidden: int = state_space.HIDDEN
+) -> Work:
     """LM iterations of the state-space model from its own start."""
-    fit = state_space.training(iterations)
+    fit = state_space.training(iterations, samples, hidden)
     return lambda: {"cost": fit().cost}
 
 

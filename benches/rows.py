@@ -6,7 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from problem import LOOP_SAMPLES, SAMPLES
-from state_space import FIRST, STEPS
+from state_space import FIRST, HIDDEN, STEPS
+from state_space import SAMPLES as STATES
 from turns import ONE_THREAD, Contender
 
 MU = 1.0
@@ -142,13 +143,15 @@ def training() -> list[Row]:
 
 
 def levels() -> list[Row]:
-    several = ("avx512", "avx2", "baseline")
+    def each(work: str, **arguments: Any) -> tuple[Contender, ...]:
+        return tuple(forced(level, work, **arguments) for level in ("avx512", "avx2", "baseline"))
+
     return [
         Row(
             "levels_training",
             "levels",
             "100 LM iterations",
-            tuple(forced(level, "training", iterations=ITERATIONS) for level in several),
+            each("training", iterations=ITERATIONS),
             agree=TRAINING,
             bars={"sewfast, avx2": -1.8},
             turns=5,
@@ -157,7 +160,7 @@ def levels() -> list[Row]:
             "levels_free_run",
             "levels",
             "free run, N = 20,000",
-            tuple(forced(level, "free_run", samples=SAMPLES) for level in several),
+            each("free_run", samples=SAMPLES),
             unit=("ns/sample", 1e9),
             parts=SAMPLES,
             agree=RUN,
@@ -167,7 +170,7 @@ def levels() -> list[Row]:
             "levels_candidates",
             "levels",
             "1,000 closed loops of 4,000 samples",
-            tuple(forced(level, "candidates", number=CANDIDATES) for level in several),
+            each("candidates", number=CANDIDATES),
             agree={"mean": 1e-9},
             turns=5,
         ),
@@ -175,7 +178,7 @@ def levels() -> list[Row]:
             "levels_neural_ss",
             "levels",
             "neural state space, 10 LM iterations and its start",
-            tuple(forced(level, "neural_ss", iterations=STEPS) for level in several),
+            each("neural_ss", iterations=STEPS),
             agree={"cost": 1e-3},
             turns=3,
             quick=False,
@@ -423,6 +426,7 @@ def growth() -> list[Row]:
                 quick=False,
             ),
         ]
+    rows += state_space_growth()
     rows += [
         Row(
             f"growth_starts_{starts}",
@@ -435,6 +439,31 @@ def growth() -> list[Row]:
         )
         for starts in (1, 2, 4, 8, 16)
     ]
+    return rows
+
+
+def state_space_growth() -> list[Row]:
+    sizes = [(samples, HIDDEN) for samples in (1000, 10_000, STATES, MILLION)]
+    rows = []
+    for samples, hidden in (*sizes, (STATES, 8), (STATES, 30)):
+        steps = max(2, min(20, 1_000_000 // samples))
+        arguments = {"samples": samples, "hidden": hidden}
+        rows.append(
+            Row(
+                f"growth_neural_ss_{samples}_{hidden}",
+                "growth",
+                f"state-space LM iteration, {9 * hidden + 20} parameters, N = {samples:,}",
+                (
+                    ours("neural_ss", iterations=FIRST + steps, **arguments),
+                    ours("neural_ss", name="first", iterations=FIRST, **arguments),
+                ),
+                unit=("ns/sample", 1e9),
+                parts=steps * samples,
+                less={"sewfast": "first"},
+                turns=3,
+                quick=False,
+            )
+        )
     return rows
 
 

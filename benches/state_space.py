@@ -19,28 +19,30 @@ MU = 2e-3
 
 
 @cache
-def record() -> tuple[np.ndarray, np.ndarray]:
+def record(samples: int = SAMPLES) -> tuple[np.ndarray, np.ndarray]:
     """A resonance with a stiffening spring, as a Silverbox has it, and noise."""
     rng = np.random.default_rng(0)
-    u = np.convolve(rng.normal(size=SAMPLES), np.ones(8) / np.sqrt(8), mode="same")
-    x, v, y = 0.0, 0.0, np.empty(SAMPLES)
-    for k in range(SAMPLES):
+    u = np.convolve(rng.normal(size=samples), np.ones(8) / np.sqrt(8), mode="same")
+    x, v, y = 0.0, 0.0, np.empty(samples)
+    for k in range(samples):
         y[k] = x
         v += 0.5 * (0.3 * u[k] - 0.25 * v - 0.4 * x - 0.15 * x**3)
         x += 0.5 * v
-    return u[:, None].copy(), y + 1e-3 * y.std() * rng.normal(size=SAMPLES)
+    return u[:, None].copy(), y + 1e-3 * y.std() * rng.normal(size=samples)
 
 
-def training(iterations: int) -> Callable[[], _core.NeuralSSFit]:
+def training(
+    iterations: int, samples: int = SAMPLES, hidden: int = HIDDEN
+) -> Callable[[], _core.NeuralSSFit]:
     """A training from a linear model, ready to begin."""
-    data = [record()]
+    data = [record(samples)]
     linear = _core.fit_oe(data, na=NX, nb=NX, nk=1, max_iterations=20).model
     return lambda: _core.fit_neural_ss(
         data,
         [],
         nx=NX,
         nk=1,
-        hidden=HIDDEN,
+        hidden=hidden,
         linear=linear,
         output="linear",
         output_parameters=np.zeros(0),

@@ -16,6 +16,7 @@ use crate::encoder::Encoder;
 use crate::simd::{self, Eight, Kernel};
 use crate::{Error, Monitor, Result};
 use alone::{Constant, Decides};
+use known::{Any, Second};
 use lanes::Lanes;
 
 /// What a controller can be closed around: one input, one output, stepped sample by sample.
@@ -153,7 +154,31 @@ impl Run {
         encoder: Option<&Encoder>,
         monitor: &Monitor,
     ) {
-        self.clear();
+        // Room for all at once: a call to make more, even one that never comes, empties the registers at every sample.
+        let samples = signals.reference.len();
+        self.u.resize(samples, 0.0);
+        self.y.resize(samples, 0.0);
+        self.feedback.resize(samples, 0.0);
+        let (end, outcome) = self.through(plant, controller, signals, encoder, monitor);
+        self.u.truncate(end);
+        self.y.truncate(end);
+        self.feedback.truncate(end);
+        self.outcome = outcome;
+    }
+
+    /// Runs through the reference, for which there is room; gives the samples that were run and how it ended.
+    #[inline(always)]
+    fn through(
+        &mut self,
+        plant: &mut (impl Plant + ?Sized),
+        controller: &mut impl Decides,
+        signals: Signals<'_>,
+        encoder: Option<&Encoder>,
+        monitor: &Monitor,
+    ) -> (usize, Outcome) {
+        let samples = signals.reference.len();
+        let commands = &mut self.u[..samples];
+        let (outputs, feedback) = (&mut self.y[..samples], &mut self.feedback[..samples]);
         plant.reset();
         controller.reset();
         let ts = controller.ts();
@@ -168,26 +193,23 @@ impl Run {
             };
             before = now;
             if !(y.abs() < RUNAWAY && measured.is_finite()) {
-                self.outcome = Outcome::Diverged(k);
-                return;
+                return (k, Outcome::Diverged(k));
             }
             if k % WATCHED == 0 && monitor.stopped() {
-                self.outcome = Outcome::Interrupted(k);
-                return;
+                return (k, Outcome::Interrupted(k));
             }
             let u = controller.decide(k == 0, r, measured, signals.feedforward_at(k));
-            self.u.push(u);
-            self.y.push(y);
-            self.feedback.push(controller.filtered());
+            commands[k] = u;
+            outputs[k] = y;
+            feedback[k] = controller.filtered();
             plant.advance(signals.disturbance_at(k).map_or(u, |added| u + added));
         }
+        (samples, Outcome::Completed)
     }
 
-    fn clear(&mut self) {
-        self.u.clear();
-        self.y.clear();
-        self.feedback.clear();
-        self.outcome = Outcome::Completed;
+    /// The largest `|u|`; 0 of an empty record.
+    pub fn largest_command(&self) -> f64 {
+        self.u.iter().fold(0.0, |most, u| f64::max(most, u.abs()))
     }
 }
 
@@ -206,16 +228,15 @@ impl Kernel for Alone<'_> {
 
     #[inline(always)]
     fn run<V: Eight>(self) {
-        let usual = self.known.lags.regressors() == 4;
         let controller = self.controller;
         if !Lanes::take(controller) {
-            let plant = known::Alone::<V, 0>::new(self.known);
+            let plant = known::Alone::<V, Any>::new(self.known);
             self.around(plant, &mut controller.clone());
-        } else if usual {
-            let plant = known::Alone::<V, 4>::new(self.known);
+        } else if Second::takes(&self.known) {
+            let plant = known::Alone::<V, Second>::new(self.known);
             self.around(plant, &mut Constant::new(controller));
         } else {
-            let plant = known::Alone::<V, 0>::new(self.known);
+            let plant = known::Alone::<V, Any>::new(self.known);
             self.around(plant, &mut Constant::new(controller));
         }
     }

@@ -90,7 +90,7 @@ impl Lags {
                 self.na
             )));
         }
-        if u.iter().chain(y_past).any(|v| !v.is_finite()) {
+        if !(all_finite(u) && all_finite(y_past)) {
             return Err(Error::data(
                 "expected finite inputs and past outputs, got NaN or infinity; cut or repair that part of the recording",
             ));
@@ -285,15 +285,21 @@ pub fn push_past(past: &mut [f64], y: f64) {
     past[0] = y;
 }
 
+/// Without a branch, so that several are looked at at once.
+fn all_finite(values: &[f64]) -> bool {
+    values.iter().fold(true, |all, v| all & v.is_finite())
+}
+
 /// The run, where all of it is finite.
 pub(crate) fn finite(run: Vec<f64>) -> Result<Vec<f64>> {
-    match run.iter().position(|y| !y.is_finite()) {
-        None => Ok(run),
-        Some(k) => Err(Error::fit(format!(
-            "expected a finite simulation, got {} at sample {k}; the model is unstable on this input: identify it again with other orders or more data",
-            run[k]
-        ))),
+    if all_finite(&run) {
+        return Ok(run);
     }
+    let k = run.iter().take_while(|y| y.is_finite()).count();
+    Err(Error::fit(format!(
+        "expected a finite simulation, got {} at sample {k}; the model is unstable on this input: identify it again with other orders or more data",
+        run[k]
+    )))
 }
 
 /// Gauss-Newton over the past outputs, with buffers that are made once.

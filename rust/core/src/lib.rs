@@ -16,6 +16,7 @@ mod guard;
 pub mod iv;
 pub mod lagged;
 pub mod least_squares;
+mod limit;
 pub mod linear;
 pub mod linear_fit;
 pub mod lm;

@@ -13,6 +13,7 @@ mod sensitivities;
 mod train;
 mod warm;
 
+pub(crate) use network::{Meanwhile, Nothing};
 pub use network::{Network, Shape};
 pub use scaling::Scaling;
 pub use train::{InitialState, NeuralFit, Settings, fit};
@@ -207,8 +208,9 @@ impl Lagged for NeuralOE {
 
     fn simulate(&self, u: &[f64], channels: usize, y_past: &[f64]) -> Result<Vec<f64>> {
         let samples = self.lags().check(u, channels, y_past)?;
-        let (u, state) = (self.scaling.inputs(u), self.scaled_state(y_past));
-        finite(self.restored(free_run::outputs(&self.network, &u, 0, &state, samples)))
+        // in the data's units nothing is scaled but the weights: no copy of the inputs, no second pass over the outputs
+        let network = self.in_data_units();
+        finite(free_run::outputs(&network, u, 0, y_past, samples))
     }
 }
 

@@ -1,6 +1,7 @@
 //! The neural state-space model: linear state equations beside one hidden layer (M. Schoukens, arXiv 2103.14516).
 
 mod draw;
+mod free_run;
 mod guard;
 mod kalman;
 mod network;
@@ -25,9 +26,9 @@ pub use state::Statistics;
 pub use stepper::Stepper;
 pub use train::{NeuralSSFit, Settings, fit};
 
+use free_run::Trajectory;
 use kalman::Filter;
 use network::{Network, Scratch};
-use problem::{FreeRun, Trajectory};
 use sensitivities::{Columns, Recursion, Rows, Sensitivities};
 
 use crate::lagged::finite;
@@ -159,7 +160,7 @@ impl NeuralSS {
         let states = (0..shape.nx).map(|j| columns.state + j);
         let mut dense = Dense {
             columns: columns.of_theta().into_iter().chain(states).collect(),
-            row: vec![0.0; columns.room * shape.outputs],
+            block: vec![0.0; columns.room * shape.outputs.max(single::BLOCK)],
             room: columns.room,
             rows: Vec::with_capacity(run.len() * (self.theta.len() + shape.nx)),
             scales: &self.scaling.y_scale,
@@ -269,16 +270,9 @@ impl NeuralSS {
         run: &mut Trajectory,
         scratch: &mut Scratch,
     ) -> Result<()> {
-        let free = FreeRun {
-            network: &self.network,
-            v,
-            state,
-            run,
-            scratch,
-            bound: f64::MAX,
-            monitor: &Monitor::default(),
-        };
-        simd::run(free).ok_or_else(|| {
+        let monitor = Monitor::default();
+        let found = free_run::alone(&self.network, v, state, run, scratch, &monitor);
+        found.then_some(()).ok_or_else(|| {
             Error::fit("expected a finite simulation, got states beyond all bounds; the model is unstable on this input: identify it again with other orders or more data")
         })
     }
@@ -333,7 +327,8 @@ impl NeuralSS {
 /// Rows in the data's units, in the order of theta.
 struct Dense<'a> {
     columns: Vec<usize>,
-    row: Vec<f64>,
+    /// Rows that are not yet kept.
+    block: Vec<f64>,
     room: usize,
     rows: Vec<f64>,
     scales: &'a [f64],
@@ -345,12 +340,12 @@ impl Rows for Dense<'_> {
     }
 
     fn room(&mut self, count: usize) -> &mut [f64] {
-        &mut self.row[..count * self.room]
+        &mut self.block[..count * self.room]
     }
 
     fn keep(&mut self, count: usize) {
-        let rows = self.row.chunks_exact(self.room).take(count);
-        for (row, scale) in rows.zip(self.scales) {
+        let rows = self.block.chunks_exact(self.room).take(count);
+        for (row, scale) in rows.zip(self.scales.iter().cycle()) {
             self.rows
                 .extend(self.columns.iter().map(|&c| row[c] * scale));
         }

@@ -77,6 +77,20 @@ pub(crate) trait Eight: Choice {
     /// `2^n` for numbers that hold the integer `n` in their low bits.
     fn power_of_two(self) -> Self;
 
+    /// `tanh` by the shortest chain, for results that wait for each other; many at once take less by [`tanh::tanh`].
+    #[inline(always)]
+    fn tanh_in_chain(self) -> Self {
+        tanh::tanh(self)
+    }
+
+    /// The output `y` of hidden units `self`, the sum of `direct + second self`, and `rest + weights y`, the arguments
+    /// that it leads to; rounded as is shortest here.
+    #[inline(always)]
+    fn fed_back(self, second: Self, direct: Self, rest: Self, weights: Self) -> (f64, Self) {
+        let y = direct.add_product(second, self).sum();
+        (y, rest.add_product(weights, Self::splat(y)))
+    }
+
     /// The first eight numbers of a slice.
     #[inline(always)]
     fn first(values: &[f64]) -> Self {

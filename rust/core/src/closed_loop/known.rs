@@ -4,6 +4,7 @@ use std::marker::PhantomData;
 
 use super::Plant;
 use crate::lagged::{Form, Lags};
+use crate::neural::Meanwhile;
 use crate::simd::{Eight, Group};
 
 /// A plant whose equations kernels know: a lagged model, its output multiplied, its input held back.
@@ -24,41 +25,36 @@ impl Known<'_> {
     }
 }
 
-/// One plant inside a kernel, where the whole loop is compiled for one processor; `N` is the number of regressors, 0 for any.
-pub(super) struct Alone<'a, V, const N: usize> {
+/// One plant inside a kernel, where the whole loop is compiled for one processor; `R` holds its regressor.
+pub(super) struct Alone<'a, V, R> {
     known: Known<'a>,
-    /// Past outputs, newest first, then the inputs of the regressor.
-    phi: Vec<f64>,
-    /// Past inputs, newest first.
-    inputs: Vec<f64>,
+    regressor: R,
     position: f64,
     level: PhantomData<V>,
 }
 
-impl<'a, V: Eight, const N: usize> Alone<'a, V, N> {
+impl<'a, V: Eight, R: Regressor> Alone<'a, V, R> {
     #[inline(always)]
     pub fn new(known: Known<'a>) -> Self {
         Self {
             known,
-            phi: vec![0.0; known.lags.regressors()],
-            inputs: vec![0.0; known.lead() + known.lags.nb],
+            regressor: R::at_rest(&known),
             position: 0.0,
             level: PhantomData,
         }
     }
 }
 
-impl<V: Eight, const N: usize> Plant for Alone<'_, V, N> {
+impl<V: Eight, R: Regressor> Plant for Alone<'_, V, R> {
     #[inline(always)]
     fn reset(&mut self) {
-        self.phi.fill(0.0);
-        self.inputs.fill(0.0);
+        self.regressor = R::at_rest(&self.known);
         self.position = 0.0;
     }
 
     #[inline(always)]
     fn output(&self) -> f64 {
-        self.known.gain * self.phi[0]
+        self.known.gain * self.regressor.newest()
     }
 
     #[inline(always)]
@@ -68,23 +64,117 @@ impl<V: Eight, const N: usize> Plant for Alone<'_, V, N> {
 
     #[inline(always)]
     fn advance(&mut self, u: f64) {
-        let (na, lead) = (self.known.lags.na, self.known.lead());
+        let before = self.regressor.newest();
+        self.regressor.take(u);
+        let y = self.regressor.output::<V>(self.known.form);
+        self.position += self.known.ts * (before + y) / 2.0;
+        self.regressor.put(y);
+    }
+}
+
+/// What the next output of one plant depends on.
+pub(super) trait Regressor {
+    fn at_rest(known: &Known<'_>) -> Self;
+    /// The newest output.
+    fn newest(&self) -> f64;
+    /// Takes a command in.
+    fn take(&mut self, u: f64);
+    /// The next output.
+    fn output<V: Eight>(&self, form: &Form) -> f64;
+    /// Takes that output in.
+    fn put(&mut self, y: f64);
+}
+
+/// Any number of outputs and inputs.
+pub(super) struct Any {
+    /// Past outputs, newest first, then the inputs of the regressor.
+    phi: Vec<f64>,
+    /// Past inputs, newest first.
+    inputs: Vec<f64>,
+    past: usize,
+    lead: usize,
+}
+
+impl Regressor for Any {
+    #[inline(always)]
+    fn at_rest(known: &Known<'_>) -> Self {
+        let (lags, lead) = (known.lags, known.lead());
+        Self {
+            phi: vec![0.0; lags.regressors()],
+            inputs: vec![0.0; lead + lags.nb],
+            past: lags.na,
+            lead,
+        }
+    }
+
+    #[inline(always)]
+    fn newest(&self) -> f64 {
+        self.phi[0]
+    }
+
+    #[inline(always)]
+    fn take(&mut self, u: f64) {
         shift(&mut self.inputs, u);
-        let (outputs, inputs) = self.phi.split_at_mut(na);
-        let due = &self.inputs[lead..][..inputs.len()];
-        // not a call to copy a few numbers
+        let inputs = &mut self.phi[self.past..];
+        let due = &self.inputs[self.lead..][..inputs.len()];
         let mut i = due.len();
         while i > 0 {
             i -= 1;
             inputs[i] = due[i];
         }
-        let newest = outputs[0];
-        let y = match self.known.form {
+    }
+
+    #[inline(always)]
+    fn output<V: Eight>(&self, form: &Form) -> f64 {
+        match form {
             Form::Linear(model) => model.next(&self.phi),
-            Form::Network(network) => network.next::<V, N>(&self.phi),
-        };
-        self.position += self.known.ts * (newest + y) / 2.0;
-        shift(&mut self.phi[..na], y);
+            Form::Network(network) => network.next::<V, 0>(&self.phi),
+        }
+    }
+
+    #[inline(always)]
+    fn put(&mut self, y: f64) {
+        shift(&mut self.phi[..self.past], y);
+    }
+}
+
+/// Two outputs and two inputs, the newest of them the last command: they stay in registers.
+pub(super) struct Second([f64; 4]);
+
+impl Second {
+    /// Whether a plant has that many, and no more delay.
+    pub fn takes(known: &Known<'_>) -> bool {
+        (known.lags.na, known.lags.regressors(), known.lead()) == (2, 4, 0)
+    }
+}
+
+impl Regressor for Second {
+    #[inline(always)]
+    fn at_rest(_known: &Known<'_>) -> Self {
+        Self([0.0; 4])
+    }
+
+    #[inline(always)]
+    fn newest(&self) -> f64 {
+        self.0[0]
+    }
+
+    #[inline(always)]
+    fn take(&mut self, u: f64) {
+        self.0 = [self.0[0], self.0[1], u, self.0[2]];
+    }
+
+    #[inline(always)]
+    fn output<V: Eight>(&self, form: &Form) -> f64 {
+        match form {
+            Form::Linear(model) => model.next(&self.0),
+            Form::Network(network) => network.next::<V, 4>(&self.0),
+        }
+    }
+
+    #[inline(always)]
+    fn put(&mut self, y: f64) {
+        self.0 = [y, self.0[0], self.0[2], self.0[3]];
     }
 }
 
@@ -132,16 +222,17 @@ impl<'a> Beside<'a> {
         V::splat(self.known.gain).mul(V::load(&self.position.0))
     }
 
-    /// Holds a command in each lane for one sample time; `N` is the number of regressors, 0 for any.
+    /// Holds a command in each lane for one sample time; `N` is the number of regressors, 0 for any. Other work may be done
+    /// meanwhile.
     #[inline(always)]
-    pub fn advance<V: Eight, const N: usize>(&mut self, u: V) {
+    pub fn advance<V: Eight, const N: usize>(&mut self, u: V, meanwhile: &mut impl Meanwhile) {
         let na = self.known.lags.na;
         let due = self.delayed(u);
         push_eight(&mut self.phi[na..], due);
         let newest = V::load(&self.phi[0].0);
         let y = match self.known.form {
             Form::Linear(model) => model.beside::<V>(&self.phi),
-            Form::Network(network) => network.beside::<V, N>(&self.phi),
+            Form::Network(network) => network.beside::<V, N>(&self.phi, meanwhile),
         };
         let moved = V::splat(self.known.ts).mul(newest.add(y));
         // a product with 1/2 is as exact as the quotient

@@ -15,12 +15,13 @@ use super::known::{Beside, Known};
 use super::{Outcome, RUNAWAY, Signals, WATCHED};
 use crate::Monitor;
 use crate::encoder::Encoder;
+use crate::neural::{Meanwhile, Nothing};
 use crate::simd::{self, Eight, Kernel, LANES};
 pub(super) use controllers::Controllers;
 pub(crate) use tally::{Sums, Tally};
 
-/// Loops that run side by side at most: two groups, of which one computes while the other waits for its results.
-pub(crate) const MOST: usize = 2 * LANES;
+/// Loops that run side by side at most: four groups, of which one computes while others wait for their results.
+pub(crate) const MOST: usize = 4 * LANES;
 
 /// What takes note of the samples of a group of lanes.
 pub(crate) trait Notes {
@@ -49,43 +50,38 @@ impl Lanes<'_> {
     ///
     /// Notes of a lane after its end mean nothing.
     pub fn run(self, notes: &mut [impl Notes]) -> [Outcome; MOST] {
-        let usual = self.known.lags.regressors() == 4;
-        match (notes, usual) {
-            ([one], true) => simd::run(Grouped::<_, 1, 4>(self, [one])),
-            ([one], false) => simd::run(Grouped::<_, 1, 0>(self, [one])),
-            ([one, other, ..], true) => simd::run(Grouped::<_, 2, 4>(self, [one, other])),
-            ([one, other, ..], false) => simd::run(Grouped::<_, 2, 0>(self, [one, other])),
-            ([], _) => [Outcome::Completed; MOST],
+        if self.known.lags.regressors() == 4 {
+            simd::run(Grouped::<_, 4>(self, notes))
+        } else {
+            simd::run(Grouped::<_, 0>(self, notes))
         }
     }
 }
 
-/// `G` groups of loops around a plant with `N` regressors, 0 for any number.
-struct Grouped<'a, S, const G: usize, const N: usize>(Lanes<'a>, [&'a mut S; G]);
+/// Groups of loops around a plant with `N` regressors, 0 for any number.
+struct Grouped<'a, 'b, S, const N: usize>(Lanes<'a>, &'b mut [S]);
 
-impl<S: Notes, const G: usize, const N: usize> Kernel for Grouped<'_, S, G, N> {
+impl<S: Notes, const N: usize> Kernel for Grouped<'_, '_, S, N> {
     type Output = [Outcome; MOST];
 
     #[inline(always)]
     fn run<V: Eight>(self) -> Self::Output {
         let Self(lanes, notes) = self;
-        let mut groups: [_; G] = std::array::from_fn(|g| Loops::<V>::new(&lanes, g));
+        // on the heap, so that one pointer finds all of a group
+        let mut groups = Vec::with_capacity(notes.len());
+        for g in 0..notes.len() {
+            groups.push(Loops::<V>::new(&lanes, g));
+        }
         let mut ends = Ends::new(lanes.controllers.len());
-        let signals = lanes.signals;
+        let signals = &lanes.signals;
         for (k, &r) in signals.reference.iter().enumerate() {
             if k % WATCHED == 0 && lanes.monitor.stopped() {
                 ends.note(ends.running, Outcome::Interrupted(k));
                 return ends.outcomes;
             }
-            for g in 0..G {
-                ends.note(groups[g].measure() << (LANES * g), Outcome::Diverged(k));
-                groups[g].decide(&signals, k, r, notes[g]);
-                // A group's decisions are one long chain of operations; the next group's plants keep the processor
-                // busy meanwhile.
-                let next = (g + 1) % G;
-                if next == 0 || k > 0 {
-                    groups[next].plants.advance::<V, N>(groups[next].applied);
-                }
+            for (g, notes) in notes.iter_mut().enumerate() {
+                let now = Now { k, r, g, signals };
+                turn::<_, _, N>(&mut groups, notes, &mut ends, now);
             }
             if ends.running == 0 {
                 return ends.outcomes;
@@ -95,9 +91,60 @@ impl<S: Notes, const G: usize, const N: usize> Kernel for Grouped<'_, S, G, N> {
     }
 }
 
+/// A sample of a group of loops.
+#[derive(Clone, Copy)]
+struct Now<'a> {
+    k: usize,
+    r: f64,
+    g: usize,
+    signals: &'a Signals<'a>,
+}
+
+/// A group decides, while the plants of the group that decided half a round ago take their step: both have time until what
+/// comes out is asked for. A group alone does one after the other.
+#[inline(always)]
+fn turn<V: Eight, S: Notes, const N: usize>(
+    groups: &mut [Loops<'_, V>],
+    notes: &mut S,
+    ends: &mut Ends,
+    now: Now<'_>,
+) {
+    let half = groups.len() / 2;
+    let begun = now.k > 0 || now.g >= half;
+    let due = if now.g < half {
+        now.g + groups.len() - half
+    } else {
+        now.g - half
+    };
+    let stage = 0;
+    if let Ok([loops, due]) = groups.get_disjoint_mut([now.g, due]) {
+        let mut decision = Decision {
+            loops,
+            notes,
+            ends,
+            now,
+            stage,
+        };
+        if begun {
+            due.plants.advance::<V, N>(due.applied, &mut decision);
+        }
+        decision.finish();
+    } else if let [loops] = groups {
+        let mut decision = Decision {
+            loops,
+            notes,
+            ends,
+            now,
+            stage,
+        };
+        decision.finish();
+        loops.plants.advance::<V, N>(loops.applied, &mut Nothing);
+    }
+}
+
 /// Which lanes still run, and how the others ended.
 struct Ends {
-    running: u32,
+    running: u64,
     outcomes: [Outcome; MOST],
 }
 
@@ -111,7 +158,7 @@ impl Ends {
 
     /// Those of `lanes` that ran until now have ended.
     #[inline(always)]
-    fn note(&mut self, lanes: u32, outcome: Outcome) {
+    fn note(&mut self, lanes: u64, outcome: Outcome) {
         let ended = lanes & self.running;
         if ended != 0 {
             self.running &= !ended;
@@ -157,7 +204,7 @@ impl<'a, V: Eight> Loops<'a, V> {
 
     /// Measures; gives the lanes whose outputs have left all bounds.
     #[inline(always)]
-    fn measure(&mut self) -> u32 {
+    fn measure(&mut self) -> u64 {
         let y: V = self.plants.output();
         let mut sound = y.size().are_less(V::splat(RUNAWAY));
         self.measured = y;
@@ -167,19 +214,60 @@ impl<'a, V: Eight> Loops<'a, V> {
             self.before = now;
             sound &= self.measured.size().are_less(V::splat(f64::INFINITY));
         }
-        u32::from(!sound)
+        u64::from(!sound)
     }
 
     /// Decides on the commands.
     #[inline(always)]
     fn decide(&mut self, signals: &Signals<'_>, k: usize, r: f64, notes: &mut impl Notes) {
         let y = self.plants.output();
-        let added = signals.feedforward_at(k);
-        let u = self.controllers.step(k == 0, r, self.measured, added);
+        let u = self
+            .controllers
+            .decide(k == 0, r, signals.feedforward_at(k));
         notes.put(k, r, u, y, self.controllers.filtered);
         self.applied = match signals.disturbance_at(k) {
             None => u,
             Some(added) => u.add(V::splat(added)),
         };
+    }
+}
+
+/// What one group of loops does in a sample but for its plants' steps, in stages: a processor goes on with another group's
+/// plants while a stage waits for its numbers.
+struct Decision<'a, 'b, V, S> {
+    loops: &'a mut Loops<'b, V>,
+    notes: &'a mut S,
+    ends: &'a mut Ends,
+    now: Now<'a>,
+    stage: usize,
+}
+
+impl<V: Eight, S: Notes> Decision<'_, '_, V, S> {
+    /// What is left to do.
+    #[inline(always)]
+    fn finish(&mut self) {
+        while self.stage < STAGES {
+            self.go();
+        }
+    }
+}
+
+/// Stages of a [`Decision`].
+const STAGES: usize = 3;
+
+impl<V: Eight, S: Notes> Meanwhile for Decision<'_, '_, V, S> {
+    #[inline(always)]
+    fn go(&mut self) {
+        let Now { k, r, g, signals } = self.now;
+        match self.stage {
+            0 => {
+                let runaway = self.loops.measure() << (LANES * g);
+                self.ends.note(runaway, Outcome::Diverged(k));
+            }
+            1 => self.loops.controllers.take(k == 0, self.loops.measured),
+            2 => self.loops.decide(signals, k, r, self.notes),
+            _ => return,
+        }
+        self.stage += 1;
     }
 }

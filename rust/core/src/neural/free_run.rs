@@ -1,4 +1,4 @@
-//! Free runs of networks in scaled units, one or two side by side.
+//! Free runs of networks in the units of their inputs, scaled or the data's, one or two side by side.
 //!
 //! A run waits for itself: each output needs the one before. What does not depend on it, the inputs' share of the hidden
 //! units' arguments, is computed for a block of samples beforehand, and a second run fits into the waiting.
@@ -6,6 +6,7 @@
 use super::network::Network;
 use super::regressor;
 use crate::Monitor;
+use crate::limit::Limit;
 use crate::simd::{self, Eight, Group, Kernel, LANES};
 
 /// Samples whose inputs are prepared at once.
@@ -26,43 +27,7 @@ pub(super) struct Run<'a> {
     pub limit: Option<Limit>,
 }
 
-/// The cost that a run has to stay below: `(before + sum)/(2 samples) + penalty`.
-#[derive(Clone, Copy)]
-pub(super) struct Limit {
-    pub before: f64,
-    pub samples: f64,
-    pub penalty: f64,
-    pub limit: f64,
-}
-
-impl Limit {
-    /// For a run that nothing is asked of.
-    pub const NONE: Self = Self {
-        before: 0.0,
-        samples: 1.0,
-        penalty: 0.0,
-        limit: f64::INFINITY,
-    };
-
-    /// The cost with this sum of squares; it grows with the sum, rounding included.
-    pub fn cost(&self, sum: f64) -> f64 {
-        0.5 * (self.before + sum) / self.samples + self.penalty
-    }
-
-    /// What is left after a run with this sum.
-    pub fn after(self, sum: f64) -> Self {
-        Self {
-            before: self.before + sum,
-            ..self
-        }
-    }
-
-    fn is_reached(&self, sum: f64) -> bool {
-        self.cost(sum) >= self.limit
-    }
-}
-
-/// Free runs of networks of one shape over the same scaled inputs.
+/// Free runs of networks of one shape over the same inputs.
 pub(super) struct FreeRuns<'a, const RUNS: usize> {
     pub runs: [Run<'a>; RUNS],
     /// Inputs of the whole experiment.
@@ -219,7 +184,7 @@ impl<'a> Chain<'a> {
             for (group, driven) in units.iter().enumerate() {
                 let weights = &network.first[group * n_phi..][..na];
                 let z = argument(V::load(&driven[k].0), weights, older, newest);
-                let h = simd::tanh::tanh(z);
+                let h = z.tanh_in_chain();
                 sum = sum.add_product(V::load(&network.second[group].0), h);
                 if let Some(hidden) = self.run.hidden.get_mut((start + k) * groups + group) {
                     h.store(&mut hidden.0);
@@ -280,24 +245,33 @@ fn together<V: Eight, const NA: usize, const RUNS: usize>(
             past[r][m] = V::splat(chain.outputs[NA - 1 - m]);
         }
     }
+    let mut arguments = [V::splat(0.0); RUNS];
+    for (r, chain) in chains.iter().enumerate() {
+        let driven = V::load(&chain.driven[0][0].0);
+        arguments[r] = older(driven, &weights[r], &past[r][1..]);
+        arguments[r] = arguments[r].add_product(weights[r][0], past[r][0]);
+    }
     let limited = chains[0].run.network.saturates();
     let kept = !chains[0].run.hidden.is_empty();
     for k in 0..count.min(BLOCK) {
         for r in 0..RUNS {
             let chain = &mut *chains[r];
-            let mut z = V::load(&chain.driven[0][k].0);
-            let mut sum = V::load(&chain.driven[1][k].0);
-            for m in (0..NA).rev() {
-                z = z.add_product(weights[r][m], past[r][m]);
-                sum = sum.add_product(direct[r][m], past[r][m]);
-            }
-            let h = simd::tanh::tanh(z);
+            let h = arguments[r].tanh_in_chain();
             if kept {
                 h.store(&mut chain.run.hidden[start + k].0);
             }
-            let mut y = sum.add_product(second[r], h).sum();
-            if limited {
+            let mut sum = V::load(&chain.driven[1][k].0);
+            for m in (0..NA).rev() {
+                sum = sum.add_product(direct[r][m], past[r][m]);
+            }
+            // behind the last sample of a block nothing follows
+            let driven = V::load(&chain.driven[0][(k + 1) % BLOCK].0);
+            let rest = older(driven, &weights[r], &past[r]);
+            let mut y;
+            (y, arguments[r]) = h.fed_back(second[r], sum, rest, weights[r][0]);
+            if limited && chain.run.network.is_clipped(y) {
                 y = chain.run.network.limited(y);
+                arguments[r] = rest.add_product(weights[r][0], V::splat(y));
             }
             for m in (1..NA).rev() {
                 past[r][m] = past[r][m - 1];
@@ -306,6 +280,16 @@ fn together<V: Eight, const NA: usize, const RUNS: usize>(
             chain.outputs[NA + k] = y;
         }
     }
+}
+
+/// Adds to the inputs' share of arguments that of all outputs but the newest; `past` begins with the one before it.
+#[inline(always)]
+fn older<V: Eight, const NA: usize>(driven: V, weights: &[V; NA], past: &[V]) -> V {
+    let mut sum = driven;
+    for m in (1..NA).rev() {
+        sum = sum.add_product(weights[m], past[m - 1]);
+    }
+    sum
 }
 
 /// Adds the squared errors of the samples that were measured; the sum of all so far.
@@ -342,7 +326,7 @@ pub(super) fn outputs(
     state: &[f64],
     samples: usize,
 ) -> Vec<f64> {
-    let mut outputs = vec![f64::NAN; samples];
+    let mut outputs = vec![0.0; samples];
     let run = Run {
         network,
         state,

@@ -2,6 +2,8 @@
 
 mod beside;
 
+pub(crate) use beside::{Meanwhile, Nothing};
+
 use crate::gram::Gram;
 use crate::lagged::{Lagged, Lags};
 use crate::simd::tanh::{rise, tanh};

@@ -1,11 +1,12 @@
 //! The network's free run as a least-squares problem.
 
-use super::free_run::{FreeRuns, Limit, Run};
+use super::free_run::{FreeRuns, Run};
 use super::network::{Network, Shape};
 use super::scaling::Scaling;
 use super::sensitivities::Recursion;
 use super::train::InitialState;
 use crate::gram::Gram;
+use crate::limit::Limit;
 use crate::lm::Problem;
 use crate::simd::{self, Group, LANES};
 use crate::{Monitor, Record};

@@ -1,11 +1,12 @@
 //! The runs by which a model is guarded: from states beside the training's, over larger inputs and in another order.
 
+use super::free_run::{self, Trajectory};
 use super::network::{Network, Scratch};
-use super::problem::{Experiment, FreeRun, Trajectory};
+use super::problem::Experiment;
 use super::shape::Shape;
 use super::state::Statistics;
+use crate::Monitor;
 use crate::guard::{Guard, enlarged, rearranged};
-use crate::{Monitor, simd};
 
 /// Where a run that is to forget its state is started, in standard deviations of the training states.
 const BESIDE: f64 = 3.0;
@@ -67,14 +68,8 @@ pub(super) fn is_sound(
 
 fn run(network: &Network, v: &[f64], state: &[f64]) -> Option<Trajectory> {
     let mut run = Trajectory::new(network, v.len() / network.shape.inputs);
-    simd::run(FreeRun {
-        network,
-        v,
-        state,
-        run: &mut run,
-        scratch: &mut Scratch::new(network.shape),
-        bound: f64::MAX,
-        monitor: &Monitor::default(),
-    })?;
-    Some(run)
+    let mut scratch = Scratch::new(network.shape);
+    let monitor = Monitor::default();
+    let found = free_run::alone(network, v, state, &mut run, &mut scratch, &monitor);
+    found.then_some(run)
 }

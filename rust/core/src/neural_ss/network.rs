@@ -22,6 +22,8 @@ pub(super) struct Network {
     products: Vec<Group>,
     /// The linear part of the slopes: `[A; C]` in the order of `products`.
     base: Vec<Group>,
+    /// For each argument its column of `[A B 0; C D c]`, where that has no more rows than a group.
+    columns: Vec<Group>,
 }
 
 /// What a step needs room for, and leaves behind.
@@ -129,6 +131,7 @@ impl Network {
             constant: vec![0.0; shape.outputs],
             products: vec![Group::ZERO; slopes * groups * LANES],
             base: vec![Group::ZERO; slopes],
+            columns: vec![Group::ZERO; width + 1],
         };
         network.load(theta);
         network
@@ -179,6 +182,14 @@ impl Network {
         }
         self.constant.copy_from_slice(&theta[parts.constant]);
         self.multiply(wx);
+        if nx + ny <= LANES {
+            for (q, row) in self.linear.chunks_exact(width).enumerate() {
+                for (column, weight) in self.columns.iter_mut().zip(row) {
+                    column.0[q] = *weight;
+                }
+            }
+            self.columns[width].0[nx..nx + ny].copy_from_slice(&self.constant);
+        }
     }
 
     /// Fills what only the slopes need.
@@ -243,6 +254,41 @@ impl Network {
         }
     }
 
+    /// [`Network::step`] of one output, a number of states and a number of groups: takes `x` a step on, with
+    /// everything in registers. Gives the sum `s`.
+    #[inline(always)]
+    pub fn step_small<V: Eight, const NX: usize, const GROUPS: usize>(
+        &self,
+        x: &mut [f64; NX],
+        v: &[f64],
+        hidden: &mut [Group; GROUPS],
+    ) -> f64 {
+        let width = NX + v.len();
+        let mut units = [V::splat(0.0); GROUPS];
+        for (g, unit) in units.iter_mut().enumerate() {
+            // The states come last: everything else is ready before they are known.
+            let weights = &self.first[g * (width + 1)..][..width + 1];
+            *unit = affine::<V, NX>(weights, x, v);
+            *unit = tanh(*unit);
+            unit.store(&mut hidden[g].0);
+        }
+        let mut linear = Group::ZERO;
+        affine::<V, NX>(&self.columns[..width + 1], x, v).store(&mut linear.0);
+        let mut sum = 0.0;
+        for q in 0..=NX {
+            let weights = &self.second[q * GROUPS..][..GROUPS];
+            let mut row = V::load(&weights[0].0).mul(units[0]);
+            for (weights, unit) in weights.iter().zip(units).skip(1) {
+                row = row.add_product(V::load(&weights.0), unit);
+            }
+            sum = linear.0[q] + row.sum();
+            if let Some(x) = x.get_mut(q) {
+                *x = sum;
+            }
+        }
+        sum
+    }
+
     /// A row of `[A B; C D] [x; v] + [E; G] h`.
     #[inline(always)]
     fn row<V: Eight>(&self, q: usize, x: &[f64], v: &[f64], hidden: &[Group]) -> f64 {
@@ -261,19 +307,72 @@ impl Network {
     /// `dx+/dx = A + E diag(1 - h^2) Wx` and `ds/dx = C + G diag(1 - h^2) Wx` from `rises`, `1 - h^2`.
     #[inline(always)]
     pub fn slopes<V: Eight>(&self, rises: &[Group], slopes: &mut [Group]) {
-        let products = self.products.chunks_exact(rises.len() * LANES);
-        for ((slope, base), products) in slopes.iter_mut().zip(&self.base).zip(products) {
-            // Two sums side by side: one alone would wait for each product.
-            let (mut even, mut odd) = (V::load(&base.0), V::splat(0.0));
-            let (products, _) = products.as_chunks::<LANES>();
-            for (rises, products) in rises.iter().zip(products) {
-                for lane in (0..LANES).step_by(2) {
-                    let (left, right) = (&products[lane], &products[lane + 1]);
-                    even = even.add_product(V::splat(rises.0[lane]), V::load(&left.0));
-                    odd = odd.add_product(V::splat(rises.0[lane + 1]), V::load(&right.0));
-                }
-            }
-            even.add(odd).store(&mut slope.0);
+        for (at, slope) in slopes.iter_mut().enumerate() {
+            let [sum] = self.slope::<V, 1>(at, rises);
+            sum.store(&mut slope.0);
         }
     }
+
+    /// [`Network::slopes`] of several samples, in the first `used` of the groups of each.
+    #[inline(always)]
+    pub fn slopes_of<V: Eight, const ROOM: usize>(
+        &self,
+        rises: &[Group],
+        slopes: &mut [[Group; ROOM]],
+        used: usize,
+    ) {
+        let groups = self.groups();
+        let (fours, rest) = slopes.as_chunks_mut::<4>();
+        let (first, last) = rises.split_at(fours.len() * 4 * groups);
+        for (slopes, rises) in fours.iter_mut().zip(first.chunks_exact(4 * groups)) {
+            for at in 0..used.min(ROOM) {
+                let sums = self.slope::<V, 4>(at, rises);
+                for (slopes, sum) in slopes.iter_mut().zip(sums) {
+                    sum.store(&mut slopes[at].0);
+                }
+            }
+        }
+        for (slopes, rises) in rest.iter_mut().zip(last.chunks_exact(groups)) {
+            self.slopes::<V>(rises, &mut slopes[..used]);
+        }
+    }
+
+    /// Group `at` of the slopes of some samples side by side.
+    #[inline(always)]
+    fn slope<V: Eight, const SAMPLES: usize>(&self, at: usize, rises: &[Group]) -> [V; SAMPLES] {
+        let groups = self.groups();
+        let (products, _) = self.products[at * groups * LANES..].as_chunks::<LANES>();
+        // Two sums side by side: one alone would wait for each product.
+        let mut even = [V::load(&self.base[at].0); SAMPLES];
+        let mut odd = [V::splat(0.0); SAMPLES];
+        for (g, products) in products.iter().enumerate().take(groups) {
+            for lane in (0..LANES).step_by(2) {
+                let (left, right) = (V::load(&products[lane].0), V::load(&products[lane + 1].0));
+                for k in 0..SAMPLES {
+                    let rises = &rises[k * groups + g].0;
+                    even[k] = even[k].add_product(V::splat(rises[lane]), left);
+                    odd[k] = odd[k].add_product(V::splat(rises[lane + 1]), right);
+                }
+            }
+        }
+        for (even, odd) in even.iter_mut().zip(odd) {
+            *even = even.add(odd);
+        }
+        even
+    }
+}
+
+/// The sum of the columns times `[x, v, 1]`, the states last.
+#[inline(always)]
+fn affine<V: Eight, const NX: usize>(columns: &[Group], x: &[f64; NX], v: &[f64]) -> V {
+    let (of_states, rest) = columns.split_at(NX);
+    let (of_inputs, constant) = rest.split_at(v.len());
+    let mut sum = V::load(&constant[0].0);
+    for (column, value) in of_inputs.iter().zip(v) {
+        sum = sum.add_product(V::load(&column.0), V::splat(*value));
+    }
+    for (column, value) in of_states.iter().zip(x) {
+        sum = sum.add_product(V::load(&column.0), V::splat(*value));
+    }
+    sum
 }

@@ -1,19 +1,20 @@
 //! The model's free run as a least-squares problem.
 
-use std::cell::RefCell;
+use std::cell::{Ref, RefCell};
 
-use super::network::{Network, Scratch, copy, unrolled};
+use super::free_run::{FreeRuns, Run, Trajectory};
+use super::network::{Network, Scratch};
 use super::sensitivities::{Columns, Recursion, Sensitivities};
 use super::shape::Shape;
+use super::single::MOST_STATES;
 use crate::Monitor;
 use crate::gram::Gram;
+use crate::limit::Limit;
 use crate::lm::Problem;
-use crate::simd::{self, Eight, Group, Kernel};
+use crate::simd::{self, Group};
 
 /// A state beyond this many of its standard deviations has diverged.
 const DIVERGED: f64 = 1e3;
-/// Samples between two looks at the monitor.
-const LOOK: usize = 4096;
 
 /// One experiment in scaled units.
 #[derive(Clone, Debug)]
@@ -24,82 +25,59 @@ pub(super) struct Experiment {
     pub y: Vec<f64>,
 }
 
-/// What a simulation leaves behind, sample by sample.
-#[derive(Clone, Debug)]
-pub(super) struct Trajectory {
-    pub states: Vec<f64>,
-    pub hidden: Vec<Group>,
-    /// Sums before the output function.
-    pub sums: Vec<f64>,
+/// Simulations of one point, with what the normal equations take from them.
+#[derive(Debug)]
+struct Attempt {
+    theta: Vec<f64>,
+    network: Network,
+    scratch: Scratch,
+    runs: Vec<Trajectory>,
 }
 
-impl Trajectory {
-    pub fn new(network: &Network, samples: usize) -> Self {
-        let Shape { nx, outputs, .. } = network.shape;
-        Self {
-            states: vec![0.0; samples * nx],
-            hidden: vec![Group::ZERO; samples * network.groups()],
-            sums: vec![0.0; samples * outputs],
-        }
+/// The last simulations: one, and the one beside it where two at once pay. Others may look at them between two calls.
+#[derive(Debug)]
+pub(super) struct Attempts(RefCell<Vec<Attempt>>);
+
+impl Attempts {
+    pub fn new(network: &Network, experiments: &[Experiment]) -> Self {
+        let outputs = network.shape.outputs;
+        let runs = |e: &Experiment| Trajectory::new(network, e.y.len() / outputs);
+        let attempt = || Attempt {
+            theta: Vec::new(),
+            network: network.clone(),
+            scratch: Scratch::new(network.shape),
+            runs: experiments.iter().map(runs).collect(),
+        };
+        let count = if pays(network, experiments) { 2 } else { 1 };
+        Self(RefCell::new((0..count).map(|_| attempt()).collect()))
+    }
+
+    /// The runs at these parameters, which were simulated last, experiment by experiment.
+    pub fn at(&self, theta: &[f64]) -> Ref<'_, [Trajectory]> {
+        Ref::map(self.0.borrow(), |attempts| {
+            let same = attempts.iter().find(|attempt| attempt.theta == theta);
+            same.unwrap_or(&attempts[0]).runs.as_slice()
+        })
+    }
+
+    fn are_two(&self) -> bool {
+        self.0.borrow().len() == 2
     }
 }
 
-/// A free run as a kernel; `None` where it leaves the bound or is stopped.
-pub(super) struct FreeRun<'a> {
-    pub network: &'a Network,
-    pub v: &'a [f64],
-    pub state: &'a [f64],
-    pub run: &'a mut Trajectory,
-    pub scratch: &'a mut Scratch,
-    /// No state may be larger.
-    pub bound: f64,
-    pub monitor: &'a Monitor,
-}
+/// Bytes up to which a second run is worth its memory.
+const MOST_TOGETHER: usize = 1 << 30;
+/// Hidden groups of a run that leaves room for a second one: more fill the waiting by themselves.
+const MOST_GROUPS: usize = 2;
 
-impl Kernel for FreeRun<'_> {
-    type Output = Option<()>;
-
-    #[inline(always)]
-    fn run<V: Eight>(self) -> Option<()> {
-        unrolled!(self.network.shape.nx, self.samples::<V>)
-    }
-}
-
-impl FreeRun<'_> {
-    /// `NX` states; 0 stands for any number.
-    #[inline(always)]
-    fn samples<V: Eight, const NX: usize>(self) -> Option<()> {
-        let Self {
-            network,
-            v,
-            state,
-            run,
-            scratch,
-            bound,
-            monitor,
-        } = self;
-        let Shape {
-            inputs, outputs, ..
-        } = network.shape;
-        let nx = if NX == 0 { network.shape.nx } else { NX };
-        scratch.next.copy_from_slice(state);
-        let kept = run
-            .states
-            .chunks_exact_mut(nx)
-            .zip(run.hidden.chunks_exact_mut(network.groups()))
-            .zip(run.sums.chunks_exact_mut(outputs));
-        for (k, (v, ((x, h), s))) in v.chunks_exact(inputs).zip(kept).enumerate() {
-            // NaN is no number within the bound either.
-            let sound = scratch.next[..nx].iter().all(|x| x.abs() <= bound);
-            if !sound || (k % LOOK == 0 && monitor.stopped()) {
-                return None;
-            }
-            copy(x, &scratch.next[..nx]);
-            scratch.set(x, v);
-            network.step::<V, NX>(&scratch.arguments, h, &mut scratch.next, s);
-        }
-        Some(())
-    }
+/// Whether a second run beside the first takes hardly any time of its own: in the widest registers; in narrower ones it is
+/// no faster than one after the other.
+fn pays(network: &Network, experiments: &[Experiment]) -> bool {
+    let Shape { nx, outputs, .. } = network.shape;
+    let samples: usize = experiments.iter().map(|e| e.y.len()).sum();
+    let bytes = size_of::<f64>() * (nx + 1) + size_of::<Group>() * network.groups();
+    let small = outputs == 1 && nx <= MOST_STATES && network.groups() <= MOST_GROUPS;
+    small && samples * bytes <= MOST_TOGETHER && simd::level() == Ok(simd::Level::Avx512)
 }
 
 /// The weight decay of each parameter.
@@ -122,12 +100,10 @@ pub(super) struct Training<'a> {
     pub decay: Decay,
     /// Known outputs.
     samples: f64,
-    /// The last simulation, which others may look at between two calls.
-    runs: &'a RefCell<Vec<Trajectory>>,
+    attempts: &'a Attempts,
     gram: Gram,
     columns: Vec<usize>,
     buffers: Sensitivities,
-    scratch: Scratch,
     held: Vec<(usize, f64)>,
 }
 
@@ -136,7 +112,7 @@ impl<'a> Training<'a> {
         experiments: &'a [Experiment],
         network: Network,
         decay: f64,
-        runs: &'a RefCell<Vec<Trajectory>>,
+        attempts: &'a Attempts,
         monitor: &'a Monitor,
     ) -> Self {
         let shape = network.shape;
@@ -154,11 +130,10 @@ impl<'a> Training<'a> {
                     .collect(),
             ),
             samples: known.count() as f64,
-            runs,
+            attempts,
             gram: Gram::new(columns.room, 0),
             columns: columns.of_theta(),
             buffers: Sensitivities::new(shape),
-            scratch: Scratch::new(shape),
             held: shape.held(),
             network,
         }
@@ -170,29 +145,56 @@ impl<'a> Training<'a> {
 
     /// Runs once more at parameters that have run before, whatever the monitor says.
     pub fn rerun(&mut self, theta: &[f64]) -> Option<()> {
-        self.network.load(&theta[..self.columns.len()]);
-        let free = Monitor::default();
-        (0..self.experiments.len()).try_for_each(|i| self.simulate(theta, i, &free).map(drop))
+        let [cost] = self.simulate([theta], f64::INFINITY, &Monitor::default());
+        cost.map(drop)
     }
 
-    /// Sum of squared errors of the free run, which is stored.
-    fn simulate(&mut self, theta: &[f64], experiment: usize, monitor: &Monitor) -> Option<f64> {
-        let nx = self.shape().nx;
-        let data = &self.experiments[experiment];
-        let run = &mut self.runs.borrow_mut()[experiment];
-        simd::run(FreeRun {
-            network: &self.network,
-            v: &data.v,
-            state: &theta[self.columns.len() + experiment * nx..][..nx],
-            run,
-            scratch: &mut self.scratch,
-            bound: DIVERGED,
-            monitor,
-        })?;
-        let output = self.network.output;
-        let known = run.sums.iter().zip(&data.y).filter(|(_, y)| !y.is_nan());
-        let sum: f64 = known.map(|(s, y)| (y - output.value(*s)).powi(2)).sum();
-        sum.is_finite().then_some(sum)
+    /// Costs below `limit` of the free runs at several points, which are stored.
+    fn simulate<const RUNS: usize>(
+        &mut self,
+        thetas: [&[f64]; RUNS],
+        limit: f64,
+        monitor: &Monitor,
+    ) -> [Option<f64>; RUNS] {
+        let (nx, own) = (self.shape().nx, self.columns.len());
+        let mut limits = thetas.map(|theta| {
+            Some(Limit {
+                before: 0.0,
+                samples: self.samples,
+                penalty: self.decay.penalty(theta),
+                limit,
+            })
+        });
+        let mut attempts = self.attempts.0.borrow_mut();
+        let Some(attempts) = attempts.first_chunk_mut::<RUNS>() else {
+            return [None; RUNS];
+        };
+        for (attempt, theta) in attempts.iter_mut().zip(thetas) {
+            attempt.network.load(&theta[..own]);
+            attempt.theta.clear();
+            attempt.theta.extend_from_slice(theta);
+        }
+        for (i, data) in self.experiments.iter().enumerate() {
+            let mut left = limits.into_iter();
+            let sums = FreeRuns {
+                runs: attempts.each_mut().map(|attempt| Run {
+                    network: &attempt.network,
+                    state: &attempt.theta[own + i * nx..][..nx],
+                    run: &mut attempt.runs[i],
+                    scratch: &mut attempt.scratch,
+                    limit: left.next().flatten(),
+                }),
+                v: &data.v,
+                y: &data.y,
+                bound: DIVERGED,
+                monitor,
+            }
+            .go();
+            for (limit, sum) in limits.iter_mut().zip(sums) {
+                *limit = limit.zip(sum).map(|(limit, sum)| limit.after(sum));
+            }
+        }
+        limits.map(|limit| limit.map(|limit| limit.cost(0.0)))
     }
 
     /// Adds the experiment's sums to the system.
@@ -240,12 +242,20 @@ impl Problem for Training<'_> {
     }
 
     fn cost(&mut self, theta: &[f64]) -> Option<f64> {
-        self.network.load(&theta[..self.columns.len()]);
-        let mut sum = 0.0;
-        for experiment in 0..self.experiments.len() {
-            sum += self.simulate(theta, experiment, self.monitor)?;
-        }
-        Some(0.5 * sum / self.samples + self.decay.penalty(theta))
+        self.cost_below(theta, f64::INFINITY)
+    }
+
+    fn cost_below(&mut self, theta: &[f64], limit: f64) -> Option<f64> {
+        let [cost] = self.simulate([theta], limit, self.monitor);
+        cost
+    }
+
+    fn takes_two(&self) -> bool {
+        self.attempts.are_two()
+    }
+
+    fn costs_below(&mut self, thetas: [&[f64]; 2], limit: f64) -> [Option<f64>; 2] {
+        self.simulate(thetas, limit, self.monitor)
     }
 
     fn normal_equations(&mut self, theta: &[f64], jtj: &mut [f64], jte: &mut [f64]) {
@@ -257,7 +267,7 @@ impl Problem for Training<'_> {
             self.gram.clear();
             simd::run(Recursion {
                 network: &self.network,
-                run: &self.runs.borrow()[i],
+                run: &self.attempts.at(theta)[i],
                 v: &data.v,
                 y: &data.y,
                 buffers: &mut self.buffers,

@@ -1,13 +1,12 @@
 //! Which iterate of a start is kept: the best on the validation data, else the best on the training data.
 
-use std::cell::RefCell;
-
+use super::free_run::{self, Trajectory};
 use super::network::{Network, Scratch};
-use super::problem::{Experiment, FreeRun, Trajectory};
+use super::problem::{Attempts, Experiment};
 use super::shape::Shape;
 use super::state::{self, Statistics};
+use crate::Monitor;
 use crate::lagged::STATE_SAMPLES;
-use crate::{Monitor, simd};
 
 /// Residual variances below this part of the output's count as this much: the arithmetic has an end.
 const LEAST_VARIANCE: f64 = 1e-12;
@@ -24,7 +23,7 @@ pub(super) struct Best {
 pub(super) struct Referee<'a> {
     network: Network,
     experiments: &'a [Experiment],
-    runs: &'a RefCell<Vec<Trajectory>>,
+    attempts: &'a Attempts,
     validation: &'a [Experiment],
     monitor: &'a Monitor,
     /// The last iterate's initial states of the validation experiments.
@@ -38,7 +37,7 @@ impl<'a> Referee<'a> {
     pub fn new(
         network: Network,
         experiments: &'a [Experiment],
-        runs: &'a RefCell<Vec<Trajectory>>,
+        attempts: &'a Attempts,
         validation: &'a [Experiment],
         monitor: &'a Monitor,
     ) -> Self {
@@ -52,7 +51,7 @@ impl<'a> Referee<'a> {
             states: vec![None; validation.len()],
             network,
             experiments,
-            runs,
+            attempts,
             validation,
             monitor,
             best: None,
@@ -62,7 +61,7 @@ impl<'a> Referee<'a> {
     /// Looks at an accepted iterate, whose training run is stored; `error` is its cost without weight decay.
     pub fn judge(&mut self, all: &[f64], cost: f64, error: f64) {
         self.network.load(&all[..self.network.shape.parameters()]);
-        let validation_cost = (!self.validation.is_empty()).then(|| self.validation_cost());
+        let validation_cost = (!self.validation.is_empty()).then(|| self.validation_cost(all));
         let score = validation_cost.unwrap_or(cost);
         if self.best.as_ref().is_none_or(|best| score < best.score) {
             self.best = Some(Best {
@@ -76,8 +75,8 @@ impl<'a> Referee<'a> {
 
     /// J over all validation experiments, after the samples that their states are estimated from; infinite where one
     /// diverges.
-    fn validation_cost(&mut self) -> f64 {
-        let statistics = statistics(&self.network, self.experiments, &self.runs.borrow());
+    fn validation_cost(&mut self, all: &[f64]) -> f64 {
+        let statistics = statistics(&self.network, self.experiments, &self.attempts.at(all));
         let (mut sum, mut samples) = (0.0, 0);
         for i in 0..self.validation.len() {
             let Some((squares, known)) = self.score(i, &statistics) else {
@@ -106,17 +105,18 @@ impl<'a> Referee<'a> {
         };
         let state = state?;
         let run = &mut self.own[i];
-        let free = FreeRun {
-            network: &self.network,
+        let found = free_run::alone(
+            &self.network,
             v,
-            state: &state,
+            &state,
             run,
-            scratch: &mut self.scratch,
-            bound: f64::MAX,
-            monitor: self.monitor,
-        };
-        self.states[i] = Some(state.clone());
-        simd::run(free)?;
+            &mut self.scratch,
+            self.monitor,
+        );
+        self.states[i] = Some(state);
+        if !found {
+            return None;
+        }
         let pairs = run.sums.iter().zip(y).skip(skipped * outputs);
         let errors = pairs
             .filter(|(_, y)| !y.is_nan())

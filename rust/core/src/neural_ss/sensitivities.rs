@@ -3,9 +3,10 @@
 //! With `X = dx/d(theta, x0)`: `X(k+1) = (dx+/dx) X(k) + dx+/dtheta` and `dy(k) = f'(s) ((ds/dx) X(k) + ds/dtheta)`,
 //! all at the states and hidden outputs that the simulation left behind.
 
+use super::free_run::Trajectory;
 use super::network::{Network, Scratch, rises_of, unrolled};
-use super::problem::Trajectory;
 use super::shape::Shape;
+use super::single::Block;
 use crate::Monitor;
 use crate::gram::{Gram, forget};
 use crate::simd::{Eight, Group, Kernel, LANES};
@@ -17,7 +18,7 @@ const LOOK: usize = 64;
 /// for each row of G, all hidden units; then `[A B]` row by row, the initial state, `[C D c]` row by row, the error.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Columns {
-    shape: Shape,
+    pub(super) shape: Shape,
     /// First column of G.
     pub direct: usize,
     /// First column of `[A B]`.
@@ -84,24 +85,21 @@ impl Columns {
 pub(super) trait Rows {
     /// Numbers from one row to the next.
     fn width(&self) -> usize;
-    /// Room for `count` rows.
+    /// Room for `count` rows, at most a block or one sample's.
     fn room(&mut self, count: usize) -> &mut [f64];
     /// The rows have been written.
     fn keep(&mut self, count: usize);
 }
 
 impl Rows for Gram {
-    #[inline(always)]
     fn width(&self) -> usize {
         Gram::width(self)
     }
 
-    #[inline(always)]
     fn room(&mut self, count: usize) -> &mut [f64] {
         Gram::room(self, count)
     }
 
-    #[inline(always)]
     fn keep(&mut self, count: usize) {
         Gram::keep(self, count);
     }
@@ -122,6 +120,7 @@ pub(super) struct Sensitivities {
     /// Room for one group of columns of the states.
     moved: Vec<Group>,
     pub(super) scratch: Scratch,
+    pub(super) block: Block,
     /// Outputs of a sample that are known: which, slope of the output function, error.
     known: Vec<(usize, f64, f64)>,
 }
@@ -139,6 +138,7 @@ impl Sensitivities {
             outward: vec![0.0; nx * shape.outputs],
             moved: vec![Group::ZERO; nx],
             scratch: Scratch::new(shape),
+            block: Block::new(shape),
             known: Vec::with_capacity(shape.outputs),
         }
     }
@@ -156,29 +156,37 @@ impl Sensitivities {
 }
 
 /// The recursion over one run, as a kernel. A stop request ends it early.
-pub(super) struct Recursion<'a, R> {
+pub(super) struct Recursion<'a> {
     pub network: &'a Network,
     pub run: &'a Trajectory,
     pub v: &'a [f64],
     /// Measured outputs; an output that is NaN has no row.
     pub y: &'a [f64],
     pub buffers: &'a mut Sensitivities,
-    pub rows: &'a mut R,
+    pub rows: &'a mut dyn Rows,
     /// Whether the slopes of saturated units keep their digits, for which their arguments are computed once more.
     pub exact: bool,
     pub monitor: &'a Monitor,
 }
 
-impl<R: Rows> Kernel for Recursion<'_, R> {
+impl Kernel for Recursion<'_> {
     type Output = ();
 
     #[inline(always)]
     fn run<V: Eight>(self) {
-        unrolled!(self.network.shape.nx, self.samples::<V>)
+        self.buffers.reset();
+        let Shape { nx, outputs, .. } = self.network.shape;
+        match (outputs, nx) {
+            (1, 1) => self.blocks::<V, 1>(),
+            (1, 2) => self.blocks::<V, 2>(),
+            (1, 3) => self.blocks::<V, 3>(),
+            (1, 4) => self.blocks::<V, 4>(),
+            _ => unrolled!(nx, self.samples::<V>),
+        }
     }
 }
 
-impl<R: Rows> Recursion<'_, R> {
+impl Recursion<'_> {
     /// `NX` states; 0 stands for any number.
     #[inline(always)]
     fn samples<V: Eight, const NX: usize>(self) {
@@ -196,7 +204,6 @@ impl<R: Rows> Recursion<'_, R> {
             inputs, outputs, ..
         } = network.shape;
         let nx = if NX == 0 { network.shape.nx } else { NX };
-        buffers.reset();
         let hidden = run.hidden.chunks_exact(network.groups());
         let samples = run
             .states
@@ -205,38 +212,32 @@ impl<R: Rows> Recursion<'_, R> {
             .zip(hidden);
         let sums = run.sums.chunks_exact(outputs).zip(y.chunks_exact(outputs));
         for (k, (((x, v), h), (s, y))) in samples.zip(sums).enumerate() {
-            if k % LOOK == 0 {
-                if monitor.stopped() {
-                    return;
-                }
-                buffers
-                    .states
-                    .iter_mut()
-                    .for_each(|x| x.0.iter_mut().for_each(forget));
+            if !buffers.look(k, monitor) {
+                return;
             }
             buffers.scratch.set(x, v);
             buffers.prepare::<V>(network, h, (s, y), exact);
             let count = buffers.known.len();
-            if outputs == 1 && (1..=4).contains(&NX) {
-                let known = buffers.known.first();
-                let known = known.map_or((0.0, 0.0), |&(_, slope, error)| (slope, error));
-                let row = rows.room(1);
-                match NX {
-                    1 => buffers.advance_single::<V, 1>(network, h, known, row),
-                    2 => buffers.advance_single::<V, 2>(network, h, known, row),
-                    3 => buffers.advance_single::<V, 3>(network, h, known, row),
-                    _ => buffers.advance_single::<V, 4>(network, h, known, row),
-                }
-            } else {
-                let width = rows.width();
-                buffers.advance::<V, NX>(network, h, rows.room(count), width);
-            }
+            let width = rows.width();
+            buffers.advance::<V, NX>(network, h, rows.room(count), width);
             rows.keep(count);
         }
     }
 }
 
 impl Sensitivities {
+    /// Every so often: ends what has all but decayed; false where the monitor says stop.
+    #[inline(always)]
+    pub(super) fn look(&mut self, k: usize, monitor: &Monitor) -> bool {
+        if !k.is_multiple_of(LOOK) {
+            return true;
+        }
+        for states in &mut self.states {
+            states.0.iter_mut().for_each(forget);
+        }
+        !monitor.stopped()
+    }
+
     /// All that the columns have in common.
     #[inline(always)]
     fn prepare<V: Eight>(
@@ -306,9 +307,12 @@ impl Sensitivities {
         let (groups, hidden) = (h.len(), network.shape.hidden);
         let width = network.shape.arguments();
         let (of_states, of_outputs) = self.weighted.split_at(nx * groups);
-        let slope = |i: usize| V::splat(self.scratch.slope(i));
+        let mut onward = [[V::splat(0.0); NX]; NX];
+        for (i, slope) in onward.as_flattened_mut().iter_mut().enumerate() {
+            *slope = V::splat(self.scratch.slope(i));
+        }
         let slopes = Slopes::<V, NX> {
-            onward: std::array::from_fn(|q| std::array::from_fn(|j| slope(q * NX + j))),
+            onward,
             scratch: &self.scratch,
             outward: &self.outward,
             known: &self.known,
@@ -404,7 +408,10 @@ impl<V: Eight, const NX: usize> Slopes<'_, V, NX> {
             x.copy_from_slice(moved);
             return;
         }
-        let old: [V; NX] = std::array::from_fn(|j| V::load(&x[j].0));
+        let mut old = [V::splat(0.0); NX];
+        for (old, x) in old.iter_mut().zip(&*x) {
+            *old = V::load(&x.0);
+        }
         for (q, (x, slopes)) in x.iter_mut().zip(&self.onward).enumerate() {
             let sum = slopes
                 .iter()

@@ -1,115 +1,440 @@
-//! The sensitivity recursion for one output and up to four states: all slopes of a sample stay in registers.
+//! The sensitivity recursion for one output and up to four states, a block of samples at a time: what the columns have
+//! in common is prepared for all of its samples, then each group of columns passes over them with its states in
+//! registers.
 
-use super::network::Network;
-use super::sensitivities::Sensitivities;
+use super::network::{Network, rises_of};
+use super::sensitivities::{Recursion, Sensitivities};
+use super::shape::Shape;
 use crate::simd::{Eight, Group, LANES};
 
-/// The slopes of one sample: `dx+/dx` and `f' ds/dx`.
-struct Slopes<V, const NX: usize> {
-    onward: [[V; NX]; NX],
-    outward: [V; NX],
+/// Samples of a block: what all groups of columns read stays in the first-level cache.
+pub(super) const BLOCK: usize = 32;
+/// States of a model that is small.
+pub(super) const MOST_STATES: usize = 4;
+/// Groups that hold the slopes of one sample.
+const SLOPES: usize = ((MOST_STATES + 1) * MOST_STATES).div_ceil(LANES);
+
+/// What the columns have in common, for each sample of a block.
+#[derive(Clone, Debug)]
+pub(super) struct Block {
+    /// `dx+/dx`, then `f' ds/dx`, row by row.
+    slopes: Box<[[Group; SLOPES]; BLOCK]>,
+    /// `1 - h^2`.
+    rises: Vec<Group>,
+    /// States, inputs and 1, one after the other.
+    arguments: Vec<[f64; BLOCK]>,
+    /// `E diag(1 - h^2)`: for each group and sample the rows of all states.
+    weighted: Vec<Group>,
+    /// `f' G diag(1 - h^2)` for each group.
+    direct: Vec<[Group; BLOCK]>,
+    /// `f'` and the error.
+    outputs: [(f64, f64); BLOCK],
+    /// Where the sample's row begins, or that of the next one that has one.
+    places: [usize; BLOCK],
+    /// States and inputs of a sample behind as many zeros as the columns of `[A B]` may be apart from them.
+    spaced: Vec<f64>,
+    /// Numbers from one sample's states to the next one's.
+    space: usize,
 }
 
-impl<V: Eight, const NX: usize> Slopes<V, NX> {
-    #[inline(always)]
-    fn of(buffers: &Sensitivities) -> Self {
-        let zero = V::splat(0.0);
-        let (mut onward, mut outward) = ([[zero; NX]; NX], [zero; NX]);
-        for (q, onward) in onward.iter_mut().enumerate() {
-            for (j, slope) in onward.iter_mut().enumerate() {
-                *slope = V::splat(buffers.scratch.slope(q * NX + j));
-            }
+impl Block {
+    pub fn new(shape: Shape) -> Self {
+        let groups = shape.hidden.div_ceil(LANES);
+        let space = (shape.nx + 1) * shape.arguments() + LANES;
+        Self {
+            slopes: Box::new([[Group::ZERO; SLOPES]; BLOCK]),
+            rises: vec![Group::ZERO; BLOCK * groups],
+            arguments: vec![[1.0; BLOCK]; shape.arguments() + 1],
+            weighted: vec![Group::ZERO; groups * BLOCK * shape.nx],
+            direct: vec![[Group::ZERO; BLOCK]; groups],
+            outputs: [(0.0, 0.0); BLOCK],
+            places: [0; BLOCK],
+            spaced: vec![0.0; (BLOCK + 1) * space],
+            space,
         }
-        for (outward, slope) in outward.iter_mut().zip(&buffers.outward) {
-            *outward = V::splat(*slope);
-        }
-        Self { onward, outward }
     }
 
-    /// Takes one group of columns of `X` a step on and gives its part of the row; `direct` and `next` are
-    /// `f' ds/dtheta` and `dx+/dtheta`.
+    /// Takes up the states and inputs of sample `k`.
     #[inline(always)]
-    fn advance(&self, x: &mut [Group; NX], direct: V, next: [V; NX]) -> V {
-        let mut old = next;
-        for (old, x) in old.iter_mut().zip(&*x) {
-            *old = V::load(&x.0);
+    fn set(&mut self, k: usize, x: &[f64], v: &[f64]) {
+        let spaced = &mut self.spaced[(k + 1) * self.space - x.len() - v.len()..];
+        let values = x.iter().chain(v);
+        for ((value, argument), spaced) in values.zip(&mut self.arguments).zip(spaced) {
+            argument[k] = *value;
+            *spaced = *value;
         }
-        let mut row = direct;
-        for (slope, old) in self.outward.iter().zip(&old) {
-            row = row.add_product(*slope, *old);
-        }
-        for ((x, next), slopes) in x.iter_mut().zip(next).zip(&self.onward) {
-            let mut sum = next;
-            for (slope, old) in slopes.iter().zip(&old) {
-                sum = sum.add_product(*slope, *old);
-            }
-            sum.store(&mut x.0);
-        }
-        row
     }
+}
+
+/// What a group of columns takes from a sample: `f' ds/dtheta`, and `dx+/dtheta` for each state; none is zero.
+#[derive(Clone, Copy)]
+struct Gains<V, const NX: usize> {
+    direct: Option<V>,
+    next: [Option<V>; NX],
+}
+
+/// A kind of columns.
+trait Source<const NX: usize>: Copy {
+    fn gains<V: Eight>(&self, k: usize) -> Gains<V, NX>;
+}
+
+/// Weights of one argument of a group of hidden units.
+#[derive(Clone, Copy)]
+struct OfArgument<'a, const NX: usize> {
+    argument: &'a [f64; BLOCK],
+    weighted: &'a [[Group; NX]; BLOCK],
+    direct: &'a [Group; BLOCK],
+}
+
+impl<const NX: usize> Source<NX> for OfArgument<'_, NX> {
+    #[inline(always)]
+    fn gains<V: Eight>(&self, k: usize) -> Gains<V, NX> {
+        let argument = V::splat(self.argument[k]);
+        let mut next = [None; NX];
+        for (next, weighted) in next.iter_mut().zip(&self.weighted[k]) {
+            *next = Some(argument.mul(V::load(&weighted.0)));
+        }
+        let direct = Some(argument.mul(V::load(&self.direct[k].0)));
+        Gains { direct, next }
+    }
+}
+
+/// Row `Q` of E, for a group of hidden units.
+#[derive(Clone, Copy)]
+struct OfUnits<'a, const Q: usize> {
+    /// Hidden outputs from this group on, and groups.
+    hidden: &'a [Group],
+    groups: usize,
+}
+
+impl<const NX: usize, const Q: usize> Source<NX> for OfUnits<'_, Q> {
+    #[inline(always)]
+    fn gains<V: Eight>(&self, k: usize) -> Gains<V, NX> {
+        let mut next = [None; NX];
+        if let Some(next) = next.get_mut(Q) {
+            *next = Some(V::load(&self.hidden[k * self.groups].0));
+        }
+        Gains { direct: None, next }
+    }
+}
+
+/// A group of `[A B x0]`.
+#[derive(Clone, Copy)]
+struct OfStates<'a> {
+    /// States and inputs between zeros, from where this group stands for the first state.
+    spaced: &'a [f64],
+    space: usize,
+    width: usize,
+}
+
+impl<const NX: usize> Source<NX> for OfStates<'_> {
+    #[inline(always)]
+    fn gains<V: Eight>(&self, k: usize) -> Gains<V, NX> {
+        let mut next = [None; NX];
+        for (q, next) in next.iter_mut().rev().enumerate() {
+            let start = k * self.space + q * self.width;
+            *next = Some(V::first(&self.spaced[start..]));
+        }
+        Gains { direct: None, next }
+    }
+}
+
+impl Block {
+    /// `E diag(1 - h^2)` and `f' G diag(1 - h^2)` of all samples.
+    #[inline(always)]
+    fn weigh<V: Eight, const NX: usize>(&mut self, network: &Network, count: usize) {
+        let groups = self.direct.len();
+        let (weighted, _) = self.weighted.as_chunks_mut::<NX>();
+        let (weighted, _) = weighted.as_chunks_mut::<BLOCK>();
+        for (g, (weighted, direct)) in weighted.iter_mut().zip(&mut self.direct).enumerate() {
+            let mut weights = [V::splat(0.0); NX];
+            for (q, weight) in weights.iter_mut().enumerate() {
+                *weight = V::load(&network.second[q * groups + g].0);
+            }
+            let outward = V::load(&network.second[NX * groups + g].0);
+            for k in 0..count.min(BLOCK) {
+                let rise = V::load(&self.rises[k * groups + g].0);
+                for (weighted, weight) in weighted[k].iter_mut().zip(weights) {
+                    weight.mul(rise).store(&mut weighted.0);
+                }
+                let steepness = V::splat(self.outputs[k].0);
+                outward.mul(steepness).mul(rise).store(&mut direct[k].0);
+            }
+        }
+    }
+
+    /// `dx+/dx` and `f' ds/dx` of all samples.
+    #[inline(always)]
+    fn incline<V: Eight, const NX: usize>(&mut self, network: &Network, count: usize) {
+        let used = (NX * (NX + 1)).div_ceil(LANES);
+        network.slopes_of::<V, SLOPES>(&self.rises, &mut self.slopes[..count], used);
+        for (slopes, (steepness, _)) in self.slopes.iter_mut().zip(self.outputs).take(count) {
+            if steepness != 1.0 {
+                for at in NX * NX..NX * (NX + 1) {
+                    slopes[at / LANES].0[at % LANES] *= steepness;
+                }
+            }
+        }
+    }
+
+    /// Takes all groups of a kind over the block, as many at a time as there are registers for.
+    #[inline(always)]
+    fn pass_all<V: Eight, const NX: usize, S: Source<NX>>(
+        &self,
+        count: usize,
+        states: &mut [[Group; NX]],
+        source: impl Fn(usize) -> S,
+        start: impl Fn(usize) -> usize,
+        rows: &mut [f64],
+    ) {
+        let mut i = 0;
+        // In the order of the columns: where a group has fewer than eight, it writes over the next one's first.
+        while V::TILE.0 == LANES && i + 2 <= states.len() {
+            let sources = [source(i), source(i + 1)];
+            let starts = [start(i), start(i + 1)];
+            self.pass::<V, NX, 2>(count, &mut states[i..i + 2], sources, starts, rows);
+            i += 2;
+        }
+        while i < states.len() {
+            let (sources, starts) = ([source(i)], [start(i)]);
+            self.pass::<V, NX, 1>(count, &mut states[i..=i], sources, starts, rows);
+            i += 1;
+        }
+    }
+
+    /// The columns of row `Q` of E, the first of which is `first`.
+    #[inline(always)]
+    fn pass_row<V: Eight, const NX: usize, const Q: usize>(
+        &self,
+        part: &Part,
+        states: &mut [[Group; NX]],
+        first: usize,
+        rows: &mut [f64],
+    ) {
+        if Q >= NX {
+            return;
+        }
+        let groups = states.len();
+        let source = |g: usize| OfUnits::<Q> {
+            hidden: &part.hidden[g..],
+            groups,
+        };
+        let start = |g: usize| first + g * LANES;
+        self.pass_all::<V, NX, _>(part.sums.len(), states, source, start, rows);
+    }
+
+    /// Takes `GROUPS` groups of columns over the block; their parts of the rows begin at `starts`.
+    #[inline(always)]
+    fn pass<V: Eight, const NX: usize, const GROUPS: usize>(
+        &self,
+        count: usize,
+        states: &mut [[Group; NX]],
+        sources: [impl Source<NX>; GROUPS],
+        starts: [usize; GROUPS],
+        rows: &mut [f64],
+    ) {
+        let mut x = [[V::splat(0.0); NX]; GROUPS];
+        for (x, states) in x.iter_mut().zip(&*states) {
+            for (x, state) in x.iter_mut().zip(states) {
+                *x = V::load(&state.0);
+            }
+        }
+        for k in 0..count.min(BLOCK) {
+            let slopes = &self.slopes[k];
+            let slope = |i: usize| slopes[i / LANES].0[i % LANES];
+            let mut sums = [[None; NX]; GROUPS];
+            for g in 0..GROUPS {
+                let gains = sources[g].gains::<V>(k);
+                let mut sum = gains.direct;
+                for (j, x) in x[g].iter().enumerate() {
+                    sum = Some(plus(sum, V::splat(slope(NX * NX + j)), *x));
+                }
+                if let (Some(sum), Some(row)) = (sum, rows.get_mut(self.places[k] + starts[g]..)) {
+                    sum.write(row);
+                }
+                sums[g] = gains.next;
+            }
+            for at in 0..NX * NX {
+                let (q, j) = (at / NX, at % NX);
+                let slope = V::splat(slope(at));
+                for g in 0..GROUPS {
+                    sums[g][q] = Some(plus(sums[g][q], slope, x[g][j]));
+                }
+            }
+            for (x, sums) in x.iter_mut().zip(sums) {
+                for (x, sum) in x.iter_mut().zip(sums) {
+                    if let Some(sum) = sum {
+                        *x = sum;
+                    }
+                }
+            }
+        }
+        for (x, states) in x.iter().zip(states) {
+            for (x, state) in x.iter().zip(states) {
+                x.store(&mut state.0);
+            }
+        }
+    }
+}
+
+/// `sum + slope x`, where there is a sum.
+#[inline(always)]
+fn plus<V: Eight>(sum: Option<V>, slope: V, x: V) -> V {
+    match sum {
+        Some(sum) => sum.add_product(slope, x),
+        None => slope.mul(x),
+    }
+}
+
+impl Recursion<'_> {
+    /// The whole run, block by block.
+    #[inline(always)]
+    pub(super) fn blocks<V: Eight, const NX: usize>(self) {
+        let Self {
+            network,
+            run,
+            v,
+            y,
+            buffers,
+            rows,
+            exact,
+            monitor,
+        } = self;
+        let (groups, inputs) = (network.groups(), network.shape.inputs);
+        for start in (0..run.sums.len()).step_by(BLOCK) {
+            let count = BLOCK.min(run.sums.len() - start);
+            if !buffers.look(start, monitor) {
+                return;
+            }
+            let samples = start..start + count;
+            let part = Part {
+                states: &run.states[samples.start * NX..samples.end * NX],
+                hidden: &run.hidden[samples.start * groups..samples.end * groups],
+                sums: &run.sums[samples.clone()],
+                v: &v[samples.start * inputs..samples.end * inputs],
+                y: &y[samples],
+            };
+            let known = buffers.prepare_block::<V, NX>(network, &part, rows.width(), exact);
+            let room = rows.room(count);
+            buffers.pass_arguments::<V, NX>(count, room);
+            buffers.pass_units::<V, NX>(&part, room);
+            buffers.pass_rest::<V, NX>(&part, room);
+            rows.keep(known);
+        }
+    }
+}
+
+/// What the simulation left behind of a block, and its inputs and measured outputs.
+struct Part<'a> {
+    states: &'a [f64],
+    hidden: &'a [Group],
+    sums: &'a [f64],
+    v: &'a [f64],
+    y: &'a [f64],
 }
 
 impl Sensitivities {
-    /// Writes the sample's row and takes `X` to the next sample; `steepness` is the slope of the output function.
+    /// All that the columns have in common; how many samples have a row.
     #[inline(always)]
-    pub(super) fn advance_single<V: Eight, const NX: usize>(
+    fn prepare_block<V: Eight, const NX: usize>(
         &mut self,
         network: &Network,
-        h: &[Group],
-        (steepness, error): (f64, f64),
-        row: &mut [f64],
-    ) {
-        let (groups, hidden) = (h.len(), network.shape.hidden);
-        let slopes = Slopes::<V, NX>::of(self);
-        let columns = self.columns;
+        part: &Part,
+        width: usize,
+        exact: bool,
+    ) -> usize {
+        let (groups, inputs) = (network.groups(), network.shape.inputs);
+        let Self { block, scratch, .. } = self;
+        let mut known = 0;
+        for (k, (s, y)) in part.sums.iter().zip(part.y).enumerate().take(BLOCK) {
+            let (value, steepness) = network.output.value_and_slope(*s);
+            block.outputs[k] = (steepness, y - value);
+            block.places[k] = known * width;
+            known += usize::from(!y.is_nan());
+        }
+        let arguments = part.states.chunks_exact(NX);
+        let arguments = arguments.zip(part.v.chunks_exact(inputs));
+        for (k, (x, v)) in arguments.enumerate().take(BLOCK) {
+            block.set(k, x, v);
+            if exact {
+                scratch.set(x, v);
+                network.rises::<V>(&scratch.arguments, &mut block.rises[k * groups..][..groups]);
+            }
+        }
+        if !exact {
+            rises_of::<V>(part.hidden, &mut block.rises);
+        }
+        block.incline::<V, NX>(network, part.sums.len());
+        block.weigh::<V, NX>(network, part.sums.len());
+        known
+    }
+
+    /// The columns of the hidden units' weights for states and inputs, and of their biases.
+    #[inline(always)]
+    fn pass_arguments<V: Eight, const NX: usize>(&mut self, count: usize, rows: &mut [f64]) {
+        let (block, hidden) = (&self.block, self.columns.shape.hidden);
+        let groups = block.direct.len();
+        let (weighted, _) = block.weighted.as_chunks::<NX>();
+        let (weighted, _) = weighted.as_chunks::<BLOCK>();
+        let source = |i: usize| OfArgument {
+            argument: &block.arguments[i / groups],
+            weighted: &weighted[i % groups],
+            direct: &block.direct[i % groups],
+        };
+        let start = |i: usize| i / groups * hidden + i % groups * LANES;
         let (states, _) = self.states.as_chunks_mut::<NX>();
-        let (linear, _) = self.linear.as_chunks::<NX>();
-        let arguments = &self.scratch.arguments;
-        let of_arguments = groups * arguments.len();
-        let (by_argument, rest) = states.split_at_mut(of_arguments);
-        let (by_unit, by_linear) = rest.split_at_mut(NX * groups);
-        let zero = V::splat(0.0);
-        // In the order of the columns: where a group has fewer than eight units, it writes over the next one's first.
-        for (c, (x, argument)) in by_argument
-            .chunks_exact_mut(groups)
-            .zip(arguments)
-            .enumerate()
-        {
-            let argument = V::splat(*argument);
-            for (g, x) in x.iter_mut().enumerate() {
-                let mut next = [zero; NX];
-                for (q, next) in next.iter_mut().enumerate() {
-                    *next = argument.mul(V::load(&self.weighted[q * groups + g].0));
-                }
-                let direct = argument.mul(V::load(&self.weighted[NX * groups + g].0));
-                let part = slopes.advance(x, direct, next);
-                part.write(&mut row[c * hidden + g * LANES..]);
+        let states = &mut states[..block.arguments.len() * groups];
+        block.pass_all::<V, NX, _>(count, states, source, start, rows);
+    }
+
+    /// The columns of E.
+    #[inline(always)]
+    fn pass_units<V: Eight, const NX: usize>(&mut self, part: &Part, rows: &mut [f64]) {
+        let (states, _) = self.states.as_chunks_mut::<NX>();
+        let groups = self.block.direct.len();
+        let states = &mut states[self.block.arguments.len() * groups..];
+        for (q, states) in states.chunks_exact_mut(groups).take(NX).enumerate() {
+            let first = (self.block.arguments.len() + q) * self.columns.shape.hidden;
+            match q {
+                0 => self.block.pass_row::<V, NX, 0>(part, states, first, rows),
+                1 => self.block.pass_row::<V, NX, 1>(part, states, first, rows),
+                2 => self.block.pass_row::<V, NX, 2>(part, states, first, rows),
+                _ => self.block.pass_row::<V, NX, 3>(part, states, first, rows),
             }
         }
-        for (q, x) in by_unit.chunks_exact_mut(groups).enumerate() {
-            let first = (arguments.len() + q) * hidden;
-            for (g, (x, h)) in x.iter_mut().zip(h).enumerate() {
-                let mut next = [zero; NX];
-                next[q] = V::load(&h.0);
-                let part = slopes.advance(x, zero, next);
-                part.write(&mut row[first + g * LANES..]);
+    }
+
+    /// The columns of G, of `[A B x0]` and of `[C D c]`, and the error.
+    #[inline(always)]
+    fn pass_rest<V: Eight, const NX: usize>(&mut self, part: &Part, rows: &mut [f64]) {
+        let (columns, block) = (self.columns, &self.block);
+        let groups = block.direct.len();
+        for (k, h) in part.hidden.chunks_exact(groups).enumerate().take(BLOCK) {
+            let steepness = V::splat(block.outputs[k].0);
+            let row = &mut rows[block.places[k] + columns.direct..];
+            for (g, h) in h.iter().enumerate() {
+                let part = V::load(&h.0).mul(steepness);
+                part.write(&mut row[g * LANES..]);
             }
         }
-        for (g, h) in h.iter().enumerate() {
-            let part = V::load(&h.0).mul(V::splat(steepness));
-            part.write(&mut row[columns.direct + g * LANES..]);
-        }
-        for (i, (x, linear)) in by_linear.iter_mut().zip(linear).enumerate() {
-            let mut next = [zero; NX];
-            for (next, linear) in next.iter_mut().zip(linear) {
-                *next = V::load(&linear.0);
+        let width = columns.shape.arguments();
+        let source = |i: usize| OfStates {
+            spaced: &block.spaced[block.space - NX * width + i * LANES..],
+            space: block.space,
+            width,
+        };
+        let start = |i: usize| columns.linear + i * LANES;
+        let (states, _) = self.states.as_chunks_mut::<NX>();
+        let states = &mut states[(block.arguments.len() + NX) * groups..];
+        block.pass_all::<V, NX, _>(part.sums.len(), states, source, start, rows);
+        for k in 0..part.sums.len().min(BLOCK) {
+            let (steepness, error) = block.outputs[k];
+            let row = &mut rows[block.places[k] + columns.sums..];
+            let (sums, rest) = row.split_at_mut(columns.error - columns.sums);
+            for (sum, argument) in sums.iter_mut().zip(&block.arguments) {
+                *sum = steepness * argument[k];
             }
-            let part = slopes.advance(x, zero, next);
-            part.write(&mut row[columns.linear + i * LANES..]);
+            rest[0] = error;
         }
-        for (sum, argument) in row[columns.sums..columns.error].iter_mut().zip(arguments) {
-            *sum = steepness * argument;
-        }
-        row[columns.error] = error;
     }
 }

@@ -1,4 +1,5 @@
 use super::*;
+use crate::limit::Limit;
 use crate::random::Random;
 use proptest::prelude::*;
 
@@ -40,7 +41,7 @@ fn moved(model: &NeuralSS, i: usize, by: f64) -> NeuralSS {
     moved
 }
 
-fn noise(count: usize, seed: u64) -> Vec<f64> {
+pub(super) fn noise(count: usize, seed: u64) -> Vec<f64> {
     let mut random = Random::new(seed);
     (0..count).map(|_| random.normal()).collect()
 }
@@ -321,4 +322,155 @@ fn a_model_is_trained_further_where_it_was_left() {
         },
     ];
     assert!(misfits.iter().all(|settings| fit(settings).is_err()));
+}
+
+/// A free run and the rows of its sensitivities, as one kernel.
+struct Whole<'a> {
+    network: &'a Network,
+    v: &'a [f64],
+    y: &'a [f64],
+    state: &'a [f64],
+}
+
+impl simd::Kernel for Whole<'_> {
+    type Output = (Trajectory, Vec<Vec<f64>>);
+
+    #[inline(always)]
+    fn run<V: simd::Eight>(self) -> Self::Output {
+        let shape = self.network.shape;
+        let monitor = Monitor::default();
+        let mut run = Trajectory::new(self.network, self.v.len() / shape.inputs);
+        let free = free_run::FreeRuns {
+            runs: [free_run::Run {
+                network: self.network,
+                state: self.state,
+                run: &mut run,
+                scratch: &mut Scratch::new(shape),
+                limit: Some(Limit::NONE),
+            }],
+            v: self.v,
+            y: &[],
+            bound: 1e3,
+            monitor: &monitor,
+        };
+        assert!(free.run::<V>()[0].is_some());
+        let columns = Columns::new(shape);
+        let mut rows = Kept {
+            width: columns.room,
+            columns: columns.error + 1,
+            block: Vec::new(),
+            rows: Vec::new(),
+        };
+        let recursion = Recursion {
+            network: self.network,
+            run: &run,
+            v: self.v,
+            y: self.y,
+            buffers: &mut Sensitivities::new(shape),
+            rows: &mut rows,
+            exact: false,
+            monitor: &monitor,
+        };
+        recursion.run::<V>();
+        (run, rows.rows)
+    }
+}
+
+/// All rows; what is not written is NaN.
+struct Kept {
+    width: usize,
+    columns: usize,
+    block: Vec<f64>,
+    rows: Vec<Vec<f64>>,
+}
+
+impl Rows for Kept {
+    fn width(&self) -> usize {
+        self.width
+    }
+
+    fn room(&mut self, count: usize) -> &mut [f64] {
+        self.block = vec![f64::NAN; count * self.width];
+        &mut self.block
+    }
+
+    fn keep(&mut self, count: usize) {
+        let rows = self.block.chunks_exact(self.width).take(count);
+        self.rows
+            .extend(rows.map(|row| row[..self.columns].to_vec()));
+    }
+}
+
+pub(super) fn network_of(seed: u64, shape: Shape) -> Network {
+    random_model(seed, shape, OutputFunction::Abs { width: 0.3 }).network
+}
+
+fn kinds() -> impl Iterator<Item = Shape> {
+    let kinds = [(1, 1), (2, 1), (3, 1), (4, 1), (5, 1), (3, 2)];
+    kinds.into_iter().flat_map(|(nx, outputs)| {
+        [3, 8, 15, 20].map(|hidden| Shape {
+            nx,
+            nk: 1,
+            inputs: 2,
+            outputs,
+            hidden,
+            integrator: false,
+        })
+    })
+}
+
+#[test]
+fn every_processor_runs_and_differentiates_alike() {
+    // Some hundred operations a sample that round at 1e-16 each, in states that forget.
+    let close = |a: f64, b: f64| (a - b).abs() < 1e-12 * (1.0 + a.abs());
+    for shape in kinds() {
+        let network = network_of(3, shape);
+        let (v, state) = (noise(75 * shape.inputs, 4), noise(shape.nx, 5));
+        let y = noise(75 * shape.outputs, 6);
+        let all = simd::run_everywhere(|| Whole {
+            network: &network,
+            v: &v,
+            y: &y,
+            state: &state,
+        });
+        let (_, (first, first_rows)) = &all[0];
+        assert_eq!(first_rows.len(), y.len());
+        for (level, (run, rows)) in &all {
+            let states = first.states.iter().zip(&run.states);
+            let sums = first.sums.iter().zip(&run.sums);
+            let slopes = first_rows.iter().flatten().zip(rows.iter().flatten());
+            for (i, (a, b)) in states.chain(sums).chain(slopes).enumerate() {
+                assert!(close(*a, *b), "{level:?} {shape:?} {i}: {a} {b}");
+            }
+        }
+    }
+}
+
+#[test]
+fn outputs_that_are_not_known_have_no_row_and_change_no_other() {
+    for shape in kinds() {
+        let network = network_of(7, shape);
+        let (v, state) = (noise(75 * shape.inputs, 8), noise(shape.nx, 9));
+        let all = noise(75 * shape.outputs, 10);
+        let is_known = |i: &usize| i % 5 != 1 && !(30..36).contains(i) && i + 1 != all.len();
+        let some: Vec<f64> = (0..all.len())
+            .map(|i| if is_known(&i) { all[i] } else { f64::NAN })
+            .collect();
+        let rows = |y: &[f64]| {
+            simd::run(Whole {
+                network: &network,
+                v: &v,
+                y,
+                state: &state,
+            })
+            .1
+        };
+        let every = rows(&all);
+        let expected: Vec<_> = (0..all.len()).filter(is_known).map(|i| &every[i]).collect();
+        assert_eq!(
+            rows(&some).iter().collect::<Vec<_>>(),
+            expected,
+            "{shape:?}"
+        );
+    }
 }

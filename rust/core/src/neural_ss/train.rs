@@ -1,10 +1,8 @@
 //! Training in free run: many starts in parallel, each by Levenberg-Marquardt, chosen by free run.
 
-use std::cell::RefCell;
-
 use super::network::Network;
 use super::output::OutputFunction;
-use super::problem::{self, Experiment, Trajectory};
+use super::problem::{self, Attempts, Experiment};
 use super::realisation::Realisation;
 use super::recording::{Recording, check_recordings, constant_cost, scaling};
 use super::referee::{Referee, statistics};
@@ -194,16 +192,12 @@ impl<'a> Task<'a> {
                 self.settings.output,
                 &vec![0.0; self.shape.parameters()],
             );
-            let runs = self
-                .experiments
-                .iter()
-                .map(|e| Trajectory::new(&network, e.y.len() / self.shape.outputs));
-            let runs = RefCell::new(runs.collect());
+            let attempts = Attempts::new(&network, &self.experiments);
             let decay = self.settings.weight_decay;
             let mut problem =
-                problem::Training::new(&self.experiments, network, decay, &runs, self.monitor);
+                problem::Training::new(&self.experiments, network, decay, &attempts, self.monitor);
             let (theta, dead) = self.drawn(&mut problem, start, &mut random)?;
-            Some((self.train(&mut problem, theta, &runs)?, dead))
+            Some((self.train(&mut problem, theta, &attempts)?, dead))
         };
         // nothing is drawn where models are trained further, so that another training would end the same
         let trainings = match self.settings.initial.is_empty() {
@@ -279,7 +273,7 @@ impl<'a> Task<'a> {
         &self,
         problem: &mut problem::Training,
         theta: Vec<f64>,
-        runs: &RefCell<Vec<Trajectory>>,
+        attempts: &Attempts,
     ) -> Option<Trained> {
         let settings = lm::Settings {
             max_iterations: self.settings.max_iterations,
@@ -291,7 +285,7 @@ impl<'a> Task<'a> {
         let mut referee = Referee::new(
             problem.network.clone(),
             &self.experiments,
-            runs,
+            attempts,
             &self.validation,
             self.monitor,
         );
@@ -305,7 +299,7 @@ impl<'a> Task<'a> {
         let spare = self.settings.max_iterations - outcome.iterations;
         self.monitor.advance(spare as u64);
         let best = referee.best.take()?;
-        self.finished(problem, best.theta, runs)
+        self.finished(problem, best.theta, attempts)
             .map(|(model, states, sound)| Trained {
                 cost: best.cost,
                 model,
@@ -323,7 +317,7 @@ impl<'a> Task<'a> {
         &self,
         problem: &mut problem::Training,
         theta: Vec<f64>,
-        runs: &RefCell<Vec<Trajectory>>,
+        attempts: &Attempts,
     ) -> Option<(NeuralSS, Vec<Vec<f64>>, bool)> {
         let own = self.shape.parameters();
         let states: Vec<Vec<f64>> = theta[own..]
@@ -332,7 +326,7 @@ impl<'a> Task<'a> {
             .collect();
         let network = Network::new(self.shape, self.settings.output, &theta[..own]);
         problem.rerun(&theta)?;
-        let runs = runs.borrow();
+        let runs = attempts.at(&theta);
         let mut statistics = statistics(&network, &self.experiments, &runs);
         statistics.process_noise = kalman::process_noise(
             &network,

@@ -11,7 +11,7 @@ pub enum Level {
     Baseline,
     /// AVX2 with fused multiply-add.
     Avx2,
-    /// AVX-512.
+    /// AVX-512, its doubles and quadwords (DQ) included.
     Avx512,
 }
 
@@ -33,7 +33,7 @@ impl Level {
         #[cfg(target_arch = "x86_64")]
         let (half, wide) = (
             is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
-            is_x86_feature_detected!("avx512f"),
+            is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq"),
         );
         #[cfg(not(target_arch = "x86_64"))]
         let (half, wide) = (false, false);

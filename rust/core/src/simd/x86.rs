@@ -4,13 +4,16 @@
 
 use std::arch::x86_64::*;
 
-use super::{Arithmetic, Choice, Eight, Kernel, LANES};
+use super::{Arithmetic, Choice, Eight, Group, Kernel, LANES, tanh};
+
+/// What is beyond the nearest quarter; half way between two of them, beyond the even one.
+const BEYOND_QUARTERS: i32 = 2 << 4 | _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
 
 /// Rounding to the integer below.
 const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
 
 /// Runs a kernel in AVX-512 registers.
-#[target_feature(enable = "avx512f,avx2,fma")]
+#[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
 pub(super) fn wide<K: Kernel>(kernel: K) -> K::Output {
     kernel.run::<Wide>()
 }
@@ -23,6 +26,48 @@ pub(super) fn half<K: Kernel>(kernel: K) -> K::Output {
 
 #[derive(Clone, Copy)]
 pub(super) struct Wide(__m512d);
+
+impl Wide {
+    /// Entries of a table, by the low four bits.
+    #[inline(always)]
+    pub(super) fn pick(self, table: &[Group; 2]) -> Self {
+        let (low, high) = (Self::load(&table[0].0), Self::load(&table[1].0));
+        // SAFETY: as `splat`.
+        unsafe {
+            Self(_mm512_permutex2var_pd(
+                low.0,
+                _mm512_castpd_si512(self.0),
+                high.0,
+            ))
+        }
+    }
+
+    /// The difference from the nearest multiple of a quarter, exact.
+    #[inline(always)]
+    pub(super) fn beyond_quarters(self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_reduce_pd::<BEYOND_QUARTERS>(self.0)) }
+    }
+
+    /// The upper four numbers before the lower four.
+    #[inline(always)]
+    fn halves_swapped(self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_shuffle_f64x2::<0b0100_1110>(self.0, self.0)) }
+    }
+
+    /// A number that is not negative, with the sign of another.
+    #[inline(always)]
+    pub(super) fn with_sign_of(self, other: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            Self(_mm512_or_pd(
+                self.0,
+                _mm512_and_pd(other.0, _mm512_set1_pd(-0.0)),
+            ))
+        }
+    }
+}
 
 impl Arithmetic for Wide {
     #[inline(always)]
@@ -168,6 +213,29 @@ impl Eight for Wide {
             let one = _mm512_castpd_si512(_mm512_set1_pd(1.0));
             Self(_mm512_castsi512_pd(_mm512_add_epi64(exponent, one)))
         }
+    }
+
+    #[inline(always)]
+    fn tanh_in_chain(self) -> Self {
+        tanh::pieces::tanh(self)
+    }
+
+    /// The sum is not waited for: halves are added, then neighbours, and the two sums that are left go into the arguments
+    /// one by one.
+    #[inline(always)]
+    fn fed_back(self, second: Self, direct: Self, rest: Self, weights: Self) -> (f64, Self) {
+        let four = direct
+            .add(direct.halves_swapped())
+            .add_product(second, self)
+            .add_product(second.halves_swapped(), self.halves_swapped());
+        // SAFETY: as `splat`.
+        let two = four.add(unsafe { Self(_mm512_permute_pd::<0b0101_0101>(four.0)) });
+        // SAFETY: as `splat`.
+        let others = unsafe { Self(_mm512_permutex_pd::<0b0100_1110>(two.0)) };
+        let arguments = rest.add_product(weights, two).add_product(weights, others);
+        // SAFETY: as `splat`.
+        let y = unsafe { _mm512_cvtsd_f64(two.0) + _mm512_cvtsd_f64(others.0) };
+        (y, arguments)
     }
 }
 

@@ -228,7 +228,7 @@ impl Measure {
             chatter: effort.du_rms,
             effort: effort.u_rms,
             saturation: effort.saturated,
-            u_max: run.u.iter().fold(0.0, |most, u| f64::max(most, u.abs())),
+            u_max: run.largest_command(),
             ..Terms::default()
         };
         self.shaped(terms, reference, &run.y, ts)

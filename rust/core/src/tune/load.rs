@@ -66,8 +66,7 @@ impl<'a> LoadStep<'a> {
 
     /// Recovery, rms deviation and largest command of a run.
     pub(super) fn terms(&self, run: &Run, ts: f64) -> Terms {
-        let u_max = run.u.iter().fold(0.0, |most, u| f64::max(most, u.abs()));
-        self.of(&run.y, u_max, ts)
+        self.of(&run.y, run.largest_command(), ts)
     }
 
     /// The same from the outputs and the largest `|u|`; recovery is the last time that the deviation was beyond the band,

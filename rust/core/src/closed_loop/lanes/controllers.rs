@@ -98,7 +98,19 @@ impl<V: Choice> Controllers<V> {
     /// From reference and measured outputs to the commands.
     #[inline(always)]
     pub fn step(&mut self, first: bool, r: f64, measured: V, feedforward: Option<f64>) -> V {
+        self.take(first, measured);
+        self.decide(first, r, feedforward)
+    }
+
+    /// Takes measured outputs.
+    #[inline(always)]
+    pub fn take(&mut self, first: bool, measured: V) {
         self.filtered = self.filter(first, measured);
+    }
+
+    /// From the reference and what was taken to the commands.
+    #[inline(always)]
+    pub fn decide(&mut self, first: bool, r: f64, feedforward: Option<f64>) -> V {
         let r = self.reference(first, r);
         self.control(r, self.filtered, feedforward)
     }

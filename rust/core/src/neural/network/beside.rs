@@ -9,9 +9,13 @@ use crate::simd::{Eight, Group, LANES};
 impl Network {
     /// The outputs for eight regressors, lane by lane; each to the bit what [`step`](Self::step) gives for it.
     ///
-    /// `N` is the number of regressors, 0 for any.
+    /// `N` is the number of regressors, 0 for any. Some of other work is done after each hidden unit.
     #[inline(always)]
-    pub(crate) fn beside<V: Eight, const N: usize>(&self, phi: &[Group]) -> V {
+    pub(crate) fn beside<V: Eight, const N: usize>(
+        &self,
+        phi: &[Group],
+        meanwhile: &mut impl Meanwhile,
+    ) -> V {
         let n = if N == 0 { phi.len() } else { N };
         let phi = &phi[..n];
         let mut sums = [V::splat(0.0); LANES];
@@ -23,6 +27,7 @@ impl Network {
             for unit in 0..units {
                 let h = tanh(argument::<V>(bias[unit], weights, unit, phi));
                 sums[unit] = sums[unit].add_product(V::splat(second[unit]), h);
+                meanwhile.go();
             }
         }
         let output = in_halves(sums);
@@ -62,6 +67,22 @@ impl Network {
         let weights = &self.first[groups * phi.len()..][..phi.len()];
         argument(self.bias[groups].0[0], weights, 0, phi)
     }
+}
+
+/// Work that has nothing to do with a step of the network: a part of it at each call, and none when all is done.
+///
+/// A processor holds about a hundred operations that wait for their numbers. Parts that stand between hidden units leave
+/// room for those of the units.
+pub(crate) trait Meanwhile {
+    fn go(&mut self);
+}
+
+/// Nothing to do meanwhile.
+pub(crate) struct Nothing;
+
+impl Meanwhile for Nothing {
+    #[inline(always)]
+    fn go(&mut self) {}
 }
 
 /// The argument of one hidden unit for eight regressors, the newest output last.

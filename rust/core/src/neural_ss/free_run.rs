@@ -1,0 +1,224 @@
+//! Free runs in scaled units, one or two side by side: a run waits for its own last state, and a second one fits into
+//! the waiting.
+
+use super::network::{Network, Scratch, copy, unrolled};
+use super::shape::Shape;
+use crate::Monitor;
+use crate::limit::Limit;
+use crate::simd::{self, Eight, Group, Kernel};
+
+/// Samples between two looks at bound and limit.
+const BLOCK: usize = 64;
+/// Samples between two looks at the monitor.
+const LOOK: usize = 64 * BLOCK;
+
+/// What a simulation leaves behind, sample by sample.
+#[derive(Clone, Debug)]
+pub(super) struct Trajectory {
+    pub states: Vec<f64>,
+    pub hidden: Vec<Group>,
+    /// Sums before the output function.
+    pub sums: Vec<f64>,
+}
+
+impl Trajectory {
+    pub fn new(network: &Network, samples: usize) -> Self {
+        let Shape { nx, outputs, .. } = network.shape;
+        Self {
+            states: vec![0.0; samples * nx],
+            hidden: vec![Group::ZERO; samples * network.groups()],
+            sums: vec![0.0; samples * outputs],
+        }
+    }
+}
+
+/// One network's run.
+pub(super) struct Run<'a> {
+    pub network: &'a Network,
+    pub state: &'a [f64],
+    /// What it leaves behind.
+    pub run: &'a mut Trajectory,
+    pub scratch: &'a mut Scratch,
+    /// None where it has already failed elsewhere.
+    pub limit: Option<Limit>,
+}
+
+/// Free runs of networks of one shape over the same inputs, as a kernel.
+pub(super) struct FreeRuns<'a, const RUNS: usize> {
+    pub runs: [Run<'a>; RUNS],
+    pub v: &'a [f64],
+    /// Measured outputs, NaN where not known; empty where nothing is measured.
+    pub y: &'a [f64],
+    /// No state may be larger.
+    pub bound: f64,
+    pub monitor: &'a Monitor,
+}
+
+impl<const RUNS: usize> FreeRuns<'_, RUNS> {
+    /// Sums of squared errors, 0 without a measure; none where a run leaves the bound, is stopped, or can no longer
+    /// stay below its limit.
+    pub fn go(self) -> [Option<f64>; RUNS] {
+        simd::run(self)
+    }
+}
+
+/// A run by itself, of which nothing is asked but finite states; false where they are not, or it is stopped.
+pub(super) fn alone(
+    network: &Network,
+    v: &[f64],
+    state: &[f64],
+    run: &mut Trajectory,
+    scratch: &mut Scratch,
+    monitor: &Monitor,
+) -> bool {
+    let run = Run {
+        network,
+        state,
+        run,
+        scratch,
+        limit: Some(Limit::NONE),
+    };
+    let runs = FreeRuns {
+        runs: [run],
+        v,
+        y: &[],
+        bound: f64::MAX,
+        monitor,
+    };
+    runs.go()[0].is_some()
+}
+
+impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
+    type Output = [Option<f64>; RUNS];
+
+    #[inline(always)]
+    fn run<V: Eight>(self) -> Self::Output {
+        unrolled!(self.runs[0].network.shape.nx, self.samples::<V>)
+    }
+}
+
+impl<const RUNS: usize> FreeRuns<'_, RUNS> {
+    /// `NX` states; 0 stands for any number.
+    #[inline(always)]
+    fn samples<V: Eight, const NX: usize>(mut self) -> [Option<f64>; RUNS] {
+        let inputs = self.runs[0].network.shape.inputs;
+        let samples = self.v.len() / inputs;
+        let mut sums = [0.0; RUNS];
+        for run in &mut self.runs {
+            run.scratch.next.copy_from_slice(run.state);
+        }
+        for start in (0..samples).step_by(BLOCK) {
+            if start % LOOK == 0 && self.monitor.stopped() {
+                return [None; RUNS];
+            }
+            let end = samples.min(start + BLOCK);
+            let v = &self.v[start * inputs..end * inputs];
+            if self.runs.iter().all(|run| run.limit.is_some()) {
+                advance::<V, NX, RUNS>(&mut self.runs, start, v, inputs);
+            } else if let Some(run) = self.runs.iter_mut().find(|run| run.limit.is_some()) {
+                advance::<V, NX, 1>(std::array::from_mut(run), start, v, inputs);
+            } else {
+                break;
+            }
+            for (run, sum) in self.runs.iter_mut().zip(&mut sums) {
+                run.conclude(start, end, self.y, sum, self.bound);
+            }
+        }
+        let mut reached = [None; RUNS];
+        for (reached, (run, sum)) in reached.iter_mut().zip(self.runs.iter().zip(sums)) {
+            *reached = run.limit.map(|_| sum).filter(|sum| sum.is_finite());
+        }
+        reached
+    }
+}
+
+/// A block of all runs.
+#[inline(always)]
+fn advance<V: Eight, const NX: usize, const RUNS: usize>(
+    runs: &mut [Run; RUNS],
+    start: usize,
+    v: &[f64],
+    inputs: usize,
+) {
+    let network = runs[0].network;
+    match (NX, network.shape.outputs, network.groups()) {
+        (1.., 1, 1) => together::<V, NX, 1, RUNS>(runs, start, v, inputs),
+        (1.., 1, 2) => together::<V, NX, 2, RUNS>(runs, start, v, inputs),
+        _ => {
+            for (k, v) in v.chunks_exact(inputs).enumerate() {
+                for run in &mut *runs {
+                    run.step::<V, NX>(start + k, v);
+                }
+            }
+        }
+    }
+}
+
+/// A block of models of one output, `NX` states and `GROUPS` groups of hidden units, side by side.
+#[inline(always)]
+fn together<V: Eight, const NX: usize, const GROUPS: usize, const RUNS: usize>(
+    runs: &mut [Run; RUNS],
+    start: usize,
+    v: &[f64],
+    inputs: usize,
+) {
+    let mut x = [[0.0; NX]; RUNS];
+    for (x, run) in x.iter_mut().zip(&*runs) {
+        x.copy_from_slice(&run.scratch.next);
+    }
+    for (k, v) in v.chunks_exact(inputs).enumerate() {
+        for r in 0..RUNS {
+            let Run { network, run, .. } = &mut runs[r];
+            let (states, _) = run.states.as_chunks_mut();
+            let (hidden, _) = run.hidden.as_chunks_mut();
+            states[start + k] = x[r];
+            run.sums[start + k] =
+                network.step_small::<V, NX, GROUPS>(&mut x[r], v, &mut hidden[start + k]);
+        }
+    }
+    for (x, run) in x.iter().zip(runs) {
+        run.scratch.next.copy_from_slice(x);
+    }
+}
+
+impl Run<'_> {
+    /// Sample `k`.
+    #[inline(always)]
+    fn step<V: Eight, const NX: usize>(&mut self, k: usize, v: &[f64]) {
+        let Shape { nx, outputs, .. } = self.network.shape;
+        let nx = if NX == 0 { nx } else { NX };
+        let (groups, scratch) = (self.network.groups(), &mut *self.scratch);
+        let x = &mut self.run.states[k * nx..][..nx];
+        let h = &mut self.run.hidden[k * groups..][..groups];
+        let s = &mut self.run.sums[k * outputs..][..outputs];
+        copy(x, &scratch.next[..nx]);
+        scratch.set(x, v);
+        self.network
+            .step::<V, NX>(&scratch.arguments, h, &mut scratch.next, s);
+    }
+
+    /// Measures a block: adds its squared errors, and ends the run where it cannot win.
+    fn conclude(&mut self, start: usize, end: usize, y: &[f64], sum: &mut f64, bound: f64) {
+        let Some(limit) = self.limit else { return };
+        let Shape { nx, outputs, .. } = self.network.shape;
+        let output = self.network.output;
+        let (first, behind) = (start * outputs, end * outputs);
+        if let Some(y) = y.get(first..behind) {
+            let pairs = self.run.sums[first..behind].iter().zip(y);
+            for (s, y) in pairs.filter(|(_, y)| !y.is_nan()) {
+                *sum += (y - output.value(*s)).powi(2);
+            }
+        }
+        let states = &self.run.states[start * nx..end * nx];
+        // NaN is no number within the bound either.
+        let sound = states
+            .iter()
+            .fold(true, |sound, x| sound & (x.abs() <= bound));
+        if !sound || limit.is_reached(*sum) {
+            self.limit = None;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;
