@@ -251,6 +251,30 @@ def test_standard_output_on_a_full_disk(folder: Path) -> None:
     assert "fault" not in found.stderr
 
 
+@pytest.mark.parametrize(
+    "option",
+    [
+        ("--limits", "volt=1,speed=300,acceleration=3000,current=5"),
+        ("--watchdog", 50),
+        ("--live", "terminal"),
+    ],
+)
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("record", "--signal", "step", "-o", "out.csv"),
+        ("run", "c.json", "--reference", "trapezoid", "-o", "out.csv"),
+        ("commission", "--out", "out"),
+    ],
+)
+def test_what_only_a_drive_keeps_to_is_refused_without_one(
+    folder: Path, command: tuple[str, ...], option: tuple[str, object]
+) -> None:
+    said = refused(folder, *command, "--on", "virtual", *option)
+    assert f"{option[0]} belongs to a drive" in said
+    assert "sewfast device" in said
+
+
 @pytest.mark.parametrize("on", ["virtual:x", "virtual:-1", "nil.json", "real"])
 def test_unknown_plant(folder: Path, on: str) -> None:
     message = refused(folder, "run", "c.json", "--on", on, "--reference", "step.csv")

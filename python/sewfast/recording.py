@@ -92,15 +92,23 @@ class Recording:
             channels={} if self.speed_true is None else {"speed_true": self.speed_true},
         )
 
-    def header(self, **settings: Any) -> Header:
-        """What its file says of it; `settings` are what is needed to record it again."""
+    def header(self, *, device: Mapping[str, Any] | None = None, **settings: Any) -> Header:
+        """What its file says of it.
+
+        Parameters
+        ----------
+        device : mapping, optional
+            What it was recorded on; the virtual machine by default.
+        **settings
+            What is needed to record it again.
+        """
         return Header(
             self.name,
             self.Ts,
             {name: UNITS.get(name, "1") for name in self.columns() if name != "t"},
             len(self),
             self.counts_per_rev,
-            {"kind": "virtual"},
+            {"kind": "virtual"} if device is None else device,
             settings,
         )
 

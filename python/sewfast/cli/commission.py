@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import Interrupted, SettingError
+from ..errors import Interrupted
 from .arguments import Commands, add_command, add_overwrite
-from .drive import add_drive, is_port, opened
+from .drive import add_drive, is_port, opened, require_no_drive_options
 from .output import print_json
 from .progress import Progress
 
@@ -80,11 +80,32 @@ def add(commands: Commands) -> None:
 
 
 def command(args: argparse.Namespace) -> int | None:
-    from ..commissioning import Refusal
-    from ..commissioning.folder import prepare, require_own
+    from ..commissioning.folder import require_own
+    from ..commissioning.taken import FOLDER, prepare
 
+    if not is_port(args.on):
+        require_no_drive_options(args)
     require_own(args.out, overwrite=args.overwrite)
     prepare(args.out)
+    if is_port(args.on):
+        # what a virtual machine did can be had again
+        print(
+            f"each recording lies in {args.out / FOLDER} as soon as it is taken, whatever comes "
+            "then",
+            file=sys.stderr,
+            flush=True,
+        )
+    try:
+        return _kept(args)
+    except KeyboardInterrupt:
+        print(f"interrupted; {args.out} is not complete, each file in it is whole", file=sys.stderr)
+        return 130
+
+
+def _kept(args: argparse.Namespace) -> int | None:
+    """Commission, and leave what came of it in the folder."""
+    from ..commissioning import Refusal
+
     try:
         found = _commissioned(args)
     except Refusal as refusal:
@@ -92,8 +113,10 @@ def command(args: argparse.Namespace) -> int | None:
             refusal.so_far.save(args.out, overwrite=True)
         raise Refusal(f"{refusal}; what there is lies in {args.out}") from refusal
     except Interrupted as stop:
+        # analysis and page take a second or two
+        print(f"interrupted; writing what there is to {args.out}", file=sys.stderr, flush=True)
         place = stop.best.save(args.out, overwrite=True)
-        print(f"interrupted; the best so far is kept: {place}", file=sys.stderr)
+        print(f"the best so far is kept: {place}", file=sys.stderr)
         return 130
     page = found.save(args.out, overwrite=True)
     if args.json:
@@ -119,12 +142,10 @@ def _commissioned(args: argparse.Namespace) -> Commissioning:
             "time_budget": args.time_budget,
             "seed": args.seed,
             "progress": lambda done, total, stage: progress.say(stage),
+            "folder": args.out,
+            "overwrite": args.overwrite,
         }
         if is_port(args.on):
             with opened(args) as drive:
                 return commission(drive, **options)
-        if args.limits is not None:
-            raise SettingError(
-                f"--limits belongs to a drive behind a port, received --on {args.on}; leave it out"
-            )
         return commission(VirtualMachine.from_name(args.on), **options)

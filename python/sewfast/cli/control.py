@@ -16,7 +16,14 @@ from .arguments import (
     add_overwrite,
     require_place,
 )
-from .drive import add_drive, is_port, opened, recording_place, say_interrupted
+from .drive import (
+    add_drive,
+    is_port,
+    opened,
+    recording_place,
+    require_no_drive_options,
+    say_interrupted,
+)
 from .host_loop import add_host_loop, at_loops_period, run_host_loop
 from .output import write_columns
 
@@ -78,6 +85,7 @@ def run_command(args: argparse.Namespace) -> int | None:
     controller = load_controller(args.controller)
     name = Path(args.reference).stem
     if not is_port(args.on):
+        require_no_drive_options(args)
         plant = plant_of(args.on)
         reference = _wanted(args, controller)
         _show_run(args, run(controller, plant, reference, name=name), None, plant)

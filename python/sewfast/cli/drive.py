@@ -60,7 +60,8 @@ def add_drive(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--limits", metavar="LIST",
         help="what the drive may do, as volt=10,speed=3500,acceleration=30000,current=15 [V, RPM, "
-        "RPM/s, A]; it stops when it does more. inf: none. A virtual drive has limits by default",
+        "RPM/s, A]; it stops when it does more. inf: none. A virtual drive has limits by default; "
+        "a virtual machine without a port has none to set",
     )  # fmt: skip
     group.add_argument(
         "--watchdog", type=float, metavar="MS",
@@ -80,6 +81,28 @@ def is_port(text: str) -> bool:
         return stat.S_ISCHR(Path(text).stat().st_mode)
     except (OSError, ValueError):
         return False
+
+
+def require_no_drive_options(args: argparse.Namespace) -> None:
+    """Refuse what only a drive behind a port can be told, where `--on` names none.
+
+    Raises
+    ------
+    SettingError
+        Rather than a run that somebody believes to be within limits.
+    """
+    given = {
+        "--limits": args.limits is not None,
+        "--watchdog": args.watchdog is not None,
+        "--live": args.live.name not in ("auto", "none"),
+    }
+    for name, is_given in given.items():
+        if is_given:
+            raise SettingError(
+                f"{name} belongs to a drive behind a port, received --on {args.on}; leave it out, "
+                "or serve a virtual machine as a drive, which keeps to limits: "
+                "`sewfast device --link DRIVE --fast`, then --on DRIVE"
+            )
 
 
 @contextmanager

@@ -16,7 +16,14 @@ from .arguments import (
     add_overwrite,
     require_place,
 )
-from .drive import add_drive, is_port, opened, recording_place, say_interrupted
+from .drive import (
+    add_drive,
+    is_port,
+    opened,
+    recording_place,
+    require_no_drive_options,
+    say_interrupted,
+)
 from .output import print_json, print_rows, write_columns
 
 if TYPE_CHECKING:
@@ -84,6 +91,7 @@ def record_command(args: argparse.Namespace) -> int | None:
     require_place(args.out, RECORDINGS)
     u, Ts = _excitation(args)
     if not is_port(args.on):
+        require_no_drive_options(args)
         _record_virtual(args, u, Ts)
         return None
     place = recording_place(args.out, overwrite=args.overwrite)

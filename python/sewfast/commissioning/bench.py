@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from ..control import Controller
 from ..dataset import FloatArray
@@ -159,10 +159,10 @@ class DriveBench:
 
 @dataclass(frozen=True)
 class NotedBench:
-    """A bench that tells `note` of every recording as it comes, so that a refusal has them."""
+    """A bench that tells `note` of every recording as it comes, with the controller that ran."""
 
     inner: Bench
-    note: Callable[[str, Recording], object]
+    note: Callable[[str, Recording, Controller | None], object]
 
     @property
     def name(self) -> str:
@@ -186,13 +186,23 @@ class NotedBench:
 
     def excite(self, u: FloatArray, name: str) -> Recording:
         recording = self.inner.excite(u, name)
-        self.note(name, recording)
+        self.note(name, recording, None)
         return recording
 
     def follow(self, controller: Controller, r: FloatArray, name: str) -> Followed:
         found = self.inner.follow(controller, r, name)
-        self.note(name, found.recording)
+        self.note(name, found.recording, controller)
         return found
+
+
+def told_of(bench: Bench) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Device and conditions, as recordings state them."""
+    if isinstance(bench, DriveBench):
+        from ..link.play import conditions_of, device_of
+
+        return device_of(bench.drive), conditions_of(bench.drive)
+    kind = "virtual" if isinstance(bench, MachineBench) else "bench"
+    return {"kind": kind, "name": bench.name}, {}
 
 
 @contextmanager

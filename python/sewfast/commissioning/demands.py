@@ -11,8 +11,12 @@ from ..constraints import Constraints
 from ..dataset import FloatArray
 from ..errors import SettingError
 from ..gains import real, whole
+from ..report.commissioned import file_name
 from ..tuning_task import budget
 from .bench import Bench
+
+LONGEST_NAME = 100
+"""Of a reference's file [bytes]; file systems take 255, of which endings need some."""
 
 MS = 2.0
 """Largest sensitivity unless said otherwise."""
@@ -134,7 +138,24 @@ def _load(load: float | None, volt: float) -> float | None:
 
 
 def _fixed(references: Mapping[str, FloatArray] | None) -> Mapping[str, FloatArray] | None:
-    return None if references is None else MappingProxyType(dict(references))
+    """Each is a file as well, of a name of its own."""
+    if references is None:
+        return None
+    files: dict[str, str] = {}
+    for name in references:
+        file = file_name(name)
+        if len(file.encode()) > LONGEST_NAME:
+            raise SettingError(
+                f"expected names of references of up to {LONGEST_NAME} bytes, got {name[:40]!r}.. "
+                f"of {len(file.encode())}; shorten it"
+            )
+        if file in files:
+            raise SettingError(
+                f"expected references whose names differ in letters, digits, '-', '_' or '.', got "
+                f"{files[file]!r} and {name!r}, which would be one file; rename one"
+            )
+        files[file] = name
+    return MappingProxyType(dict(references))
 
 
 def _at_least(least: int, name: str, value: int) -> int:

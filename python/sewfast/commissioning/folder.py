@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from .. import __version__, jsonfile
 from ..analysis.filing import NUMBERS as ANALYSIS
-from ..errors import DataError, SettingError
+from ..errors import SettingError
 from ..report.commissioned import FORMAT, NUMBERS, VERSION, run_file
 from ..writers import write_table
 from .numbers import numbers
+from .taken import clear, prepare, require_repeatable
 
 if TYPE_CHECKING:
     from .result import Commissioning
@@ -30,7 +31,13 @@ def require_own(folder: Path, *, overwrite: bool) -> None:
     ------
     SettingError
     """
-    if overwrite or _may_be_replaced(folder):
+    if not overwrite:
+        require_repeatable(folder)
+        _require_own_artefacts(folder)
+
+
+def _require_own_artefacts(folder: Path) -> None:
+    if _may_be_replaced(folder):
         return
     place = first_taken(folder, (*_FOLDERS, NUMBERS, "results.json", "report.html"))
     if place is not None:
@@ -64,28 +71,15 @@ def numbers_in(file: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def prepare(folder: Path) -> None:
-    """Make the folder, so that one that cannot be made is refused before the machine moves.
-
-    Raises
-    ------
-    DataError
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(
-            f"{folder}: cannot be made ({error.strerror}); choose a folder that is writable"
-        ) from error
-
-
 def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
     """Put the artefacts in place of those of an earlier commissioning; then the page.
 
     Without `commissioning.json` a folder is refused by the report: an interruption in between
-    leaves no mixture that looks whole.
+    leaves no mixture that looks whole. What was written there as the recordings came stays until
+    then.
     """
-    require_own(folder, overwrite=overwrite)
+    if not overwrite:
+        _require_own_artefacts(folder)
     prepare(folder)
     for name in (NUMBERS, ANALYSIS, "report.html"):
         (folder / name).unlink(missing_ok=True)
@@ -99,6 +93,8 @@ def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
     _artefacts(found, folder)
     _analysis(found, folder)
     jsonfile.write(folder / NUMBERS, FORMAT, VERSION, {"sewfast": __version__, **numbers(found)})
+    if found.taken_in is not None and found.taken_in.resolve() == folder.resolve():
+        clear(folder)
     return _page(folder)
 
 

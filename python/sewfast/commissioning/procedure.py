@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,13 +18,15 @@ from ..dataset import FloatArray
 from ..errors import DataError, Interrupted, SettingError
 from ..machine import VirtualMachine
 from ..models import Ensemble
+from ..recording import Recording
 from ..threads import available
 from ..tuning import TuningResult
 from . import excitations
 from .agreement import agreeing
-from .bench import Bench, NotedBench, bench_of
+from .bench import Bench, NotedBench, bench_of, told_of
 from .demands import MS, Demands, demands
 from .first_order import step_response
+from .folder import require_own
 from .gains import cost_of, first_gains, ruled, search, start_of
 from .journal import STAGES, Journal, Progress
 from .motion import first_motion
@@ -30,6 +34,7 @@ from .references import standard
 from .refusal import Refusal
 from .requirements import Requirements
 from .result import Commissioning
+from .taken import Taken
 from .training import Trained, train
 from .verification import judged, measure, predict, require_alike, require_unsaturated
 
@@ -60,6 +65,8 @@ def commission(
     seed: int = 0,
     threads: int | None = None,
     progress: Progress | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
 ) -> Commissioning:
     """From a machine at rest to a controller that was verified on it.
 
@@ -107,6 +114,12 @@ def commission(
         All processors by default.
     progress : callable(done, total, stage), optional
         Called as each stage begins, within long ones, and at the end.
+    folder : path, optional
+        Where every recording is written as soon as it is there, as `unfinished/NAME.mcap`, so that
+        a process that is killed does not lose it; `Commissioning.save` into the same folder puts
+        tables in their place. One that cannot be written is warned of.
+    overwrite : bool
+        See `Commissioning.save`.
 
     Returns
     -------
@@ -118,7 +131,8 @@ def commission(
     Refusal
         Where the evidence is not good enough; `so_far` holds it.
     SettingError
-        For demands that contradict the machine's limits, before anything moves.
+        For demands that contradict the machine's limits, or a folder with files of somebody
+        else's, before anything moves.
     LinkError
         Where port or drive failed or tripped; the motor is stopped.
     Interrupted
@@ -140,8 +154,17 @@ def commission(
             time_budget=time_budget,
         )
         journal = Journal(bench.name, progress)
+        taken = None if folder is None else _place(Path(folder), bench, asked, overwrite=overwrite)
+        if taken is not None:
+            journal.keep(taken_in=taken.folder)
+
+        def note(name: str, recording: Recording, controller: Controller | None) -> None:
+            journal.note(name, recording)
+            if taken is not None:
+                taken.keep(journal.stage, name, recording, controller)
+
         try:
-            return _carry_out(NotedBench(bench, journal.note), asked, cost, journal)
+            return _carry_out(NotedBench(bench, note), asked, cost, journal)
         except Refusal as refusal:
             refusal.stage = journal.stage
             refusal.so_far = journal.result("refused", str(refusal))
@@ -151,6 +174,16 @@ def commission(
             if isinstance(best, Controller):
                 journal.keep(controller=best)
             raise Interrupted(journal.result("interrupted", "Ctrl-C")) from stop
+
+
+def _place(folder: Path, bench: Bench, asked: Demands, *, overwrite: bool) -> Taken:
+    """Where the recordings go as they come, made before anything moves."""
+    require_own(folder, overwrite=overwrite)
+    device, conditions = told_of(bench)
+    own = {"u_max": asked.u_max, "speed": asked.speed, "seed": asked.seed}
+    taken = Taken(folder, device, {**own, **conditions})
+    taken.begin()
+    return taken
 
 
 def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal) -> Commissioning:

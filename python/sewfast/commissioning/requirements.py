@@ -28,7 +28,9 @@ LEVEL = 0.75
 RECOVERED = 0.01
 """Of what the load would do to the speed without control."""
 HAIR = 1.001
+"""What a limit taken from the rule's own gains leaves above them, so that these meet it."""
 AS_IT_IS = ((1.0, 0),)
+"""Variations of a member: none, its own gain and no more delay."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Requirements:
         cls, ensemble: Ensemble, fopdt: Fopdt, rival: Controller, demands: Demands
     ) -> Requirements:
         """What is required of gains for these members."""
-        loads = _load_steps(fopdt, demands, rival.Ts)
+        loads = _load_steps(fopdt, demands)
         bears = bool(loads) and _bears(rival, ensemble, loads)
         linear = _linear(ensemble.members, demands, rival.Ts) if demands.Ms is not None else []
         speed = LEVEL * demands.speed
@@ -93,7 +95,7 @@ def _limit(asked: float | None, own: Sequence[float]) -> float | None:
     return max([asked, *(HAIR * x for x in own if math.isfinite(x))])
 
 
-def _load_steps(fopdt: Fopdt, demands: Demands, Ts: float) -> tuple[LoadStep, ...]:
+def _load_steps(fopdt: Fopdt, demands: Demands) -> tuple[LoadStep, ...]:
     """One that brakes, at three quarters of the top speed."""
     volt = LOAD * demands.u_max if demands.load is None else demands.load
     if volt == 0.0:

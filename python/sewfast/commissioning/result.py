@@ -58,6 +58,8 @@ class Commissioning:
         What speaks against the loops as predicted.
     comparisons : tuple of Comparison
         Predicted and measured, per reference.
+    taken_in : Path or None
+        The folder in which each recording was written as it came.
     """
 
     machine: str
@@ -78,6 +80,7 @@ class Commissioning:
     card: ReportCard | None = None
     judgement: Judgement | None = None
     comparisons: tuple[Comparison, ...] = ()
+    taken_in: Path | None = None
 
     @property
     def is_verified(self) -> bool:

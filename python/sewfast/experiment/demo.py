@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from .. import __version__
-from ..commissioning.folder import prepare
+from ..commissioning.taken import prepare
 from ..control import Controller, Fopdt, paper_controller
 from ..machine import VirtualMachine
 from ..report import report

@@ -136,18 +136,22 @@ def _writer(
         columns={column: unit or "1" for column, unit in columns.items()},
         n=len(plan.values),
         counts_per_rev=_counts_per_rev(drive),
-        device={"kind": "drive", **asdict(identity)},
-        settings={
-            "mode": plan.mode,
-            "limits": _finite(drive.limits().values),
-            "watchdog_s": drive.watchdog,
-            **controller,
-            **settings,
-        },
+        device=device_of(drive),
+        settings={"mode": plan.mode, **conditions_of(drive), **controller, **settings},
     )
     place = Path(file)
     # that it may be replaced where it exists has been asked
     return RecordWriter(place, header, overwrite=place.exists(), lazy=True)
+
+
+def device_of(drive: Drive) -> dict[str, Any]:
+    """What a recording says of the drive that it was made on."""
+    return {"kind": "drive", **asdict(drive.identity)}
+
+
+def conditions_of(drive: Drive) -> dict[str, Any]:
+    """Limits and watchdog in force, as a recording states them."""
+    return {"limits": _finite(drive.limits().values), "watchdog_s": drive.watchdog}
 
 
 def _finite(limits: tuple[float, ...]) -> dict[str, float | None]:

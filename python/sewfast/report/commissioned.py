@@ -31,8 +31,12 @@ _HOW = {
 
 def run_file(reference: str, kind: str) -> str:
     """Where in the folder a closed loop lies; `kind` is predicted or measured."""
-    safe = "".join(c if c.isalnum() or c in "-_." else "_" for c in reference)
-    return f"runs/{safe}_{kind}.npz"
+    return f"runs/{file_name(reference)}_{kind}.npz"
+
+
+def file_name(reference: str) -> str:
+    """What a reference of any name is called in a folder."""
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in reference)
 
 
 def is_commissioning(folder: Path) -> bool:

@@ -1,0 +1,137 @@
+"""`Taken`: the recordings of a commissioning as files, each written as soon as it is there."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..control import Controller
+from ..errors import DataError, SettingError
+from ..recordfile import save_columns
+from ..recordfile.keeping import ENDING, require_replaceable
+from ..recordfile.reader import read_header
+from ..recording import Recording
+from ..report.commissioned import file_name
+from .journal import STAGES
+
+FOLDER = "unfinished"
+"""Of its own, so that a killed commissioning and an earlier whole one never mix."""
+_MARK = "commissioning"
+"""The setting that tells these files from any others."""
+
+
+@dataclass
+class Taken:
+    """Without it a process that is killed, or a computer without power, loses what a machine did.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the commissioning; the files lie in its `unfinished` until `folder.write` has written
+        the tables that hold the same.
+    device, conditions : mapping
+        What the recordings are made on, and under which settings.
+    """
+
+    folder: Path
+    device: Mapping[str, Any]
+    conditions: Mapping[str, Any]
+    _has_warned: bool = field(default=False, init=False)
+
+    def begin(self) -> None:
+        """Make the place; files of an earlier commissioning would pass for this one's.
+
+        Raises
+        ------
+        DataError
+        """
+        clear(self.folder)
+        prepare(self.folder / FOLDER)
+
+    def keep(
+        self, stage: str, name: str, recording: Recording, controller: Controller | None
+    ) -> None:
+        """Write one; an earlier one of that name was not good enough.
+
+        A file that cannot be written is warned of, once: what the machine did is in memory as well.
+        """
+        if stage == STAGES[-1]:
+            # a reference may have the name of an excitation
+            name = f"{stage}_{name}"
+        columns = recording.columns()
+        del columns["t"]
+        own = {} if controller is None else {"controller": controller.to_dict()}
+        settings = {_MARK: {"stage": stage, **self.conditions}, **own}
+        header = recording.header(device=self.device, **settings)
+        try:
+            save_columns(self.folder / FOLDER / f"{file_name(name)}{ENDING}", header, columns)
+        except DataError as error:
+            if not self._has_warned:
+                self._has_warned = True
+                warnings.warn(
+                    f"{error}; the commissioning goes on, its recordings are in memory alone",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+
+
+def prepare(folder: Path) -> None:
+    """Make the folder, so that one that cannot be made is refused before the machine moves.
+
+    Raises
+    ------
+    DataError
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be made ({error.strerror}); choose a folder that is writable"
+        ) from error
+
+
+def clear(folder: Path) -> None:
+    """Take the files away: of an earlier commissioning, or of one whose tables are there."""
+    place = folder / FOLDER
+    for file in _inside(place):
+        if _is_own(file):
+            file.unlink()
+    with suppress(OSError):
+        # what somebody else has put there stays
+        place.rmdir()
+
+
+def require_repeatable(folder: Path) -> None:
+    """Refuse files there that a virtual machine could not make again.
+
+    Raises
+    ------
+    SettingError
+    """
+    for file in _inside(folder / FOLDER):
+        if not _is_own(file):
+            raise SettingError(
+                f"{file}: expected nothing but recordings of a commissioning in this folder; "
+                "choose another folder, or overwrite them (--overwrite)"
+            )
+        require_replaceable(file, overwrite=False)
+
+
+def _inside(place: Path) -> list[Path]:
+    return sorted(place.iterdir()) if place.is_dir() else []
+
+
+def _is_own(file: Path) -> bool:
+    """Such a file, or what was being written of one when its process was killed."""
+    if not file.is_file():
+        return False
+    if file.name.startswith(".") and f"{ENDING}." in file.name and file.suffix == ".tmp":
+        return True
+    try:
+        return file.suffix == ENDING and _MARK in read_header(file).settings
+    except DataError:
+        return False

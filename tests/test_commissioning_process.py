@@ -1,0 +1,192 @@
+"""`sewfast commission` as a process that is killed, or interrupted."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli import PROGRAM, environment, refused, sewfast
+from moments import PATIENCE, until
+from sewfast import (
+    Commissioning,
+    Controller,
+    Gains,
+    SettingError,
+    VirtualMachine,
+    commission,
+    read_table,
+)
+from sewfast.commissioning.folder import require_own
+from sewfast.commissioning.taken import Taken, prepare
+from sewfast.link import VirtualDevice
+from sewfast.recordfile import read_recording
+from sewfast.recording import Recording, record
+
+
+@contextmanager
+def commissioning(folder: Path, on: str = "virtual") -> Iterator[subprocess.Popen[str]]:
+    """One that fills `out`, once it has recorded its first closed loop."""
+    command = [*PROGRAM, "commission", "--on", on, "--out", "out", "--members", "2"]
+    with subprocess.Popen(
+        command, cwd=folder, env=environment(), text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        try:
+            until(lambda: (folder / "out/unfinished/trapezoids.mcap").exists())
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("behind", ["process", "port"])
+def test_a_killed_commissioning_leaves_its_recordings(tmp_path: Path, behind: str) -> None:
+    with ExitStack() as stack:
+        on = "virtual"
+        if behind == "port":
+            on = stack.enter_context(VirtualDevice(fast=True)).port
+        with commissioning(tmp_path, on) as process:
+            process.send_signal(signal.SIGKILL)
+            _, said = process.communicate(timeout=PATIENCE)
+    assert ("recording lies in out/unfinished" in said) == (behind == "port")
+    out = tmp_path / "out"
+    assert not (out / "commissioning.json").exists()
+    files = {file.stem: file for file in (out / "unfinished").glob("*.mcap")}
+    assert {"motion_1", "step", "trapezoids"} <= set(files)
+    for file in files.values():
+        found = read_recording(file)
+        assert found.complete
+        told = found.header.settings["commissioning"]
+        assert (told["u_max"], told["speed"]) == (20.0, 2000.0)
+        assert ("limits" in told) == (behind == "port")
+    step, loop = (read_recording(files[name]).header for name in ("step", "trapezoids"))
+    assert step.settings["commissioning"]["stage"] == "step response"
+    assert loop.settings["controller"]["u_max"] == 20.0
+    sewfast(tmp_path, "identify", files["trapezoids"], "--model", "arx", "-o", "model.json")
+    # a computer can make these again
+    require_own(out, overwrite=False)
+
+
+def test_ctrl_c_says_at_once_that_it_writes(tmp_path: Path) -> None:
+    with commissioning(tmp_path) as process:
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    said = [line for line in told.splitlines() if "interrupted" in line or "best" in line]
+    assert said[0] == "interrupted; writing what there is to out"
+    assert said[1].startswith("the best so far is kept: ")
+    assert not list((tmp_path / "out").rglob("*.mcap"))
+    assert (tmp_path / "out/recordings/trapezoids.csv").exists()
+
+
+def test_a_second_ctrl_c_leaves_no_half_file(tmp_path: Path) -> None:
+    with commissioning(tmp_path) as process:
+        assert process.stderr is not None
+        process.send_signal(signal.SIGINT)
+        while "writing what there is" not in process.stderr.readline():
+            assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    files = [file for file in (tmp_path / "out").rglob("*") if file.is_file()]
+    assert not [file for file in files if file.suffix == ".tmp"]
+    places = ("recordings", "unfinished")
+    kept = {file.stem: file for file in files if file.parent.name in places}
+    assert {"step", "trapezoids"} <= set(kept)
+    assert all(len(read_table(file)["u"]) > 100 for file in kept.values())
+
+
+# --- the files ----------------------------------------------------------------------------------
+
+
+def taken(folder: Path, kind: str = "virtual") -> Recording:
+    """A recording that lies in a folder, of a commissioning on what `kind` says."""
+    recording = record(VirtualMachine(), np.full(300, 2.0), name="step")
+    prepare(folder)
+    files = Taken(folder, {"kind": kind, "name": "bench 2"}, {"u_max": 9.0})
+    files.begin()
+    files.keep("step response", "step", recording, None)
+    return recording
+
+
+def test_what_is_written_is_what_was_recorded(tmp_path: Path) -> None:
+    recording = taken(tmp_path)
+    found = read_recording(tmp_path / "unfinished/step.mcap")
+    for name in ("u", "counts", "y", "speed_true"):
+        np.testing.assert_array_equal(found.columns[name], recording.columns()[name])
+    assert found.header.device["name"] == "bench 2"
+    assert found.header.settings == {"commissioning": {"stage": "step response", "u_max": 9.0}}
+
+
+def test_recordings_of_a_drive_are_kept(tmp_path: Path) -> None:
+    taken(tmp_path, "drive")
+    with pytest.raises(SettingError, match="'bench 2'"):
+        require_own(tmp_path, overwrite=False)
+    # nor does what a virtual machine has left beside them make a difference
+    told = {"format": "sewfast.commissioning", "version": 1, "machine": "virtual"}
+    (tmp_path / "commissioning.json").write_text(json.dumps(told))
+    said = refused(tmp_path, "commission", "--on", "virtual", "--out", tmp_path)
+    assert "'bench 2'" in said
+    assert (tmp_path / "unfinished/step.mcap").exists()
+
+
+def test_files_of_others_are_neither_repeatable_nor_cleared(tmp_path: Path) -> None:
+    recording = taken(tmp_path)
+    mine = tmp_path / "unfinished/mine.mcap"
+    recording.save(mine)
+    with pytest.raises(SettingError, match="choose another folder"):
+        require_own(tmp_path, overwrite=False)
+    Taken(tmp_path, {}, {}).begin()
+    assert list((tmp_path / "unfinished").iterdir()) == [mine]
+
+
+def test_a_whole_commissioning_stays_beside_an_unfinished_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = record(VirtualMachine(), np.full(300, 2.0), name="step")
+    drive = Commissioning("bench 2", "refused", "step response", "", {}, {"step": recording})
+    drive.save(tmp_path)
+    before = {f: f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()}
+    taken(tmp_path, "drive")
+    assert before == {f: f.read_bytes() for f in before}
+    # saved by one that has not taken them, they stay; by the one that has, tables take their place
+    drive.save(tmp_path, overwrite=True)
+    assert (tmp_path / "unfinished/step.mcap").exists()
+    monkeypatch.chdir(tmp_path.parent)
+    own = replace(drive, taken_in=Path(tmp_path.name))
+    own.save(tmp_path, overwrite=True)
+    assert not (tmp_path / "unfinished").exists()
+
+
+def test_a_recording_that_cannot_be_written_does_not_end_a_commissioning(tmp_path: Path) -> None:
+    recording = taken(tmp_path)
+    files = Taken(tmp_path / "missing", {"kind": "virtual"}, {})
+    with pytest.warns(RuntimeWarning, match="goes on, its recordings are in memory alone"):
+        files.keep("limits", "pulses", recording, None)
+    # once: a second warning would be an error here
+    files.keep("limits", "again", recording, None)
+
+
+@pytest.mark.parametrize(
+    ("names", "message"), [(["a b", "a/b"], "would be one file"), (["r" * 300], "shorten it")]
+)
+def test_references_have_files_of_their_own(names: list[str], message: str) -> None:
+    references = {name: np.full(100, 500.0) for name in names}
+    with pytest.raises(SettingError, match=message):
+        commission(VirtualMachine(), references=references)
+
+
+def test_a_reference_does_not_replace_a_recording_of_its_name(tmp_path: Path) -> None:
+    recording = taken(tmp_path)
+    controller = Controller(Gains.standard(0.01, 0.1))
+    files = Taken(tmp_path, {"kind": "virtual"}, {})
+    files.keep("verification", "step", recording, controller)
+    names = {file.name for file in (tmp_path / "unfinished").iterdir()}
+    assert names == {"step.mcap", "verification_step.mcap"}

@@ -1,0 +1,177 @@
+"""Commissioning: every reason to stop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from commissioned import SMALL, short
+from sewfast import Controller, DataError, Gains, SettingError, VirtualMachine, commission
+from sewfast.commissioning import Bench, Followed, Refusal, gains, procedure, training
+from sewfast.commissioning.bench import MachineBench
+from sewfast.recording import Recording
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _short() -> Iterator[None]:
+    with short():
+        yield
+
+
+@dataclass
+class Bent(Bench):
+    """The virtual machine with a bend in what it does or shows."""
+
+    inner: MachineBench
+    sign: float = 1.0
+    most: float = np.inf
+    slips: bool = False
+    played: int = 0
+
+    name = "bent"
+    speed = np.inf
+
+    @property
+    def Ts(self) -> float:
+        return self.inner.Ts
+
+    @property
+    def counts_per_rev(self) -> float:
+        return self.inner.counts_per_rev
+
+    @property
+    def volt(self) -> float:
+        return self.inner.volt
+
+    def bend(self, recording: Recording) -> Recording:
+        counts = np.minimum(self.sign * recording.counts, self.most)
+        if self.slips:
+            counts = counts * (1.0 + 0.5 * np.sin(np.arange(len(counts)) / 700.0))
+        bent = replace(recording, counts=counts)
+        return replace(bent, y=bent.speed("savgol"))
+
+    def excite(self, u: np.ndarray, name: str) -> Recording:
+        self.played += 1
+        return self.bend(self.inner.excite(u, name))
+
+    def follow(self, controller: Controller, r: np.ndarray, name: str) -> Followed:
+        self.played += 1
+        found = self.inner.follow(controller, r, name)
+        return Followed(found.run, self.bend(found.recording))
+
+
+def bent(parameters: dict[str, float] | None = None, **bend: Any) -> Bent:
+    return Bent(MachineBench(VirtualMachine(parameters=parameters)), **bend)
+
+
+def refused(bench: Bench, match: str, **options: Any) -> Refusal:
+    with pytest.raises(Refusal, match=match) as caught:
+        commission(bench, **{**SMALL, **options})
+    assert caught.value.so_far is not None
+    assert caught.value.so_far.verdict == "refused"
+    assert caught.value.so_far.stage == caught.value.stage
+    return caught.value
+
+
+def test_a_dead_machine_is_refused_at_the_first_motion() -> None:
+    found = refused(bent({"coulomb_torque": 10.0}), "expected the machine to move.*free")
+    assert found.stage == "first motion"
+    assert found.so_far is not None
+    assert found.so_far.recordings
+
+
+def test_a_machine_that_turns_backwards_is_refused_before_a_loop_is_closed() -> None:
+    bench = bent(sign=-1.0)
+    assert refused(bench, "backwards; swap").stage == "first motion"
+    assert bench.played <= 8
+
+
+def test_an_end_stop_is_too_little_travel() -> None:
+    assert refused(bent(most=300.0), "too little travel").stage == "first motion"
+
+
+def test_a_machine_too_weak_for_its_top_speed_is_refused() -> None:
+    found = refused(bent(), "lower speed", u_max=3.0)
+    assert found.stage in ("first motion", "step response")
+
+
+def test_a_loop_that_leans_on_its_limit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def wild(*args: Any) -> Controller:
+        return replace(gains.first_gains(*args), gains=Gains.standard(50.0, 0.05))
+
+    monkeypatch.setattr(procedure, "first_gains", wild)
+    found = refused(bent(), "within its limits most of the time")
+    assert found.stage == "closed loop"
+
+
+def test_a_step_that_does_not_settle_is_refused() -> None:
+    assert refused(bent(slips=True), "expected a s").stage in ("first motion", "step response")
+
+
+def test_networks_that_do_not_predict_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = iter([(100.0, 40.0), (110.0, 35.0)])
+    monkeypatch.setattr(training, "validate_member", lambda *_: next(scores))
+    assert refused(bent(), "free-run fit of 85 %").stage == "training"
+
+
+def test_networks_that_differ_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = iter([(3.0, 99.0), (100.0, 60.0), (120.0, 50.0)])
+    monkeypatch.setattr(training, "validate_member", lambda *_: next(scores))
+    assert refused(bent(), "networks that agree", members=3).stage == "training"
+
+
+def test_a_machine_that_changed_is_not_verified() -> None:
+    class Changes(Bent):
+        def follow(self, controller: Controller, r: np.ndarray, name: str) -> Followed:
+            if name not in ("trapezoids", "levels"):
+                values = {"current_limit": 1.0}
+                self.inner = MachineBench(VirtualMachine(parameters=values))
+            return super().follow(controller, r, name)
+
+    found = refused(Changes(MachineBench(VirtualMachine())), "verif|limits most")
+    assert found.stage == "verification"
+    assert found.so_far is not None
+    assert found.so_far.controller is not None
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"u_max": 0.0}, "u_max above 0"),
+        ({"u_max": 40.0}, "within the machine's limit of 20 V"),
+        ({"speed": -1.0}, "top speed above 0"),
+        ({"members": 0}, "members of 1"),
+        ({"evaluations": 0}, "evaluations of 1"),
+        ({"load": -1.0}, "load from 0 V"),
+        ({"load": 20.0}, "load from 0 V to below u_max"),
+        ({"Ms": 0.9}, "above 1 for Ms"),
+        ({"time_budget": 0.0}, "time_budget above 0"),
+        ({"references": "trapezoid"}, "references by name"),
+        ({"references": ["nonsense"]}, "known ones"),
+        ({"references": ["trapezoid"], "speed": 500.0}, "raise speed"),
+    ],
+)
+def test_demands_that_contradict_are_refused_before_anything_moves(
+    options: dict[str, Any], match: str
+) -> None:
+    bench = bent()
+    with pytest.raises(SettingError, match=match):
+        commission(bench, **options)
+    assert bench.played == 0
+
+
+@pytest.mark.parametrize("samples", [[], [1.0, float("nan")]])
+def test_a_reference_that_cannot_be_run_is_refused(samples: list[float]) -> None:
+    bench = bent()
+    with pytest.raises(DataError, match="finite samples in the reference 'mine'"):
+        commission(bench, references={"mine": samples})
+    assert bench.played == 0
+
+
+def test_only_machines_are_commissioned() -> None:
+    with pytest.raises(SettingError, match="VirtualMachine, a Drive or a Bench"):
+        commission("virtual")  # type: ignore[arg-type]
