@@ -51,7 +51,7 @@ stubs: $(DEV)
 
 # one seed for every property: a build that passed passes again; without the variable each run tries others
 rust-test: $(DEV) ## unit, property and documentation tests of the crates
-	PROPTEST_RNG_SEED=1 cargo test --workspace --release --quiet
+	PROPTEST_RNG_SEED=1 cargo test --workspace --profile checked --quiet
 
 no-std: ## links the controller crate without the standard library, and its frames without a path that panics
 	cargo build --package sewfast-control --release --quiet

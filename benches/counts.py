@@ -32,7 +32,8 @@ FEW = 1e-3
 
 def build() -> Path:
     """The program with the kernels."""
-    command = ["cargo", "build", "--release", "--quiet", "--package", "sewfast-core"]
+    # with the features of the whole workspace, as the extension: the core is there already
+    command = ["cargo", "build", "--release", "--quiet", "--workspace"]
     subprocess.run([*command, "--example", "kernels"], cwd=ROOT, check=True)
     target = os.environ.get("CARGO_TARGET_DIR", str(ROOT / "target"))
     return Path(target) / "release" / "examples" / "kernels"
