@@ -132,6 +132,31 @@ impl Run {
         encoder: Option<&Encoder>,
         monitor: &Monitor,
     ) {
+        self.alone(plant, controller, signals, encoder, monitor, false);
+    }
+
+    /// [`record_with`](Self::record_with), to the bit what one of several controllers gives that run side by side; around a
+    /// network this takes longer, and differs in last digits.
+    pub(crate) fn record_as_lane(
+        &mut self,
+        plant: &mut (impl Plant + ?Sized),
+        controller: &mut Controller<f64>,
+        signals: Signals<'_>,
+        encoder: Option<&Encoder>,
+        monitor: &Monitor,
+    ) {
+        self.alone(plant, controller, signals, encoder, monitor, true);
+    }
+
+    fn alone(
+        &mut self,
+        plant: &mut (impl Plant + ?Sized),
+        controller: &mut Controller<f64>,
+        signals: Signals<'_>,
+        encoder: Option<&Encoder>,
+        monitor: &Monitor,
+        as_lane: bool,
+    ) {
         match plant.known() {
             Some(known) => simd::run(Alone {
                 run: self,
@@ -140,6 +165,7 @@ impl Run {
                 signals,
                 encoder,
                 monitor,
+                as_lane,
             }),
             None => self.fill(plant, controller, signals, encoder, monitor),
         }
@@ -221,6 +247,8 @@ struct Alone<'a> {
     signals: Signals<'a>,
     encoder: Option<&'a Encoder>,
     monitor: &'a Monitor,
+    /// Whether the bits are those of a lane.
+    as_lane: bool,
 }
 
 impl Kernel for Alone<'_> {
@@ -230,13 +258,16 @@ impl Kernel for Alone<'_> {
     fn run<V: Eight>(self) {
         let controller = self.controller;
         if !Lanes::take(controller) {
-            let plant = known::Alone::<V, Any>::new(self.known);
+            let plant = known::Alone::<V, Any, true>::new(self.known);
             self.around(plant, &mut controller.clone());
+        } else if Second::takes(&self.known) && self.as_lane {
+            let plant = known::Alone::<V, Second, true>::new(self.known);
+            self.around(plant, &mut Constant::new(controller));
         } else if Second::takes(&self.known) {
-            let plant = known::Alone::<V, Second>::new(self.known);
+            let plant = known::Alone::<V, Second, false>::new(self.known);
             self.around(plant, &mut Constant::new(controller));
         } else {
-            let plant = known::Alone::<V, Any>::new(self.known);
+            let plant = known::Alone::<V, Any, true>::new(self.known);
             self.around(plant, &mut Constant::new(controller));
         }
     }

@@ -77,9 +77,21 @@ pub(crate) trait Eight: Choice {
     /// `2^n` for numbers that hold the integer `n` in their low bits.
     fn power_of_two(self) -> Self;
 
-    /// `tanh` by the shortest chain, for results that wait for each other; many at once take less by [`tanh::tanh`].
+    /// `tanh` by the shortest chain, for results that wait for each other.
     #[inline(always)]
     fn tanh_in_chain(self) -> Self {
+        tanh::tanh(self)
+    }
+
+    /// `tanh` by the fewest operations, for results that do not wait for each other.
+    #[inline(always)]
+    fn tanh_of_four([a, b, c, d]: [Self; 4]) -> [Self; 4] {
+        [tanh::tanh(a), tanh::tanh(b), tanh::tanh(c), tanh::tanh(d)]
+    }
+
+    /// To the bit what [`tanh_of_four`](Self::tanh_of_four) gives where neighbours are its first two or its last two.
+    #[inline(always)]
+    fn tanh_as_of_four(self) -> Self {
         tanh::tanh(self)
     }
 

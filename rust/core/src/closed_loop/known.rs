@@ -25,15 +25,16 @@ impl Known<'_> {
     }
 }
 
-/// One plant inside a kernel, where the whole loop is compiled for one processor; `R` holds its regressor.
-pub(super) struct Alone<'a, V, R> {
+/// One plant inside a kernel, where the whole loop is compiled for one processor; `R` holds its regressor. `BITS` asks for
+/// those of a lane, else a network's output is there sooner.
+pub(super) struct Alone<'a, V, R, const BITS: bool> {
     known: Known<'a>,
     regressor: R,
     position: f64,
     level: PhantomData<V>,
 }
 
-impl<'a, V: Eight, R: Regressor> Alone<'a, V, R> {
+impl<'a, V: Eight, R: Regressor, const BITS: bool> Alone<'a, V, R, BITS> {
     #[inline(always)]
     pub fn new(known: Known<'a>) -> Self {
         Self {
@@ -45,7 +46,7 @@ impl<'a, V: Eight, R: Regressor> Alone<'a, V, R> {
     }
 }
 
-impl<V: Eight, R: Regressor> Plant for Alone<'_, V, R> {
+impl<V: Eight, R: Regressor, const BITS: bool> Plant for Alone<'_, V, R, BITS> {
     #[inline(always)]
     fn reset(&mut self) {
         self.regressor = R::at_rest(&self.known);
@@ -66,7 +67,7 @@ impl<V: Eight, R: Regressor> Plant for Alone<'_, V, R> {
     fn advance(&mut self, u: f64) {
         let before = self.regressor.newest();
         self.regressor.take(u);
-        let y = self.regressor.output::<V>(self.known.form);
+        let y = self.regressor.output::<V, BITS>(self.known.form);
         self.position += self.known.ts * (before + y) / 2.0;
         self.regressor.put(y);
     }
@@ -80,7 +81,7 @@ pub(super) trait Regressor {
     /// Takes a command in.
     fn take(&mut self, u: f64);
     /// The next output.
-    fn output<V: Eight>(&self, form: &Form) -> f64;
+    fn output<V: Eight, const BITS: bool>(&self, form: &Form) -> f64;
     /// Takes that output in.
     fn put(&mut self, y: f64);
 }
@@ -125,10 +126,10 @@ impl Regressor for Any {
     }
 
     #[inline(always)]
-    fn output<V: Eight>(&self, form: &Form) -> f64 {
+    fn output<V: Eight, const BITS: bool>(&self, form: &Form) -> f64 {
         match form {
             Form::Linear(model) => model.next(&self.phi),
-            Form::Network(network) => network.next::<V, 0>(&self.phi),
+            Form::Network(network) => network.next::<V, 0, BITS>(&self.phi, self.past),
         }
     }
 
@@ -165,10 +166,10 @@ impl Regressor for Second {
     }
 
     #[inline(always)]
-    fn output<V: Eight>(&self, form: &Form) -> f64 {
+    fn output<V: Eight, const BITS: bool>(&self, form: &Form) -> f64 {
         match form {
             Form::Linear(model) => model.next(&self.0),
-            Form::Network(network) => network.next::<V, 4>(&self.0),
+            Form::Network(network) => network.next::<V, 4, BITS>(&self.0, 2),
         }
     }
 
@@ -226,13 +227,18 @@ impl<'a> Beside<'a> {
     /// meanwhile.
     #[inline(always)]
     pub fn advance<V: Eight, const N: usize>(&mut self, u: V, meanwhile: &mut impl Meanwhile) {
-        let na = self.known.lags.na;
         let due = self.delayed(u);
-        push_eight(&mut self.phi[na..], due);
-        let newest = V::load(&self.phi[0].0);
+        let (na, n) = if N == 4 {
+            (2, 4)
+        } else {
+            (self.known.lags.na, self.phi.len())
+        };
+        let phi = &mut self.phi[..n];
+        push_eight(&mut phi[na..], due);
+        let newest = V::load(&phi[0].0);
         let y = match self.known.form {
-            Form::Linear(model) => model.beside::<V>(&self.phi),
-            Form::Network(network) => network.beside::<V, N>(&self.phi, meanwhile),
+            Form::Linear(model) => model.beside::<V>(phi),
+            Form::Network(network) => network.beside::<V, N>(phi, meanwhile),
         };
         let moved = V::splat(self.known.ts).mul(newest.add(y));
         // a product with 1/2 is as exact as the quotient
@@ -240,7 +246,7 @@ impl<'a> Beside<'a> {
         V::load(&self.position.0)
             .add(moved)
             .store(&mut self.position.0);
-        push_eight(&mut self.phi[..na], y);
+        push_eight(&mut phi[..na], y);
     }
 
     #[inline(always)]

@@ -1,6 +1,7 @@
 //! Loops of many controllers around one plant, side by side in the processor's registers.
 //!
-//! A lane does the operations of a loop that runs alone, in the same order: on one level both give the same bits.
+//! A lane does the operations of a loop that runs alone, in the same order: on one level it gives the bits of
+//! [`Run::record_as_lane`](super::Run::record_as_lane). A loop that runs alone for its own sake may take a shorter way.
 
 mod average;
 mod controllers;
@@ -50,7 +51,7 @@ impl Lanes<'_> {
     ///
     /// Notes of a lane after its end mean nothing.
     pub fn run(self, notes: &mut [impl Notes]) -> [Outcome; MOST] {
-        if self.known.lags.regressors() == 4 {
+        if (self.known.lags.na, self.known.lags.regressors()) == (2, 4) {
             simd::run(Grouped::<_, 4>(self, notes))
         } else {
             simd::run(Grouped::<_, 0>(self, notes))

@@ -2,6 +2,8 @@
 
 #[cfg(target_arch = "x86_64")]
 pub(super) mod pieces;
+#[cfg(target_arch = "x86_64")]
+pub(super) mod sums;
 
 use crate::simd::Eight;
 
@@ -231,11 +233,64 @@ mod tests {
         }
     }
 
-    /// Either way on every level.
+    /// Each number as the first, and as the last, of four of which the others differ.
+    struct OfFour([f64; LANES], bool);
+
+    impl Kernel for OfFour {
+        type Output = [f64; LANES];
+
+        #[inline(always)]
+        fn run<V: Eight>(self) -> Self::Output {
+            let mut values = self.0;
+            let own = V::load(&values);
+            let other = own.mul(V::splat(0.3));
+            let x = [own, other, other, own];
+            let found = V::tanh_of_four(x);
+            found[if self.1 { 3 } else { 0 }].store(&mut values);
+            values
+        }
+    }
+
+    struct Neighbours([f64; LANES]);
+
+    impl Kernel for Neighbours {
+        type Output = ([f64; LANES], [f64; LANES]);
+
+        #[inline(always)]
+        fn run<V: Eight>(self) -> Self::Output {
+            let (mut alone, mut four) = (self.0, self.0);
+            V::load(&self.0).tanh_as_of_four().store(&mut alone);
+            for half in [0, 4] {
+                let mut place = [0.0; LANES];
+                let one = |i: usize| V::splat(self.0[half + i]);
+                let found = V::tanh_of_four([one(0), one(1), one(2), one(3)]);
+                for i in 0..4 {
+                    found[i].store(&mut place);
+                    four[half + i] = place[i];
+                }
+            }
+            (alone, four)
+        }
+    }
+
+    /// Every way on every level.
     fn everywhere(x: [f64; LANES]) -> Vec<(Level, [f64; LANES])> {
         let mut all = run_everywhere(|| Tanh(x));
         all.extend(run_everywhere(|| Chained(x)));
+        all.extend(run_everywhere(|| OfFour(x, false)));
+        all.extend(run_everywhere(|| OfFour(x, true)));
         all
+    }
+
+    fn neighbours_are_as_of_four(x: [f64; LANES]) {
+        for (level, (alone, four)) in run_everywhere(|| Neighbours(x)) {
+            let bits = |values: [f64; LANES]| values.map(f64::to_bits);
+            let nan = x.iter().any(|x| x.is_nan());
+            assert!(
+                nan || bits(alone) == bits(four),
+                "{level:?} {x:?} {alone:?} {four:?}"
+            );
+        }
     }
 
     impl Kernel for Tanh {
@@ -319,11 +374,13 @@ mod tests {
         #[test]
         fn agrees_with_the_library_where_networks_work(x in prop::array::uniform8(-4.0f64..4.0)) {
             agrees_with_the_library(x);
+            neighbours_are_as_of_four(x);
         }
 
         #[test]
         fn is_bounded_and_odd_at_any_size(bits in prop::array::uniform8(any::<u64>())) {
             let x = bits.map(f64::from_bits);
+            neighbours_are_as_of_four(x);
             for ((_, values), (_, mirrored)) in
                 everywhere(x).into_iter().zip(everywhere(x.map(|x| -x)))
             {

@@ -49,6 +49,13 @@ impl Wide {
         unsafe { Self(_mm512_reduce_pd::<BEYOND_QUARTERS>(self.0)) }
     }
 
+    /// Each pair of numbers the other way round.
+    #[inline(always)]
+    pub(super) fn neighbours(self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_permute_pd::<0b0101_0101>(self.0)) }
+    }
+
     /// The upper four numbers before the lower four.
     #[inline(always)]
     fn halves_swapped(self) -> Self {
@@ -220,6 +227,16 @@ impl Eight for Wide {
         tanh::pieces::tanh(self)
     }
 
+    #[inline(always)]
+    fn tanh_of_four(x: [Self; 4]) -> [Self; 4] {
+        tanh::sums::of_four(x)
+    }
+
+    #[inline(always)]
+    fn tanh_as_of_four(self) -> Self {
+        tanh::sums::of_neighbours(self)
+    }
+
     /// The sum is not waited for: halves are added, then neighbours, and the two sums that are left go into the arguments
     /// one by one.
     #[inline(always)]
@@ -228,8 +245,7 @@ impl Eight for Wide {
             .add(direct.halves_swapped())
             .add_product(second, self)
             .add_product(second.halves_swapped(), self.halves_swapped());
-        // SAFETY: as `splat`.
-        let two = four.add(unsafe { Self(_mm512_permute_pd::<0b0101_0101>(four.0)) });
+        let two = four.add(four.neighbours());
         // SAFETY: as `splat`.
         let others = unsafe { Self(_mm512_permutex_pd::<0b0100_1110>(two.0)) };
         let arguments = rest.add_product(weights, two).add_product(weights, others);

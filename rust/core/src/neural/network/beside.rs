@@ -3,11 +3,10 @@
 //! Loops count by hand: the calls of an iterator that the compiler leaves would empty the wide registers.
 
 use super::Network;
-use crate::simd::tanh::tanh;
 use crate::simd::{Eight, Group, LANES};
 
 impl Network {
-    /// The outputs for eight regressors, lane by lane; each to the bit what [`step`](Self::step) gives for it.
+    /// The outputs for eight regressors, lane by lane; each to the bit what [`next`](Self::next) gives for it with `BITS`.
     ///
     /// `N` is the number of regressors, 0 for any. Some of other work is done after each hidden unit.
     #[inline(always)]
@@ -21,14 +20,13 @@ impl Network {
         let mut sums = [V::splat(0.0); LANES];
         sums[0] = self.direct::<V>(phi);
         for group in 0..self.second.len() {
-            let weights = &self.first[group * n..][..n];
-            let (bias, second) = (&self.bias[group].0, &self.second[group].0);
-            let units = (self.shape.hidden - group * LANES).min(LANES);
-            for unit in 0..units {
-                let h = tanh(argument::<V>(bias[unit], weights, unit, phi));
-                sums[unit] = sums[unit].add_product(V::splat(second[unit]), h);
-                meanwhile.go();
+            // places of the sums that the compiler knows, so that they stay in registers; units that are missing add nothing
+            self.four::<V, 0>(group, &phi[..n], &mut sums);
+            meanwhile.go();
+            if self.shape.hidden - group * LANES > 4 {
+                self.four::<V, 4>(group, &phi[..n], &mut sums);
             }
+            meanwhile.go();
         }
         let output = in_halves(sums);
         if self.saturates {
@@ -38,23 +36,58 @@ impl Network {
         }
     }
 
-    /// The output for the regressor `phi` alone, to the bit that of [`step`](Self::step).
+    /// The output for the regressor `phi` alone.
     ///
-    /// `N` is the number of regressors, 0 for any.
+    /// `N` is the number of regressors, 0 for any. `BITS` asks for the bits of [`beside`](Self::beside), else the result is
+    /// there sooner after the newest command.
     #[inline(always)]
-    pub(crate) fn next<V: Eight, const N: usize>(&self, phi: &[f64]) -> f64 {
+    pub(crate) fn next<V: Eight, const N: usize, const BITS: bool>(
+        &self,
+        phi: &[f64],
+        past: usize,
+    ) -> f64 {
         let n = if N == 0 { phi.len() } else { N };
+        let last = if BITS { 0 } else { past };
         let (phi, groups) = (&phi[..n], self.second.len());
         let mut sum = V::load(&self.bias[groups].0);
         if self.shape.bypass {
-            sum = together::<V>(sum, &self.first[groups * n..][..n], phi);
+            sum = together::<V>(sum, &self.first[groups * n..][..n], phi, last);
         }
         for group in 0..groups {
             let z = V::load(&self.bias[group].0);
-            let z = together::<V>(z, &self.first[group * n..][..n], phi);
-            sum = sum.add_product(V::load(&self.second[group].0), tanh(z));
+            let z = together::<V>(z, &self.first[group * n..][..n], phi, last);
+            let h = if BITS {
+                z.tanh_as_of_four()
+            } else {
+                z.tanh_in_chain()
+            };
+            sum = sum.add_product(V::load(&self.second[group].0), h);
         }
         self.limited(sum.sum())
+    }
+
+    /// Adds what the hidden units from `FIRST` on give, four of one group.
+    #[inline(always)]
+    fn four<V: Eight, const FIRST: usize>(
+        &self,
+        group: usize,
+        phi: &[Group],
+        sums: &mut [V; LANES],
+    ) {
+        let weights = &self.first[group * phi.len()..][..phi.len()];
+        let (bias, second) = (&self.bias[group].0, &self.second[group].0);
+        let argument = |unit: usize| argument::<V>(bias[unit], weights, unit, phi);
+        let z = [
+            argument(FIRST),
+            argument(FIRST + 1),
+            argument(FIRST + 2),
+            argument(FIRST + 3),
+        ];
+        let h = V::tanh_of_four(z);
+        for i in 0..4 {
+            let place = &mut sums[FIRST + i];
+            *place = place.add_product(V::splat(second[FIRST + i]), h[i]);
+        }
     }
 
     /// What reaches the output past the hidden units.
@@ -96,15 +129,17 @@ fn argument<V: Eight>(bias: f64, weights: &[Group], unit: usize, phi: &[Group]) 
     z
 }
 
-/// The arguments of eight hidden units for one regressor, the newest output last.
+/// The arguments of eight hidden units for one regressor, the entry at `last` as the last.
 #[inline(always)]
-fn together<V: Eight>(bias: V, weights: &[Group], phi: &[f64]) -> V {
+fn together<V: Eight>(bias: V, weights: &[Group], phi: &[f64], last: usize) -> V {
     let (mut z, mut c) = (bias, phi.len());
     while c > 0 {
         c -= 1;
-        z = z.add_product(V::load(&weights[c].0), V::splat(phi[c]));
+        if c != last {
+            z = z.add_product(V::load(&weights[c].0), V::splat(phi[c]));
+        }
     }
-    z
+    z.add_product(V::load(&weights[last].0), V::splat(phi[last]))
 }
 
 /// The sums of [`Eight::sum`], in its order.

@@ -7,9 +7,9 @@ use crate::simd::{Arithmetic, Choice};
 use super::tanh as quotients;
 
 /// Adding this rounds to quarters, whose number is then found in the low bits.
-const QUARTERS: f64 = 1_688_849_860_263_936.0;
+pub(super) const QUARTERS: f64 = 1_688_849_860_263_936.0;
 /// Below this size [`near`] holds.
-const NEAR: f64 = 3.875;
+pub(super) const NEAR: f64 = 3.875;
 
 /// `tanh(x)` at any size.
 #[inline(always)]
