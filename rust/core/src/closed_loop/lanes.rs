@@ -117,28 +117,14 @@ fn turn<V: Eight, S: Notes, const N: usize>(
     } else {
         now.g - half
     };
-    let stage = 0;
     if let Ok([loops, due]) = groups.get_disjoint_mut([now.g, due]) {
-        let mut decision = Decision {
-            loops,
-            notes,
-            ends,
-            now,
-            stage,
-        };
+        let mut decision = Decision::new(loops, notes, ends, now);
         if begun {
             due.plants.advance::<V, N>(due.applied, &mut decision);
         }
         decision.finish();
     } else if let [loops] = groups {
-        let mut decision = Decision {
-            loops,
-            notes,
-            ends,
-            now,
-            stage,
-        };
-        decision.finish();
+        Decision::new(loops, notes, ends, now).finish();
         loops.plants.advance::<V, N>(loops.applied, &mut Nothing);
     }
 }
@@ -243,7 +229,23 @@ struct Decision<'a, 'b, V, S> {
     stage: usize,
 }
 
-impl<V: Eight, S: Notes> Decision<'_, '_, V, S> {
+impl<'a, 'b, V: Eight, S: Notes> Decision<'a, 'b, V, S> {
+    #[inline(always)]
+    fn new(
+        loops: &'a mut Loops<'b, V>,
+        notes: &'a mut S,
+        ends: &'a mut Ends,
+        now: Now<'a>,
+    ) -> Self {
+        Self {
+            loops,
+            notes,
+            ends,
+            now,
+            stage: 0,
+        }
+    }
+
     /// What is left to do.
     #[inline(always)]
     fn finish(&mut self) {

@@ -4,7 +4,7 @@ use proptest::prelude::*;
 use sewfast_control::{Design, Settings, Standard};
 
 use super::*;
-use crate::closed_loop::alone::Constant;
+use crate::closed_loop::alone::{Constant, Decides};
 use crate::closed_loop::known;
 use crate::closed_loop::{LaggedPlant, Plant, Run, Varied, encoder};
 use crate::lagged::Lags;
@@ -111,52 +111,33 @@ impl Kernel for Both<'_> {
             (outcomes[i], records[i / LANES].0.each_ref().map(of))
         });
         let alone = self.controllers.iter().map(|controller| {
-            let mut run = Run::default();
-            let mut plant = known::Alone::<V, known::Any, true>::new(self.known);
             let mut constant = Constant::new(controller);
-            let mut again = Run::default();
-            again.fill(
-                &mut plant,
-                &mut constant,
-                self.signals,
-                self.encoder,
-                &monitor,
-            );
-            let mut controller = Controller::clone(controller);
-            run.fill(
-                &mut plant,
-                &mut controller,
-                self.signals,
-                self.encoder,
-                &monitor,
-            );
-            assert_eq!(run, again);
+            let any = || known::Alone::<V, known::Any, true>::new(self.known);
+            let run = self.alone(any(), &mut Controller::clone(controller));
+            assert_eq!(run, self.alone(any(), &mut constant));
             if known::Second::takes(&self.known) {
-                let mut plant = known::Alone::<V, known::Second, true>::new(self.known);
-                again.fill(
-                    &mut plant,
-                    &mut constant,
-                    self.signals,
-                    self.encoder,
-                    &monitor,
-                );
-                assert_eq!(run, again);
-                let mut plant = known::Alone::<V, known::Second, false>::new(self.known);
-                again.fill(
-                    &mut plant,
-                    &mut constant,
-                    self.signals,
-                    self.encoder,
-                    &monitor,
-                );
+                let plant = known::Alone::<V, known::Second, true>::new(self.known);
+                assert_eq!(run, self.alone(plant, &mut constant));
+                let plant = known::Alone::<V, known::Second, false>::new(self.known);
+                let sooner = self.alone(plant, &mut constant);
                 if self.encoder.is_none() {
-                    alike(&run, &again);
+                    alike(&run, &sooner);
                 }
             }
             (run.outcome, [run.u, run.y, run.feedback])
         });
         let sums = (0..self.controllers.len()).map(|i| tallies[i / LANES].sums(i % LANES));
         (together.collect(), alone.collect(), sums.collect())
+    }
+}
+
+impl Both<'_> {
+    /// The run of one loop.
+    #[inline(always)]
+    fn alone(&self, mut plant: impl Plant, controller: &mut impl Decides) -> Run {
+        let (mut run, monitor) = (Run::default(), Monitor::default());
+        run.fill(&mut plant, controller, self.signals, self.encoder, &monitor);
+        run
     }
 }
 
