@@ -37,7 +37,13 @@ pub(in crate::simd) fn of_four(x: [Wide; 4]) -> [Wide; 4] {
     let [a, b, c, d] = x;
     let parts = [Parts::of(a), Parts::of(b), Parts::of(c), Parts::of(d)];
     let [p, q, r, s] = parts;
-    let near = [p.beside(q), q.beside(p), r.beside(s), s.beside(r)];
+    let (first, last) = (p.share(q), r.share(s));
+    let near = [
+        p.beside(q, first),
+        q.beside(p, first),
+        r.beside(s, last),
+        s.beside(r, last),
+    ];
     if p.are_near() & q.are_near() & r.are_near() & s.are_near() == Wide::ALL {
         return near;
     }
@@ -54,7 +60,7 @@ pub(in crate::simd) fn of_four(x: [Wide; 4]) -> [Wide; 4] {
 pub(in crate::simd) fn of_neighbours(x: Wide) -> Wide {
     let own = Parts::of(x);
     let other = own.of_neighbours();
-    let near = own.beside(other);
+    let near = own.beside(other, own.share(other));
     if own.are_near() == Wide::ALL {
         return near;
     }
@@ -109,10 +115,15 @@ impl Parts {
         self.size.are_less(Wide::splat(NEAR))
     }
 
+    /// The division that two have in common.
+    #[inline(always)]
+    fn share(self, other: Self) -> Wide {
+        Wide::splat(1.0).div(self.below.mul(other.below))
+    }
+
     /// `tanh(x)` where both are near.
     #[inline(always)]
-    fn beside(self, other: Self) -> Wide {
-        let share = Wide::splat(1.0).div(self.below.mul(other.below));
+    fn beside(self, other: Self, share: Wide) -> Wide {
         self.sum.mul(other.below.mul(share)).with_sign_of(self.x)
     }
 
