@@ -220,6 +220,15 @@ def test_an_interruption_keeps_what_there_is(stage: str, tmp_path: Path) -> None
     assert load_controller(tmp_path / "out" / "controllers" / "tuned.json") == best.controller
 
 
+def test_an_interruption_of_the_first_stage_is_none_of_the_program() -> None:
+    def interrupt(*told: Any) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted) as caught:
+        commission(VirtualMachine(), **SMALL, progress=interrupt)
+    assert caught.value.best.stage == STAGES[0]
+
+
 def test_ctrl_c_does_not_wait_for_what_cannot_be_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a member is told of itself after its training takes seconds and looks at no request."""
     begun, over = threading.Event(), threading.Event()

@@ -175,3 +175,9 @@ def test_a_reference_that_cannot_be_run_is_refused(samples: list[float]) -> None
 def test_only_machines_are_commissioned() -> None:
     with pytest.raises(SettingError, match="VirtualMachine, a Drive or a Bench"):
         commission("virtual")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("folder", [5, b"folder", "a\0b", ""])
+def test_what_names_no_folder_is_refused(folder: Any) -> None:
+    with pytest.raises(SettingError, match="expected a folder's name"):
+        commission(VirtualMachine(), **SMALL, folder=folder)

@@ -94,7 +94,9 @@ def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
     _analysis(found, folder)
     jsonfile.write(folder / NUMBERS, FORMAT, VERSION, {"sewfast": __version__, **numbers(found)})
     if found.taken_in is not None and found.taken_in.resolve() == folder.resolve():
-        clear(folder)
+        with suppress(OSError):
+            # they hold nothing that the tables have not; the page is worth more than their absence
+            clear(folder)
     return _page(folder)
 
 

@@ -57,8 +57,9 @@ class Journal:
 
     def enter(self, stage: str) -> None:
         """Begin a stage."""
-        self._tell(STAGES.index(stage), stage)
+        # begun before it is told: whoever is told may stop
         self._began.append((stage, time.perf_counter()))
+        self._tell(STAGES.index(stage), stage)
 
     def within(self, done: int, total: int) -> None:
         """Tell how far the stage is."""

@@ -154,7 +154,7 @@ def commission(
             time_budget=time_budget,
         )
         journal = Journal(bench.name, progress)
-        taken = None if folder is None else _place(Path(folder), bench, asked, overwrite=overwrite)
+        taken = None if folder is None else _place(folder, bench, asked, overwrite=overwrite)
         if taken is not None:
             journal.keep(taken_in=taken.folder)
 
@@ -176,8 +176,14 @@ def commission(
             raise Interrupted(journal.result("interrupted", "Ctrl-C")) from stop
 
 
-def _place(folder: Path, bench: Bench, asked: Demands, *, overwrite: bool) -> Taken:
+def _place(name: str | os.PathLike[str], bench: Bench, asked: Demands, *, overwrite: bool) -> Taken:
     """Where the recordings go as they come, made before anything moves."""
+    if not isinstance(name, (str, os.PathLike)) or not str(name) or "\0" in str(name):
+        raise SettingError(
+            f"expected a folder's name, got {name!r}; as in folder='commissioned', or '.' for the "
+            "present one"
+        )
+    folder = Path(name)
     require_own(folder, overwrite=overwrite)
     device, conditions = told_of(bench)
     own = {"u_max": asked.u_max, "speed": asked.speed, "seed": asked.seed}

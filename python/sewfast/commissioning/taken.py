@@ -49,7 +49,13 @@ class Taken:
         ------
         DataError
         """
-        clear(self.folder)
+        try:
+            clear(self.folder)
+        except OSError as error:
+            raise DataError(
+                f"{self.folder / FOLDER}: recordings of an earlier commissioning cannot be taken "
+                f"away ({error.strerror}); choose another folder"
+            ) from error
         prepare(self.folder / FOLDER)
 
     def keep(

@@ -208,9 +208,13 @@ impl Lagged for NeuralOE {
 
     fn simulate(&self, u: &[f64], channels: usize, y_past: &[f64]) -> Result<Vec<f64>> {
         let samples = self.lags().check(u, channels, y_past)?;
-        // in the data's units nothing is scaled but the weights: no copy of the inputs, no second pass over the outputs
-        let network = self.in_data_units();
-        finite(free_run::outputs(&network, u, 0, y_past, samples))
+        if self.scaling.is_moderate() {
+            // in the data's units nothing is scaled but the weights: no copy of the inputs, no second pass over the outputs
+            let network = self.in_data_units();
+            return finite(free_run::outputs(&network, u, 0, y_past, samples));
+        }
+        let (u, state) = (self.scaling.inputs(u), self.scaled_state(y_past));
+        finite(self.restored(free_run::outputs(&self.network, &u, 0, &state, samples)))
     }
 }
 
@@ -220,6 +224,42 @@ mod tests {
     use crate::random::Random;
     use crate::{Monitor, Record};
     use proptest::prelude::*;
+
+    #[test]
+    fn a_mean_far_beyond_its_scale_costs_no_digits() {
+        let near = random_model(3, 8, true, false);
+        let random = &mut Random::new(5);
+        let v: Vec<f64> = (0..400).map(|_| random.between(-1.0, 1.0)).collect();
+        let of = |scaling: Scaling| {
+            let limits = (f64::NEG_INFINITY, f64::INFINITY);
+            let far = NeuralOE::new(near.shape(), near.theta().to_vec(), scaling.clone(), limits);
+            let far = far.unwrap();
+            let u: Vec<f64> = v
+                .chunks_exact(2)
+                .flat_map(|v| [0, 1].map(|j| v[j] * scaling.u_scale[j] + scaling.u_mean[j]))
+                .collect();
+            let y = far.simulate(&u, 2, &[scaling.y_mean; 2]).unwrap();
+            let scaled = y.iter().map(|y| (y - scaling.y_mean) / scaling.y_scale);
+            scaled.collect::<Vec<_>>()
+        };
+        let power = |n: i32| 2f64.powi(n);
+        let scaling = |mean: f64, u_scale: f64, y_scale: f64| Scaling {
+            u_mean: vec![mean * u_scale; 2],
+            u_scale: vec![u_scale; 2],
+            y_mean: mean * y_scale,
+            y_scale,
+        };
+        let expected = of(scaling(0.0, 1.0, 1.0));
+        // what remains is the rounding of u and y themselves
+        for (found, most) in [
+            (of(scaling(power(20), 1.0, 1.0)), 1e-8),
+            (of(scaling(0.0, power(-700), power(700))), 1e-13),
+        ] {
+            for (a, b) in found.iter().zip(&expected) {
+                assert!((a - b).abs() <= most, "{a} {b}");
+            }
+        }
+    }
 
     fn random_model(seed: u64, hidden: usize, bypass: bool, clipped: bool) -> NeuralOE {
         let mut random = Random::new(seed);

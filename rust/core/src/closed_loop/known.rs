@@ -26,7 +26,7 @@ impl Known<'_> {
 }
 
 /// One plant inside a kernel, where the whole loop is compiled for one processor; `R` holds its regressor. `BITS` asks for
-/// those of a lane, else a network's output is there sooner.
+/// those of a lane, else a network's output is there sooner (where its [`Second`] is taken).
 pub(super) struct Alone<'a, V, R, const BITS: bool> {
     known: Known<'a>,
     regressor: R,

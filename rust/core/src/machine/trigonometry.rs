@@ -1,6 +1,6 @@
 //! Sine and cosine of an angle together, the same bits on every platform.
 
-/// 2/pi, and pi/2 in three parts whose products with small whole numbers are exact (Cody and Waite 1980).
+/// 2/pi, and pi/2 in two parts whose products with small whole numbers are exact (Cody and Waite 1980).
 const PER_QUADRANT: f64 = std::f64::consts::FRAC_2_PI;
 const QUADRANT: [f64; 2] = [1.570_796_326_734_125_6, 6.077_100_506_506_192e-11];
 

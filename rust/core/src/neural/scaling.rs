@@ -68,6 +68,14 @@ impl Scaling {
         Ok(())
     }
 
+    /// Whether weights may take the scaling in: a mean far beyond its scale would cost digits, a scale beyond all use its sense.
+    pub(super) fn is_moderate(&self) -> bool {
+        let inputs = self.u_mean.iter().zip(&self.u_scale);
+        inputs
+            .chain([(&self.y_mean, &self.y_scale)])
+            .all(|(mean, scale)| (1e-100..1e100).contains(scale) && mean.abs() <= 1e3 * scale)
+    }
+
     /// All inputs, scaled.
     pub fn inputs(&self, u: &[f64]) -> Vec<f64> {
         let mut scaled = u.to_vec();

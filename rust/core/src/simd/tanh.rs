@@ -1,4 +1,4 @@
-//! The hyperbolic tangent, eight at a time, by the shortest chain of dependent operations.
+//! The hyperbolic tangent, eight at a time: as a quotient, by the shortest chain of operations that every processor has.
 
 #[cfg(target_arch = "x86_64")]
 pub(super) mod pieces;

@@ -39,7 +39,7 @@ impl Network {
     /// The output for the regressor `phi` alone.
     ///
     /// `N` is the number of regressors, 0 for any. `BITS` asks for the bits of [`beside`](Self::beside), else the result is
-    /// there sooner after the newest command.
+    /// there sooner after the newest command, which is at the place `past` of `phi`.
     #[inline(always)]
     pub(crate) fn next<V: Eight, const N: usize, const BITS: bool>(
         &self,

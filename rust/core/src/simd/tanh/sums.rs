@@ -70,7 +70,7 @@ pub(in crate::simd) fn of_neighbours(x: Wide) -> Wide {
 /// `tanh(x)` below [`NEAR`] before the division: `(A + B)/(1 + A B)` of the tangents `A` of the nearest quarter and `B` of
 /// what is beyond it.
 ///
-/// With one division for two these are 23 operations where the quotients take 33, but a longer chain.
+/// With one division for two these are 20 operations where the quotients take 33, but a longer chain.
 #[derive(Clone, Copy)]
 struct Parts {
     x: Wide,
