@@ -64,6 +64,37 @@ def extremes(values: list[mp.mpf], unknowns: int) -> list[int]:
     return best
 
 
+def polynomial(
+    grid: list[mp.mpf], wanted: list[mp.mpf], given: list[mp.mpf], degree: int
+) -> tuple[list[mp.mpf], mp.mpf]:
+    """Coefficients with the least relative error on a grid, and that error; the first are given."""
+    free, high = degree + 1 - len(given), grid[-1]
+    chosen = [round((len(grid) - 1) * i / free) for i in range(free + 1)]
+    best: tuple[list[mp.mpf], mp.mpf] = ([], mp.inf)
+    for _ in range(8):
+        left, right = mp.matrix(free + 1, free + 1), mp.matrix(free + 1, 1)
+        for row, i in enumerate(chosen):
+            share = grid[i] / high
+            for j in range(free):
+                left[row, j] = share ** (j + len(given))
+            left[row, free] = (-1) ** row * wanted[i]
+            right[row] = wanted[i] - mp.polyval(given[::-1], grid[i])
+        found = mp.lu_solve(left, right)
+        scaled = [found[j] / high ** (j + len(given)) for j in range(free)]
+        coefficients = given + scaled
+        errors = [
+            mp.polyval(coefficients[::-1], t) / value - 1
+            for t, value in zip(grid, wanted, strict=True)
+        ]
+        largest = max(abs(e) for e in errors)
+        if largest < best[1]:
+            best = (coefficients, largest)
+        chosen = extremes(errors, free + 1)
+        if len(chosen) < free + 1:
+            break
+    return best
+
+
 def quotient(degree: int, end: mp.mpf) -> tuple[mp.mpf, list[mp.mpf], list[mp.mpf]]:
     """The largest relative error, P and Q of s/end up to end."""
     unknowns = 2 * degree + 2

@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 
 import mpmath as mp
-from tanh import extremes
+from tanh import polynomial
 
 mp.mp.dps = 50
 DEGREE = 11
@@ -25,34 +25,9 @@ def piece(centre: mp.mpf) -> tuple[list[mp.mpf], mp.mpf]:
     """
     given = [mp.mpf(0), mp.mpf(1)] if centre == 0 else []
     low, high = (mp.mpf(0) if given else -STEP / 2), STEP / 2
-    free = DEGREE + 1 - len(given)
     grid = [(low + high - (high - low) * mp.cos(mp.pi * i / GRID)) / 2 for i in range(GRID + 1)]
     grid = grid[1:] if given else grid
-    wanted = [mp.tanh(centre + t) for t in grid]
-    chosen = [round((len(grid) - 1) * i / free) for i in range(free + 1)]
-    best: tuple[list[mp.mpf], mp.mpf] = ([], mp.inf)
-    for _ in range(8):
-        left, right = mp.matrix(free + 1, free + 1), mp.matrix(free + 1, 1)
-        for row, i in enumerate(chosen):
-            share = grid[i] / high
-            for j in range(free):
-                left[row, j] = share ** (j + len(given))
-            left[row, free] = (-1) ** row * wanted[i]
-            right[row] = wanted[i] - mp.polyval(given[::-1], grid[i])
-        found = mp.lu_solve(left, right)
-        scaled = [found[j] / high ** (j + len(given)) for j in range(free)]
-        coefficients = given + scaled
-        errors = [
-            mp.polyval(coefficients[::-1], t) / value - 1
-            for t, value in zip(grid, wanted, strict=True)
-        ]
-        largest = max(abs(e) for e in errors)
-        if largest < best[1]:
-            best = (coefficients, largest)
-        chosen = extremes(errors, free + 1)
-        if len(chosen) < free + 1:
-            break
-    return best
+    return polynomial(grid, [mp.tanh(centre + t) for t in grid], given, DEGREE)
 
 
 def main() -> None:

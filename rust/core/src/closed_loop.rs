@@ -132,23 +132,12 @@ impl Run {
         encoder: Option<&Encoder>,
         monitor: &Monitor,
     ) {
-        self.alone(plant, controller, signals, encoder, monitor, false);
+        self.record_by(plant, controller, signals, encoder, monitor, false);
     }
 
-    /// [`record_with`](Self::record_with), to the bit what one of several controllers gives that run side by side; around a
-    /// network this takes longer, and differs in last digits.
-    pub(crate) fn record_as_lane(
-        &mut self,
-        plant: &mut (impl Plant + ?Sized),
-        controller: &mut Controller<f64>,
-        signals: Signals<'_>,
-        encoder: Option<&Encoder>,
-        monitor: &Monitor,
-    ) {
-        self.alone(plant, controller, signals, encoder, monitor, true);
-    }
-
-    fn alone(
+    /// [`record_with`](Self::record_with); where `as_lane`, to the bit what one of several controllers gives that run side by
+    /// side. Around a network this takes longer, and differs in last digits.
+    pub(crate) fn record_by(
         &mut self,
         plant: &mut (impl Plant + ?Sized),
         controller: &mut Controller<f64>,

@@ -1,7 +1,7 @@
 //! Loops of many controllers around one plant, side by side in the processor's registers.
 //!
 //! A lane does the operations of a loop that runs alone, in the same order: on one level it gives the bits of
-//! [`Run::record_as_lane`](super::Run::record_as_lane). A loop that runs alone for its own sake takes a
+//! [`Run::record_by`](super::Run::record_by) as a lane. A loop that runs alone for its own sake takes a
 //! shorter way around a network of two past outputs and two inputs without delay.
 
 mod average;

@@ -222,7 +222,7 @@ impl<P: Plant + Clone> Bench<P> {
         let signals = task.signals(run);
         let (plant, encoder) = (&mut self.plants[plant], task.encoder.as_ref());
         self.run
-            .record_as_lane(plant, controller, signals, encoder, monitor);
+            .record_by(plant, controller, signals, encoder, monitor, true);
         if self.run.outcome != Outcome::Completed || monitor.stopped() {
             return None;
         }
