@@ -223,8 +223,8 @@ impl<'a> Beside<'a> {
         V::splat(self.known.gain).mul(V::load(&self.position.0))
     }
 
-    /// Holds a command in each lane for one sample time; `N` is the number of regressors, 0 for any. Other work may be done
-    /// meanwhile.
+    /// Holds a command in each lane for one sample time; `N` is 4 for two outputs and two inputs in the regressor, 0 for any.
+    /// Other work may be done meanwhile.
     #[inline(always)]
     pub fn advance<V: Eight, const N: usize>(&mut self, u: V, meanwhile: &mut impl Meanwhile) {
         let due = self.delayed(u);

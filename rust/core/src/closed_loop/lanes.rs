@@ -60,7 +60,7 @@ impl Lanes<'_> {
     }
 }
 
-/// Groups of loops around a plant with `N` regressors, 0 for any number.
+/// Groups of loops around a plant; `N` is 4 for two outputs and two inputs in its regressor, 0 for any.
 struct Grouped<'a, 'b, S, const N: usize>(Lanes<'a>, &'b mut [S]);
 
 impl<S: Notes, const N: usize> Kernel for Grouped<'_, '_, S, N> {
