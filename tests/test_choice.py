@@ -12,10 +12,10 @@ from plants import bent_data, linear_data
 from sewfast.dataset import Dataset
 from sewfast.errors import FitError
 from sewfast.identification import identify
-from sewfast.recipes.candidate import Candidate, pooled
-from sewfast.recipes.holdout import FOLDS, folds
-from sewfast.recipes.memory import Memory, remembered
-from sewfast.recipes.structure import Start, Structure
+from sewfast.identification.candidate import Candidate, pooled
+from sewfast.identification.folds import FOLDS, folds
+from sewfast.identification.memory import Memory, remembered
+from sewfast.identification.training import Start, Structure
 
 F = NDArray[np.float64]
 STRUCTURE = Structure(2, 1, 4, 1e-4)

@@ -16,7 +16,7 @@ from ..errors import FitError
 from ..workers import spread
 from .clock import stopping
 from .memory import Memory
-from .output import LINEAR, Output, scale_of
+from .outputs import LINEAR, Output, scale_of
 from .task import Pairs, Story, Task, arrays
 
 HIDDEN_SCALE = 1.0

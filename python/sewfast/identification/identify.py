@@ -6,30 +6,31 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Literal, TypeAlias
 
-from . import recipes
-from .dataset import Dataset, require_dataset
-from .errors import DataError, SettingError
-from .evidence import remembered
-from .models import Model
-from .models.base import INIT
-from .recipes import Clock, Progress, Task
-from .recipes.output import OUTPUTS
-from .recipes.structure import Structure
-from .threads import available
-from .workers import Workers, require_workers
+from ..dataset import Dataset, require_dataset
+from ..errors import DataError, SettingError
+from ..evidence import remembered
+from ..models import Model
+from ..models.base import INIT
+from ..threads import available
+from ..workers import Workers, require_workers
+from . import auto, lagged, linear
+from .clock import Clock, Progress
+from .outputs import OUTPUTS
+from .task import Task
+from .training import Structure
 
 Kind: TypeAlias = Literal[
     "auto", "arx", "iv", "oe", "neural_oe", "neural-oe", "neural_ss", "neural-ss"
 ]
 
 _RECIPES: dict[str, Callable[[Task], Model]] = {
-    "auto": recipes.auto,
-    "arx": recipes.arx,
-    "iv": recipes.iv,
-    "oe": recipes.oe,
-    "neural_oe": recipes.neural_oe,
-    "neural_ss": recipes.neural_ss,
-    "paper": recipes.paper,
+    "auto": auto.auto,
+    "arx": linear.arx,
+    "iv": linear.iv,
+    "oe": linear.oe,
+    "neural_oe": lagged.neural_oe,
+    "neural_ss": auto.neural_ss,
+    "paper": lagged.paper,
 }
 _SEARCHED = ("auto", "neural_ss")
 """Kinds that find their own structure; the others have lags."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 from .. import _core
 from ..models.ensemble import EnsembleCore
-from .holdout import Split, held_out_error
-from .structure import Start, Structure
+from .folds import Split, held_out_error
 from .task import Story, finite
+from .training import Start, Structure
 
 WORST = 3.0
 """Members whose J exceeds this multiple of the best one's are dropped."""

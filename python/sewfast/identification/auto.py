@@ -14,13 +14,13 @@ from ..errors import FitError, Interrupted
 from ..models import Ensemble, LinearOE, Model, NeuralSS
 from .candidate import Candidate
 from .finish import ENOUGH_TO_CHOOSE_BY, LEAST_AGREEING, Finished, finish, ratios
-from .holdout import LEAST_HELD_OUT, SHARE, folds
+from .folds import LEAST_HELD_OUT, SHARE, folds
 from .linear import linear_model
-from .output import LINEAR
+from .outputs import LINEAR
 from .plan import plan_of
 from .search import Search
-from .structure import Stopped
 from .task import Story, Task, arrays, bare, finite, told, with_story
+from .training import Stopped
 
 _NO_NETWORK = "too few samples for a network, or none stayed finite on data not trained on"
 AGREEMENT = 1 / 3

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from .. import _core
 from ..models.ensemble import EnsembleCore
 from .candidate import Candidate, judged, members
-from .holdout import Split, held_out_error
+from .folds import Split, held_out_error
 from .plan import FINAL_OPERATIONS
 from .search import Search
-from .structure import Structure, Training, train
+from .training import Structure, Training, train
 
 ENOUGH_TO_CHOOSE_BY = 2_000
 """Held-out samples from which on a single best start may be taken instead of the median."""

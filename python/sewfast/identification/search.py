@@ -12,12 +12,12 @@ from .. import _core
 from ..dataset import Dataset
 from ..errors import FitError
 from .candidate import Candidate, judged, pooled
-from .holdout import Split, held_out_error
+from .folds import Split, held_out_error
 from .memory import Memory, Rectified, Simulator
-from .output import ABS, LINEAR, Output, named, rectified_start, rms_error, suggested
+from .outputs import ABS, LINEAR, Output, named, rectified_start, rms_error, suggested
 from .plan import SEARCH_OPERATIONS, Plan
-from .structure import Stopped, Structure, Training, train
 from .task import Pairs, Story, Task, arrays, finite
+from .training import Stopped, Structure, Training, train
 
 LINEAR_ORDERS = (1, 2, 3, 4, 5, 6)
 WORTH_AN_ORDER = 0.97
