@@ -253,8 +253,8 @@ def test_an_interruption_hands_over_the_best_model(kind: Any) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"model": "narx"}, "auto, arx, iv, oe, neural-oe or neural-ss, received 'narx'"),
-        ({"model": "paper"}, "auto, arx, iv, oe, neural-oe or"),
+        ({"model": "narx"}, "auto, arx, iv, oe, neural-oe, neural-ss or a model .*, received 'narx'"),
+        ({"model": "paper"}, "auto, arx, iv, oe, neural-oe, neural-ss or"),
         ({"preset": "other"}, "'paper' or none"),
         ({"preset": "paper", "model": "arx"}, "neural-oe"),
         ({"preset": "paper", "na": 3}, "na = 2"),

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import Interrupted
+from ..errors import Interrupted, SettingError
 from .arguments import (
     Commands,
     add_columns,
@@ -31,9 +33,10 @@ Identify a model of a drive from recordings of its input and its output.
 DATA is a CSV, .mat, .npz, Parquet or MCAP file; several files are several experiments of one drive.
 FILE:IN:OUT names the columns of one file, IN1+IN2 several inputs.
 
-The default, auto, fits linear output error, then small state-space networks that start from it, and
-keeps a network only where it does better in free run on samples that it was not fitted to. What was
-tried, with its errors, is printed.
+The default, auto, fits linear output error of several orders, then networks that start from it, and
+keeps a network only where it does credibly better in free run on samples that it was not fitted to.
+What was tried is printed with its errors; the last lines say whether the model is good enough to
+tune a controller on, and what to do next.
 """
 
 EXAMPLES = """\
@@ -61,6 +64,12 @@ examples:
 
   sewfast identify run.csv --input u --output y --time-budget 30 -o drive.json
       the best model that is found in half a minute
+
+  sewfast identify run.csv --input u --output y --alternatives -o drive.json
+      also what would have been chosen next: drive-alternative-1.json and so on
+
+  sewfast identify today.csv --input u --output y --further drive.json -o drive2.json
+      the model in drive.json, trained further on today's recording
 """
 
 
@@ -91,7 +100,7 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
         "--model", choices=("auto", "arx", "iv", "oe", "neural-oe", "neural-ss"), default="auto",
         help="arx: least squares one step ahead; iv: refined instrumental variables; oe: linear "
         "output error; neural-oe: lagged network output error; neural-ss: neural state space; auto "
-        "(default): oe or neural-ss, whichever does better",
+        "(default): oe or a network, whichever does better",
     )  # fmt: skip
     parser.add_argument(
         "--preset", choices=("paper",),
@@ -112,7 +121,16 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
     add_argument("--seed", **whole, default=0, help="seed of the starts (0)")
     add_argument(
         "--time-budget", type=float, metavar="S",
-        help="seconds after which auto and neural-ss keep the best so far (none)",
+        help="seconds for everything; the best model until then is kept (none)",
+    )  # fmt: skip
+    add_argument(
+        "--no-select", dest="select", action="store_false",
+        help="neural-oe: hold nothing out, train to the last iteration; to compare methods",
+    )  # fmt: skip
+    add_argument("--further", metavar="MODEL.json", help="a model to train further, as it is")
+    add_argument(
+        "--alternatives", action="store_true",
+        help="also write what would have been chosen next, to MODEL-alternative-1.json and so on",
     )  # fmt: skip
 
 
@@ -130,18 +148,36 @@ def identify_command(args: argparse.Namespace) -> int | None:
         return 130
     scores = _scores(model, train, held)
     model.save(args.out)
-    _show(args, model, scores)
+    others = _save_alternatives(args, model) if args.alternatives else []
+    _show(args, model, scores, others)
     return None
+
+
+def _save_alternatives(args: argparse.Namespace, model: Model) -> list[Path]:
+    """Files beside the model's, the best alternative first."""
+    out = Path(args.out)
+    paths = []
+    for i, other in enumerate(model.alternatives, start=1):
+        path = out.with_name(f"{out.stem}-alternative-{i}{out.suffix}")
+        other.save(path)
+        paths.append(path)
+    return paths
 
 
 def _identify(
     args: argparse.Namespace, train: Dataset, held: Dataset | None, progress: Progress
 ) -> Model:
     from ..identification import identify
+    from ..models import load_model
 
+    if args.further is not None and args.model != "auto":
+        raise SettingError(
+            f"--further: the model in {args.further} keeps its kind, received --model "
+            f"{args.model}; leave one of them out"
+        )
     return identify(
         train,
-        model=args.model,
+        model=args.model if args.further is None else load_model(args.further),
         preset=args.preset,
         na=args.na,
         nb=args.nb,
@@ -152,6 +188,7 @@ def _identify(
         starts=args.starts,
         seed=args.seed,
         time_budget=args.time_budget,
+        select=args.select,
         validation=held,
         progress=progress,
     )
@@ -164,7 +201,12 @@ def _scores(model: Model, train: Dataset, held: Dataset | None) -> dict[str, Val
     return {name: validate(model, data) for name, data in sets.items()}
 
 
-def _show(args: argparse.Namespace, model: Model, scores: dict[str, Validation]) -> None:
+def _show(
+    args: argparse.Namespace,
+    model: Model,
+    scores: dict[str, Validation],
+    others: Sequence[Path],
+) -> None:
     if args.json:
         found: dict[str, Any] = {
             "file": str(args.out),
@@ -173,6 +215,7 @@ def _show(args: argparse.Namespace, model: Model, scores: dict[str, Validation])
             **model.orders,
             "training": dict(model.training),
             "scores": {name: s.to_json() for name, s in scores.items()},
+            "alternatives": [str(path) for path in others],
         }
         print_json(found)
         return
@@ -182,4 +225,6 @@ def _show(args: argparse.Namespace, model: Model, scores: dict[str, Validation])
         s = score.simulation
         unit = f" {score.unit}" if score.unit else ""
         print(f"{label}: free-run fit {s.fit_percent:.2f} %, rmse {s.rmse:.5g}{unit}")
+    for path, other in zip(others, model.alternatives, strict=True):
+        print(f"alternative: {other!r} in {path}")
     print(f"written to {args.out}; score it on another recording: sewfast validate {args.out} DATA")

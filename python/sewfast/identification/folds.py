@@ -1,7 +1,8 @@
-"""`Split`: what models are fitted to, and what they are chosen by."""
+"""What models are fitted to, what they are chosen by, and how their errors there are compared."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from ..dataset import Dataset, Experiment, FloatArray
 from ..errors import FitError
 from ..models.base import INIT, Core
-from .task import Story, sources
+from .task import Provenance, sources
 
 SHARE = 0.2
 """Part of every experiment that is held out, at its end.
@@ -43,7 +44,7 @@ class Split:
     fitted: Dataset
     held: Dataset
     is_given: bool = False
-    sources: tuple[Story, ...] = ()
+    sources: tuple[Provenance, ...] = ()
 
     @property
     def scored(self) -> int:
@@ -59,7 +60,7 @@ class Split:
 
     def shortened(self, fitted: int, held: int) -> Split:
         """About so many samples, of every experiment its proportional part."""
-        return replace(self, fitted=_thinned(self.fitted, fitted), held=_shortened(self.held, held))
+        return replace(self, fitted=thinned(self.fitted, fitted), held=_shortened(self.held, held))
 
 
 def split(data: Dataset, skipped: float = 0.0) -> Split | None:
@@ -125,7 +126,7 @@ def _shortened(data: Dataset, samples: int) -> Dataset:
     return replace(data, experiments=tuple(pieces))
 
 
-def _thinned(data: Dataset, samples: int) -> Dataset:
+def thinned(data: Dataset, samples: int) -> Dataset:
     """Blocks from all over every experiment: a chirp is another signal at its end."""
     if len(data) <= samples:
         return data
@@ -143,23 +144,81 @@ def _blocks(e: Experiment, samples: int) -> list[Experiment]:
     return [b for b in blocks if len(b) - b.unmeasured > INIT]
 
 
-def held_out_error(core: Core, split: Split) -> float:
-    """Root mean square of the free run's error on what is held out; infinite for a runaway."""
-    squares, known = 0.0, 0
-    for e in split.held.experiments:
-        run = _free_run(core, e)
-        if run is None:
-            return float("inf")
+# --- errors on what is held out, and their comparison ---------------------------------------------
+
+ERROR_BLOCKS = 12
+"""Blocks of squared errors that a comparison resamples, over all held-out parts together."""
+RESAMPLES = 400
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Squared free-run errors on what is held out, summed block by block.
+
+    Attributes
+    ----------
+    squares : array, shape (B,)
+        Sum of squared errors of each block.
+    counts : array, shape (B,)
+        Known outputs in it.
+    """
+
+    squares: FloatArray
+    counts: FloatArray
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square error over all blocks."""
+        samples = self.counts.sum()
+        return float(np.sqrt(self.squares.sum() / samples)) if samples else float("inf")
+
+
+RUNAWAY = Errors(np.array([np.inf]), np.array([1.0]))
+"""Of a model whose free run leaves the finite numbers."""
+
+
+def errors_of(runs: Sequence[FloatArray] | None, held: Split) -> Errors:
+    """The errors of free runs over the held-out parts, one run for each experiment."""
+    if runs is None:
+        return RUNAWAY
+    experiments = held.held.experiments
+    parts = max(2, round(ERROR_BLOCKS / len(experiments)))
+    squares, counts = [], []
+    for run, e in zip(runs, experiments, strict=True):
         error = (e.y - run)[e.initial_samples(INIT) :]
-        error = error[~np.isnan(error)]
-        squares, known = squares + float(error @ error), known + len(error)
-    return float(np.sqrt(squares / known)) if known else float("inf")
+        known = np.flatnonzero(np.isfinite(error))
+        for block in np.array_split(error[known], parts):
+            squares.append(float(block @ block))
+            counts.append(float(len(block)))
+    return Errors(np.array(squares), np.array(counts))
 
 
-def _free_run(core: Core, e: Experiment) -> FloatArray | None:
-    try:
-        first = e.initial_samples(INIT)
-        state = core.estimate_initial_state(e.u[:first], e.y[:first])
-        return core.simulate(e.u, state)
-    except FitError:
-        return None
+def free_runs(core: Core, held: Split) -> list[FloatArray] | None:
+    """Free runs over the held-out parts, each from its own estimated state; None for a runaway."""
+    runs = []
+    for e in held.held.experiments:
+        try:
+            first = e.initial_samples(INIT)
+            state = core.estimate_initial_state(e.u[:first], e.y[:first])
+            runs.append(core.simulate(e.u, state))
+        except FitError:
+            return None
+    return runs
+
+
+def compared(one: Errors, other: Errors) -> tuple[float, float]:
+    """Logarithm of the ratio of two rms errors, and its standard error.
+
+    Errors of neighbouring samples belong together, so whole blocks are resampled, the same ones of
+    both models (Kuensch 1989; Efron and Tibshirani 1993, section 8.6).
+    """
+    one_runs, other_runs = np.isfinite(one.squares).all(), np.isfinite(other.squares).all()
+    if not (one_runs and other_runs):
+        return 0.0 if one_runs == other_runs else -np.inf if one_runs else np.inf, 0.0
+    picks = np.random.default_rng(0).integers(0, len(one.squares), (RESAMPLES, len(one.squares)))
+    tiny = 1e-300
+    drawn = 0.5 * np.log(
+        (one.squares[picks].sum(axis=1) + tiny) / (other.squares[picks].sum(axis=1) + tiny)
+    )
+    ratio = 0.5 * np.log((one.squares.sum() + tiny) / (other.squares.sum() + tiny))
+    return float(ratio), float(drawn.std())

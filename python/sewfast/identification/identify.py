@@ -7,31 +7,38 @@ from collections.abc import Callable, Mapping
 from typing import Literal, TypeAlias
 
 from ..dataset import Dataset, require_dataset
-from ..errors import DataError, SettingError
+from ..errors import DataError, FitError, Interrupted, SettingError
 from ..evidence import remembered
 from ..models import Model
 from ..models.base import INIT
 from ..threads import available
 from ..workers import Workers, require_workers
-from . import auto, lagged, linear
-from .clock import Clock, Progress
+from . import choice, further, lagged, linear
+from .effort import Clock, Progress
+from .folds import thinned
 from .outputs import OUTPUTS
-from .task import Task
+from .task import Task, with_provenance
 from .training import Structure
 
 Kind: TypeAlias = Literal[
     "auto", "arx", "iv", "oe", "neural_oe", "neural-oe", "neural_ss", "neural-ss"
 ]
 
-_RECIPES: dict[str, Callable[[Task], Model]] = {
-    "auto": auto.auto,
+_KINDS: dict[str, Callable[[Task], Model]] = {
+    "auto": choice.auto,
     "arx": linear.arx,
     "iv": linear.iv,
     "oe": linear.oe,
     "neural_oe": lagged.neural_oe,
-    "neural_ss": auto.neural_ss,
+    "neural_ss": choice.neural_ss,
     "paper": lagged.paper,
 }
+SHARE_OF_FIT = 0.85
+"""Of a time budget; the rest is for the evidence that is kept with the model."""
+NETWORKS = ("neural_oe", "neural_ss")
+LINEAR_WIDTH = 10
+EVIDENCE_RATE, LEAST_EVIDENCE = 1e6, 2_000
+"""Samples times parameters for which evidence is found in a second, on a slow machine."""
 _SEARCHED = ("auto", "neural_ss")
 """Kinds that find their own structure; the others have lags."""
 _LAGS = 2
@@ -42,7 +49,7 @@ _PAPER_STARTS = 8
 def identify(
     data: Dataset,
     *,
-    model: Kind = "auto",
+    model: Kind | Model = "auto",
     preset: Literal["paper"] | None = None,
     na: int | None = None,
     nb: int | None = None,
@@ -57,23 +64,27 @@ def identify(
     threads: int | None = None,
     workers: Workers | None = None,
     time_budget: float | None = None,
+    select: bool = True,
     progress: Progress | None = None,
 ) -> Model:
     """Identify a model from recordings.
 
-    Without further settings a small grid of structures is searched (docs/choosing-a-model.md), and
-    the model says why it was chosen: `print(model)`, `model.training["choice"]`.
+    Without further settings many structures are tried (docs/choosing-a-model.md), and the model
+    says why it was chosen and whether it is good enough: `print(model)`, `model.training["choice"]`
+    and `["verdict"]`. What would have been chosen next is in `model.alternatives`.
 
     Parameters
     ----------
     data : Dataset
         Training data: inputs complete; outputs that are NaN were not measured and have no weight.
-    model : {"auto", "arx", "iv", "oe", "neural_oe", "neural_ss"}
+    model : {"auto", "arx", "iv", "oe", "neural_oe", "neural_ss"} or Model
         `arx`: least squares of the one-step error. `iv`: refined instrumental variables, which
         measurement noise does not bias. `oe`: linear output error. `neural_oe`: the
         lagged network, trained in free run from the linear output-error model. `neural_ss`: the
-        state-space network. `auto`: `oe` or `neural_ss`, by the free-run error on data not trained
-        on; on little data the median of many networks, an `Ensemble`.
+        state-space network. `auto`: one of `oe`, `neural_ss` and `neural_oe`, by the free-run error
+        on data not trained on; on little data the median of several networks, an `Ensemble`.
+        A kind that is asked for by name is what comes back. A model is trained further on these
+        data, in its own structure.
     preset : "paper" or None
         The paper's network (docs/CONVENTIONS.md): no linear start, fixed scaling and orders.
     na, nb : int or None
@@ -105,8 +116,11 @@ def identify(
         Where the starts of `auto` and `neural_ss` are trained: a `concurrent.futures.Executor`, a
         Dask client, or anything with `map(function, jobs)`. None: threads of this process.
     time_budget : float or None
-        Seconds after which `auto` and `neural_ss` keep the best so far; the model says where the
-        budget has cut the search short.
+        Seconds for everything, linear fits and evidence included; the best so far is returned, and
+        the model says where the budget has cut the work short.
+    select : bool
+        Whether data are held out to stop the training of `neural_oe` and to choose its weight
+        decay. False trains on all data to the last iteration, for comparisons of methods.
     progress : callable(done, total, best_cost) or None
         Called from the calling thread now and then, once through for each stage.
 
@@ -132,11 +146,16 @@ def identify(
     network and its training: paper, Eq. 2 to 4; the state-space network: M. Schoukens, arXiv
     2103.14516.
     """
-    kind = str(model).replace("-", "_")
-    if kind not in _RECIPES or kind == "paper":
-        raise SettingError(
-            f"model: expected auto, arx, iv, oe, neural-oe or neural-ss, received {model!r}"
-        )
+    if isinstance(model, Model):
+        _require_alone(na=na, nb=nb, nk=nk, nx=nx, hidden=hidden, output=output, preset=preset)
+        kind = "further"
+    else:
+        kind = str(model).replace("-", "_")
+        if kind not in _KINDS or kind == "paper":
+            raise SettingError(
+                "model: expected auto, arx, iv, oe, neural-oe, neural-ss or a model to train "
+                f"further, received {model!r}"
+            )
     if preset is not None:
         kind = _preset(preset, kind, {"na": na, "nb": nb, "nk": nk, "hidden": hidden})
         starts = _PAPER_STARTS if starts is None else starts
@@ -146,6 +165,9 @@ def identify(
     )  # fmt: skip
     _require_meaning(kind, na=na, nb=nb, nx=nx, output=output, time_budget=time_budget)
     require_workers(workers)
+    if not isinstance(select, bool):
+        raise SettingError(f"select: expected True or False, received {select!r}")
+    clock = Clock(time_budget)
     task = Task(
         data=data,
         validation=validation,
@@ -159,12 +181,47 @@ def identify(
         seed=seed,
         iterations=iterations,
         threads=available() if threads is None else threads,
-        progress=progress,
+        progress=progress if kind in _SEARCHED else clock.limited(progress, SHARE_OF_FIT),
         workers=workers,
-        clock=Clock(time_budget),
+        clock=clock,
+        select=select,
     )
     _require_data(task, kind)
-    return remembered(_RECIPES[kind](task), data)
+    if isinstance(model, Model):
+        found = _within_budget(lambda t: further.trained(t, model), task)
+    else:
+        found = _within_budget(_KINDS[kind], task)
+    return remembered(found, _excerpt(found, task))
+
+
+def _within_budget(identified: Callable[[Task], Model], task: Task) -> Model:
+    """What is reached when the time is up, with a note; a Ctrl-C goes on to the caller."""
+    try:
+        return identified(task)
+    except Interrupted as e:
+        if not task.clock.over(SHARE_OF_FIT):
+            raise
+        note = f"the time budget of {task.clock.budget:g} s ended the training early"
+        return with_provenance(e.best, {"notes": [*e.best.training.get("notes", []), note]})
+    except KeyboardInterrupt:
+        if not task.clock.over(SHARE_OF_FIT):
+            raise
+        raise FitError(
+            f"time_budget: expected time for at least one iteration, received "
+            f"{task.clock.budget:g} s; give more, fewer data, or leave the budget out"
+        ) from None
+
+
+def _excerpt(model: Model, task: Task) -> Dataset:
+    """The data for the evidence that is kept with a model; less of them where time is short."""
+    clock = task.clock
+    if clock.budget is None:
+        return task.data
+    left = max(0.0, clock.budget - clock.spent)
+    width = max(
+        (len(m.core.theta) for m in model.members or (model,) if m.kind[:2] == "ne"), default=10
+    )
+    return thinned(task.data, max(LEAST_EVIDENCE, round(left * EVIDENCE_RATE / width)))
 
 
 def _preset(preset: str, kind: str, orders: Mapping[str, int | None]) -> str:
@@ -182,6 +239,16 @@ def _preset(preset: str, kind: str, orders: Mapping[str, int | None]) -> str:
             "the preset"
         )
     return "paper"
+
+
+def _require_alone(**settings: object) -> None:
+    """A model that is trained further has its structure already."""
+    for name, value in settings.items():
+        if value is not None:
+            raise SettingError(
+                f"{name}: a model that is trained further keeps its own structure, received "
+                f"{value!r}; leave it out, or name a kind of model"
+            )
 
 
 def _require_settings(**settings: object) -> None:

@@ -10,20 +10,20 @@ import numpy as np
 
 from .. import _core
 from ..dataset import Experiment
-from ..errors import Interrupted
+from ..errors import FitError, Interrupted
 from ..models import LinearOE, Model, NeuralOE
 from ..models.base import INIT
 from .linear import linear_fit
 from .task import (
-    Story,
+    Provenance,
     Task,
     arrays,
-    bare,
+    documented,
     finite,
-    fit_story,
+    fit_provenance,
     free_run_rmse,
     sources,
-    with_story,
+    wrap,
 )
 
 BLOCKS = 8
@@ -34,6 +34,8 @@ DECAYS = (1e-2, 1e-4)
 """Weight decays that the default network is trained with, the strongest first."""
 ABOUT_AS_WELL = 1.25
 """Largest ratio to the best held-out error at which a stronger weight decay is taken."""
+SAME = 1e-6
+"""Relative difference of two errors that says that the network is still its linear start."""
 _USUAL_STARTS = 4
 WORTH_IT = 0.98
 """The network must bring the free-run error below this part of the linear model's."""
@@ -62,19 +64,60 @@ def paper(task: Task) -> Model:
         initial_theta=None,
         progress=task.progress,
     )
-    story = {"preset": "paper", "initial_state": "measured"}
-    return _unless_interrupted(fit, _network_model(task, fit, began, story))
+    provenance = {"preset": "paper", "initial_state": "measured"}
+    return _unless_interrupted(fit, _network_model(task, fit, began, provenance))
 
 
 def neural_oe(task: Task) -> Model:
-    """The network, trained in free run from the linear output-error model."""
+    """The network, trained in free run from the linear output-error model.
+
+    What comes back is always a trained network. Where held-out blocks stop the training before its
+    first step, because no step does better there than the linear model, the network is trained on
+    all data without them, and a note says so.
+    """
     began = time.perf_counter()
     linear = linear_fit(task, began)
+    if not task.select:
+        fit = _network_fit(task, linear, DECAYS[-1], began)
+        return _network_model(task, fit, began, {"weight_decay": DECAYS[-1], "selected": False})
     trial = task if task.validation is not None else _with_blocks_held_out(task)
     network, decays = _selected_network(trial, linear, began)
-    story = {"samples_fitted": len(trial.data), **decays}
-    story |= _choice_story(_comparison(trial, linear, network))
-    return _network_model(task, network, began, story)
+    choice = _comparison(trial, linear, network)
+    provenance = {"samples_fitted": len(trial.data), **decays}
+    if len(network.trace) > 1 and not _is_still_linear(choice):
+        return _network_model(task, network, began, provenance | _choice_provenance(choice))
+    # a strong decay would take the network back to its linear part
+    everything = replace(task, validation=None)
+    network = _network_fit(everything, linear, DECAYS[-1], began)
+    _require_another(task, linear, network)
+    choice["reason"] += "; no step of the training did better on held-out blocks"
+    provenance = {**decays, "samples_fitted": len(task.data), "weight_decay": DECAYS[-1]}
+    return _network_model(task, network, began, provenance | _choice_provenance(choice))
+
+
+def _require_another(task: Task, linear: _core.LinearFit, network: _core.NeuralFit) -> None:
+    """A network whose runs are the linear model's is none, and is not returned as one."""
+    pairs = arrays(task.data)
+    gaps, spreads = [], []
+    for (u, _), x, z in zip(pairs, network.initial_states, linear.initial_states, strict=False):
+        run = linear.model.simulate(u, np.ascontiguousarray(z))
+        gaps.append(np.mean((network.model.simulate(u, np.ascontiguousarray(x)) - run) ** 2))
+        spreads.append(np.var(run))
+    if np.sqrt(np.mean(gaps)) <= SAME * np.sqrt(np.mean(spreads)):
+        raise FitError(
+            f"{task.data.source}: expected a network that differs from the linear model, received "
+            "the linear model itself: the data show nothing that is not linear; ask for model oe, "
+            "or train without held-out blocks (select=False, --no-select)"
+        )
+
+
+def _is_still_linear(choice: Provenance) -> bool:
+    """Whether network and linear model have the same error on held-out blocks."""
+    rmse = choice.get("free_run_rmse", {})
+    network, linear = rmse.get("neural_oe"), rmse.get("oe")
+    if network is None or linear is None:
+        return False
+    return abs(network - linear) <= SAME * linear
 
 
 # --- fits -------------------------------------------------------------------------------------
@@ -82,7 +125,7 @@ def neural_oe(task: Task) -> Model:
 
 def _selected_network(
     task: Task, linear: _core.LinearFit, began: float
-) -> tuple[_core.NeuralFit, Story]:
+) -> tuple[_core.NeuralFit, Provenance]:
     """The network with the strongest weight decay that does about as well as the best.
 
     Held-out blocks lie where the drive has been before; a smoother network is the safer one where
@@ -166,19 +209,19 @@ def _with_enough_measured(pieces: list[Experiment]) -> list[Experiment]:
     return [e for e in pieces if len(e) - e.unmeasured > LEAST_BLOCK]
 
 
-_NOTHING_HELD_OUT: Story = {
+_NOTHING_HELD_OUT: Provenance = {
     "chosen": "oe",
     "reason": f"the record is too short to hold out blocks of {LEAST_BLOCK} samples to compare on",
 }
 
 
-def _comparison(task: Task, linear: _core.LinearFit, network: _core.NeuralFit) -> Story:
+def _comparison(task: Task, linear: _core.LinearFit, network: _core.NeuralFit) -> Provenance:
     """Free-run errors of both on data not trained on, the choice and its reason."""
     if task.validation is None:
         return _NOTHING_HELD_OUT
     rmse = {
-        "oe": free_run_rmse(bare(LinearOE, linear.model, task.data), task.validation),
-        "neural_oe": free_run_rmse(bare(NeuralOE, network.model, task.data), task.validation),
+        "oe": free_run_rmse(wrap(LinearOE, linear.model, task.data), task.validation),
+        "neural_oe": free_run_rmse(wrap(NeuralOE, network.model, task.data), task.validation),
     }
     is_better = network.sound and rmse["neural_oe"] < WORTH_IT * rmse["oe"]
     ratio = rmse["neural_oe"] / rmse["oe"] if rmse["oe"] > 0.0 else 1.0
@@ -196,21 +239,21 @@ def _comparison(task: Task, linear: _core.LinearFit, network: _core.NeuralFit) -
     }
 
 
-def _choice_story(choice: Story) -> Story:
+def _choice_provenance(choice: Provenance) -> Provenance:
     if choice["chosen"] != "neural_oe":
         return {"choice": choice, "notes": [f"{choice['reason']}; consider model oe"]}
     return {"choice": choice}
 
 
 def _network_model(
-    task: Task, fit: _core.NeuralFit, began: float, extra: Story | None = None
+    task: Task, fit: _core.NeuralFit, began: float, extra: Provenance | None = None
 ) -> Model:
-    story: Story = {"initial_state": "estimated", "cost_unit": "scaled output squared"}
-    story |= {"seed": task.seed, "starts": _starts(task), "start": fit.start}
-    story |= {"start_costs": [finite(c) for c in fit.start_costs.tolist()]}
-    story |= {"validation_cost": fit.validation_cost}
-    told = fit_story(fit) | story | (extra or {})
-    return with_story(bare(NeuralOE, fit.model, task.data), task, began, told)
+    provenance: Provenance = {"initial_state": "estimated", "cost_unit": "scaled output squared"}
+    provenance |= {"seed": task.seed, "starts": _starts(task), "start": fit.start}
+    provenance |= {"start_costs": [finite(c) for c in fit.start_costs.tolist()]}
+    provenance |= {"validation_cost": fit.validation_cost}
+    known = fit_provenance(fit) | provenance | (extra or {})
+    return documented(wrap(NeuralOE, fit.model, task.data), task, began, known)
 
 
 def _starts(task: Task) -> int:

@@ -11,19 +11,19 @@ from .. import _core
 from ..errors import Interrupted
 from ..models import ARX, IV, LinearOE, Model
 from ..models.base import INIT
-from .task import Story, Task, arrays, bare, fit_story, told, with_story
+from .task import Provenance, Task, arrays, documented, fit_provenance, with_provenance, wrap
 
 
 def arx(task: Task) -> Model:
     """Least squares of the one-step error."""
     began = time.perf_counter()
     core = _core.fit_arx(arrays(task.data), **task.orders, offset=True)
-    story = {"cost_horizon": "one step", "initial_state": "measured", "termination": "solved"}
-    model = with_story(bare(ARX, core, task.data), task, began, story)
+    provenance = {"cost_horizon": "one step", "initial_state": "measured", "termination": "solved"}
+    model = documented(wrap(ARX, core, task.data), task, began, provenance)
     pairs = zip(arrays(task.data), model.predict(task.data), strict=True)
     one_step = np.concatenate([(y - yhat)[INIT:] for (_, y), yhat in pairs])
     cost = float(np.nanmean(one_step**2) / 2)
-    return told(model, {"cost": cost, "cost_unit": "output unit squared"})
+    return with_provenance(model, {"cost": cost, "cost_unit": "output unit squared"})
 
 
 def iv(task: Task) -> Model:
@@ -56,17 +56,17 @@ def linear_model(
     task: Task,
     fit: _core.LinearFit,
     began: float,
-    extra: Story | None = None,
+    extra: Provenance | None = None,
     cls: type[IV] | type[LinearOE] = LinearOE,
 ) -> Model:
-    """A fit as a model with its story."""
-    story: Story = {"initial_state": "estimated", "cost_unit": "output unit squared"}
-    story |= {"standard_errors": _standard_errors(fit)}
-    told_ = fit_story(fit) | story | (extra or {})
-    return with_story(bare(cls, fit.model, task.data), task, began, told_)
+    """A fit as a model with its provenance."""
+    provenance: Provenance = {"initial_state": "estimated", "cost_unit": "output unit squared"}
+    provenance |= {"standard_errors": _standard_errors(fit)}
+    known = fit_provenance(fit) | provenance | (extra or {})
+    return documented(wrap(cls, fit.model, task.data), task, began, known)
 
 
-def _standard_errors(fit: _core.LinearFit) -> Story:
+def _standard_errors(fit: _core.LinearFit) -> Provenance:
     """Of the coefficients, for white measurement noise; None where the data do not fix them."""
     errors = [e if math.isfinite(e) else None for e in fit.standard_errors.tolist()]
     (na, (inputs, nb)) = (fit.model.na, fit.model.b.shape)

@@ -18,6 +18,8 @@ CORNER = 0.03
 """Width of a corner, relative to the output's scale."""
 NEAR_ZERO = 0.05
 """Part of the range within which an output counts as zero."""
+BELOW_ZERO = 0.03
+"""Part of the range that a rectified output reaches below zero, by noise."""
 PILE = 0.02
 """Share of the samples within a hundredth of the range from its end that makes a pile."""
 SHARPNESS = 4.0
@@ -53,7 +55,7 @@ ABS = Output("abs")
 def suggested(data: Dataset) -> list[Output]:
     """Output functions worth a trial; the plain one always is."""
     found = [LINEAR]
-    if _may_be_rectified(_known(data)):
+    if _changes_sign(data) and _may_be_rectified(_known(data)):
         found.append(ABS)
     saturated = saturation(data)
     return found if saturated is None else [*found, saturated]
@@ -99,10 +101,17 @@ def _piles(distance: FloatArray, width: float) -> bool:
     return at >= PILE and at > SHARPNESS * beside
 
 
+def _changes_sign(data: Dataset) -> bool:
+    """Whether an input goes clearly to both sides of zero: only then is there a sign to lose."""
+    u = np.concatenate([e.u for e in data.experiments])
+    low, high = u.min(axis=0), u.max(axis=0)
+    return bool((np.minimum(-low, high) > 0.2 * np.maximum(-low, high)).any())
+
+
 def _may_be_rectified(y: FloatArray) -> bool:
     """Never clearly below zero, and often at zero without staying there for good."""
     top = float(y.max())
-    if top <= 0.0 or float(y.min()) < -NEAR_ZERO * top:
+    if top <= 0.0 or float(y.min()) < -BELOW_ZERO * top:
         return False
     return bool(np.mean(y <= NEAR_ZERO * top) > 0.005)
 

@@ -1,305 +1,618 @@
-"""The search for a structure: a few steps from a usual one, each kept where free run gains."""
+"""The search for a structure: cheap trials of many, longer ones of the better half, then growth.
+
+All sizes are counted in multiplications, not in seconds, so that a seed gives the same model on
+every machine; a time budget is converted into multiplications by the speed of the first trials.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import time
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from .. import _core
-from ..dataset import Dataset
+from ..dataset import FloatArray
 from ..errors import FitError
-from .candidate import Candidate, judged, pooled
-from .folds import Split, held_out_error
-from .memory import Memory, Rectified, Simulator
+from ..models.ensemble import EnsembleCore
+from .effort import Look, Pool
+from .folds import RUNAWAY, Errors, Split, compared, errors_of, free_runs
+from .guard import grown, guard
+from .orders import LinearTable, slowest_pole
 from .outputs import ABS, LINEAR, Output, named, rectified_start, rms_error, suggested
-from .plan import SEARCH_OPERATIONS, Plan
-from .task import Pairs, Story, Task, arrays, finite
-from .training import Stopped, Structure, Training, train
+from .task import Provenance, Task, arrays, finite
+from .training import Network, Request, Start, Structure, train
 
-LINEAR_ORDERS = (1, 2, 3, 4, 5, 6)
-WORTH_AN_ORDER = 0.97
-"""A larger linear order must bring the error below this part of the smaller one's."""
-WORTH_A_DECAY = 0.99
+SMALL, LARGE = 3_750, 45_000
+"""Samples up to which a data set is small, and above which it is large."""
+TRIAL_SAMPLES, TRIAL_SAMPLES_LARGE = 20_000, 12_000
+"""Fitted samples of a trial. Fewer than 20,000 cost a factor of up to 3 in the final error."""
+SEARCH_OPERATIONS, SEARCH_OPERATIONS_LARGE = 1.8e11, 4e11
+"""Multiplications after which nothing further is tried; a core makes some 1.4e10 in a second."""
+WORST = 3.0
+"""Starts whose J exceeds this multiple of the best one's are left out of a candidate."""
+SAMPLES_PER_PARAMETER = 4
+MOST_NX, MOST_HIDDEN, MOST_HIDDEN_SMALL = 8, 32, 16
+LEAST_DECAY, MOST_DECAY = 1e-10, 1e-1
+DECAY_MATTERS = 6_000
+"""Samples above which another weight decay hardly ever gains."""
+WORTH_A_STEP = 0.97
+"""A step of the climb must bring the error below this part."""
+LEAST_STEP = 0.005
+"""Relative gain of a step that is taken where the gain is known to be one."""
 WORTH_A_FEEDTHROUGH = 0.5
 """nk = 0 is no plant for a loop, and a smoothed speed leans ahead a little: it must be worth it."""
-USUAL_HIDDEN = 8
 WORTH_A_RECTIFIER = 0.9
-LEAST_NX, MOST_NX = 2, 8
-LEAST_DECAY, MOST_DECAY = 1e-10, 1e-1
-SAMPLES_PER_PARAMETER = 4
-SHARE_FOR_SEARCH = 0.6
-"""Part of a time budget after which no further candidate is tried."""
+FAR_BEHIND = 2.0
+"""A kind of network whose best is this many times worse than the other's climbs no further."""
+ROUNDS = 6
+SCREEN_ITERATIONS, HALVING_ITERATIONS, CLIMB_ITERATIONS = 20, (25, 40), 40
+REPEATED = 0.85
+"""Correlation of an input with itself, some time later, that makes a repetition."""
+INTEGRATING_POLE = 0.9995
+"""A slower real pole of the linear models asks for an integrator."""
+ENDLESS_GAIN = 5.0
+"""Steady gain times the input's range, in widths of the output's range, of what never settles."""
+INTEGRATING_ITERATIONS, INTEGRATING_STARTS = 40, 6
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A structure, its trained starts, and the held-out errors of their median."""
+
+    structure: Structure
+    starts: tuple[Start, ...]
+    errors: Errors
+    iterations: int
+    converged: bool = False
+
+    @property
+    def error(self) -> float:
+        """Root mean square on what is held out."""
+        return self.errors.rmse
+
+    @property
+    def members(self) -> list[Start]:
+        """The starts that count: sound unless none is, not far worse than the best; best first."""
+        return counting(self.starts)
+
+    @property
+    def models(self) -> list[Network]:
+        """Of the starts that count."""
+        return [s.model for s in self.members]
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether any start has passed the guard."""
+        return any(s.is_sound for s in self.starts)
+
+    def to_json(self) -> Provenance:
+        """For the table."""
+        row = self.structure.to_json() | {"starts": len(self.starts)}
+        row |= {"sound": sum(s.is_sound for s in self.starts)}
+        return row | {"free_run_rmse": finite(self.error)}
+
+
+def counting(starts: Iterable[Start]) -> list[Start]:
+    """Sound starts, unless there is none, that are not far worse than the best; best first."""
+    starts = list(starts)
+    able = sorted([s for s in starts if s.is_sound] or starts, key=lambda s: s.cost)
+    return [s for s in able if s.cost <= WORST * able[0].cost]
+
+
+def median_of(models: Sequence[Network]) -> Any:
+    """One model as it is, several as their median."""
+    return models[0] if len(models) == 1 else EnsembleCore(tuple(models), "median")
 
 
 @dataclass
 class Search:
-    """One search: what it works on, and the table it fills."""
+    """One search: what it works on, what it has spent, and the candidates that it found.
+
+    Attributes
+    ----------
+    trials : tuple of Split
+        The folds, as short as trials are; the newest first.
+    linear : LinearTable
+    candidates : dict of Structure to Candidate
+        On the newest fold; the latest training of each.
+    operations : float
+        Multiplications spent.
+    """
 
     task: Task
-    plan: Plan
-    split: Split
     folds: tuple[Split, ...]
-    linear: dict[tuple[int, int, str, int], _core.LinearModel | None] = field(default_factory=dict)
-    linear_errors: dict[int, tuple[float, ...]] = field(default_factory=dict)
-    order: int = 0
-    table: dict[Structure, Candidate] = field(default_factory=dict)
-    memories: dict[tuple[int, str, int], Memory | None] = field(default_factory=dict)
+    pool: Pool
+    candidates: dict[Structure, Candidate] = field(default_factory=dict)
     operations: float = 0.0
 
-    @classmethod
-    def of(cls, task: Task, plan: Plan, folds: Sequence[Split]) -> Search:
-        """A search that has not begun."""
-        trials = (f.shortened(plan.trial_samples, plan.held_samples) for f in folds)
-        return cls(task, plan, folds[0], tuple(trials))
+    def __post_init__(self) -> None:
+        self.samples = len(self.task.data)
+        self.inputs = self.task.data.n_inputs
+        size = TRIAL_SAMPLES_LARGE if self.is_large else TRIAL_SAMPLES
+        self.trials = tuple(f.shortened(size, size) for f in self.folds[:2])
+        self.linear = LinearTable(self.task, self.folds[:1], self.pool)
+        self.budget = SEARCH_OPERATIONS_LARGE if self.is_large else SEARCH_OPERATIONS
+        self._starts: dict[tuple[int, int, str, int], _core.LinearModel | None] = {}
+        self._guarded = arrays(self.task.data)
 
     @property
-    def trial(self) -> Split:
-        """The newest fold, as short as trials are."""
-        return self.folds[0]
+    def is_small(self) -> bool:
+        """Little data: variance is what matters, and many starts are cheap."""
+        return self.samples <= SMALL
+
+    @property
+    def is_large(self) -> bool:
+        """Much data: little variance, and larger networks to gain from."""
+        return self.samples > LARGE
+
+    @property
+    def until(self) -> float | None:
+        """When the search has to end, on `time.perf_counter`."""
+        return self.pool.clock.until(SHARE_OF_SEARCH)
+
+    @property
+    def decay(self) -> float:
+        """Weight decay to begin with."""
+        return 1e-4 if self.samples < 4_000 else 1e-5 if self.samples < 20_000 else 1e-7
+
+    # --- the steps ------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Linear models, then networks of every likely size, then what grows out of the best."""
+        self.linear.search(self.pool.clock.until(SHARE_OF_LINEAR))
+        alive = self.screen()
+        for iterations in HALVING_ITERATIONS:
+            alive = self.halve(alive, iterations)
+        self.climb()
+
+    def screen(self) -> list[Candidate]:
+        """A short training of every likely structure; the best first."""
+        wanted = [(s, SCREEN_ITERATIONS, 4 if self.is_small else 3) for s in self._likely()]
+        if self.task.hidden is None or self.task.nx is None:
+            wanted += [(s, INTEGRATING_ITERATIONS, INTEGRATING_STARTS) for s in self._integrating()]
+        wanted += [(s, SCREEN_ITERATIONS, 2) for s in self._lagged()]
+        began, before = time.perf_counter(), self.operations
+        found = self.tried([(s, i, self._limited(n)) for s, i, n in wanted], share=0.25)
+        self._calibrate(time.perf_counter() - began, self.operations - before)
+        return sorted(found, key=lambda c: c.error)
+
+    def halve(self, alive: Sequence[Candidate], iterations: int) -> list[Candidate]:
+        """The better half is trained further, with fresh starts for some luck."""
+        kept = list(alive[: max(2, len(alive) // 2)])
+        fresh = [0 if c.structure.integrator else 2 if self.is_small else 1 for c in kept]
+        return sorted(self.continued(kept, iterations, fresh), key=lambda c: c.error)
+
+    def climb(self) -> None:
+        """Larger networks, other decays and delays, from the best so far while each step gains.
+
+        State-space and lagged networks climb side by side, as long as neither is far behind.
+        """
+        asked: set[tuple[str, Structure]] = set()
+        climbing = [c for c in (self.best_of("neural_ss"), self.best_of("neural_oe")) if c]
+        for round_ in range(ROUNDS):
+            if not climbing or self.is_over:
+                return
+            least = min(c.error for c in climbing)
+            climbing = [c for c in climbing if c.error <= FAR_BEHIND * least]
+            moves = [
+                (c, kind, s)
+                for c in climbing
+                for kind, s in self._moves(c, round_ == 0)
+                if (kind, s) not in asked
+            ]
+            asked.update((kind, s) for _, kind, s in moves)
+            found = self._moved(moves)
+            climbing = [up for c in climbing if (up := self._step(c, moves, found)) is not None]
+
+    def _step(
+        self,
+        best: Candidate,
+        moves: Sequence[tuple[Candidate, str, Structure]],
+        found: Sequence[Candidate],
+    ) -> Candidate | None:
+        """The best of the moves from `best`, trained a little further; None where none gains."""
+        own = [new for (c, _, _), new in zip(moves, found, strict=True) if c is best]
+        better = [new for new in own if self._is_step(new, best)]
+        if not better:
+            return None
+        new = min(better, key=lambda c: c.error)
+        return new if new.converged else self.continued([new], 30, [0])[0]
+
+    def best_of(self, kind: str) -> Candidate | None:
+        """The lowest held-out error of one kind, a sound candidate first."""
+        return self._lowest(c for c in self.eligible if c.structure.kind == kind)
+
+    @property
+    def best(self) -> Candidate | None:
+        """The lowest held-out error, a sound candidate first."""
+        return self._lowest(self.eligible)
+
+    @property
+    def eligible(self) -> list[Candidate]:
+        """Candidates that may be chosen: with direct feedthrough only where it is worth it."""
+        found = [c for c in self.candidates.values() if math.isfinite(c.error) and c.starts]
+        delayed = min((c.error for c in found if c.structure.nk > 0), default=math.inf)
+        most = delayed if self.task.nk == 0 else WORTH_A_FEEDTHROUGH * delayed
+        return [c for c in found if c.structure.nk > 0 or c.error < most]
+
+    @staticmethod
+    def _lowest(candidates: Iterable[Candidate]) -> Candidate | None:
+        finite_ = [c for c in candidates if math.isfinite(c.error)]
+        sound = [c for c in finite_ if c.is_sound] or finite_
+        return min(sound, key=lambda c: c.error, default=None)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the search has had its share of operations or of the time budget."""
+        until = self.until
+        is_late = until is not None and time.perf_counter() >= until
+        self.pool.clock.truncated |= is_late
+        return is_late or self.operations >= self.budget
+
+    # --- what is tried --------------------------------------------------------------------------
+
+    def _likely(self) -> list[Structure]:
+        """Sizes about the linear order, with every output function that the data suggest."""
+        nk, task = self.linear.nk, self.task
+        hidden = (4, 8) if task.hidden is None else (task.hidden,)
+        orders = self._orders() if task.nx is None else [task.nx]
+        all_ = [
+            Structure(nx, nk, h, self.decay, output)
+            for output in self._outputs()
+            for nx in orders
+            for h in hidden
+        ]
+        if self.nk > nk:
+            # a delay can feign an order, and the other way round: both are asked
+            order = self.linear.choice.order
+            all_ += [replace(s, nk=self.nk) for s in all_ if s.nx == order]
+        affordable = [s for s in all_ if self.is_affordable(s)]
+        if not affordable and None in (task.nx, task.hidden):
+            least = Structure(task.nx or 1, nk, task.hidden or 2, self.decay)
+            affordable = [least] if self.is_affordable(least) else []
+        return affordable
+
+    def _orders(self) -> list[int]:
+        """The first four of the linear order, the best one, and their neighbours."""
+        if not self.linear.eligible:
+            return [2, 3]
+        order, best = self.linear.choice.order, self.linear.best.order
+        likely = (order, best, 2, order + 1, best + 1, 3)
+        return [nx for nx in dict.fromkeys(likely) if nx <= MOST_NX][:4]
 
     @property
     def nk(self) -> int:
-        """The delay to begin with."""
-        return 1 if self.task.nk is None else self.task.nk
+        """The delay of the linear model that the data ask for."""
+        return self.linear.choice.nk if self.linear.eligible else self.linear.nk
 
-    # --- linear models --------------------------------------------------------------------------
-
-    def start_model(
-        self, nx: int, nk: int, output: Output = LINEAR, fold: int = 0
-    ) -> _core.LinearModel | None:
-        """The linear model of that order, fitted once to what the fold learns from."""
-        key = (nx, nk, output.name, fold)
-        if key not in self.linear:
-            data = self.folds[fold].fitted
-            if output == ABS:
-                self.linear[key] = rectified_start(data, nx, nk)
-            else:
-                self.linear[key] = _output_error(self.task, arrays(data), nx, nk)
-        return self.linear[key]
-
-    def linear_order(self) -> int:
-        """The smallest order about as good on all folds as the best; fills `linear_errors`."""
-        for order in LINEAR_ORDERS:
-            errors = tuple(self._linear_error(order, i) for i in range(len(self.folds)))
-            if self.start_model(order, self.nk) is not None:
-                self.linear_errors[order] = errors
-        self.order = self._smallest_order(pooled)
-        return self.order
-
-    def _smallest_order(self, error: Callable[[tuple[float, ...]], float]) -> int:
-        chosen = min(self.linear_errors, default=0)
-        for order, errors in self.linear_errors.items():
-            if error(errors) < WORTH_AN_ORDER * error(self.linear_errors[chosen]):
-                chosen = order
-        return chosen
-
-    def best_order(self) -> int:
-        """The one best on all folds together: for a model that is linear in the end."""
-        errors = self.linear_errors
-        return min(errors, key=lambda o: pooled(errors[o]), default=self.order)
-
-    def linear_error(self, order: int) -> float:
-        """On the newest fold; infinite where that order was not fitted."""
-        return self.linear_errors[order][0] if order in self.linear_errors else math.inf
-
-    def _linear_error(self, order: int, fold: int) -> float:
-        """No model counts for worse than a constant."""
-        model, held = self.start_model(order, self.nk, fold=fold), self.folds[fold]
-        return held.spread if model is None else min(held_out_error(model, held), held.spread)
-
-    # --- networks -------------------------------------------------------------------------------
-
-    def ladder(self) -> Candidate | None:
-        """The best candidate after all steps; None where no network could be trained.
-
-        It begins with as many states as the order of the linear model that the newest fold, where
-        networks are judged, asks for.
-        """
-        order = self._smallest_order(lambda errors: errors[0])
-        nx = self.task.nx or min(max(order, LEAST_NX), LINEAR_ORDERS[-1])
-        hidden = (USUAL_HIDDEN, 4, 2) if self.task.hidden is None else (self.task.hidden,)
-        sizes = (Structure(nx, self.nk, h, self.plan.decay) for h in hidden)
-        base = next(filter(self.is_affordable, sizes), None)
-        if base is None:
-            return None
-        best = self._best_of(replace(base, output=o) for o in self._outputs(nx))
-        for step in (
-            self._delays,
-            self._decays,
-            self._sizes,
-            self._orders,
-            self._sizes,
-            self._decays,
-        ):
-            best = step(best)
-        return best if best is not None and math.isfinite(best.error) else None
-
-    def _outputs(self, nx: int) -> list[Output]:
-        data = self.trial.fitted
+    def _outputs(self) -> list[Output]:
+        data = self.trials[0].fitted
         if self.task.output is not None:
             return [named(self.task.output, data)]
-        return [o for o in suggested(data) if o != ABS or self._is_rectified(nx)]
+        return [o for o in suggested(data) if o != ABS or self._is_rectified()]
 
-    def _is_rectified(self, nx: int) -> bool:
+    def _is_rectified(self) -> bool:
         """Whether a linear model behind a rectifier does better than one without."""
-        plain, behind = self.start_model(nx, self.nk), self.start_model(nx, self.nk, ABS)
+        plain, behind = self.start(2, self.nk, LINEAR), self.start(2, self.nk, ABS)
         if plain is None or behind is None:
             return behind is not None
-        pairs = arrays(self.trial.fitted)
+        pairs = arrays(self.trials[0].fitted)
         return rms_error(behind, pairs, np.abs) < WORTH_A_RECTIFIER * rms_error(plain, pairs)
 
-    def _decays(self, best: Candidate | None) -> Candidate | None:
-        if best is None:
-            return None
-        step = self.plan.decay_step
-        weaker = self._climbed(best, lambda s: _decayed(s, 1.0 / step), WORTH_A_DECAY)
-        if weaker is not best:
-            return weaker
-        return self._climbed(best, lambda s: _decayed(s, step), WORTH_A_DECAY)
-
-    def _orders(self, best: Candidate | None) -> Candidate | None:
-        if best is None or self.task.nx is not None:
-            return best
-        larger = self._climbed(best, _with_a_state_more)
-        if larger is not best or best.structure.nx <= 1:
-            return larger
-        return self._climbed(best, lambda s: replace(s, nx=s.nx - 1) if s.nx > 1 else None)
-
-    def _sizes(self, best: Candidate | None) -> Candidate | None:
-        if best is None or self.task.hidden is not None:
-            return best
-        most = self.plan.most_hidden
-        larger = self._climbed(
-            best, lambda s: replace(s, hidden=2 * s.hidden) if 2 * s.hidden <= most else None
+    def _integrating(self) -> list[Structure]:
+        """Small networks behind an integrator, where a linear pole is nearly 1."""
+        if self.task.nx is not None or self.task.output not in (None, "linear"):
+            return []
+        if not self.linear.eligible or not self._integrates():
+            return []
+        sizes = (1, 2) if self.repeats else (1, 2, 4, 8)
+        sizes = sizes if self.task.hidden is None else (self.task.hidden,)
+        structures = (
+            Structure(nx, self.linear.nk, h, self.decay, integrator=True)
+            for nx in (2, 3)
+            for h in sizes
         )
-        if larger is not best:
-            return larger
-        return self._best_of([replace(best.structure, hidden=best.structure.hidden // 2)], best)
+        return [s for s in structures if self.is_affordable(s)]
 
-    def _delays(self, best: Candidate | None) -> Candidate | None:
-        if best is None or self.task.nk is not None:
-            return best
-        later = self._best_of([replace(best.structure, nk=2)], best) or best
-        if self.task.data.counts is not None:
-            return later
-        return self._best_of([replace(best.structure, nk=0)], later, WORTH_A_FEEDTHROUGH)
+    @cached_property
+    def repeats(self) -> bool:
+        """Whether the record repeats one trajectory: what is held out was then seen before."""
+        return any(_repeats(e.u) for e in self.task.data.experiments)
 
-    def _climbed(
-        self,
-        best: Candidate,
-        step: Callable[[Structure], Structure | None],
-        worth: float | None = None,
-    ) -> Candidate:
-        """Steps of one kind as long as each is worth it."""
-        while (following := step(best.structure)) is not None:
-            tried = self._best_of([following], best, worth)
-            if tried is best or tried is None:
-                break
-            best = tried
-        return best
+    def _integrates(self) -> bool:
+        """Whether the linear models that do best have a pole at 1, and a steady gain without end.
 
-    def _best_of(
-        self,
-        structures: Iterable[Structure],
-        best: Candidate | None = None,
-        worth: float | None = None,
-    ) -> Candidate | None:
-        for structure in structures:
-            tried = self._tried(structure)
-            if tried is None:
-                continue
-            if best is None or tried.is_better(best, worth or self.plan.worth_a_step):
-                best = tried
-        return best
-
-    def _tried(self, structure: Structure) -> Candidate | None:
-        """The candidate, from the table where it was tried before; None where it cannot be."""
-        if structure in self.table:
-            return self.table[structure]
-        if self._is_over() or not self.is_affordable(structure):
-            return None
-        self.table[structure] = self.trial_on(structure)
-        return self.table[structure]
-
-    def trial_on(self, structure: Structure, fold: int = 0) -> Candidate:
-        """The structure trained on what a fold learns from and judged on what it holds out."""
-        plan = self.plan
-        training = self.training(structure, plan.trial_starts, plan.trial_iterations, fold)
-        starts = train(self.task, structure, training)
-        self.operations += training.operations(structure)
-        return judged(structure, starts, self.folds[fold])
-
-    def _is_over(self) -> bool:
-        """Time or work is used up; the first candidate is always tried."""
-        out_of_time = self.task.clock.over(SHARE_FOR_SEARCH)
-        return bool(self.table) and (out_of_time or self.operations > SEARCH_OPERATIONS)
-
-    def training(
-        self, structure: Structure, starts: int, iterations: int, fold: int = 0
-    ) -> Training:
-        """A training of the structure on what the fold learns from."""
-        return Training(
-            self.folds[fold].fitted,
-            self.folds[fold].held,
-            self.start_model(structure.nx, structure.nk, structure.output, fold),
-            starts if self.task.starts is None else self.task.starts,
-            _limited(iterations, self.task),
-            memory=self.memory(self.folds[fold].fitted, structure.output, fold),
+        A record of a drive with friction or limits lures larger orders to a pole near 1, too; they
+        do worse on what is held out, so that only the best ones are asked.
+        """
+        data = self.task.data
+        low, high = data.output_range
+        swing = np.ptp(np.concatenate([e.u for e in data.experiments]), axis=0)
+        asked = [c.models[0] for c in (self.linear.choice, self.linear.best)]
+        return all(
+            m is not None
+            and slowest_pole(m) > INTEGRATING_POLE
+            and float(np.abs(m.dc_gain() * swing).max()) > ENDLESS_GAIN * (high - low)
+            for m in asked
         )
 
-    def memory(self, data: Dataset, output: Output, fold: int = 0) -> Memory | None:
-        """The bound on a network's memory that linear models set; computed once."""
-        key = (id(data), output.name, fold)
-        if key not in self.memories:
-            self.memories[key] = self._memory(data, output, fold)
-        return self.memories[key]
+    def _lagged(self) -> list[Structure]:
+        """The lagged network of second order; weight decay has another meaning there."""
+        task = self.task
+        if task.nx is not None or task.output not in (None, "linear"):
+            return []
+        s = Structure(
+            2, self.nk, task.hidden or 8, 1e-3 if self.is_small else 1e-4, kind="neural_oe"
+        )
+        return [s] if s.nk >= 1 and self.is_affordable(s) else []
 
-    def _memory(self, data: Dataset, output: Output, fold: int) -> Memory | None:
-        """Of the chosen order; behind a rectifier as well where the network is."""
-        outputs = [LINEAR, ABS] if output == ABS else [LINEAR]
-        known: list[Simulator] = []
-        for o in outputs:
-            linear = self.start_model(max(self.order, 1), self.nk, o, fold)
-            if linear is not None:
-                known.append(Rectified(linear) if o == ABS else linear)
-        return Memory.of(known, data) if known else None
+    def _moves(self, best: Candidate, is_first: bool) -> list[tuple[str, Structure]]:
+        s, task = best.structure, self.task
+        if s.kind == "neural_oe":
+            return [("fresh", replace(s, hidden=2 * s.hidden)), ("fresh", replace(s, nx=s.nx + 1))]
+        moves: list[tuple[str, Structure]] = []
+        if s.integrator and self.repeats:
+            return []
+        most = MOST_HIDDEN_SMALL if len(self.trials[0].fitted) < 5_000 else MOST_HIDDEN
+        wider = task.hidden is None and 2 * s.hidden <= most
+        taller = task.nx is None and s.nx < MOST_NX
+        if wider:
+            moves.append(("grow", replace(s, hidden=2 * s.hidden)))
+        if taller:
+            moves.append(("grow", replace(s, nx=s.nx + 1)))
+            if wider:
+                moves.append(("grow", replace(s, nx=s.nx + 1, hidden=2 * s.hidden)))
+            if self.is_small:
+                moves.append(("fresh", replace(s, nx=s.nx + 1)))
+        if self.samples < DECAY_MATTERS:
+            step = 10.0 if self.is_small else 100.0
+            moves += [("decay", _decayed(s, f)) for f in (step, 1.0 / step)]
+        if is_first and task.nk is None and not s.integrator:
+            later, at_once = replace(s, nk=s.nk + 1), replace(s, nk=0)
+            moves += [("fresh", later)]
+            moves += [("fresh", at_once)] if task.data.counts is None and s.nk == 1 else []
+        return [m for m in moves if self._is_possible(m[1])]
 
-    def is_affordable(self, structure: Structure, fold: int = 0) -> bool:
+    def _is_possible(self, s: Structure) -> bool:
+        return LEAST_DECAY <= s.decay <= MOST_DECAY and self.is_affordable(s)
+
+    def _moved(self, moves: Sequence[tuple[Candidate, str, Structure]]) -> list[Candidate]:
+        """All moves of one round, trained side by side."""
+        requests: list[Request] = []
+        iterations: list[int] = []
+        for best, kind, s in moves:
+            if kind == "grow":
+                models = [grown(m, s.nx, s.hidden, self.task.seed) for m in best.models[:3]]
+                requests.append(self._request(s, CLIMB_ITERATIONS, initial=models))
+                iterations.append(best.iterations + CLIMB_ITERATIONS)
+            elif kind == "decay":
+                requests.append(self._request(s, 30, initial=best.models[:4]))
+                iterations.append(best.iterations + 30)
+            else:
+                count = 30 if self.is_large else 60
+                starts = self._limited(4 if self.is_small else 2)
+                requests.append(self._request(s, count, starts=starts))
+                iterations.append(count)
+        found = self._trained(requests)
+        return [
+            self._judged(s, starts, count)
+            for (_, _, s), starts, count in zip(moves, found, iterations, strict=True)
+        ]
+
+    def _is_step(self, found: Candidate, best: Candidate) -> bool:
+        worth = WORTH_A_STEP
+        if found.structure.nk == 0 and best.structure.nk > 0:
+            worth *= WORTH_A_FEEDTHROUGH
+        if best.is_sound and not found.is_sound:
+            return False
+        if found.error < worth * best.error:
+            return True
+        # below the noise a step gains little of the error, and still gains
+        ratio, deviation = compared(found.errors, best.errors)
+        return worth == WORTH_A_STEP and ratio < -max(2.0 * deviation, LEAST_STEP)
+
+    def is_affordable(self, s: Structure, fold: int = 0) -> bool:
         """Whether the fold has samples enough for its parameters."""
-        wanted = structure.parameters(self.task.data.n_inputs) * SAMPLES_PER_PARAMETER
-        is_fixed = None not in (self.task.nx, self.task.hidden)
-        return is_fixed or wanted <= len(self.folds[fold].fitted)
+        wanted = s.parameters(self.inputs) * SAMPLES_PER_PARAMETER
+        is_given = None not in (self.task.nx, self.task.hidden)
+        return is_given or wanted <= len(self.trials[fold].fitted)
 
-    def rows(self) -> Iterator[Story]:
+    # --- training -------------------------------------------------------------------------------
+
+    def tried(
+        self,
+        wanted: Sequence[tuple[Structure, int, int]],
+        fold: int = 0,
+        share: float | None = None,
+        until: float | None = None,
+    ) -> list[Candidate]:
+        """Candidates of (structure, iterations, starts), trained afresh side by side."""
+        self._prepare([s for s, _, _ in wanted], fold)
+        requests = [self._request(s, i, starts=n, fold=fold) for s, i, n in wanted]
+        found = self._trained(requests, share, until)
+        pairs = zip(wanted, found, strict=True)
+        return [self._judged(s, starts, i, fold) for (s, i, _), starts in pairs]
+
+    def continued(
+        self, candidates: Sequence[Candidate], iterations: int, fresh: Sequence[int]
+    ) -> list[Candidate]:
+        """Candidates trained further, each with so many fresh starts; never worse than before."""
+        requests = []
+        for c, more in zip(candidates, fresh, strict=True):
+            requests.append(self._request(c.structure, iterations, initial=c.models))
+            total = c.iterations + iterations
+            more = min(more, self._limited(more + len(c.starts)) - len(c.starts))
+            requests.append(
+                self._request(c.structure, total, starts=max(more, 0), first=len(c.starts))
+            )
+        trained = iter(self._trained(requests))
+        found = []
+        for c in candidates:
+            starts = [*next(trained), *next(trained)]
+            new = self._judged(c.structure, starts, c.iterations + iterations)
+            if new.error > c.error:
+                new = replace(c, iterations=c.iterations + iterations, converged=True)
+            else:
+                new = replace(new, converged=new.error > 0.995 * c.error)
+            self.candidates[c.structure] = new
+            found.append(new)
+        return found
+
+    def _request(
+        self,
+        s: Structure,
+        iterations: int,
+        *,
+        starts: int = 0,
+        first: int = 0,
+        initial: Sequence[Network] = (),
+        fold: int = 0,
+    ) -> Request:
+        data = self.trials[fold]
+        needs_linear = not initial or s.kind == "neural_oe"
+        linear = self.start(s.nx, s.nk, s.output, fold) if needs_linear else None
+        most = self.task.iterations
+        iterations = iterations if most is None else min(iterations, most)
+        return Request(s, data.fitted, data.held, iterations, linear, starts, first, tuple(initial))
+
+    def _trained(
+        self,
+        requests: Sequence[Request],
+        share: float | None = None,
+        until: float | None = None,
+    ) -> list[list[Start]]:
+        """Starts of every request, looked at by the guard."""
+        self.operations += sum(r.operations for r in requests)
+        if share is None:
+            share = max(self.pool.share, min(0.6, 0.25 + 0.35 * self.operations / self.budget))
+        found = train(
+            requests,
+            self.pool,
+            self.task.seed,
+            workers=self.task.workers,
+            until=self.until if until is None else until,
+            share=share,
+        )
+        return self.guarded(found)
+
+    def guarded(self, found: Sequence[Sequence[Start]]) -> list[list[Start]]:
+        """The starts with what the guard finds on whole records."""
+        flat = [start for starts in found for start in starts]
+        bounds = self.bounding_models
+
+        def fault(start: Start, look: Look) -> str:
+            return guard(start.model, self._guarded, linear=bounds)
+
+        faults = iter(self.pool.map(fault, flat))
+        return [[replace(s, fault=next(faults) or "") for s in starts] for starts in found]
+
+    @property
+    def bounding_models(self) -> list[_core.LinearModel]:
+        """Linear models whose memory bounds that of networks."""
+        if not self.linear.eligible:
+            return []
+        most = max(2, self.linear.choice.order)
+        usable = [c for c in self.linear.eligible if c.order <= most]
+        model = max(usable, key=lambda c: c.order).models[0]
+        return [] if model is None else [model]
+
+    def _judged(
+        self, s: Structure, starts: Sequence[Start], iterations: int, fold: int = 0
+    ) -> Candidate:
+        """The candidate with the held-out errors of its members' median."""
+        models = [start.model for start in counting(starts)]
+        held = self.trials[fold]
+        errors = errors_of(free_runs(median_of(models), held), held) if models else RUNAWAY
+        found = Candidate(s, tuple(starts), errors, iterations)
+        if fold == 0:
+            self.candidates[s] = found
+            self.pool.best = min(self.pool.best, found.error)
+        return found
+
+    def start(
+        self, nx: int, nk: int, output: Output = LINEAR, fold: int = 0
+    ) -> _core.LinearModel | None:
+        """The linear model that networks of this order and delay begin at."""
+        if fold == 0 and output != ABS:
+            self.linear.add([(nx, nk)], self.until)
+            return self.linear.start(nx, nk)
+        key = (nx, nk, output.name, fold)
+        if key not in self._starts:
+            self._prepare([Structure(nx, nk, 1, 0.0, output)], fold)
+        return self._starts[key]
+
+    def _prepare(self, structures: Sequence[Structure], fold: int) -> None:
+        """Fit what `start` needs, side by side."""
+        plain = {(s.nx, s.nk) for s in structures if s.output != ABS}
+        if fold == 0:
+            self.linear.add(sorted(plain), self.until)
+        keys = {
+            (s.nx, s.nk, s.output.name, fold): s for s in structures if s.output == ABS or fold > 0
+        }
+        missing = [(k, s) for k, s in keys.items() if k not in self._starts]
+
+        def fit(job: tuple[Any, Structure], look: Look) -> _core.LinearModel | None:
+            s, data = job[1], self.trials[fold].fitted
+            try:
+                if s.output == ABS:
+                    return rectified_start(data, s.nx, s.nk)
+                return _core.fit_oe(
+                    arrays(self.trials[fold].shortened(6_000, 6_000).fitted),
+                    na=s.nx, nb=s.nx + 1, nk=s.nk, max_iterations=60, progress=look,
+                ).model  # fmt: skip
+            except FitError:
+                return None
+
+        for (key, _), model in zip(missing, self.pool.map(fit, missing), strict=True):
+            self._starts[key] = model
+
+    # --- effort ---------------------------------------------------------------------------------
+
+    def _limited(self, starts: int) -> int:
+        return starts if self.task.starts is None else min(starts, self.task.starts)
+
+    def _calibrate(self, seconds: float, operations: float) -> None:
+        """Convert what is left of a time budget into multiplications."""
+        until = self.until
+        self.rate = operations / max(seconds, 1e-3)
+        if until is not None:
+            left = max(0.0, until - time.perf_counter())
+            self.budget = min(self.budget, self.operations + self.rate * left)
+
+    def rows(self) -> Iterator[Provenance]:
         """The table: linear models, then networks in the order of their trials."""
-        for order, errors in self.linear_errors.items():
-            row: Story = {"kind": "oe", "na": order, "nb": order + 1, "nk": self.nk}
-            yield row | {"free_run_rmse": finite(pooled(errors))}
-        yield from (c.to_json() for c in self.table.values())
+        yield from self.linear.rows()
+        yield from (c.to_json() for c in self.candidates.values())
 
 
-def _with_a_state_more(structure: Structure) -> Structure | None:
-    return replace(structure, nx=structure.nx + 1) if structure.nx < MOST_NX else None
+SHARE_OF_LINEAR, SHARE_OF_SEARCH = 0.12, 0.48
+"""Parts of a time budget after which no linear model, and no network, is tried any more."""
 
 
-def _decayed(structure: Structure, factor: float) -> Structure | None:
-    """With another weight decay, as long as that can matter."""
-    decay = float(f"{structure.decay * factor:.0e}")
-    return replace(structure, decay=decay) if LEAST_DECAY <= decay <= MOST_DECAY else None
+def _repeats(u: FloatArray) -> bool:
+    """Whether an input comes back nearly the same after a while, twice or more in the record."""
+    N = len(u)
+    if N < 200:
+        return False
+    for column in u.T:
+        x = column - column.mean()
+        power = np.concatenate([[0.0], np.cumsum(x**2)])
+        spectrum = np.fft.rfft(x, 2 * N)
+        products = np.fft.irfft(np.abs(spectrum) ** 2)[: N // 2 + 1]
+        lags = np.arange(N // 2 + 1)
+        sizes = np.sqrt(power[N - lags] * (power[N] - power[lags]))
+        likeness = products / np.maximum(sizes, 1e-300)
+        # beyond the first time that it is unlike itself, so that a slow input does not count
+        unlike = np.flatnonzero(likeness < 0.3)
+        if len(unlike) and likeness[unlike[0] :].max(initial=0.0) > REPEATED:
+            return True
+    return False
 
 
-def _limited(iterations: int, task: Task) -> int:
-    return iterations if task.iterations is None else min(iterations, task.iterations)
-
-
-def _output_error(task: Task, pairs: Pairs, order: int, nk: int) -> _core.LinearModel | None:
-    try:
-        fit = _core.fit_oe(pairs, **task.fit_options(na=order, nb=order + 1, nk=nk))
-    except FitError:
-        return None
-    if fit.termination == "interrupted":
-        raise Stopped([])
-    return fit.model
+def _decayed(s: Structure, factor: float) -> Structure:
+    return replace(s, decay=float(f"{s.decay * factor:.0e}"))

@@ -1,4 +1,4 @@
-"""`Task`: one identification with its settings; the story that every model tells of it."""
+"""`Task`: one identification with its settings; what every model says of its origin."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from ..errors import FitError
 from ..models import Model
 from ..validation import validate
 from ..workers import Workers
-from .clock import Clock, Progress
+from .effort import Clock, Progress
 
-Story: TypeAlias = dict[str, Any]
+Provenance: TypeAlias = dict[str, Any]
 Pairs: TypeAlias = list[tuple[FloatArray, FloatArray]]
 
 
@@ -37,6 +37,7 @@ class Task:
     threads: int
     progress: Progress | None
     workers: Workers | None = None
+    select: bool = True
     clock: Clock = field(default_factory=lambda: Clock(None))
 
     @property
@@ -46,8 +47,8 @@ class Task:
 
     def fit_options(self, **orders: int) -> dict[str, Any]:
         """Settings of a linear fit, in the task's orders unless others are given."""
-        told: dict[str, Any] = {**self.orders, **orders}
-        return told | {"max_iterations": self.iterations_or_usual, "progress": self.progress}
+        options: dict[str, Any] = {**self.orders, **orders}
+        return options | {"max_iterations": self.iterations_or_usual, "progress": self.progress}
 
     @property
     def iterations_or_usual(self) -> int:
@@ -65,24 +66,24 @@ def arrays(data: Dataset) -> Pairs:
     return [(e.u, e.y) for e in data.experiments]
 
 
-def sources(data: Dataset) -> list[Story]:
+def sources(data: Dataset) -> list[Provenance]:
     """Where the samples are from, as JSON values."""
     return [{"name": e.name, "range": e.range_text, "samples": len(e)} for e in data.experiments]
 
 
-def bare(cls: type[Model], core: Any, data: Dataset) -> Model:
-    """A model in the data's names and units, without its story."""
+def wrap(cls: type[Model], core: Any, data: Dataset) -> Model:
+    """A model in the data's names and units, without its provenance."""
     d = data
     return cls(core, d.Ts, d.input_names, d.output_name, d.input_units, d.output_unit, d.counts)
 
 
-def told(model: Model, story: Story) -> Model:
-    """The model with more of its story."""
-    return replace(model, training={**model.training, **story})
+def with_provenance(model: Model, extra: Provenance) -> Model:
+    """The model with more of its provenance."""
+    return replace(model, training={**model.training, **extra})
 
 
-def with_story(model: Model, task: Task, began: float, story: Story) -> Model:
-    """The model with what every recipe tells, and this."""
+def documented(model: Model, task: Task, began: float, extra: Provenance) -> Model:
+    """The model with what every kind of model says of its origin, and `extra`."""
     data = task.data
     common = {
         "data": sources(data),
@@ -94,10 +95,12 @@ def with_story(model: Model, task: Task, began: float, story: Story) -> Model:
         "settings": {"max_iterations": task.iterations_or_usual},
         "seconds": time.perf_counter() - began,
     }
-    return told(model, common | story)
+    return with_provenance(model, common | extra)
 
 
-def fit_story(fit: _core.LinearFit | _core.NeuralFit) -> Story:
+def fit_provenance(
+    fit: _core.LinearFit | _core.NeuralFit | _core.NeuralSSFit,
+) -> Provenance:
     """How a fit went."""
     return {
         "cost": fit.cost,

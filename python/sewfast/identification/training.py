@@ -1,32 +1,55 @@
-"""`Structure`: the size and form of one state-space network; starts of it, trained anywhere."""
+"""Training of networks: what distinguishes one from another, and starts of many at once.
+
+A `Structure` sizes a network. A `Request` asks for some starts of one; requests are cut into jobs
+of one start each, which threads of this process or a user's workers run in any order with the same
+result.
+"""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from .. import _core
 from ..dataset import Dataset
 from ..errors import FitError
-from ..workers import spread
-from .clock import stopping
-from .memory import Memory
+from ..workers import Workers, spread
+from .effort import Look, Pool, Stopped
 from .outputs import LINEAR, Output, scale_of
-from .task import Pairs, Story, Task, arrays
+from .task import Pairs, Provenance, arrays
 
 HIDDEN_SCALE = 1.0
 OVERHEAD = 2_000
-"""What a sample costs beside its sensitivities, in multiplications."""
+"""What a sample costs apart from its sensitivities, in multiplications."""
+
+Network: TypeAlias = _core.NeuralSS | _core.NeuralOE
 
 
 @dataclass(frozen=True)
 class Structure:
-    """What distinguishes one candidate from another."""
+    """What distinguishes one network from another.
+
+    Attributes
+    ----------
+    nx : int
+        States; of a lagged network the past outputs, with nx + 1 past inputs.
+    nk : int
+        Delay [samples].
+    hidden : int
+        Hidden units (tanh).
+    decay : float
+        Weight decay.
+    output : Output
+        Output function of a state-space network.
+    integrator : bool
+        Whether the last state is the sum of a function of the others.
+    kind : {"neural_ss", "neural_oe"}
+    """
 
     nx: int
     nk: int
@@ -34,10 +57,14 @@ class Structure:
     decay: float
     output: Output = LINEAR
     integrator: bool = False
+    kind: str = "neural_ss"
 
     def parameters(self, inputs: int) -> int:
         """Length of theta."""
         nx, h = self.nx, self.hidden
+        if self.kind == "neural_oe":
+            regressors = nx + (nx + 1) * inputs
+            return h * (regressors + 2) + regressors + 1
         return nx * nx + nx * inputs + 2 * nx * h + h * inputs + 2 * h + nx + inputs + 1
 
     def operations(self, inputs: int, samples: int) -> float:
@@ -45,180 +72,254 @@ class Structure:
         p = self.parameters(inputs)
         return samples * (p * p / 2.0 + self.nx * self.nx * p + OVERHEAD)
 
-    def to_json(self) -> Story:
+    def to_json(self) -> Provenance:
         """For the table of candidates."""
-        story: Story = {"nx": self.nx, "nk": self.nk, "hidden": self.hidden}
-        story |= {"output": self.output.name, "weight_decay": self.decay}
-        return story | ({"integrator": True} if self.integrator else {})
+        sizes = {"nx": self.nx} if self.kind == "neural_ss" else {"na": self.nx, "nb": self.nx + 1}
+        row: Provenance = {"kind": self.kind, **sizes, "nk": self.nk, "hidden": self.hidden}
+        row |= {"output": self.output.name, "weight_decay": self.decay}
+        return row | ({"integrator": True} if self.integrator else {})
 
 
 @dataclass(frozen=True)
 class Start:
-    """One trained start: the model, J on what is held out (else on training), the guard's word."""
+    """One trained start.
 
-    model: _core.NeuralSS
+    Attributes
+    ----------
+    model : compiled network
+    cost : float
+        J on what is held out, else on the training data.
+    fault : str
+        What the guard found wrong with it; empty for a sound one.
+    """
+
+    model: Network
     cost: float
-    is_sound: bool
+    fault: str = ""
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the guard found nothing."""
+        return not self.fault
+
+
+@dataclass(frozen=True)
+class Request:
+    """Some starts of one structure on some data.
+
+    `initial` are models to be trained further, one start each; otherwise `starts` new ones are
+    drawn around `linear`, numbered from `first` on.
+    """
+
+    structure: Structure
+    fitted: Dataset
+    held: Dataset | None
+    iterations: int
+    linear: _core.LinearModel | None = None
+    starts: int = 0
+    first: int = 0
+    initial: Sequence[Network] = field(default=())
+
+    @property
+    def count(self) -> int:
+        """Starts."""
+        return len(self.initial) or self.starts
+
+    @property
+    def operations(self) -> float:
+        """Multiplications, if every start takes all its iterations."""
+        each = self.structure.operations(self.fitted.n_inputs, len(self.fitted))
+        return each * self.iterations * self.count
 
 
 @dataclass(frozen=True)
 class Job:
-    """Some starts of one structure: all that a worker needs, picklable."""
+    """One start: all that a worker needs, picklable for state-space networks."""
 
     experiments: Pairs
-    validation: Pairs
+    held: Pairs
     settings: dict[str, Any]
     linear: tuple[Any, ...] | None
-    starts: int
-    first_start: int
-    initial: tuple[dict[str, Any], ...] | None = None
-    deadline: float | None = None
-    threads: int = 1
+    initial: dict[str, Any] | None
+    number: int
+    seed: int
+    deadline: float | None
 
+    def run(self, look: Look | None) -> tuple[Network, float] | None:
+        """The trained network and its cost; None where it failed."""
+        fit = self._lagged if "na" in self.settings else self._state_space
+        try:
+            return fit(look)
+        except FitError:
+            return None
 
-@dataclass(frozen=True)
-class Training:
-    """How a structure is trained: data, where it starts, how long."""
-
-    fitted: Dataset
-    held: Dataset | None
-    linear: _core.LinearModel | None
-    starts: int
-    iterations: int
-    first_start: int = 0
-    initial: Sequence[_core.NeuralSS] = field(default=())
-    memory: Memory | None = None
-
-    def operations(self, structure: Structure) -> float:
-        """Multiplications, if every start takes all its iterations."""
-        each = structure.operations(self.fitted.n_inputs, len(self.fitted))
-        return each * self.iterations * (len(self.initial) or self.starts)
-
-    def affordable(self, structure: Structure, operations: float) -> Training:
-        """With as many iterations as that much work allows, at least a tenth."""
-        share = min(1.0, max(0.1, operations / self.operations(structure)))
-        return replace(self, iterations=max(1, round(share * self.iterations)))
-
-
-def train(task: Task, structure: Structure, training: Training) -> list[Start]:
-    """Starts with a finite free run, in their order; none where every one failed."""
-    starts = _trained(task, _job(task, structure, training))
-    memory = training.memory
-    if memory is None:
-        return starts
-    return [replace(s, is_sound=s.is_sound and memory.allows(s.model)) for s in starts]
-
-
-def _trained(task: Task, job: Job) -> list[Start]:
-    """By threads of this process, or by the workers."""
-    if task.workers is None:
-        return _in_threads(task, job)
-    jobs = [_part(job, i) for i in range(job.starts)]
-    try:
-        found = spread(task.workers, run_job, jobs)
-    except KeyboardInterrupt:
-        raise Stopped([]) from None
-    task.clock.over()
-    return [_start(*values) for results in found for values in results]
-
-
-def _part(job: Job, i: int) -> Job:
-    """The i-th start alone."""
-    initial = job.initial and (job.initial[i],)
-    return replace(job, starts=1, first_start=job.first_start + i, initial=initial)
-
-
-def run_job(job: Job) -> list[tuple[dict[str, Any], float, bool]]:
-    """Train the job's starts; what comes back is picklable too."""
-    return [(_values(s.model), s.cost, s.is_sound) for s in _fitted(job, None)[0]]
-
-
-def _in_threads(task: Task, job: Job) -> list[Start]:
-    """In this process, from this thread, which hears Ctrl-C and shows progress."""
-    starts, was_stopped = _fitted(replace(job, threads=task.threads), task.progress)
-    if was_stopped and not task.clock.over():
-        raise Stopped(starts)
-    return starts
-
-
-class Stopped(Exception):
-    """Ctrl-C while starts were trained; what there is of them."""
-
-    def __init__(self, starts: list[Start]) -> None:
-        super().__init__("interrupted")
-        self.starts = starts
-
-
-def _fitted(job: Job, progress: Any) -> tuple[list[Start], bool]:
-    """The starts, and whether they were stopped before their end."""
-    linear = None if job.linear is None else _core.LinearModel(*_copied(job.linear))
-    initial = None if job.initial is None else [_model(v) for v in job.initial]
-    try:
+    def _state_space(self, look: Look | None) -> tuple[Network, float] | None:
         fit = _core.fit_neural_ss(
-            [_copied(pair) for pair in job.experiments],
-            [_copied(pair) for pair in job.validation],
-            **job.settings,
-            linear=linear,
-            initial=initial,
-            starts=job.starts,
-            first_start=job.first_start,
-            threads=job.threads,
-            progress=stopping(progress, _seconds(job)),
+            self.experiments,
+            self.held,
+            **self.settings,
+            linear=None if self.linear is None else _core.LinearModel(*self.linear),
+            initial=None if self.initial is None else [_core.NeuralSS(**self.initial)],
+            starts=1,
+            first_start=self.number,
+            seed=self.seed,
+            threads=1,
+            progress=look,
         )
-    except FitError:
-        return [], False
-    except KeyboardInterrupt:
-        return [], True
-    found = zip(fit.start_models, fit.start_costs.tolist(), fit.sounds, strict=True)
-    starts = [Start(m, c, s) for m, c, s in found if m is not None and math.isfinite(c)]
-    return starts, fit.termination == "interrupted"
+        cost = float(fit.start_costs[0])
+        return (fit.model, cost) if math.isfinite(cost) else None
+
+    def _lagged(self, look: Look | None) -> tuple[Network, float] | None:
+        known = self.initial or {}
+        fit = _core.fit_neural_oe(
+            self.experiments,
+            self.held,
+            **self.settings,
+            linear=None if self.linear is None else _core.LinearModel(*self.linear),
+            u_mean=known.get("u_mean"),
+            u_scale=known.get("u_scale"),
+            y_mean=known.get("y_mean"),
+            y_scale=known.get("y_scale"),
+            saturate=1.0,
+            initial_state="estimated",
+            starts=1,
+            # the core numbers these starts from 0 in every call
+            seed=(self.seed + self.number * 0x9E3779B97F4A7C15) % 2**64,
+            threads=1,
+            initial_theta=None if self.initial is None else known["theta"][None, :],
+            progress=look,
+        )
+        cost = float(fit.start_costs[0])
+        return (fit.model, cost) if math.isfinite(cost) else None
 
 
-def _job(task: Task, structure: Structure, training: Training) -> Job:
-    s, linear = structure, training.linear
-    if training.initial:
-        output_parameters = training.initial[0].settings["output_parameters"]
-    else:
-        output_parameters = s.output.parameters(*scale_of(training.fitted, s.output))
-    return Job(
-        experiments=arrays(training.fitted),
-        validation=[] if training.held is None else arrays(training.held),
-        settings={
-            "nx": s.nx,
-            "nk": s.nk,
-            "hidden": s.hidden,
-            "integrator": s.integrator,
-            "output": s.output.name,
-            "output_parameters": output_parameters,
-            "weight_decay": s.decay,
-            "hidden_scale": HIDDEN_SCALE,
-            "max_iterations": training.iterations,
-            "seed": task.seed,
-        },
-        linear=None if linear is None else (linear.a, linear.b, linear.nk, linear.offset),
-        starts=len(training.initial) or training.starts,
-        first_start=training.first_start,
-        initial=tuple(_values(m) for m in training.initial) or None,
-        deadline=None if task.clock.left is None else time.time() + task.clock.left,
+def run_job(job: Job) -> tuple[dict[str, Any], float] | None:
+    """A job of a state-space network on a worker; what comes back is picklable too."""
+    own = Job(
+        [_aligned(pair) for pair in job.experiments],
+        [_aligned(pair) for pair in job.held],
+        dict(zip(job.settings, _aligned(job.settings.values()), strict=True)),
+        None if job.linear is None else _aligned(job.linear),
+        None if job.initial is None else _values_aligned(job.initial),
+        job.number,
+        job.seed,
+        job.deadline,
     )
 
+    def look(*_: object) -> None:
+        if job.deadline is not None and time.time() >= job.deadline:
+            raise KeyboardInterrupt
 
-def _seconds(job: Job) -> float | None:
-    return None if job.deadline is None else max(0.0, job.deadline - time.time())
+    try:
+        found = own.run(look)
+    except KeyboardInterrupt:
+        return None
+    return None if found is None else (_values(found[0]), found[1])
 
 
-def _values(model: _core.NeuralSS) -> dict[str, Any]:
+def train(
+    requests: Sequence[Request],
+    pool: Pool,
+    seed: int,
+    *,
+    workers: Workers | None = None,
+    until: float | None = None,
+    share: float | None = None,
+) -> list[list[Start]]:
+    """Starts with a finite free run of every request, in their order.
+
+    Parameters
+    ----------
+    requests : sequence of Request
+    pool : Pool
+    seed : int
+        Start `i` of a structure draws from stream `i`.
+    workers : executor or None
+        Trains the state-space networks; the bits are the same.
+    until : float or None
+        Deadline on `time.perf_counter`; starts return their best until then.
+    share : float or None
+        As in `Pool.map`.
+
+    Raises
+    ------
+    Stopped
+        On Ctrl-C.
+    """
+    jobs = [job for request in requests for job in _jobs(request, seed, until)]
+    if workers is None:
+        found = pool.map(lambda job, look: job.run(look), jobs, until=until, share=share)
+    else:
+        found = _spread(workers, jobs)
+        if until is not None and time.perf_counter() >= until:
+            pool.clock.truncated = True
+    left = iter(found)
+    starts = [[next(left) for _ in range(request.count)] for request in requests]
+    return [[Start(*values) for values in some if values is not None] for some in starts]
+
+
+def _spread(workers: Workers, jobs: Sequence[Job]) -> list[tuple[Network, float] | None]:
+    """State-space networks by the workers, lagged ones (a few, and quick) here."""
+    remote = [i for i, job in enumerate(jobs) if "nx" in job.settings]
+    try:
+        answers = iter(spread(workers, run_job, [jobs[i] for i in remote]))
+        found: list[tuple[Network, float] | None] = []
+        for job in jobs:
+            if "nx" in job.settings:
+                answer = next(answers)
+                found.append(None if answer is None else (_model(answer[0]), answer[1]))
+            else:
+                found.append(job.run(None))
+    except KeyboardInterrupt:
+        raise Stopped from None
+    return found
+
+
+def _jobs(request: Request, seed: int, until: float | None) -> list[Job]:
+    s, linear = request.structure, request.linear
+    settings: dict[str, Any] = {"nk": s.nk, "hidden": s.hidden, "weight_decay": s.decay}
+    settings["max_iterations"] = request.iterations
+    if s.kind == "neural_oe":
+        settings |= {"na": s.nx, "nb": s.nx + 1}
+    else:
+        settings |= {"nx": s.nx, "integrator": s.integrator, "output": s.output.name}
+        settings |= {"output_parameters": _output_parameters(request)}
+        settings |= {"hidden_scale": HIDDEN_SCALE}
+    common = {
+        "experiments": arrays(request.fitted),
+        "held": [] if request.held is None else arrays(request.held),
+        "settings": settings,
+        "linear": None if linear is None else (linear.a, linear.b, linear.nk, linear.offset),
+        "seed": seed,
+        "deadline": None if until is None else time.time() + until - time.perf_counter(),
+    }
+    if request.initial:
+        return [
+            Job(**common, number=request.first + i, initial=_values(model))
+            for i, model in enumerate(request.initial)
+        ]
+    return [Job(**common, number=request.first + i, initial=None) for i in range(request.starts)]
+
+
+def _output_parameters(request: Request) -> Any:
+    if request.initial:
+        return request.initial[0].settings["output_parameters"]
+    output = request.structure.output
+    return output.parameters(*scale_of(request.fitted, output))
+
+
+def _values(model: Network) -> dict[str, Any]:
     return {**model.settings, "theta": model.theta}
 
 
-def _start(values: dict[str, Any], cost: float, is_sound: bool) -> Start:
-    return Start(_model(values), cost, is_sound)
-
-
 def _model(values: dict[str, Any]) -> _core.NeuralSS:
-    return _core.NeuralSS(**dict(zip(values, _copied(values.values()), strict=True)))
+    return _core.NeuralSS(**_values_aligned(values))
 
 
-def _copied(values: Iterable[Any]) -> Any:
-    """Copies as the core takes them: what came through a network may lie in memory otherwise."""
+def _values_aligned(values: dict[str, Any]) -> dict[str, Any]:
+    return dict(zip(values, _aligned(values.values()), strict=True))
+
+
+def _aligned(values: Iterable[Any]) -> Any:
+    """Copies as the core takes them: what came over a network may lie in memory otherwise."""
     return tuple(np.array(v, order="C") if isinstance(v, np.ndarray) else v for v in values)

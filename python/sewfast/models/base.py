@@ -20,7 +20,7 @@ from ..dataset import (
     require_same_units,
 )
 from ..errors import DataError, SettingError, SewfastError
-from .choice import choice_lines
+from .choice import choice_lines, verdict_lines
 
 if TYPE_CHECKING:
     from ..evidence import Bands, ReportCard
@@ -70,6 +70,8 @@ class Model(ABC):
         Set where the output is a speed computed from encoder counts.
     training : mapping
         How it came about: data, settings, cost with its horizon, termination. JSON values only.
+    alternatives : tuple of Model
+        What `identify` would have chosen next, the best first; not written to the model's file.
     """
 
     core: Any
@@ -80,6 +82,7 @@ class Model(ABC):
     output_unit: str
     counts: tuple[str, float] | None = None
     training: Mapping[str, Any] = field(default_factory=dict)
+    alternatives: tuple[Model, ...] = ()
 
     kind: ClassVar[str]
     title: ClassVar[str]
@@ -255,9 +258,9 @@ class Model(ABC):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # the compiled model is made again from its numbers, as when a file is read
-        from .files import from_dict
+        from .files import restored
 
-        return from_dict, (self.to_dict(),)
+        return restored, (self.to_dict(), self.alternatives)
 
     def __repr__(self) -> str:
         orders = ", ".join(f"{k}={v}" for k, v in self.orders.items())
@@ -289,4 +292,5 @@ class Model(ABC):
             prepared[_STEPS_SHOWN:] = [f"prepared: and {len(prepared) - _STEPS_SHOWN} more"]
         lines += prepared
         lines += choice_lines(t, self.output_unit)
-        return lines + [str(note) for note in t.get("notes", [])]
+        lines += [str(note) for note in t.get("notes", [])]
+        return lines + verdict_lines(t)

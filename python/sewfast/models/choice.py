@@ -21,6 +21,14 @@ def choice_lines(training: Mapping[str, Any], unit: str) -> list[str]:
     return [*lines, f"chosen: {choice.get('chosen')}; {choice.get('reason')}"]
 
 
+def verdict_lines(training: Mapping[str, Any]) -> list[str]:
+    """The closing words: good enough to tune on or not, because of what, what to do next."""
+    verdict = training.get("verdict")
+    if not isinstance(verdict, Mapping):
+        return []
+    return [f"verdict: {verdict.get('text')}", *(f"  {n}" for n in verdict.get("next", ()))]
+
+
 def _table(
     candidates: Sequence[Mapping[str, Any]], choice: Mapping[str, Any], unit: str
 ) -> list[str]:
@@ -36,7 +44,9 @@ def _row(c: Mapping[str, Any], chosen: Any) -> tuple[str, ...]:
     error = _number(c.get("free_run_rmse"), "runs away")
     if c.get("kind") == "oe":
         return f"oe, na = {c.get('na')}, nb = {c.get('nb')}, nk = {c.get('nk')}", "", "", error, ""
-    size = f"neural_ss, nx = {c.get('nx')}, {c.get('hidden')} tanh, nk = {c.get('nk')}"
+    orders = ", ".join(f"{k} = {c[k]}" for k in ("nx", "na", "nb") if k in c)
+    size = f"{c.get('kind')}, {orders}, {c.get('hidden')} tanh, nk = {c.get('nk')}"
+    size += ", integrator" if c.get("integrator") else ""
     decay = f"decay {_number(c.get('weight_decay'), '?')}"
     is_chosen = isinstance(chosen, Mapping) and all(c.get(k) == v for k, v in chosen.items())
     return size, str(c.get("output")), decay, error, "chosen" if is_chosen else ""

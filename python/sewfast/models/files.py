@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.resources import files
 from typing import Any, TypeAlias
 
@@ -47,6 +48,11 @@ def load_model(path: str | os.PathLike[str]) -> Model:
 def from_dict(values: dict[str, Any]) -> Model:
     """The model that `Model.to_dict` gave these values."""
     return _read(Fields("model", {"version": VERSION} | values))
+
+
+def restored(values: dict[str, Any], alternatives: tuple[Model, ...]) -> Model:
+    """The model of `from_dict` with its alternatives: what a pickle holds."""
+    return replace(from_dict(values), alternatives=alternatives)
 
 
 def model_schema() -> dict[str, Any]:

@@ -1,0 +1,547 @@
+"""Which candidate becomes the model: against linear ones, trained to the end, guarded, refitted.
+
+A candidate that fails a question makes room for the next one; the linear model is returned only
+where no network is credibly better. What was second stays with the model, in `alternatives`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from .. import _core
+from ..dataset import Dataset
+from ..errors import FitError, Interrupted
+from ..models import Ensemble, LinearOE, Model, NeuralOE, NeuralSS
+from .effort import Look, Pool, Stopped
+from .folds import LEAST_HELD_OUT, SHARE, Split, compared, errors_of, folds, free_runs
+from .linear import linear_model
+from .orders import LinearCandidate, LinearTable
+from .search import Candidate, Search, counting, median_of
+from .task import Provenance, Task, arrays, documented, finite, with_provenance, wrap
+from .training import Network, Request, Start, Structure, train
+from .verdict import verdict
+
+WORTH_IT = 0.9
+"""Every start of a network must bring the error below this part of the best linear model's."""
+WORTH_LOOKING = 0.97
+"""Where the median of the starts does not even reach this, nothing is asked."""
+BY_FAR = 0.2
+"""Below this part of the linear model's error the network has won without a second fold."""
+VERIFIED = 4
+"""Structures that are learned again on the earlier fold."""
+FINALISTS = 3
+WITHIN, WITHIN_LARGE = 2.0, 1.3
+"""How much larger than the best one's a finalist's error may be."""
+WORTH_AN_INTEGRATOR = 0.7
+ENOUGH_TO_CHOOSE_BY = 1_500
+"""Held-out samples from which on a single start may be taken instead of the median."""
+MOST_MEMBERS = 15
+"""Of an ensemble: a controller is tuned on every one, and a median of more is hardly better."""
+MOST_ALTERNATIVES = 2
+TOGETHER = 1.25
+"""On little data the median goes over all finalists whose error is within this factor."""
+FINAL_OPERATIONS, FINAL_OPERATIONS_LARGE = 1.5e11, 8e11
+LEGS = 3
+LEG_ITERATIONS = 80
+BEHIND = 1.15
+"""A finalist that is behind by more after a leg is not trained on."""
+FINISHED = 0.995
+"""A leg that does not bring the error below this part ends the training."""
+SHARE_OF_VERIFYING, SHARE_OF_FINAL, SHARE_OF_REFIT = 0.55, 0.78, 0.85
+"""Parts of a time budget at which each stage has to be done."""
+
+
+def auto(task: Task) -> Model:
+    """The network where it is credibly better, else linear output error."""
+    return _identified(task, wants_network=False)
+
+
+def neural_ss(task: Task) -> Model:
+    """The state-space network, whether it is better or not."""
+    return _identified(task, wants_network=True)
+
+
+def _identified(task: Task, wants_network: bool) -> Model:
+    began = time.perf_counter()
+    parts = folds(task.data, task.validation)
+    if not parts:
+        return _without_held_out(task, began, wants_network)
+    search = Search(task, parts, Pool(task.threads, task.clock, task.progress))
+    choice = Choice(search, began, wants_network)
+    try:
+        search.run()
+        return choice.model()
+    except Stopped as stopped:
+        raise Interrupted(choice.best_so_far(stopped)) from None
+
+
+@dataclass
+class Choice:
+    """The end of a search: from its candidates to one model."""
+
+    search: Search
+    began: float
+    wants_network: bool
+    reasons: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.task = self.search.task
+        self.clock = self.search.pool.clock
+        self.split = self.search.folds[0]
+
+    def model(self) -> Model:
+        """The chosen model, with the second best as alternatives."""
+        asked = self._worth_asking()
+        while asked:
+            finalists = self._finalists(asked)
+            finished = self._finish(finalists)
+            chosen = self._sound_and_settled(finished)
+            if chosen:
+                others = [c for c in finished if c.is_sound and c not in chosen]
+                return self._network(chosen, others)
+            asked = [c for c in asked if c.structure not in {f.structure for f in finalists}]
+            if self.clock.over(SHARE_OF_FINAL):
+                break
+        if self.wants_network:
+            return self._network(self._any_network(), [])
+        return self._linear()
+
+    # --- against the linear model ---------------------------------------------------------------
+
+    @property
+    def linear(self) -> LinearCandidate | None:
+        """The linear model with the lowest held-out error: what a network has to beat."""
+        return self.search.linear.best if self.search.linear.eligible else None
+
+    def _worth_asking(self) -> list[Candidate]:
+        """Candidates credibly better than linear, the best first."""
+        found = self.search.eligible
+        ranked = sorted([c for c in found if c.is_sound], key=lambda c: c.error)
+        linear = self.linear
+        if self.wants_network or linear is None:
+            if self.wants_network:
+                self.reasons.append("a state-space network was asked for")
+            only = [c for c in ranked or found if c.structure.kind == "neural_ss"]
+            return only if self.wants_network else ranked
+        if not ranked:
+            self.reasons.append(
+                "no network could be trained on so few samples"
+                if not found
+                else "no network forgets its initial state and withstands larger inputs"
+            )
+            return []
+        ratio = ranked[0].error / max(linear.rmse, 1e-300)
+        self.reasons.append(
+            f"free-run error of the best network on data not trained on: {100 * ratio:.1f} % of "
+            "the best linear model's"
+        )
+        if ratio >= WORTH_LOOKING:
+            return []
+        return ranked if ratio <= BY_FAR else self._verified(ranked, linear)
+
+    def _verified(self, ranked: Sequence[Candidate], linear: LinearCandidate) -> list[Candidate]:
+        """Those that beat linear models with every start on two later parts.
+
+        Forward chaining: the best structure of each size is learned again from what is before an
+        earlier fifth, so that a win by luck, of the start or of the part, is none.
+        """
+        search = self.search
+        best_of: dict[tuple[int, bool, str], Candidate] = {}
+        for c in ranked:
+            best_of.setdefault((c.structure.nx, c.structure.integrator, c.structure.kind), c)
+        asked = list(best_of.values())[:VERIFIED]
+        asked = [c for c in asked if self._worst(c, search.trials[0]) < WORTH_IT * linear.rmse]
+        passed: list[tuple[float, Candidate]] = []
+        if len(search.trials) < 2:
+            passed = [(c.error, c) for c in asked]
+        elif asked:
+            earlier = LinearTable(self.task, [search.folds[1]], search.pool)
+            nk = linear.nk
+            orders = {search.linear.choice.order, linear.order}
+            earlier.add([(o, nk) for o in sorted(orders)], None)
+            bound = earlier.best.rmse if earlier.candidates else math.inf
+            able = [c for c in asked if search.is_affordable(c.structure, 1)]
+            passed = [(c.error, c) for c in asked if c not in able]
+            starts = 6 if search.is_small else 3
+            until = self.clock.until(SHARE_OF_VERIFYING)
+            again = search.tried([(c.structure, 80, starts) for c in able], 1, until=until)
+            for c, other in zip(able, again, strict=True):
+                if self._worst(other, search.trials[1]) < WORTH_IT * bound:
+                    passed.append((math.sqrt(c.error * other.error), c))
+        passed.sort(key=lambda p: p[0])
+        self.reasons.append(
+            f"{len(passed)} of {len(asked)} network sizes beat it with every start on "
+            f"{min(2, len(search.trials))} later part(s)"
+        )
+        sizes = {(c.structure.nx, c.structure.integrator, c.structure.kind): c for _, c in passed}
+        kept = []
+        for c in ranked:
+            size = sizes.get((c.structure.nx, c.structure.integrator, c.structure.kind))
+            if size is not None and c.structure.hidden <= size.structure.hidden:
+                kept.append(c)
+        order = [id(c) for _, c in passed]
+        return sorted(kept, key=lambda c: order.index(id(c)) if id(c) in order else len(order))
+
+    def _worst(self, c: Candidate, held: Split) -> float:
+        """The largest error of the median and of its members alone."""
+        each = [errors_of(free_runs(m, held), held).rmse for m in c.models]
+        return max([c.error, *each])
+
+    # --- training to the end --------------------------------------------------------------------
+
+    def _finalists(self, ranked: Sequence[Candidate]) -> list[Candidate]:
+        """Up to three of different structure, about as good as the best."""
+        within = WITHIN_LARGE if len(self.task.data) >= 20_000 else WITHIN
+        first, found = ranked[0], []
+        seen: set[tuple[object, ...]] = set()
+        for c in ranked:
+            s = c.structure
+            key = (s.kind, s.nx, s.hidden, s.nk, s.integrator, s.output.name)
+            close = c.error <= within * first.error or (
+                # held-out data that repeat what was learned do not tell small networks apart
+                s.integrator and first.structure.integrator and self.search.repeats
+            )
+            if close and key not in seen and len(found) < FINALISTS:
+                seen.add(key)
+                found.append(c)
+        if all(c.structure.integrator for c in found):
+            plain = next((c for c in ranked if not c.structure.integrator), None)
+            if plain is not None:
+                found[FINALISTS - 1 :] = [plain]
+        return found
+
+    def _finish(self, finalists: Sequence[Candidate]) -> list[Candidate]:
+        """More starts, then all fitted data, until nothing is gained any more."""
+        search = self.search
+        budget = FINAL_OPERATIONS_LARGE if search.is_large else FINAL_OPERATIONS
+        until = self.clock.until(SHARE_OF_FINAL)
+        if until is not None:
+            left = until - time.perf_counter()
+            budget = min(budget, max(0.0, left) * search.rate)
+        alive = self._with_more_starts(finalists, budget / 3.0)
+        alive = [self._rejudged(c) for c in alive]
+        spent = 0.0
+        for leg in range(LEGS):
+            if self.clock.over(SHARE_OF_FINAL):
+                break
+            requests = self._leg(alive, (budget - spent) / (LEGS - leg))
+            spent += sum(r.operations for r in requests)
+            found = search.guarded(
+                train(
+                    requests,
+                    search.pool,
+                    self.task.seed,
+                    workers=self.task.workers,
+                    until=until,
+                    share=0.6 + 0.35 * (leg + 1) / LEGS,
+                )
+            )
+            following = [self._better(c, starts) for c, starts in zip(alive, found, strict=True)]
+            gained = any(
+                n.error < FINISHED * c.error for c, n in zip(alive, following, strict=True)
+            )
+            alive = following
+            if not search.is_small and not (search.repeats and alive[0].structure.integrator):
+                best = min(c.error for c in alive)
+                alive = [c for c in alive if c.error <= BEHIND * best]
+            if not gained:
+                break
+        return sorted(alive, key=lambda c: c.error)
+
+    def _with_more_starts(self, finalists: Sequence[Candidate], budget: float) -> list[Candidate]:
+        search, requests = self.search, []
+        for c in finalists:
+            many = 16 if search.is_small else 12 if c.structure.integrator else 6
+            many = 4 if len(self.task.data) >= 25_000 and not c.structure.integrator else many
+            wanted = many if self.task.starts is None else self.task.starts
+            request = search._request(c.structure, 60, starts=1, first=20)
+            can = int(budget / len(finalists) / request.operations)
+            requests.append(replace(request, starts=max(0, min(wanted - len(c.starts), can))))
+        added = search._trained(requests, 0.6, self.clock.until(SHARE_OF_FINAL - 0.15))
+        return [
+            search._judged(c.structure, [*c.starts, *starts], c.iterations)
+            for c, starts in zip(finalists, added, strict=True)
+        ]
+
+    def _leg(self, alive: Sequence[Candidate], budget: float) -> list[Request]:
+        """One leg for the starts that count: as many iterations as the budget allows."""
+        task, requests = self.task, []
+        for c in alive:
+            each = c.structure.operations(self.search.inputs, len(self.split.fitted))
+            share = budget / len(alive)
+            most = LEG_ITERATIONS if task.iterations is None else task.iterations
+            kept = c.models[: max(1, int(share / (each * 30)))]
+            iterations = int(min(most, max(5, share / (each * len(kept)))))
+            linear = self.search.start(c.structure.nx, c.structure.nk, c.structure.output)
+            requests.append(
+                Request(
+                    c.structure,
+                    self.split.fitted,
+                    self.split.held,
+                    iterations,
+                    linear if c.structure.kind == "neural_oe" else None,
+                    initial=kept,
+                )
+            )
+        return requests
+
+    def _rejudged(self, c: Candidate) -> Candidate:
+        """The same starts, judged on all that is held out."""
+        models = c.models
+        return replace(c, errors=errors_of(free_runs(median_of(models), self.split), self.split))
+
+    def _better(self, before: Candidate, starts: Sequence[Start]) -> Candidate:
+        """The candidate after a leg, unless that has made it worse."""
+        if not starts:
+            return before
+        after = self._rejudged(replace(before, starts=tuple(starts)))
+        if after.error <= 1.02 * before.error and (after.is_sound or not before.is_sound):
+            return self._alone(after)
+        return before
+
+    def _alone(self, c: Candidate) -> Candidate:
+        """The best start alone, where long held-out data say that it is better so."""
+        if len(c.models) < 2 or self.split.scored < ENOUGH_TO_CHOOSE_BY:
+            return c
+        if c.structure.integrator and self.search.repeats:
+            return c
+        one = self._rejudged(replace(c, starts=(c.members[0],)))
+        return one if one.error < c.error else c
+
+    # --- the choice -----------------------------------------------------------------------------
+
+    def _sound_and_settled(self, finished: Sequence[Candidate]) -> list[Candidate]:
+        """The chosen candidate and those that join its median; empty where none may be taken."""
+        able = [c for c in finished if c.is_sound and math.isfinite(c.error)]
+        linear = self.linear
+        if linear is not None and not self.wants_network:
+            able = [c for c in able if c.error < WORTH_LOOKING * linear.rmse]
+        plain = [c for c in able if not c.structure.integrator]
+        integrates = bool(able) and able[0].structure.integrator
+        if integrates and plain and able[0].error > WORTH_AN_INTEGRATOR * plain[0].error:
+            able = plain
+        if not able:
+            return []
+        best = able[0]
+        for c in sorted(able, key=lambda c: c.structure.parameters(self.search.inputs)):
+            ratio, deviation = compared(c.errors, best.errors)
+            if ratio <= min(deviation, 0.02):
+                best = c
+                break
+        return [best, *self._joining(best, able)]
+
+    def _joining(self, best: Candidate, able: Sequence[Candidate]) -> list[Candidate]:
+        """Others whose runs bring the median's error down, on little data all about as good."""
+        group = [best]
+        if best.structure.integrator and self.search.repeats:
+            # what is held out repeats what was learned and cannot tell them: all that are small
+            return [c for c in able if c is not best and c.structure.integrator]
+        for c in able:
+            if c is best or c.structure.integrator != best.structure.integrator:
+                continue
+            before = self._error_of(group)
+            after = self._error_of([*group, c])
+            if after < 0.98 * before or (self.search.is_small and c.error < TOGETHER * best.error):
+                group.append(c)
+        return group[1:]
+
+    def _error_of(self, group: Sequence[Candidate]) -> float:
+        models = [m for c in group for m in c.models]
+        return errors_of(free_runs(median_of(models), self.split), self.split).rmse
+
+    def _any_network(self) -> list[Candidate]:
+        found = [
+            c for c in self.search.candidates.values()
+            if c.structure.kind == "neural_ss" and math.isfinite(c.error)
+        ]  # fmt: skip
+        if not found:
+            raise FitError(
+                f"{self.task.data.source}: expected a network with a finite free run on data not "
+                "trained on, found none; record longer, give nx and hidden, or ask for model oe"
+            )
+        self.reasons.append("no network passed the guard: the best of them all the same")
+        return [min(found, key=lambda c: c.error)]
+
+    # --- the model ------------------------------------------------------------------------------
+
+    def _refitted(self, c: Candidate, most: int) -> list[Network]:
+        """A few iterations on everything, the held-out part included, where that stays sound."""
+        search, models = self.search, c.models[:most]
+        if self.split.is_given or self.clock.over(SHARE_OF_REFIT):
+            return models
+        linear = search.start(c.structure.nx, c.structure.nk, c.structure.output)
+        request = Request(
+            c.structure, self.task.data, None, 6 if search.samples > 60_000 else 15,
+            linear if c.structure.kind == "neural_oe" else None, initial=models,
+        )  # fmt: skip
+        (found,) = search.guarded(
+            train(
+                [request], search.pool, self.task.seed, workers=self.task.workers,
+                until=self.clock.until(SHARE_OF_REFIT), share=1.0,
+            )
+        )  # fmt: skip
+        kept = [s.model for s in counting(found) if s.is_sound]
+        return kept if len(kept) >= min(len(models), 3) else models
+
+    def _network(self, chosen: Sequence[Candidate], others: Sequence[Candidate]) -> Model:
+        task, first = self.task, chosen[0]
+        most = math.ceil(MOST_MEMBERS / len(chosen))
+        models = [m for c in chosen for m in self._refitted(c, most)]
+        error = self._error_of(chosen)
+        s = first.structure
+        provenance: Provenance = {
+            "initial_state": "estimated",
+            "cost_horizon": "free run",
+            "cost_unit": "output unit squared",
+            "termination": "time budget" if self.clock.truncated else "chosen by free run",
+            "seed": task.seed,
+            "samples_fitted": len(task.data),
+            "weight_decay": s.decay,
+            "choice": self._choice(s.kind, error),
+        }
+        provenance["choice"]["chosen_structure"] = s.to_json()
+        provenance["choice"]["final_free_run_rmse"] = finite(error)
+        model = self._of(models, s)
+        provenance["cost"] = cost_of(model, task.data)
+        model = documented(model, task, self.began, provenance)
+        runners_up = [self._alternative(c) for c in others[:MOST_ALTERNATIVES]]
+        return self._closed(model, error, [*runners_up, *self._linear_alternative()])
+
+    def _of(self, models: Sequence[Network], s: Structure) -> Model:
+        """One model as it is, several as an ensemble, in the data's names and units."""
+        known: Provenance = {"weight_decay": s.decay, "samples_fitted": len(self.task.data)}
+        members = [
+            with_provenance(
+                wrap(NeuralOE if isinstance(m, _core.NeuralOE) else NeuralSS, m, self.task.data),
+                known,
+            )
+            for m in models
+        ]
+        return members[0] if len(members) == 1 else Ensemble.of(members)
+
+    def _alternative(self, c: Candidate) -> Model:
+        model = self._of(c.models[:MOST_MEMBERS], c.structure)
+        choice = {"chosen": c.structure.kind, "reason": "an alternative to what was chosen"}
+        choice |= {"free_run_rmse": {c.structure.kind: finite(c.error)}}
+        extra: Provenance = {"initial_state": "estimated", "choice": choice}
+        return documented(model, self.task, self.began, extra)
+
+    def _linear_alternative(self) -> list[Model]:
+        """The linear model that the network was compared with."""
+        if not self.search.linear.eligible:
+            return []
+        chosen = self.search.linear.choice
+        core = chosen.models[0]
+        choice = {"chosen": "oe", "reason": "the linear alternative to what was chosen"}
+        choice |= {"free_run_rmse": {"oe": finite(chosen.rmse)}}
+        extra: Provenance = {"initial_state": "estimated", "choice": choice}
+        return [documented(wrap(LinearOE, core, self.task.data), self.task, self.began, extra)]
+
+    def _linear(self) -> Model:
+        """Output error on all data, of the simplest order that is about as good as the best."""
+        task, table = self.task, self.search.linear
+        if not table.eligible:
+            return self._least_squares()
+        chosen = table.choice
+        core = chosen.models[0]
+        provenance: Provenance = {"choice": self._choice("oe", chosen.rmse)}
+        until = self.clock.until(SHARE_OF_REFIT)
+        (fit,) = self.search.pool.map(self._linear_fit, [chosen], until=until, share=1.0)
+        if fit is None:
+            # no time for all samples: the excerpt's model
+            extra = {"initial_state": "estimated", "termination": "time budget", **provenance}
+            model = documented(wrap(LinearOE, core, task.data), task, self.began, extra)
+        else:
+            model = linear_model(task, fit, self.began, provenance)
+        ranked = sorted((c for c in self.search.eligible if c.is_sound), key=lambda c: c.error)
+        others = [self._alternative(c) for c in ranked[:1]]
+        return self._closed(model, chosen.rmse, others)
+
+    def _least_squares(self) -> Model:
+        """What there is when no output-error fit has come to an end: least squares, in free run."""
+        task = self.task
+        core = _core.fit_arx(arrays(task.data), **task.orders, offset=True)
+        if not core.is_stable:
+            raise FitError(
+                f"{task.data.source}: expected a linear model or a network with a finite free run, "
+                "found none; check units and signs, record longer, or give more time"
+            )
+        self.reasons.append("no output-error fit came to an end; least squares instead")
+        model = wrap(LinearOE, core, task.data)
+        error = errors_of(free_runs(core, self.split), self.split).rmse
+        extra: Provenance = {"initial_state": "estimated", "termination": "time budget"}
+        extra["choice"] = {"chosen": "oe", "reason": "; ".join(self.reasons), "candidates": []}
+        return self._closed(documented(model, task, self.began, extra), error, [])
+
+    def _linear_fit(self, chosen: LinearCandidate, look: Look) -> _core.LinearFit | None:
+        task = self.task
+        options = task.fit_options(na=chosen.order, nb=chosen.order + 1, nk=chosen.nk)
+        return _core.fit_oe(arrays(task.data), **{**options, "progress": look})
+
+    def _closed(self, model: Model, error: float, alternatives: Sequence[Model]) -> Model:
+        """The model with its alternatives, notes and verdict."""
+        notes = list(model.training.get("notes", []))
+        if self.clock.truncated:
+            notes.append(
+                f"the time budget of {self.clock.budget:g} s ended the search early: the result "
+                "depends on the speed of the machine"
+            )
+        linear = self.linear
+        if self.wants_network and linear is not None and error >= WORTH_IT * linear.rmse:
+            notes.append(
+                f"free-run error on data not trained on: {100 * error / linear.rmse:.1f} % of the "
+                "best linear model's; consider model oe"
+            )
+        extra: Provenance = {"notes": notes} if notes else {}
+        extra["verdict"] = verdict(self, model, error)
+        return replace(with_provenance(model, extra), alternatives=tuple(alternatives))
+
+    def _choice(self, kind: str, error: float) -> Provenance:
+        linear = self.linear
+        rmse = {} if linear is None else {"oe": finite(linear.rmse)}
+        return {
+            "chosen": kind,
+            "reason": "; ".join(self.reasons),
+            "free_run_rmse": rmse | {kind: finite(error)},
+            "candidates": list(self.search.rows()),
+            "held_out": list(self.split.sources),
+        }
+
+    def best_so_far(self, stopped: Stopped) -> Model:
+        """What there is when Ctrl-C comes: the best candidate, else the linear model."""
+        best, linear = self.search.best, self.linear
+        bound = math.inf if linear is None else linear.rmse
+        if best is not None and best.error < WORTH_IT * bound:
+            self.reasons = ["interrupted: the best candidate so far"]
+            self._refitted = lambda c, most: c.models[:most]  # type: ignore[method-assign]
+            model = self._network([best], [])
+            return with_provenance(model, {"termination": "interrupted"})
+        if linear is None or linear.models[0] is None:
+            raise KeyboardInterrupt from stopped
+        model = wrap(LinearOE, linear.models[0], self.task.data)
+        provenance = {"termination": "interrupted", "initial_state": "estimated"}
+        return documented(model, self.task, self.began, provenance)
+
+
+def _without_held_out(task: Task, began: float, wants_network: bool) -> Model:
+    """A record too short to choose by: second order, and no network."""
+    reason = (
+        f"the record is too short to hold out {100 * SHARE:.0f} % of every experiment, at least "
+        f"{LEAST_HELD_OUT} samples, to compare on"
+    )
+    if wants_network:
+        raise FitError(f"{task.data.source}: {reason}; record longer, or give validation data")
+    fit = _core.fit_oe(arrays(task.data), **task.fit_options())
+    return linear_model(task, fit, began, {"choice": {"chosen": "oe", "reason": reason}})
+
+
+def cost_of(model: Model, data: Dataset) -> float:
+    """J of the free run, in the output's unit squared."""
+    runs = zip(model.simulate(data), data.experiments, strict=True)
+    errors = np.concatenate([e.y - run for run, e in runs])
+    return float(np.nanmean(errors**2) / 2.0)

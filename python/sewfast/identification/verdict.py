@@ -1,0 +1,86 @@
+"""The closing words of `identify`: good enough to tune on or not, why, and what to do next."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..dataset import Dataset
+from ..dataset.noise import white_noise
+from ..models import Model
+from .task import Provenance
+
+if TYPE_CHECKING:
+    from .choice import Choice
+
+GOOD, FAIR, POOR = 90.0, 70.0, 30.0
+"""Percent of the free run's fit on data not trained on."""
+AT_THE_NOISE = 1.5
+"""An error below this multiple of the measurement noise leaves nothing to be explained."""
+
+
+def verdict(choice: Choice, model: Model, error: float) -> Provenance:
+    """Whether a controller may be tuned on the model, in words and as values.
+
+    Parameters
+    ----------
+    choice : Choice
+        The search and what was held out.
+    model : Model
+    error : float
+        Free-run error on what is held out [output unit].
+
+    Returns
+    -------
+    dict
+        `grade` ("good", "fair", "poor" or "useless"), `fit_percent` on data not trained on,
+        `text`, and `next`: a list of things to do, the most important one first.
+    """
+    data, spread = choice.task.data, choice.split.spread
+    fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else float("nan")
+    noise = _noise(data)
+    explained = error <= AT_THE_NOISE * noise
+    unit = f" {data.output_unit}" if data.output_unit else ""
+    measured = f"free run explains {fit:.1f} % of data not trained on (rmse {error:.3g}{unit})"
+    todo = []
+    if fit >= GOOD or explained:
+        grade, text = "good", f"good enough to tune a controller on: {measured}"
+        if fit < GOOD:
+            text += f"; what is left is measurement noise ({noise:.3g}{unit})"
+        todo.append("validate it on another recording, then tune")
+    elif fit >= FAIR:
+        grade, text = "fair", f"good enough for a first, cautious controller: {measured}"
+    elif fit >= POOR:
+        grade, text = "poor", f"not good enough to tune a controller on: {measured}"
+    else:
+        grade, text = "useless", f"useless: {measured}; a constant would do about as well"
+    if choice.clock.truncated and grade != "good":
+        todo.append("give a longer time budget, or none")
+    if grade in ("fair", "poor", "useless"):
+        todo += _what_to_record(choice, model)
+    return {
+        "grade": grade,
+        "fit_percent": fit if np.isfinite(fit) else None,
+        "text": text,
+        "next": todo,
+    }
+
+
+def _what_to_record(choice: Choice, model: Model) -> list[str]:
+    """What another recording should have that this one lacks."""
+    data = choice.task.data
+    wanted = [
+        "record longer, with more levels of the input and the speeds that the controller will use"
+    ]
+    if len(data.experiments) == 1:
+        wanted.append("give several recordings: they are fitted together")
+    wanted.append("see the report card (check) for what the residual still contains")
+    return wanted
+
+
+def _noise(data: Dataset) -> float:
+    """White measurement noise of the output, pooled over experiments; 0 where unknown."""
+    found = [white_noise(e.y) for e in data.experiments]
+    known = [n for n in found if np.isfinite(n)]
+    return float(np.sqrt(np.mean(np.square(known)))) if known else 0.0
