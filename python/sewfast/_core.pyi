@@ -259,7 +259,7 @@ class NeuralFit:
         """Models of all starts with a finite cost, sound ones first, then by cost: an ensemble."""
     @property
     def sound(self) -> bool:
-        """The model forgets its initial state and stands inputs a quarter larger; else no start did."""
+        """The model passes the guard on the training data (see `guard`); else no start's does."""
     @property
     def initial_states(self) -> _F:
         """Past outputs before the first simulated sample of each training experiment, newest first, (n_experiments, na)."""
@@ -310,7 +310,7 @@ class NeuralSSFit:
         """The model of each start, in the order of the starts; None: failed, or not begun before Ctrl-C."""
     @property
     def sounds(self) -> list[bool]:
-        """Whether each start's model forgets its initial state and stands inputs a quarter larger."""
+        """Whether each start's model passes the guard on the training data; all True where it was not asked."""
     @property
     def sound(self) -> bool:
         """The same of the chosen model; else no start's does."""
@@ -343,7 +343,7 @@ def fit_neural_ss(
     linear: LinearModel | None, output: Literal["linear", "saturation", "abs"], output_parameters: _F,
     integrator: bool, weight_decay: float, hidden_scale: float, max_iterations: int, starts: int,
     first_start: int, seed: int, threads: int, initial: Sequence[NeuralSS] | None = None,
-    progress: _Progress = None,
+    guard: bool = True, progress: _Progress = None,
 ) -> NeuralSSFit:
     """Train in free run; each start is stopped and judged on ``validation``, without it on the training data.
 
@@ -352,6 +352,20 @@ def fit_neural_ss(
     without it a start begins with random states. Start i of the seed is ``first_start + i`` here: starts spread over
     several calls, or over threads (0 takes all), have the same bits. With ``initial`` nothing is drawn: start i trains
     the i-th of these models further, in their scaling; they are of one shape and as many as ``starts``.
+    ``guard`` asks `guard` of each start's model on these experiments, with ``linear``; short pieces of records say
+    little there, so that a search on pieces leaves it out and asks it of whole records itself.
+    """
+
+def guard(
+    model: LinearModel | NeuralOE | NeuralSS, experiments: _Experiments, *, linear: Sequence[LinearModel] = ...,
+) -> str:
+    """Why the model is not sound on these whole records, in words that follow "the model"; "" where it is.
+
+    It must have a finite free run, keep within a width of the output's range on inputs a quarter larger, forget its
+    initial state, stay near the range with its inputs' blocks in another order, and then be where it was in the
+    record's order (8 blocks of 100 samples or more). Where the ``linear`` models of the same records do more of
+    these, 1.5 times of what they do is allowed. An integrator is asked the first two only; it has to move at speeds
+    like its record's. Of an experiment the first 20,000 samples count. Ctrl-C raises KeyboardInterrupt.
     """
 
 # --- least_squares.rs --------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ pub mod encoder;
 pub mod error;
 pub mod fopdt;
 mod gram;
-mod guard;
+pub mod guard;
 pub mod iv;
 pub mod lagged;
 pub mod least_squares;

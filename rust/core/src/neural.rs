@@ -3,7 +3,6 @@
 mod data_units;
 mod draw;
 mod free_run;
-mod guard;
 mod network;
 mod problem;
 mod referee;

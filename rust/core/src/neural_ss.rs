@@ -2,7 +2,6 @@
 
 mod draw;
 mod free_run;
-mod guard;
 mod kalman;
 mod network;
 mod output;
@@ -31,6 +30,7 @@ use kalman::Filter;
 use network::{Network, Scratch};
 use sensitivities::{Columns, Recursion, Rows, Sensitivities};
 
+use crate::guard::Guarded;
 use crate::lagged::finite;
 use crate::{Error, Monitor, Result, simd};
 
@@ -131,7 +131,7 @@ impl NeuralSS {
     /// # Errors
     /// `ErrorKind::Data` for wrong shapes or values, `ErrorKind::Fit` for a run that leaves the finite numbers.
     pub fn simulate(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<Vec<f64>> {
-        let run = self.run(u, channels, state)?;
+        let run = self.run(u, channels, state, &Monitor::default())?;
         finite(self.restored(&run.sums))
     }
 
@@ -140,7 +140,8 @@ impl NeuralSS {
     /// # Errors
     /// As [`NeuralSS::simulate`].
     pub fn states(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<Vec<f64>> {
-        finite(self.run(u, channels, state)?.states)
+        let run = self.run(u, channels, state, &Monitor::default())?;
+        finite(run.states)
     }
 
     /// Free run in the data's units, and its derivatives row by row, output by output: by theta, then by the state.
@@ -154,7 +155,8 @@ impl NeuralSS {
         state: &[f64],
     ) -> Result<(Vec<f64>, Vec<f64>)> {
         let shape = self.shape();
-        let trajectory = self.run(u, channels, state)?;
+        let monitor = Monitor::default();
+        let trajectory = self.run(u, channels, state, &monitor)?;
         let run = finite(self.restored(&trajectory.sums))?;
         let columns = Columns::new(shape);
         let states = (0..shape.nx).map(|j| columns.state + j);
@@ -174,7 +176,7 @@ impl NeuralSS {
             buffers: &mut Sensitivities::new(shape),
             rows: &mut dense,
             exact: true,
-            monitor: &Monitor::default(),
+            monitor: &monitor,
         });
         Ok((run, dense.rows))
     }
@@ -223,6 +225,7 @@ impl NeuralSS {
                 state,
                 &mut trajectory,
                 &mut scratch,
+                &Monitor::default(),
             )?;
             run.extend(self.restored(&trajectory.sums[horizon * shape.outputs..]));
         }
@@ -255,11 +258,18 @@ impl NeuralSS {
         })
     }
 
-    fn run(&self, u: &[f64], channels: usize, state: &[f64]) -> Result<Trajectory> {
+    fn run(
+        &self,
+        u: &[f64],
+        channels: usize,
+        state: &[f64],
+        monitor: &Monitor,
+    ) -> Result<Trajectory> {
         let samples = self.check(u, channels, state)?;
         let mut run = Trajectory::new(&self.network, samples);
         let v = self.scaling.delayed_inputs(u, self.shape().nk);
-        self.free(&v, state, &mut run, &mut Scratch::new(self.shape()))?;
+        let mut scratch = Scratch::new(self.shape());
+        self.free(&v, state, &mut run, &mut scratch, monitor)?;
         Ok(run)
     }
 
@@ -269,9 +279,9 @@ impl NeuralSS {
         state: &[f64],
         run: &mut Trajectory,
         scratch: &mut Scratch,
+        monitor: &Monitor,
     ) -> Result<()> {
-        let monitor = Monitor::default();
-        let found = free_run::alone(&self.network, v, state, run, scratch, &monitor);
+        let found = free_run::alone(&self.network, v, state, run, scratch, monitor);
         found.then_some(()).ok_or_else(|| {
             Error::fit("expected a finite simulation, got states beyond all bounds; the model is unstable on this input: identify it again with other orders or more data")
         })
@@ -321,6 +331,49 @@ impl NeuralSS {
             ));
         }
         Ok(())
+    }
+}
+
+/// States beyond those of training, in standard deviations from their mean.
+const BESIDE: f64 = 3.0;
+
+impl Guarded for NeuralSS {
+    fn inputs(&self) -> usize {
+        self.shape().inputs
+    }
+
+    fn outputs(&self) -> usize {
+        self.shape().outputs
+    }
+
+    fn first_state(&self, u: &[f64], y: &[f64]) -> Result<Vec<f64>> {
+        self.estimate_initial_state(u, self.shape().inputs, y)
+    }
+
+    fn free_run(&self, u: &[f64], state: &[f64], monitor: &Monitor) -> Result<Vec<f64>> {
+        let run = self.run(u, self.shape().inputs, state, monitor)?;
+        finite(self.restored(&run.sums))
+    }
+
+    fn states_beside(&self, _: f64, _: f64) -> [Vec<f64>; 2] {
+        let Statistics {
+            state_mean,
+            state_covariance,
+            ..
+        } = &self.statistics;
+        let variances = state_covariance.iter().step_by(state_mean.len() + 1);
+        [BESIDE, -BESIDE].map(|far| {
+            let pairs = state_mean.iter().zip(variances.clone());
+            pairs.map(|(mean, var)| mean + far * var.sqrt()).collect()
+        })
+    }
+
+    fn integrates(&self) -> bool {
+        self.shape().integrator
+    }
+
+    fn is_rectified(&self) -> bool {
+        matches!(self.output(), OutputFunction::Abs { .. })
     }
 }
 

@@ -69,6 +69,7 @@ macro_rules! started_fit_methods {
     };
 }
 
+mod guard;
 pub mod linear;
 pub mod neural;
 pub mod neural_ss;
@@ -81,6 +82,7 @@ use sewfast_core::lagged::Lagged;
 use crate::arrays::{raise, rows, slice};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    guard::register(module)?;
     linear::register(module)?;
     neural::register(module)?;
     neural_ss::register(module)

@@ -10,7 +10,7 @@ use crate::lagged::{Lagged, STATE_SAMPLES};
 /// Keeps the best iterate of a start: on the validation data, else on the training data.
 pub(super) struct Referee<'t> {
     training: &'t Training<'t>,
-    pub network: Network,
+    network: Network,
     /// Score, validation J, all parameters, cost.
     pub best: Option<(f64, Option<f64>, Vec<f64>, f64)>,
 }

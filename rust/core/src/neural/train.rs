@@ -4,10 +4,12 @@ use super::network::{Network, Shape};
 use super::problem::{Experiment, FreeRun};
 use super::referee::Referee;
 use super::scaling::Scaling;
-use super::{NeuralOE, draw, guard, warm};
+use super::{NeuralOE, draw, warm};
+use crate::guard;
 use crate::lagged::Lagged;
 use crate::linear::LinearModel;
 use crate::lm::{self, Damping, Outcome, Termination};
+use crate::neural_ss::Recording;
 use crate::random::Random;
 use crate::{Error, Monitor, Record, Result, arx, starts};
 
@@ -78,8 +80,7 @@ pub struct NeuralFit {
     pub start_costs: Vec<f64>,
     /// Starts that were dead and drawn again.
     pub discarded: usize,
-    /// Whether the chosen model passed the guard: it forgets its initial state and does not run away on inputs a
-    /// quarter larger. False only where no start passed.
+    /// Whether the chosen model passed the [`guard`](crate::guard) on the training data; false only where no start did.
     pub sound: bool,
     /// Models of all starts with a finite cost, those that passed the guard first, each part best first.
     pub models: Vec<NeuralOE>,
@@ -99,8 +100,7 @@ const DEAD_SHARE: f64 = 0.9;
 /// A start is dead where its free run is not finite, lies on a limit almost throughout or ends no better than a
 /// constant output; it is drawn again from its own stream, and counted in `discarded`.
 ///
-/// A start whose model does not forget its initial state, or runs away on somewhat larger inputs, is chosen only where
-/// all do.
+/// A start whose model does not pass the guard is chosen only where none does.
 ///
 /// # Errors
 /// `ErrorKind::Data` and `ErrorKind::Setting` for what cannot be trained; `ErrorKind::Fit` where every start failed.
@@ -122,6 +122,7 @@ pub fn fit(
 pub(super) struct Training<'a> {
     pub settings: &'a Settings,
     monitor: &'a Monitor,
+    recordings: Vec<Recording<'a>>,
     pub shape: Shape,
     scaling: Scaling,
     pub limits: (f64, f64),
@@ -144,7 +145,7 @@ struct Trained {
 
 impl<'a> Training<'a> {
     fn new(
-        records: &[Record],
+        records: &[Record<'a>],
         validation: &[Record],
         settings: &'a Settings,
         monitor: &'a Monitor,
@@ -180,6 +181,7 @@ impl<'a> Training<'a> {
         Ok(Self {
             settings,
             monitor,
+            recordings: records.iter().map(Recording::from).collect(),
             shape,
             limits: limits(&experiments, settings.saturate),
             constant_cost: constant_cost(&experiments),
@@ -270,15 +272,23 @@ impl<'a> Training<'a> {
         let spare = self.settings.max_iterations - outcome.iterations;
         self.monitor.advance(spare as u64);
         let (_, validation_cost, theta, cost) = referee.best.take()?;
-        referee.network.load(&theta[..own]);
         Some(Trained {
-            sound: guard::is_sound(&referee.network, &self.experiments),
+            sound: self.passes(&theta),
             cost: cost - problem.penalty(&theta),
             theta,
             validation_cost,
             outcome,
             trace,
             discarded: 0,
+        })
+    }
+
+    /// The guard's verdict, whatever the monitor says: what has been trained is to be judged as well.
+    fn passes(&self, theta: &[f64]) -> bool {
+        let linear = self.settings.linear.as_slice();
+        let monitor = Monitor::default();
+        self.model(theta).is_ok_and(|model| {
+            guard::verdict(&model, &self.recordings, linear, &monitor) == Ok(None)
         })
     }
 

@@ -4,7 +4,7 @@ use super::output::OutputFunction;
 use super::problem::Experiment;
 use super::scaling::{Scaling, moments};
 use super::shape::Shape;
-use crate::{Error, Result};
+use crate::{Error, Record, Result};
 
 /// One experiment as it was measured; outputs that are not known are NaN.
 #[derive(Clone, Copy, Debug)]
@@ -17,6 +17,17 @@ pub struct Recording<'a> {
     pub y: &'a [f64],
     /// Number of outputs.
     pub outputs: usize,
+}
+
+impl<'a> From<&Record<'a>> for Recording<'a> {
+    fn from(record: &Record<'a>) -> Self {
+        Self {
+            u: record.u,
+            inputs: record.channels,
+            y: record.y,
+            outputs: 1,
+        }
+    }
 }
 
 impl<'a> Recording<'a> {
@@ -54,8 +65,17 @@ impl<'a> Recording<'a> {
         })
     }
 
-    fn samples(&self) -> usize {
+    /// Number of samples.
+    pub(crate) fn samples(&self) -> usize {
         self.u.len() / self.inputs
+    }
+
+    /// Number of leading samples of which `count` have a known output; all where there are not as many.
+    pub(crate) fn first_samples(&self, count: usize) -> usize {
+        let known = |y: &[f64]| y.iter().any(|y| !y.is_nan());
+        let mut samples = self.y.chunks_exact(self.outputs).enumerate();
+        let last = samples.by_ref().filter(|(_, y)| known(y)).nth(count - 1);
+        last.map_or(self.samples(), |(k, _)| k + 1)
     }
 }
 

@@ -224,6 +224,7 @@ fn settings(shape: Shape) -> Settings {
         integrator: shape.integrator,
         weight_decay: 0.0,
         hidden_scale: 1.0,
+        guard: true,
         max_iterations: 60,
         starts: 3,
         first_start: 0,

@@ -9,7 +9,8 @@ use super::referee::{Referee, statistics};
 use super::scaling::Scaling;
 use super::shape::Shape;
 use super::state::{self, Statistics};
-use super::{NeuralSS, draw, guard, kalman};
+use super::{NeuralSS, draw, kalman};
+use crate::guard;
 use crate::linear::LinearModel;
 use crate::lm::{self, Damping, Outcome, Problem, Termination};
 use crate::random::Random;
@@ -47,6 +48,9 @@ pub struct Settings {
     pub seed: u64,
     /// Threads; 0 takes as many as the machine has. The result does not depend on it.
     pub threads: usize,
+    /// Whether each start's model is asked the questions of [`guard`](crate::guard) on the training data. Pieces of
+    /// records that are shorter than the drive's memory say little there: rather ask a chosen model on whole records.
+    pub guard: bool,
 }
 
 /// A trained model with the story of its training.
@@ -70,13 +74,13 @@ pub struct NeuralSSFit {
     pub start_costs: Vec<f64>,
     /// Starts that were dead and drawn again.
     pub discarded: usize,
-    /// Whether the chosen model passed the guard; false only where no start passed.
+    /// Whether the chosen model passed the guard, or was not asked; false only where no start passed.
     pub sound: bool,
     /// Models of all starts with a finite cost, those that passed the guard first, each part best first.
     pub models: Vec<NeuralSS>,
     /// The model of each start, in the order of the starts.
     pub start_models: Vec<Option<NeuralSS>>,
-    /// Whether each start's model passed the guard.
+    /// Whether each start's model passed the guard; true for all where it was not asked.
     pub sounds: Vec<bool>,
     /// Initial state of each training experiment, in scaled units.
     pub initial_states: Vec<Vec<f64>>,
@@ -95,7 +99,7 @@ const LINEAR_RESIDUAL: f64 = 0.1;
 ///
 /// With validation data each start keeps its best iterate on them. A start is dead where its free run diverges or ends
 /// no better than a constant output; it is drawn again from its own stream, and counted in `discarded`. A start whose
-/// model does not forget its initial state, or runs away on somewhat larger inputs, is chosen only where all do.
+/// model does not pass the guard, where that is asked, is chosen only where none does.
 ///
 /// # Errors
 /// `ErrorKind::Data` and `ErrorKind::Setting` for what cannot be trained; `ErrorKind::Fit` where every start failed.
@@ -117,6 +121,7 @@ pub fn fit(
 struct Task<'a> {
     settings: &'a Settings,
     monitor: &'a Monitor,
+    recordings: &'a [Recording<'a>],
     shape: Shape,
     scaling: Scaling,
     experiments: Vec<Experiment>,
@@ -139,7 +144,7 @@ struct Trained {
 
 impl<'a> Task<'a> {
     fn new(
-        recordings: &[Recording],
+        recordings: &'a [Recording<'a>],
         validation: &[Recording],
         settings: &'a Settings,
         monitor: &'a Monitor,
@@ -172,6 +177,7 @@ impl<'a> Task<'a> {
         Ok(Self {
             settings,
             monitor,
+            recordings,
             shape,
             constant_cost: constant_cost(&experiments, shape),
             validation: validation.iter().map(scaled).collect(),
@@ -335,7 +341,6 @@ impl<'a> Task<'a> {
             &states,
             self.monitor,
         );
-        let sound = guard::is_sound(&network, &self.experiments, &runs, &states, &statistics);
         let model = NeuralSS::new(
             self.shape,
             self.settings.output,
@@ -343,7 +348,19 @@ impl<'a> Task<'a> {
             self.scaling.clone(),
             statistics,
         );
-        model.ok().map(|model| (model, states, sound))
+        let model = model.ok()?;
+        let sound = !self.settings.guard || self.passes(&model);
+        Some((model, states, sound))
+    }
+
+    /// The guard's verdict, whatever the monitor says: what has been trained is to be judged as well.
+    fn passes(&self, model: &NeuralSS) -> bool {
+        let linear = match self.shape.outputs {
+            1 => self.settings.linear.as_slice(),
+            _ => &[],
+        };
+        let monitor = Monitor::default();
+        guard::verdict(model, self.recordings, linear, &monitor) == Ok(None)
     }
 
     fn chosen(&self, mut results: Vec<Option<Trained>>) -> Result<NeuralSSFit> {

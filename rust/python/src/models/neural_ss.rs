@@ -20,8 +20,8 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
 }
 
 /// Outputs: one per sample, or rows of several.
-type Outputs<'py> = PyReadonlyArrayDyn<'py, f64>;
-type Pairs<'py> = Vec<(Rows<'py>, Outputs<'py>)>;
+pub(super) type Outputs<'py> = PyReadonlyArrayDyn<'py, f64>;
+pub(super) type Pairs<'py> = Vec<(Rows<'py>, Outputs<'py>)>;
 type Array<'py> = Bound<'py, PyArrayDyn<f64>>;
 
 /// Neural state-space model.
@@ -237,7 +237,7 @@ fn outputs<'a>(py: Python<'_>, y: &'a Outputs<'_>) -> PyResult<(&'a [f64], usize
     Ok((values, count))
 }
 
-fn recordings<'a>(py: Python<'_>, pairs: &'a Pairs<'_>) -> PyResult<Vec<Recording<'a>>> {
+pub(super) fn recordings<'a>(py: Python<'_>, pairs: &'a Pairs<'_>) -> PyResult<Vec<Recording<'a>>> {
     let recording = |(u, y): &'a (Rows<'_>, Outputs<'_>)| {
         let ((u, inputs), (y, count)) = (rows(u, "u")?, outputs(py, y)?);
         Recording::new(u, inputs, y, count).map_err(|e| raise(py, e))
@@ -289,7 +289,7 @@ started_fit_methods!(NeuralSSFit {
 #[pyfunction]
 #[pyo3(signature = (
     experiments, validation, *, nx, nk, hidden, linear, output, output_parameters, integrator, weight_decay,
-    hidden_scale, max_iterations, starts, first_start, seed, threads, initial = None, progress = None
+    hidden_scale, max_iterations, starts, first_start, seed, threads, initial = None, guard = true, progress = None
 ))]
 #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
 fn fit_neural_ss(
@@ -311,6 +311,7 @@ fn fit_neural_ss(
     seed: u64,
     threads: usize,
     initial: Option<Vec<PyRef<'_, NeuralSS>>>,
+    guard: bool,
     progress: Option<Bound<'_, PyAny>>,
 ) -> PyResult<NeuralSSFit> {
     let initial = initial.unwrap_or_default();
@@ -331,6 +332,7 @@ fn fit_neural_ss(
         first_start,
         seed,
         threads,
+        guard,
     };
     let (recordings, validation) = (recordings(py, &experiments)?, recordings(py, &validation)?);
     let inner = watched(py, progress.as_ref(), |monitor| {
