@@ -180,6 +180,12 @@ class NeuralSS:
     def nx(self) -> int: ...
     @property
     def nk(self) -> int: ...
+    def grown(self, nx: int, hidden: int, seed: int) -> NeuralSS:
+        """The same model with more states and hidden units, from which a larger one is trained.
+
+        It keeps all weights; what is new acts on the rest with weights of about 1e-3, so that the free run hardly
+        changes. New states come after the old ones, before an integrated one. Smaller sizes are a SettingError.
+        """
     def rest_state(self) -> _F:
         """State that minimises |x+ - x|^2 + |y|^2 at input zero, (nx,)."""
     def simulate(self, u: _F, state: _F) -> _F: ...

@@ -2,6 +2,7 @@
 
 mod draw;
 mod free_run;
+mod growth;
 mod kalman;
 mod network;
 mod output;

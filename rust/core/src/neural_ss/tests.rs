@@ -475,3 +475,111 @@ fn outputs_that_are_not_known_have_no_row_and_change_no_other() {
         );
     }
 }
+
+/// The state of a grown model that corresponds to one of the model itself.
+fn grown_state(model: &NeuralSS, grown: &NeuralSS, state: &[f64]) -> Vec<f64> {
+    let kept = state.len() - usize::from(model.shape().integrator);
+    let added = grown.shape().nx - state.len();
+    let new = grown.statistics().state_mean[kept..kept + added].to_vec();
+    [&state[..kept], &new, &state[kept..]].concat()
+}
+
+#[test]
+fn a_grown_model_runs_almost_as_before() {
+    let functions = [
+        OutputFunction::Linear,
+        OutputFunction::Abs { width: 0.3 },
+        OutputFunction::Saturation {
+            low: -0.6,
+            high: 0.7,
+            width: 0.2,
+        },
+    ];
+    for seed in 0..60_u64 {
+        let shape = Shape {
+            nx: 1 + seed as usize % 5,
+            nk: 1,
+            inputs: 1 + seed as usize % 2,
+            outputs: 1 + seed as usize % 3 / 2,
+            hidden: 1 + seed as usize % 17,
+            integrator: seed % 4 == 3,
+        };
+        let mut model = random_model(seed, shape, functions[seed as usize % 3]);
+        if seed % 4 == 0 {
+            // the first state is slow
+            model.theta[..shape.nx].fill(0.0);
+            model.theta[0] = 0.998;
+            let e = shape.parts().e.start;
+            model.theta[e..e + shape.hidden].fill(0.001);
+            model.network.load(&model.theta);
+        }
+        let u = noise(2_000 * shape.inputs, seed ^ 1);
+        let state = noise(shape.nx, seed ^ 2);
+        let y = model.simulate(&u, shape.inputs, &state).unwrap();
+        for (nx, hidden) in [(0, 8), (1, 0), (2, 8)] {
+            let grown = model
+                .grown(shape.nx + nx, shape.hidden + hidden, seed)
+                .unwrap();
+            assert_eq!(grown.shape().nx, shape.nx + nx);
+            let state = grown_state(&model, &grown, &state);
+            let run = grown.simulate(&u, shape.inputs, &state).unwrap();
+            for p in 0..shape.outputs {
+                let of = |run: &[f64]| -> Vec<f64> {
+                    run.iter().skip(p).step_by(shape.outputs).copied().collect()
+                };
+                let (y, run) = (of(&y), of(&run));
+                let mean = y.iter().sum::<f64>() / y.len() as f64;
+                let rms = |squares: f64| (squares / y.len() as f64).sqrt();
+                let spread = rms(y.iter().map(|y| (y - mean).powi(2)).sum());
+                let moved = rms(y.iter().zip(&run).map(|(y, run)| (y - run).powi(2)).sum());
+                // an output that hardly moves is measured by the scale of those in training
+                let moved = moved / spread.max(model.scaling().y_scale[p]);
+                assert!(
+                    moved < 1e-2 && moved > 0.0,
+                    "{seed} {shape:?} {nx} {hidden}: {moved}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn growing_keeps_all_weights_and_refuses_less() {
+    let shape = Shape {
+        nx: 3,
+        hidden: 4,
+        integrator: true,
+        ..SMALL
+    };
+    let model = random_model(7, shape, OutputFunction::Linear);
+    let same = model.grown(3, 4, 1).unwrap();
+    assert_eq!(same.theta(), model.theta());
+    assert_eq!(same.statistics(), model.statistics());
+    let grown = model.grown(5, 6, 1).unwrap();
+    let parts = grown.shape().parts();
+    let (a, old) = (&grown.theta()[parts.a], model.theta());
+    assert_eq!(
+        [a[0], a[1], a[5], a[20], a[21]],
+        [old[0], old[1], old[3], old[6], old[7]]
+    );
+    assert_eq!([a[4], a[9], a[14], a[19], a[24]], [0.0, 0.0, 0.0, 0.0, 1.0]);
+    assert!((POLES_OF_NEW_STATES).contains(&a[12]) && POLES_OF_NEW_STATES.contains(&a[18]));
+    assert!(
+        [a[2], a[3], a[7], a[8], a[22], a[23]]
+            .iter()
+            .all(|a| *a == 0.0)
+    );
+    let wx = &grown.theta()[parts.wx];
+    assert!((0..4).all(|i| wx[i * 5 + 2..i * 5 + 5].iter().all(|w| *w == 0.0)));
+    assert!((4..6).all(|i| wx[i * 5 + 4] == 0.0 && wx[i * 5 + 2] != 0.0));
+    assert_ne!(model.grown(5, 6, 2).unwrap().theta(), grown.theta());
+    assert_eq!(model.grown(5, 6, 1).unwrap().theta(), grown.theta());
+    for (nx, hidden) in [(2, 4), (3, 3), (51, 4), (3, 1_001)] {
+        assert_eq!(
+            model.grown(nx, hidden, 0).unwrap_err().kind,
+            crate::ErrorKind::Setting
+        );
+    }
+}
+
+const POLES_OF_NEW_STATES: std::ops::Range<f64> = 0.5..0.98;

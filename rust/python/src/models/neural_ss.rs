@@ -127,6 +127,11 @@ impl NeuralSS {
         Ok(settings)
     }
 
+    fn grown(&self, py: Python<'_>, nx: usize, hidden: usize, seed: u64) -> PyResult<Self> {
+        let grown = self.inner.grown(nx, hidden, seed);
+        grown.map(|inner| Self { inner }).map_err(|e| raise(py, e))
+    }
+
     fn rest_state<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         array1(py, py.detach(|| self.inner.rest_state()))
     }
