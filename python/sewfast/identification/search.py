@@ -21,7 +21,6 @@ from ..errors import FitError
 from ..models.ensemble import EnsembleCore
 from .effort import Look, Pool
 from .folds import RUNAWAY, Errors, Split, compared, errors_of, free_runs
-from .guard import grown, guard
 from .orders import LinearTable, slowest_pole
 from .outputs import ABS, LINEAR, Output, named, rectified_start, rms_error, suggested
 from .task import Provenance, Task, arrays, finite
@@ -387,7 +386,7 @@ class Search:
         iterations: list[int] = []
         for best, kind, s in moves:
             if kind == "grow":
-                models = [grown(m, s.nx, s.hidden, self.task.seed) for m in best.models[:3]]
+                models = [m.grown(s.nx, s.hidden, self.task.seed) for m in best.models[:3]]
                 requests.append(self._request(s, CLIMB_ITERATIONS, initial=models))
                 iterations.append(best.iterations + CLIMB_ITERATIONS)
             elif kind == "decay":
@@ -506,7 +505,7 @@ class Search:
         bounds = self.bounding_models
 
         def fault(start: Start, look: Look) -> str:
-            return guard(start.model, self._guarded, linear=bounds)
+            return _core.guard(start.model, self._guarded, linear=bounds)
 
         faults = iter(self.pool.map(fault, flat))
         return [[replace(s, fault=next(faults) or "") for s in starts] for starts in found]

@@ -164,6 +164,8 @@ class Job:
             first_start=self.number,
             seed=self.seed,
             threads=1,
+            # the search asks it of whole records
+            guard=False,
             progress=look,
         )
         cost = float(fit.start_costs[0])
