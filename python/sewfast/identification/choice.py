@@ -32,6 +32,8 @@ WORTH_LOOKING = 0.97
 """Where the median of the starts does not even reach this, nothing is asked."""
 BY_FAR = 0.2
 """Below this part of the linear model's error the network has won without a second fold."""
+LEAST_PASSING = 0.5
+"""Part of the network sizes that must beat linear models on the earlier part, too."""
 VERIFIED = 4
 """Structures that are learned again on the earlier fold."""
 FINALISTS = 3
@@ -43,6 +45,8 @@ ENOUGH_TO_CHOOSE_BY = 1_500
 MOST_MEMBERS = 15
 """Of an ensemble: a controller is tuned on every one, and a median of more is hardly better."""
 MOST_ALTERNATIVES = 2
+LIKELY = 1.5
+"""Linear models whose error on the newest part is within this factor are asked on earlier ones."""
 TOGETHER = 1.25
 """On little data the median goes over all finalists whose error is within this factor."""
 FINAL_OPERATIONS, FINAL_OPERATIONS_LARGE = 1.5e11, 8e11
@@ -155,19 +159,21 @@ class Choice:
         for c in ranked:
             best_of.setdefault((c.structure.nx, c.structure.integrator, c.structure.kind), c)
         asked = list(best_of.values())[:VERIFIED]
-        asked = [c for c in asked if self._worst(c, search.trials[0]) < WORTH_IT * linear.rmse]
         passed: list[tuple[float, Candidate]] = []
+        newest = search.trials[0]
+        winning = [c for c in asked if self._worst(c, newest) < WORTH_IT * linear.rmse]
         if len(search.trials) < 2:
-            passed = [(c.error, c) for c in asked]
-        elif asked:
+            passed = [(c.error, c) for c in winning]
+        elif winning:
             earlier = LinearTable(self.task, [search.folds[1]], search.pool)
             nk = linear.nk
-            orders = {search.linear.choice.order, linear.order}
-            earlier.add([(o, nk) for o in sorted(orders)], None)
+            # another part may ask for another order, and the network has to beat that one, too
+            orders = {1, 2, 3, search.linear.choice.order, linear.order}
+            earlier.add([(o, nk) for o in sorted(orders)], self.clock.until(SHARE_OF_VERIFYING))
             bound = earlier.best.rmse if earlier.candidates else math.inf
-            able = [c for c in asked if search.is_affordable(c.structure, 1)]
-            passed = [(c.error, c) for c in asked if c not in able]
-            starts = 6 if search.is_small else 3
+            able = [c for c in winning if search.is_affordable(c.structure, 1)]
+            passed = [(c.error, c) for c in winning if c not in able]
+            starts = 3 if search.is_large else 6
             until = self.clock.until(SHARE_OF_VERIFYING)
             again = search.tried([(c.structure, 80, starts) for c in able], 1, until=until)
             for c, other in zip(able, again, strict=True):
@@ -178,6 +184,9 @@ class Choice:
             f"{len(passed)} of {len(asked)} network sizes beat it with every start on "
             f"{min(2, len(search.trials))} later part(s)"
         )
+        if len(passed) < LEAST_PASSING * len(asked):
+            # one of four sizes passes by luck now and then; what the data show, most sizes can see
+            return []
         sizes = {(c.structure.nx, c.structure.integrator, c.structure.kind): c for _, c in passed}
         kept = []
         for c in ranked:
@@ -447,7 +456,7 @@ class Choice:
         task, table = self.task, self.search.linear
         if not table.eligible:
             return self._least_squares()
-        chosen = table.choice
+        chosen = self._linear_choice()
         core = chosen.models[0]
         provenance: Provenance = {"choice": self._choice("oe", chosen.rmse)}
         until = self.clock.until(SHARE_OF_REFIT)
@@ -461,6 +470,17 @@ class Choice:
         ranked = sorted((c for c in self.search.eligible if c.is_sound), key=lambda c: c.error)
         others = [self._alternative(c) for c in ranked[:1]]
         return self._closed(model, chosen.rmse, others)
+
+    def _linear_choice(self) -> LinearCandidate:
+        """The simplest linear model within a standard error of the best on all later parts."""
+        table = self.search.linear
+        if self.clock.over(SHARE_OF_VERIFYING):
+            return table.choice
+        likely = [c for c in table.eligible if c.order <= 3 or c.rmse <= LIKELY * table.best.rmse]
+        everywhere = LinearTable(self.task, self.search.folds, self.search.pool)
+        wanted = [(c.order, c.nk) for c in likely]
+        everywhere.add(wanted, self.clock.until(SHARE_OF_FINAL))
+        return everywhere.choice if everywhere.eligible else table.choice
 
     def _least_squares(self) -> Model:
         """What there is when no output-error fit has come to an end: least squares, in free run."""

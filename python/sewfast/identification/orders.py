@@ -143,8 +143,9 @@ class LinearTable:
 
     @property
     def choice(self) -> LinearCandidate:
-        """The simplest one within a standard error of the best."""
-        return simplest(self.eligible, lambda c: c.errors[0])
+        """The simplest one within a standard error of the best, over all folds together."""
+        least = [min(c.errors[i].rmse for c in self.eligible) for i in range(len(self.folds))]
+        return simplest(self.eligible, lambda c: _together(c.errors, least))
 
     def start(self, order: int, nk: int) -> _core.LinearModel | None:
         """A model of that order for a network to begin at.
@@ -192,6 +193,17 @@ def fitted(split: Split, order: int, nk: int, look: Look | None) -> _core.Linear
         ).model
     except (FitError, DataError):
         return None
+
+
+def _together(errors: Sequence[Errors], least: Sequence[float]) -> Errors:
+    """Errors on several folds, each relative to the least one there: every fold counts alike."""
+    if len(errors) == 1:
+        return errors[0]
+    scales = [1.0 / max(s, 1e-300) ** 2 for s in least]
+    return Errors(
+        np.concatenate([e.squares * s for e, s in zip(errors, scales, strict=True)]),
+        np.concatenate([e.counts for e in errors]),
+    )
 
 
 def raised(model: _core.LinearModel, order: int) -> _core.LinearModel:
