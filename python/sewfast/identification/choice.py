@@ -49,7 +49,7 @@ LIKELY = 1.5
 """Linear models whose error on the newest part is within this factor are asked on earlier ones."""
 TOGETHER = 1.25
 """On little data the median goes over all finalists whose error is within this factor."""
-FINAL_OPERATIONS, FINAL_OPERATIONS_LARGE = 1.5e11, 8e11
+FINAL_OPERATIONS, FINAL_OPERATIONS_LARGE = 1.5e11, 1.25e12
 LEGS = 3
 LEG_ITERATIONS = 80
 BEHIND = 1.15

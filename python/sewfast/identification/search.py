@@ -30,7 +30,7 @@ SMALL, LARGE = 3_750, 45_000
 """Samples up to which a data set is small, and above which it is large."""
 TRIAL_SAMPLES, TRIAL_SAMPLES_LARGE = 20_000, 12_000
 """Fitted samples of a trial. Fewer than 20,000 cost a factor of up to 3 in the final error."""
-SEARCH_OPERATIONS, SEARCH_OPERATIONS_LARGE = 1.8e11, 4e11
+SEARCH_OPERATIONS, SEARCH_OPERATIONS_LARGE = 1.8e11, 5e11
 """Multiplications after which nothing further is tried; a core makes some 1.4e10 in a second."""
 WORST = 3.0
 """Starts whose J exceeds this multiple of the best one's are left out of a candidate."""
