@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo accuracy commissioning bench bench-parts counts bench-device clean $(MARKED)
+.PHONY: help demo accuracy battery commissioning bench bench-parts counts bench-device clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -102,6 +102,11 @@ bench-parts: $(VENV)/bench.stamp ## every benchmark by itself, with its spread (
 
 accuracy: $(DEV) ## accuracy of the default configuration on public records, beside published figures (SEWFAST_DATA)
 	$(BIN)/python benches/accuracy.py
+
+battery: $(VENV)/bench.stamp ## identify on simulated systems of known truth (SPLIT=rules|held|all, FAMILIES=, SEEDS=, RUNS=, QUICK=1)
+	$(BIN)/python benches/battery.py --cache target/battery.json $(if $(SPLIT),--split $(SPLIT)) \
+	  $(if $(FAMILIES),--families $(FAMILIES)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(RUNS),--runs $(RUNS)) \
+	  $(if $(QUICK),--quick) $(if $(JSON),--json $(JSON))
 
 commissioning: $(DEV) ## figures of commissioning on five virtual machines, beside an oracle (docs/RESULTS.md)
 	$(BIN)/python benches/commissioning.py
