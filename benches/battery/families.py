@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -132,7 +132,7 @@ class System:
     test: Sequence[Record]
     Ts: float = 0.001
     gain_levels: tuple[float, float, int] | None = None
-    inputs: int = field(default=1)
+    inputs: int = 1
 
 
 FAMILIES: dict[str, Family] = {}

@@ -26,7 +26,7 @@ import numpy as np
 
 from sewfast import Model, SewfastError, identify
 
-from .families import FAMILIES, make
+from .families import FAMILIES, Case, make
 from .references import References, digest, gain_error, references, score
 
 WORSE = 1.05
@@ -61,7 +61,7 @@ class Run:
 
     @property
     def is_network(self) -> bool:
-        return self.kind in NETWORKS
+        return any(kind in NETWORKS for kind in self.kind.split("+"))
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,10 @@ class Outcome:
 
     def over_oe(self) -> list[float]:
         return [r.error / self.references.oe for r in self.runs]
+
+    def over_oe_measured(self) -> list[float]:
+        s = self.references.noise
+        return [math.hypot(r.error, s) / math.hypot(self.references.oe, s) for r in self.runs]
 
     def over_noise(self) -> list[float]:
         return [r.error / self.references.noise for r in self.runs]
@@ -137,7 +141,7 @@ def outcome(task: Task) -> Outcome:
     return Outcome(task.family, task.seed, case.samples, case.is_linear, kept, tuple(runs))
 
 
-def _run(task: Task, case: Any, kept: References, seed: int) -> Run:
+def _run(task: Task, case: Case, kept: References, seed: int) -> Run:
     data = case.training
     wall, used = time.perf_counter(), time.process_time()
     failure, model = "", None
@@ -200,6 +204,7 @@ class Cache:
             return
         self._kept[key] = found.references
         text = json.dumps({k: v.to_json() for k, v in sorted(self._kept.items())}, indent=1)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
         new = self.path.with_name(self.path.name + f".{os.getpid()}")
         new.write_text(text + "\n", "utf-8")
         new.replace(self.path)
@@ -219,6 +224,7 @@ def _summary(outcomes: Sequence[Outcome]) -> dict[str, float | int | None]:
     gains = [r.gain_error for _, r in runs if r.gain_error is not None]
     linear = [r.is_network for o, r in runs if o.is_linear]
     worse = [x > WORSE for o in outcomes for x in o.over_oe()]
+    visibly = [x > WORSE for o in outcomes for x in o.over_oe_measured()]
     repeated = [o.spread for o in outcomes if len(o.runs) > 1]
     return {
         "cases": len(outcomes),
@@ -230,6 +236,7 @@ def _summary(outcomes: Sequence[Outcome]) -> dict[str, float | int | None]:
         "as_measured_90": _quantile([x for o in outcomes for x in o.as_measured()], 0.9),
         "over_noise_median": _quantile([x for o in outcomes for x in o.over_noise()], 0.5),
         "worse_than_oe": _share(worse),
+        "worse_than_oe_measured": _share(visibly),
         "spread_95": _quantile(repeated, 0.95),
         "networks_for_linear_truth": _share(linear),
         "gain_error_median": _quantile(gains, 0.5),
@@ -261,6 +268,7 @@ _WORDS = {
     "as_measured_90": "the same with the training's noise, 90 % quantile",
     "over_noise_median": "error over the noise, median",
     "worse_than_oe": f"share over {WORSE} x output error",
+    "worse_than_oe_measured": "the same with the training's noise",
     "spread_95": "worst over median seed, 95 % quantile",
     "networks_for_linear_truth": "share of networks for a linear truth",
     "gain_error_median": "steady gain of motors, median error",
