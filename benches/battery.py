@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     tasks = [
         Task(name, seed, args.runs, args.time_budget, args.threads, cache.get(name, seed))
         for name in _names(args)
-        for seed in _seeds(args.seeds)
+        for seed in args.seeds
     ]
     if not IS_COMPILED:
         print("numba is not installed (extra bench): the references take minutes longer")
@@ -57,7 +57,9 @@ def _parsed(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--split", choices=tuple(SPLITS), default="all")
     parser.add_argument("--families", nargs="+", choices=tuple(FAMILIES), metavar="NAME")
-    parser.add_argument("--seeds", default="3", help="of the systems: a number, or 0,4,7, or 5-9")
+    parser.add_argument(
+        "--seeds", type=_seeds, default="3", help="of the systems: a number, or 0,4,7, or 5-9"
+    )
     parser.add_argument("--runs", type=int, default=1, help="seeds of identify; 0: references only")
     parser.add_argument("--time-budget", type=float, help="seconds, given to identify")
     parser.add_argument("--threads", type=int, help="given to identify")
@@ -67,7 +69,7 @@ def _parsed(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="small families, one seed")
     args = parser.parse_args(arguments)
     if args.quick:
-        args.seeds = "1"
+        args.seeds = [0]
     return args
 
 
