@@ -75,8 +75,9 @@ def _identified(task: Task, wants_network: bool) -> Model:
     parts = folds(task.data, task.validation)
     if not parts:
         return _without_held_out(task, began, wants_network)
-    search = Search(task, parts, Pool(task.threads, task.clock, task.progress))
-    choice = Choice(search, began, wants_network)
+    pool = Pool(task.threads, task.clock, task.progress)
+    search = Search(task, parts, pool, wants_network)
+    choice = Choice(search, began)
     try:
         search.run()
         return choice.model()
@@ -90,11 +91,11 @@ class Choice:
 
     search: Search
     began: float
-    wants_network: bool
     reasons: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.task = self.search.task
+        self.wants_network = self.search.wants_network
         self.clock = self.search.pool.clock
         self.split = self.search.folds[0]
 
@@ -206,7 +207,8 @@ class Choice:
     def _finalists(self, ranked: Sequence[Candidate]) -> list[Candidate]:
         """Up to three of different structure, about as good as the best."""
         within = WITHIN_LARGE if len(self.task.data) >= 20_000 else WITHIN
-        first, found = ranked[0], []
+        first = ranked[0]
+        found: list[Candidate] = []
         seen: set[tuple[object, ...]] = set()
         for c in ranked:
             s = c.structure
@@ -435,7 +437,10 @@ class Choice:
 
     def _alternative(self, c: Candidate) -> Model:
         model = self._of(c.models[:MOST_MEMBERS], c.structure)
-        choice = {"chosen": c.structure.kind, "reason": "an alternative to what was chosen"}
+        choice: Provenance = {
+            "chosen": c.structure.kind,
+            "reason": "an alternative to what was chosen",
+        }
         choice |= {"free_run_rmse": {c.structure.kind: finite(c.error)}}
         extra: Provenance = {"initial_state": "estimated", "choice": choice}
         return documented(model, self.task, self.began, extra)
@@ -446,7 +451,7 @@ class Choice:
             return []
         chosen = self.search.linear.choice
         core = chosen.models[0]
-        choice = {"chosen": "oe", "reason": "the linear alternative to what was chosen"}
+        choice: Provenance = {"chosen": "oe", "reason": "the linear alternative"}
         choice |= {"free_run_rmse": {"oe": finite(chosen.rmse)}}
         extra: Provenance = {"initial_state": "estimated", "choice": choice}
         return [documented(wrap(LinearOE, core, self.task.data), self.task, self.began, extra)]

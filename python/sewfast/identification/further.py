@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import Any
 
 from .. import _core
 from ..errors import Interrupted, SettingError
@@ -26,15 +27,16 @@ def trained(task: Task, model: Model) -> Model:
     """
     _require_match(task, model)
     began = time.perf_counter()
-    if model.members:
+    if isinstance(model, Ensemble):
         # the task's budget holds for all members together
         together = Ensemble.of([trained(task, m) for m in model.members], model.combine)
         known = {"initial_state": "estimated", "seed": task.seed, "trained_further": True}
         return documented(together, task, began, known)
     if isinstance(model, (ARX, IV)):
         # both are solved anew: what they begin with does not matter
-        orders = {k: model.orders[k] for k in ("na", "nb", "nk")}
-        return (arx if isinstance(model, ARX) else iv)(replace(task, **orders))
+        o = model.orders
+        own = replace(task, na=o["na"], nb=o["nb"], nk=o["nk"])
+        return arx(own) if isinstance(model, ARX) else iv(own)
     if isinstance(model, LinearOE):
         return _linear(task, model, began)
     if isinstance(model, NeuralSS):
@@ -61,7 +63,7 @@ def _linear(task: Task, model: LinearOE, began: float) -> Model:
 
 
 def _state_space(task: Task, model: NeuralSS, began: float) -> Model:
-    s = model.core.settings
+    s: dict[str, Any] = model.core.settings
     decay = _decay(model)
     fit = _core.fit_neural_ss(
         arrays(task.data),

@@ -117,7 +117,7 @@ def _is_still_linear(choice: Provenance) -> bool:
     network, linear = rmse.get("neural_oe"), rmse.get("oe")
     if network is None or linear is None:
         return False
-    return abs(network - linear) <= SAME * linear
+    return bool(abs(network - linear) <= SAME * linear)
 
 
 # --- fits -------------------------------------------------------------------------------------

@@ -32,8 +32,8 @@ PATIENCE = 2
 MISLED = 1.2
 """An order whose error exceeds a smaller one's by more is no start for a network."""
 SPARE_POLES = (0.6, 0.8, 0.4, 0.9, 0.7, 0.5, 0.3)
-LEAST_GAIN = math.log(1.01)
-"""A difference in error below one per cent counts as none, however well it is known."""
+LEAST_GAIN = math.log(1.005)
+"""A difference in error below half a per cent counts as none, however well it is known."""
 
 
 @dataclass(frozen=True)
@@ -133,8 +133,15 @@ class LinearTable:
 
     @property
     def eligible(self) -> list[LinearCandidate]:
-        """Those that may be chosen: direct feedthrough is only a network's start, unless asked."""
-        return [c for c in self.candidates.values() if c.nk > 0 or self.task.nk == 0]
+        """Those that may be chosen.
+
+        Direct feedthrough is only a network's start, unless it is asked for. A delay makes a model
+        smaller, and is believed only where it does as well as the best model without.
+        """
+        usual = [c for c in self.candidates.values() if c.nk == self.nk]
+        least = min((self._pooled(c).rmse for c in usual), default=math.inf) * math.exp(LEAST_GAIN)
+        delayed = [c for c in self.candidates.values() if c.nk > self.nk]
+        return usual + [c for c in delayed if self._pooled(c).rmse <= least]
 
     @property
     def best(self) -> LinearCandidate:
@@ -144,8 +151,18 @@ class LinearTable:
     @property
     def choice(self) -> LinearCandidate:
         """The simplest one within a standard error of the best, over all folds together."""
-        least = [min(c.errors[i].rmse for c in self.eligible) for i in range(len(self.folds))]
-        return simplest(self.eligible, lambda c: _together(c.errors, least))
+        return simplest(self.eligible, self._pooled)
+
+    def _pooled(self, c: LinearCandidate) -> Errors:
+        """Errors on all folds, each relative to the least one there: every fold counts alike."""
+        if len(self.folds) == 1:
+            return c.errors[0]
+        squares, counts = [], []
+        for i, errors in enumerate(c.errors):
+            least = min(other.errors[i].rmse for other in self.candidates.values())
+            squares.append(errors.squares / max(least, 1e-300) ** 2)
+            counts.append(errors.counts)
+        return Errors(np.concatenate(squares), np.concatenate(counts))
 
     def start(self, order: int, nk: int) -> _core.LinearModel | None:
         """A model of that order for a network to begin at.
@@ -193,17 +210,6 @@ def fitted(split: Split, order: int, nk: int, look: Look | None) -> _core.Linear
         ).model
     except (FitError, DataError):
         return None
-
-
-def _together(errors: Sequence[Errors], least: Sequence[float]) -> Errors:
-    """Errors on several folds, each relative to the least one there: every fold counts alike."""
-    if len(errors) == 1:
-        return errors[0]
-    scales = [1.0 / max(s, 1e-300) ** 2 for s in least]
-    return Errors(
-        np.concatenate([e.squares * s for e, s in zip(errors, scales, strict=True)]),
-        np.concatenate([e.counts for e in errors]),
-    )
 
 
 def raised(model: _core.LinearModel, order: int) -> _core.LinearModel:

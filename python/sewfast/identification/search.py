@@ -39,9 +39,11 @@ MOST_NX, MOST_HIDDEN, MOST_HIDDEN_SMALL = 8, 32, 16
 LEAST_DECAY, MOST_DECAY = 1e-10, 1e-1
 DECAY_MATTERS = 6_000
 """Samples above which another weight decay hardly ever gains."""
+HOPELESS = 0.98
+"""Where the best network of the second halving is not below this part of the linear error."""
 WORTH_A_STEP = 0.97
 """A step of the climb must bring the error below this part."""
-LEAST_STEP = 0.005
+LEAST_STEP = 0.01
 """Relative gain of a step that is taken where the gain is known to be one."""
 WORTH_A_FEEDTHROUGH = 0.5
 """nk = 0 is no plant for a loop, and a smoothed speed leans ahead a little: it must be worth it."""
@@ -126,6 +128,7 @@ class Search:
     task: Task
     folds: tuple[Split, ...]
     pool: Pool
+    wants_network: bool = False
     candidates: dict[Structure, Candidate] = field(default_factory=dict)
     operations: float = 0.0
 
@@ -167,7 +170,15 @@ class Search:
         alive = self.screen()
         for iterations in HALVING_ITERATIONS:
             alive = self.halve(alive, iterations)
-        self.climb()
+        if not self.is_hopeless:
+            self.climb()
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether no network is visibly better than linear by now: growing them would not help."""
+        if self.wants_network or not self.linear.eligible or self.best is None:
+            return False
+        return self.best.error >= HOPELESS * self.linear.best.rmse
 
     def screen(self) -> list[Candidate]:
         """A short training of every likely structure; the best first."""
@@ -309,8 +320,8 @@ class Search:
             return []
         if not self.linear.eligible or not self._integrates():
             return []
-        sizes = (1, 2) if self.repeats else (1, 2, 4, 8)
-        sizes = sizes if self.task.hidden is None else (self.task.hidden,)
+        likely = (1, 2) if self.repeats else (1, 2, 4, 8)
+        sizes = likely if self.task.hidden is None else (self.task.hidden,)
         structures = (
             Structure(nx, self.linear.nk, h, self.decay, integrator=True)
             for nx in (2, 3)
@@ -386,7 +397,11 @@ class Search:
         iterations: list[int] = []
         for best, kind, s in moves:
             if kind == "grow":
-                models = [m.grown(s.nx, s.hidden, self.task.seed) for m in best.models[:3]]
+                models = [
+                    m.grown(s.nx, s.hidden, self.task.seed)
+                    for m in best.models[:3]
+                    if isinstance(m, _core.NeuralSS)
+                ]
                 requests.append(self._request(s, CLIMB_ITERATIONS, initial=models))
                 iterations.append(best.iterations + CLIMB_ITERATIONS)
             elif kind == "decay":
@@ -411,9 +426,11 @@ class Search:
             return False
         if found.error < worth * best.error:
             return True
-        # below the noise a step gains little of the error, and still gains
+        # below the noise a step gains little of the error, and still gains; on much data that would
+        # go on for long
         ratio, deviation = compared(found.errors, best.errors)
-        return worth == WORTH_A_STEP and ratio < -max(2.0 * deviation, LEAST_STEP)
+        is_small_step = worth == WORTH_A_STEP and not self.is_large
+        return is_small_step and ratio < -max(2.0 * deviation, LEAST_STEP)
 
     def is_affordable(self, s: Structure, fold: int = 0) -> bool:
         """Whether the fold has samples enough for its parameters."""

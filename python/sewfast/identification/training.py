@@ -287,7 +287,7 @@ def _jobs(request: Request, seed: int, until: float | None) -> list[Job]:
         settings |= {"nx": s.nx, "integrator": s.integrator, "output": s.output.name}
         settings |= {"output_parameters": _output_parameters(request)}
         settings |= {"hidden_scale": HIDDEN_SCALE}
-    common = {
+    common: dict[str, Any] = {
         "experiments": arrays(request.fitted),
         "held": [] if request.held is None else arrays(request.held),
         "settings": settings,
