@@ -223,7 +223,7 @@ def operating_range(
     region = stored_region(model)
     first = representative(model)
     if inputs is None:
-        grid, varied = _grid(first, points, region)
+        grid, varied = _grid(first, _input_range(model, first), points, region)
     else:
         grid, varied = _given(model, inputs)
     members = model.members or (model,)
@@ -234,16 +234,21 @@ def operating_range(
     )  # fmt: skip
 
 
-def _grid(
-    model: Model, points: int, region: Region | None
-) -> tuple[list[FloatArray], tuple[int, ...]]:
-    ranges = model.training.get("input_range")
+def _input_range(model: Model, first: Model) -> FloatArray:
+    """Of the training inputs, (nu, 2): an ensemble stores it itself, or its members do."""
+    ranges = model.training.get("input_range") or first.training.get("input_range")
     if not ranges:
         raise DataError(
             "operating range: expected a model that stores the range of its training inputs, "
-            "received one without; give the operating points (inputs=...)"
+            "received one without; identify it anew, or give the operating points"
         )
-    limits = np.array(ranges, dtype=np.float64)
+    limits: FloatArray = np.array(ranges, dtype=np.float64)
+    return limits
+
+
+def _grid(
+    model: Model, limits: FloatArray, points: int, region: Region | None
+) -> tuple[list[FloatArray], tuple[int, ...]]:
     grid: list[FloatArray] = []
     for i in range(len(limits)):
         grid += _closed_in(model, limits, i, points, region)
