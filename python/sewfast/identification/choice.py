@@ -42,6 +42,10 @@ WITHIN, WITHIN_LARGE = 2.0, 1.3
 WORTH_AN_INTEGRATOR = 0.7
 ENOUGH_TO_CHOOSE_BY = 1_500
 """Held-out samples from which on a single start may be taken instead of the median."""
+MOST_STARTS_LARGE = 2
+"""Starts of a finalist that are trained to the end on much data."""
+ALONE = 0.98
+"""A single start must bring the error of the median below this part: a median errs less often."""
 MOST_MEMBERS = 15
 """Of an ensemble: a controller is tuned on every one, and a median of more is hardly better."""
 MOST_ALTERNATIVES = 2
@@ -54,6 +58,8 @@ LEGS = 3
 LEG_ITERATIONS = 80
 BEHIND = 1.15
 """A finalist that is behind by more after a leg is not trained on."""
+BEHIND_LARGE = 1.01
+"""The same on much data, where held-out errors are sure and iterations dear."""
 FINISHED = 0.995
 """A leg that does not bring the error below this part ends the training."""
 SHARE_OF_VERIFYING, SHARE_OF_FINAL, SHARE_OF_REFIT = 0.55, 0.78, 0.85
@@ -259,7 +265,8 @@ class Choice:
             alive = following
             if not search.is_small and not (search.repeats and alive[0].structure.integrator):
                 best = min(c.error for c in alive)
-                alive = [c for c in alive if c.error <= BEHIND * best]
+                behind = BEHIND_LARGE if search.is_large else BEHIND
+                alive = [c for c in alive if c.error <= behind * best]
             if not gained:
                 break
         return sorted(alive, key=lambda c: c.error)
@@ -270,12 +277,12 @@ class Choice:
             many = 16 if search.is_small else 12 if c.structure.integrator else 6
             many = 4 if len(self.task.data) >= 25_000 and not c.structure.integrator else many
             wanted = many if self.task.starts is None else self.task.starts
-            request = search._request(c.structure, 60, starts=1, first=20)
+            request = search.request(c.structure, 60, starts=1, first=20)
             can = int(budget / len(finalists) / request.operations)
             requests.append(replace(request, starts=max(0, min(wanted - len(c.starts), can))))
-        added = search._trained(requests, 0.6, self.clock.until(SHARE_OF_FINAL - 0.15))
+        added = search.trained(requests, 0.6, self.clock.until(SHARE_OF_FINAL - 0.15))
         return [
-            search._judged(c.structure, [*c.starts, *starts], c.iterations)
+            search.judged(c.structure, [*c.starts, *starts], c.iterations)
             for c, starts in zip(finalists, added, strict=True)
         ]
 
@@ -286,7 +293,8 @@ class Choice:
             each = c.structure.operations(self.search.inputs, len(self.split.fitted))
             share = budget / len(alive)
             most = LEG_ITERATIONS if task.iterations is None else task.iterations
-            kept = c.models[: max(1, int(share / (each * 30)))]
+            able = max(1, int(share / (each * 30)))
+            kept = c.models[: min(able, MOST_STARTS_LARGE) if self.search.is_large else able]
             iterations = int(min(most, max(5, share / (each * len(kept)))))
             linear = self.search.start(c.structure.nx, c.structure.nk, c.structure.output)
             requests.append(
@@ -319,10 +327,12 @@ class Choice:
         """The best start alone, where long held-out data say that it is better so."""
         if len(c.models) < 2 or self.split.scored < ENOUGH_TO_CHOOSE_BY:
             return c
+        if self.search.is_large:
+            return self._rejudged(replace(c, starts=(c.members[0],)))
         if c.structure.integrator and self.search.repeats:
             return c
         one = self._rejudged(replace(c, starts=(c.members[0],)))
-        return one if one.error < c.error else c
+        return one if one.error < ALONE * c.error else c
 
     # --- the choice -----------------------------------------------------------------------------
 
@@ -371,9 +381,10 @@ class Choice:
             if c.structure.kind == "neural_ss" and math.isfinite(c.error)
         ]  # fmt: skip
         if not found:
+            remedy = "give more time" if self.clock.truncated else "record longer"
             raise FitError(
                 f"{self.task.data.source}: expected a network with a finite free run on data not "
-                "trained on, found none; record longer, give nx and hidden, or ask for model oe"
+                f"trained on, found none; {remedy}, give nx and hidden, or ask for model oe"
             )
         self.reasons.append("no network passed the guard: the best of them all the same")
         return [min(found, key=lambda c: c.error)]

@@ -402,19 +402,19 @@ class Search:
                     for m in best.models[:3]
                     if isinstance(m, _core.NeuralSS)
                 ]
-                requests.append(self._request(s, CLIMB_ITERATIONS, initial=models))
+                requests.append(self.request(s, CLIMB_ITERATIONS, initial=models))
                 iterations.append(best.iterations + CLIMB_ITERATIONS)
             elif kind == "decay":
-                requests.append(self._request(s, 30, initial=best.models[:4]))
+                requests.append(self.request(s, 30, initial=best.models[:4]))
                 iterations.append(best.iterations + 30)
             else:
                 count = 30 if self.is_large else 60
                 starts = self._limited(4 if self.is_small else 2)
-                requests.append(self._request(s, count, starts=starts))
+                requests.append(self.request(s, count, starts=starts))
                 iterations.append(count)
-        found = self._trained(requests)
+        found = self.trained(requests)
         return [
-            self._judged(s, starts, count)
+            self.judged(s, starts, count)
             for (_, _, s), starts, count in zip(moves, found, iterations, strict=True)
         ]
 
@@ -449,10 +449,10 @@ class Search:
     ) -> list[Candidate]:
         """Candidates of (structure, iterations, starts), trained afresh side by side."""
         self._prepare([s for s, _, _ in wanted], fold)
-        requests = [self._request(s, i, starts=n, fold=fold) for s, i, n in wanted]
-        found = self._trained(requests, share, until)
+        requests = [self.request(s, i, starts=n, fold=fold) for s, i, n in wanted]
+        found = self.trained(requests, share, until)
         pairs = zip(wanted, found, strict=True)
-        return [self._judged(s, starts, i, fold) for (s, i, _), starts in pairs]
+        return [self.judged(s, starts, i, fold) for (s, i, _), starts in pairs]
 
     def continued(
         self, candidates: Sequence[Candidate], iterations: int, fresh: Sequence[int]
@@ -460,17 +460,17 @@ class Search:
         """Candidates trained further, each with so many fresh starts; never worse than before."""
         requests = []
         for c, more in zip(candidates, fresh, strict=True):
-            requests.append(self._request(c.structure, iterations, initial=c.models))
+            requests.append(self.request(c.structure, iterations, initial=c.models))
             total = c.iterations + iterations
             more = min(more, self._limited(more + len(c.starts)) - len(c.starts))
             requests.append(
-                self._request(c.structure, total, starts=max(more, 0), first=len(c.starts))
+                self.request(c.structure, total, starts=max(more, 0), first=len(c.starts))
             )
-        trained = iter(self._trained(requests))
+        trained = iter(self.trained(requests))
         found = []
         for c in candidates:
             starts = [*next(trained), *next(trained)]
-            new = self._judged(c.structure, starts, c.iterations + iterations)
+            new = self.judged(c.structure, starts, c.iterations + iterations)
             if new.error > c.error:
                 new = replace(c, iterations=c.iterations + iterations, converged=True)
             else:
@@ -479,7 +479,7 @@ class Search:
             found.append(new)
         return found
 
-    def _request(
+    def request(
         self,
         s: Structure,
         iterations: int,
@@ -489,6 +489,7 @@ class Search:
         initial: Sequence[Network] = (),
         fold: int = 0,
     ) -> Request:
+        """Starts of a structure on a trial's data, or models to be trained further on them."""
         data = self.trials[fold]
         needs_linear = not initial or s.kind == "neural_oe"
         linear = self.start(s.nx, s.nk, s.output, fold) if needs_linear else None
@@ -496,7 +497,7 @@ class Search:
         iterations = iterations if most is None else min(iterations, most)
         return Request(s, data.fitted, data.held, iterations, linear, starts, first, tuple(initial))
 
-    def _trained(
+    def trained(
         self,
         requests: Sequence[Request],
         share: float | None = None,
@@ -537,7 +538,7 @@ class Search:
         model = max(usable, key=lambda c: c.order).models[0]
         return [] if model is None else [model]
 
-    def _judged(
+    def judged(
         self, s: Structure, starts: Sequence[Start], iterations: int, fold: int = 0
     ) -> Candidate:
         """The candidate with the held-out errors of its members' median."""
