@@ -37,4 +37,6 @@ with VirtualDevice(fast=True) as device, tempfile.TemporaryDirectory() as name:
 
     data = sewfast.read(file, inputs="u", counts="counts")
     train, test = data.split(0.6)
-    print(sewfast.validate(sewfast.identify(train, model="oe"), test))
+    score = sewfast.validate(sewfast.identify(train, model="oe"), test)
+    print(score)
+    assert score.simulation.fit_percent > 95.0, score

@@ -25,3 +25,5 @@ measured = sewfast.run(tuned.controller, machine, reference)
 difference = np.sqrt(np.mean((promised.y - measured.y) ** 2))
 print(measured)
 print(f"the model was off by {difference:.1f} RPM rms")
+assert difference < 15.0, difference
+assert measured.metrics()["overshoot_percent"] < 3.0, measured
