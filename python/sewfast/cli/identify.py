@@ -225,6 +225,7 @@ def _show(
         s = score.simulation
         unit = f" {score.unit}" if score.unit else ""
         print(f"{label}: free-run fit {s.fit_percent:.2f} %, rmse {s.rmse:.5g}{unit}")
-    for path, other in zip(others, model.alternatives, strict=True):
+    # without --alternatives nothing was written
+    for path, other in zip(others, model.alternatives, strict=False):
         print(f"alternative: {other!r} in {path}")
     print(f"written to {args.out}; score it on another recording: sewfast validate {args.out} DATA")

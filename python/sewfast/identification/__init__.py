@@ -1,11 +1,11 @@
 """`identify`: from a data set to a model.
 
-In the order in which to read it: `identify` (the public function and its refusals), `task` (one
+In the order in which to read it: `entry` (the public function and its refusals), `task` (one
 identification with its settings), `linear` and `lagged` (models of given orders), `folds` (what is
 held out, and how models are compared on it), `training` (starts of one structure, on any number of
 threads), `search` (which structures are tried), `choice` (which of them becomes the model).
 """
 
-from .identify import identify
+from .entry import identify
 
 __all__ = ["identify"]

@@ -140,11 +140,7 @@ class Choice:
             only = [c for c in ranked or found if c.structure.kind == "neural_ss"]
             return only if self.wants_network else ranked
         if not ranked:
-            self.reasons.append(
-                "no network could be trained on so few samples"
-                if not found
-                else "no network forgets its initial state and withstands larger inputs"
-            )
+            self.reasons.append(self._why_no_network(found))
             return []
         ratio = ranked[0].error / max(linear.rmse, 1e-300)
         self.reasons.append(
@@ -154,6 +150,13 @@ class Choice:
         if ratio >= WORTH_LOOKING:
             return []
         return ranked if ratio <= BY_FAR else self._verified(ranked, linear)
+
+    def _why_no_network(self, found: Sequence[Candidate]) -> str:
+        if found:
+            return "no network forgets its initial state and withstands larger inputs"
+        if self.clock.truncated:
+            return "the time budget left no time for a network"
+        return "no network could be trained: too few samples, or no start had a finite free run"
 
     def _verified(self, ranked: Sequence[Candidate], linear: LinearCandidate) -> list[Candidate]:
         """Those that beat linear models with every start on two later parts.

@@ -525,8 +525,8 @@ class Search:
         def fault(start: Start, look: Look) -> str:
             return _core.guard(start.model, self._guarded, linear=bounds)
 
-        faults = iter(self.pool.map(fault, flat))
-        return [[replace(s, fault=next(faults) or "") for s in starts] for starts in found]
+        faults = iter(self.pool.map(fault, flat, until=self.pool.clock.until(SHARE_OF_GUARD)))
+        return [[replace(s, fault=_said(next(faults))) for s in starts] for starts in found]
 
     @property
     def bounding_models(self) -> list[_core.LinearModel]:
@@ -607,8 +607,13 @@ class Search:
         yield from (c.to_json() for c in self.candidates.values())
 
 
+SHARE_OF_GUARD = 0.88
 SHARE_OF_LINEAR, SHARE_OF_SEARCH = 0.12, 0.48
 """Parts of a time budget after which no linear model, and no network, is tried any more."""
+
+
+def _said(fault: str | None) -> str:
+    return "not asked within the time budget" if fault is None else fault
 
 
 def _repeats(u: FloatArray) -> bool:

@@ -21,7 +21,7 @@ Pairs: TypeAlias = list[tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True)
 class Task:
-    """One identification: data, where to select on, and settings; None is left to the recipe."""
+    """One identification: data, where to select on, and settings (None: the usual)."""
 
     data: Dataset
     validation: Dataset | None
@@ -52,7 +52,7 @@ class Task:
 
     @property
     def iterations_or_usual(self) -> int:
-        """Of one fit whose number the recipe leaves open."""
+        """Of one fit whose number is left open."""
         return 100 if self.iterations is None else self.iterations
 
     @property
