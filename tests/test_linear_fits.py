@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sewfast as api
-from sewfast import IV, Dataset, FitError, _core
+from sewfast import IV, Dataset, FitError, SettingError, _core
 
 SIGMA = 0.5
 DELAYS = (1, 3, 2)
@@ -21,6 +21,23 @@ def plant(inputs: int) -> _core.LinearModel:
     for j, delay in enumerate(DELAYS[:inputs]):
         b[j, delay - 1 : delay + 1] = np.array([0.5, 0.3]) * (-1) ** j * (1 + j)
     return _core.LinearModel(np.array([-1.5, 0.7]), b, 1, 0.4)
+
+
+def test_output_error_goes_on_from_a_model_and_refuses_one_of_other_orders() -> None:
+    rng, truth = np.random.default_rng(3), plant(2)
+    u = excitation(2_000, 2, 4)
+    data = [(u, truth.simulate(u, np.zeros(2)) + SIGMA * rng.normal(size=len(u)))]
+    searched = _core.fit_oe(data, na=2, nb=NB, nk=1)
+    found = _core.fit_oe(data, na=2, nb=NB, nk=1, initial=truth)
+    assert found.cost == pytest.approx(searched.cost, rel=1e-9)
+    assert found.iterations < searched.iterations / 5
+    assert np.allclose(theta_of(found.model), theta_of(searched.model), rtol=1e-5, atol=1e-7)
+    again = _core.fit_oe(data, na=2, nb=NB, nk=1, initial=found.model)
+    assert again.trace[0] == pytest.approx(found.cost, rel=1e-12)
+    with pytest.raises(SettingError, match="na 2, nb 3 and nk 1, got one with na 2, nb 4 and nk 1"):
+        _core.fit_oe(data, na=2, nb=3, nk=1, initial=truth)
+    with pytest.raises(SettingError, match="initial model of 2 inputs"):
+        _core.fit_oe(data, na=2, nb=NB, nk=1, initial=plant(1))
 
 
 def excitation(n: int, inputs: int, seed: int) -> np.ndarray:

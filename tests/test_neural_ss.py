@@ -161,6 +161,52 @@ def test_a_model_that_runs_away_says_so() -> None:
 # --- training -------------------------------------------------------------------------------------
 
 
+def test_the_guard_says_in_words_what_is_wrong_with_a_model() -> None:
+    u, y = bent(3_000, 3, 1.0)
+    linear = linear_start(u, y)
+    found = fit([(u, y)], linear=linear, guard=False)
+    assert found.sounds == [True, True]
+    good = found.model
+    assert _core.guard(good, [(u, y)], linear=[linear]) == ""
+    assert _core.guard(linear, [(u, y)]) == ""
+    theta = good.theta.copy()
+    theta[0] += 1.0  # a pole beyond 1
+    wild = _core.NeuralSS(theta=theta, **good.settings)
+    assert "runs away" in _core.guard(wild, [(u, y)], linear=[linear])
+    slow = _core.LinearModel(np.array([-0.99999]), np.array([[1e-5]]), 1, 300e-5)
+    assert _core.guard(slow, [(u, y)]) == "does not forget its initial state"
+    assert _core.guard(slow, [(u, y)], linear=[slow]) == ""
+    lagged = _core.fit_neural_oe(
+        [(u, y)], [], na=2, nb=2, nk=1, hidden=3, linear=linear, u_mean=None, u_scale=None,
+        y_mean=None, y_scale=None, saturate=None, initial_state="estimated", weight_decay=1e-8,
+        max_iterations=20, starts=1, seed=0, threads=1,
+    )  # fmt: skip
+    assert lagged.sound
+    assert _core.guard(lagged.model, [(u, y)], linear=[linear]) == ""
+    with pytest.raises(
+        TypeError, match="expected a LinearModel, a NeuralOE or a NeuralSS, got int"
+    ):
+        _core.guard(3, [(u, y)])  # type: ignore[arg-type]
+    with pytest.raises(DataError, match="1 inputs and 1 outputs"):
+        _core.guard(good, [(np.hstack([u, u]), y)])
+
+
+def test_a_grown_model_is_trained_further() -> None:
+    u, y = bent(1_500, 4, 1.0)
+    small = fit([(u, y)], nx=1, hidden=2, max_iterations=30)
+    larger = small.model.grown(3, 8, 5)
+    assert (larger.settings["nx"], larger.settings["hidden"]) == (3, 8)
+    state = larger.estimate_initial_state(u[:20], y[:20])
+    before = small.model.simulate(u, small.model.estimate_initial_state(u[:20], y[:20]))
+    assert np.std(larger.simulate(u, state)[100:] - before[100:]) < 1e-2 * np.std(y)
+    trained = fit(
+        [(u, y)], nx=3, hidden=8, max_iterations=60, starts=1, initial=[larger], guard=False
+    )
+    assert trained.cost < 0.5 * small.cost
+    with pytest.raises(SettingError, match="at least the 1 states and 2 hidden units"):
+        small.model.grown(1, 1, 0)
+
+
 def test_training_finds_what_a_linear_model_cannot() -> None:
     u, y = bent(2000, 0, noise=0.05)
     other, truth = bent(1000, 1)

@@ -326,8 +326,12 @@ class NeuralSSFit:
 
 def fit_oe(
     experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool = True,
-    max_iterations: int = 100, progress: _Progress = None,
-) -> LinearFit: ...
+    max_iterations: int = 100, initial: LinearModel | None = None, progress: _Progress = None,
+) -> LinearFit:
+    """Output error. ``initial``, of these orders, takes the place of the search over many starts.
+
+    Ctrl-C gives the best model so far as "interrupted"; its initial states and cost may then be those of an excerpt.
+    """
 def fit_neural_oe(
     experiments: _Experiments, validation: _Experiments, *, na: int, nb: int, nk: int, hidden: int,
     linear: LinearModel | None, u_mean: _F | None, u_scale: _F | None, y_mean: float | None,

@@ -2,6 +2,12 @@
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
+/// Samples between two looks at a monitor in a loop with `products` per sample, a power of two: a few milliseconds.
+pub(crate) fn look(products: usize) -> usize {
+    let samples = (1 << 22) / products.max(1);
+    1 << samples.clamp(16, 4096).ilog2()
+}
+
 /// Shared by a long computation (which reports and asks) and its watcher (which reads and requests a stop).
 #[derive(Debug)]
 pub struct Monitor {
@@ -86,6 +92,11 @@ mod tests {
         monitor.set_total(4);
         monitor.advance(3);
         assert_eq!(monitor.progress(), (3, 4, 1.0));
+    }
+
+    #[test]
+    fn looks_more_often_where_a_sample_takes_long() {
+        assert_eq!([0, 100, 2_000, 1 << 30].map(look), [4096, 4096, 2048, 16]);
     }
 
     #[test]

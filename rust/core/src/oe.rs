@@ -9,6 +9,8 @@ use excerpt::excerpt;
 use problem::OutputError;
 use restart::restart_error;
 
+use crate::lagged::{Lagged, Lags};
+use crate::linear::{LinearModel, stabilised};
 use crate::linear_fit::LinearFit;
 use crate::lm::{self, Outcome, Problem, Settings, Termination};
 use crate::{Error, Monitor, Record, Result, arx};
@@ -65,6 +67,54 @@ pub fn fit(
         Some(found) => found,
         None => searched(&mut problem, records, max_iterations, monitor).ok_or_else(no_model)?,
     };
+    finished(problem, best, spent, max_iterations, monitor)
+}
+
+/// [`fit`] from one model instead of a search over many: for data that a model is known to describe nearly.
+///
+/// The initial states are estimated first. The poles of a model that is not stable are mirrored into the unit circle, and
+/// its numerator is estimated anew. Without `offset` that of the model is left out.
+///
+/// # Errors
+/// As [`fit`], `ErrorKind::Setting` for a model with another number of inputs than the records have.
+pub fn fit_from(
+    records: &[Record],
+    initial: &LinearModel,
+    offset: bool,
+    max_iterations: usize,
+    monitor: &Monitor,
+) -> Result<LinearFit> {
+    let Lags {
+        na,
+        nb,
+        nk,
+        channels,
+    } = initial.lags();
+    let lags = arx::check(records, na, nb, nk)?;
+    if lags.channels != channels {
+        return Err(Error::setting(format!(
+            "expected an initial model of {} inputs, as the records have, got one of {channels}; leave it out",
+            lags.channels
+        )));
+    }
+    let mut problem = OutputError::new(records, lags, offset, monitor)?;
+    monitor.set_total(max_iterations as u64);
+    let (cost, theta) = problem
+        .with_states(initial)
+        .or_else(|| problem.with_poles(&stabilised(initial.a())))
+        .ok_or_else(no_model)?;
+    let start = unfinished(cost, theta, Termination::MaxIterations);
+    finished(problem, start, 0, max_iterations, monitor)
+}
+
+/// The fit that goes on from `best` for the iterations that are left, after `spent` ones in all.
+fn finished(
+    mut problem: OutputError,
+    best: Outcome,
+    spent: usize,
+    max_iterations: usize,
+    monitor: &Monitor,
+) -> Result<LinearFit> {
     let left = max_iterations.saturating_sub(best.iterations);
     let goes_on = best.termination == Termination::MaxIterations && left > 0;
     let (best, spent) = if goes_on {
@@ -84,7 +134,10 @@ pub fn fit(
         model: problem.model(&best.theta)?,
         cost: best.cost,
         iterations: spent,
-        termination: best.termination,
+        termination: match monitor.stopped() {
+            true => Termination::Interrupted,
+            false => best.termination,
+        },
         trace: best.trace,
         initial_states: problem.initial_states(&best.theta),
         covariance: problem.covariance(&best.theta, best.cost),
@@ -98,11 +151,14 @@ fn searched(
     max_iterations: usize,
     monitor: &Monitor,
 ) -> Option<(Outcome, usize)> {
+    if monitor.stopped() {
+        return None;
+    }
     let candidates = starts::candidates(problem, records, monitor);
-    let candidates = promising(problem, records, candidates);
+    let candidates = promising(problem, records, candidates, monitor);
     let heats = refined(problem, candidates, max_iterations, monitor);
     let spent = heats.iter().map(|o| o.iterations).sum();
-    Some((chosen(problem, records, heats)?, spent))
+    Some((chosen(problem, records, heats, monitor)?, spent))
 }
 
 /// The same in pieces of the records; what comes out is a start for all of them.
@@ -134,12 +190,13 @@ fn promising(
     problem: &OutputError,
     records: &[Record],
     candidates: Vec<(f64, Vec<f64>)>,
+    monitor: &Monitor,
 ) -> Vec<(f64, Vec<f64>)> {
     let (first, rest) = candidates.split_at(candidates.len().min(REFINED / 2));
     let mut ranked: Vec<_> = rest
         .iter()
         .take(RESTARTED)
-        .map(|c| (restarted(problem, records, &c.1), c))
+        .map(|c| (restarted(problem, records, &c.1, monitor), c))
         .collect();
     ranked.sort_by(|x, y| x.0.total_cmp(&y.0));
     let others = ranked.into_iter().map(|(_, c)| c);
@@ -147,10 +204,17 @@ fn promising(
 }
 
 /// The outcome with the lowest cost among those that restart about as well as the best one.
-fn chosen(problem: &OutputError, records: &[Record], outcomes: Vec<Outcome>) -> Option<Outcome> {
+///
+/// After a stop those that have not been restarted yet do not count, or all of them alike.
+fn chosen(
+    problem: &OutputError,
+    records: &[Record],
+    outcomes: Vec<Outcome>,
+    monitor: &Monitor,
+) -> Option<Outcome> {
     let ranked: Vec<(f64, Outcome)> = outcomes
         .into_iter()
-        .map(|o| (restarted(problem, records, &o.theta), o))
+        .map(|o| (restarted(problem, records, &o.theta, monitor), o))
         .collect();
     let least = ranked.iter().map(|r| r.0).fold(f64::INFINITY, f64::min);
     let good = ranked.into_iter().filter(|r| r.0 <= ABOUT_AS_WELL * least);
@@ -158,10 +222,9 @@ fn chosen(problem: &OutputError, records: &[Record], outcomes: Vec<Outcome>) -> 
         .min_by(|x, y| x.cost.total_cmp(&y.cost))
 }
 
-fn restarted(problem: &OutputError, records: &[Record], theta: &[f64]) -> f64 {
-    problem
-        .model(theta)
-        .map_or(f64::INFINITY, |model| restart_error(&model, records))
+fn restarted(problem: &OutputError, records: &[Record], theta: &[f64], monitor: &Monitor) -> f64 {
+    let error = |model| restart_error(&model, records, monitor);
+    problem.model(theta).map_or(f64::INFINITY, error)
 }
 
 /// A few iterations from each of the best candidates; the best candidate as it is where a stop leaves no time for that.
@@ -175,20 +238,28 @@ fn refined(
     let mut outcomes = Vec::with_capacity(REFINED);
     for (cost, theta) in candidates.into_iter().take(REFINED) {
         if !monitor.stopped() {
-            outcomes.push(lm::minimize(problem, theta, &heat, monitor, |_, _| {}));
-        } else if outcomes.is_empty() {
-            outcomes.push(Outcome {
-                theta,
-                cost,
-                iterations: 0,
-                trials: 0,
-                termination: Termination::Interrupted,
-                trace: vec![cost],
-            });
+            let start = theta.clone();
+            outcomes.push(lm::minimize(problem, start, &heat, monitor, |_, _| {}));
+        }
+        // a stop may come before the refinement has a cost of its own
+        outcomes.retain(|o: &Outcome| o.cost.is_finite());
+        if monitor.stopped() && outcomes.is_empty() {
+            outcomes.push(unfinished(cost, theta, Termination::Interrupted));
         }
     }
-    outcomes.retain(|o| o.cost.is_finite());
     outcomes
+}
+
+/// Parameters from which no iteration has been done.
+fn unfinished(cost: f64, theta: Vec<f64>, termination: Termination) -> Outcome {
+    Outcome {
+        theta,
+        cost,
+        iterations: 0,
+        trials: 0,
+        termination,
+        trace: vec![cost],
+    }
 }
 
 fn settings(max_iterations: usize) -> Settings {
@@ -218,9 +289,9 @@ fn no_model() -> Error {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::{AtomicBool, Ordering};
+
     use super::*;
-    use crate::lagged::Lagged;
-    use crate::linear::LinearModel;
     use crate::machine::{Machine, Parameters};
     use crate::random::Random;
 
@@ -376,5 +447,63 @@ mod tests {
                 .message
                 .contains("longer")
         );
+    }
+
+    #[test]
+    fn goes_on_from_a_model_that_is_nearly_right() {
+        let truth = LinearModel::new(vec![-1.5, 0.7], vec![0.5, 0.3], 1, 1, 0.4).unwrap();
+        let u = chirp(4_000, 3.0);
+        let y = noisy(&truth.simulate(&u, 1, &[3.0, -2.0]).unwrap(), 0.2, 3);
+        let records = [Record::new(&u, 1, &y).unwrap()];
+        let searched = fit(&records, 2, 2, 1, true, 100, &Monitor::default()).unwrap();
+        let near = LinearModel::new(vec![-1.45, 0.66], vec![0.4, 0.4], 1, 1, 0.0).unwrap();
+        let found = fit_from(&records, &near, true, 100, &Monitor::default()).unwrap();
+        assert!((found.cost / searched.cost - 1.0).abs() < 1e-9);
+        assert!((found.model.a()[0] - searched.model.a()[0]).abs() < 1e-6);
+        assert!(
+            found.iterations < searched.iterations / 3,
+            "{}",
+            found.iterations
+        );
+        // at the end of one fit there is nothing left to do but the last test
+        let again = fit_from(&records, &searched.model, true, 100, &Monitor::default()).unwrap();
+        assert!(again.iterations <= PATIENCE, "{}", again.iterations);
+        assert!((again.trace[0] / searched.cost - 1.0).abs() < 1e-9);
+        let without = fit_from(&records, &near, false, 100, &Monitor::default()).unwrap();
+        assert_eq!(without.model.offset(), 0.0);
+        let unstable = LinearModel::new(vec![-2.2, 1.2], vec![0.4, 0.4], 1, 1, 0.0).unwrap();
+        let found = fit_from(&records, &unstable, true, 100, &Monitor::default()).unwrap();
+        assert!(found.model.is_stable());
+        let two = LinearModel::new(vec![-0.5], vec![0.4, 0.4], 2, 1, 0.0).unwrap();
+        let refused = fit_from(&records, &two, true, 100, &Monitor::default()).unwrap_err();
+        assert_eq!(refused.kind, crate::ErrorKind::Setting);
+    }
+
+    /// Slow iterations that end a fit.
+    const PATIENCE: usize = 6;
+
+    #[test]
+    fn gives_the_best_so_far_wherever_it_is_stopped() {
+        let truth = LinearModel::new(vec![-1.5, 0.7], vec![0.5, 0.3], 1, 1, 0.4).unwrap();
+        let u = chirp(3_000, 3.0);
+        let y = noisy(&truth.simulate(&u, 1, &[0.0; 2]).unwrap(), 0.5, 3);
+        let records = [Record::new(&u, 1, &y).unwrap()];
+        // iterations of the first refinements, of which there are more
+        for iterations in [1, 20, 40] {
+            let (monitor, done) = (Monitor::default(), AtomicBool::new(false));
+            let found = std::thread::scope(|scope| {
+                scope.spawn(|| {
+                    while monitor.progress().0 < iterations && !done.load(Ordering::Relaxed) {
+                        std::thread::yield_now();
+                    }
+                    monitor.request_stop();
+                });
+                let found = fit(&records, 4, 5, 1, true, 100, &monitor);
+                done.store(true, Ordering::Relaxed);
+                found.unwrap()
+            });
+            assert_eq!(found.termination, Termination::Interrupted);
+            assert!(found.model.is_stable() && found.cost.is_finite());
+        }
     }
 }

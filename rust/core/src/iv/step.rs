@@ -6,10 +6,9 @@ use super::run::{Point, Run, best_run, responses};
 use crate::lagged::Lags;
 use crate::linear::{LinearModel, is_stable, stabilised};
 use crate::linear_fit::{soften, spread};
+use crate::monitor::look;
 use crate::{Monitor, Record};
 
-/// Samples between two looks at the monitor.
-const LOOK: usize = 4096;
 /// A pivot of the scaled matrix below this part of the largest one leaves no digits.
 const SMALL_PIVOT: f64 = 1e-14;
 
@@ -148,8 +147,9 @@ impl<'a> Refiner<'a> {
             let series = self.filtered_series(&point.model, record, run);
             let mut sums = Sums::new(columns, self.lags.na);
             let (mut row, mut z) = (vec![0.0; columns], vec![0.0; columns]);
+            let look = look(columns * columns);
             for k in self.lags.first_whole()..record.len() {
-                if k % LOOK == 0 && self.monitor.stopped() {
+                if k & (look - 1) == 0 && self.monitor.stopped() {
                     return None;
                 }
                 if record.y[k].is_nan() {

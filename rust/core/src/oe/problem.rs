@@ -7,6 +7,7 @@ use crate::lagged::{Lagged, Lags, push_past};
 use crate::linear::{LinearModel, is_stable};
 use crate::linear_fit::{covariance_rows, spread, without_nuisance};
 use crate::lm::{Problem, cholesky, substitute};
+use crate::monitor::look;
 use crate::{Error, Monitor, Record, Result};
 
 /// Nearest that a reflection coefficient may come to the unit circle.
@@ -85,26 +86,43 @@ impl<'a> OutputError<'a> {
             .collect()
     }
 
-    /// The best parameters with these poles: everything but `a` enters the free run linearly.
+    /// The best parameters with these poles.
     pub fn with_poles(&mut self, a: &[f64]) -> Option<(f64, Vec<f64>)> {
-        let (na, n) = (self.lags.na, self.parameters());
-        let mut theta = vec![0.0; n];
-        theta[..na].copy_from_slice(a);
+        let mut theta = vec![0.0; self.parameters()];
+        theta[..a.len()].copy_from_slice(a);
+        self.completed(theta, a.len())
+    }
+
+    /// The parameters of this model, and the best initial states for it.
+    pub fn with_states(&mut self, model: &LinearModel) -> Option<(f64, Vec<f64>)> {
+        let shared = self.shared();
+        let known = [model.a(), model.b(), &[model.offset()]].concat();
+        let mut theta = vec![0.0; self.parameters()];
+        theta[..shared].copy_from_slice(&known[..shared]);
+        self.completed(theta, shared)
+    }
+
+    /// `theta` with the best parameters from `first` on, which must not be among `a`: all others enter the free run
+    /// linearly.
+    fn completed(&mut self, mut theta: Vec<f64>, first: usize) -> Option<(f64, Vec<f64>)> {
+        let n = self.parameters();
         self.cost(&theta)?;
         let (mut jtj, mut jte) = (vec![0.0; n * n], vec![0.0; n]);
         self.normal_equations(&theta, &mut jtj, &mut jte);
-        let linear = n - na;
+        let linear = n - first;
         let mut normal = vec![0.0; linear * linear];
         for i in 0..linear {
-            normal[i * linear..][..linear].copy_from_slice(&jtj[(i + na) * n + na..][..linear]);
+            normal[i * linear..][..linear]
+                .copy_from_slice(&jtj[(i + first) * n + first..][..linear]);
             // Initial states that have decayed within the first samples leave no trace in the output.
             normal[i * linear + i] = normal[i * linear + i] * (1.0 + 1e-12) + f64::MIN_POSITIVE;
         }
         if !cholesky(&mut normal, linear) {
             return None;
         }
-        substitute(&normal, linear, &mut jte[na..]);
-        theta[na..].copy_from_slice(&jte[na..]);
+        substitute(&normal, linear, &mut jte[first..]);
+        let step = theta[first..].iter_mut().zip(&jte[first..]);
+        step.for_each(|(value, step)| *value += step);
         Some((self.cost(&theta)?, theta))
     }
 
@@ -158,8 +176,9 @@ impl<'a> OutputError<'a> {
         for i in 0..na {
             self.gram.past_mut(i + 1)[shared + i] = 1.0;
         }
+        let look = look((shared + na).pow(2));
         for (k, &y) in (self.firsts[experiment]..).zip(run) {
-            if k % LOOK == 0 && self.monitor.stopped() {
+            if k & (look - 1) == 0 && self.monitor.stopped() {
                 return;
             }
             lags.write_inputs(record.u, k, &mut self.phi[na..]);

@@ -1,9 +1,9 @@
 //! How well a linear model runs on from a state that a few samples gave it.
 
-use crate::Record;
 use crate::data::window;
 use crate::lagged::{Lagged, STATE_SAMPLES};
 use crate::linear::LinearModel;
+use crate::{Monitor, Record};
 
 /// Segments an experiment is cut into, where it is long enough.
 const SEGMENTS: usize = 8;
@@ -14,8 +14,9 @@ const SHORTEST: usize = 5;
 ///
 /// Where the model cannot hold all of the drive (friction, limits), a slow pole almost cancelled by a zero can lower
 /// the cost by following the record's trend. Nobody can tell that pole's state from a few samples, so such a model
-/// fails whenever it is started anew, which is what a model is for. Infinite where a run leaves the finite numbers.
-pub(super) fn restart_error(model: &LinearModel, records: &[Record]) -> f64 {
+/// fails whenever it is started anew, which is what a model is for. Infinite where a run leaves the finite numbers, and
+/// after a stop.
+pub(super) fn restart_error(model: &LinearModel, records: &[Record], monitor: &Monitor) -> f64 {
     let (mut sum, mut count) = (0.0, 0);
     for record in records {
         let length = (record.len() / SEGMENTS)
@@ -25,7 +26,11 @@ pub(super) fn restart_error(model: &LinearModel, records: &[Record]) -> f64 {
             .map(|i| i * length)
             .take_while(|s| s + length <= record.len())
         {
-            let Some((error, samples)) = segment_error(model, record, start, length) else {
+            let found = match monitor.stopped() {
+                true => None,
+                false => segment_error(model, record, start, length),
+            };
+            let Some((error, samples)) = found else {
                 return f64::INFINITY;
             };
             sum += error;

@@ -6,7 +6,7 @@ use nalgebra::Complex;
 
 use super::problem::OutputError;
 use crate::iv::{self, Outputs};
-use crate::linear::{is_stable, polynomial, stabilised};
+use crate::linear::{LinearModel, is_stable, polynomial, stabilised};
 use crate::random::Random;
 use crate::{Monitor, Record, arx};
 
@@ -24,11 +24,19 @@ pub(super) fn candidates(
     monitor: &Monitor,
 ) -> Vec<(f64, Vec<f64>)> {
     let mut found: Vec<(f64, Vec<f64>)> = Vec::new();
-    for a in identified(problem, records, monitor)
-        .into_iter()
-        .chain(drawn(problem, records))
-    {
-        if monitor.stopped() && !found.is_empty() {
+    let lags = problem.lags;
+    let offset = problem.shared() > lags.regressors();
+    // the quickest one first, so that there is something after an early stop
+    let least_squares = arx::fit(records, lags.na, lags.nb, lags.nk, offset);
+    if let Ok(first) = &least_squares {
+        found.extend(problem.with_poles(&stabilised(first.a())));
+    }
+    let identified = least_squares.map_or_else(
+        |_| Vec::new(),
+        |first| identified(records, &first, offset, monitor),
+    );
+    for a in identified.into_iter().chain(drawn(problem, records)) {
+        if monitor.stopped() {
             break;
         }
         found.extend(problem.with_poles(&a));
@@ -38,25 +46,19 @@ pub(super) fn candidates(
     found
 }
 
-/// Denominators by ARX, by SRIV and by Steiglitz and McBride, made stable.
-fn identified(problem: &OutputError, records: &[Record], monitor: &Monitor) -> Vec<Vec<f64>> {
-    let lags = problem.lags;
-    let offset = problem.shared() > lags.regressors();
-    let Ok(first) = arx::fit(records, lags.na, lags.nb, lags.nk, offset) else {
-        return Vec::new();
-    };
-    let mut all = vec![stabilised(first.a())];
-    for instruments in [Outputs::Simulated, Outputs::Measured] {
-        all.extend(iv::denominators(
-            records,
-            &first,
-            offset,
-            instruments,
-            IV_ITERATIONS,
-            monitor,
-        ));
-    }
-    all
+/// Denominators by SRIV and by Steiglitz and McBride, made stable.
+fn identified(
+    records: &[Record],
+    first: &LinearModel,
+    offset: bool,
+    monitor: &Monitor,
+) -> Vec<Vec<f64>> {
+    let denominators =
+        |instruments| iv::denominators(records, first, offset, instruments, IV_ITERATIONS, monitor);
+    [Outputs::Simulated, Outputs::Measured]
+        .into_iter()
+        .flat_map(denominators)
+        .collect()
 }
 
 /// Denominators with poles drawn over time constants from half a sample to a quarter of the record; a third of them

@@ -3,7 +3,7 @@
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use sewfast_core::lagged::Lagged;
-use sewfast_core::{arx, iv, linear, linear_fit, oe};
+use sewfast_core::{Error, arx, iv, linear, linear_fit, oe};
 
 use super::{Rows, RunAndJacobian, Values};
 use crate::arrays::{Experiments, array1, array2, raise, records, rows, samples, slice};
@@ -174,7 +174,9 @@ fn fit_arx(
 }
 
 #[pyfunction]
-#[pyo3(signature = (experiments, *, na, nb, nk, offset = true, max_iterations = 100, progress = None))]
+#[pyo3(signature = (
+    experiments, *, na, nb, nk, offset = true, max_iterations = 100, initial = None, progress = None
+))]
 #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
 fn fit_oe(
     py: Python<'_>,
@@ -184,11 +186,25 @@ fn fit_oe(
     nk: usize,
     offset: bool,
     max_iterations: usize,
+    initial: Option<PyRef<'_, LinearModel>>,
     progress: Option<Bound<'_, PyAny>>,
 ) -> PyResult<LinearFit> {
     let records = records(py, &experiments)?;
-    let inner = watched(py, progress.as_ref(), |monitor| {
-        oe::fit(&records, na, nb, nk, offset, max_iterations, monitor)
+    let initial = initial.map(|m| m.inner.clone());
+    if let Some(lags) = initial.as_ref().map(Lagged::lags)
+        && (lags.na, lags.nb, lags.nk) != (na, nb, nk)
+    {
+        return Err(raise(
+            py,
+            Error::setting(format!(
+                "expected an initial model with na {na}, nb {nb} and nk {nk}, got one with na {}, nb {} and nk {}; take its orders, or leave it out",
+                lags.na, lags.nb, lags.nk
+            )),
+        ));
+    }
+    let inner = watched(py, progress.as_ref(), |monitor| match &initial {
+        Some(initial) => oe::fit_from(&records, initial, offset, max_iterations, monitor),
+        None => oe::fit(&records, na, nb, nk, offset, max_iterations, monitor),
     })?;
     Ok(LinearFit { inner })
 }
