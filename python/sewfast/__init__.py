@@ -20,7 +20,7 @@ if TYPE_CHECKING:
         table_1,
     )
     from .cost import Cost
-    from .dataset import Dataset, Experiment
+    from .dataset import Dataset, Diagnosis, Experiment, diagnose
     from .delays import DelayEstimate, delay
     from .errors import (
         DataError,
@@ -60,6 +60,7 @@ __all__ = [
     "DataError",
     "Dataset",
     "DelayEstimate",
+    "Diagnosis",
     "Ensemble",
     "Experiment",
     "FitError",
@@ -88,6 +89,7 @@ __all__ = [
     "check",
     "commission",
     "delay",
+    "diagnose",
     "fit_fopdt",
     "identify",
     "least_squares",
@@ -120,7 +122,7 @@ _HOMES = {
     "load_step": "LoadStep",
     "control": "Controller Gains fit_fopdt load_controller paper_controller table_1",
     "cost": "Cost",
-    "dataset": "Dataset Experiment",
+    "dataset": "Dataset Diagnosis Experiment diagnose",
     "delays": "DelayEstimate delay",
     "errors": "DataError FitError Interrupted LinkError ModelFileError SettingError SewfastError",
     "evidence": "ReportCard check",

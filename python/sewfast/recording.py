@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -82,7 +82,7 @@ class Recording:
         y : array, shape (N,), optional
             Another estimate of the speed [RPM].
         """
-        return Dataset.from_arrays(
+        data = Dataset.from_arrays(
             self.u,
             self.y if y is None else y,
             self.Ts,
@@ -91,6 +91,7 @@ class Recording:
             name=self.name,
             channels={} if self.speed_true is None else {"speed_true": self.speed_true},
         )
+        return replace(data, looks_ahead=y is None)
 
     def header(self, *, device: Mapping[str, Any] | None = None, **settings: Any) -> Header:
         """What its file says of it.

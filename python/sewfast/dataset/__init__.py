@@ -3,6 +3,7 @@
 from .arrays import FloatArray
 from .checks import require_dataset
 from .dataset import Dataset
+from .diagnosis import Diagnosis, Finding, diagnose
 from .experiment import Experiment
 from .outliers import Outliers
 from .pieces import SHORTEST_PIECE
@@ -14,13 +15,16 @@ __all__ = [
     "SHORTEST_PIECE",
     "ColumnSummary",
     "Dataset",
+    "Diagnosis",
     "Experiment",
+    "Finding",
     "FloatArray",
     "HasUnits",
     "Outliers",
     "Summary",
     "Trend",
     "column_summary",
+    "diagnose",
     "labelled",
     "require_dataset",
     "require_same_units",

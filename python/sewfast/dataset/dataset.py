@@ -36,6 +36,9 @@ class Dataset:
         Set where the output is a speed [RPM] computed from an encoder's counts.
     notes : tuple of str
         What was left out when the data set was made.
+    looks_ahead : bool
+        The output was computed with samples after it as well, by a smoother or a filter without
+        delay: it begins to move before the input does.
 
     Raises
     ------
@@ -51,6 +54,7 @@ class Dataset:
     output_unit: str = ""
     counts: tuple[str, float] | None = None
     notes: tuple[str, ...] = ()
+    looks_ahead: bool = False
 
     def __post_init__(self) -> None:
         if not self.experiments:
@@ -131,6 +135,7 @@ class Dataset:
             first,
             experiments=tuple(e for part in parts for e in part.experiments),
             notes=tuple(note for part in parts for note in part.notes),
+            looks_ahead=any(part.looks_ahead for part in parts),
         )
 
     @property

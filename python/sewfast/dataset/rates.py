@@ -86,7 +86,13 @@ def resample(
     note += "" if antialias else ", without a filter"
     if antialias and inputs == "held" and all(_is_held(e.u, ratio) for e in data.experiments):
         note += "; every input is constant over whole new periods: antialias=False is exact"
-    return replace(data, experiments=experiments, Ts=float(Ts), notes=(*data.notes, note))
+    return replace(
+        data,
+        experiments=experiments,
+        Ts=float(Ts),
+        notes=(*data.notes, note),
+        looks_ahead=data.looks_ahead or antialias,
+    )
 
 
 def _rounded(ratio: float) -> float:

@@ -84,7 +84,9 @@ def read(
     extra = {c: table[c] for c in channels}
     experiment = Experiment(u, y, extra, name or table.path.name)
     units = tuple(table.unit(n) for n in names)
-    return Dataset((experiment,), period, names, label, units, unit, source)
+    return Dataset(
+        (experiment,), period, names, label, units, unit, source, looks_ahead=source is not None
+    )
 
 
 def _require_distinct(inputs: tuple[str, ...], output: str | None) -> None:

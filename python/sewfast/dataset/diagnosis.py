@@ -1,0 +1,503 @@
+"""`diagnose`: what a record is, where that decides what can be identified from it."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runs import runs
+from .arrays import FloatArray
+from .checks import LARGEST, require_dataset
+from .feedback import feedback
+from .integrator import Integration, integration
+from .noise import MAD, quantum
+from .units import labelled
+
+if TYPE_CHECKING:
+    from .dataset import Dataset
+    from .experiment import Experiment
+
+SHORT = 3.0
+"""Time constants of the slowest pole that a record should be long, at least."""
+SURE = 5.0
+"""Standard errors by which that pole must be known before a record is called short."""
+RESTING = 0.2
+"""Part of a record that may be at rest at its ends."""
+REPEATED = 0.95
+"""Correlation of the inputs with themselves one period later that makes a record repeat."""
+REPEATED_LOOSELY, OUTPUT_REPEATED = 0.3, 0.98
+"""The same in a closed loop, where noise comes back in the input: inputs, and output with them."""
+CLUSTERED = 0.95
+"""Part of the samples that must be at one of two levels."""
+COARSE = 10.0
+"""Steps of the sensor in a standard deviation of the output, below which it counts as coarse."""
+LIMITED, VISITS = 0.02, 3
+"""Part of the samples, and separate stretches, from which on an input counts as limited."""
+_MOST = 65_536
+"""Values that a period is looked for in; longer records are averaged in blocks."""
+_REFERENCE = re.compile(
+    r"(y_?)?(r|ref|reference|set_?point|sp|target|soll|sollwert|demand)([_ .-].*)?", re.IGNORECASE
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a record is.
+
+    Attributes
+    ----------
+    kind : str
+        `integrator`, `wraps`, `closed_loop`, `repeats`, `two_level_input`, `rests`,
+        `short_record`, `limited_input` or `coarse_output`.
+    text : str
+        What was found and what it means, one sentence without a full stop.
+    remedy : str
+        What to do about it, the same way.
+    evidence : mapping of str to number or str
+        What it was found by, in SI units and the columns' own.
+    """
+
+    kind: str
+    text: str
+    remedy: str
+    evidence: Mapping[str, float | str] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values: None where a number is not known."""
+        evidence = {
+            name: value if isinstance(value, str) or math.isfinite(value) else None
+            for name, value in self.evidence.items()
+        }
+        return {"kind": self.kind, "text": self.text, "remedy": self.remedy, "evidence": evidence}
+
+    def __str__(self) -> str:
+        return f"{self.text}. {self.remedy[:1].upper()}{self.remedy[1:]}."
+
+
+@dataclass(frozen=True, repr=False)
+class Diagnosis:
+    """What `diagnose` finds; `str` is a page of text.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+        What decides most comes first.
+    """
+
+    findings: tuple[Finding, ...]
+
+    def find(self, kind: str) -> Finding | None:
+        """The first finding of that kind; None where there is none."""
+        return next((f for f in self.findings if f.kind == kind), None)
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {"findings": [f.to_json() for f in self.findings]}
+
+    def __repr__(self) -> str:
+        return f"Diagnosis({', '.join(f.kind for f in self.findings) or 'nothing found'})"
+
+    def __str__(self) -> str:
+        if not self.findings:
+            return "what the data are: nothing that stands in the way of identifying"
+        return "\n".join(["what the data are:", *(f"- {f}" for f in self.findings)])
+
+
+def diagnose(data: Dataset) -> Diagnosis:
+    """Say what a record is, where that decides what can be identified from it.
+
+    ==================  ======================================================================
+    `integrator`        the output is a position: it integrates what an input drives
+    `wraps`             the output is an angle that jumps back by a turn
+    `closed_loop`       an input was computed from the output, or a reference was recorded
+    `repeats`           one trajectory over and over: a held-out part holds nothing new
+    `two_level_input`   no nonlinearity can be told from an input with two levels
+    `rests`             the ends, a fifth of the record or more, at rest
+    `short_record`      shorter than three of its slowest time constants
+    `limited_input`     an input that often stays at its limit
+    `coarse_output`     a sensor with few steps in what the output does
+    ==================  ======================================================================
+
+    Nothing is changed, and no finding forbids anything. Long records take some tenths of a second:
+    at most 20,000 samples are looked at for feedback, and means of blocks for most of the rest.
+
+    Parameters
+    ----------
+    data : Dataset
+        Values may be missing.
+
+    Returns
+    -------
+    Diagnosis
+
+    Raises
+    ------
+    DataError
+        Where it is no data set.
+
+    Notes
+    -----
+    The tests for an integrator and for feedback are statistical: `sewfast.dataset.integrator` and
+    `sewfast.dataset.feedback` say what they rest on.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> u = np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], 200), 10)
+    >>> position = np.cumsum(np.convolve(u, np.full(8, 0.125), "full")[:2000]) * 0.01
+    >>> diagnose(Dataset.from_arrays(u, position, 0.01))
+    Diagnosis(integrator, two_level_input)
+    """
+    require_dataset(data, "data")
+    wrapped = list(_wraps(data))
+    found = None if wrapped else integration(data)
+    return Diagnosis(
+        (
+            *wrapped,
+            *_integrator(data, found),
+            *_closed_loop(data),
+            *_repeats(data),
+            *_two_levels(data),
+            *_rests(data),
+            *_short(data, found),
+            *_limited(data),
+            *_coarse(data),
+        )
+    )
+
+
+def _input(data: Dataset, j: int) -> str:
+    return labelled(data.input_names[j], data.input_units[j])
+
+
+def _output(data: Dataset) -> str:
+    return labelled(data.output_name, data.output_unit)
+
+
+def _known(column: FloatArray) -> FloatArray:
+    return column[np.abs(column) < LARGEST]
+
+
+# --- the output -----------------------------------------------------------------------------------
+
+
+def _integrator(data: Dataset, found: Integration | None) -> Iterator[Finding]:
+    if found is None or not found.is_integral:
+        return
+    u = data.input_names[found.input]
+    yield Finding(
+        "integrator",
+        f"{_output(data)} integrates what {u} drives, as a position does: it moves on for as long "
+        f"as {u} acts, and nothing in the record brings it back",
+        "take its speed, data.differentiate() (--differentiate), or keep the position and identify "
+        "a model with an integrator; a model without one has no steady state to find",
+        {
+            "input": u,
+            "gain_per_second": found.gain,
+            "lengths_in_time_constants": found.lengths,
+            "standard_errors_driving": found.driving,
+            "standard_errors_restoring": found.restoring,
+        },
+    )
+
+
+def _short(data: Dataset, found: Integration | None) -> Iterator[Finding]:
+    if found is None or found.is_integral or found.restoring < SURE:
+        return
+    if 0.0 < found.lengths < SHORT and found.driving > SURE:
+        yield Finding(
+            "short_record",
+            f"the record is {found.lengths:.2g} times as long as the slowest time constant of "
+            f"{data.output_name}, about {found.time_constant:.2g} s: its steady gain is a guess",
+            f"record for {5.0 * found.time_constant:.2g} s or more, with some levels held for as "
+            "long as a time constant",
+            {
+                "lengths_in_time_constants": found.lengths,
+                "time_constant_s": found.time_constant,
+                "standard_errors_restoring": found.restoring,
+            },
+        )
+
+
+def _wraps(data: Dataset) -> Iterator[Finding]:
+    """Jumps by nearly the whole range, against the motion before and after."""
+    columns = [e.y[np.abs(e.y) < LARGEST] for e in data.experiments]
+    everything = np.concatenate(columns)
+    span = float(np.ptp(everything)) if len(everything) else 0.0
+    if span == 0.0:
+        return
+    back, other, sizes = 0, 0, []
+    for y in columns:
+        change = np.diff(y)
+        for k in np.flatnonzero(np.abs(change) > 0.7 * span):
+            around = np.concatenate([change[max(k - 5, 0) : k], change[k + 1 : k + 6]])
+            slope = float(np.median(around)) if len(around) else 0.0
+            if slope * change[k] < 0.0 and abs(slope) < 0.2 * span:
+                back += 1
+                sizes.append(abs(float(change[k]) - slope))
+            else:
+                other += 1
+    if back < 2 or back < 4 * other:
+        return
+    period = float(np.median(sizes))
+    turns = (360.0, math.tau, 1.0, *(2.0**b for b in range(8, 33)))
+    period = next((turn for turn in turns if abs(period / turn - 1.0) < 0.02), period)
+    yield Finding(
+        "wraps",
+        f"{_output(data)} jumps back by {period:.6g} at {back} places while it moves on: an angle "
+        "or a counter that wraps, which no model can follow",
+        f"unwrap it before it is read: np.unwrap(y, period={period:.6g})",
+        {"period": period, "jumps": back},
+    )
+
+
+def _coarse(data: Dataset) -> Iterator[Finding]:
+    known = _known(np.concatenate([e.y for e in data.experiments])[:200_000])
+    step = quantum(known) if len(known) else None
+    if step is None or not float(known.std()) < COARSE * step:
+        return
+    steps = float(known.std()) / step
+    yield Finding(
+        "coarse_output",
+        f"{_output(data)} comes in steps of {step:.4g}, {steps:.2g} of them in its standard "
+        "deviation: rounding is much of what a model would fit",
+        "of an encoder, record the counts and let their speed be computed (--counts COL "
+        "--counts-per-rev N); else excite more strongly or use a finer sensor",
+        {"step": step, "steps_in_standard_deviation": steps},
+    )
+
+
+# --- the inputs -----------------------------------------------------------------------------------
+
+
+def _two_levels(data: Dataset) -> Iterator[Finding]:
+    for j in range(data.n_inputs):
+        levels = two_levels(_known(np.concatenate([e.u[:, j] for e in data.experiments])))
+        if levels is None:
+            continue
+        low, high = levels
+        yield Finding(
+            "two_level_input",
+            f"{_input(data, j)} has two levels only, {low:.4g} and {high:.4g}: no nonlinearity of "
+            "it can be told from these, a straight line goes through any two points",
+            "take a linear model, valid between these levels; for another one record many levels: "
+            "random steps, a multisine, a chirp (sewfast signals)",
+            {"input": data.input_names[j], "low": low, "high": high},
+        )
+
+
+def two_levels(values: FloatArray) -> tuple[float, float] | None:
+    """The two levels that all values are at but for noise and few on their way; else None."""
+    if len(values) == 0 or values.min() == values.max():
+        return None
+    low, high = float(values.min()), float(values.max())
+    if bool(((values == low) | (values == high)).all()):
+        return low, high
+    sample = values[:: max(1, len(values) // 20_000)]
+    # one outlier would take the middle with it
+    middle = float(np.mean(np.quantile(sample, [0.02, 0.98])))
+    groups = sample[sample < middle], sample[sample >= middle]
+    if min(map(len, groups)) < 0.02 * len(sample):
+        return None
+    levels = [float(np.median(g)) for g in groups]
+    gap = levels[1] - levels[0]
+    spreads = [MAD * float(np.median(np.abs(g - at))) for g, at in zip(groups, levels, strict=True)]
+    if max(spreads) > gap / 20.0:
+        return None
+    there = sum(
+        int((np.abs(g - at) < max(5.0 * spread, 0.02 * gap)).sum())
+        for g, at, spread in zip(groups, levels, spreads, strict=True)
+    )
+    return (levels[0], levels[1]) if there > CLUSTERED * len(sample) else None
+
+
+def _limited(data: Dataset) -> Iterator[Finding]:
+    for j in range(data.n_inputs):
+        columns = [e.u[:, j] for e in data.experiments]
+        known = _known(np.concatenate(columns))
+        # a staircase has its highest level too
+        if len(known) == 0 or len(np.unique(known[:200_000])) < 50:
+            continue
+        for value in (float(known.min()), float(known.max())):
+            stretches = [n for c in columns for _, n in runs(c == value) if n >= 3]
+            share = sum(stretches) / len(known)
+            if len(stretches) >= VISITS and share > LIMITED:
+                yield Finding(
+                    "limited_input",
+                    f"{_input(data, j)} stays at its limit of {value:.4g} in {len(stretches)} "
+                    f"stretches, {share:.0%} of the samples",
+                    "make sure that it was recorded behind the limiter: a command that the "
+                    "amplifier did not follow makes a wrong model",
+                    {"input": data.input_names[j], "limit": value, "share": share},
+                )
+
+
+def _closed_loop(data: Dataset) -> Iterator[Finding]:
+    remedy = (
+        "identify by output error (oe, networks) on long records, not by arx, which noise in a "
+        "loop biases; move the reference strongly, and validate on another trajectory"
+    )
+    reference = _reference(data)
+    if reference is not None:
+        name, correlation = reference
+        yield Finding(
+            "closed_loop",
+            f"{data.output_name} follows the recorded reference {name}: the record was made in "
+            "closed loop, so the inputs hold noise of the output",
+            remedy,
+            {"reference": name, "correlation": correlation},
+        )
+        return
+    found = feedback(data)
+    if found is None:
+        return
+    when = "in the same sample" if found.lead == 0 else f"{found.lead} samples later"
+    yield Finding(
+        "closed_loop",
+        f"{data.input_names[found.input]} answers to the noise of {data.output_name} {when}: the "
+        "record was made in closed loop",
+        remedy,
+        {
+            "input": data.input_names[found.input],
+            "lead_samples": found.lead,
+            "correlation": found.correlation,
+            "standard_errors": found.significance,
+            "standard_errors_of_misfit": found.misfit,
+        },
+    )
+
+
+def _reference(data: Dataset) -> tuple[str, float] | None:
+    """A channel that is named as a reference and that the output follows, with its correlation."""
+    for name in data.experiments[0].channels:
+        if not _REFERENCE.fullmatch(name) or any(name not in e.channels for e in data.experiments):
+            continue
+        r, y = (
+            np.concatenate(c)
+            for c in zip(*((e.channels[name], e.y) for e in data.experiments), strict=True)
+        )
+        known = (np.abs(r) < LARGEST) & (np.abs(y) < LARGEST)
+        if known.sum() > 2 and np.ptp(r[known]) > 0.0 and np.ptp(y[known]) > 0.0:
+            correlation = float(np.corrcoef(r[known], y[known])[0, 1])
+            if correlation > 0.5:
+                return name, correlation
+    return None
+
+
+# --- the record -----------------------------------------------------------------------------------
+
+
+def _repeats(data: Dataset) -> Iterator[Finding]:
+    e = max(data.experiments, key=len)
+    found = _period(e)
+    if found is None:
+        return
+    period, correlation = found
+    seconds, times = period * data.Ts, len(e) / period
+    yield Finding(
+        "repeats",
+        f"{e.name} repeats one trajectory of {seconds:.3g} s {times:.1f} times: what is held out "
+        "of it was learned elsewhere in it, and its error flatters",
+        "record another trajectory and judge the model on that (sewfast validate MODEL OTHER)",
+        {"period_s": seconds, "times": times, "correlation": correlation},
+    )
+
+
+def _period(e: Experiment) -> tuple[float, float] | None:
+    """Samples after which the inputs come again, two times or more, and their correlation then."""
+    size = max(1, len(e) // _MOST)
+    columns = [_averaged(c, size) for c in (*e.u.T, e.y)]
+    *inputs, output = [None if c is None else _autocorrelation(c) for c in columns]
+    moving = [r for r in inputs if r is not None]
+    if not moving or len(moving[0]) < 20:
+        return None
+    r = np.min(moving, axis=0)
+    # next to lag 0 every signal is like itself
+    again = (r >= REPEATED) & np.maximum.accumulate(r < 0.5)
+    if output is not None:
+        loosely = (r >= REPEATED_LOOSELY) & (output >= OUTPUT_REPEATED)
+        again |= loosely & np.maximum.accumulate(output < 0.5)
+    stretches = runs(again)
+    if not stretches:
+        return None
+    first, count = stretches[0]
+    lag = first + int(np.argmax(r[first : first + count]))
+    return float(lag * size), float(r[lag])
+
+
+def _averaged(column: FloatArray, size: int) -> FloatArray | None:
+    """Means of blocks without their mean, 0 where nothing is known; None where nothing moves."""
+    count = len(column) // size
+    cut = column[: count * size].reshape(count, size)
+    known = np.abs(cut) < LARGEST
+    number = known.sum(axis=1)
+    means = np.where(known, cut, 0.0).sum(axis=1) / np.maximum(number, 1)
+    some = number > 0
+    if not some.any():
+        return None
+    means = np.where(some, means - means[some].mean(), 0.0)
+    largest = float(np.abs(means).max())
+    scaled: FloatArray = means / largest if largest > 0.0 else means
+    return scaled if largest > 1e-12 * float(np.abs(_known(column)).max()) else None
+
+
+def _autocorrelation(column: FloatArray) -> FloatArray:
+    """Correlation of the column with itself at lags up to half its length, over each overlap."""
+    n = len(column)
+    power = np.abs(np.fft.rfft(column, 2 * n)) ** 2
+    products = np.fft.irfft(power, 2 * n)[: n // 2 + 1]
+    squares = np.concatenate([[0.0], np.cumsum(column**2)])
+    lags = np.arange(n // 2 + 1)
+    size = np.sqrt(squares[n - lags] * (squares[n] - squares[lags]))
+    correlation: FloatArray = products / np.maximum(size, 1e-9 * squares[n])
+    return correlation
+
+
+def _rests(data: Dataset) -> Iterator[Finding]:
+    ends = [(e, _resting(e), _resting(e, backwards=True)) for e in data.experiments]
+    ends = [(e, 0, 0) if a >= len(e) else (e, a, b) for e, a, b in ends]
+    share = sum(a + b for _, a, b in ends) / len(data)
+    if share < RESTING:
+        return
+    e, before, after = max(ends, key=lambda end: end[1] + end[2])
+    # some rest shows the level, and lets the initial state be estimated
+    keep = max(20, len(e) // 50)
+    first, last = max(0, before - keep), len(e) - max(0, after - keep)
+    one = len(data.experiments) == 1
+    where = f"before sample {before} and from {len(e) - after} on"
+    if not before or not after:
+        where = f"from sample {len(e) - after} on" if after else f"before sample {before}"
+    yield Finding(
+        "rests",
+        f"inputs and output rest for {share:.0%} of the record"
+        f"{'' if one else 's'}, {'' if one else f'{e.name} '}{where}: these samples say little and "
+        "weigh as much as the others",
+        f"leave most of them out: data[{first}:{last}] (--train {first}:{last})"
+        + ("" if one else f" for {e.name}"),
+        {"share": share, "first": float(first), "last": float(last)},
+    )
+
+
+def _resting(e: Experiment, *, backwards: bool = False) -> int:
+    """Samples at one end in which every column stays at its level there."""
+    still: NDArray[np.bool_] = np.ones(len(e), dtype=np.bool_)
+    end = max(5, min(50, len(e) // 20))
+    for i, column in enumerate((*e.u.T, e.y)):
+        ordered = column[::-1] if backwards else column
+        known = _known(ordered)
+        if len(known) < 2 * end or known.min() == known.max():
+            continue
+        level = float(np.median(known[:end]))
+        spread = MAD * float(np.median(np.abs(known[:end] - level)))
+        span = float(np.ptp(known))
+        # noise may be seen, but an input that is noise does not rest
+        most = 0.05 if i < e.u.shape[1] else 0.1
+        tolerance = min(max(0.01 * span, 5.0 * spread), most * span)
+        still &= ~(np.abs(ordered - level) > tolerance)
+    return len(e) if still.all() else int(np.argmin(still))

@@ -1,0 +1,250 @@
+"""Whether a record was made in closed loop: whether noise of the output comes back in an input."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..runs import runs
+from .arrays import FloatArray
+from .checks import LARGEST
+
+if TYPE_CHECKING:
+    from .dataset import Dataset
+
+PAST = 20
+"""Past outputs and inputs of the regressions that leave innovations; fewer with many inputs."""
+LEADS = 10
+"""Samples after an innovation of the output up to which an input is looked at."""
+AT_ONCE = 0.2
+"""Part of the plant's response that a controller can feign within a sample, at most."""
+SPANS = (1, 3, 10)
+"""Samples over which that input is summed up: a filter in the loop spreads what it feeds back."""
+SIGNIFICANT = 4.2
+"""Standard errors from which on a correlation is one; chance reaches it in one of 1,000 records."""
+OVER_MISFIT = 2.0
+"""Times the largest correlation with the past, which only a misfit of the regression leaves."""
+HELD = 0.5
+"""Part of the samples in which a fed back input can keep its value to the last bit."""
+MOST_SAMPLES = 20_000
+LEAST = 300
+_CLIP = 5.0
+_EXACT = 1e-9
+"""Innovation over standard deviation below which a signal is known from its past: rounding."""
+_SMOOTH = 12
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """How one input follows the output's innovations.
+
+    Attributes
+    ----------
+    input : int
+    lead : int
+        Samples after which the input follows.
+    correlation : float
+        Of the innovations at this lead.
+    significance : float
+        The same in standard errors.
+    misfit : float
+        The largest correlation with the input's past beyond the regression, in standard errors.
+    """
+
+    input: int
+    lead: int
+    correlation: float
+    significance: float
+    misfit: float
+
+
+def feedback(data: Dataset) -> Feedback | None:
+    """The input that noise of the output reaches most clearly; None where none is seen.
+
+    Both are made white first: the output by a regression on the past of itself and of all inputs
+    (and the sign of its motion, for dry friction), each input by one on its own past. What is left,
+    e of the output and w of the input, correlates at positive leads, e(k) with w(k + 1) and later,
+    only where the input was computed from the output (Granger 1969; Box, Jenkins, Reinsel 2008,
+    section 12.1). Standard errors are those of a product that is neither normal nor white (Newey,
+    West 1987), and both are clipped at 5 robust standard deviations, so that steps of a reference
+    do not hide the noise.
+
+    At lead 0 a controller that answers within the sample looks like a plant that does. The signs
+    tell them apart: a controller opposes what it sees, so there e(k) w(k) has the sign against the
+    plant's own response, and is small beside it.
+
+    A plant that is not linear leaves something of the input in e. That correlates with the
+    input's past beyond the regression as well, where feedback does not: a lead counts only where it
+    is twice as significant as anything there.
+
+    An input that keeps its value for most samples while the output is noisy is fed back by nobody;
+    where it changes every so many samples, those samples are looked at. An output that a smoother
+    computed with later samples anticipates the input, which looks like feedback, and is not asked
+    (`Dataset.looks_ahead`).
+    """
+    pieces = [] if data.looks_ahead else _pieces(data)
+    found: list[Feedback] = []
+    for j in range(data.n_inputs):
+        every = _sampling([p[:, j] for p in pieces])
+        if every is None:
+            continue
+        step, kept = every
+        thinned = [p[first::step] for p, first in zip(pieces, kept, strict=True)]
+        thinned = [p for p in thinned if len(p) > 4 * (PAST + LEADS)]
+        if sum(map(len, thinned)) >= LEAST:
+            found += _of_input(thinned, j, step)
+    return max(found, key=lambda f: f.significance, default=None)
+
+
+def _pieces(data: Dataset) -> list[FloatArray]:
+    """The longest runs in which everything is known, columns in deviations."""
+    pieces: list[FloatArray] = []
+    for e in sorted(data.experiments, key=len, reverse=True):
+        columns = np.column_stack([e.u, e.y])
+        known = np.logical_and.reduce(np.abs(columns) < LARGEST, axis=1)
+        pieces += [columns[a : a + n] for a, n in runs(known) if n > 4 * (PAST + LEADS)]
+    chosen, left = [], MOST_SAMPLES
+    for piece in sorted(pieces, key=len, reverse=True):
+        if left > 4 * (PAST + LEADS):
+            chosen.append(piece[:left])
+            left -= len(chosen[-1])
+    if not chosen:
+        return []
+    everything = np.concatenate(chosen)
+    middle, size = everything.mean(axis=0), everything.std(axis=0)
+    scale = 1.0 / np.where(size > 0.0, size, 1.0)
+    return [(piece - middle) * scale for piece in chosen]
+
+
+def _sampling(column: list[FloatArray]) -> tuple[int, list[int]] | None:
+    """Samples between changes of a held input, and where they begin; None: it is not fed back."""
+    if not column:
+        return None
+    low, high = min(float(p.min()) for p in column), max(float(p.max()) for p in column)
+    # an input that stays at its limit was held by the limit
+    free = [(piece[:-1] > low) & (piece[:-1] < high) for piece in column]
+    changes = [np.diff(piece) != 0.0 for piece in column]
+    count = sum(int((c & f).sum()) for c, f in zip(changes, free, strict=True))
+    total = sum(int(f.sum()) for f in free)
+    if total < LEAST:
+        return None
+    if count > (1.0 - HELD) * total:
+        return 1, [0] * len(column)
+    at = [np.flatnonzero(c) + 1 for c in changes]
+    between = np.concatenate([np.diff(a) for a in at])
+    if len(between) == 0:
+        return None
+    step = int(np.bincount(between).argmax())
+    regular = float((between % step == 0).mean())
+    if step < 2 or regular < 0.9 or count * step < (1.0 - HELD) * total:
+        return None
+    return step, [int(a[0]) % step if len(a) else 0 for a in at]
+
+
+def _of_input(pieces: list[FloatArray], j: int, step: int) -> list[Feedback]:
+    width = pieces[0].shape[1]
+    past = max(3, min(PAST, 2 * (PAST + 1) // width))
+    values = np.concatenate([p[past:] for p in pieces])
+    lagged = np.concatenate([_lagged(p, past) for p in pieces])
+    friction = np.concatenate([_motion(p[:, -1], past) for p in pieces])
+    u, y = values[:, j], values[:, -1]
+    e, response = _innovation(np.column_stack([lagged, friction]), u, y)
+    w, _ = _innovation(lagged[:, j::width], u, u)
+    if e is None or w is None:
+        return []
+    ends = np.cumsum([len(p) - past for p in pieces])[:-1]
+    parts = list(zip(np.split(e, ends), np.split(w, ends), strict=True))
+    misfit = max(
+        abs(_correlation(parts, lag, span)[1])
+        for span in SPANS
+        for lag in range(-past - LEADS, -past - span + 1)
+    )
+    leads = [
+        (lag, *_correlation(parts, lag, span))
+        for span in SPANS
+        for lag in range(1, LEADS + 2 - span)
+    ]
+    at_once, impulse = (0, *_correlation(parts, 0, 1)), _impulse(response, past, width, j)
+    small = abs(impulse[0]) < AT_ONCE * float(np.abs(impulse).max())
+    if small and at_once[1] * float(impulse.sum()) < 0.0:
+        leads.append(at_once)
+    lead, size, significance = max(leads, key=lambda found: abs(found[2]))
+    if not abs(significance) > max(SIGNIFICANT, OVER_MISFIT * misfit):
+        return []
+    return [Feedback(j, lead * step, size, abs(significance), misfit)]
+
+
+def _lagged(piece: FloatArray, past: int) -> FloatArray:
+    """All columns one sample ago, two samples ago and so on, shape (N - past, past * width)."""
+    k = np.arange(past, len(piece))
+    return np.concatenate([piece[k - i] for i in range(1, past + 1)], axis=1)
+
+
+def _motion(y: FloatArray, past: int) -> FloatArray:
+    """Sign of the last two changes of the output, rounded off where it hardly moves."""
+    change = np.diff(y)
+    sign = change / np.sqrt(change**2 + 0.01 * change.var() + np.finfo(np.float64).tiny)
+    k = np.arange(past, len(y))
+    return np.column_stack([sign[k - 2], sign[k - 3]])
+
+
+def _innovation(X: FloatArray, u: FloatArray, y: FloatArray) -> tuple[FloatArray | None, Any]:
+    """What the columns leave of y, clipped, and the coefficients with u as one column more.
+
+    The first is None where the columns leave rounding only.
+    """
+    X = np.column_stack([X, np.ones(len(X))])
+    length = np.linalg.norm(X, axis=0)
+    X /= np.where(length > 0.0, length, 1.0)
+    R = np.asarray(np.linalg.qr(np.column_stack([X, u, y]), mode="r"), dtype=np.float64)
+    n = X.shape[1]
+    theta = np.linalg.lstsq(R[:, :n], R[:, -1], rcond=1e-13)[0]
+    with_u = np.linalg.lstsq(R[:, : n + 1], R[:, -1], rcond=1e-13)[0]
+    with_u[:n] /= np.where(length > 0.0, length, 1.0)
+    left: FloatArray = y - X @ theta
+    if not float(left.std()) > _EXACT * max(float(y.std()), np.finfo(np.float64).tiny):
+        return None, with_u
+    robust = 1.4826 * float(np.median(np.abs(left)))
+    if robust > 0.0:
+        left = np.clip(left, -_CLIP * robust, _CLIP * robust)
+    return left - left.mean(), with_u
+
+
+def _impulse(theta: FloatArray, past: int, width: int, j: int) -> FloatArray:
+    """Response of the output to one sample of input j, from the same sample on, (past + 1,)."""
+    lags: FloatArray = theta[: past * width].reshape(past, width)
+    to_u, to_y = np.concatenate([theta[-1:], lags[:, j]]), lags[:, -1]
+    response = np.zeros(past + 1)
+    for k in range(past + 1):
+        response[k] = to_u[k] + to_y[:k] @ response[:k][::-1]
+    return response
+
+
+def _correlation(
+    parts: list[tuple[FloatArray, FloatArray]], lag: int, span: int
+) -> tuple[float, float]:
+    """Of e(k) with w(k + lag) + .. + w(k + lag + span - 1): its size, and in standard errors."""
+    total, variance, e2, w2, n = 0.0, 0.0, 0.0, 0.0, 0
+    for e, w in parts:
+        sums = np.concatenate([[0.0], np.cumsum(w)])
+        later = sums[span:] - sums[:-span]
+        first, last = max(0, -lag), min(len(e), len(later) - lag)
+        if last - first <= _SMOOTH:
+            continue
+        one, other = e[first:last], later[first + lag : last + lag]
+        z = one * other
+        total += float(z.sum())
+        n += len(z)
+        own = float(z @ z)
+        between = sum(
+            2.0 * (1.0 - i / (_SMOOTH + 1.0)) * float(z[i:] @ z[:-i]) for i in range(1, _SMOOTH + 1)
+        )
+        # never less than without memory: a negative sum is chance
+        variance += max(own + between, own)
+        e2, w2 = e2 + float(one @ one), w2 + float(other @ other)
+    if not (variance > 0.0 and e2 > 0.0 and w2 > 0.0):
+        return 0.0, 0.0
+    return total / math.sqrt(e2 * w2), total / math.sqrt(variance)
