@@ -537,7 +537,7 @@ class Choice:
                 "best linear model's; consider model oe"
             )
         extra: Provenance = {"notes": notes} if notes else {}
-        extra["verdict"] = verdict(self, model, error)
+        extra["verdict"] = verdict(self, error)
         return replace(with_provenance(model, extra), alternatives=tuple(alternatives))
 
     def _choice(self, kind: str, error: float) -> Provenance:

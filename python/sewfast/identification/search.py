@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from .. import _core
-from ..dataset import FloatArray
+from ..dataset import Diagnosis, diagnose
 from ..errors import FitError
 from ..models.ensemble import EnsembleCore
 from .effort import Look, Pool
@@ -52,8 +52,6 @@ FAR_BEHIND = 2.0
 """A kind of network whose best is this many times worse than the other's climbs no further."""
 ROUNDS = 6
 SCREEN_ITERATIONS, HALVING_ITERATIONS, CLIMB_ITERATIONS = 20, (25, 40), 40
-REPEATED = 0.85
-"""Correlation of an input with itself, some time later, that makes a repetition."""
 INTEGRATING_POLE = 0.9995
 """A slower real pole of the linear models asks for an integrator."""
 ENDLESS_GAIN = 5.0
@@ -330,9 +328,14 @@ class Search:
         return [s for s in structures if self.is_affordable(s)]
 
     @cached_property
+    def diagnosis(self) -> Diagnosis:
+        """What the record is, where that decides what can be identified from it."""
+        return diagnose(self.task.data)
+
+    @property
     def repeats(self) -> bool:
         """Whether the record repeats one trajectory: what is held out was then seen before."""
-        return any(_repeats(e.u) for e in self.task.data.experiments)
+        return self.diagnosis.find("repeats") is not None
 
     def _integrates(self) -> bool:
         """Whether the linear models that do best have a pole at 1, and a steady gain without end.
@@ -340,6 +343,8 @@ class Search:
         A record of a drive with friction or limits lures larger orders to a pole near 1, too; they
         do worse on what is held out, so that only the best ones are asked.
         """
+        if self.diagnosis.find("integrator") is not None:
+            return True
         data = self.task.data
         low, high = data.output_range
         swing = np.ptp(np.concatenate([e.u for e in data.experiments]), axis=0)
@@ -614,26 +619,6 @@ SHARE_OF_LINEAR, SHARE_OF_SEARCH = 0.12, 0.48
 
 def _said(fault: str | None) -> str:
     return "not asked within the time budget" if fault is None else fault
-
-
-def _repeats(u: FloatArray) -> bool:
-    """Whether an input comes back nearly the same after a while, twice or more in the record."""
-    N = len(u)
-    if N < 200:
-        return False
-    for column in u.T:
-        x = column - column.mean()
-        power = np.concatenate([[0.0], np.cumsum(x**2)])
-        spectrum = np.fft.rfft(x, 2 * N)
-        products = np.fft.irfft(np.abs(spectrum) ** 2)[: N // 2 + 1]
-        lags = np.arange(N // 2 + 1)
-        sizes = np.sqrt(power[N - lags] * (power[N] - power[lags]))
-        likeness = products / np.maximum(sizes, 1e-300)
-        # beyond the first time that it is unlike itself, so that a slow input does not count
-        unlike = np.flatnonzero(likeness < 0.3)
-        if len(unlike) and likeness[unlike[0] :].max(initial=0.0) > REPEATED:
-            return True
-    return False
 
 
 def _decayed(s: Structure, factor: float) -> Structure:

@@ -8,7 +8,6 @@ import numpy as np
 
 from ..dataset import Dataset
 from ..dataset.noise import white_noise
-from ..models import Model
 from .task import Provenance
 
 if TYPE_CHECKING:
@@ -20,14 +19,13 @@ AT_THE_NOISE = 1.5
 """An error below this multiple of the measurement noise leaves nothing to be explained."""
 
 
-def verdict(choice: Choice, model: Model, error: float) -> Provenance:
+def verdict(choice: Choice, error: float) -> Provenance:
     """Whether a controller may be tuned on the model, in words and as values.
 
     Parameters
     ----------
     choice : Choice
         The search and what was held out.
-    model : Model
     error : float
         Free-run error on what is held out [output unit].
 
@@ -55,10 +53,14 @@ def verdict(choice: Choice, model: Model, error: float) -> Provenance:
         grade, text = "poor", f"not good enough to tune a controller on: {measured}"
     else:
         grade, text = "useless", f"useless: {measured}; a constant would do about as well"
+    if grade == "good" and choice.search.repeats:
+        grade = "fair"
+        text = text.replace("good enough to tune a controller on", "good where it repeats itself")
     if choice.clock.truncated and grade != "good":
         todo.append("give a longer time budget, or none")
     if grade in ("fair", "poor", "useless"):
-        todo += _what_to_record(choice, model)
+        todo += _what_to_record(choice.task.data)
+    todo += [f"{f.text}: {f.remedy}" for f in choice.search.diagnosis.findings]
     return {
         "grade": grade,
         "fit_percent": fit if np.isfinite(fit) else None,
@@ -67,9 +69,8 @@ def verdict(choice: Choice, model: Model, error: float) -> Provenance:
     }
 
 
-def _what_to_record(choice: Choice, model: Model) -> list[str]:
+def _what_to_record(data: Dataset) -> list[str]:
     """What another recording should have that this one lacks."""
-    data = choice.task.data
     wanted = [
         "record longer, with more levels of the input and the speeds that the controller will use"
     ]
