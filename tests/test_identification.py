@@ -253,7 +253,10 @@ def test_an_interruption_hands_over_the_best_model(kind: Any) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"model": "narx"}, "auto, arx, iv, oe, neural-oe, neural-ss or a model .*, received 'narx'"),
+        (
+            {"model": "narx"},
+            "auto, arx, iv, oe, neural-oe, neural-ss or a model .*, received 'narx'",
+        ),
         ({"model": "paper"}, "auto, arx, iv, oe, neural-oe, neural-ss or"),
         ({"preset": "other"}, "'paper' or none"),
         ({"preset": "paper", "model": "arx"}, "neural-oe"),
