@@ -65,6 +65,7 @@ def check_command(args: argparse.Namespace) -> None:
         training, _ = read_for_model(args.training, model, args)
         if args.training_range is not None:
             training = training.slice(args.training_range)
+        training = prepared(training, args, cut=True)
     card = model.check(part, training, init=args.init)
     written = []
     if args.plot is not None:

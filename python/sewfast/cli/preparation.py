@@ -11,13 +11,18 @@ if TYPE_CHECKING:
 
 
 def add_preparation(parser: argparse.ArgumentParser, *, detrend: bool = True) -> None:
-    """`--mask`, `--hold-inputs`, `--resample` and, where a model may come of it, `--detrend`."""
+    """`--mask` to `--resample` and, where a model may come of it, `--detrend`."""
     group = parser.add_argument_group("preparation, in this order")
     group.add_argument(
         "--mask", action="append", metavar="A:B", default=[],
-        help="outputs of each file to take out: no weight, no score; repeat it for several ranges",
+        help="outputs of each file to take out: no weight, no score; repeat it for several ranges; "
+        "outliers: those that stand out of their neighbours",
     )  # fmt: skip
     add_hold(group)
+    group.add_argument(
+        "--differentiate", action="store_true",
+        help="the output is a position: take its speed, [deg] becomes [deg/s]",
+    )  # fmt: skip
     group.add_argument(
         "--resample", type=float, metavar="TS",
         help="new sample time [s]; the output is filtered, inputs are averaged as held ones",
@@ -48,7 +53,10 @@ def masked(data: Dataset, args: argparse.Namespace) -> Dataset:
     """The data without the outputs that are masked: ranges are of whole files."""
     before = len(data.notes)
     for text in args.mask:
-        data = data.mask(text)
+        if text == "outliers":
+            data = data.mask(data.mark_outliers(), why="stand out")
+        else:
+            data = data.mask(text)
     _tell(data, before)
     return data
 
@@ -70,6 +78,8 @@ def prepared(
     before = len(data.notes)
     if getattr(args, "split_at_gaps", False):
         data = data.split_at_gaps()
+    if args.differentiate:
+        data = data.differentiate()
     if args.resample is not None:
         data = data.resample(args.resample)
     data = _detrended(data, getattr(args, "detrend", None), like)

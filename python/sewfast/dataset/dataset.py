@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import DataError, SettingError
-from . import checks, gaps, outliers, pieces, rates, summary, trends
+from . import checks, derivative, gaps, outliers, pieces, rates, summary, trends
 from .arrays import range_of, texts
 from .experiment import Experiment
 from .units import labelled
@@ -184,6 +184,7 @@ class Dataset:
     detrend = trends.detrend
     restore = trends.restore
     resample = rates.resample
+    differentiate = derivative.differentiate
     mark_outliers = outliers.mark_outliers
     summary = summary.summary
 
