@@ -16,6 +16,7 @@ import sewfast as api
 from cli import refused, sewfast
 from sewfast.dataset import Dataset
 from sewfast.dataset.advice import nice
+from sewfast.dataset.outliers import usual_threshold
 from sewfast.dataset.spectrum import band, power_spectrum
 from sewfast.errors import SettingError
 
@@ -79,13 +80,38 @@ def test_the_spectrum_holds_the_power() -> None:
         (excited(), np.random.default_rng(0).standard_normal(N), "of what y does: excite"),
         (excited(), np.sin(T), "data.resample"),
         (excited(), np.where(T[7] == T, np.inf, excited(1)), "1 values of y are infinite"),
-        (excited(), np.sin(9 * T) + 5.0 * (T[777] == T), "1 values of y stand out"),
+        (
+            excited(),
+            np.sin(9 * T) + 5.0 * (T[777] == T),
+            "1 value of y stands out of its neighbours, at sample 777:",
+        ),
         (excited()[:300], excited(1)[:300], "300 samples are few"),
         (excited(), np.sin(2 * np.pi * 300 * T), "close to half the sampling rate"),
     ],
 )
 def test_each_finding_has_its_advice(u: Any, y: Any, words: str) -> None:
     assert words in advice(u, y)
+
+
+def test_chance_makes_no_outliers_of_a_long_record() -> None:
+    """The threshold grows with the record, and a spike of 30 deviations still stands out."""
+    n = 1_000_000
+    y = 0.01 * np.random.default_rng(0).standard_normal(n) + np.sin(np.arange(n) / 300)
+    y[234_567] += 0.3
+    data = Dataset.from_arrays(np.repeat(excited(), 50), y, TS)
+    assert usual_threshold(data[:20_000]) == 6.0
+    assert usual_threshold(data) == pytest.approx(7.27, abs=0.01)
+    assert data.summary().outliers_at == (("array", 234_567),)
+
+
+def test_a_position_is_not_to_be_resampled_for_its_slow_spectrum() -> None:
+    u = excited()
+    angle = np.cumsum(np.convolve(u, np.exp(-np.arange(100) / 20), "full")[:N])
+    found = Dataset.from_arrays(u, angle, TS).summary()
+    assert found.diagnosis.find("integrator") is not None
+    assert not any("resample" in line for line in found.advice)
+    assert "as a position does" in str(found)
+    json.dumps(found.to_json(), allow_nan=False)
 
 
 def test_good_data_need_no_advice() -> None:
@@ -135,13 +161,19 @@ def test_look_lists_columns_then_says_what_is_in_them(folder: Path) -> None:
     assert "--input COL --output COL" in listed
     text = sewfast(folder, "look", "run.csv:u:speed").out
     assert "50 in 1 gaps" in text
-    assert "1 values of speed stand out" in text
+    assert "1 value of speed stands out of its neighbours, at sample 700" in text
+    assert "--mask outliers" in text
+    taken = sewfast(folder, "look", "run.csv:u:speed", "--mask", "outliers")
+    assert "stands out" not in taken.out
+    assert "1 outputs stand out" in taken.err
     assert "--hold-inputs" in text
     found = json.loads(
         sewfast(folder, "look", "run.csv", "--input", "u", "--output", "speed", "--json").out
     )
     assert found["columns"][0]["missing"] == 5
     assert found["outliers"] == 1
+    assert found["outliers_at"] == [{"experiment": "run.csv", "sample": 700}]
+    assert found["findings"] == []
     assert (
         json.loads(sewfast(folder, "look", "run.csv", "--json").out)["run.csv"][2]["name"]
         == "speed"

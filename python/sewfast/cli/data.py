@@ -40,7 +40,18 @@ def _read_named(source: str, args: argparse.Namespace) -> Dataset:
         Ts=args.ts,
         counts=counts,
         counts_per_rev=args.counts_per_rev,
+        channels=_references(table, (*inputs, output, counts)),
     )
+
+
+def _references(table: Table, taken: tuple[str | None, ...]) -> list[str]:
+    """Columns that are named as a reference: they show that a record was made in closed loop."""
+    from ..dataset import is_reference
+
+    used = {table.resolve(name) for name in taken if name and name in table}
+    lengths = {len(table[name]) for name in used}
+    names = (n for n in table.names if is_reference(n) and n not in used)
+    return [n for n in names if {len(table[n])} == lengths]
 
 
 def _of_recording(

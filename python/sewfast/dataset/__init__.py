@@ -3,7 +3,7 @@
 from .arrays import FloatArray
 from .checks import require_dataset
 from .dataset import Dataset
-from .diagnosis import Diagnosis, Finding, diagnose
+from .diagnosis import Diagnosis, Finding, diagnose, is_reference
 from .experiment import Experiment
 from .outliers import Outliers
 from .pieces import SHORTEST_PIECE
@@ -25,6 +25,7 @@ __all__ = [
     "Trend",
     "column_summary",
     "diagnose",
+    "is_reference",
     "labelled",
     "require_dataset",
     "require_same_units",

@@ -1,4 +1,4 @@
-"""What to do about what a summary of data shows."""
+"""What to do about the numbers that a summary of data shows."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ ENOUGH = 10.0
 """Samples that such a period needs."""
 NYQUIST = 0.25
 """Upper end of the band, in parts of the sampling rate, from which on it is close to the limit."""
+SHOWN = 8
+"""Outliers whose places are named."""
 FEW = 500
 """Samples below which an identification has little to go by."""
 
@@ -29,13 +31,12 @@ def advice(found: Summary) -> Iterator[str]:
     for c in found.columns:
         yield from _values(c)
     if found.outliers:
-        yield (
-            f"{found.outliers} values of {output.name} stand out of their neighbours: look at them "
-            "(data.mark_outliers()), then take them out: data.mask(data.mark_outliers())"
-        )
+        yield _outliers(found, output.name)
     yield from _limits(output)
     yield from _noise(output)
-    yield from _rate(output, found.Ts)
+    # of a position nearly all power is slow, whatever the speed does
+    if found.diagnosis.find("integrator") is None and found.diagnosis.find("wraps") is None:
+        yield from _rate(output, found.Ts)
     if found.n < FEW:
         yield (
             f"{found.n} samples are few: a network needs about ten for each of its parameters; "
@@ -70,6 +71,19 @@ def _values(c: ColumnSummary) -> Iterator[str]:
     elif not c.moves:
         moves = "excites the plant" if c.role == "input" else "follows the input"
         yield f"{c.name} is constant at {c.low:g}: there is nothing to learn until it {moves}"
+
+
+def _outliers(found: Summary, name: str) -> str:
+    several = len(found.experiments) > 1
+    shown = ", ".join(f"{k} of {e}" if several else str(k) for e, k in found.outliers_at[:SHOWN])
+    more = "" if found.outliers <= SHOWN else f" and {found.outliers - SHOWN} more"
+    one = found.outliers == 1
+    return (
+        f"{found.outliers} {'value' if one else 'values'} of {name} "
+        f"{'stands' if one else 'stand'} out of {'its' if one else 'their'} neighbours, at sample"
+        f"{'' if one else 's'} {shown}{more}: look at {'it' if one else 'them'}, then take "
+        f"{'it' if one else 'them'} out, data.mask(data.mark_outliers()) (--mask outliers)"
+    )
 
 
 def _limits(output: ColumnSummary) -> Iterator[str]:

@@ -149,6 +149,7 @@ def diagnose(data: Dataset) -> Diagnosis:
     Examples
     --------
     >>> import numpy as np
+    >>> from sewfast.dataset import Dataset
     >>> u = np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], 200), 10)
     >>> position = np.cumsum(np.convolve(u, np.full(8, 0.125), "full")[:2000]) * 0.01
     >>> diagnose(Dataset.from_arrays(u, position, 0.01))
@@ -235,7 +236,12 @@ def _wraps(data: Dataset) -> Iterator[Finding]:
     back, other, sizes = 0, 0, []
     for y in columns:
         change = np.diff(y)
-        for k in np.flatnonzero(np.abs(change) > 0.7 * span):
+        jumps = np.where(np.abs(change) > 0.7 * span, np.sign(change), 0.0)
+        for k in np.flatnonzero(jumps):
+            if -jumps[k] in jumps[max(k - 5, 0) : k + 6]:
+                # there and back: a spike
+                other += 1
+                continue
             around = np.concatenate([change[max(k - 5, 0) : k], change[k + 1 : k + 6]])
             slope = float(np.median(around)) if len(around) else 0.0
             if slope * change[k] < 0.0 and abs(slope) < 0.2 * span:
@@ -373,10 +379,15 @@ def _closed_loop(data: Dataset) -> Iterator[Finding]:
     )
 
 
+def is_reference(name: str) -> bool:
+    """Whether a column is named as the reference of a loop: r, ref, setpoint, target_speed."""
+    return _REFERENCE.fullmatch(name) is not None
+
+
 def _reference(data: Dataset) -> tuple[str, float] | None:
     """A channel that is named as a reference and that the output follows, with its correlation."""
     for name in data.experiments[0].channels:
-        if not _REFERENCE.fullmatch(name) or any(name not in e.channels for e in data.experiments):
+        if not is_reference(name) or any(name not in e.channels for e in data.experiments):
             continue
         r, y = (
             np.concatenate(c)

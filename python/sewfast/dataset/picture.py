@@ -12,7 +12,7 @@ from ..errors import SettingError
 from ..runs import runs
 from .arrays import FloatArray
 from .checks import LARGEST
-from .outliers import distances
+from .outliers import distances, usual_threshold
 from .spectrum import band, power_spectrum
 from .units import labelled
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 INPUT, OUTPUT, MISSING, OUTLIER = "#333333", "#0072B2", "#D55E00", "#CC0000"
 MOST_PANELS = 8
 _BUCKETS = 1200
-_MARKED = 6.0
 
 
 def save(data: Dataset, path: str | os.PathLike[str]) -> None:
@@ -64,7 +63,7 @@ def figure(data: Dataset) -> Figure:
         is_output = i == len(names) - 1
         columns = [e.y if is_output else e.u[:, i] for e in data.experiments]
         columns = [np.where(np.abs(c) < LARGEST, c, np.nan) for c in columns]
-        _over_time(left, columns, data.Ts, name, is_output)
+        _over_time(left, columns, data.Ts, name, usual_threshold(data) if is_output else None)
         _over_frequency(right, columns, data.Ts, OUTPUT if is_output else INPUT)
     several = ", experiments one after the other" if len(data.experiments) > 1 else ""
     axes[-1, 0].set_xlabel(f"time [s]{several}")
@@ -73,8 +72,11 @@ def figure(data: Dataset) -> Figure:
     return drawn
 
 
-def _over_time(ax: Axes, columns: list[FloatArray], Ts: float, name: str, is_output: bool) -> None:
-    offset = 0
+def _over_time(
+    ax: Axes, columns: list[FloatArray], Ts: float, name: str, threshold: float | None
+) -> None:
+    """One column; with a threshold it is the output, whose outliers are circled."""
+    is_output, offset = threshold is not None, 0
     labels: dict[str, Any] = {}
     look: dict[str, Any] = {"lw": 0.9, "color": OUTPUT if is_output else INPUT}
     look |= {"drawstyle": "default" if is_output else "steps-post"}
@@ -87,8 +89,8 @@ def _over_time(ax: Axes, columns: list[FloatArray], Ts: float, name: str, is_out
             labels["missing"] = ax.axvspan(
                 left, left + length * Ts, color=MISSING, alpha=0.25, lw=0
             )
-        if is_output:
-            at = np.flatnonzero(distances(column) > _MARKED)
+        if threshold is not None:
+            at = np.flatnonzero(distances(column) > threshold)
             if len(at):
                 (labels["stands out"],) = ax.plot(
                     (offset + at) * Ts, column[at], "o", ms=5, mfc="none", mec=OUTLIER

@@ -1,4 +1,4 @@
-"""What one should see of data before anything is identified from them."""
+"""What to know of data before anything is identified from them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from ..runs import runs
 from .advice import advice
 from .arrays import FloatArray
 from .checks import LARGEST
+from .diagnosis import Diagnosis, diagnose
 from .noise import quantum, share_at_limits, white_noise
+from .outliers import distances, usual_threshold
 from .spectrum import band, power_spectrum, top
 from .units import labelled
 
@@ -83,16 +85,20 @@ class Summary:
     ----------
     columns : tuple of ColumnSummary
         Inputs, then the output.
-    outliers : int
-        Outputs that stand out of their neighbours (`Dataset.mark_outliers`).
+    outliers_at : tuple of (str, int)
+        Experiment and sample (0-based, of its file) of outputs that stand out of their neighbours
+        (`Dataset.mark_outliers`).
+    diagnosis : Diagnosis
+        What the data are (`sewfast.diagnose`).
     advice : tuple of str
-        What to do about what was found, in the order of its weight.
+        What to do about the numbers, in the order of their weight.
     """
 
     Ts: float
     experiments: tuple[tuple[str, str, int], ...]
     columns: tuple[ColumnSummary, ...]
-    outliers: int
+    outliers_at: tuple[tuple[str, int], ...]
+    diagnosis: Diagnosis
     notes: tuple[str, ...] = ()
     data: Dataset | None = field(default=None, repr=False)
 
@@ -100,6 +106,11 @@ class Summary:
     def n(self) -> int:
         """Samples in all experiments together."""
         return sum(n for _, _, n in self.experiments)
+
+    @property
+    def outliers(self) -> int:
+        """How many outputs stand out."""
+        return len(self.outliers_at)
 
     @property
     def advice(self) -> tuple[str, ...]:
@@ -116,6 +127,8 @@ class Summary:
             ],
             "columns": [_plain(asdict(c)) for c in self.columns],
             "outliers": self.outliers,
+            "outliers_at": [{"experiment": e, "sample": k} for e, k in self.outliers_at],
+            **self.diagnosis.to_json(),
             "advice": list(self.advice),
             "notes": list(self.notes),
         }
@@ -134,7 +147,8 @@ class Summary:
         save(self.data, path)
 
     def __repr__(self) -> str:
-        return f"Summary({self.n} samples, {len(self.columns)} columns, {len(self.advice)} hints)"
+        hints = len(self.advice) + len(self.diagnosis.findings)
+        return f"Summary({self.n} samples, {len(self.columns)} columns, {hints} hints)"
 
     def __str__(self) -> str:
         count = len(self.experiments)
@@ -143,7 +157,8 @@ class Summary:
         lines = [f"{self.n} samples{several}, {self.n * self.Ts:.4g} s at {rate}"]
         lines += [f"  {name} [{text}]" for name, text, _ in self.experiments[:10]]
         lines += ["", *table(self.columns)]
-        lines += ["", *(f"- {line}" for line in self.advice or ("nothing stands in the way",))]
+        hints = [*self.diagnosis.findings, *self.advice] or ["nothing stands in the way"]
+        lines += ["", *(f"- {hint}" for hint in hints)]
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
 
@@ -164,15 +179,19 @@ def summary(data: Dataset) -> Summary:
     columns.append(column_summary(data.output_name, data.output_unit, "output", outputs, data.Ts))
     sane = data.mask(lambda e: ~(np.abs(e.y) < LARGEST))
     inputs_too = all((np.abs(e.u) < LARGEST).any() for e in data.experiments)
-    outliers = _marked(sane) if inputs_too else 0
+    outliers = _marked(sane) if inputs_too else ()
     experiments = tuple((e.name, e.range_text, len(e)) for e in data.experiments)
-    return Summary(data.Ts, experiments, tuple(columns), outliers, data.notes, data)
+    found = diagnose(data)
+    return Summary(data.Ts, experiments, tuple(columns), outliers, found, data.notes, data)
 
 
-def _marked(data: Dataset) -> int:
-    from .outliers import distances
-
-    return sum(int((distances(e.y) > 6.0).sum()) for e in data.experiments)
+def _marked(data: Dataset) -> tuple[tuple[str, int], ...]:
+    limit = usual_threshold(data)
+    return tuple(
+        (e.name, e.start + int(k))
+        for e in data.experiments
+        for k in np.flatnonzero(distances(e.y) > limit)
+    )
 
 
 def column_summary(
