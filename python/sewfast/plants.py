@@ -40,16 +40,14 @@ def each_plant(on: Plants | None) -> list[Plant]:
 
 
 def _singles(plant: Plant) -> list[Plant]:
-    """Members know the training region and ranges of their ensemble where these speak of them."""
+    """Members know what their ensemble stores of the training data, region and ranges."""
     if not isinstance(plant, Ensemble):
         return [plant]
-    return [_informed(m, plant, first=i == 0) for i, m in enumerate(plant.members)]
+    return [_informed(m, plant) for m in plant.members]
 
 
-def _informed(member: Model, ensemble: Ensemble, *, first: bool) -> Model:
-    shared = ["input_range", "output_range"]
-    # the region is its first member's: states of another have no unit in common with it
-    shared += ["region"] if first or "na" in member.orders else []
+def _informed(member: Model, ensemble: Ensemble) -> Model:
+    shared = ("input_range", "output_range", "region")
     known = {k: ensemble.training[k] for k in shared if k in ensemble.training}
     return replace(member, training={**known, **member.training})
 

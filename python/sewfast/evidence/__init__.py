@@ -6,7 +6,7 @@ from .correlations import ResidualTest
 from .operating import OperatingPoint, OperatingRange, operating_range
 from .parameters import Parameters, estimate
 from .portmanteau import residual_tests
-from .region import Region, training_region
+from .region import Region, TrainingRegion, training_region
 from .residuals import Residuals
 from .simulation_bands import Bands, bands
 
@@ -20,6 +20,7 @@ __all__ = [
     "ReportCard",
     "ResidualTest",
     "Residuals",
+    "TrainingRegion",
     "bands",
     "check",
     "estimate",

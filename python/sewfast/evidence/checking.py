@@ -95,11 +95,11 @@ def check(
     covered = _bands(model, data, free, training, level, place)
     if covered is not None:
         lines.append(questions.coverage(covered))
-    outside = math.nan
+    outside = farthest = math.nan
     if far:
         judged = np.concatenate([d[init:] for d in far])
-        outside = float(np.mean(judged > 1.0))
-        lines.append(questions.region(outside, float(judged.max())))
+        outside, farthest = float(np.mean(judged > 1.0)), float(judged.max())
+    lines.append(questions.region(outside, farthest))
     operating = _operating(model)
     if operating is not None:
         lines += questions.operation(operating)

@@ -14,7 +14,7 @@ from ..dataset import FloatArray
 from ..errors import DataError, SettingError
 from ..models.base import Model
 from .linearised import Linearised, linearise
-from .region import Region, stored_region
+from .region import TrainingRegion, stored_region
 from .residuals import representative
 
 POINTS = 9
@@ -247,7 +247,7 @@ def _input_range(model: Model, first: Model) -> FloatArray:
 
 
 def _grid(
-    model: Model, limits: FloatArray, points: int, region: Region | None
+    model: Model, limits: FloatArray, points: int, region: TrainingRegion | None
 ) -> tuple[list[FloatArray], tuple[int, ...]]:
     grid: list[FloatArray] = []
     for i in range(len(limits)):
@@ -256,7 +256,7 @@ def _grid(
 
 
 def _closed_in(
-    model: Model, limits: FloatArray, i: int, points: int, region: Region | None
+    model: Model, limits: FloatArray, i: int, points: int, region: TrainingRegion | None
 ) -> list[FloatArray]:
     """Values of input i over what the data came near: a pulse's height was never held for long."""
     low, high = limits[i]
@@ -289,7 +289,7 @@ def _given(model: Model, inputs: Sequence[FloatArray]) -> tuple[list[FloatArray]
 
 
 def _points(
-    model: Model, grid: Sequence[FloatArray], region: Region | None
+    model: Model, grid: Sequence[FloatArray], region: TrainingRegion | None
 ) -> list[OperatingPoint]:
     found, state = [], None
     for u in grid:
@@ -306,25 +306,11 @@ def _points(
                 small.delay,
                 small.settled,
                 small.saturated,
-                _is_known(model, u, small, region),
+                region is None or region.holds(u, small.y),
                 model.Ts,
             )
         )
     return found
-
-
-def _is_known(model: Model, u: FloatArray, small: Linearised, region: Region | None) -> bool:
-    """Whether the point lies in the training region: a constant input may never have been held."""
-    if region is None:
-        return True
-    if "na" in model.orders:
-        y = np.full(model.orders["na"], small.y)
-        place = np.concatenate([y, np.tile(u, model.orders["nb"])])
-    else:
-        place = np.concatenate([small.state, u])
-    if len(place) != len(region.mean) or not np.isfinite(place).all():
-        return len(place) != len(region.mean)
-    return bool(region.distance(place[None])[0] <= region.radius)
 
 
 def _row(p: OperatingPoint, i: int) -> list[str]:

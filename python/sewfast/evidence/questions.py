@@ -25,7 +25,7 @@ SMALL = 0.1
 GOOD_FIT, POOR_FIT = 70.0, 30.0
 COVERAGE = (0.88, 0.99)
 LEAST_COVERAGE = 0.8
-OUTSIDE, FAR_OUTSIDE = 0.02, 0.2
+OUTSIDE, FAR_OUTSIDE = 0.05, 0.2
 CONDITION = 1e8
 SAMPLES_PER_PARAMETER = 10.0
 GROWTH, LARGE_GROWTH = 1.5, 3.0
@@ -293,20 +293,25 @@ def coverage(b: Bands) -> Line:
 
 
 def region(outside: float, farthest: float) -> Line:
-    """Share of samples unlike any in the training data."""
-    verdict: Verdict = "ok" if outside <= OUTSIDE else "warn"
-    meaning = {
-        "ok": "the model is used where it has been trained",
-        "warn": "some samples are unlike any in the training data: the model extrapolates there",
-        "far": "the model is used where it has not been trained: trust what was measured here, not "
-        "what it computes elsewhere; record such operation and identify again",
-    }["far" if outside > FAR_OUTSIDE else verdict]
-    if verdict != "ok":
-        meaning += f" (farthest: {farthest:.3g} times the region's radius)"
-    limit = f"<= {100 * OUTSIDE:g} %"
-    return Line(
-        "outside training region", outside, f"{100 * outside:.2f} %", limit, verdict, meaning
-    )
+    """Share of samples unlike any in the training data; NaN where the region is not known."""
+    name, limit = "outside training region", f"<= {100 * OUTSIDE:g} %"
+    if math.isnan(outside):
+        text = (
+            "the model stores no training region, or one of an older version: identify it again, "
+            "or give its training data as well"
+        )
+        return Line(name, math.nan, "not known", limit, "info", text)
+    shown = f"{100 * outside:.2f} %"
+    if outside <= OUTSIDE:
+        return Line(name, outside, shown, limit, "ok", "the model is used where it was trained")
+    text = "some samples are unlike any in the training data: the model extrapolates there"
+    if outside > FAR_OUTSIDE:
+        text = (
+            "the model is used where it was not trained: believe it here only as far as it was "
+            "measured, and not elsewhere; record such operation and identify again"
+        )
+    text += f" (up to {farthest:.3g} times the region's bound)"
+    return Line(name, outside, shown, limit, "warn", text)
 
 
 def operation(found: OperatingRange) -> list[Line]:

@@ -1,89 +1,123 @@
-"""The training region: where in regressor or state space a model has been, and what lies outside.
+"""The training region: where a model has been on its training data, and what lies outside.
 
-The training data's points are whitened and covered by balls about up to 200 of themselves (the
-greedy k-centre of Gonzalez 1985); what 99.5 % of the training points keep from their nearest
-centre is the radius, or what 98 % of them keep from the centres of other parts of the record where
-that is more. A point farther than that from every centre is outside: no training sample was like
-it.
+A model is judged by what goes in and comes out of its free run, so that one measure serves every
+kind, ensembles included. A sample lies outside where any of three distances exceeds 1:
+
+- *nearest*: from the point (inputs, output, change of the output over a lag) to the nearest
+  training point, over the radius. The lag is the one over which the output changes visibly, so
+  that a short sample time does not shrink the change to nothing. The radius is what a tenth of the
+  training record keeps from the other nine tenths, the worst tenth of ten: a new stretch of the
+  same excitation is to the record what each tenth is to the others.
+- *level*: the rms of each signal about its training mean over a window, over the largest that the
+  training data reach. A signal of twice the size still crosses zero, and a Gaussian one is seldom
+  where the training data have never been; its rms over some time gives it away. The window is the
+  shortest one over which most of the training record itself, at twice its size, would be outside.
+- *peak*: the largest deviation within the last few lags, the time that a sample stays in the
+  model's memory.
+
+A two-level input makes the regressor's points degenerate (they lie on a few planes), and any
+ellipsoid or whitening of them turns rounding into distance. Here nothing is whitened: every
+coordinate is divided by half its own range.
+
+What a new stretch exceeds by depends on how many independent pieces the record holds; the margins
+below were set on PRBS, steps, multisines and chirps into lags of first and second order, and are
+measured on others by tests/test_region.py.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from ..dataset import Dataset, FloatArray
 from ..models.base import INIT, Model
-from .residuals import representative
 
-CENTRES = 200
-LARGEST_DIMENSION = 8
-_SMALLEST_VARIANCE = 1e-8
-_LEAST_SPREAD = 0.1
-"""Deviations smaller than a tenth of a variable's own spread are no new region.
+Signals: TypeAlias = tuple[FloatArray, FloatArray]
+"""Inputs (N, nu) and output (N,) of one run."""
 
-Between one sample and the next of a fast record there is less; any new rate would be far away.
-"""
-_MOST_POINTS = 20_000
+FORM = 2
+"""Of the stored values; the first form whitened the model's own regressor or state."""
+CENTRES = 300
+_SUBSAMPLE = 4000
 _BLOCK = 4096
 _TENTHS = 10
-_FARTHEST = 1e60
+_FARTHEST = 1000.0
+"""Larger distances say no more, and their squares would drown what follows in rounding."""
+
+_LEAST_RADIUS = 0.1
+"""Of half a range: a twentieth of the range is no new region."""
+_LEFT_OUT = 0.98
+"""Share of a tenth of the record that lies within its distance from the others."""
+_MOVED = 0.5
+"""Mean square change over a lag, over the variance: samples correlate by three quarters."""
+
+_INPUT_LEVEL, _FEW_WINDOWS = 1.2, 0.2
+"""Factor on the largest training level of an input, and what is added where windows are few."""
+_WHOLE_LEVEL = 1.4
+"""Factor on the level of the whole record, where that is more: half way to the double, in dB."""
+_INPUT_PEAK, _OUTPUT = 1.3, 1.7
+"""Factors on the largest peak of an input, on largest level and peak of the output."""
+_SEEN = 0.85
+"""Share of the training record at twice its size that the window has to find outside."""
+_LARGEST_WINDOW = 6
+"""Windows that the record holds at least."""
+_PEAK_LAGS = 3
+_SMALLEST = 1e-6
+"""Of a signal's own size: an input that never moved is outside as soon as it moves."""
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Balls of one radius about whitened centres.
+    """Balls of one radius about scaled centres.
 
     Attributes
     ----------
-    mean : array, shape (d0,)
-    turn : array, shape (d0, d)
-        (point - mean) @ turn is whitened.
+    mean, scale : array, shape (d,)
+        (point - mean) / scale is what the centres are given in.
     centres : array, shape (c, d)
     radius : float
     """
 
     mean: FloatArray
-    turn: FloatArray
+    scale: FloatArray
     centres: FloatArray
     radius: float
 
     @classmethod
-    def of(cls, points: FloatArray) -> Region:
-        """The region of points, shape (N, d0), in their order of time."""
-        mean, turn = _whitening(points)
-        every = max(1, len(points) // _MOST_POINTS)
-        centres = _spread_out(((points - mean) @ turn)[::every])
-        region = cls(mean, turn, centres, 0.0)
-        covering = float(np.quantile(region.distance(points), 0.995))
-        radius = max(covering, _cross_radius(region, points[::every]))
-        return cls(mean, turn, centres, radius * (1.0 + 1e-6) + 1e-9)
+    def of(cls, points: FloatArray, least_scale: FloatArray | None = None) -> Region:
+        """The region of points, shape (N, d), in their order of time.
+
+        Parameters
+        ----------
+        points : array, shape (N, d)
+        least_scale : array, shape (d,), optional
+            Lower bound of each coordinate's scale, which is half its range.
+        """
+        low, high = points.min(axis=0), points.max(axis=0)
+        mean = 0.5 * (low + high)
+        scale = np.maximum(0.5 * (high - low), _SMALLEST * np.maximum(abs(low), abs(high)))
+        if least_scale is not None:
+            scale = np.maximum(scale, least_scale)
+        scale = np.maximum(scale, 1e-12)
+        kept = ((points - mean) / scale)[:: max(1, len(points) // _SUBSAMPLE)]
+        centres, covered = _spread_out(kept)
+        radius = max(_LEAST_RADIUS, _between_tenths(kept)) + covered
+        return cls(mean, scale, centres, radius)
 
     def distance(self, points: FloatArray) -> FloatArray:
-        """Whitened distance of points (N, d0) to the nearest centre, shape (N,)."""
-        return np.concatenate([np.sqrt(d.min(axis=1)) for d in self._squares(points)])
-
-    def _squares(self, points: FloatArray) -> Iterator[FloatArray]:
-        """Squared distances (n, c) of a block of points after the other to all centres."""
-        # a run that leaves the world is far away, and no overflow
-        bounded = np.clip(np.nan_to_num(points), -_FARTHEST, _FARTHEST)
-        white = np.clip((bounded - self.mean) @ self.turn, -_FARTHEST, _FARTHEST)
-        centres = np.square(self.centres).sum(axis=1)
-        for a in range(0, len(white), _BLOCK):
-            part = white[a : a + _BLOCK]
-            cross = centres - 2.0 * part @ self.centres.T
-            yield np.maximum(np.square(part).sum(axis=1)[:, None] + cross, 0.0)
+        """Scaled distance of points (N, d) to the nearest centre, shape (N,)."""
+        return _nearest((points - self.mean) / self.scale, self.centres)
 
     def to_json(self) -> dict[str, Any]:
         """As JSON values with the digits that matter."""
         return {
-            "mean": _short(self.mean),
-            "turn": _short(self.turn),
-            "centres": _short(self.centres),
+            "mean": _short(self.mean, 7),
+            "scale": _short(self.scale, 7),
+            "centres": _short(self.centres, 4),
             "radius": self.radius,
         }
 
@@ -96,55 +130,164 @@ class Region:
         ValueError
             Where the values are of another form.
         """
-        try:
-            mean, turn, centres = (
-                np.array(values[k], dtype=np.float64) for k in ("mean", "turn", "centres")
-            )
-            region = cls(mean, turn.reshape(len(mean), -1), centres, float(values["radius"]))
-        except (KeyError, TypeError, ValueError) as e:
-            raise ValueError(f"expected mean, turn, centres and radius: {e}") from e
-        sizes = region.turn.shape[1], region.centres.shape[-1]
-        if centres.ndim != 2 or sizes[0] != sizes[1] or not np.isfinite(region.radius):
+        mean, scale, centres = (_array(values, k) for k in ("mean", "scale", "centres"))
+        sound = mean.ndim == 1 and mean.shape == scale.shape and bool((scale > 0.0).all())
+        if not sound or centres.shape[1:] != mean.shape or not len(centres):
             raise ValueError(
-                f"expected centres as wide as turn, received {sizes[1]} and {sizes[0]}"
+                f"expected mean and scale of shape (d,) and centres (c, d), received {mean.shape}, "
+                f"{scale.shape} and {centres.shape}"
             )
-        return region
+        return cls(mean, scale, centres, _positive(values, "radius"))
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingRegion:
+    """Where a model has been on its training data.
+
+    Attributes
+    ----------
+    nearest : Region
+        Of the points (inputs, output, change of the output over `lag`).
+    centre, level, peak : array, shape (nu + 1,)
+        Means of the inputs and the output; the bounds of rms and peak about them.
+    lag, window : int
+        Samples.
+    """
+
+    nearest: Region
+    centre: FloatArray
+    level: FloatArray
+    peak: FloatArray
+    lag: int
+    window: int
+
+    @classmethod
+    def of(cls, runs: Sequence[Signals]) -> TrainingRegion:
+        """Of runs on training data.
+
+        Parameters
+        ----------
+        runs : sequence of (u, y)
+            Inputs, shape (N, nu), and output, shape (N,), of each experiment.
+        """
+        lag = max(1, int(np.median([_lag(y) for _, y in runs])))
+        points = np.concatenate([_points(u, y, lag) for u, y in runs])
+        signals = [np.column_stack(run) for run in runs]
+        together = np.concatenate(signals)
+        centre = together.mean(axis=0)
+        # a change of the output that is small beside the output itself is no new region
+        floor = np.zeros(points.shape[1])
+        floor[-1] = 0.1 * 0.5 * float(np.ptp(together[:, -1]))
+        largest = np.maximum(
+            np.abs(together - centre).max(axis=0), _SMALLEST * np.abs(together).max(axis=0)
+        )
+        largest = np.maximum(largest, 1e-12)
+        factors = np.full(len(centre), _INPUT_PEAK)
+        factors[-1] = _OUTPUT
+        peak = factors * largest
+        window, level = _window(signals, centre, peak, lag)
+        return cls(Region.of(points, floor), centre, level, peak, lag, window)
+
+    def distances(self, u: FloatArray, y: FloatArray) -> FloatArray:
+        """How far every sample of a run lies, in units of the bound: above 1 is outside.
+
+        Parameters
+        ----------
+        u : array, shape (N, nu)
+        y : array, shape (N,)
+
+        Returns
+        -------
+        array, shape (N,)
+            At most 1000.
+        """
+        y = np.nan_to_num(y, nan=1e300, posinf=1e300, neginf=-1e300)
+        near = self.nearest.distance(_points(u, y, self.lag)) / self.nearest.radius
+        signals = np.column_stack([u, y]) - self.centre
+        size = _size(signals, self.level, self.peak, self.lag, self.window)
+        return np.minimum(np.maximum(near, size), _FARTHEST)
+
+    def holds(self, u: FloatArray, y: float) -> bool:
+        """Whether the training data came near a steady state: inputs (nu,) and output at rest."""
+        point = np.concatenate([u, [y, 0.0]])
+        if not np.isfinite(point).all():
+            return False
+        return bool(self.nearest.distance(point[None])[0] <= self.nearest.radius)
+
+    @property
+    def n_inputs(self) -> int:
+        """Inputs of the model."""
+        return len(self.centre) - 1
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {
+            "form": FORM,
+            "lag": self.lag,
+            "window": self.window,
+            **{k: _short(getattr(self, k), 7) for k in ("centre", "level", "peak")},
+            "nearest": self.nearest.to_json(),
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> TrainingRegion:
+        """What `to_json` gave.
+
+        Raises
+        ------
+        ValueError
+            Where the values are of another form, such as an older version's.
+        """
+        nearest = values.get("nearest")
+        if values.get("form") != FORM or not isinstance(nearest, Mapping):
+            raise ValueError(f"expected a region of form {FORM}, received {values.get('form')!r}")
+        inner = Region.from_json(nearest)
+        centre, level, peak = (_array(values, k) for k in ("centre", "level", "peak"))
+        lag, window = (int(_positive(values, k)) for k in ("lag", "window"))
+        shapes = {centre.shape, level.shape, peak.shape}
+        if shapes != {(len(inner.mean) - 1,)} or not ((level > 0.0) & (peak > 0.0)).all():
+            raise ValueError(
+                f"expected centre, level and peak of shape ({len(inner.mean) - 1},), received "
+                f"{shapes}"
+            )
+        return cls(inner, centre, level, peak, max(lag, 1), max(window, 1))
 
 
 def training_region(model: Model, data: Dataset) -> dict[str, Any]:
     """The region that a model passes through on its training data, for its `training["region"]`."""
-    return Region.of(np.concatenate(points(model, data))).to_json()
+    return TrainingRegion.of(_runs(model, data, INIT)).to_json()
 
 
-def stored_region(model: Model) -> Region | None:
+def stored_region(model: Model) -> TrainingRegion | None:
     """The region stored with the model; None where there is none that can be read."""
     values = model.training.get("region")
     if not isinstance(values, Mapping):
         return None
     try:
-        return Region.from_json(values)
+        region = TrainingRegion.from_json(values)
     except ValueError:
         return None
+    return region if region.n_inputs == len(model.input_names) else None
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where a free run goes, seen from the training region.
+    """Where free runs go, seen from the training region.
 
     Attributes
     ----------
-    points : arrays, shape (N, d0), one per experiment
-    distances : arrays, shape (N,)
-        To the nearest known point, over the region's radius.
+    runs : list of (u, y)
+        Inputs, shape (N, nu), and simulated output, shape (N,), of each experiment.
+    distances : list of array, shape (N,)
+        Over the region's bounds: above 1 is outside.
     """
 
-    region: Region
-    points: list[FloatArray]
+    region: TrainingRegion
+    runs: list[Signals]
 
     @cached_property
     def distances(self) -> list[FloatArray]:
-        radius = max(self.region.radius, 1e-300)
-        return [self.region.distance(p) / radius for p in self.points]
+        return [self.region.distances(u, y) for u, y in self.runs]
 
 
 def placed(
@@ -154,86 +297,171 @@ def placed(
 
     None where there is neither.
     """
-    known = stored_region(model)
     if training is not None:
-        known = Region.from_json(training_region(model, training))
-    if known is None:
-        return None
-    where = points(model, data, init)
-    return Place(known, where) if where[0].shape[1] == len(known.mean) else None
+        known: TrainingRegion | None = TrainingRegion.of(_runs(model, training, INIT))
+    else:
+        known = stored_region(model)
+    return None if known is None else Place(known, _runs(model, data, init))
 
 
-def points(model: Model, data: Dataset, init: int = INIT) -> list[FloatArray]:
-    """Where the model is at every sample in free run, one array (N, d0) per experiment.
+def _runs(model: Model, data: Dataset, init: int) -> list[Signals]:
+    simulated = model.simulate(data, init=init)
+    return [(e.u, yhat) for e, yhat in zip(data.experiments, simulated, strict=True)]
 
-    State and input for a state-space model, simulated regressor for the others.
+
+# --- the nearest training point -------------------------------------------------------------------
+
+
+def _points(u: FloatArray, y: FloatArray, lag: int) -> FloatArray:
+    """Inputs, output and its change over the lag, (N, nu + 2)."""
+    change = np.zeros(len(y))
+    if len(y) > 1:
+        lag = min(lag, len(y) - 1)
+        change[lag:] = y[lag:] - y[:-lag]
+        change[:lag] = change[lag]
+    return np.column_stack([u, y, change])
+
+
+def _lag(y: FloatArray) -> int:
+    """Samples over which the output changes visibly, up to a twentieth of the record."""
+    variance = float(y.var())
+    lag = 1
+    while lag < len(y) // 20:
+        if np.mean(np.square(y[lag:] - y[:-lag])) > _MOVED * variance:
+            break
+        lag = max(lag + 1, int(1.3 * lag))
+    return lag
+
+
+def _spread_out(points: FloatArray) -> tuple[FloatArray, float]:
+    """Up to `CENTRES` points, each the farthest from those before, and what they leave uncovered.
+
+    The greedy k-centre of Gonzalez (1985): extremes are among the first.
     """
-    single = representative(model)
-    found = []
-    for e, yhat in zip(data.experiments, model.simulate(data, init=init), strict=True):
-        states = getattr(single.core, "states", None)
-        if states is not None:
-            inputs = _late(e.u, single.orders["nk"])
-            found.append(np.column_stack([states(e.u, single.initial_state(e, init)), inputs]))
-        else:
-            found.append(_regressors(e.u, yhat, single.orders))
-    return found
-
-
-def _regressors(u: FloatArray, yhat: FloatArray, orders: Mapping[str, int]) -> FloatArray:
-    past = [_late(yhat, i) for i in range(1, orders["na"] + 1)]
-    past += [_late(u, orders["nk"] + i) for i in range(orders["nb"])]
-    return np.column_stack(past)
-
-
-def _late(x: FloatArray, lag: int) -> FloatArray:
-    late: FloatArray = x[np.maximum(np.arange(len(x)) - lag, 0)]
-    return late
-
-
-def _whitening(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean and the turn to unit covariance over the directions that vary."""
-    mean = points.mean(axis=0)
-    scale = points.std(axis=0)
-    scale[scale <= 1e-12 * np.maximum(np.abs(mean), 1e-300)] = np.inf
-    scaled = (points - mean) / scale
-    sizes, vectors = np.linalg.eigh(scaled.T @ scaled / len(points))
-    kept = np.flatnonzero(sizes > _SMALLEST_VARIANCE * max(sizes[-1], 1e-300))[-LARGEST_DIMENSION:]
-    spread = np.sqrt(np.maximum(sizes[kept], _LEAST_SPREAD**2))
-    return mean, (vectors[:, kept] / spread) / scale[:, None]
-
-
-def _spread_out(points: FloatArray) -> FloatArray:
-    """Up to `CENTRES` of the points, each the farthest from those before it."""
     chosen = [int(np.argmin(np.square(points).sum(axis=1)))]
     nearest = np.square(points - points[chosen[0]]).sum(axis=1)
     while len(chosen) < CENTRES:
         farthest = int(np.argmax(nearest))
-        if nearest[farthest] <= 1e-12:
+        if nearest[farthest] <= 1e-4:
             break
         chosen.append(farthest)
         np.minimum(nearest, np.square(points - points[farthest]).sum(axis=1), out=nearest)
-    centres: FloatArray = points[chosen]
-    return centres
+    return points[chosen], float(np.sqrt(nearest.max()))
 
 
-def _cross_radius(region: Region, points: FloatArray) -> float:
-    """What 98 % of the points keep from the centres of the other half of the tenths of the record.
-
-    Without it every new record would seem to leave the region a little, as no two are the same.
-    """
+def _between_tenths(points: FloatArray) -> float:
+    """What 98 % of a tenth of the points keep from the other nine, the worst tenth of ten."""
     if len(points) < 2 * _TENTHS:
         return 0.0
-    half = np.arange(len(points)) * _TENTHS // len(points) % 2 == 0
-    white = (points - region.mean) @ region.turn
-    distances = [
-        replace(region, centres=_spread_out(white[one])).distance(points[~one])
-        for one in (half, ~half)
-    ]
-    return float(np.quantile(np.concatenate(distances), 0.98))
+    tenth = np.arange(len(points)) * _TENTHS // len(points)
+    found = [_nearest(points[tenth == i], points[tenth != i]) for i in range(_TENTHS)]
+    return float(max(np.quantile(d, _LEFT_OUT) for d in found))
 
 
-def _short(values: FloatArray) -> Any:
-    """Seven digits: the region is a judgement, its last bits are not."""
-    rounded = [float(f"{v:.6e}") for v in values.ravel()]
+def _nearest(points: FloatArray, centres: FloatArray) -> FloatArray:
+    """Distance of every point (N, d) to the nearest centre (c, d), shape (N,)."""
+    bounded = np.clip(np.nan_to_num(points), -_FARTHEST, _FARTHEST)
+    square = np.square(centres).sum(axis=1)
+    found = np.empty(len(points))
+    for a in range(0, len(points), _BLOCK):
+        part = bounded[a : a + _BLOCK]
+        cross = (square - 2.0 * part @ centres.T).min(axis=1)
+        found[a : a + _BLOCK] = np.square(part).sum(axis=1) + cross
+    return np.sqrt(np.maximum(found, 0.0))
+
+
+# --- level and peak -------------------------------------------------------------------------------
+
+
+def _window(
+    signals: Sequence[FloatArray], centre: FloatArray, peak: FloatArray, lag: int
+) -> tuple[int, FloatArray]:
+    """The window and the bounds of the level: the shortest that finds twice the inputs outside.
+
+    Twice about their mean as well as about zero. Where none does, the one that finds most.
+    """
+    n = sum(map(len, signals))
+    whole = np.sqrt(sum(np.square(x - centre).sum(axis=0) for x in signals) / n)
+    window, largest = max(4, 2 * lag), max(4, 2 * lag, n // _LARGEST_WINDOW)
+    best: tuple[float, int, FloatArray] | None = None
+    while True:
+        rms = np.max([_rms(x - centre, window).max(axis=0) for x in signals], axis=0)
+        factors = np.full(len(centre), _INPUT_LEVEL + _FEW_WINDOWS * np.sqrt(window / n))
+        factors[-1] = _OUTPUT
+        level = np.maximum(np.maximum(factors * rms, _WHOLE_LEVEL * whole), _SMALLEST * peak)
+        doubled = (
+            np.concatenate(
+                [_size(d[:, :-1], level[:-1], peak[:-1], lag, window) > 1.0 for d in bigger]
+            )
+            for bigger in (
+                [2.0 * x - centre for x in signals],
+                [2.0 * (x - centre) for x in signals],
+            )
+        )
+        seen = min(float(d.mean()) for d in doubled)
+        if best is None or seen > best[0]:
+            best = seen, window, level
+        if seen >= _SEEN or window >= largest:
+            return best[1], best[2]
+        window = min(int(1.4 * window) + 1, largest)
+
+
+def _size(
+    signals: FloatArray, level: FloatArray, peak: FloatArray, lag: int, window: int
+) -> FloatArray:
+    """Rms and peak of deviations (N, m) over their bounds, the largest of all, (N,)."""
+    bound = _FARTHEST * np.minimum(level, peak)
+    signals = np.clip(signals, -bound, bound)
+    rms = (_rms(signals, window) / level).max(axis=1)
+    peaks = _largest((np.abs(signals) / peak).max(axis=1), min(window, max(4, _PEAK_LAGS * lag)))
+    size: FloatArray = np.maximum(rms, peaks)
+    return size
+
+
+def _rms(signals: FloatArray, window: int) -> FloatArray:
+    """Over the last samples of each column; the first ones as the first whole window."""
+    window = min(window, len(signals))
+    sums = np.cumsum(np.square(signals), axis=0)
+    sums[window:] -= sums[:-window].copy()
+    sums[: window - 1] = sums[window - 1]
+    rms: FloatArray = np.sqrt(np.maximum(sums, 0.0) / window)
+    return rms
+
+
+def _largest(values: FloatArray, window: int) -> FloatArray:
+    """Largest of the last values, (N,), by doubling spans; the first ones as the first window."""
+    window = min(window, len(values))
+    found: FloatArray = values.copy()
+    span = 1
+    while span < window:
+        step = min(span, window - span)
+        found[step:] = np.maximum(found[step:], found[:-step])
+        span += step
+    found[: window - 1] = found[window - 1]
+    return found
+
+
+# --- as JSON --------------------------------------------------------------------------------------
+
+
+def _short(values: FloatArray, digits: int) -> Any:
+    """The region is a judgement, its last bits are not."""
+    rounded = [float(f"{v:.{digits - 1}e}") for v in values.ravel()]
     return np.array(rounded).reshape(values.shape).tolist()
+
+
+def _array(values: Mapping[str, Any], name: str) -> FloatArray:
+    try:
+        found = np.array(values[name], dtype=np.float64)
+    except (KeyError, TypeError, ValueError) as e:
+        raise ValueError(f"{name}: expected numbers: {e}") from e
+    if not np.isfinite(found).all():
+        raise ValueError(f"{name}: expected finite numbers")
+    return found
+
+
+def _positive(values: Mapping[str, Any], name: str) -> float:
+    found = _array(values, name)
+    if found.ndim or not found > 0.0:
+        raise ValueError(f"{name}: expected a number above 0, received {found}")
+    return float(found)
