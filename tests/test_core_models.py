@@ -132,6 +132,37 @@ def test_one_step_prediction_is_one_step_of_a_run_from_measured_outputs() -> Non
         assert abs(one[k] - first) < 1e-13 * case["settings"]["y_scale"]
 
 
+@pytest.mark.parametrize("kind", ["linear", "network"])
+def test_small_signals_follow_the_linearised_step(kind: str) -> None:
+    rng = np.random.default_rng(7)
+    na, nb, nk, nu = 2, 3, 2, 2
+    b = 0.3 * rng.standard_normal((nu, nb))
+    model: Any = _core.LinearModel(np.array([-1.2, 0.4]), b, nk, 0.3)
+    if kind == "network":
+        theta = 0.3 * rng.standard_normal(4 * (na + nu * nb + 2) + 1)
+        model = _core.NeuralOE(
+            na=na, nb=nb, nk=nk, n_inputs=nu, hidden=4, bypass=False, theta=theta,
+            u_mean=np.ones(nu), u_scale=np.array([2.0, 3.0]), y_mean=4.0, y_scale=5.0,
+            output_low=None, output_high=None,
+        )  # fmt: skip
+    u = np.tile([1.0, -2.0], (400, 1))
+    rest = np.full(na, model.simulate(u, np.zeros(na))[-1])
+    A, B, C, D = model.linearise(u[0], np.concatenate([rest, np.repeat(u[0], nb - 1)]))
+    assert (A.shape, B.shape, C.shape, D.shape) == ((6, 6), (6, 2), (1, 6), (1, 2))
+    for j in range(nu):
+        pulse = np.zeros((60, nu))
+        pulse[10, j] = 1e-4
+        up, down = (model.simulate(u[:60] + s * pulse, rest) for s in (1.0, -1.0))
+        run, x = [], np.zeros(len(A))
+        for k in range(60):
+            v = pulse[k - nk] if k >= nk else np.zeros(nu)
+            run.append(float((C @ x + D @ v)[0]))
+            x = A @ x + B @ v
+        np.testing.assert_allclose((up - down) / 2, run, atol=1e-9)
+    with pytest.raises(DataError, match="2 inputs and 6 states"):
+        model.linearise(u[0], rest)
+
+
 def test_settings_rebuild_the_same_network() -> None:
     case = reference.random_case(np.random.default_rng(5))
     model = _network(case)

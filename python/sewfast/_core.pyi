@@ -132,6 +132,12 @@ class LinearModel:
     def estimate_initial_state(self, u: _F, y: _F) -> _F: ...
     def jacobian(self, u: _F, y_past: _F) -> tuple[_F, _F]:
         """Free run (N,) and its sensitivities (N, n_theta + na): [a, b input by input, offset], then y_past."""
+    def linearise(self, u: _F, state: _F) -> tuple[_F, _F, _F, _F]:
+        """A (n, n), B (n, nu), C (1, n), D (1, nu) of one step about inputs (nu,) and a state (n,), in the data's units.
+
+        x+ = A x + B v, y = C x + D v with v(k) = u(k - nk). The state is [y(k-1) .. y(k-na)], then of one input after the
+        other [v(k-1) .. v(k-nb+1)]: n = na + nu (nb - 1).
+        """
 
 @final
 class NeuralOE:
@@ -156,6 +162,12 @@ class NeuralOE:
     def estimate_initial_state(self, u: _F, y: _F) -> _F: ...
     def jacobian(self, u: _F, y_past: _F) -> tuple[_F, _F]:
         """Free run (N,) in the data's units and its sensitivities (N, n_theta + na): theta, then y_past."""
+    def linearise(self, u: _F, state: _F) -> tuple[_F, _F, _F, _F]:
+        """A (n, n), B (n, nu), C (1, n), D (1, nu) of one step about inputs (nu,) and a state (n,), in the data's units.
+
+        x+ = A x + B v, y = C x + D v with v(k) = u(k - nk). The state is [y(k-1) .. y(k-na)], then of one input after the
+        other [v(k-1) .. v(k-nb+1)]: n = na + nu (nb - 1).
+        """
 
 @final
 class NeuralSS:
@@ -180,6 +192,8 @@ class NeuralSS:
     def nx(self) -> int: ...
     @property
     def nk(self) -> int: ...
+    def slowed(self, factor: float) -> NeuralSS:
+        """The same steady states, reached a factor more slowly."""
     def grown(self, nx: int, hidden: int, seed: int) -> NeuralSS:
         """The same model with more states and hidden units, from which a larger one is trained.
 
@@ -197,6 +211,11 @@ class NeuralSS:
         """Maximum a posteriori, (nx,); NaN in y does not count."""
     def jacobian(self, u: _F, state: _F) -> tuple[_F, _F]:
         """Free run and its sensitivities in the data's units: theta, then the state."""
+    def linearise(self, u: _F, state: _F) -> tuple[_F, _F, _F, _F]:
+        """A (nx, nx), B (nx, nu), C (ny, nx), D (ny, nu) of one step about inputs (nu,) and a state (nx,).
+
+        x+ = A x + B v, y = C x + D v with v(k) = u(k - nk); inputs and outputs in the data's units, states in their own.
+        """
 
 @final
 class LinearFit:

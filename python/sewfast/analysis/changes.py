@@ -174,7 +174,7 @@ def with_time_constants(model: Model, factor: float) -> Model:
     if isinstance(model, LinearDifference):
         return _slower_linear(model, factor)
     if isinstance(model, NeuralSS):
-        return _changed(model, theta=_slower_theta(model, factor).tolist())
+        return _changed(model, theta=model.core.slowed(factor).theta.tolist())
     raise SettingError(
         f"expected a linear or a state-space model to change time constants of, got a "
         f"{model.kind}; identify with model='neural_ss', or look at the gain instead"
@@ -195,14 +195,3 @@ def _slower_linear(model: LinearDifference, factor: float) -> Model:
     a = np.real(np.poly(moved))[1:]
     values = {"a": a.tolist(), "b": (share * core.b).tolist(), "offset": share * core.offset}
     return _changed(model, **values)
-
-
-def _slower_theta(model: NeuralSS, factor: float) -> Any:
-    """A becomes I + (A - I)/factor, B and E are divided by it."""
-    s, theta = model.settings, np.array(model.core.theta)
-    nx, nu, hidden = s["nx"], s["n_inputs"], s["hidden"]
-    ends = np.cumsum([nx * nx, nx * nu, nx * hidden])
-    A = theta[: ends[0]].reshape(nx, nx)
-    theta[: ends[0]] = (np.eye(nx) + (A - np.eye(nx)) / factor).ravel()
-    theta[ends[0] : ends[2]] /= factor
-    return theta

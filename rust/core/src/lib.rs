@@ -19,6 +19,7 @@ pub mod least_squares;
 mod limit;
 pub mod linear;
 pub mod linear_fit;
+pub mod linearised;
 pub mod lm;
 pub mod loop_transfer;
 pub mod machine;

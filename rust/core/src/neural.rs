@@ -126,6 +126,19 @@ impl NeuralOE {
         Ok((finite(self.restored(scaled))?, rows))
     }
 
+    /// The derivatives of the output by the whole regressor, in the data's units.
+    pub(crate) fn slopes(&self, phi: &[f64]) -> Vec<f64> {
+        let Lags { na, nb, .. } = self.lags();
+        let mut scaled = vec![0.0; phi.len()];
+        self.scaling.regressor(phi, na, nb, &mut scaled);
+        let mut slopes = vec![0.0; phi.len()];
+        self.network.output_and_slope(&scaled, &mut slopes);
+        for (i, slope) in slopes[na..].iter_mut().enumerate() {
+            *slope *= self.scaling.y_scale / self.scaling.u_scale[i / nb];
+        }
+        slopes
+    }
+
     fn scaled_state(&self, y_past: &[f64]) -> Vec<f64> {
         y_past.iter().map(|y| self.scaling.output(*y)).collect()
     }

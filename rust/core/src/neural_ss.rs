@@ -117,6 +117,30 @@ impl NeuralSS {
         &self.statistics
     }
 
+    /// The same model with every step going `1/factor` of its way: the steady states stay, what leads there takes a factor
+    /// longer.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for a factor that is not above 0 and finite.
+    pub fn slowed(&self, factor: f64) -> Result<Self> {
+        if !(factor > 0.0 && factor.is_finite()) {
+            return Err(Error::setting(format!(
+                "expected a finite factor above 0 for the time constants, got {factor}; 2 is half as fast"
+            )));
+        }
+        let (nx, parts) = (self.shape().nx, self.shape().parts());
+        let mut theta = self.theta.clone();
+        for (i, a) in theta[parts.a].iter_mut().enumerate() {
+            let stay = f64::from(u8::from(i % (nx + 1) == 0));
+            *a = stay + (*a - stay) / factor;
+        }
+        theta[parts.b.start..parts.e.end]
+            .iter_mut()
+            .for_each(|t| *t /= factor);
+        let (scaling, statistics) = (self.scaling.clone(), self.statistics.clone());
+        Self::new(self.shape(), self.output(), theta, scaling, statistics)
+    }
+
     /// The state at which the model rests at input zero, in scaled units: least `|x+ - x|^2 + |y|^2`.
     pub fn rest_state(&self) -> Vec<f64> {
         let Shape {

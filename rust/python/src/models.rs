@@ -78,14 +78,40 @@ use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use sewfast_core::Result;
 use sewfast_core::lagged::Lagged;
+use sewfast_core::linearised::Linearised;
 
-use crate::arrays::{raise, rows, slice};
+use crate::arrays::{array2, raise, rows, slice};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     guard::register(module)?;
     linear::register(module)?;
     neural::register(module)?;
     neural_ss::register(module)
+}
+
+/// A, B, C, D.
+type Matrices<'py> = (
+    Bound<'py, PyArray2<f64>>,
+    Bound<'py, PyArray2<f64>>,
+    Bound<'py, PyArray2<f64>>,
+    Bound<'py, PyArray2<f64>>,
+);
+
+fn matrices(py: Python<'_>, found: Result<Linearised>) -> PyResult<Matrices<'_>> {
+    let Linearised {
+        a,
+        b,
+        c,
+        d,
+        states,
+        inputs,
+    } = found.map_err(|e| raise(py, e))?;
+    Ok((
+        array2(py, a, states)?,
+        array2(py, b, inputs)?,
+        array2(py, c, states)?,
+        array2(py, d, inputs)?,
+    ))
 }
 
 type RunAndJacobian<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);

@@ -53,7 +53,7 @@ impl Scaling {
     }
 
     /// An input, scaled.
-    pub(super) fn input(&self, j: usize, u: f64) -> f64 {
+    pub(crate) fn input(&self, j: usize, u: f64) -> f64 {
         (u - self.u_mean[j]) / self.u_scale[j]
     }
 

@@ -32,7 +32,7 @@ const MOST: [(&str, usize, usize); 5] = [
 
 /// Where each part of theta stands.
 #[derive(Clone, Debug)]
-pub(super) struct Parts {
+pub(crate) struct Parts {
     pub a: Range<usize>,
     pub b: Range<usize>,
     pub e: Range<usize>,
@@ -72,7 +72,8 @@ impl Shape {
         self.nx + self.inputs
     }
 
-    pub(super) fn parts(&self) -> Parts {
+    /// Where each part stands.
+    pub(crate) fn parts(&self) -> Parts {
         let (nx, nu, ny, hidden) = (self.nx, self.inputs, self.outputs, self.hidden);
         let mut next = 0;
         let mut part = |size: usize| {

@@ -583,3 +583,27 @@ fn growing_keeps_all_weights_and_refuses_less() {
 }
 
 const POLES_OF_NEW_STATES: std::ops::Range<f64> = 0.5..0.98;
+
+#[test]
+fn a_slowed_model_has_the_same_steady_states_and_takes_longer() {
+    let model = random_model(9, SMALL, OutputFunction::Linear);
+    let slowed = model.slowed(4.0).unwrap();
+    let (u, state) = (vec![1.3; 600], [0.0; 2]);
+    let (fast, slow) = (
+        model.simulate(&u, 1, &state).unwrap(),
+        slowed.simulate(&u, 1, &state).unwrap(),
+    );
+    assert!((fast[599] - slow[599]).abs() < 1e-9 * fast[599].abs().max(1.0));
+    let settled = |run: &[f64]| {
+        run.iter()
+            .rposition(|y| (y - run[599]).abs() > 0.05)
+            .unwrap()
+    };
+    assert!(
+        settled(&slow) > 2 * settled(&fast),
+        "{} {}",
+        settled(&slow),
+        settled(&fast)
+    );
+    assert!(model.slowed(0.0).is_err() && model.slowed(f64::NAN).is_err());
+}

@@ -5,7 +5,7 @@ use pyo3::prelude::*;
 use sewfast_core::lagged::Lagged;
 use sewfast_core::{Error, arx, iv, linear, linear_fit, oe};
 
-use super::{Rows, RunAndJacobian, Values};
+use super::{Matrices, Rows, RunAndJacobian, Values};
 use crate::arrays::{Experiments, array1, array2, raise, records, rows, samples, slice};
 use crate::watch::watched;
 
@@ -111,6 +111,18 @@ impl LinearModel {
         y: Values<'py>,
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
         Ok(array1(py, super::initial_state(py, &self.inner, &u, &y)?))
+    }
+
+    fn linearise<'py>(
+        &self,
+        py: Python<'py>,
+        u: Values<'py>,
+        state: Values<'py>,
+    ) -> PyResult<Matrices<'py>> {
+        let found = self
+            .inner
+            .linearise(slice(&u, "u")?, slice(&state, "state")?);
+        super::matrices(py, found)
     }
 
     fn jacobian<'py>(

@@ -8,7 +8,7 @@ use sewfast_core::neural::{self, InitialState, Scaling, Settings, Shape};
 use sewfast_core::{Error, Result};
 
 use super::linear::LinearModel;
-use super::{Rows, RunAndJacobian, Values};
+use super::{Matrices, Rows, RunAndJacobian, Values};
 use crate::arrays::{Experiments, array1, array2, raise, records, rows, slice};
 use crate::watch::watched;
 
@@ -126,6 +126,18 @@ impl NeuralOE {
         y: Values<'py>,
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
         Ok(array1(py, super::initial_state(py, &self.inner, &u, &y)?))
+    }
+
+    fn linearise<'py>(
+        &self,
+        py: Python<'py>,
+        u: Values<'py>,
+        state: Values<'py>,
+    ) -> PyResult<Matrices<'py>> {
+        let found = self
+            .inner
+            .linearise(slice(&u, "u")?, slice(&state, "state")?);
+        super::matrices(py, found)
     }
 
     fn jacobian<'py>(

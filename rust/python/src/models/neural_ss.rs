@@ -9,7 +9,7 @@ use sewfast_core::neural_ss::{
 use sewfast_core::{Error, Result};
 
 use super::linear::LinearModel;
-use super::{Rows, Values};
+use super::{Matrices, Rows, Values};
 use crate::arrays::{array1, array2, raise, rows, slice};
 use crate::watch::watched;
 
@@ -127,6 +127,11 @@ impl NeuralSS {
         Ok(settings)
     }
 
+    fn slowed(&self, py: Python<'_>, factor: f64) -> PyResult<Self> {
+        let slowed = self.inner.slowed(factor);
+        slowed.map(|inner| Self { inner }).map_err(|e| raise(py, e))
+    }
+
     fn grown(&self, py: Python<'_>, nx: usize, hidden: usize, seed: u64) -> PyResult<Self> {
         let grown = self.inner.grown(nx, hidden, seed);
         grown.map(|inner| Self { inner }).map_err(|e| raise(py, e))
@@ -181,6 +186,18 @@ impl NeuralSS {
         let ((u, channels), (y, _)) = (rows(&u, "u")?, outputs(py, &y)?);
         let state = super::released(py, || self.inner.estimate_initial_state(u, channels, y))?;
         Ok(array1(py, state))
+    }
+
+    fn linearise<'py>(
+        &self,
+        py: Python<'py>,
+        u: Values<'py>,
+        state: Values<'py>,
+    ) -> PyResult<Matrices<'py>> {
+        let found = self
+            .inner
+            .linearise(slice(&u, "u")?, slice(&state, "state")?);
+        super::matrices(py, found)
     }
 
     fn jacobian<'py>(
