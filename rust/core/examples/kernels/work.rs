@@ -153,7 +153,7 @@ fn state_space_settings(max_iterations: usize, linear: LinearModel) -> neural_ss
         integrator: false,
         weight_decay: 1e-6,
         hidden_scale: 1.0,
-        guard: true,
+        guard: false,
         max_iterations,
         starts: 1,
         first_start: 0,
