@@ -62,7 +62,7 @@ BEHIND_LARGE = 1.01
 """The same on much data, where held-out errors are sure and iterations dear."""
 FINISHED = 0.995
 """A leg that does not bring the error below this part ends the training."""
-SHARE_OF_VERIFYING, SHARE_OF_FINAL, SHARE_OF_REFIT = 0.55, 0.78, 0.85
+SHARE_OF_VERIFYING, SHARE_OF_FINAL, SHARE_OF_REFIT = 0.55, 0.74, 0.8
 """Parts of a time budget at which each stage has to be done."""
 
 

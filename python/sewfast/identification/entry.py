@@ -33,11 +33,11 @@ _KINDS: dict[str, Callable[[Task], Model]] = {
     "neural_ss": choice.neural_ss,
     "paper": lagged.paper,
 }
-SHARE_OF_FIT = 0.85
+SHARE_OF_FIT = 0.8
 """Of a time budget; the rest is for the evidence that is kept with the model."""
 NETWORKS = ("neural_oe", "neural_ss")
 LINEAR_WIDTH = 10
-EVIDENCE_RATE, LEAST_EVIDENCE = 4e5, 2_000
+EVIDENCE_RATE, LEAST_EVIDENCE = 2.5e5, 2_000
 """Samples times parameters for which evidence is found in a second, on a slow machine."""
 _SEARCHED = ("auto", "neural_ss")
 """Kinds that find their own structure; the others have lags."""

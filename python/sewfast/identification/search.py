@@ -612,7 +612,7 @@ class Search:
         yield from (c.to_json() for c in self.candidates.values())
 
 
-SHARE_OF_GUARD = 0.88
+SHARE_OF_GUARD = 0.82
 SHARE_OF_LINEAR, SHARE_OF_SEARCH = 0.12, 0.48
 """Parts of a time budget after which no linear model, and no network, is tried any more."""
 
