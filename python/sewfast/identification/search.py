@@ -136,7 +136,8 @@ class Search:
         size = TRIAL_SAMPLES_LARGE if self.is_large else TRIAL_SAMPLES
         self.trials = tuple(f.shortened(size, size) for f in self.folds[:2])
         self.linear = LinearTable(self.task, self.folds[:1], self.pool)
-        self.budget = SEARCH_OPERATIONS_LARGE if self.is_large else SEARCH_OPERATIONS
+        self.most = SEARCH_OPERATIONS_LARGE if self.is_large else SEARCH_OPERATIONS
+        self.budget, self.rate = self.most, 0.0
         self._starts: dict[tuple[int, int, str, int], _core.LinearModel | None] = {}
         self._guarded = arrays(self.task.data)
 
@@ -184,9 +185,7 @@ class Search:
         if self.task.hidden is None or self.task.nx is None:
             wanted += [(s, INTEGRATING_ITERATIONS, INTEGRATING_STARTS) for s in self._integrating()]
         wanted += [(s, SCREEN_ITERATIONS, 2) for s in self._lagged()]
-        began, before = time.perf_counter(), self.operations
         found = self.tried([(s, i, self._limited(n)) for s, i, n in wanted], share=0.25)
-        self._calibrate(time.perf_counter() - began, self.operations - before)
         return sorted(found, key=lambda c: c.error)
 
     def halve(self, alive: Sequence[Candidate], iterations: int) -> list[Candidate]:
@@ -509,7 +508,9 @@ class Search:
         until: float | None = None,
     ) -> list[list[Start]]:
         """Starts of every request, looked at by the guard."""
-        self.operations += sum(r.operations for r in requests)
+        wanted = sum(r.operations for r in requests)
+        self.operations += wanted
+        began = time.perf_counter()
         if share is None:
             share = max(self.pool.share, min(0.6, 0.25 + 0.35 * self.operations / self.budget))
         found = train(
@@ -520,6 +521,7 @@ class Search:
             until=self.until if until is None else until,
             share=share,
         )
+        self._calibrate(time.perf_counter() - began, wanted)
         return self.guarded(found)
 
     def guarded(self, found: Sequence[Sequence[Start]]) -> list[list[Start]]:
@@ -599,12 +601,13 @@ class Search:
         return starts if self.task.starts is None else min(starts, self.task.starts)
 
     def _calibrate(self, seconds: float, operations: float) -> None:
-        """Convert what is left of a time budget into multiplications."""
+        """Convert what is left of a time budget into multiplications, by the best speed so far."""
         until = self.until
-        self.rate = operations / max(seconds, 1e-3)
+        # short trainings of small networks say little of the speed of long ones
+        self.rate = max(self.rate, operations / max(seconds, 1e-3))
         if until is not None:
             left = max(0.0, until - time.perf_counter())
-            self.budget = min(self.budget, self.operations + self.rate * left)
+            self.budget = min(self.most, self.operations + self.rate * left)
 
     def rows(self) -> Iterator[Provenance]:
         """The table: linear models, then networks in the order of their trials."""
