@@ -1,6 +1,6 @@
 """Identified models: linear ones and networks, with their files."""
 
-from .base import Model
+from .base import FreeRunJacobian, Model, NotLinearError
 from .ensemble import Ensemble
 from .files import load_model, model_schema
 from .linear import ARX, IV, LinearOE
@@ -11,10 +11,12 @@ __all__ = [
     "ARX",
     "IV",
     "Ensemble",
+    "FreeRunJacobian",
     "LinearOE",
     "Model",
     "NeuralOE",
     "NeuralSS",
+    "NotLinearError",
     "load_model",
     "model_schema",
 ]

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import jsonfile
 from ..dataset import (
@@ -23,7 +25,7 @@ from ..errors import DataError, SettingError, SewfastError
 from .choice import choice_lines, verdict_lines
 
 if TYPE_CHECKING:
-    from ..evidence import Bands, ReportCard
+    from ..evidence import Bands, OperatingPoint, ReportCard
     from ..validation import Validation
 
 FORMAT = "sewfast.model"
@@ -31,6 +33,33 @@ VERSION = 1
 INIT = 20
 """Samples that set the initial state, unless told otherwise."""
 _STEPS_SHOWN = 4
+_OF_LINEAR_MODELS = (
+    "dc_gain", "frequency_response", "poles", "steady_output", "to_continuous", "to_control",
+    "to_scipy", "to_ss", "to_tf", "transfer_function",
+)  # fmt: skip
+"""What other models have about an operating point only."""
+
+
+class NotLinearError(SettingError, AttributeError):
+    """A transfer function, or what follows from one, was asked of a model that has none."""
+
+
+class FreeRunJacobian(NamedTuple):
+    """A free run and its derivatives, all in the output's unit.
+
+    Attributes
+    ----------
+    y : array, shape (N,)
+        The free run.
+    theta : array, shape (N, p)
+        By the parameters, in the order of `Model.theta` and `Model.parameter_names`.
+    state : array, shape (N, s)
+        By the initial state, in the order of `Model.state_names`.
+    """
+
+    y: FloatArray
+    theta: FloatArray
+    state: FloatArray
 
 
 def require_init(init: int) -> None:
@@ -101,6 +130,30 @@ class Model(ABC):
         """Lines about the model itself, for `str`."""
 
     @property
+    @abstractmethod
+    def theta(self) -> FloatArray:
+        """All parameters as one vector, shape (p,), in the order of docs/CONVENTIONS.md, Models.
+
+        Those of a network are in its scaled units.
+        """
+
+    @property
+    @abstractmethod
+    def parameter_names(self) -> tuple[str, ...]:
+        """One name for each entry of `theta`; indices count from 0, those of a_i and b_i from 1."""
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """One name for each entry of an initial state: past outputs, the newest first, or states.
+
+        Past outputs are in the output's unit, states of a state-space model in scaled units.
+        """
+        na = self.orders.get("na")
+        if na is not None:
+            return tuple(f"{self.output_name}(-{i + 1})" for i in range(na))
+        return tuple(f"x[{i}]" for i in range(self.orders["nx"]))
+
+    @property
     def members(self) -> tuple[Model, ...]:
         """The models that an ensemble consists of; a single model has none."""
         return ()
@@ -116,29 +169,62 @@ class Model(ABC):
             "counts_per_rev": per_rev,
         }
 
-    def simulate(self, data: Dataset, *, init: int = INIT) -> list[FloatArray]:
+    @overload
+    def simulate(self, data: Dataset, *, init: int = INIT) -> list[FloatArray]: ...
+    @overload
+    def simulate(
+        self, data: ArrayLike, *, initial_state: ArrayLike | None = None
+    ) -> FloatArray: ...
+
+    def simulate(
+        self,
+        data: Dataset | ArrayLike,
+        *,
+        init: int = INIT,
+        initial_state: ArrayLike | None = None,
+    ) -> list[FloatArray] | FloatArray:
         """Free run: from the inputs and the initial state alone.
 
         Parameters
         ----------
-        data : Dataset
-            Inputs are complete; outputs may be NaN, and are not looked at after the initial ones.
+        data : Dataset or array, shape (N,) or (N, n_inputs)
+            Inputs are complete; outputs of a data set may be NaN, and are not looked at after the
+            initial ones. An array holds inputs alone, in the model's units and at its sample time.
         init : int
             The initial state is estimated from this many measured outputs, the first ones; 0 starts
             from rest.
+        initial_state : array, shape (s,), optional
+            Of a run on an array; its entries are `state_names`. By default rest.
 
         Returns
         -------
-        list of array, shape (N,)
-            One per experiment, in the output's unit, from the first sample on.
+        list of array, shape (N,), or array, shape (N,)
+            In the output's unit, from the first sample on: one per experiment of a data set, of an
+            array the run itself.
 
         Raises
         ------
         DataError
-            Where the data do not fit the model: inputs, sample time, values that are not finite.
+            Where the data do not fit the model: inputs, sample time, shapes, values that are not
+            finite.
+        SettingError
+            For an initial state together with a data set, whose outputs set it.
         FitError
             Where the model is unstable on this input.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import sewfast
+        >>> model = sewfast.LinearOE.from_tf([0.0, 0.5], [1.0, -0.5], Ts=0.01)
+        >>> model.simulate(np.ones(4))
+        array([0.5  , 0.75 , 0.875, 0.9375])
+
+        Inputs before the first sample count as equal to it.
         """
+        if not isinstance(data, Dataset):
+            return self._simulate_array(data, initial_state)
+        _require_no_state(initial_state)
         self._require_match(data)
         try:
             return [self.core.simulate(e.u, self.initial_state(e, init)) for e in data.experiments]
@@ -146,6 +232,93 @@ class Model(ABC):
             # the core looks at every input, too, but does not know where it came from
             data.require_inputs()
             raise
+
+    def _simulate_array(self, u: ArrayLike, initial_state: ArrayLike | None) -> FloatArray:
+        run: FloatArray = self.core.simulate(self._inputs(u), self._state(initial_state))
+        return run
+
+    @overload
+    def jacobian(self, data: Dataset, *, init: int = INIT) -> list[FreeRunJacobian]: ...
+    @overload
+    def jacobian(
+        self, data: ArrayLike, *, initial_state: ArrayLike | None = None
+    ) -> FreeRunJacobian: ...
+
+    def jacobian(
+        self,
+        data: Dataset | ArrayLike,
+        *,
+        init: int = INIT,
+        initial_state: ArrayLike | None = None,
+    ) -> list[FreeRunJacobian] | FreeRunJacobian:
+        """Free run and its derivatives by every parameter and by the initial state.
+
+        The sensitivities run along with the model, so that they are exact: what training, standard
+        errors and bands are computed from. An estimated initial state counts as given.
+
+        Parameters
+        ----------
+        data, init, initial_state
+            As for `simulate`.
+
+        Returns
+        -------
+        FreeRunJacobian or list of it, one per experiment
+            `y` (N,), `theta` (N, p) and `state` (N, s); `parameter_names` and `state_names` name
+            the columns. The median of an ensemble has the derivatives of the member in the middle
+            at each sample; parameters of the others have 0 there.
+
+        Raises
+        ------
+        DataError, SettingError, FitError
+            As for `simulate`; for an ensemble also where any member is unstable on this input.
+        """
+        if not isinstance(data, Dataset):
+            return self._jacobian(self._inputs(data), self._state(initial_state))
+        _require_no_state(initial_state)
+        self._require_match(data)
+        data.require_inputs()
+        return [self._jacobian(e.u, self.initial_state(e, init)) for e in data.experiments]
+
+    def _jacobian(self, u: FloatArray, state: FloatArray) -> FreeRunJacobian:
+        y, rows = self.core.jacobian(u, state)
+        split = rows.shape[1] - len(state)
+        return FreeRunJacobian(y, rows[:, :split], rows[:, split:])
+
+    def linearise(self, u: ArrayLike | None = None) -> OperatingPoint:
+        """The linear model about the equilibrium at constant inputs.
+
+        Parameters
+        ----------
+        u : float or array, shape (n_inputs,), optional
+            By default the middle of the training inputs.
+
+        Returns
+        -------
+        OperatingPoint
+            With A, B, C, D, poles, steady gain and `to_control()`; see
+            `sewfast.evidence.operating_range` for many points at once.
+
+        Raises
+        ------
+        SettingError
+            For an ensemble, whose members are linear models of their own.
+        DataError
+            Where `u` has not one finite value per input, or is not given and the model does not
+            store the range of its training inputs.
+        """
+        from ..evidence.operating import operating_range
+
+        if self.members:
+            raise SettingError(
+                "linearise: expected a single model, received an ensemble; linearise its members"
+            )
+        if u is None:
+            middle = np.mean(np.atleast_2d(self.training.get("input_range", np.nan)), axis=1)
+            given = [np.asarray(middle, dtype=np.float64)]
+        else:
+            given = [np.atleast_1d(np.asarray(u, dtype=np.float64))]
+        return operating_range(self, given).points[0]
 
     def predict(self, data: Dataset, horizon: int = 1, *, init: int = INIT) -> list[FloatArray]:
         """Outputs `horizon` steps ahead of the measured ones.
@@ -217,6 +390,52 @@ class Model(ABC):
         )
         return state
 
+    def _inputs(self, values: ArrayLike) -> FloatArray:
+        """Inputs as (N, n_inputs)."""
+        n = len(self.input_names)
+        expected = "(N,) or (N, 1)" if n == 1 else f"(N, {n})"
+        if values is None or isinstance(values, (str, os.PathLike)):
+            require_dataset(values, "data")
+        try:
+            u = np.array(values, dtype=np.float64, order="C")
+        except (TypeError, ValueError) as e:
+            raise DataError(f"u: expected numbers of shape {expected}, received {e}") from e
+        shape = u.shape
+        if u.ndim == 1 and n == 1:
+            u = u[:, None]
+        if u.ndim != 2 or u.shape[1] != n or len(u) == 0:
+            raise DataError(
+                f"u: expected shape {expected} for {', '.join(self.input_names)}, received "
+                f"{shape}; time comes first"
+            )
+        unknown = np.flatnonzero(~np.isfinite(u).all(axis=1))
+        if len(unknown):
+            raise DataError(
+                f"u: expected finite inputs, received {u[unknown[0]].tolist()} at sample "
+                f"{unknown[0]}; fill it first"
+            )
+        return u
+
+    def _state(self, values: ArrayLike | None) -> FloatArray:
+        """An initial state as the core takes it; None is rest."""
+        rest: FloatArray = self.core.rest_state()
+        if values is None:
+            return rest
+        try:
+            state = np.array(values, dtype=np.float64)
+        except (TypeError, ValueError) as e:
+            raise DataError(
+                f"initial_state: expected numbers of shape {rest.shape}, received {e}"
+            ) from e
+        if state.shape != rest.shape:
+            raise DataError(
+                f"initial_state: expected shape {rest.shape}, one value for each of "
+                f"{', '.join(self.state_names)}; received {state.shape}"
+            )
+        if not np.isfinite(state).all():
+            raise DataError(f"initial_state: expected finite values, received {state.tolist()}")
+        return state
+
     def _require_match(self, data: Dataset) -> None:
         if not isinstance(data, Dataset):
             require_dataset(data, "data")
@@ -256,6 +475,29 @@ class Model(ABC):
         """
         jsonfile.write(path, FORMAT, VERSION, self.to_dict())
 
+    def __eq__(self, other: object) -> bool:
+        """Whether both have the same kind, numbers, names, units and provenance, as in a file."""
+        if not isinstance(other, Model):
+            return NotImplemented
+        return self is other or (type(self) is type(other) and self._text() == other._text())
+
+    def __hash__(self) -> int:
+        return hash((self.kind, self.Ts, self.input_names, self.output_name, self.theta.tobytes()))
+
+    def _text(self) -> str:
+        return json.dumps(self.to_dict(), sort_keys=True, default=repr)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            if name not in _OF_LINEAR_MODELS:
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            one = "members[0]." if self.members else ""
+            raise NotLinearError(
+                f"{name}: expected a linear model, received {self.title}; linearise it about a "
+                f"constant input first, as in model.{one}linearise(u).to_control()"
+            )
+
     def __reduce__(self) -> tuple[Any, ...]:
         # the compiled model is made again from its numbers, as when a file is read
         from .files import restored
@@ -294,3 +536,11 @@ class Model(ABC):
         lines += choice_lines(t, self.output_unit)
         lines += [str(note) for note in t.get("notes", [])]
         return lines + verdict_lines(t)
+
+
+def _require_no_state(initial_state: ArrayLike | None) -> None:
+    if initial_state is not None:
+        raise SettingError(
+            "initial_state: expected with an array of inputs, received with a data set, whose "
+            "first measured outputs set the state (init)"
+        )

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..dataset import FloatArray
 from ..errors import FitError, SettingError
-from .base import Core, Model
+from .base import Core, FreeRunJacobian, Model
 
 Combine: TypeAlias = Literal["median", "mean"]
 COMBINATIONS: tuple[Combine, ...] = ("median", "mean")
@@ -154,6 +154,32 @@ class Ensemble(Model):
         first, *others = (m.orders for m in self.members)
         common = {k: v for k, v in first.items() if all(o.get(k) == v for o in others)}
         return {"members": len(self.members), **common}
+
+    @property
+    def theta(self) -> FloatArray:
+        """The members' parameters, one member after the other."""
+        return np.concatenate([m.theta for m in self.members])
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Those of the members, each with its member's number, counted from 0."""
+        return tuple(f"{i}: {n}" for i, m in enumerate(self.members) for n in m.parameter_names)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """As `parameter_names`."""
+        return tuple(f"{i}: {n}" for i, m in enumerate(self.members) for n in m.state_names)
+
+    def _jacobian(self, u: FloatArray, state: FloatArray) -> FreeRunJacobian:
+        # the core's columns are member by member, parameters and then states of each
+        y, rows = self.core.jacobian(u, state)
+        theta, states, at = [], [], 0
+        for m in self.members:
+            p, s = len(m.theta), len(m.core.rest_state())
+            theta.append(rows[:, at : at + p])
+            states.append(rows[:, at + p : at + p + s])
+            at += p + s
+        return FreeRunJacobian(y, np.hstack(theta), np.hstack(states))
 
     def parameters(self) -> dict[str, Any]:
         members = [

@@ -110,3 +110,12 @@ class Fields:
         if not math.isfinite(number):
             raise self.refuse(name, "a finite number", value)
         return number
+
+
+def entries(shapes: Mapping[str, tuple[int, ...]]) -> tuple[str, ...]:
+    """The name of every entry of matrices that stand one after the other, row by row."""
+    return tuple(
+        name + (f"[{','.join(map(str, index))}]" if index else "")
+        for name, shape in shapes.items()
+        for index in np.ndindex(*shape)
+    )

@@ -43,6 +43,20 @@ class LinearDifference(Model):
         return {"na": self.core.na, "nb": int(self.core.b.shape[1]), "nk": self.core.nk}
 
     @property
+    def theta(self) -> FloatArray:
+        """`[a, b input by input, offset]`, shape (na + nu nb + 1,)."""
+        core = self.core
+        return np.concatenate([core.a, core.b.ravel(), [core.offset]])
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """`a1 ..`, `b1 ..` (of several inputs `b1 of NAME`), `offset`."""
+        nb = self.core.b.shape[1]
+        of = ["" if len(self.core.b) == 1 else f" of {name}" for name in self.input_names]
+        b = [f"b{i + 1}{one}" for one in of for i in range(nb)]
+        return (*(f"a{i + 1}" for i in range(self.core.na)), *b, "offset")
+
+    @property
     def poles(self) -> tuple[complex, ...]:
         """Poles in the z plane, the slowest first."""
         found = [complex(re, im) for re, im in self.core.poles()]

@@ -7,8 +7,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from .. import _core
+from ..dataset import FloatArray
 from .base import Model
-from .fields import Fields
+from .fields import Fields, entries
 
 
 class NeuralOE(Model):
@@ -31,6 +32,19 @@ class NeuralOE(Model):
     def orders(self) -> dict[str, int]:
         settings = self.settings
         return {k: settings[k] for k in ("na", "nb", "nk", "hidden")}
+
+    @property
+    def theta(self) -> FloatArray:
+        """`[W1 row by row, b1, w2, b2, linear]` in scaled units, shape (p,)."""
+        return self.core.theta
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """`W1[i,j]`, `b1[i]`, `w2[i]`, `b2` and, with a bypass, `linear[j]`."""
+        s = self.settings
+        hidden, width = s["hidden"], s["na"] + s["nb"] * s["n_inputs"]
+        shapes = {"W1": (hidden, width), "b1": (hidden,), "w2": (hidden,), "b2": ()}
+        return entries(shapes | ({"linear": (width,)} if s["bypass"] else {}))
 
     def parameters(self) -> dict[str, Any]:
         return {**self.settings, "theta": self.core.theta.tolist()}

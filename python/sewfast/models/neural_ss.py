@@ -9,7 +9,7 @@ import numpy as np
 from .. import _core
 from ..dataset import Dataset, FloatArray
 from .base import INIT, Model
-from .fields import Fields
+from .fields import Fields, entries
 
 OUTPUTS = ("linear", "saturation", "abs")
 
@@ -39,6 +39,24 @@ class NeuralSS(Model):
     def orders(self) -> dict[str, int]:
         settings = self.settings
         return {k: settings[k] for k in ("nx", "nk", "hidden")}
+
+    @property
+    def theta(self) -> FloatArray:
+        """`[A, B, E, Wx, Wu, bh, C, D, c, G]`, row by row, in scaled units, shape (p,)."""
+        return self.core.theta
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """`A[i,j]` and so on, in the order of `theta`."""
+        s = self.settings
+        nx, nu, hidden = s["nx"], s["n_inputs"], s["hidden"]
+        return entries(
+            {
+                "A": (nx, nx), "B": (nx, nu), "E": (nx, hidden), "Wx": (hidden, nx),
+                "Wu": (hidden, nu), "bh": (hidden,), "C": (1, nx), "D": (1, nu), "c": (1,),
+                "G": (1, hidden),
+            }
+        )  # fmt: skip
 
     def states(self, data: Dataset, *, init: int = INIT) -> list[FloatArray]:
         """States of the free run.
