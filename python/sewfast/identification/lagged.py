@@ -13,7 +13,9 @@ from ..dataset import Experiment
 from ..errors import FitError, Interrupted
 from ..models import LinearOE, Model, NeuralOE
 from ..models.base import INIT
+from .folds import folds
 from .linear import linear_fit
+from .orders import is_misled, raised
 from .task import (
     Provenance,
     Task,
@@ -78,19 +80,20 @@ def neural_oe(task: Task) -> Model:
     all data without them, and a note says so.
     """
     began = time.perf_counter()
-    linear = linear_fit(task, began)
+    linear = linear_fit(task, began).model
+    start = _start(task, linear)
     if not task.select:
-        fit = _network_fit(task, linear, DECAYS[-1], began)
+        fit = _network_fit(task, start, DECAYS[-1], began)
         return _network_model(task, fit, began, {"weight_decay": DECAYS[-1], "selected": False})
     trial = task if task.validation is not None else _with_blocks_held_out(task)
-    network, decays = _selected_network(trial, linear, began)
+    network, decays = _selected_network(trial, start, began)
     choice = _comparison(trial, linear, network)
     provenance = {"samples_fitted": len(trial.data), **decays}
     if len(network.trace) > 1 and not _is_still_linear(choice):
         return _network_model(task, network, began, provenance | _choice_provenance(choice))
     # a strong decay would take the network back to its linear part
     everything = replace(task, validation=None)
-    network = _network_fit(everything, linear, DECAYS[-1], began)
+    network = _network_fit(everything, start, DECAYS[-1], began)
     _require_trained(task, network)
     choice["reason"] += "; no step of the training did better on held-out blocks"
     provenance = {**decays, "samples_fitted": len(task.data), "weight_decay": DECAYS[-1]}
@@ -119,8 +122,31 @@ def _is_still_linear(choice: Provenance) -> bool:
 # --- fits -------------------------------------------------------------------------------------
 
 
+def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
+    """Where the training begins: the linear model, or a smaller one that is misled less.
+
+    Networks that begin at a slow pole which the drive has not (`orders.is_misled`) hardly ever find
+    away from it.
+    """
+    orders = task.orders
+    na, nb = orders["na"] - 1, orders["nb"] - 1
+    parts = folds(task.data, task.validation)
+    if na < 1 or nb < 1 or not parts:
+        return linear
+    learned = arrays(parts[0].fitted)
+    models = []
+    for a, b in ((na, nb), (orders["na"], orders["nb"])):
+        options = task.fit_options(na=a, nb=b, nk=orders["nk"])
+        try:
+            models.append(_core.fit_oe(learned, **options).model)
+        except FitError:
+            return linear
+    smaller, own = models
+    return raised(smaller, orders["na"]) if is_misled(own, smaller, parts[0]) else linear
+
+
 def _selected_network(
-    task: Task, linear: _core.LinearFit, began: float
+    task: Task, linear: _core.LinearModel, began: float
 ) -> tuple[_core.NeuralFit, Provenance]:
     """The network with the strongest weight decay that does about as well as the best.
 
@@ -142,14 +168,14 @@ def _selected_network(
 
 
 def _network_fit(
-    task: Task, linear: _core.LinearFit, decay: float, began: float
+    task: Task, linear: _core.LinearModel, decay: float, began: float
 ) -> _core.NeuralFit:
     fit = _core.fit_neural_oe(
         arrays(task.data),
         [] if task.validation is None else arrays(task.validation),
         **task.orders,
         hidden=task.hidden_or_usual,
-        linear=linear.model,
+        linear=linear,
         u_mean=None,
         u_scale=None,
         y_mean=None,
@@ -211,12 +237,12 @@ _NOTHING_HELD_OUT: Provenance = {
 }
 
 
-def _comparison(task: Task, linear: _core.LinearFit, network: _core.NeuralFit) -> Provenance:
+def _comparison(task: Task, linear: _core.LinearModel, network: _core.NeuralFit) -> Provenance:
     """Free-run errors of both on data not trained on, the choice and its reason."""
     if task.validation is None:
         return _NOTHING_HELD_OUT
     rmse = {
-        "oe": free_run_rmse(wrap(LinearOE, linear.model, task.data), task.validation),
+        "oe": free_run_rmse(wrap(LinearOE, linear, task.data), task.validation),
         "neural_oe": free_run_rmse(wrap(NeuralOE, network.model, task.data), task.validation),
     }
     is_better = network.sound and rmse["neural_oe"] < WORTH_IT * rmse["oe"]

@@ -11,6 +11,7 @@ from .. import _core
 from ..dataset import Dataset, FloatArray
 from ..errors import FitError
 from ..models.base import INIT
+from .effort import Look
 from .task import Pairs
 
 OUTPUTS = ("linear", "saturation", "abs")
@@ -26,8 +27,10 @@ SHARPNESS = 4.0
 """How many times denser than its surroundings a pile is."""
 MEMORIES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98)
 """Poles of the low-pass filters whose sign is the first guess of the output's."""
-ROUNDS = 12
-SIGN_SAMPLES = 3_000
+FIRST_ROUNDS, ROUNDS = 2, 12
+"""Of all first guesses; of the better two."""
+SIGN_SAMPLES = 2_000
+"""Of all experiments together: signs are found in turns, and every turn is a fit."""
 
 
 @dataclass(frozen=True)
@@ -119,27 +122,50 @@ def _may_be_rectified(y: FloatArray) -> bool:
 # --- a linear start behind a rectifier ----------------------------------------------------------
 
 
-def rectified_start(data: Dataset, order: int, nk: int) -> _core.LinearModel | None:
+def rectified_start(
+    data: Dataset, order: int, nk: int, look: Look | None = None
+) -> _core.LinearModel | None:
     """The linear model whose magnitude comes nearest to a rectified output.
 
     Signs and model in turns: the model's own sign goes onto the measured magnitude, and output
     error is fitted to that, from the signs of the input through low-pass filters of several
     memories (alternating projections, as for the phase of a diffraction pattern: Fienup 1982).
     """
-    pairs = [(e.u[:SIGN_SAMPLES], e.y[:SIGN_SAMPLES]) for e in data.experiments]
-    tried = [_restored(pairs, order, nk, memory) for memory in MEMORIES]
-    return min(tried, key=lambda t: t[0])[1]
+    share = min(1.0, SIGN_SAMPLES / len(data))
+    lengths = [max(2 * INIT, round(share * len(e))) for e in data.experiments]
+    pairs = [(e.u[:n], e.y[:n]) for e, n in zip(data.experiments, lengths, strict=True)]
+    guesses = [[_sign(_low_pass(u, memory)) for u, _ in pairs] for memory in MEMORIES]
+    tried = [_restored(pairs, g, order, nk, FIRST_ROUNDS, look) for g in guesses]
+    likely = sorted(tried, key=lambda t: t.error)[:2]
+    tried = [_restored(pairs, t.signs, order, nk, ROUNDS - FIRST_ROUNDS, look, t) for t in likely]
+    return min(tried, key=lambda t: t.error).model
+
+
+@dataclass(frozen=True)
+class _Restored:
+    """A model, its squared error, and the signs that it gives to the output."""
+
+    error: float
+    model: _core.LinearModel | None
+    signs: list[FloatArray]
 
 
 def _restored(
-    pairs: Pairs, order: int, nk: int, memory: float
-) -> tuple[float, _core.LinearModel | None]:
-    signs = [_sign(_low_pass(u, memory)) for u, _ in pairs]
-    best: tuple[float, _core.LinearModel | None] = (np.inf, None)
-    for _ in range(ROUNDS):
+    pairs: Pairs,
+    signs: list[FloatArray],
+    order: int,
+    nk: int,
+    rounds: int,
+    look: Look | None,
+    best: _Restored | None = None,
+) -> _Restored:
+    best = best or _Restored(np.inf, None, signs)
+    for _ in range(rounds):
         signed = [(u, y * s) for (u, y), s in zip(pairs, signs, strict=True)]
         try:
-            fit = _core.fit_oe(signed, na=order, nb=order + 1, nk=nk, max_iterations=15)
+            fit = _core.fit_oe(
+                signed, na=order, nb=order + 1, nk=nk, max_iterations=15, progress=look
+            )
             runs = [_run(fit, i, u) for i, (u, _) in enumerate(signed)]
         except FitError:
             break
@@ -147,9 +173,9 @@ def _restored(
             float(np.nansum((np.abs(run) - np.abs(y)) ** 2))
             for run, (_, y) in zip(runs, pairs, strict=True)
         )
-        if error < best[0]:
-            best = (error, fit.model)
         following = [_sign(run) for run in runs]
+        if error < best.error:
+            best = _Restored(error, fit.model, following)
         if all(np.array_equal(a, b) for a, b in zip(signs, following, strict=True)):
             break
         signs = following

@@ -47,7 +47,7 @@ LEAST_STEP = 0.01
 """Relative gain of a step that is taken where the gain is known to be one."""
 WORTH_A_FEEDTHROUGH = 0.5
 """nk = 0 is no plant for a loop, and a smoothed speed leans ahead a little: it must be worth it."""
-WORTH_A_RECTIFIER = 0.9
+WORTH_A_RECTIFIER = 0.8
 FAR_BEHIND = 2.0
 """A kind of network whose best is this many times worse than the other's climbs no further."""
 ROUNDS = 6
@@ -304,12 +304,14 @@ class Search:
         return [o for o in suggested(data) if o != ABS or self._is_rectified()]
 
     def _is_rectified(self) -> bool:
-        """Whether a linear model behind a rectifier does better than one without."""
-        plain, behind = self.start(2, self.nk, LINEAR), self.start(2, self.nk, ABS)
-        if plain is None or behind is None:
-            return behind is not None
+        """Whether a linear model behind a rectifier does better than any without."""
+        behind = self.start(2, self.nk, ABS)
+        if behind is None:
+            return False
         pairs = arrays(self.trials[0].fitted)
-        return rms_error(behind, pairs, np.abs) < WORTH_A_RECTIFIER * rms_error(plain, pairs)
+        plain = [c.models[0] for c in self.linear.eligible if c.order <= 2]
+        bound = min((rms_error(m, pairs) for m in plain if m is not None), default=math.inf)
+        return rms_error(behind, pairs, np.abs) < WORTH_A_RECTIFIER * bound
 
     def _integrating(self) -> list[Structure]:
         """Small networks behind an integrator, where a linear pole is nearly 1."""
@@ -584,7 +586,7 @@ class Search:
             s, data = job[1], self.trials[fold].fitted
             try:
                 if s.output == ABS:
-                    return rectified_start(data, s.nx, s.nk)
+                    return rectified_start(data, s.nx, s.nk, look)
                 return _core.fit_oe(
                     arrays(self.trials[fold].shortened(6_000, 6_000).fitted),
                     na=s.nx, nb=s.nx + 1, nk=s.nk, max_iterations=60, progress=look,
@@ -592,7 +594,7 @@ class Search:
             except FitError:
                 return None
 
-        for (key, _), model in zip(missing, self.pool.map(fit, missing), strict=True):
+        for (key, _), model in zip(missing, self.pool.map(fit, missing, until=self.until), strict=True):
             self._starts[key] = model
 
     # --- effort ---------------------------------------------------------------------------------
