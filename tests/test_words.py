@@ -1,4 +1,4 @@
-"""What `validate`, `check` and the text of a model say: units, one closing sentence, no false comfort."""
+"""What `validate`, `check` and the text of a model say: units, a closing sentence, no flattery."""
 
 from __future__ import annotations
 
