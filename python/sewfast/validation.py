@@ -16,6 +16,8 @@ from .models.base import INIT, Model, require_init
 
 GOOD, FAIR, POOR = 90.0, 70.0, 30.0
 """Percent of the free run's fit from which a model is good, fair, poor; below it is useless."""
+FEW = 100
+"""Scored samples below which a verdict has little to go by."""
 AT_THE_NOISE = 1.5
 """Below this multiple of the measurement noise an error leaves nothing to be explained."""
 
@@ -153,6 +155,10 @@ class Validation:
     @property
     def verdict(self) -> str:
         """The grade in a sentence."""
+        few = f"; {self.n} samples are few to judge by" if self.n < FEW else ""
+        return self._judged() + few
+
+    def _judged(self) -> str:
         fit = f"fit {self.simulation.fit_percent:.1f} % in free run"
         if self.grade == "good" and self.simulation.fit_percent < GOOD:
             return f"good enough to tune a controller on: {fit}, and what is left is noise"
