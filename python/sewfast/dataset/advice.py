@@ -75,7 +75,7 @@ def _values(c: ColumnSummary) -> Iterator[str]:
         moves = "excites the plant" if c.role == "input" else "follows the input"
         yield f"{c.name} is constant at {c.low:g}: there is nothing to learn until it {moves}"
     elif c.high - c.low < SMALLEST_FITTED:
-        yield f"{c.name} moves by {c.high - c.low:g} alone, which no fit can square: change the unit"
+        yield f"{c.name} moves by {c.high - c.low:g}, too little to be squared: change the unit"
 
 
 def _outliers(found: Summary, name: str) -> str:

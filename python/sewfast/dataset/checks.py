@@ -144,8 +144,8 @@ def require_fittable(data: Dataset) -> None:
         low, high = range_of(column)
         if high - low < SMALLEST_FITTED:
             raise DataError(
-                f"{data.source}, {name!r}: expected values that differ by {SMALLEST_FITTED:g} or more, "
-                f"received {low:g} to {high:g}; change the unit, or check the column"
+                f"{data.source}, {name!r}: expected values that differ by {SMALLEST_FITTED:g} or "
+                f"more, received {low:g} to {high:g}; change the unit, or check the column"
             )
 
 
