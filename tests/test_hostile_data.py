@@ -119,6 +119,17 @@ def test_one_wild_value_does_not_make_a_model_good() -> None:
     assert verdict["grade"] == "useless"
 
 
+def test_a_short_experiment_does_not_keep_the_others_from_a_search() -> None:
+    lengths = (600, 40, 300)
+    data = Dataset.concat([dataset(*record(n)) for n in lengths])
+    training = identify(data, time_budget=2.0).training
+    assert training["verdict"]["grade"] == "good"
+    assert len(training["choice"]["candidates"]) > 1
+    assert len(training["choice"]["held_out"]) == 2
+    few = identify(Dataset.concat([dataset(*record(40)) for _ in range(5)]), time_budget=1.0)
+    assert "too short" in few.training["choice"]["reason"]
+
+
 # --- interruptions --------------------------------------------------------------------------------
 
 

@@ -69,7 +69,9 @@ class Split:
 
 
 def split(data: Dataset, skipped: float = 0.0) -> Split | None:
-    """Hold out the end of every experiment; None where they are too short for that.
+    """Hold out the end of every experiment that is long enough; None where none is.
+
+    A short one is learned from as a whole: it must not keep the others from being compared on.
 
     Parameters
     ----------
@@ -84,7 +86,8 @@ def split(data: Dataset, skipped: float = 0.0) -> Split | None:
         stop = round((1.0 - skipped) * len(e))
         at = stop - round(SHARE * len(e))
         if stop - at < LEAST_HELD_OUT or at < LEAST_HELD_OUT:
-            return None
+            fitted.append(e)
+            continue
         if min(_measured(e.y[:at]), _measured(e.y[at:stop])) < LEAST_HELD_OUT:
             # a long gap has left too little on one side to be split
             fitted.append(e.cut(0, stop))
