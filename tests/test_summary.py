@@ -79,7 +79,7 @@ def test_the_spectrum_holds_the_power() -> None:
         (excited(), np.minimum(excited(1), 0.5), "y stays at 0.5 for 3"),
         (excited(), np.random.default_rng(0).standard_normal(N), "of what y does: excite"),
         (excited(), np.sin(T), "data.resample"),
-        (excited(), np.where(T[7] == T, np.inf, excited(1)), "1 values of y are infinite"),
+        (excited(), np.where(T[7] == T, np.inf, excited(1)), "1 value of y is infinite"),
         (
             excited(),
             np.sin(9 * T) + 5.0 * (T[777] == T),

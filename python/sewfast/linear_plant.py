@@ -53,12 +53,13 @@ def _of_model(model: Any, Ts: float, speed: float | None) -> tuple[FloatArray, F
         return num[0].copy(), den
     if model.members:
         raise SettingError(
-            "expected one linear plant, received an ensemble; take margins of each of its members"
+            "expected one plant, received an ensemble; take the margins of each of its members, or "
+            "analyse the controller on all of them"
         )
     if speed is None:
         raise SettingError(
             "expected the speed at which the nonlinear model is linearised, received none; give "
-            "speed, or a point of sewfast.evidence.operating_range(model)"
+            "speed, or the linear model about a command: model.linearise(u)"
         )
     return _of_point(operating_point(model, speed), Ts)
 
@@ -75,6 +76,8 @@ def operating_point(model: Any, speed: float) -> Any:
 
     low, high = model.training.get("input_range", [[-1.0, 1.0]])[0]
     grid = operating_range(model, [np.array([u]) for u in np.linspace(low, high, _GRID)]).points
+    if not any(p.settled for p in grid) and any(p.drift for p in grid):
+        return _integrating_point(model, grid, speed)
     pairs = [p for p in itertools.pairwise(grid) if (p[0].y - speed) * (p[1].y - speed) <= 0.0]
     if not pairs:
         reached = [p.y for p in grid]
@@ -91,6 +94,27 @@ def operating_point(model: Any, speed: float) -> Any:
         else:
             above = found
     return _require_steady(above, speed)
+
+
+def _integrating_point(model: Any, grid: Any, level: float) -> Any:
+    """Where an integrator keeps its output: at a command of its own, at any level."""
+    from .evidence.operating import operating_range, point_at_level
+
+    pairs = [p for p in itertools.pairwise(grid) if p[0].drift * p[1].drift <= 0.0]
+    if not pairs:
+        raise SettingError(
+            "expected a command at which the integrating model keeps its output, received none: "
+            f"from {grid[0].u[0]:.4g} to {grid[-1].u[0]:.4g} it always moves the same way; record "
+            "both ways and identify again"
+        )
+    below, above = pairs[0]
+    for _ in range(_HALVINGS):
+        found = operating_range(model, [0.5 * (below.u + above.u)]).points[0]
+        if found.drift * below.drift > 0.0:
+            below = found
+        else:
+            above = found
+    return _require_steady(point_at_level(model, above.u, level), level)
 
 
 def _require_steady(point: Any, speed: float) -> Any:

@@ -8,6 +8,8 @@ import numpy as np
 
 from .control import Controller, Fopdt, Gains, fit_fopdt, table_1
 from .errors import DataError, FitError, SettingError
+from .evidence.linearised import linearise
+from .evidence.residuals import representative
 from .loop import Plant, plant_units
 from .models import Model
 from .units import REVOLUTIONS_PER_SECOND
@@ -17,6 +19,8 @@ DERIVATIVE_FILTER = 10.0
 _STEP_SHARES = (0.25, 0.5, 0.1)
 """Shares of u_max that the first step response is looked for at."""
 _STEP_SAMPLES = (4_000, 16_000)
+_INTEGRATES = 1e-5
+"""Distance of a pole from 1 below which a step takes far longer than these."""
 
 
 def first_controller(
@@ -99,7 +103,20 @@ def _step_fit(model: Model, u_max: float) -> Fopdt:
                 return fit_fopdt(u, y, Ts=model.Ts)
             except (DataError, FitError) as error:
                 reason = error
+    if _integrates(model):
+        raise FitError(
+            "expected a model whose step response settles, received one that integrates its input, "
+            "as a position does; give a controller to start from, or identify the rate: "
+            "differentiate the recorded output"
+        ) from reason
     raise FitError(
         f"expected a model whose step response settles, got none up to u = {0.5 * u_max:g} "
         f"({reason}); give a controller to start from"
     ) from reason
+
+
+def _integrates(model: Model) -> bool:
+    """Whether a pole lies at 1, or so near that no step within reach settles."""
+    small = linearise(representative(model).core, np.zeros(1))
+    finite = bool(np.isfinite(small.A).all())
+    return finite and bool(np.any(np.abs(np.linalg.eigvals(small.A) - 1.0) < _INTEGRATES))

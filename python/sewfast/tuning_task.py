@@ -116,8 +116,8 @@ class TuningTask:
             plants = list(given) if isinstance(given, (list, tuple)) else [given]
         if not plants:
             raise SettingError(
-                "expected a linear plant to take Ms on, got none among the plants; give "
-                "Constraints(plant=...), for example a linear model of the same drive"
+                "expected a linear plant to take Ms on, got none among the plants; add a linear "
+                "model of the same drive to them"
             )
         return [sampled(plant, self.start.Ts, self.constraints.speed) for plant in plants]
 

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from .dataset import Dataset, Experiment, FloatArray, require_dataset
+from .dataset.noise import white_noise
 from .errors import DataError
 from .models.base import INIT, Model, require_init
+
+GOOD, FAIR, POOR = 90.0, 70.0, 30.0
+"""Percent of the free run's fit from which a model is good, fair, poor; below it is useless."""
+FEW = 100
+"""Scored samples below which a verdict has little to go by."""
+AT_THE_NOISE = 1.5
+"""Below this multiple of the measurement noise an error leaves nothing to be explained."""
 
 
 @dataclass(frozen=True)
@@ -133,6 +142,35 @@ class Validation:
     def unmeasured(self) -> int:
         return sum(e.unmeasured for e in self.experiments)
 
+    @property
+    def noise(self) -> float:
+        """White measurement noise of what is scored against [unit]; NaN where unknown."""
+        return noise_of([e.y for e in self.experiments])
+
+    @property
+    def grade(self) -> str:
+        """`good`, `fair`, `poor` or `useless` by the free run; empty where y is constant."""
+        return grade_of(self.simulation.fit_percent, self.simulation.rmse, self.noise)
+
+    @property
+    def verdict(self) -> str:
+        """The grade in a sentence."""
+        few = f"; {self.n} samples are few to judge by" if self.n < FEW else ""
+        return self._judged() + few
+
+    def _judged(self) -> str:
+        fit = f"fit {self.simulation.fit_percent:.1f} % in free run"
+        if self.grade == "good" and self.simulation.fit_percent < GOOD:
+            return f"good enough to tune a controller on: {fit}, and what is left is noise"
+        return {
+            "": "the output is constant here: only the size of the error says something",
+            "good": f"good enough to tune a controller on: {fit}",
+            "fair": f"good enough for a first, cautious controller: {fit}",
+            "poor": f"not good enough to tune a controller on: {fit}",
+            "useless": f"useless here, {_beside_a_constant(self.simulation)}: {fit}; check the "
+            "columns, or record data like these and identify again",
+        }[self.grade]
+
     def to_json(self) -> dict[str, Any]:
         """Scores as JSON values."""
         return {
@@ -143,6 +181,8 @@ class Validation:
             "unmeasured": self.unmeasured,
             "unit": self.unit,
             "against": self.against,
+            "grade": self.grade or None,
+            "verdict": self.verdict,
             "experiments": [
                 {
                     "name": e.name,
@@ -177,10 +217,45 @@ class Validation:
             lines += [
                 _row(f"  {i + 1}, free run", e.simulation_scores) for i, e in self._numbered()
             ]
-        return "\n".join([*lines, *(f"note: {n}" for n in self.notes)])
+        notes = [f"note: {n}" for n in self.notes]
+        return "\n".join([*lines, *notes, f"verdict: {self.verdict}"])
 
     def _numbered(self) -> list[tuple[int, ExperimentErrors]]:
         return list(enumerate(self.experiments))
+
+
+def noise_of(outputs: Sequence[FloatArray]) -> float:
+    """White measurement noise of outputs (N,), pooled; NaN where unknown."""
+    found = [white_noise(y) for y in outputs]
+    known = [n for n in found if math.isfinite(n)]
+    return math.sqrt(sum(n * n for n in known) / len(known)) if known else math.nan
+
+
+def grade_of(fit: float, rmse: float, noise: float) -> str:
+    """`good`, `fair`, `poor` or `useless`; empty where the output is constant.
+
+    An error of the size of the measurement noise is good though the fit is not: no model can do
+    better. Where the output itself is hardly larger than its noise, that shows nothing, so a fit
+    below `POOR` is useless all the same.
+
+    Parameters
+    ----------
+    fit : float
+        Of the free run [%].
+    rmse, noise : float
+        Its error, and the white measurement noise of the output, in one unit.
+    """
+    if not math.isfinite(fit):
+        return ""
+    explained = fit >= POOR and rmse <= AT_THE_NOISE * noise
+    if fit >= GOOD or explained:
+        return "good"
+    return "fair" if fit >= FAIR else "poor" if fit >= POOR else "useless"
+
+
+def _beside_a_constant(scores: Scores) -> str:
+    worse = scores.fit_percent < 0.0
+    return "worse than a constant" if worse else "hardly better than a constant"
 
 
 def validate(

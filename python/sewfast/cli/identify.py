@@ -146,10 +146,13 @@ def identify_command(args: argparse.Namespace) -> int | None:
         e.best.save(args.out)
         print(f"interrupted; kept the best so far in {args.out}", file=sys.stderr)
         return 130
-    scores = _scores(model, train, held)
     model.save(args.out)
-    others = _save_alternatives(args, model) if args.alternatives else []
-    _show(args, model, scores, others)
+    try:
+        others = _save_alternatives(args, model) if args.alternatives else []
+        _show(args, model, _scores(model, train, held), others)
+    except KeyboardInterrupt:
+        print(f"interrupted; the model is in {args.out}, it was not scored", file=sys.stderr)
+        return 130
     return None
 
 

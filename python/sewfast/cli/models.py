@@ -26,7 +26,8 @@ VALIDATE = """\
 Score a model on a recording that it was not trained on, in free run and one step ahead.
 
 Free run is the headline: the model starts once and lives with its own outputs, as it does when a
-controller is tuned on it. One step ahead is put right by the measured output at every sample.
+controller is tuned on it. One step ahead starts from the measured output at every sample: that
+looks good for models that are of no use alone, and bad where the outputs are noisy.
 """
 
 VALIDATE_EXAMPLES = """\

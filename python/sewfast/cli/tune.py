@@ -75,8 +75,13 @@ def add(commands: Commands) -> None:
         help="encoder in the loop; default: the model's own, else 1572 where the output is a speed",
     )  # fmt: skip
     parser.add_argument(
-        "--filter", type=int, default=8, metavar="N",
+        "--filter", type=int, metavar="N",
         help="moving average over N samples of the feedback (8); 1: none",
+    )  # fmt: skip
+    parser.add_argument(
+        "--start", metavar="CONTROLLER.json",
+        help="what the search begins with, its limits, encoder and filters included; default: "
+        "Table 1 on the first model's step response",
     )  # fmt: skip
     _add_search(parser)
     add_output(parser, "CONTROLLER.json", "controller file to write", required=True)
@@ -179,6 +184,31 @@ def _settings(args: argparse.Namespace) -> dict[str, Any]:
     return settings
 
 
+def _first(args: argparse.Namespace, model: Any) -> dict[str, Any]:
+    """The controller to begin with, or limits, encoder and filter of the one to be found.
+
+    Raises
+    ------
+    SettingError
+        For both.
+    """
+    if args.start is None:
+        return _loop(args, model)
+    from ..control import load_controller
+
+    given = [
+        "--" + option.replace("_", "-")
+        for option in ("u_min", "u_max", "limits_of", "counts_per_rev", "filter")
+        if getattr(args, option) is not None
+    ]
+    if given:
+        raise SettingError(
+            "--start: the controller brings its own limits, encoder and filters; leave out "
+            f"{', '.join(given)}, or change them in {args.start}"
+        )
+    return {"start": load_controller(args.start)}
+
+
 def _loop(args: argparse.Namespace, model: Any) -> dict[str, Any]:
     """Limits, encoder and filter of the first controller."""
     u_min, u_max = _command_limits(args)
@@ -187,7 +217,7 @@ def _loop(args: argparse.Namespace, model: Any) -> dict[str, Any]:
         "u_min": u_min,
         "u_max": u_max,
         "counts_per_rev": counts,
-        "filter_samples": args.filter,
+        "filter_samples": 8 if args.filter is None else args.filter,
     }
 
 
@@ -198,7 +228,7 @@ def _tuned(
 
     with Progress("tune") as progress:
         return tune(
-            models, references, **_loop(args, models[0]), **settings, method=args.method,
+            models, references, **_first(args, models[0]), **settings, method=args.method,
             time_budget=args.time_budget, progress=progress,
         )  # fmt: skip
 
@@ -209,7 +239,8 @@ def _front(
     from ..front import pareto
     from ..starting import first_controller
 
-    start = first_controller(models[0], **_loop(args, models[0]))
+    first = _first(args, models[0])
+    start = first.get("start") or first_controller(models[0], **first)
     with Progress("tune") as progress:
         return pareto(
             models, references, objectives=args.pareto.split(","), start=start, **settings,

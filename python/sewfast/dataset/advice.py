@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from .checks import SMALLEST_FITTED
+
 if TYPE_CHECKING:
     from .summary import ColumnSummary, Summary
 
@@ -47,8 +49,9 @@ def advice(found: Summary) -> Iterator[str]:
 def _values(c: ColumnSummary) -> Iterator[str]:
     if c.unusable:
         yield (
-            f"{c.unusable} values of {c.name} are infinite or 1e150 and more, as no sensor gives "
-            "them: repair the file"
+            f"{c.unusable} {'value' if c.unusable == 1 else 'values'} of {c.name} "
+            f"{'is' if c.unusable == 1 else 'are'} infinite or 1e150 and more, as no sensor gives "
+            f"{'it' if c.unusable == 1 else 'them'}: repair the file"
             + (
                 ", or mask them: data.mask(lambda e: abs(e.y) > LIMIT)"
                 if c.role == "output"
@@ -68,9 +71,11 @@ def _values(c: ColumnSummary) -> Iterator[str]:
             f"{c.name} was not measured at {c.missing} samples ({c.missing / c.n:.1%}): they have "
             "no weight, models run through them; nothing needs to be done"
         )
-    elif not c.moves:
+    elif not c.moves and not math.isnan(c.low):
         moves = "excites the plant" if c.role == "input" else "follows the input"
         yield f"{c.name} is constant at {c.low:g}: there is nothing to learn until it {moves}"
+    elif c.high - c.low < SMALLEST_FITTED:
+        yield f"{c.name} moves by {c.high - c.low:g}, too little to be squared: change the unit"
 
 
 def _outliers(found: Summary, name: str) -> str:
@@ -97,7 +102,9 @@ def _limits(output: ColumnSummary) -> Iterator[str]:
 
 
 def _noise(output: ColumnSummary) -> Iterator[str]:
-    if output.moves and math.isfinite(output.noise) and output.noise > NOISY * output.std:
+    # the square of a tiny output may be 0
+    known = output.moves and output.std > 0.0 and math.isfinite(output.noise)
+    if known and output.noise > NOISY * output.std:
         yield (
             f"white noise is {output.noise / output.std:.0%} of what {output.name} does: excite "
             "more strongly or record longer; prefer output error to arx, which noise bends"

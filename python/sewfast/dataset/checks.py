@@ -96,20 +96,22 @@ def require_complete(data: Dataset) -> None:
 
 LARGEST = 1e150
 """Magnitude from which on squares leave the numbers: no measured quantity."""
+LARGEST_FITTED, SMALLEST_FITTED = 1e60, 1e-60
+"""Magnitude and range between which covariances and their inverses stay within the numbers."""
 
 
-def require_sane(data: Dataset) -> None:
+def require_sane(data: Dataset, largest: float = LARGEST) -> None:
     """Raise `DataError` where a value is infinite or beyond any measured quantity; NaN is none."""
     for e in data.experiments:
         columns = zip((*data.input_names, data.output_name), (*e.u.T, e.y), strict=True)
         for name, column in columns:
-            bad = np.abs(column) >= LARGEST
+            bad = np.abs(column) >= largest
             if bad.any():
                 k = int(np.argmax(bad))
                 raise DataError(
-                    f"{e.name}, {name!r}: expected finite values, or NaN where nothing is known, "
-                    f"received {column[k]:g} at sample {e.start + k} (0-based); set it to NaN "
-                    "(of an output: Dataset.mask)"
+                    f"{e.name}, {name!r}: expected finite values below {largest:g}, or NaN where "
+                    f"nothing is known, received {column[k]:g} at sample {e.start + k} (0-based); "
+                    "set it to NaN (of an output: Dataset.mask), or change the unit"
                 )
 
 
@@ -128,6 +130,23 @@ def require_excited(data: Dataset) -> None:
             f"{data.source}: output {data.output_name!r} is constant at {ranges[0][0]:g}; expected "
             "an output that follows the input; check the column and the sensor"
         )
+
+
+def require_fittable(data: Dataset) -> None:
+    """Raise `DataError` where values are so large, or move so little, that no fit can square them.
+
+    To be asked after `require_measured`: infinite values are named there.
+    """
+    require_sane(data, LARGEST_FITTED)
+    columns = [*np.concatenate([e.u for e in data.experiments]).T]
+    columns.append(np.concatenate([e.y for e in data.experiments]))
+    for name, column in zip((*data.input_names, data.output_name), columns, strict=True):
+        low, high = range_of(column)
+        if high - low < SMALLEST_FITTED:
+            raise DataError(
+                f"{data.source}, {name!r}: expected values that differ by {SMALLEST_FITTED:g} or "
+                f"more, received {low:g} to {high:g}; change the unit, or check the column"
+            )
 
 
 def require_finite(column: FloatArray, what: str, start: int, remedy: str) -> None:

@@ -59,8 +59,13 @@ class Dataset:
     def __post_init__(self) -> None:
         if not self.experiments:
             raise DataError("expected at least one experiment, received none")
-        if isinstance(self.Ts, bool) or not (math.isfinite(self.Ts) and self.Ts > 0):
-            raise DataError(f"Ts: expected a positive sample time in seconds, received {self.Ts}")
+        try:
+            given = math.nan if isinstance(self.Ts, bool) else float(self.Ts)
+        except (TypeError, ValueError):
+            given = math.nan
+        if not 0.0 < given < math.inf:
+            raise DataError(f"Ts: expected a positive sample time in seconds, received {self.Ts!r}")
+        object.__setattr__(self, "Ts", given)
         widths = sorted({e.u.shape[1] for e in self.experiments})
         if len(widths) > 1:
             raise DataError(
@@ -109,7 +114,7 @@ class Dataset:
         default = ("u",) if width == 1 else tuple(f"u{i + 1}" for i in range(width))
         return cls(
             (experiment,),
-            float(Ts),
+            Ts,
             texts(input_names, default),
             output_name,
             texts(input_units, ("",) * width),

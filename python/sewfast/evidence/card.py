@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from .lines import Judged, Line, Verdict
+from .summary import summary
 
 if TYPE_CHECKING:
     from ..dataset import FloatArray
@@ -77,6 +78,7 @@ class ReportCard(Judged):
             "data": self.data,
             "on_training": self.on_training,
             "verdict": self.verdict,
+            "summary": self.summary,
             "lines": [line.to_json() for line in self.lines],
             "scores": self.scores.to_json(),
             "tests": [_test_json(t) for t in self.tests],
@@ -86,6 +88,11 @@ class ReportCard(Judged):
             "operating": self.operating and self.operating.to_json(),
             "outside": self.outside if math.isfinite(self.outside) else None,
         }
+
+    @property
+    def summary(self) -> str:
+        """Whether the model is good enough to tune on, what speaks against it, what to do first."""
+        return summary(self.lines)
 
     @property
     def title(self) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from ..dataset import Dataset, require_dataset
 from ..errors import FitError, SewfastError
 from ..models.base import INIT, Model
-from ..validation import Scores
+from ..validation import Scores, noise_of
 from . import questions
 from .card import Line, ReportCard
 from .criteria import Criteria
@@ -75,7 +75,7 @@ def check(
     scores = horizon_scores(model, data, free)
     unit = free.unit
     on_training = training is data or (training is None and is_training_data(model, data))
-    lines = questions.accuracy(scores, unit)
+    lines = questions.accuracy(scores, unit, noise_of([r.y[r.counts] for r in free.runs]))
     if training is not None and training is not data:
         lines.append(
             questions.generalisation(

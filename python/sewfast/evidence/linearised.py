@@ -23,6 +23,8 @@ class Linearised:
     ----------
     state : array
         Where it is linearised, as the compiled model's `simulate` takes it.
+    drift : float
+        What the output of an integrator changes by at every sample there; 0 for other models.
     """
 
     y: float
@@ -34,10 +36,21 @@ class Linearised:
     settled: bool
     saturated: bool
     state: FloatArray
+    drift: float = 0.0
 
 
-def linearise(core: Any, u: FloatArray, state: FloatArray | None = None) -> Linearised:
+def linearise(
+    core: Any, u: FloatArray, state: FloatArray | None = None, level: float | None = None
+) -> Linearised:
     """About the equilibrium at a constant input, sought from `state` on (None: rest).
+
+    Parameters
+    ----------
+    core : compiled model
+    u : array, shape (nu,)
+    state : array, optional
+    level : float, optional
+        Where the output of an integrator is to be, which rests at any level or at none.
 
     Raises
     ------
@@ -47,24 +60,31 @@ def linearise(core: Any, u: FloatArray, state: FloatArray | None = None) -> Line
     """
     u = np.ascontiguousarray(u, dtype=np.float64)
     if hasattr(core, "a") and hasattr(core, "offset"):
-        return _linear(core, u)
+        return _linear(core, u, level)
     settings = core.settings
     if "na" in settings:
         return _network(core, settings, u, state)
     if "nx" in settings:
-        return _state_space(core, settings, u, state)
+        return _state_space(core, settings, u, state, level)
     raise SettingError(f"linearise: expected a model of sewfast, received {type(core).__name__}")
 
 
 # --- lagged models -------------------------------------------------------------------------------
 
 
-def _linear(core: Any, u: FloatArray) -> Linearised:
+def _linear(core: Any, u: FloatArray, level: float | None) -> Linearised:
     left = 1.0 + core.a.sum()
+    push = float(core.b.sum(axis=1) @ u + core.offset)
     settled = bool(abs(left) > 1e-12)
-    y = float((core.b.sum(axis=1) @ u + core.offset) / left) if settled else np.nan
-    state = np.full(core.na, y if settled else 0.0)
-    return _difference(-core.a, core.b, core.nk, y, settled, False, state)
+    if settled:
+        y, drift = push / left, 0.0
+    else:
+        # A(q) = (1 - q^-1) F(q): the output moves by push / F(1) a sample
+        rest = float(np.cumsum(np.concatenate([[1.0], core.a]))[:-1].sum())
+        y = np.nan if level is None else level
+        drift = push / rest if rest != 0.0 else np.inf
+    state = np.full(core.na, y if np.isfinite(y) else 0.0)
+    return _difference(-core.a, core.b, core.nk, y, settled, False, state, drift)
 
 
 def _network(core: Any, s: dict[str, Any], u: FloatArray, state: FloatArray | None) -> Linearised:
@@ -103,7 +123,7 @@ def _steady(core: Any, u: FloatArray, state: FloatArray) -> float:
 
 def _difference(
     to_y: FloatArray, to_u: FloatArray, nk: int, y: float, settled: bool, saturated: bool,
-    state: FloatArray,
+    state: FloatArray, drift: float = 0.0,
 ) -> Linearised:  # fmt: skip
     """Observer form of y(k) = sum to_y_i y(k-i) + sum to_u_ji v_j(k-i+1)."""
     n = max(len(to_y), to_u.shape[1] - 1)
@@ -114,14 +134,14 @@ def _difference(
     A = np.eye(n, k=1)
     A[:, 0] += a
     B = later + np.outer(a, d)
-    return Linearised(y, A, B, np.eye(1, n), d[None, :], nk, settled, saturated, state)
+    return Linearised(y, A, B, np.eye(1, n), d[None, :], nk, settled, saturated, state, drift)
 
 
 # --- state space ---------------------------------------------------------------------------------
 
 
 def _state_space(
-    core: Any, s: dict[str, Any], u: FloatArray, state: FloatArray | None
+    core: Any, s: dict[str, Any], u: FloatArray, state: FloatArray | None, level: float | None
 ) -> Linearised:
     x = _last_state(core, u, core.rest_state() if state is None else state)
     # an integrator's last state drifts, and nothing but itself depends on it
@@ -139,9 +159,31 @@ def _state_space(
         x = x.copy()
         x[:free] += step
     settled = settled and bool(np.abs(core.states(held, x)[1] - x).max(initial=0.0) <= 1e-6)
+    if s["integrator"] and level is not None:
+        x = _moved_to(core, u, x, level)
     A, B, C, D = core.linearise(u, x)
-    y = float(np.ravel(core.simulate(u[None, :], x))[0])
-    return Linearised(y, A, B, C[:1], D[:1], s["nk"], settled, False, x)
+    y, following = np.ravel(core.simulate(held, x))
+    drift = float(following - y) if s["integrator"] else 0.0
+    return Linearised(float(y), A, B, C[:1], D[:1], s["nk"], settled, False, x, drift)
+
+
+def _moved_to(core: Any, u: FloatArray, x: FloatArray, level: float) -> FloatArray:
+    """The integrator's state, the last one, at which the output is `level`, by Newton's method.
+
+    Where the output function does not reach that level, the state stays as it is.
+    """
+    moved = x.copy()
+    for _ in range(_NEWTON):
+        left = level - float(np.ravel(core.simulate(u[None, :], moved))[0])
+        if abs(left) <= 1e-9 * max(abs(level), 1.0):
+            return moved
+        slope = float(core.linearise(u, moved)[2][0, -1])
+        if abs(slope) < 1e-12:
+            break
+        moved[-1] += left / slope
+        if not np.isfinite(moved).all():
+            break
+    return x
 
 
 def _last_state(core: Any, u: FloatArray, state: FloatArray) -> FloatArray:

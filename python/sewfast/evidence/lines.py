@@ -70,6 +70,11 @@ class Judged:
         """The worst of the lines."""
         return max((line.verdict for line in self.lines), key=_ORDER.__getitem__, default="info")
 
+    @property
+    def summary(self) -> str:
+        """What the lines amount to and what to do, in a sentence; empty where they stand alone."""
+        return ""
+
     def line(self, name: str) -> Line:
         """The line of that name.
 
@@ -95,9 +100,10 @@ class Judged:
             f'<th scope="col">{h}</th>'
             for h in ("question", "value", "limit", "verdict", "meaning")
         )
+        closing = f"<br>{escape(self.summary)}" if self.summary else ""
         return (
             f'<table class="{self.style}"><caption>{escape(self.title)}: '
-            f'<b class="verdict {self.verdict}">{self.verdict}</b></caption>\n'
+            f'<b class="verdict {self.verdict}">{self.verdict}</b>{closing}</caption>\n'
             f"<thead><tr>{heads}</tr></thead>\n<tbody>\n{rows}\n</tbody></table>"
         )
 
@@ -112,10 +118,15 @@ class Judged:
             for k in ("name", "shown", "limit")
         ]
         found = [f"{self.heading}: {self.title}", f"verdict: {self.verdict}", ""]
+        before = ""
         for x in self.lines:
             cells = zip((x.name, x.shown, x.limit), wide, strict=True)
             found.append(f"{x.verdict:4}  " + "  ".join(c.ljust(w) for c, w in cells).rstrip())
-            found += textwrap.wrap(
-                x.meaning, _WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6
-            )
+            if x.meaning != before:
+                found += textwrap.wrap(
+                    x.meaning, _WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6
+                )
+            before = x.meaning
+        if self.summary:
+            found += ["", *textwrap.wrap(f"in short: {self.summary}", _WIDTH)]
         return "\n".join(found)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,8 @@ class OperatingPoint:
         Whether the training data came near it; so too where the model does not store its region.
     Ts : float
         Sample time [s].
+    drift : float
+        What the output of an integrator changes by at every sample; 0 for other models.
     """
 
     u: FloatArray
@@ -57,6 +59,7 @@ class OperatingPoint:
     saturated: bool
     known: bool
     Ts: float
+    drift: float = 0.0
 
     @property
     def poles(self) -> NDArray[np.complex128]:
@@ -145,7 +148,7 @@ class OperatingPoint:
         """As JSON values; what is not finite becomes None."""
         return {
             "u": self.u.tolist(),
-            "y": self.y,
+            "y": self.y if math.isfinite(self.y) else None,
             "poles": [[p.real, p.imag] for p in self.poles.tolist()],
             "time_constants_s": _finite(self.time_constants),
             "dc_gain": _finite(self.dc_gain),
@@ -178,6 +181,11 @@ class OperatingRange:
     output_name: str
     output_unit: str
     Ts: float
+
+    def gain_unit(self, i: int = 0) -> str:
+        """Unit of the gain from input i; empty where either unit is unknown."""
+        known = self.output_unit and self.input_units[i]
+        return f"{self.output_unit}/{self.input_units[i]}" if known else ""
 
     @property
     def frequencies(self) -> FloatArray:
@@ -293,24 +301,27 @@ def _points(
 ) -> list[OperatingPoint]:
     found, state = [], None
     for u in grid:
-        small: Linearised = linearise(model.core, u, state)
+        small = linearise(model.core, u, state)
         state = small.state
-        found.append(
-            OperatingPoint(
-                u,
-                small.y,
-                small.A,
-                small.B,
-                small.C,
-                small.D,
-                small.delay,
-                small.settled,
-                small.saturated,
-                region is None or region.holds(u, small.y),
-                model.Ts,
-            )
-        )
+        found.append(_point(model, u, small, region))
     return found
+
+
+def _point(
+    model: Model, u: FloatArray, small: Linearised, region: TrainingRegion | None
+) -> OperatingPoint:
+    known = region is None or region.holds(u, small.y)
+    return OperatingPoint(
+        u, small.y, small.A, small.B, small.C, small.D, small.delay, small.settled,
+        small.saturated, known, model.Ts, small.drift,
+    )  # fmt: skip
+
+
+def point_at_level(model: Model, u: FloatArray, level: float) -> OperatingPoint:
+    """The point of an integrator at an input at which it keeps its output, at that output."""
+    small = linearise(model.core, u, level=level)
+    reached = abs(small.y - level) <= 1e-6 * max(abs(level), 1.0)
+    return _point(model, u, replace(small, settled=reached), stored_region(model))
 
 
 def _row(p: OperatingPoint, i: int) -> list[str]:
@@ -319,7 +330,8 @@ def _row(p: OperatingPoint, i: int) -> list[str]:
     note = "saturated" if p.saturated else note
     note = note if p.is_stable else "unstable"
     numbers = [p.dc_gain[i], float(p.time_constants.max(initial=0.0)), p.bandwidth(i)]
-    return [*(f"{v:.4g}" for v in [*p.u, p.y, *numbers]), note]
+    # an integrator rests at any output, and has no gain
+    return [*("-" if math.isnan(v) else f"{v:.4g}" for v in [*p.u, p.y, *numbers]), note]
 
 
 def _finite(values: Sequence[float] | FloatArray) -> list[float | None]:

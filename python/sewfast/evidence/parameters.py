@@ -153,15 +153,15 @@ class Knowledge:
 
 
 def estimate(model: Model, residuals: Residuals) -> Parameters | None:
-    """What the data say of a model's parameters; None where the model has no sensitivities."""
-    if residuals.width == 0:
+    """What the data say of a model's parameters; None for an ensemble, which has no one set."""
+    if residuals.width == 0 or model.members:
         return None
     information = Information.of(model, residuals)
     inverse = information.inverse()
     effective = float(np.trace(inverse @ information.gram))
     noise = residuals.noise(spent=effective)
     covariance = inverse @ _meat(residuals, noise) @ inverse
-    values, names = _values(representative(model), residuals)
+    values, names = _values(model, residuals)
     condition, lost = information.conditioning()
     return Parameters(values, covariance, effective, condition, lost, names)
 
@@ -214,19 +214,10 @@ def _meat(residuals: Residuals, noise: Noise) -> FloatArray:
 
 
 def _values(model: Model, residuals: Residuals) -> tuple[FloatArray, tuple[str, ...]]:
-    core = model.core
-    if hasattr(core, "theta"):
-        theta = np.asarray(core.theta, dtype=np.float64)
-        return theta, tuple(f"theta[{i}]" for i in range(len(theta)))
-    values = np.concatenate([core.a, core.b.ravel(), [core.offset]])
-    a = [f"a{i + 1}" for i in range(core.na)]
-    width = core.b.shape[1]
-    b = [f"b{i + 1}" for i in range(width)]
-    if len(core.b) > 1:
-        b = [f"b{i + 1} of {name}" for name in residuals.input_names for i in range(width)]
-    names = (*a, *b, "offset")
+    values, names = model.theta, model.parameter_names
     if residuals.horizon == "one step":
         # regressors are past outputs themselves, a_i their negative factors
-        values = np.concatenate([-core.a, core.b.ravel(), [core.offset]])
-        names = tuple(f"-{n}" if n in a else n for n in names)
+        na = model.orders["na"]
+        values = np.concatenate([-values[:na], values[na:]])
+        names = (*(f"-{n}" for n in names[:na]), *names[na:])
     return values[: residuals.width], names[: residuals.width]

@@ -18,6 +18,8 @@ from .residuals import Residuals, Run
 LAGS = 25
 LEAST_SAMPLES = 50
 _FOLLOWED = 1e-4
+_MODERATE = 60
+"""Binary exponent up to which the tests take values as they are."""
 LARGEST_SET = 50
 """Sums in one test: with several inputs there are fewer lags of each."""
 
@@ -50,8 +52,33 @@ def residual_tests(residuals: Residuals, memory: int = LAGS) -> tuple[ResidualTe
     """
     if residuals.is_nothing or residuals.n < LEAST_SAMPLES:
         return ()
-    setting = _Setting.of(residuals, memory)
+    setting = _Setting.of(_within_reach(residuals), memory)
     return tuple(test(setting) for test in _TESTS)
+
+
+def _within_reach(residuals: Residuals) -> Residuals:
+    """In other units where values are so large or small that their sixth powers leave the numbers.
+
+    The tests have no unit, and powers of two change no digit.
+    """
+    u = np.concatenate([r.u for r in residuals.runs])
+    y = np.concatenate([r.yhat[r.counts] for r in residuals.runs])
+    sizes = np.abs(np.column_stack([u.max(axis=0), u.min(axis=0)])).max(axis=1)
+    of_u, of_y = _exponents(sizes), _exponents(np.abs(y).max(keepdims=True))
+    if not (of_u.any() or of_y.any()):
+        return residuals
+    runs = tuple(
+        replace(
+            r, u=np.ldexp(r.u, -of_u), y=np.ldexp(r.y, -of_y), yhat=np.ldexp(r.yhat, -of_y)
+        )
+        for r in residuals.runs
+    )  # fmt: skip
+    return replace(residuals, runs=runs)
+
+
+def _exponents(sizes: FloatArray) -> NDArray[np.int32]:
+    exponents: NDArray[np.int32] = np.frexp(sizes)[1]
+    return np.where(np.abs(exponents) > _MODERATE, exponents, 0).astype(np.int32)
 
 
 def parameter_test(residuals: Residuals, trained: int) -> ResidualTest | None:

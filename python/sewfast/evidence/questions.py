@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from ..dataset import FloatArray
-from ..validation import Scores
+from ..validation import FAIR, Scores, grade_of
 from .card import Line, Verdict
 from .correlations import LEVEL, ResidualTest
 from .criteria import Criteria
@@ -22,7 +22,6 @@ from .simulation_bands import Bands
 
 SMALL = 0.1
 """Part of the rms error that a detected dependence must be worth for a failure, not a warning."""
-GOOD_FIT, POOR_FIT = 70.0, 30.0
 COVERAGE = (0.88, 0.99)
 LEAST_COVERAGE = 0.8
 OUTSIDE, FAR_OUTSIDE = 0.05, 0.2
@@ -87,35 +86,57 @@ _PASSED = {
 }
 
 
-def accuracy(scores: HorizonScores, unit: str) -> list[Line]:
-    """Free run, judged, and the steps ahead, told."""
+def accuracy(scores: HorizonScores, unit: str, noise: float) -> list[Line]:
+    """Free run, judged, and errors some steps ahead, which inform.
+
+    Parameters
+    ----------
+    scores : HorizonScores
+    unit : str
+    noise : float
+        White measurement noise of the output; NaN where unknown.
+    """
     free = scores.pooled["free run"]
-    fit = free.fit_percent
-    verdict: Verdict = "ok" if fit >= GOOD_FIT else "warn" if fit >= POOR_FIT else "fail"
-    meaning = {
-        "ok": "the model alone, from the inputs, follows the output: what tuning and "
-        "simulation need",
-        "warn": "the model follows the output loosely; look where the error is large (the "
-        "plot), and "
-        "whether the data hold what drives the plant",
-        "fail": "the model alone is hardly better than the mean of the output; do not tune on it: "
-        "check columns, delay and orders, or record with a larger excitation",
-    }[verdict]
-    if not math.isfinite(fit):
-        verdict, meaning = (
-            "info",
-            "the output is constant here: only the error's size says something",
-        )
-    found = [
-        Line(
-            "free run", free.rmse, fit_text(free, unit), f"fit >= {GOOD_FIT:g} %", verdict, meaning
-        )
-    ]
+    found = [_free_run(free, unit, grade_of(free.fit_percent, free.rmse, noise))]
+    text = (
+        "started from measured outputs each time: the model's own errors have no time to grow, "
+        "while the noise of these outputs counts in full; it says little of a model that has to "
+        "run alone"
+    )
     for name, s in scores.pooled.items():
         if name != "free run":
-            text = "put right by measured outputs so often, nearly any model looks good"
             found.append(Line(f"{name} ahead", s.rmse, fit_text(s, unit), "", "info", text))
     return found + _worst(scores, unit)
+
+
+def _free_run(free: Scores, unit: str, grade: str) -> Line:
+    verdict, meaning = _GRADES[grade]
+    if grade == "good" and free.fit_percent < FAIR:
+        meaning = "the model alone follows the output; what is left is measurement noise"
+    if grade == "useless" and free.fit_percent < 0.0:
+        meaning = meaning.replace("hardly better", "worse")
+    shown = fit_text(free, unit)
+    return Line("free run", free.rmse, shown, f"fit >= {FAIR:g} %", verdict, meaning)
+
+
+_GRADES: dict[str, tuple[Verdict, str]] = {
+    "good": (
+        "ok",
+        "the model alone, from the inputs, follows the output: what tuning and simulation need",
+    ),
+    "fair": ("ok", "the model alone, from the inputs, follows the output, though not closely"),
+    "poor": (
+        "warn",
+        "the model follows the output loosely; look where the error is large (the plot), and "
+        "whether the data hold what drives the plant",
+    ),
+    "useless": (
+        "fail",
+        "useless here: hardly better than a constant; do not tune on it: check columns, delay and "
+        "orders, or record with a larger excitation",
+    ),
+    "": ("info", "the output is constant here: only the error's size says something"),
+}
 
 
 def _worst(scores: HorizonScores, unit: str) -> list[Line]:
@@ -152,13 +173,18 @@ _OFFSET: tuple[Verdict, str] = (
 
 
 def bias(residuals: Residuals) -> Line:
-    """Mean residual, beside what the initial state explains, against what chance lets it vary."""
+    """Mean residual, less what the initial state explains, against what chance lets it vary."""
     ones, mean = residuals.constants, residuals.mean
     noise = residuals.noise()
     length = max(float(sum(one @ one for one in ones)), 1e-300)
     error = math.sqrt(sum(float(np.square(noise.shaped(o[:, None])).sum()) for o in ones)) / length
+    power = residuals_power(residuals)
     shown = f"{mean:.3g} +- {2.58 * error:.2g} {residuals.unit}".rstrip()
-    share = mean**2 / max(residuals_power(residuals), 1e-300)
+    share = mean**2 / max(power, 1e-300)
+    if 2.58 * error > math.sqrt(power):
+        # an integrator, or a record no longer than the model's memory
+        text = "nothing to test: the initial state explains a constant as well"
+        return Line("mean residual", mean, "not tested", "99 % about 0", "info", text)
     if abs(mean) <= 2.58 * error:
         verdict, text = _NO_OFFSET
     elif share < SMALL**2:
@@ -181,7 +207,7 @@ def correlation(t: ResidualTest) -> Line:
             "nothing to test: the residual or the input does not move, or there are too few samples"
         )
         return Line(t.title, math.nan, "not tested", limit if t.judges else "", "info", text)
-    shown = f"p = {_probability(t.p_value)}"
+    shown = "p < 1e-12" if t.p_value < 1e-12 else f"p = {t.p_value:.2g}"
     if not t.judges:
         text = _PASSED[t.name] if t.passed else _INFORMS.get(t.name, _FOUND[t.name])
         return Line(t.title, t.p_value, shown, "", "info", text)
@@ -202,10 +228,6 @@ _INFORMS = {
 }
 
 
-def _probability(p: float) -> str:
-    return "< 1e-12" if p < 1e-12 else f"{p:.2g}"
-
-
 def parameters(p: Knowledge) -> list[Line]:
     """Samples per parameter, conditioning."""
     ratio = p.samples / max(p.effective, 1e-12)
@@ -221,7 +243,7 @@ def parameters(p: Knowledge) -> list[Line]:
     )  # fmt: skip
     sound = p.condition <= CONDITION
     if sound:
-        text = "the data tell the parameters apart"
+        text = "the data determine the parameters"
     elif p.undetermined:
         text = (
             f"{p.undetermined} direction(s) in parameter space change nothing in these data; "
@@ -252,7 +274,7 @@ def looseness(p: Parameters) -> Line:
     text = "every parameter is larger than its standard error" if not loose else (
         f"standard error larger than the value: {named}; a zero would do as well"
     )  # fmt: skip
-    return Line("parameters not told from 0", float(len(loose)), shown, "", "info", text)
+    return Line("parameters near 0", float(len(loose)), shown, "", "info", text)
 
 
 def information(c: Criteria, unit: str) -> Line:
@@ -323,26 +345,40 @@ def operation(found: OperatingRange) -> list[Line]:
     verdict: Verdict = "ok" if not wild else "info" if len(integrating) == len(wild) else "fail"
     text = {
         "ok": "every operating point that the training data came near is stable",
-        "info": "the model integrates its input",
+        "info": "the model integrates its input, as a position does: it rests at any output, and "
+        "errors of its input add up",
         "fail": f"{len(wild) - len(integrating)} of {len(known)} operating points are "
         "unstable: a loop tuned there is tuned on a plant that does not exist; train on data from "
         "there",
     }[verdict]
-    lines = [Line("largest pole", largest, f"{largest:.6g}", "< 1", verdict, text)]
+    limit = "" if verdict == "info" else "< 1"
+    lines = [Line("largest pole", largest, _pole(largest), limit, verdict, text)]
+    none = "an integrator has none" if integrating else "not defined over the operating range"
     for i, name in enumerate(found.input_names):
-        here = [p for p, j in zip(found.points, found.varied, strict=True) if j == i and p.known]
-        lines.append(_spread_line(f"gain from {name}", np.array([p.dc_gain[i] for p in here]), ""))
+        here = [p for p, j in zip(found.points, found.varied, strict=True) if j == i]
+        here = [p for p in here if p.known] or here
+        gains = np.array([p.dc_gain[i] for p in here])
+        lines.append(_spread_line(f"gain from {name}", gains, found.gain_unit(i), none))
         widths = np.array([p.bandwidth(i) for p in here])
-        lines.append(_spread_line(f"bandwidth from {name}", widths, "Hz"))
+        lines.append(_spread_line(f"bandwidth from {name}", widths, "Hz", none))
     return lines
 
 
-def _spread_line(name: str, values: FloatArray, unit: str) -> Line:
+def _pole(size: float) -> str:
+    """To six digits; what would round to 1 by its distance from it."""
+    left = 1.0 - size
+    if 1e-9 < abs(left) < 1e-5:
+        return f"1 {'-' if left > 0.0 else '+'} {abs(left):.2g}"
+    return f"{size:.6g}"
+
+
+def _spread_line(name: str, values: FloatArray, unit: str, none: str) -> Line:
     known = values[np.isfinite(values)]
     if len(known) == 0:
-        return Line(name, math.nan, "none", "", "info", "not defined over the operating range")
+        return Line(name, math.nan, "none", "", "info", none)
     low, high = float(known.min()), float(known.max())
-    shown = f"{low:.4g} to {high:.4g} {unit}".rstrip()
+    same = f"{low:.4g}" == f"{high:.4g}"
+    shown = (f"{low:.4g} {unit}" if same else f"{low:.4g} to {high:.4g} {unit}").rstrip()
     same = high - low <= 0.1 * max(abs(low), abs(high))
     text = (
         "nearly the same over the operating range: one set of gains will do"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, TypeAlias
@@ -11,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..dataset import Dataset, Experiment, FloatArray, require_dataset
-from ..errors import DataError
-from ..models.base import INIT, Model, require_init
+from ..errors import DataError, FitError
+from ..models.base import INIT, FreeRunJacobian, Model, require_init
 from .noise import Noise
 
 Horizon: TypeAlias = Literal["free run", "one step"]
@@ -159,27 +160,31 @@ class Residuals:
 
 
 def representative(model: Model) -> Model:
-    """The model itself, or an ensemble's first member: it stands for all sensitivities."""
+    """The model itself, or an ensemble's first member: the one that did best in training."""
     return model.members[0] if model.members else model
 
 
 def _free_runs(model: Model, data: Dataset, init: int) -> list[Run]:
-    single = representative(model)
     simulated = model.simulate(data, init=init)
+    slopes = _sensitivities(model, data, init, simulated)
     return [
-        _run(e, yhat, init, *_sensitivity(single, e, init))
-        for e, yhat in zip(data.experiments, simulated, strict=True)
+        _run(e, yhat, init, slope.theta, slope.state)
+        for e, yhat, slope in zip(data.experiments, simulated, slopes, strict=True)
     ]
 
 
-def _sensitivity(model: Model, e: Experiment, init: int) -> tuple[FloatArray, FloatArray]:
-    jacobian = getattr(model.core, "jacobian", None)
-    if jacobian is None:
-        return np.zeros((len(e), 0)), np.zeros((len(e), 0))
-    state = model.initial_state(e, init)
-    _, rows = jacobian(e.u, state)
-    split = rows.shape[1] - len(state)
-    return rows[:, :split], rows[:, split:]
+def _sensitivities(
+    model: Model, data: Dataset, init: int, simulated: Sequence[FloatArray]
+) -> list[FreeRunJacobian]:
+    """Of the model; of an ensemble, of the member whose free runs are nearest to its own."""
+    nearest, least = model, np.inf
+    for member in model.members:
+        with suppress(FitError):
+            runs = member.simulate(data, init=init)
+            distance = max(float(np.abs(a - b).max()) for a, b in zip(runs, simulated, strict=True))
+            if distance < least:
+                nearest, least = member, distance
+    return nearest.jacobian(data, init=init)
 
 
 def _one_step_runs(model: Model, data: Dataset, init: int) -> list[Run]:

@@ -87,7 +87,8 @@ def _identified(task: Task, wants_network: bool) -> Model:
     try:
         search.run()
         return choice.model()
-    except Stopped as stopped:
+    except (Stopped, KeyboardInterrupt) as stopped:
+        # Ctrl-C also comes between two pieces of compiled work
         raise Interrupted(choice.best_so_far(stopped)) from None
 
 
@@ -551,7 +552,7 @@ class Choice:
             "held_out": list(self.split.sources),
         }
 
-    def best_so_far(self, stopped: Stopped) -> Model:
+    def best_so_far(self, stopped: BaseException) -> Model:
         """What there is when Ctrl-C comes: the best candidate, else the linear model."""
         best, linear = self.search.best, self.linear
         bound = math.inf if linear is None else linear.rmse
@@ -568,10 +569,10 @@ class Choice:
 
 
 def _without_held_out(task: Task, began: float, wants_network: bool) -> Model:
-    """A record too short to choose by: second order, and no network."""
+    """A record too short to choose by, or still until its end: second order, and no network."""
     reason = (
         f"the record is too short to hold out {100 * SHARE:.0f} % of every experiment, at least "
-        f"{LEAST_HELD_OUT} samples, to compare on"
+        f"{LEAST_HELD_OUT} samples, to compare on; or nothing moves before"
     )
     if wants_network:
         raise FitError(f"{task.data.source}: {reason}; record longer, or give validation data")

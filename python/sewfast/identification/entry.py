@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Literal, TypeAlias
 
 from ..dataset import Dataset, require_dataset
+from ..dataset.checks import LARGEST_FITTED, require_fittable, require_sane
 from ..errors import DataError, FitError, Interrupted, SettingError
 from ..evidence import remembered
 from ..models import Model
@@ -191,7 +192,10 @@ def identify(
         found = _within_budget(lambda t: further.trained(t, model), task)
     else:
         found = _within_budget(_KINDS[kind], task)
-    return remembered(found, _excerpt(found, task))
+    try:
+        return remembered(found, _excerpt(found, task))
+    except KeyboardInterrupt:
+        raise Interrupted(found) from None
 
 
 def _within_budget(identified: Callable[[Task], Model], task: Task) -> Model:
@@ -295,12 +299,14 @@ def _require_data(task: Task, kind: str) -> None:
     require_dataset(task.data, "data")
     task.data.require_measured()
     task.data.require_excited()
+    require_fittable(task.data)
     _require_enough(task, kind)
     if kind == "paper" and task.data.n_inputs != 1:
         raise DataError(f"preset 'paper' has one input, the data have {task.data.n_inputs}")
     if task.validation is not None:
         require_dataset(task.validation, "validation")
         task.validation.require_measured()
+        require_sane(task.validation, LARGEST_FITTED)
         Dataset.concat([task.data, task.validation])
         _require_longer(task.validation, INIT)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..dataset import Dataset, Experiment, FloatArray
-from ..errors import FitError
+from ..errors import DataError, FitError
 from ..models.base import INIT, Core
 from .task import Provenance, sources
 
@@ -53,8 +53,13 @@ class Split:
 
     @property
     def spread(self) -> float:
-        """Error of a constant, the mean of what is fitted: the worst that counts."""
-        mean = float(np.nanmean(np.concatenate([e.y for e in self.fitted.experiments])))
+        """Error of a constant, the mean of what is fitted: the worst that counts.
+
+        Without its outermost percent: one wild value would make every error look small.
+        """
+        fitted = np.concatenate([e.y for e in self.fitted.experiments])
+        low, high = np.nanquantile(fitted, [0.005, 0.995])
+        mean = float(np.nanmean(np.clip(fitted, low, high)))
         parts = [e.y[e.initial_samples(INIT) :] for e in self.held.experiments]
         return float(np.sqrt(np.nanmean((np.concatenate(parts) - mean) ** 2)))
 
@@ -64,7 +69,9 @@ class Split:
 
 
 def split(data: Dataset, skipped: float = 0.0) -> Split | None:
-    """Hold out the end of every experiment; None where they are too short for that.
+    """Hold out the end of every experiment that is long enough; None where none is.
+
+    A short one is learned from as a whole: it must not keep the others from being compared on.
 
     Parameters
     ----------
@@ -79,7 +86,8 @@ def split(data: Dataset, skipped: float = 0.0) -> Split | None:
         stop = round((1.0 - skipped) * len(e))
         at = stop - round(SHARE * len(e))
         if stop - at < LEAST_HELD_OUT or at < LEAST_HELD_OUT:
-            return None
+            fitted.append(e)
+            continue
         if min(_measured(e.y[:at]), _measured(e.y[at:stop])) < LEAST_HELD_OUT:
             # a long gap has left too little on one side to be split
             fitted.append(e.cut(0, stop))
@@ -103,7 +111,16 @@ def folds(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]
     if validation is not None:
         return (Split(data, validation, is_given=True, sources=tuple(sources(validation))),)
     found = (split(data, skipped=i * SHARE) for i in range(FOLDS))
-    return tuple(f for f in found if f is not None and f.scored)
+    return tuple(f for f in found if f is not None and f.scored and _moves(f.fitted))
+
+
+def _moves(data: Dataset) -> bool:
+    """Whether there is something to learn: a step at the end of a record may all be held out."""
+    try:
+        data.require_excited()
+    except DataError:
+        return False
+    return True
 
 
 def _measured(y: FloatArray) -> int:

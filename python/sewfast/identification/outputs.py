@@ -46,7 +46,8 @@ class Output:
         if self.name == "abs":
             return np.array([CORNER])
         if self.name == "saturation":
-            low, high = ((v - mean) / scale for v in (self.low, self.high))
+            # a part of the data may not move at all, and then has no scale of its own
+            low, high = ((v - mean) / (scale or 1.0) for v in (self.low, self.high))
             return np.array([low, high, CORNER])
         return np.zeros(0)
 

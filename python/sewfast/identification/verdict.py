@@ -7,16 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..dataset import Dataset
-from ..dataset.noise import white_noise
+from ..validation import GOOD, grade_of, noise_of
 from .task import Provenance
 
 if TYPE_CHECKING:
     from .choice import Choice
-
-GOOD, FAIR, POOR = 90.0, 70.0, 30.0
-"""Percent of the free run's fit on data not trained on."""
-AT_THE_NOISE = 1.5
-"""An error below this multiple of the measurement noise leaves nothing to be explained."""
 
 
 def verdict(choice: Choice, error: float) -> Provenance:
@@ -37,22 +32,23 @@ def verdict(choice: Choice, error: float) -> Provenance:
     """
     data, spread = choice.task.data, choice.split.spread
     fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else float("nan")
-    noise = _noise(data)
-    explained = error <= AT_THE_NOISE * noise
+    noise = noise_of([e.y for e in data.experiments])
+    grade = grade_of(fit, error, noise)
     unit = f" {data.output_unit}" if data.output_unit else ""
     measured = f"free run explains {fit:.1f} % of data not trained on (rmse {error:.3g}{unit})"
+    text = {
+        "": f"the output hardly moves where it was not trained on (rmse {error:.3g}{unit})",
+        "good": f"good enough to tune a controller on: {measured}",
+        "fair": f"good enough for a first, cautious controller: {measured}",
+        "poor": f"not good enough to tune a controller on: {measured}",
+        "useless": f"useless: {measured}; a constant would do about as well",
+    }[grade]
+    grade = grade or "useless"
     todo = []
-    if fit >= GOOD or explained:
-        grade, text = "good", f"good enough to tune a controller on: {measured}"
+    if grade == "good":
         if fit < GOOD:
             text += f"; what is left is measurement noise ({noise:.3g}{unit})"
         todo.append("validate it on another recording, then tune")
-    elif fit >= FAIR:
-        grade, text = "fair", f"good enough for a first, cautious controller: {measured}"
-    elif fit >= POOR:
-        grade, text = "poor", f"not good enough to tune a controller on: {measured}"
-    else:
-        grade, text = "useless", f"useless: {measured}; a constant would do about as well"
     if grade == "good" and choice.search.repeats:
         grade = "fair"
         text = text.replace("good enough to tune a controller on", "good where it repeats itself")
@@ -78,10 +74,3 @@ def _what_to_record(data: Dataset) -> list[str]:
         wanted.append("give several recordings: they are fitted together")
     wanted.append("see the report card (check) for what the residual still contains")
     return wanted
-
-
-def _noise(data: Dataset) -> float:
-    """White measurement noise of the output, pooled over experiments; 0 where unknown."""
-    found = [white_noise(e.y) for e in data.experiments]
-    known = [n for n in found if np.isfinite(n)]
-    return float(np.sqrt(np.mean(np.square(known)))) if known else 0.0

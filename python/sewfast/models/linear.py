@@ -317,11 +317,27 @@ def _polynomial(coefficients: Any, delay: int) -> str:
 
 
 def _pole_text(pole: complex, Ts: float) -> str:
-    """A pole with the time constant, and the frequency where it is complex, of its mode."""
+    """A pole with what its mode does: time constant, frequency, alternation, integration."""
     size = abs(pole)
     number = f"{pole.real:.6g}{pole.imag:+.6g}i" if pole.imag else f"{pole.real:.6g}"
+    if abs(pole - 1.0) <= 1e-9:
+        return f"{number} (integrates)"
+    if number == "1":
+        number = f"1 {'-' if pole.real < 1.0 else '+'} {abs(1.0 - pole.real):.2g}"
     if not 0.0 < size < 1.0:
         return number
-    tau = f"{-1e3 * Ts / math.log(size):.4g} ms"
-    hertz = abs(cmath.phase(pole)) / (2 * math.pi * Ts)
-    return f"{number} ({tau}, {hertz:.4g} Hz)" if pole.imag else f"{number} ({tau})"
+    tau = duration(-Ts / math.log(size))
+    if pole.imag:
+        hertz = abs(cmath.phase(pole)) / (2 * math.pi * Ts)
+        return f"{number} ({tau}, {hertz:.4g} Hz)"
+    if pole.real < 0.0:
+        # no lag of the plant gives this: delay, noise or an order too many
+        return f"{number} (alternates from sample to sample, dies away in {tau})"
+    return f"{number} ({tau})"
+
+
+def duration(seconds: float) -> str:
+    """A time constant in ms below a second, in s below three hours, in h above."""
+    if seconds < 1.0:
+        return f"{1e3 * seconds:.4g} ms"
+    return f"{seconds:.4g} s" if seconds < 10800.0 else f"{seconds / 3600.0:.4g} h"

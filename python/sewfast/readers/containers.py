@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..errors import DataError, SettingError
-from .table import MAX_COLUMNS, Table, freeze
+from .table import MAX_COLUMNS, Table, freeze, printable
 
 _MAX_DEPTH = 16
 Value: TypeAlias = Any
@@ -141,7 +141,7 @@ def _flatten(
         for key, item in items:
             _flatten(f"{name}.{key}", item, columns, unusable, depth + 1)
         return
-    reason = _reason(value)
+    name, reason = printable(name), _reason(value)
     if reason is not None:
         unusable[name] = f"variable {name!r} is {reason}; expected a series of real numbers"
     elif value.ndim == 1 or 1 in value.shape:

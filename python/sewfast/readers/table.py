@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -67,7 +68,7 @@ class Table:
         DataError
             Where the file has no such column, or it cannot be used.
         """
-        for candidate in (name, split_unit(name)[0]):
+        for candidate in (name, split_unit(name)[0], printable(split_unit(name)[0])):
             if candidate in self.columns:
                 return candidate
             if candidate in self.unusable:
@@ -101,8 +102,15 @@ def split_unit(header: str) -> tuple[str, str]:
     return match[1], (match[2] or match[3] or "").strip()
 
 
+def printable(name: str) -> str:
+    """A name without control characters: a file must not steer the terminal that it is shown on."""
+    shown = (c.isprintable() or unicodedata.category(c) == "Zs" for c in name)
+    return "".join(c if keep else ascii(c)[1:-1] for c, keep in zip(name, shown, strict=True))
+
+
 def split_units(headers: Sequence[str]) -> tuple[list[str], list[str]]:
     """Names and units of a header row; a name that would then occur twice keeps its unit."""
+    headers = [printable(h.strip()) for h in headers]
     pairs = [split_unit(h) for h in headers]
     bare = [name for name, _ in pairs]
     names = [n if bare.count(n) == 1 else h.strip() for n, h in zip(bare, headers, strict=True)]

@@ -1,0 +1,151 @@
+"""What `validate`, `check` and the text of a model say: units, a closing sentence, no flattery."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from kinds import TS, model_of, recording
+from plants import linear_data
+from sewfast import Dataset, LinearOE, identify
+from sewfast.evidence import Residuals, operating_range
+from sewfast.evidence.questions import accuracy, correlation, operation
+from sewfast.evidence.scores import horizon_scores
+from sewfast.evidence.summary import summary
+from sewfast.validation import grade_of, validate
+
+
+def oe(poles: list[complex], Ts: float) -> LinearOE:
+    den = np.real(np.poly(poles))
+    num = [0.0, 0.1]
+    return LinearOE.from_tf(num, den, Ts, input_units=["V"], output_name="speed", output_unit="RPM")
+
+
+# --- time constants -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("pole", "Ts", "shown"),
+    [
+        (0.9, 0.001, "0.9 (9.491 ms)"),
+        (0.9, 4.0, "0.9 (37.96 s)"),
+        (0.9999, 4.0, "0.9999 (11.11 h)"),
+        (-0.9, 0.001, "-0.9 (alternates from sample to sample, dies away in 9.491 ms)"),
+        (1.0, 0.001, "1 (integrates)"),
+        (1.0 - 2e-7, 0.001, "1 - 2e-07 (5000 s)"),
+        (1.2, 0.001, "1.2"),
+    ],
+)
+def test_a_pole_is_shown_with_what_its_mode_does(pole: float, Ts: float, shown: str) -> None:
+    assert f"poles: {shown}\n" in str(oe([pole], Ts)) + "\n"
+
+
+def test_a_pair_of_poles_has_a_frequency() -> None:
+    assert "(37.96 s, 0.01768 Hz)" in str(oe([0.9 * np.exp(0.4443j), 0.9 * np.exp(-0.4443j)], 4.0))
+
+
+# --- validate -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fit", "rmse", "noise", "grade"),
+    [
+        (95.0, 1.0, 0.1, "good"),
+        (75.0, 1.0, 0.1, "fair"),
+        (40.0, 1.0, 0.1, "poor"),
+        (40.0, 1.0, 0.9, "good"),  # nothing but noise is left
+        (2.0, 1.0, 0.9, "useless"),  # the output itself is nothing but noise
+        (-328.0, 4.0, float("nan"), "useless"),
+        (float("nan"), 1.0, 0.1, ""),
+    ],
+)
+def test_grades(fit: float, rmse: float, noise: float, grade: str) -> None:
+    assert grade_of(fit, rmse, noise) == grade
+
+
+def test_a_useless_fit_is_called_useless() -> None:
+    model = model_of("oe")
+    (e,) = recording(model, 400, seed=2).experiments
+    wrong_way = Dataset.from_arrays(
+        e.u, -e.y, TS, input_names=["u"], input_units=["V"], output_name="speed", output_unit="RPM"
+    )
+    found = validate(model, wrong_way)
+    assert found.grade == "useless"
+    last = str(found).splitlines()[-1]
+    assert last.startswith("verdict: useless here, worse than a constant: fit -")
+    assert "columns" in last
+    assert found.to_json()["grade"] == "useless"
+    assert validate(model, recording(model, 400, seed=2)).verdict.startswith("good enough to tune")
+
+
+def test_identify_and_validate_use_the_same_words_for_noise_alone() -> None:
+    """An output that is white noise is as small as its noise: that does not make a model good."""
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 80), 20)
+    data = Dataset.from_arrays(u, rng.normal(size=1600), 0.01)
+    model = identify(data)
+    assert model.training["verdict"]["grade"] == "useless"
+    assert validate(model, data).grade == "useless"
+
+
+def test_a_noisy_record_of_a_known_plant_is_no_reproach() -> None:
+    model = identify(linear_data(1500, noise=0.02), model="oe")
+    found = validate(model, linear_data(1500, seed=5, noise=3.0))
+    assert found.simulation.fit_percent < 90.0
+    assert "what is left is noise" in found.verdict
+
+
+# --- check ----------------------------------------------------------------------------------------
+
+
+def test_the_card_ends_in_one_sentence() -> None:
+    good = model_of("oe")
+    card = good.check(recording(good, 500, seed=2))
+    assert card.summary.startswith("good enough to tune")
+    assert str(card).replace("\n", " ").endswith(f"in short: {card.summary}")
+    assert card.to_json()["summary"] == card.summary
+    assert card.summary in card.to_html()
+    bent = model_of("neural_oe, saturates")
+    wrong = good.check(recording(bent, 500, seed=2))
+    assert wrong.verdict == "fail"
+    assert re.search(r"; first \w+", wrong.summary)
+
+
+def test_the_sentence_of_a_useless_model_and_of_a_constant_output() -> None:
+    model = model_of("oe")
+    (e,) = recording(model, 400, seed=2).experiments
+    for y, words in ((-e.y, "useless here ("), (np.full(400, 3.0), "output is constant")):
+        data = Dataset.from_arrays(
+            e.u, y, TS, input_names=["u"], input_units=["V"], output_name="speed",
+            output_unit="RPM",
+        )  # fmt: skip
+        assert words in model.check(data).summary
+    assert summary([]).startswith("good")
+
+
+def test_a_small_probability_and_a_pole_near_one_are_written_once() -> None:
+    model = model_of("oe")
+    card = model.check(recording(model_of("neural_oe, saturates"), 700, seed=2))
+    tests = [correlation(t) for t in card.tests]
+    assert any(line.shown == "p < 1e-12" for line in tests)
+    assert not any("= <" in line.shown for line in tests)
+    near = oe([1.0 - 2e-7], TS)
+    line = operation(operating_range(near, [np.zeros(1)]))[0]
+    assert (line.shown, line.limit) == ("1 - 2e-07", "< 1")
+    line = operation(operating_range(model_of("oe, integrator"), [np.zeros(1)]))[0]
+    assert (line.shown, line.limit, line.verdict) == ("1", "", "info")
+    assert "integrates" in line.meaning
+
+
+def test_no_line_praises_one_step_errors() -> None:
+    """Noise in the measured outputs that it starts from makes it worse than the free run here."""
+    model = model_of("oe")
+    data = recording(model, 500, seed=2, noise=0.3)
+    scores = horizon_scores(model, data, Residuals.of(model, data))
+    assert scores.pooled["1 step"].rmse > scores.pooled["free run"].rmse
+    lines = accuracy(scores, "RPM", float("nan"))
+    ahead = next(x for x in lines if x.name == "1 step ahead")
+    assert ahead.verdict == "info"
+    assert "says little" in ahead.meaning
