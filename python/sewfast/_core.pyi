@@ -477,11 +477,13 @@ class _Task(TypedDict):
 
     Every plant is taken in every variation (gain, extra delay in samples). Load steps are (reference, disturbance, band [y],
     samples of the mean). ``variables`` are (name, bounds or None); none at all stands for the usual ones. Weights left out of ``cost``
-    keep their defaults. ``linear_plants`` are (num, den) in powers of z^-1.
+    keep their defaults. ``linear_plants`` are (num, den) in powers of z^-1. ``disturbances`` are commands behind the limits, one
+    for each reference or none at all.
     """
 
     plants: Sequence[_Plant]
     references: Sequence[_F]
+    disturbances: Sequence[_F]
     load_steps: Sequence[tuple[_F, _F, float, int]]
     start: Controller
     counts_per_unit: float

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from . import _core
 from .constraints import Constraints
@@ -110,6 +110,7 @@ def tune(
     constraints: Constraints | None = None,
     variations: Sequence[tuple[float, int]] | None = None,
     loads: Sequence[LoadStep] = (),
+    disturbances: Sequence[ArrayLike] | None = None,
     method: Method = "genetic",
     evaluations: int = EVALUATIONS,
     time_budget: float | None = None,
@@ -157,6 +158,9 @@ def tune(
     loads : sequence of LoadStep
         Load steps that every candidate has to bear as well; what recovery and load of `cost` and
         `constraints` are taken on. Their runs count for nothing else.
+    disturbances : sequence of array, shape (N,), optional
+        One for each reference: a command that is added behind the limits, unseen by the controller
+        [u]. A load over the turn that no model holds, for instance.
     method : "genetic" or "cma-es"
         A genetic algorithm with local refinement, or CMA-ES with restarts.
     evaluations : int
@@ -198,6 +202,7 @@ def tune(
         constraints=constraints,
         variations=variations,
         loads=loads,
+        disturbances=disturbances,
     )
     deadline = Deadline(None if time_budget is None else budget(time_budget), progress)
     found = _core.tune(

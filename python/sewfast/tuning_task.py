@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from . import _core
 from .constraints import Constraints
-from .control import Controller
+from .control import Controller, vector
 from .cost import Cost
 from .errors import SettingError
 from .gains import real, whole
@@ -39,6 +40,7 @@ class TuningTask:
     plants: list[Any]
     references: list[Any]
     loads: list[LoadStep]
+    disturbances: list[Any]
     start: Controller
     variations: list[tuple[float, int]]
     cost: Cost
@@ -59,6 +61,7 @@ class TuningTask:
         constraints: Constraints | None,
         variations: Sequence[tuple[float, int]] | None,
         loads: Sequence[LoadStep] = (),
+        disturbances: Sequence[ArrayLike] | None = None,
     ) -> TuningTask:
         """Checked; without a start, `first` are the settings of the first controller."""
         given = list(models) if isinstance(models, Sequence) else [models]
@@ -80,6 +83,7 @@ class TuningTask:
                 reference_samples(r, start) for r in each_reference(references, REFERENCES)
             ],
             loads=_load_steps(loads),
+            disturbances=[vector("disturbance", d) for d in disturbances or ()],
             start=start,
             variations=_checked(default_variations(start) if variations is None else variations),
             cost=_instance(cost, Cost, "Cost(chatter=5.0)"),
@@ -94,6 +98,7 @@ class TuningTask:
         return {
             "plants": [plant.core for plant in self.plants],
             "references": self.references,
+            "disturbances": self.disturbances,
             "load_steps": [step.samples(self.start.Ts) for step in self.loads],
             "start": self.start.core(),
             "counts_per_unit": self.start.counts_per_unit,

@@ -1,6 +1,6 @@
 """Commissioning: from a machine at rest to a verified controller."""
 
-from .bench import Bench, Followed
+from .bench import Bench, Followed, Stepped, SteppedBench
 from .procedure import STAGES, commission
 from .refusal import Refusal
 from .result import Commissioning
@@ -13,5 +13,7 @@ __all__ = [
     "Comparison",
     "Followed",
     "Refusal",
+    "Stepped",
+    "SteppedBench",
     "commission",
 ]

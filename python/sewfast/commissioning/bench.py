@@ -7,12 +7,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
+import numpy as np
+
 from ..control import Controller
 from ..dataset import FloatArray
 from ..errors import LinkError, SettingError
 from ..loop import ClosedLoopRun, run, run_of_drive
 from ..machine import VirtualMachine
 from ..recording import Recording, record, recording_of_drive
+from ..speed import speed_from_counts
 
 if TYPE_CHECKING:
     from ..link import Drive
@@ -98,6 +101,91 @@ class MachineBench:
         # undisturbed, the machine does the same again and shows its counts
         found = run(controller, self.machine, r, name=name)
         return Followed(found, record(self.machine, found.u, name=name))
+
+
+class Stepped(Protocol):
+    """A machine that is advanced one sample at a time: a simulator, or a test rig without a clock.
+
+    `speed_rpm`, where there is one, is its true speed [RPM]: runs are then scored by it, and by the
+    speed estimated from counts otherwise.
+    """
+
+    @property
+    def counts(self) -> float:
+        """What its encoder shows now."""
+
+    def reset(self) -> None:
+        """Bring it to rest."""
+
+    def step(self, u: float) -> None:
+        """Hold a command [V] for one sample."""
+
+
+@dataclass(frozen=True, eq=False)
+class SteppedBench:
+    """Any machine that can be advanced sample by sample, with sewfast's own controller around it.
+
+    Parameters
+    ----------
+    machine : Stepped
+        With `reset()`, `step(u)` and `counts`.
+    Ts : float
+        Sample time [s].
+    counts_per_rev : float
+        Encoder counts of one turn.
+    volt : float
+        Largest command that it takes to either side [V]; larger ones are clipped.
+    name : str
+    speed : float
+        Speed beyond which it stops by itself [RPM].
+    """
+
+    machine: Stepped
+    Ts: float
+    counts_per_rev: float
+    volt: float
+    name: str = "machine"
+    speed: float = float("inf")
+
+    def excite(self, u: FloatArray, name: str) -> Recording:
+        return self._recording(u, *self._played(lambda k, counts: float(u[k]), len(u)), name)
+
+    def follow(self, controller: Controller, r: FloatArray, name: str) -> Followed:
+        core = controller.core()
+        per_count = 60.0 / (self.counts_per_rev * self.Ts)
+        u, feedback, before = np.zeros(len(r)), np.zeros(len(r)), [0.0]
+
+        def decide(k: int, counts: float) -> float:
+            u[k] = core.step(float(r[k]), (counts - before[0]) * per_count)
+            feedback[k], before[0] = core.filtered, counts
+            return float(u[k])
+
+        recording = self._recording(u, *self._played(decide, len(r)), name)
+        truth = recording.speed_true
+        found = ClosedLoopRun(
+            np.arange(len(r)) * self.Ts, np.array(r), u, recording.y if truth is None else truth,
+            feedback, controller, self.name, name,
+        )  # fmt: skip
+        return Followed(found, recording)
+
+    def _played(
+        self, decide: Callable[[int, float], float], samples: int
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Counts, from 0, and true speeds, each read before the sample's command acts."""
+        machine = self.machine
+        machine.reset()
+        first, counts, speed = machine.counts, np.zeros(samples), np.zeros(samples)
+        for k in range(samples):
+            counts[k], speed[k] = machine.counts - first, getattr(machine, "speed_rpm", np.nan)
+            machine.step(min(max(decide(k, float(counts[k])), -self.volt), self.volt))
+        return counts, speed if hasattr(machine, "speed_rpm") else None
+
+    def _recording(
+        self, u: FloatArray, counts: FloatArray, speed: FloatArray | None, name: str
+    ) -> Recording:
+        y = speed_from_counts(counts, self.Ts, self.counts_per_rev, method="kalman")
+        u = np.clip(u, -self.volt, self.volt)
+        return Recording(u, counts, y, speed, self.Ts, self.counts_per_rev, name)
 
 
 @dataclass(eq=False)

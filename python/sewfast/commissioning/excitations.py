@@ -7,8 +7,13 @@ import numpy as np
 from .. import _core
 from ..control import Fopdt
 from ..dataset import FloatArray
+from ..recording import Recording
 from .demands import Demands
 
+SPAN = 0.02
+"""Over which a change of speed is an acceleration and not the encoder's noise [s]."""
+LEAST_HARD = 50
+"""Samples near the largest command from which an acceleration is told."""
 LONGEST = 60.0
 """Of any excitation [s]."""
 PULSES = 20.0
@@ -30,8 +35,19 @@ TRAPEZOIDS = (
 
 
 def acceleration(fopdt: Fopdt, demands: Demands) -> float:
-    """What the largest command gives at rest [RPM/s]."""
+    """What the largest command would give at rest without a current limit [RPM/s]."""
     return fopdt.K * demands.u_max / fopdt.T
+
+
+def acceleration_shown(recording: Recording, demands: Demands) -> float:
+    """What the machine does under the pulses [RPM/s]: the ninth decile of its changes of speed."""
+    span = max(1, round(SPAN / recording.Ts))
+    hard = np.abs(recording.u) >= 0.7 * demands.u_max
+    whole = np.convolve(hard, np.ones(span), "valid")[:-1] >= span
+    change = np.abs(recording.y[span:] - recording.y[:-span])[: len(whole)][whole]
+    if len(change) < LEAST_HARD:
+        return float("inf")
+    return float(np.quantile(change, 0.9)) / (span * recording.Ts)
 
 
 def step(u: float, seconds: float, Ts: float) -> FloatArray:
@@ -39,9 +55,9 @@ def step(u: float, seconds: float, Ts: float) -> FloatArray:
     return _core.step(duration=seconds, Ts=Ts, at=0.1 * seconds, low=0.0, high=u)
 
 
-def trapezoids(fopdt: Fopdt, demands: Demands, Ts: float) -> FloatArray:
+def trapezoids(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float) -> FloatArray:
     """A reference over the working range, edges from gentle to steep [RPM]."""
-    top, fastest = demands.top, acceleration(fopdt, demands)
+    top = demands.top
     hold = 1.5 * fopdt.T
     slow = SLOW * top
     parts = [np.linspace(0.0, slow, max(2, round(0.4 * fopdt.T / Ts)))]
@@ -62,9 +78,9 @@ def trapezoids(fopdt: Fopdt, demands: Demands, Ts: float) -> FloatArray:
     return np.concatenate(parts)
 
 
-def levels(fopdt: Fopdt, demands: Demands, Ts: float, seed: int) -> FloatArray:
+def levels(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float, seed: int) -> FloatArray:
     """A reference of random levels over the working range, to judge models by [RPM]."""
-    change = max(0.8 * fopdt.T, 4.0 * demands.speed / acceleration(fopdt, demands))
+    change = max(0.8 * fopdt.T, 4.0 * demands.speed / fastest)
     return _core.random_steps(
         duration=min(25.0 * change, LONGEST),
         Ts=Ts,

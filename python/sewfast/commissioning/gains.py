@@ -15,7 +15,9 @@ from ..cost import Cost
 from ..dataset import FloatArray
 from ..errors import DataError, FitError
 from ..machine import VirtualMachine
-from ..models import Ensemble
+from ..gains import Gains
+from ..models import Ensemble, Model
+from ..robustness import margins
 from ..rules import Rule, eq_12, simc
 from ..tuning import TuningResult, costs, tune
 from .bench import Bench
@@ -26,19 +28,29 @@ from .requirements import Requirements
 FILTER = 8e-3
 """Of the feedback's moving average [s]: one count a millisecond of 1,572 a turn is 38 RPM."""
 DERIVATIVE_FILTER = 10.0
-FIRST_MS = 1.8
-"""Of the first gains, which meet a machine that only a step response tells of."""
+FIRST_MS, SAFE_MS = 1.8, 2.0
+"""Of the first gains on first order with dead time; the largest on the machine's small signals."""
+LOWER, STEPS = 0.85, 29
+"""Factor by which gains are lowered, and how often."""
+SEARCHED = ("Kp", "Ti", "Td", "alpha", "beta", "N", "filter_samples", "filter_time")
+"""What is searched: the feedback's filter is worth as much as the gains."""
 ALPHAS, BETAS = (0.0, 0.1, 0.2, 0.4), (-1.0, 0.0, 0.5)
 """Among which the search's start is chosen."""
 RATIOS = (0.01, 2.0)
 """L/T between which Eq. 12 is solved."""
 
 
-def first_gains(fopdt: Fopdt, bench: Bench, demands: Demands) -> Controller:
-    """Gains by Eq. 12 with a limit of Ms; the feedback filter's delay counts as dead time."""
+def first_gains(
+    fopdt: Fopdt, bench: Bench, demands: Demands, plant: Model | None = None
+) -> Controller:
+    """Gains by Eq. 12 with a limit of Ms; the feedback filter's delay counts as dead time.
+
+    Where a linear `plant` shows more than first order with dead time, a resonance above all, the
+    gains are lowered until its Ms is within the limit, too.
+    """
     samples = max(1, min(64, round(FILTER / bench.Ts)))
     rule = _rule(fopdt, (samples - 1) / 2 * bench.Ts, FIRST_MS)
-    return Controller(
+    found = Controller(
         gains=rule.gains,
         Ts=bench.Ts,
         alpha=rule.alpha,
@@ -50,6 +62,29 @@ def first_gains(fopdt: Fopdt, bench: Bench, demands: Demands) -> Controller:
         counts_per_rev=bench.counts_per_rev,
         notes=f"{rule.name} on the recorded step response",
     )
+    return found if plant is None else lowered(found, plant, SAFE_MS)
+
+
+def lowered(controller: Controller, plant: Model, Ms: float) -> Controller:
+    """The controller with its gains lowered together until the loop with `plant` has this Ms."""
+    for step in range(STEPS):
+        found = scaled(controller, LOWER**step)
+        if margins(found, plant).Ms <= Ms:
+            return found
+    raise Refusal(
+        f"expected gains under which the loop is stable with an Ms of at most {Ms:g} on the "
+        "machine's small signals, found none down to a hundredth of the rule's; see the recording "
+        "small_signals"
+    )
+
+
+def scaled(controller: Controller, share: float) -> Controller:
+    """The same controller with a share of its gain."""
+    if share == 1.0:
+        return controller
+    g = controller.gains.to("standard")
+    own = Gains.standard(share * g.Kp, g.Ti, g.Td, u_unit=g.u_unit, y_unit=g.y_unit)
+    return replace(controller, gains=own)
 
 
 def ruled(fopdt: Fopdt, like: Controller) -> Controller:
@@ -122,6 +157,7 @@ def search(
     *,
     requirements: Requirements | None = None,
     variations: Sequence[tuple[float, int]] | None = None,
+    disturbances: Sequence[FloatArray] | None = None,
 ) -> TuningResult:
     """The gains of least cost over all members, each with the usual gain spread and delay.
 
@@ -138,9 +174,11 @@ def search(
             models,
             list(references.values()),
             start=start,
+            variables=SEARCHED,
             cost=cost,
             constraints=asked.constraints,
             loads=asked.loads,
+            disturbances=disturbances,
             variations=variations,
             evaluations=demands.evaluations,
             seed=demands.seed,

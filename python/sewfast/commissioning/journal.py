@@ -16,8 +16,9 @@ Progress: TypeAlias = Callable[[int, int, str], object]
 STAGES = (
     "first motion",
     "step response",
-    "closed loop",
+    "small signals",
     "limits",
+    "closed loop",
     "training",
     "tuning",
     "verification",
@@ -48,6 +49,11 @@ class Journal:
     def first(self) -> Controller:
         """The first gains."""
         found: Controller = self._values["first"]
+        return found
+
+    def recording(self, name: str) -> Recording:
+        """One that was noted."""
+        found: Recording = self._values["recordings"][name]
         return found
 
     @property

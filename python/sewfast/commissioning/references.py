@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from .. import _core
-from ..control import Fopdt
 from ..dataset import FloatArray
 from .demands import Demands
-from .excitations import acceleration
 
-GENTLE = 0.3
-"""Largest share of the limit's acceleration that the standard references ask for."""
+GENTLE = 0.75
+"""Largest share of the machine's acceleration that the standard references ask for."""
 SHORT = 0.35
 """Length of the sweeps to tune on, in shares of those to verify on."""
 
 
-def pace_of(fopdt: Fopdt, demands: Demands) -> float:
+def pace_of(fastest: float, demands: Demands) -> float:
     """How many times longer everything lasts than on a machine that is fast enough."""
-    return max(1.0, demands.speed / 0.4 / (GENTLE * acceleration(fopdt, demands)))
+    return max(1.0, demands.speed / 0.4 / (GENTLE * fastest))
 
 
-def standard(fopdt: Fopdt, demands: Demands, Ts: float, *, short: bool) -> dict[str, FloatArray]:
+def standard(fastest: float, demands: Demands, Ts: float, *, short: bool) -> dict[str, FloatArray]:
     """Trapezoid, chirps of shrinking and of growing amplitude, random levels [RPM].
 
     At 2,000 RPM and a machine that is fast enough: 0 to 2,000 RPM in .4 s; .1 to 3 Hz in 20 s to
@@ -28,10 +26,12 @@ def standard(fopdt: Fopdt, demands: Demands, Ts: float, *, short: bool) -> dict[
 
     Parameters
     ----------
+    fastest : float
+        What the machine accelerates with at the limit of its command [RPM/s].
     short : bool
         Whether to tune on: shorter sweeps, other random levels.
     """
-    pace = pace_of(fopdt, demands)
+    pace = pace_of(fastest, demands)
     size = demands.speed / 2000.0
     share = SHORT if short else 1.0
     return {

@@ -20,6 +20,7 @@ from ..robustness import margins
 from ..tuning import recoveries
 from .demands import Demands
 from .references import pace_of
+from .small_signal import SmallSignal
 
 LOAD = 0.1
 """Of the largest command: the load that comes on unless another is asked for."""
@@ -52,14 +53,24 @@ class Requirements:
 
     @classmethod
     def of(
-        cls, ensemble: Ensemble, fopdt: Fopdt, rival: Controller, demands: Demands
+        cls,
+        ensemble: Ensemble,
+        fopdt: Fopdt,
+        fastest: float,
+        rival: Controller,
+        demands: Demands,
+        small: SmallSignal | None,
     ) -> Requirements:
         """What is required of gains for these members."""
-        loads = _load_steps(fopdt, demands)
+        loads = _load_steps(fopdt, fastest, demands)
         bears = bool(loads) and _bears(rival, ensemble, loads)
         linear = _linear(ensemble.members, demands, rival.Ts) if demands.Ms is not None else []
         speed = LEVEL * demands.speed
-        own = [margins(rival, m, speed=speed).Ms for m in linear] if bears else []
+        if small is not None and demands.Ms is not None:
+            # what answers within milliseconds, a shaft above all, is in no network of a drive
+            linear = [*linear, small.model]
+        is_stiff = small is None or small.resonance is None
+        own = [margins(rival, m, speed=speed).Ms for m in linear] if bears and is_stiff else []
         constraints = Constraints(
             # gains that are no slower than the rule's are hardly less sensitive
             Ms=_limit(demands.Ms, own) if linear else None,
@@ -95,12 +106,12 @@ def _limit(asked: float | None, own: Sequence[float]) -> float | None:
     return max([asked, *(HAIR * x for x in own if math.isfinite(x))])
 
 
-def _load_steps(fopdt: Fopdt, demands: Demands) -> tuple[LoadStep, ...]:
+def _load_steps(fopdt: Fopdt, fastest: float, demands: Demands) -> tuple[LoadStep, ...]:
     """One that brakes, at three quarters of the top speed."""
     volt = LOAD * demands.u_max if demands.load is None else demands.load
     if volt == 0.0:
         return ()
-    pace = pace_of(fopdt, demands)
+    pace = pace_of(fastest, demands)
     return (
         LoadStep(
             LEVEL * demands.speed, -volt, band=RECOVERED * volt * fopdt.K,

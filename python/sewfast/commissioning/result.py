@@ -16,9 +16,14 @@ from ..recording import Recording
 from ..trust import Judgement
 from ..tuning import TuningResult
 from .motion import Motion
+from .small_signal import SmallSignal
+from .turn import TurnLoad
 from .verification import Comparison
 
-VERDICTS = ("verified", "refused", "interrupted")
+VERIFIED, VERIFIED_POORLY = "verified", "verified, prediction poor"
+VERDICTS = (VERIFIED, VERIFIED_POORLY, "refused", "interrupted")
+POOR = 2.0
+"""Measured cost over the predicted one from which the prediction is poor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +34,8 @@ class Commissioning:
     ----------
     machine : str
     verdict : str
-        ``verified``: run on the machine, where it did as predicted. ``refused``, ``interrupted``:
+        ``verified``: run on the machine, where it did as predicted; ``verified, prediction poor``:
+        it kept to the speeds predicted, at more than twice the cost. ``refused``, ``interrupted``:
         ended at `stage`; what there is until then is here, the rest is None or empty.
     stage, reason : str
         The last stage; why it ended there.
@@ -39,6 +45,10 @@ class Commissioning:
     motion : Motion or None
     fopdt : Fopdt or None
         From the step response.
+    small_signal : SmallSignal or None
+        The machine about a working speed, with its resonance where it has one.
+    turn_load : TurnLoad or None
+        The load over the turn, as a command; None where none was seen.
     first : Controller or None
         The gains by rule, under which the closed loop was recorded.
     models : Ensemble or None
@@ -70,6 +80,8 @@ class Commissioning:
     recordings: Mapping[str, Recording] = field(default_factory=dict)
     motion: Motion | None = None
     fopdt: Fopdt | None = None
+    small_signal: SmallSignal | None = None
+    turn_load: TurnLoad | None = None
     first: Controller | None = None
     models: Ensemble | None = None
     rmse: tuple[float, ...] = ()
@@ -85,7 +97,13 @@ class Commissioning:
     @property
     def is_verified(self) -> bool:
         """Whether the machine did as predicted."""
-        return self.verdict == "verified"
+        return self.verdict in (VERIFIED, VERIFIED_POORLY)
+
+    @property
+    def is_predicted_poorly(self) -> bool:
+        """Whether the machine costs more than twice what was predicted."""
+        predicted, measured = self.predicted_cost, self.measured_cost
+        return predicted is not None and measured is not None and measured > POOR * predicted
 
     @property
     def predicted_cost(self) -> float | None:

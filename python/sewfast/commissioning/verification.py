@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from ..trust import Judgement, judge
 from .agreement import DISAGREE
 from .bench import Bench
 from .refusal import Refusal, require
+from .turn import TurnLoad
 
 APART = 0.05
 """Largest distance of measurement from prediction, rms over the reference's span."""
@@ -65,9 +66,12 @@ def _rms(values: FloatArray) -> float:
 
 
 def predict(
-    controller: Controller, ensemble: Ensemble, references: Mapping[str, FloatArray]
+    controller: Controller,
+    ensemble: Ensemble,
+    references: Mapping[str, FloatArray],
+    load: TurnLoad | None = None,
 ) -> tuple[Comparison, ...]:
-    """What the ensemble says of every reference.
+    """What the ensemble says of every reference, with the load over the turn where one was seen.
 
     Raises
     ------
@@ -76,8 +80,11 @@ def predict(
     """
     found = []
     for name, r in references.items():
+        push = None if load is None else load.along(r, controller.Ts)
         try:
-            runs = tuple(run(controller, m, r, name=name) for m in ensemble.members)
+            runs = tuple(
+                run(controller, m, r, name=name, disturbance=push) for m in ensemble.members
+            )
         except FitError as error:
             raise Refusal(
                 f"expected predictions of {name!r}, a member ran away: {error}"
@@ -101,13 +108,25 @@ def predict(
 
 
 def measure(
-    controller: Controller, bench: Bench, predicted: tuple[Comparison, ...]
+    controller: Controller,
+    bench: Bench,
+    predicted: tuple[Comparison, ...],
+    keep: Callable[[tuple[Comparison, ...]], object],
 ) -> tuple[Comparison, ...]:
-    """The same on the machine."""
-    return tuple(
-        replace(c, measured=bench.follow(controller, c.predicted.r, c.reference).run)
-        for c in predicted
-    )
+    """The same on the machine: the shortest reference first, each judged as it ends.
+
+    Raises
+    ------
+    Refusal
+        As `require_alike`, before the next reference is run.
+    """
+    found = dict(enumerate(predicted))
+    for i in sorted(found, key=lambda i: len(found[i].predicted.r)):
+        run = bench.follow(controller, found[i].predicted.r, found[i].reference).run
+        found[i] = replace(found[i], measured=run)
+        keep(tuple(found[k] for k in range(len(predicted))))
+        require_alike(found[i])
+    return tuple(found[k] for k in range(len(predicted)))
 
 
 def judged(predicted: tuple[Comparison, ...], ensemble: Ensemble) -> Judgement:
@@ -119,24 +138,23 @@ def judged(predicted: tuple[Comparison, ...], ensemble: Ensemble) -> Judgement:
     return judge(runs, ensemble, refuse=False)
 
 
-def require_alike(comparisons: tuple[Comparison, ...]) -> None:
+def require_alike(c: Comparison) -> None:
     """Refuse a prediction that the machine has not borne out.
 
     Raises
     ------
     Refusal
     """
-    for c in comparisons:
-        assert c.measured is not None
-        assert c.apart is not None
-        require_unsaturated(c.measured)
-        require(
-            c.apart <= APART * c.span,
-            f"expected the machine within {100 * APART:g} % of the span from the prediction on "
-            f"{c.reference!r}, it was {c.apart:.3g} RPM rms apart; the controller is not verified: "
-            "see both in the report; the machine may have changed since it was recorded, or the "
-            "reference goes where it was not",
-        )
+    assert c.measured is not None
+    assert c.apart is not None
+    require_unsaturated(c.measured)
+    require(
+        c.apart <= APART * c.span,
+        f"expected the machine within {100 * APART:g} % of the span from the prediction on "
+        f"{c.reference!r}, it was {c.apart:.3g} RPM rms apart; the controller is not verified: "
+        "see both in the report; the machine may have changed since it was recorded, or the "
+        "reference goes where it was not",
+    )
 
 
 def require_unsaturated(found: ClosedLoopRun) -> None:

@@ -19,7 +19,7 @@ pub use variable::{Parameter, Variable};
 
 use sewfast_control::{Controller, Design, Settings};
 
-use crate::closed_loop::{Plant, Signals, check_reference};
+use crate::closed_loop::{Plant, Signals};
 use crate::encoder::Encoder;
 use crate::search::{
     Candidate, Judgement, Options, Problem, Termination, cma_es, genetic, several,
@@ -35,6 +35,8 @@ pub struct Task<'a, P> {
     pub plants: &'a [P],
     /// References that it has to follow, each with the same weight.
     pub references: &'a [&'a [f64]],
+    /// A command that is added behind the limits along each reference \[u\], as long as that; empty for none at all.
+    pub disturbances: &'a [&'a [f64]],
     /// Load steps that it has to bear, each with the same weight; of their runs only recovery, deviation and `|u|` count.
     pub loads: &'a [LoadStep<'a>],
     /// The encoder of plants that bring none; `None` for ideal feedback.
@@ -221,10 +223,18 @@ impl<'a, P> Task<'a, P> {
 
     /// What acts on a run from outside.
     fn signals(&self, run: usize) -> Signals<'a> {
-        self.loads.get(run).map_or_else(
-            || Signals::new(self.references[run - self.loads.len()]),
-            LoadStep::signals,
-        )
+        match self.loads.get(run) {
+            Some(load) => load.signals(),
+            None => self.along(run - self.loads.len()),
+        }
+    }
+
+    /// A reference with what disturbs it.
+    fn along(&self, reference: usize) -> Signals<'a> {
+        Signals {
+            disturbance: self.disturbances.get(reference).copied(),
+            ..Signals::new(self.references[reference])
+        }
     }
 
     /// How many runs of its kind share the weight of one.
@@ -265,7 +275,14 @@ impl<'a, P> Task<'a, P> {
         self.check_variables()?;
         self.constraints.check()?;
         self.check_loads()?;
-        self.references.iter().try_for_each(|r| check_reference(r))
+        if !(self.disturbances.is_empty() || self.disturbances.len() == self.references.len()) {
+            return Err(Error::setting(format!(
+                "expected a disturbance for each of {} references or none at all, got {}",
+                self.references.len(),
+                self.disturbances.len()
+            )));
+        }
+        (0..self.references.len()).try_for_each(|i| self.along(i).check())
     }
 
     fn check_loads(&self) -> Result<()> {

@@ -272,6 +272,7 @@ fn candidates(encoded: bool) -> Call {
         let task = Task {
             plants: &plants,
             references: &[&r],
+            disturbances: &[],
             loads: &[],
             encoder: encoder(counts(encoded), 0.5).expect("an encoder"),
             start: designs[0],

@@ -26,7 +26,7 @@ impl<'a> Signals<'a> {
 
     /// # Errors
     /// `ErrorKind::Data` for signals that are empty, not finite or of different lengths.
-    pub(super) fn check(&self) -> Result<()> {
+    pub(crate) fn check(&self) -> Result<()> {
         check_reference(self.reference)?;
         let beside = [
             ("feedforward", self.feedforward),

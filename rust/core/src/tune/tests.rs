@@ -52,6 +52,7 @@ fn with_task<T>(
     work(&Task {
         plants: &plants,
         references: &[&r],
+        disturbances: &[],
         loads: &[],
         encoder: Some(Encoder::new(26.2, 0.5)),
         start,

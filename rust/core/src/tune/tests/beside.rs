@@ -46,6 +46,7 @@ fn controllers_side_by_side_are_worth_what_they_are_worth_alone() {
                 loads,
                 constraints,
                 references: &references,
+                disturbances: &[],
                 ..task.clone()
             };
             compare(&task, &designs(&task.start));

@@ -47,6 +47,7 @@ struct Limits<'py> {
 pub struct Asked<'py> {
     plants: Vec<Bound<'py, PyAny>>,
     references: Vec<Values<'py>>,
+    disturbances: Vec<Values<'py>>,
     load_steps: Vec<Load<'py>>,
     start: Bound<'py, Controller>,
     counts_per_unit: f64,
@@ -62,6 +63,7 @@ pub struct Asked<'py> {
 pub struct Given {
     models: Vec<Model>,
     references: Vec<Vec<f64>>,
+    disturbances: Vec<Vec<f64>>,
     load_steps: Vec<OwnedLoad>,
     variations: Vec<(f64, usize)>,
     counts_per_unit: f64,
@@ -149,7 +151,10 @@ impl Given {
     pub fn new(py: Python<'_>, asked: &Asked<'_>) -> PyResult<Self> {
         let refused = |e| raise(py, e);
         let start = *asked.start.borrow().core.design();
-        let samples = |r: &Values<'_>| slice(r, "references").map(<[f64]>::to_vec);
+        let owned = |name: &'static str, signals: &[Values<'_>]| -> PyResult<Vec<Vec<f64>>> {
+            let samples = |s: &Values<'_>| slice(s, name).map(<[f64]>::to_vec);
+            signals.iter().map(samples).collect()
+        };
         let limits = &asked.limits;
         Ok(Self {
             models: asked
@@ -157,11 +162,8 @@ impl Given {
                 .iter()
                 .map(Model::of)
                 .collect::<PyResult<_>>()?,
-            references: asked
-                .references
-                .iter()
-                .map(samples)
-                .collect::<PyResult<_>>()?,
+            references: owned("references", &asked.references)?,
+            disturbances: owned("disturbances", &asked.disturbances)?,
             load_steps: asked
                 .load_steps
                 .iter()
@@ -190,6 +192,7 @@ impl Given {
     ) -> Result<T> {
         let plants = varied(&self.models, &self.variations, self.start.pid.ts)?;
         let references: Vec<&[f64]> = self.references.iter().map(Vec::as_slice).collect();
+        let disturbances: Vec<&[f64]> = self.disturbances.iter().map(Vec::as_slice).collect();
         let load_steps: Vec<LoadStep<'_>> = self.load_steps.iter().map(OwnedLoad::step).collect();
         if self.ms.is_some() && self.loops.is_empty() {
             return Err(Error::setting(
@@ -211,6 +214,7 @@ impl Given {
         let mut task = Task {
             plants: &plants,
             references: &references,
+            disturbances: &disturbances,
             loads: &load_steps,
             encoder,
             start: self.start,
