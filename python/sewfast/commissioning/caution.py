@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..control import Controller
 from ..dataset import FloatArray
-from ..loop import ClosedLoopRun
+from ..errors import FitError
+from ..loop import ClosedLoopRun, run
+from ..models import Ensemble
 from .bench import Bench
 from .demands import Demands
 from .gains import scaled
@@ -23,6 +26,8 @@ PERIODS = 100
 """Samples that it is held at the least."""
 CHATTER = 0.12
 """Standard deviation of a quiet loop's command at a held speed, in shares of the largest command."""
+EXPECTED = 2.0
+"""Times the models' own, which is the encoder's, that it may be in any case."""
 RAILED = 0.05
 """Share of the held samples at a limit."""
 BACK = 0.5
@@ -58,20 +63,25 @@ def held(demands: Demands, fastest: float, Ts: float) -> tuple[FloatArray, int]:
     return level * np.minimum(1.0, np.arange(settle + hold) / rise), settle
 
 
-def swing_of(run: ClosedLoopRun, settled: int, share: float = 1.0) -> Swing | None:
-    """Whether the command swings at a held speed; None for a quiet loop."""
-    u, limits = run.u[settled:], run.controller
+def swing_of(
+    found: ClosedLoopRun, settled: int, share: float = 1.0, expected: float = 0.0
+) -> Swing | None:
+    """Whether the command swings at a held speed; None for a quiet loop.
+
+    `expected` is what models say of its standard deviation [V].
+    """
+    u, limits = found.u[settled:], found.controller
     u = u[np.isfinite(u)]
     reach = 0.5 * (limits.u_max - limits.u_min)
     railed = float(np.mean((u >= limits.u_max - 1e-9) | (u <= limits.u_min + 1e-9)))
     deviation = float(u.std())
-    if deviation <= CHATTER * reach and railed <= RAILED:
+    if deviation <= max(CHATTER * reach, EXPECTED * expected) and railed <= RAILED:
         return None
     k = np.arange(len(u))
     rest = u - np.polyval(np.polyfit(k, u, 1), k)
     power = np.abs(np.fft.rfft(rest * np.hanning(len(rest)))) ** 2
     at = 1 + int(np.argmax(power[1:]))
-    return Swing(share, at / (len(u) * run.Ts), deviation, railed)
+    return Swing(share, at / (len(u) * found.Ts), deviation, railed)
 
 
 def cautious(
@@ -81,8 +91,11 @@ def cautious(
     fastest: float,
     name: str,
     small: SmallSignal | None,
+    models: Ensemble | None = None,
 ) -> tuple[Controller, Swing | None]:
     """The gains that hold a speed quietly, of those that were asked for, and the swing that was met.
+
+    `models` know how far the encoder's counts alone move the command.
 
     Raises
     ------
@@ -92,7 +105,9 @@ def cautious(
     r, settled = held(demands, fastest, bench.Ts)
     for share in SHARES:
         tried = scaled(controller, share)
-        swing = swing_of(bench.follow(tried, r, f"{name}_{100 * share:g}").run, settled, share)
+        expected = 0.0 if models is None else _chatter(tried, models, r, settled)
+        found = bench.follow(tried, r, f"{name}_{100 * share:g}").run
+        swing = swing_of(found, settled, share, expected)
         if swing is None:
             continue
         kept = BACK * share
@@ -103,6 +118,15 @@ def cautious(
             )
         return scaled(controller, kept), swing
     return controller, None
+
+
+def _chatter(
+    controller: Controller, models: Ensemble, r: FloatArray, settled: int
+) -> float:  # fmt: skip
+    """Standard deviation of the command at the held speed, the largest of any model [V]."""
+    with suppress(FitError):
+        return max(float(run(controller, m, r).u[settled:].std()) for m in models.members)
+    return 0.0
 
 
 def cause(swing: Swing, small: SmallSignal | None) -> str:

@@ -18,8 +18,8 @@ LONGEST = 60.0
 """Of any excitation [s]."""
 PULSES = 20.0
 """Length of the pulses in time constants."""
-HARD = 0.8
-"""Least size of a pulse in shares of the largest command."""
+HARD = 0.25
+"""Least size of a pulse in shares of the largest command: a current limit is met halfway."""
 SLOW = 0.15
 """Speed between the trapezoids in shares of the top: a shaft that friction holds tells nothing."""
 TRAPEZOIDS = (
@@ -94,12 +94,11 @@ def levels(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float, seed: int)
     )
 
 
-def pulses(fopdt: Fopdt, demands: Demands, Ts: float, seed: int) -> FloatArray:
+def pulses(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float, seed: int) -> FloatArray:
     """Short commands near the largest, between speeds of the working range [V].
 
-    A drive limits its current there, which no gentle loop reaches and every fast one does. They are
-    planned with the acceleration that the command would give without such a limit: what is there
-    is less, and the speed stays below the plan.
+    A drive limits its current there, which no gentle loop reaches and every fast one does. Planned
+    with a larger acceleration than the machine has, they stay below the speeds of the plan.
     """
     T = fopdt.T
     return _core.jumps(
@@ -114,6 +113,6 @@ def pulses(fopdt: Fopdt, demands: Demands, Ts: float, seed: int) -> FloatArray:
         hold_max=2.0 * T,
         ramp=0.0,
         gain=fopdt.K,
-        acceleration=acceleration(fopdt, demands),
+        acceleration=fastest,
         seed=seed,
     )

@@ -88,8 +88,12 @@ def scaled(controller: Controller, share: float) -> Controller:
 
 
 def ruled(fopdt: Fopdt, like: Controller) -> Controller:
-    """Eq. 12's gains without a limit of Ms, in the surroundings of another controller."""
-    rule = _rule(fopdt, (like.filter_samples - 1) / 2 * like.Ts + like.filter_time, math.inf)
+    """Eq. 12's gains with an Ms of at most 2, in the surroundings of another controller.
+
+    Without that limit the short dead time of small signals asks for gains that move the command by
+    volts for every count of the encoder.
+    """
+    rule = _rule(fopdt, (like.filter_samples - 1) / 2 * like.Ts + like.filter_time, SAFE_MS)
     return replace(
         like, gains=rule.gains, alpha=rule.alpha, beta=rule.beta, schedule=(),
         notes=f"{rule.name} on the recorded step response",

@@ -48,6 +48,8 @@ __all__ = ["STAGES", "commission"]
 
 MEMBERS = 4
 EVALUATIONS = 3000
+FALLS_SHORT = 0.7
+"""Of the planned acceleration: below it a drive limits its current."""
 
 References = Mapping[str, ArrayLike] | Sequence[str]
 
@@ -216,10 +218,7 @@ def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal
     journal.keep(first=first, controller=first)
 
     journal.enter("limits")
-    pulses = bench.excite(excitations.pulses(step, asked, bench.Ts, asked.seed), "pulses")
-    fastest = min(
-        excitations.acceleration(step, asked), excitations.acceleration_shown(pulses, asked)
-    )
+    fastest, pulses = _pulses(bench, step, asked)
 
     journal.enter("closed loop")
     first, _ = cautious(bench, first, asked, fastest, "hold_first", small)
@@ -231,7 +230,7 @@ def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal
     levels = bench.follow(first, r, "levels")
 
     journal.enter("training")
-    learned = [journal.recording("step"), trapezoids.recording, pulses]
+    learned = [journal.recording("step"), trapezoids.recording, *pulses]
     trained = train(learned, levels.recording, asked, journal.within)
     journal.keep(models=trained.ensemble, rmse=trained.rmse, card=trained.card)
     load = None
@@ -247,19 +246,38 @@ def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal
     ensemble, controller = _tuned(trained, plan, journal)
 
     journal.enter("verification")
-    controller, swing = cautious(bench, controller, asked, fastest, "hold_tuned", small)
+    controller, swing = cautious(
+        bench, controller, asked, fastest, "hold_tuned", small, ensemble
+    )
     if swing is not None:
-        raise Refusal(
-            f"expected a quiet loop under the tuned gains, at {100 * swing.share:g} % of them it "
-            f"swings at {swing.frequency:.3g} Hz ({swing.command:.3g} V rms): "
-            f"{cause(swing, small)}"
+        note = (
+            f"{controller.notes}; gains lowered, as the machine swung at {swing.frequency:.3g} Hz "
+            f"under {100 * swing.share:g} % of them: {cause(swing, small)}"
         )
+        controller = replace(controller, notes=note)
+        journal.keep(controller=controller)
     comparisons = predict(controller, ensemble, verify, load)
     journal.keep(comparisons=comparisons, judgement=judged(comparisons, ensemble))
     measure(controller, bench, comparisons, lambda found: journal.keep(comparisons=found))
     journal.finish()
     found = journal.result(VERIFIED)
     return replace(found, verdict=VERIFIED_POORLY) if found.is_predicted_poorly else found
+
+
+def _pulses(bench: Bench, fopdt: Fopdt, asked: Demands) -> tuple[float, list[Recording]]:
+    """The acceleration at the command's limit [RPM/s], and recordings of pulses.
+
+    The first ones are planned without a current limit, and where there is one they fall short of
+    the speeds; then others are planned with the acceleration that these have shown.
+    """
+    fastest = excitations.acceleration(fopdt, asked)
+    u = excitations.pulses(fopdt, fastest, asked, bench.Ts, asked.seed)
+    found = [bench.excite(u, "pulses")]
+    shown = excitations.acceleration_shown(found[0], asked)
+    if shown > FALLS_SHORT * fastest:
+        return min(shown, fastest), found
+    u = excitations.pulses(fopdt, shown, asked, bench.Ts, asked.seed + 1)
+    return shown, [*found, bench.excite(u, "pulses_limited")]
 
 
 @dataclass(frozen=True)
@@ -294,12 +312,13 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
             disturbances=pushes,
         )  # fmt: skip
 
-    required, tuning = of(trained.ensemble)
-    ensemble = agreeing(tuning.controller, trained.ensemble, practice)
-    if ensemble is not trained.ensemble:
+    alike = agreeing(first, trained.ensemble, practice)
+    required, tuning = of(alike)
+    ensemble = agreeing(tuning.controller, alike, practice)
+    if ensemble is not alike:
         # one that parts from the others has had its say in these gains
-        journal.keep(models=ensemble, rmse=trained.errors_of(ensemble))
         required, tuning = of(ensemble)
+    journal.keep(models=ensemble, rmse=trained.errors_of(ensemble))
     controller = replace(tuning.controller, notes="commissioned on an ensemble of networks")
     journal.keep(tuning=tuning, controller=controller, met=required.met(controller, ensemble))
     return ensemble, controller

@@ -8,6 +8,8 @@ from .demands import Demands
 
 GENTLE = 0.75
 """Largest share of the machine's acceleration that the standard references ask for."""
+BRIEF = 2.5
+"""Slowness up to which the ones to tune on last longer; beyond it they cover less."""
 SHORT = 0.35
 """Length of the sweeps to tune on, in shares of those to verify on."""
 
@@ -34,15 +36,17 @@ def standard(fastest: float, demands: Demands, Ts: float, *, short: bool) -> dic
     pace = pace_of(fastest, demands)
     size = demands.speed / 2000.0
     share = SHORT if short else 1.0
+    # a slow machine's whole sweeps would be minutes of every loop that a search simulates
+    brief = min(pace, BRIEF) if short else pace
     return {
         "trapezoid": _core.trapezoid(
             duration=2.0 * pace, Ts=Ts, start=0.1 * pace, rise=0.4 * pace, hold=0.6 * pace,
             fall=0.4 * pace, low=0.0, high=demands.speed,
         ),
-        "chirp_hi_lo": _sweep((1080.0, 150.0), (1080.0, 400.0), size, pace, share, Ts),
-        "chirp_lo_hi": _sweep((50.0, 250.0), (50.0, 350.0), size, pace, share, Ts),
+        "chirp_hi_lo": _sweep((1080.0, 150.0), (1080.0, 400.0), size, pace, brief * share, Ts),
+        "chirp_lo_hi": _sweep((50.0, 250.0), (50.0, 350.0), size, pace, brief * share, Ts),
         "random": _core.random_steps(
-            duration=(5.0 if short else 10.0) * pace, Ts=Ts, low=200.0 * size,
+            duration=5.0 * brief if short else 10.0 * pace, Ts=Ts, low=200.0 * size,
             high=2000.0 * size, hold_min=0.25 * pace, hold_max=0.9 * pace, smoothing=0.2 * pace,
             seed=demands.seed + short, start=0.0,
         ),
@@ -54,11 +58,11 @@ def _sweep(
     offset: tuple[float, float],
     size: float,
     pace: float,
-    share: float,
+    length: float,
     Ts: float,
 ) -> FloatArray:
     return _core.chirp(
-        duration=20.0 * pace * share, Ts=Ts, f_start=0.1 / pace, f_end=3.0 / pace,
+        duration=20.0 * length, Ts=Ts, f_start=0.1 / pace, f_end=3.0 / pace,
         amplitude_start=size * amplitude[0], amplitude_end=size * amplitude[1],
         offset_start=size * offset[0], offset_end=size * offset[1],
     )  # fmt: skip

@@ -32,15 +32,13 @@ SAMPLES, LONGEST = 4_000, 12.0
 """Samples that are shaken; not longer than that [s]."""
 HOLD = 2
 """Samples that each random value is held: power up to a quarter of the sample rate."""
-ORDERS = (1, 2, 3, 4, 5, 6)
+ORDERS = (1, 2, 3, 4, 5)
 LEAST_GAIN = math.log(1.005)
 """A difference in error that counts as none, however well it is known."""
 SWINGS = 0.3
 """Damping ratio below which a pair of poles is a resonance."""
 LOWEST, HIGHEST = 2.0, 0.4
 """Frequencies looked at: from so many Hz to that share of the sample rate."""
-VISIBLE = 1.03
-"""How much worse the machine without its resonance must explain the record."""
 LEAST_FIT = 90.0
 """Percent at which the model's own step response is one of first order with dead time."""
 
@@ -123,11 +121,8 @@ def explained(recording: Recording, settled: int, fopdt: Fopdt) -> SmallSignal |
         return None
     order = _simplest(found)
     core = found[order][0]
-    resonance = _resonance(core, recording.Ts)
-    smaller = [e.rmse for o, (_, e) in found.items() if o < order and o <= 2]
-    if resonance is not None and smaller and min(smaller) < VISIBLE * found[order][1].rmse:
-        resonance = None
     model = wrap(LinearOE, core, data)
+    resonance = _resonance(core, recording.Ts)
     return SmallSignal(model, resonance, _first_order(core, recording.Ts, fopdt))
 
 
@@ -155,19 +150,19 @@ def _simplest(found: dict[int, tuple[_core.LinearModel, Errors]]) -> int:
 
 
 def _resonance(core: _core.LinearModel, Ts: float) -> Resonance | None:
-    """The least damped pair of poles within the frequencies looked at."""
-    poles = core.poles()
-    s = np.log((poles[:, 0] + 1j * poles[:, 1]).astype(complex)) / Ts
-    pairs = [
-        Resonance(float(abs(p)) / (2.0 * math.pi), float(-p.real / abs(p)))
-        for p in s
-        if p.imag > 0.0
-    ]
-    seen = [
-        r for r in pairs
-        if LOWEST <= r.frequency <= HIGHEST / Ts and r.damping < SWINGS
-    ]  # fmt: skip
-    return min(seen, key=lambda r: r.damping, default=None)
+    """Of the lightly damped pairs of poles within the frequencies looked at, the highest peak."""
+    poles = core.poles()[:, 0] + 1j * core.poles()[:, 1]
+    found: list[tuple[float, Resonance]] = []
+    for p in poles[poles.imag > 0.0]:
+        s = np.log(p) / Ts
+        resonance = Resonance(float(abs(s)) / (2.0 * math.pi), float(-s.real / abs(s)))
+        is_seen = LOWEST <= resonance.frequency <= HIGHEST / Ts and resonance.damping < SWINGS
+        # the pair's share of the response at its own frequency: its residue over its distance
+        others = np.prod(p - poles[np.abs(poles - p) > 0.0])
+        peak = abs(np.polyval(core.b[0], p) / others) / max(1.0 - abs(p), 1e-9)
+        if is_seen:
+            found.append((float(peak), resonance))
+    return max(found, key=lambda f: f[0], default=(0.0, None))[1]
 
 
 def _first_order(core: _core.LinearModel, Ts: float, recorded: Fopdt) -> Fopdt | None:

@@ -26,9 +26,7 @@ LEAST_FIT = 85.0
 CLOSE = 0.02
 """Of the span of that recording: members that are within it stay, whatever the best one does."""
 DRAWN = 2
-"""Lagged networks that are trained for each one that is wanted."""
-HIDDEN = 8
-"""Of the state-space networks: more would make the search of gains slow, and gain little."""
+"""Networks that are trained for each one that is wanted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,32 +115,11 @@ def validate_member(model: Model, data: Dataset) -> tuple[float, float]:
 def _members(
     data: Dataset, demands: Demands, progress: Callable[[int, int], object]
 ) -> list[Model]:
-    """State-space networks by the search, then lagged ones by seed; a Ctrl-C ends all of them.
+    """Networks by seed, side by side; a Ctrl-C ends all of them.
 
-    Several kinds from several starts: where they agree, it is the machine. Twice as many lagged
-    networks are trained as are wanted, as some end in a poor minimum; the better half of them by
-    the error on their own training data stays.
+    Twice as many are trained as are wanted, as some end in a poor minimum: the better half by the
+    error on their own training data stays.
     """
-    total = 1 + DRAWN * demands.members
-
-    def look(*_: object) -> None:
-        progress(0, total)
-
-    try:
-        found = identify(
-            data, model="neural_ss", hidden=HIDDEN, nk=1, starts=max(4, demands.members),
-            seed=demands.seed, threads=demands.threads, progress=look,
-        )  # fmt: skip
-        members = list(found.members or (found,))[: demands.members]
-    except FitError:
-        members = []
-    lagged = _lagged(data, demands, lambda done: progress(1 + done, total))
-    trained = sorted(lagged, key=lambda m: validate_member(m, data)[0])
-    return members + trained[: demands.members]
-
-
-def _lagged(data: Dataset, demands: Demands, progress: Callable[[int], object]) -> list[Model]:
-    """Networks by seed, side by side."""
     stopped = threading.Event()
     seeds = [demands.seed + i for i in range(DRAWN * demands.members)]
     done: list[Model | None] = [None] * len(seeds)
@@ -164,11 +141,12 @@ def _lagged(data: Dataset, demands: Demands, progress: Callable[[int], object]) 
     try:
         for i, future in enumerate([pool.submit(one, i) for i in range(len(seeds))]):
             future.result()
-            progress(i + 1)
+            progress(i + 1, len(seeds))
     except BaseException:
         stopped.set()
         # the evidence that follows a training cannot be stopped, nor is it waited for
         pool.shutdown(wait=False, cancel_futures=True)
         raise
     pool.shutdown()
-    return [m for m in done if m is not None]
+    trained = sorted((m for m in done if m is not None), key=lambda m: validate_member(m, data)[0])
+    return trained[: demands.members]
