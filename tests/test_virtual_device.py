@@ -155,7 +155,7 @@ def armed(host: RawHost, watchdog: int) -> None:
     host.credit(host.frames[-1][3] + 300_000, watchdog=LONG)
     host.settle()
     host.command(raw.LIMITS, struct.pack("<4f", 20.0, 6000.0, 1e6, 50.0))
-    while host.ask(raw.ARM, struct.pack("<I", watchdog))[0]:
+    while host.ask(raw.ARM, host.arming(watchdog))[0]:
         host.credit(host.frames[-1][3] + 300_000, watchdog=LONG)
 
 
@@ -282,7 +282,7 @@ class TestFaults:
             assert host.boot & 0xFFFF != boot & 0xFFFF
             host.settle()
             # limits are not set since this boot
-            assert host.ask(raw.ARM, struct.pack("<I", LONG))[0] in (11, 12)
+            assert host.ask(raw.ARM, host.arming(LONG))[0] in (11, 12)
 
     def test_an_unplugged_port_comes_back_with_the_session_in_force(self, device):
         with ready(RawHost(device.port)) as host:

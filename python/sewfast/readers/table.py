@@ -67,6 +67,7 @@ class Table:
         DataError
             Where the file has no such column, or it cannot be used.
         """
+        name = printable(name)
         for candidate in (name, split_unit(name)[0]):
             if candidate in self.columns:
                 return candidate
@@ -93,6 +94,11 @@ class Table:
         return f"sample {k} (0-based)" if self.lines is None else f"line {self.lines[k]}"
 
 
+def printable(name: str) -> str:
+    r"""A name that cannot steer the terminal that it is shown on: `a\x1b` is written `a\\x1b`."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in name)
+
+
 def split_unit(header: str) -> tuple[str, str]:
     """`u [V]` or `u (V)` -> `("u", "V")`; no unit gives an empty one."""
     match = re.fullmatch(r"\s*(\S.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*", header)
@@ -117,7 +123,7 @@ def from_headers(
     lines: Sequence[int] | None = None,
 ) -> Table:
     """A table from a header row; `bad` holds the reason for each column that cannot be used."""
-    names, units = split_units(headers)
+    names, units = split_units([printable(h.strip()) for h in headers])
     unusable = {
         n: f"the header {n!r} occurs more than once; rename one"
         for n in names

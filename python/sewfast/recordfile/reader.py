@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -221,7 +221,7 @@ def decode_recording(path: Path, raw: bytes) -> RecordedFile:
     """As `read_recording`, from the file's bytes."""
     found = _Contents()
     stop: int | None = None
-    for chunk in walk.chunks(raw):
+    for chunk in _chunks(path, raw):
         whole = (
             walk.is_start(raw, chunk.start)
             if stop is None
@@ -237,6 +237,13 @@ def decode_recording(path: Path, raw: bytes) -> RecordedFile:
     if stop is not None and (fault := walk.ending_fault(raw, stop, damaged=bool(found.damage))):
         found.damage.append(fault)
     return found.assemble(path, found.header)
+
+
+def _chunks(path: Path, raw: bytes) -> Iterator[walk.Chunk]:
+    try:
+        yield from walk.chunks(raw)
+    except DataError as e:
+        raise DataError(f"{path}: {e}") from e
 
 
 def _headless(path: Path, raw: bytes, damage: list[str]) -> DataError:

@@ -24,6 +24,10 @@ pub struct Lags {
 const MOST_LAGS: usize = 1_000;
 /// How often the prior of the initial state may be loosened; on a clean record each time gains two digits or more.
 const RELAXATIONS: usize = 6;
+/// The least weight of the prior.
+const LEAST_PRIOR: f64 = 1e-9;
+/// Times that the prior is then lowered to a tenth, for as long as that halves the residual.
+const PROBES: usize = 8;
 
 impl Lags {
     /// Orders that make a model.
@@ -253,6 +257,16 @@ pub trait Lagged {
             }
             best = search.descend(best.1.clone()).unwrap_or(best);
         }
+        // where the output hardly moves the prior's own bias looks like noise; noise stays when the prior goes
+        for _ in 0..PROBES {
+            if known.len() <= 2 * lags.na {
+                break;
+            }
+            match search.probe(&best.1) {
+                Some(found) => best = found,
+                None => break,
+            }
+        }
         Ok(best.1)
     }
 }
@@ -415,13 +429,36 @@ impl<'a, M: Lagged + ?Sized> StateSearch<'a, M> {
         Some((cost, state))
     }
 
+    /// The state with a tenth of the prior's weight, where that is less than half as far from the record.
+    fn probe(&mut self, state: &[f64]) -> Option<(f64, Vec<f64>)> {
+        let prior = self.rho;
+        if prior <= LEAST_PRIOR {
+            return None;
+        }
+        let before = self.residual(state);
+        self.rho = (0.1 * prior).max(LEAST_PRIOR);
+        let found = self.descend(state.to_vec());
+        let found = found.filter(|(_, state)| self.residual(state) < 0.5 * before);
+        if found.is_none() {
+            self.rho = prior;
+        }
+        found
+    }
+
+    /// Sum of squared residuals alone.
+    fn residual(&mut self, state: &[f64]) -> f64 {
+        let prior = std::mem::replace(&mut self.rho, 0.0);
+        let residual = self.evaluate(state);
+        self.rho = prior;
+        residual
+    }
+
     /// Lowers the prior's weight to what the residual says; false where it is low enough already.
     fn relax(&mut self, state: &[f64], level: f64, known: &[f64]) -> bool {
         let (prior, samples) = (self.rho, known.len());
-        self.rho = 0.0;
-        let residual = self.evaluate(state) / (samples - self.lags.na) as f64;
+        let residual = self.residual(state) / (samples - self.lags.na) as f64;
         let spread = known.iter().map(|y| (y - level) * (y - level)).sum::<f64>() / samples as f64;
-        self.rho = (residual / spread.max(f64::MIN_POSITIVE)).clamp(1e-9, prior);
+        self.rho = (residual / spread.max(f64::MIN_POSITIVE)).clamp(LEAST_PRIOR, prior);
         self.rho < prior
     }
 }

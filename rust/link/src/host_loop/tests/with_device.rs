@@ -80,6 +80,7 @@ impl Bench {
     fn new() -> Self {
         let device = Device::new(Identity {
             boot_id: 3,
+            entropy: 0,
             name: "bench",
             firmware: "1",
             period: 1000,
@@ -100,7 +101,7 @@ impl Bench {
         };
         bench.pass(200);
         let mut hello = Body::new();
-        hello.u8(2).u8(2).u32(99);
+        hello.u8(3).u8(3).u32(99);
         bench.say(0x01, 0, 0, &hello);
         let mut limits = Body::new();
         limits
