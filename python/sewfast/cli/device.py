@@ -61,7 +61,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--anyone", action="store_true",
-        help="--tcp may name an address that other computers reach; who reaches it starts the motor",
+        help="--tcp may name an address that other computers reach, and start the motor from",
     )  # fmt: skip
     parser.add_argument(
         "--machine", default="virtual", metavar="virtual[:SEED]", help="the machine (virtual)"

@@ -23,8 +23,8 @@ Value: TypeAlias = Any
 def read_npz(path: Path, raw: bytes) -> Table:
     """Read the arrays of an `.npz` archive; pickled objects are never loaded.
 
-    An archive may say of itself that it unpacks to a thousand times its size: what its members claim
-    is bounded before any of them is unpacked, and a member gives no more than it claims.
+    An archive may unpack to a thousand times its size: what its members claim is bounded before any
+    of them is unpacked, and a member gives no more than it claims.
     """
     try:
         with np.load(io.BytesIO(raw), allow_pickle=False) as archive:

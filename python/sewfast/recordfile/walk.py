@@ -34,7 +34,7 @@ from .topics import Topic
 LARGEST_CHUNK = 4 << 20
 """Bytes; a recording's own chunks are far smaller."""
 BUDGET = 4
-"""Checksums that fail may cover so many times the file; of one that is damaged each covers a chunk."""
+"""Checksums that fail may cover so many times the file; each damaged chunk is covered by one."""
 
 
 class Chunk(NamedTuple):
@@ -84,7 +84,10 @@ def _claimed(raw: bytes, at: int) -> int | None:
 
 def _chunk_at(raw: bytes, at: int, size: int) -> Chunk | None:
     stop = at + CHUNK_HEAD.size + size
-    if zlib.crc32(memoryview(raw)[at + CHUNK_HEAD.size : stop]) != CHUNK_HEAD.unpack_from(raw, at)[5]:
+    if (
+        zlib.crc32(memoryview(raw)[at + CHUNK_HEAD.size : stop])
+        != CHUNK_HEAD.unpack_from(raw, at)[5]
+    ):
         return None
     body = raw[at + CHUNK_HEAD.size : stop]
     messages = _messages(body)
