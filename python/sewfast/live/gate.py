@@ -1,6 +1,6 @@
 """`Gate`: who may connect to a WebSocket server of this computer, by the head of the request.
 
-A browser lets any page connect to a WebSocket on the computer it runs on, and read what it sends; the
+A browser lets any page connect to a WebSocket on its own computer and read what it sends; the
 page's address stands in `Origin`, which a page cannot change. A page whose name was made to lead to
 this computer (DNS rebinding) gives itself away by `Host`. The server behind, Foxglove's own, looks
 at neither, so that what passes is handed on to it.

@@ -50,6 +50,8 @@ const BEYOND: f64 = 0.005;
 const GRID: usize = 21;
 /// Times that the search is narrowed about the best point, each time to a half.
 const ROUNDS: usize = 26;
+/// Shares of `T` in the sum of `T` and `L` from which the polish begins, too.
+const SHARES: [f64; 9] = [0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0];
 /// Most steps of the polish, and halvings of one.
 const STEPS: usize = 30;
 const HALVINGS: usize = 12;
@@ -275,7 +277,16 @@ impl<'a> Step<'a> {
             ln_t = narrowed(ln_t, best.t.ln(), f64::NEG_INFINITY);
             l = narrowed(l, best.l, 0.0);
         }
-        self.polished(best)
+        // The sum of T and L is what a response tells best; how it is shared between them the grid can miss by a whole basin where
+        // T is a small part of it.
+        let sum = best.t + best.l;
+        let shared = SHARES.map(|share| self.candidate(share * sum, (1.0 - share) * sum));
+        let other = shared
+            .into_iter()
+            .reduce(|x, y| if y.cost < x.cost { y } else { x });
+        let other = other.map(|other| self.polished(other));
+        let best = self.polished(best);
+        other.filter(|other| other.cost < best.cost).unwrap_or(best)
     }
 
     /// Gauss and Newton's steps from where the grid has ended, for as long as they lower the squares.

@@ -24,10 +24,8 @@ pub struct Lags {
 const MOST_LAGS: usize = 1_000;
 /// How often the prior of the initial state may be loosened; on a clean record each time gains two digits or more.
 const RELAXATIONS: usize = 6;
-/// The least weight of the prior.
-const LEAST_PRIOR: f64 = 1e-9;
-/// Times that the prior is then lowered to a tenth, for as long as that halves the residual.
-const PROBES: usize = 8;
+/// In so short a record other starts are tried too, as two basins may look alike.
+const SHORT: usize = 1000;
 
 impl Lags {
     /// Orders that make a model.
@@ -257,18 +255,34 @@ pub trait Lagged {
             }
             best = search.descend(best.1.clone()).unwrap_or(best);
         }
-        // where the output hardly moves the prior's own bias looks like noise; noise stays when the prior goes
-        for _ in 0..PROBES {
-            if known.len() <= 2 * lags.na {
-                break;
-            }
-            match search.probe(&best.1) {
-                Some(found) => best = found,
-                None => break,
+        if known.len() <= SHORT {
+            // a network need not be monotone: starts with all past outputs alike can all lead to a state that is not the nearest
+            for start in spread_starts(lags.na, level, &known) {
+                best = match search.descend(start) {
+                    // what noise alone makes of another start is left
+                    Some(found) if found.0 < 0.5 * best.0 => found,
+                    _ => best,
+                };
             }
         }
         Ok(best.1)
     }
+}
+
+/// Past outputs that differ from each other, as far from `level` as the outputs go, and three times as far.
+fn spread_starts(na: usize, level: f64, known: &[f64]) -> Vec<Vec<f64>> {
+    let width = known.iter().map(|y| (y - level).abs()).fold(0.0, f64::max);
+    let patterns: [fn(usize) -> f64; 4] = [
+        |_| 1.0,
+        |i| if i % 2 == 0 { 1.0 } else { -1.0 },
+        |i| f64::from(u8::from(i == 0)),
+        |i| f64::from(u8::from(i > 0)),
+    ];
+    let sizes = [width, -width, 3.0 * width, -3.0 * width];
+    let starts = sizes.into_iter().flat_map(|size| {
+        patterns.map(|pattern| (0..na).map(|i| level + size * pattern(i)).collect())
+    });
+    starts.collect()
 }
 
 fn best_of(found: impl Iterator<Item = (f64, Vec<f64>)>) -> Result<(f64, Vec<f64>)> {
@@ -429,36 +443,13 @@ impl<'a, M: Lagged + ?Sized> StateSearch<'a, M> {
         Some((cost, state))
     }
 
-    /// The state with a tenth of the prior's weight, where that is less than half as far from the record.
-    fn probe(&mut self, state: &[f64]) -> Option<(f64, Vec<f64>)> {
-        let prior = self.rho;
-        if prior <= LEAST_PRIOR {
-            return None;
-        }
-        let before = self.residual(state);
-        self.rho = (0.1 * prior).max(LEAST_PRIOR);
-        let found = self.descend(state.to_vec());
-        let found = found.filter(|(_, state)| self.residual(state) < 0.5 * before);
-        if found.is_none() {
-            self.rho = prior;
-        }
-        found
-    }
-
-    /// Sum of squared residuals alone.
-    fn residual(&mut self, state: &[f64]) -> f64 {
-        let prior = std::mem::replace(&mut self.rho, 0.0);
-        let residual = self.evaluate(state);
-        self.rho = prior;
-        residual
-    }
-
     /// Lowers the prior's weight to what the residual says; false where it is low enough already.
     fn relax(&mut self, state: &[f64], level: f64, known: &[f64]) -> bool {
         let (prior, samples) = (self.rho, known.len());
-        let residual = self.residual(state) / (samples - self.lags.na) as f64;
+        self.rho = 0.0;
+        let residual = self.evaluate(state) / (samples - self.lags.na) as f64;
         let spread = known.iter().map(|y| (y - level) * (y - level)).sum::<f64>() / samples as f64;
-        self.rho = (residual / spread.max(f64::MIN_POSITIVE)).clamp(LEAST_PRIOR, prior);
+        self.rho = (residual / spread.max(f64::MIN_POSITIVE)).clamp(1e-9, prior);
         self.rho < prior
     }
 }

@@ -385,7 +385,11 @@ mod tests {
         let mut guard = guard();
         guard.begin();
         (0..20 * half).find_map(|k| {
-            let u = if k / half % 2 == 0 { size } else { -size };
+            let u = if (k / half).is_multiple_of(2) {
+                size
+            } else {
+                -size
+            };
             guard.expect_calm(-10.0, 10.0, u).err().map(|(reason, f)| {
                 assert_eq!(reason, Reason::Swinging);
                 (k, f)
