@@ -31,7 +31,7 @@ def armed(host: RawHost) -> None:
     host.credit(host.frames[-1][3] + 300_000, watchdog=10_000_000)
     host.settle()
     host.command(raw.LIMITS, struct.pack("<4f", 20.0, 6000.0, 1e6, 50.0))
-    while host.ask(raw.ARM, struct.pack("<I", 10_000_000))[0]:
+    while host.ask(raw.ARM, host.arming(10_000_000))[0]:
         host.credit(host.frames[-1][3] + 300_000, watchdog=10_000_000)
 
 

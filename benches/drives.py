@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from sewfast import Controller, commission
+from sewfast import commission
 from sewfast.commissioning import Refusal, SteppedBench
 
 try:

@@ -26,6 +26,7 @@ import link_frames as golden
 HELLO, DESCRIBE, STATUS, LIMITS, ARM, STOP, CLEAR, UPLOAD, GAINS, START, ECHO = range(1, 12)
 KEEP, DRIVE, CREDIT = 0x20, 0x21, 0x22
 BOOT, IDLE, ARMED, RUNNING, TRIPPED = range(5)
+KEY = 0xC0FFEE11
 PERIOD = 1000
 CEILINGS = (20.0, 5000.0, 1e6, 10.0)
 
@@ -321,12 +322,12 @@ class ScriptedDevice(threading.Thread):
             self._session, self._last, self.limits = session, None, (0.0,) * 4
             if self.state == RUNNING:
                 self.trip(7)
-        schema = zlib.crc32(struct.pack("<BI", 2, PERIOD) + b"".join(CHANNELS[: self.channels]))
+        schema = zlib.crc32(struct.pack("<BI", 3, PERIOD) + b"".join(CHANNELS[: self.channels]))
         head = struct.pack(
-            "<BIIBBIIIf", 2, self.boot, self.schema or schema, self.state, self.channels, PERIOD,
+            "<BIIBBIIIf", 3, self.boot, self.schema or schema, self.state, self.channels, PERIOD,
             self.capabilities, self.capacity, 1572.0,
         )  # fmt: skip
-        answer = b"\0" + head + text("script") + text("1.0") + struct.pack("<I", session)
+        answer = b"\0" + head + text("script") + text("1.0") + struct.pack("<II", session, KEY)
         if self.hello_result != b"\0":
             answer = self.hello_result
         self._reply(HELLO, 0, answer)
@@ -366,7 +367,10 @@ class ScriptedDevice(threading.Thread):
     def _arm(self, body: bytes) -> bytes:
         if not any(self.limits):
             return b"\x0c" + bytes(4)
-        self._watchdog = struct.unpack("<I", body)[0] * 1e-6
+        watchdog, key = struct.unpack("<II", body)
+        if key != KEY:
+            return b"\x0d" + bytes(4)
+        self._watchdog = watchdog * 1e-6
         self._fed = self._monotonic()
         self.state = ARMED
         return b"\0"

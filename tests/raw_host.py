@@ -36,7 +36,7 @@ class RawHost:
         self._rest = b""
         self._count = {False: 0, True: 0}
         self.frames: list[golden.Frame] = []
-        self.tag = 0
+        self.tag = self.key = 0
         self.session = session
         self.repeat = 0.5
 
@@ -45,11 +45,17 @@ class RawHost:
         self.close()
         self._fd, self._socket = _opened(port)
         self._rest = b""
-        self.command(HELLO, struct.pack("<BBI", 2, 2, self.session))
+        self.hello_again()
+
+    def hello_again(self) -> bytes:
+        """HELLO of the session, which keeps its sequences where it is in force."""
+        reply = self.command(HELLO, struct.pack("<BBI", 3, 3, self.session))
+        session, self.key = struct.unpack("<II", reply[-8:])
+        assert session == self.session
+        return reply
 
     def hello(self) -> bytes:
-        body = struct.pack("<BBI", 2, 2, self.session)
-        reply = self.command(HELLO, body)
+        reply = self.hello_again()
         self.boot = struct.unpack_from("<I", reply, 1)[0]
         self.tag = self.boot & 0xFFFF
         self._count = {False: 0, True: 0}
@@ -136,10 +142,14 @@ class RawHost:
         while self.state() != state:
             pass
 
+    def arming(self, watchdog: int = WATCHDOG) -> bytes:
+        """The body of ARM."""
+        return struct.pack("<II", watchdog, self.key)
+
     def arm(self, *, watchdog: int = WATCHDOG) -> None:
         self.command(LIMITS, struct.pack("<4f", 20.0, 6000.0, 1e6, 50.0))
         # a motor is known to stand still after 100 ms of it
-        while (answer := self.ask(ARM, struct.pack("<I", watchdog)))[0] == 11:
+        while (answer := self.ask(ARM, self.arming(watchdog)))[0] == 11:
             time.sleep(0.01)
         assert answer[0] == 0, answer
 

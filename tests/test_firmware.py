@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ import pytest
 
 from cli import refused, sewfast
 from sewfast.errors import LinkError
-from sewfast.link import connect, examine
+from sewfast.link import Plan, connect, examine
 from sewfast.recordfile import read_recording
 from sewfast.recording import record
 
@@ -21,6 +23,10 @@ DESK = Path(__file__).resolve().parents[1] / "target" / "bare" / "desk"
 LIMITS = "volt=8,speed=3500,acceleration=40000,current=inf"
 WATCHDOG = 2.0
 """A busy computer may leave host or board without the processor for long [s]."""
+
+
+STALLED = 0.4
+"""A watchdog time of which most passes while the board stands still [s]."""
 
 
 @pytest.fixture
@@ -105,3 +111,45 @@ def test_two_boots_have_two_boot_ids() -> None:
                 boots.add(drive.identity.boot)
             desk.terminate()
     assert len(boots) == 3
+
+
+class Counting:
+    """Takes samples and counts them."""
+
+    def __init__(self) -> None:
+        self.taken = 0
+
+    def samples(self, first: int, columns: Mapping[str, np.ndarray]) -> None:
+        self.taken = first + len(columns["counts"])
+
+    def event(self, kind: str, index: int, **detail: object) -> None:
+        pass
+
+
+def test_a_board_that_makes_up_for_lost_time_hears_what_came_meanwhile() -> None:
+    """Stalls of 3/4 of the watchdog time: with no heartbeat heard in them the device trips."""
+    if not DESK.exists():
+        pytest.skip("needs the firmware on its desk board: make c-test")
+    with subprocess.Popen([DESK], stdout=subprocess.PIPE, text=True) as desk:
+        assert desk.stdout is not None
+        port = desk.stdout.readline().removeprefix("port ").strip()
+        stopped = threading.Event()
+
+        def stall() -> None:
+            while not stopped.wait(0.15):
+                desk.send_signal(signal.SIGSTOP)
+                time.sleep(0.75 * STALLED)
+                desk.send_signal(signal.SIGCONT)
+
+        with connect(port, watchdog=STALLED) as drive:
+            drive.set_limits(volt=8.0)
+            sink = Counting()
+            thread = threading.Thread(target=stall)
+            thread.start()
+            try:
+                drive.stream(Plan("commands", np.full(6_000, 1.0)), sink)
+            finally:
+                stopped.set()
+                thread.join()
+        desk.terminate()
+    assert sink.taken == 6_000

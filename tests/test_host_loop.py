@@ -79,7 +79,7 @@ def _at_tick(device: ScriptedDevice, number: int, action: Callable[[], object]) 
 
 def _host_loop(port: int, **changed: Any) -> dict[str, Any]:
     settings: dict[str, Any] = {
-        "tag": 1, "session": 5, "command": 0, "heartbeat": 0, "device_period": 1000,
+        "tag": 1, "session": 5, "key": 0, "command": 0, "heartbeat": 0, "device_period": 1000,
         "ratio": 10, "watchdog": 50_000, "batch": 10, "mask": 1, "channels": [(0, 1)],
         "counts_per_unit": 26.2,
     }  # fmt: skip

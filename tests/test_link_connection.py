@@ -33,7 +33,7 @@ def test_a_device_is_known_by_its_greeting():
     with simulated() as (_, port):
         drive = driven(port)
         identity = drive.identity
-        assert (identity.name, identity.firmware, identity.version) == ("script", "1.0", 2)
+        assert (identity.name, identity.firmware, identity.version) == ("script", "1.0", 3)
         assert (identity.boot, identity.tag) == (0x1BEEF, 0xBEEF)
         assert (identity.period_us, identity.Ts, identity.capacity) == (1000, 0.001, 512)
         assert identity.counts_per_rev == 1572.0
@@ -112,7 +112,7 @@ def test_a_device_that_boots_slowly_is_waited_for():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"hello_result": b"\x0a\x03\0\0\0"}, r"protocol version 3, sewfast 2; update the older"),
+        ({"hello_result": b"\x0a\x04\0\0\0"}, r"protocol version 4, sewfast 3; update the older"),
         ({"schema": 0x12345678}, r"match the device's schema hash"),
         ({"channels": 1}, r"2 to 16 channels"),
     ],

@@ -305,6 +305,37 @@ def test_program_ends_beside_a_foxglove_client_that_never_reads() -> None:
             assert program.wait(120) == 0
 
 
+@pytest.mark.parametrize(
+    ("host", "origin", "passes"),
+    [
+        ("localhost:8765", None, True),
+        ("127.0.0.1:8765", "https://app.foxglove.dev", True),
+        ("[::1]:8765", "http://localhost:8080", True),
+        ("127.0.0.1", "file://", True),
+        ("127.0.0.1:8765", "https://attacker.example", False),
+        ("127.0.0.1:8765", "https://foxglove.dev.attacker.example", False),
+        ("127.0.0.1:8765", "https://localhost.attacker.example", False),
+        ("127.0.0.1:8765", "http://app.foxglove.dev", False),
+        ("127.0.0.1:8765", "null", False),
+        ("attacker.example:8765", None, False),
+        ("attacker.example:8765", "http://attacker.example:8765", False),
+    ],
+)
+def test_foxglove_serves_no_web_page(host: str, origin: str | None, passes: bool) -> None:
+    pytest.importorskip("foxglove", reason="needs the foxglove extra")
+    lines = [
+        "GET / HTTP/1.1", f"Host: {host}", "Upgrade: websocket", "Connection: Upgrade",
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Protocol: foxglove.sdk.v1", *([f"Origin: {origin}"] if origin else []),
+    ]  # fmt: skip
+    with (
+        open_view("foxglove:0", feed(), own_process=False) as view,
+        socket.create_connection(("127.0.0.1", view.port), timeout=10.0) as client,
+    ):
+        client.sendall(("\r\n".join(lines) + "\r\n\r\n").encode())
+        assert client.recv(4096).split(b"\r\n")[0].split()[1] == (b"101" if passes else b"403")
+
+
 def test_foxglove_port_that_is_taken_is_refused() -> None:
     pytest.importorskip("foxglove", reason="needs the foxglove extra")
     with socket.socket() as taken:

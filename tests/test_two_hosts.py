@@ -104,7 +104,7 @@ def test_limits_of_one_host_are_not_those_of_the_next(device: VirtualDevice) -> 
         host.hello()
         host.settle()
         assert struct.unpack("<4f", host.command(raw.LIMITS, bytes(16))[:16]) == (0.0,) * 4
-        result, _ = host.ask(raw.ARM, struct.pack("<I", 50_000))
+        result, _ = host.ask(raw.ARM, host.arming(50_000))
         assert result == 12
 
 

@@ -45,10 +45,11 @@ class Host:
         self.batches: list[tuple[int, bytes]] = []
         self.replies: dict[int, bytes] = {}
         self.finished = False
-        self._send(HELLO, 0, struct.pack("<BBI", 2, 2, SESSION))
+        self._send(HELLO, 0, struct.pack("<BBI", 3, 3, SESSION))
         while 0 not in self.replies:
             self.hear()
         _, boot = struct.unpack_from("<BI", self.replies[0])
+        self.key = self.replies[0][-4:]
         self.capacity = struct.unpack_from("<I", self.replies[0], 19)[0]
         self.tag = boot & 0xFFFF
 
@@ -100,7 +101,7 @@ class Host:
         self.batches, self.finished = [], False
         while end < min(n, self.capacity - PER_FRAME):
             end = self._uploaded(self.ask(UPLOAD, self._piece(steps, end)))
-        self.ask(ARM, struct.pack("<I", WATCHDOG_US))
+        self.ask(ARM, struct.pack("<I", WATCHDOG_US) + self.key)
         body = struct.pack("<BIQIHB", 0, WATCHDOG_US, 0, n, 0b11, 10)
         _, start = struct.unpack("<IQ", self.ask(START, body))
         upload = None

@@ -1,8 +1,12 @@
-/* What a board brings: the five functions that a firmware author writes. */
+/* What a board brings: the six functions that a firmware author writes. */
 #ifndef BOARD_H
 #define BOARD_H
 
 #include "sewfast.h"
+
+/* Says what the drive is: boot id, entropy, name, period, counts per turn, capabilities, ceilings, channels. Called once, before
+ * anything else; texts and channels stay where they are. */
+void board_identity(sewfast_identity *identity);
 
 /* Microseconds since boot, from a timer that only goes forwards; 64 bits, read without tearing. */
 uint64_t board_time(void);
@@ -21,7 +25,7 @@ size_t board_read(uint8_t *bytes, size_t size);
 size_t board_write(const uint8_t *bytes, size_t count);
 
 /* The loop around them. */
-bool firmware_init(uint32_t boot_id);
+bool firmware_init(void);
 void firmware_step(void);
 
 #endif

@@ -2,7 +2,8 @@
  * tried with `sewfast doctor PORT`, `record` and `run` before there is any hardware (POSIX only; built by `make c-test`).
  *
  * The first line that it prints is `port NAME`. A computer does not keep a millisecond: where it was late, the periods are made
- * up for one after the other, each with the time at which it was due, before anything else is read. */
+ * up for one after the other, each with the time at which it was due. What came meanwhile is spread over them, as nobody knows
+ * when it came: read after them, a host's heartbeats would all be late, and before them, all early. */
 #define _XOPEN_SOURCE 600
 
 #include "board.h"
@@ -11,13 +12,14 @@
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include <termios.h>
 #include <time.h>
 #include <unistd.h>
 
 enum { PERIOD = 1000, FINE = 20 };
 
-static const double COUNTS_PER_REV = 1572.0;
+static const float COUNTS_PER_REV = 1572.0f;
 static const double GAIN = 490.0; /* RPM/V */
 static const double LAG = 0.15;   /* s */
 
@@ -25,6 +27,8 @@ static int port = -1;
 static uint64_t sampled, now;
 static double speed, turns; /* RPM, revolutions */
 static double applied;      /* V */
+static uint8_t held[4096];  /* has come, and waits for its turn */
+static size_t held_count;
 
 static uint64_t real_time(void) {
     static struct timespec start;
@@ -34,8 +38,9 @@ static uint64_t real_time(void) {
     return (uint64_t)((t.tv_sec - start.tv_sec) * 1000000LL + (t.tv_nsec - start.tv_nsec) / 1000);
 }
 
-static bool is_behind(void) {
-    return real_time() >= sampled + PERIOD;
+/* Periods that are due and have not been sampled. */
+static uint64_t behind(void) {
+    return (real_time() - sampled) / PERIOD;
 }
 
 uint64_t board_time(void) {
@@ -54,7 +59,7 @@ static void turn_the_motor(void) {
 }
 
 bool board_measure(sewfast_measurement *measurement, uint64_t *when) {
-    if (!is_behind()) {
+    if (behind() == 0) {
         const struct timespec nap = {0, 100000};
         nanosleep(&nap, NULL);
         return false;
@@ -73,8 +78,15 @@ void board_apply(sewfast_output output) {
 }
 
 size_t board_read(uint8_t *bytes, size_t size) {
-    const ssize_t count = is_behind() ? 0 : read(port, bytes, size);
-    return count > 0 ? (size_t)count : 0;
+    const ssize_t come = read(port, held + held_count, sizeof held - held_count);
+    if (come > 0) held_count += (size_t)come;
+    const size_t turns_left = (size_t)behind() + 1;
+    size_t count = (held_count + turns_left - 1) / turns_left;
+    if (count > size) count = size;
+    memcpy(bytes, held, count);
+    held_count -= count;
+    memmove(held, held + count, held_count);
+    return count;
 }
 
 size_t board_write(const uint8_t *bytes, size_t count) {
@@ -84,15 +96,33 @@ size_t board_write(const uint8_t *bytes, size_t count) {
 
 /* Without memory that outlives the program, entropy: the same low 16 bits as at the boot before come once in 65536 boots. A drive has a
  * counter in non-volatile memory instead, which never gives them. */
-static uint32_t boot_id(void) {
+static uint32_t drawn(void) {
     uint32_t id = (uint32_t)time(NULL) * 2654435761u ^ (uint32_t)getpid();
     FILE *source = fopen("/dev/urandom", "rb");
     if (source != NULL) {
-        uint32_t drawn;
-        if (fread(&drawn, sizeof drawn, 1, source) == 1) id = drawn;
+        uint32_t bits;
+        if (fread(&bits, sizeof bits, 1, source) == 1) id = bits;
         fclose(source);
     }
     return id;
+}
+
+void board_identity(sewfast_identity *identity) {
+    static const sewfast_channel channels[] = {
+        {SEWFAST_COUNTS, SEWFAST_FROM_COUNTS, 0, 1, "counts", "1"},
+        {SEWFAST_STEPS, SEWFAST_FROM_COMMAND, 0, 1000, "u", "V"},
+        {SEWFAST_FLOAT, SEWFAST_FROM_FEEDBACK, 0, 1, "feedback", "RPM"},
+    };
+    identity->boot_id = drawn();
+    identity->entropy = drawn();
+    identity->name = "example drive";
+    identity->firmware = "1.0";
+    identity->period = PERIOD;
+    identity->counts_per_rev = COUNTS_PER_REV;
+    identity->capabilities = SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN;
+    identity->ceilings = (sewfast_limits){20.0f, 4000.0f, 60000.0f, INFINITY}; /* what the machine bears */
+    identity->channels = channels;
+    identity->channel_count = sizeof channels / sizeof channels[0];
 }
 
 static bool open_port(void) {
@@ -107,7 +137,7 @@ static bool open_port(void) {
 }
 
 int main(void) {
-    if (!open_port() || !firmware_init(boot_id())) {
+    if (!open_port() || !firmware_init()) {
         fprintf(stderr, "desk: no pseudo-terminal, or the identity is refused\n");
         return 1;
     }

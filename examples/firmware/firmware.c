@@ -2,13 +2,11 @@
  *
  *     int main(void) {
  *         board_init();
- *         if (!firmware_init(board_next_boot_id())) halt_with_the_drive_off();
+ *         if (!firmware_init()) halt_with_the_drive_off();
  *         for (;;) firmware_step();
  *     }
  */
 #include "board.h"
-
-#include <math.h>
 
 static union {
     uint64_t align;
@@ -17,25 +15,10 @@ static union {
 
 static sewfast_device *device;
 
-static const sewfast_channel channels[] = {
-    {SEWFAST_COUNTS, SEWFAST_FROM_COUNTS, 0, 1, "counts", "1"},
-    {SEWFAST_STEPS, SEWFAST_FROM_COMMAND, 0, 1000, "u", "V"},
-    {SEWFAST_FLOAT, SEWFAST_FROM_FEEDBACK, 0, 1, "feedback", "RPM"},
-};
-
-/* `boot_id` counts the boots: two in a row must differ in their low 16 bits. */
-bool firmware_init(uint32_t boot_id) {
-    const sewfast_identity identity = {
-        boot_id,
-        "example drive",
-        "1.0",
-        1000,    /* us */
-        1572.0f, /* counts per turn */
-        SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN,
-        {20.0f, 4000.0f, 60000.0f, INFINITY}, /* what the machine bears */
-        channels,
-        sizeof channels / sizeof channels[0],
-    };
+/* False where the board's identity is refused. */
+bool firmware_init(void) {
+    sewfast_identity identity = {0};
+    board_identity(&identity);
     device = sewfast_device_init(&storage, sizeof storage, &identity, NULL);
     return device != NULL;
 }

@@ -637,8 +637,8 @@ class LinkReceiver:
 # --- host_loop.rs -----------------------------------------------------------------------------------------
 
 def host_loop(
-    port: int, controller: Controller, reference: _F, *, tag: int, session: int, command: int, heartbeat: int, device_period: int,
-    ratio: int, watchdog: int, batch: int, mask: int, channels: Sequence[tuple[int, int]], counts_per_unit: float,
+    port: int, controller: Controller, reference: _F, *, tag: int, session: int, key: int, command: int, heartbeat: int,
+    device_period: int, ratio: int, watchdog: int, batch: int, mask: int, channels: Sequence[tuple[int, int]], counts_per_unit: float,
     lock_memory: bool = False, progress: _Progress = None,
 ) -> dict[str, Any]:
     """Drive a device in mode 2 from the open descriptor ``port``; every time is in microseconds.
@@ -657,11 +657,13 @@ class DeviceServer:
     """The virtual device on a thread of its own; `sewfast.link.VirtualDevice` checks the arguments."""
 
     def __new__(
-        cls, machine: Machine, *, name: str, pty: bool, link: Path | None, address: str, fast: bool,
+        cls, machine: Machine, *, name: str, pty: bool, link: Path | None, address: str, anyone: bool,
+        fast: bool,
         baud: int | None, faults: str, seed: int, once: bool, duration: float | None, fault_log: Path | None,
         trace: Path | None,
     ) -> DeviceServer:
-        """Opens the port; raises LinkError where it cannot. ``link`` is of a pty, ``address`` of TCP."""
+        """Opens the port; raises LinkError where it cannot. ``link`` is of a pty, ``address`` of TCP,
+        ``anyone`` lets it be one that other computers reach."""
     @property
     def port(self) -> str: ...
     def wait(self, timeout: float) -> bool:

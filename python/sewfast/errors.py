@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from typing import Any
 
 
@@ -49,3 +50,9 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, best: Any) -> None:
         super().__init__("interrupted; the best result so far is kept")
         self.best = best
+
+
+def printable(name: str) -> str:
+    """A name without control characters: a file must not steer the terminal that it is shown on."""
+    shown = (c.isprintable() or unicodedata.category(c) == "Zs" for c in name)
+    return "".join(c if keep else ascii(c)[1:-1] for c, keep in zip(name, shown, strict=True))

@@ -111,7 +111,7 @@ def samples() -> list[dict[str, Any]]:
 def catalogue() -> list[tuple[str, Frame]]:
     """Frames that reach every edge of the layout."""
     dice = random.Random(7)
-    boot, hello = 0xBEEF, struct.pack("<BBI", 2, 2, 0x12345678)
+    boot, hello = 0xBEEF, struct.pack("<BBI", 3, 3, 0x12345678)
 
     def at(us: int) -> int:
         return host_time(0x12345678, us)
@@ -122,7 +122,7 @@ def catalogue() -> list[tuple[str, Frame]]:
         ("all ones", (0xFF, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFFFFFFFFFF, b"\xff" * 4)),
         ("HELLO", (0x01, 0, 0, 1_000_000, hello)),
         ("DESCRIBE", (0x02, boot, 2, at(1_010_000), b"\x01")),
-        ("ARM for 50 ms", (0x05, boot, 3, at(1_020_000), struct.pack("<I", 50_000))),
+        ("ARM for 50 ms", (0x05, boot, 3, at(1_020_000), struct.pack("<II", 50_000, 0x9E3779B9))),
         ("KEEP for 50 ms", (0x20, boot, 4, at(1_030_000), struct.pack("<I", 50_000))),
         ("DRIVE at 1.5", (0x21, boot, 5, at(1_040_000), struct.pack("<If", 50_000, 1.5))),
         ("CREDIT", (0x22, boot, 6, at(1_050_000), struct.pack("<IQ", 50_000, 2**40))),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..dataset import FloatArray
+from ..dataset.units import lettered
 from ..evidence.figures import shade
 from ..report.canvas import Float, panels, require_matplotlib, style, thin
 from .bode import LoopBode
@@ -61,8 +62,8 @@ def response_figure(a: Analysis) -> Figure:
         output.plot(*thin(t, np.median(r.y, axis=0)), color=BLUE, lw=1.4, label=name)
         command.plot(*thin(t, np.median(r.u, axis=0)), color=BLUE, lw=1.1)
         output.set_title(_step_title(r))
-        output.set_ylabel(f"output [{r.y_unit}]")
-        command.set_ylabel(f"command [{r.u_unit}]")
+        output.set_ylabel(lettered(f"output [{r.y_unit}]"))
+        command.set_ylabel(lettered(f"command [{r.u_unit}]"))
         command.set_xlabel("time since the step [ms]")
         output.margins(x=0.01)
     handles, labels = axes[0, 0].get_legend_handles_labels()
@@ -72,8 +73,8 @@ def response_figure(a: Analysis) -> Figure:
 
 def _step_title(r: Responses) -> str:
     if r.kind == "reference":
-        return f"reference step of {r.size:.4g} {r.y_unit}"
-    return f"disturbance worth {r.disturbance:.3g} {r.u_unit} at the plant's input"
+        return lettered(f"reference step of {r.size:.4g} {r.y_unit}")
+    return lettered(f"disturbance worth {r.disturbance:.3g} {r.u_unit} at the plant's input")
 
 
 def _band(ax: Axes, t: FloatArray, low: FloatArray, high: FloatArray) -> None:
@@ -90,7 +91,7 @@ def bode_figure(a: Analysis) -> Figure:
     """Gain and phase of L on the left, |S| and |T| on the right, per operating point."""
     figure, axes = panels([2.5, 2.5], widths=[1, 1])
     gain, phase, s, t = axes[0, 0], axes[1, 0], axes[0, 1], axes[1, 1]
-    unit = a.controller.gains.y_unit
+    unit = lettered(a.controller.gains.y_unit)
     for n, loop in enumerate(a.loops):
         look = {
             "color": shade(n, len(a.loops)),
@@ -202,7 +203,7 @@ def what_if_figure(a: Analysis) -> Figure:
     names = ["as it is", *(w.name for w in a.what_if)]
     scores = [a.score, *(w.score for w in a.what_if)]
     figure, axes = panels([0.32 * len(names) + 1.0], widths=[1, 1, 1], share_x=False)
-    unit = a.controller.gains.y_unit
+    unit = lettered(a.controller.gains.y_unit)
     rows: tuple[tuple[str, Any], ...] = (
         (f"cost [{unit}]", lambda s: s.cost),
         (f"worst error [{unit} rms]", lambda s: s.tracking),

@@ -60,6 +60,10 @@ def add(commands: Commands) -> None:
         help="serve on TCP instead; port 0 takes a free one (127.0.0.1:0)",
     )  # fmt: skip
     parser.add_argument(
+        "--anyone", action="store_true",
+        help="--tcp may name an address that other computers reach, and start the motor from",
+    )  # fmt: skip
+    parser.add_argument(
         "--machine", default="virtual", metavar="virtual[:SEED]", help="the machine (virtual)"
     )
     parser.add_argument(
@@ -102,6 +106,7 @@ def device_command(args: argparse.Namespace) -> None:
                 endpoint="tcp" if args.tcp is not None else None,
                 link=args.link,
                 address=args.tcp or "127.0.0.1:0",
+                anyone=args.anyone,
                 once=args.once,
                 duration=args.duration,
                 fault_log=args.fault_log,

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .. import __version__, jsonfile
 from ..analysis.filing import NUMBERS as ANALYSIS
-from ..errors import SettingError
+from ..errors import DataError, SettingError
 from ..report.commissioned import FORMAT, NUMBERS, VERSION, run_file
 from ..writers import write_table
 from .numbers import numbers
@@ -101,17 +102,41 @@ def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
 
 
 def _artefacts(found: Commissioning, folder: Path) -> None:
-    for name, recording in found.recordings.items():
-        recording.save(folder / "recordings" / f"{name}.csv")
-    if found.models is not None:
-        found.models.save(folder / "models" / "ensemble.json")
-    for name, controller in (("first", found.first), ("tuned", found.controller)):
+    """What the machine's minutes were for, a few kB, comes first: a disk may be full by the tables.
+
+    A table that has no room does not keep the others from being written.
+
+    Raises
+    ------
+    DataError
+        For the first table that could not be written, once all others are.
+    """
+    for name, controller in (("tuned", found.controller), ("first", found.first)):
         if controller is not None:
             controller.save(folder / "controllers" / f"{name}.json")
-    for c in found.comparisons:
-        for kind, loop in (("predicted", c.predicted), ("measured", c.measured)):
-            if loop is not None:
-                write_table(folder / run_file(c.reference, kind), loop.columns())
+    if found.models is not None:
+        found.models.save(folder / "models" / "ensemble.json")
+    tables: list[Callable[[], object]] = [
+        partial(recording.save, folder / "recordings" / f"{name}.csv")
+        for name, recording in found.recordings.items()
+    ]
+    tables += [
+        partial(write_table, folder / run_file(c.reference, kind), loop.columns())
+        for c in found.comparisons
+        for kind, loop in (("predicted", c.predicted), ("measured", c.measured))
+        if loop is not None
+    ]
+    failures: list[Exception] = []
+    for table in tables:
+        try:
+            table()
+        except (OSError, DataError) as error:
+            failures.append(error)
+    if failures:
+        raise DataError(
+            f"{failures[0]}; {len(failures)} of {len(tables)} tables could not be written, the "
+            f"controllers and models are in {folder}: free some space and save again"
+        ) from failures[0]
 
 
 def _analysis(found: Commissioning, folder: Path) -> None:

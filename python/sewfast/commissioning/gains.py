@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
@@ -14,8 +13,8 @@ from ..control import Controller, Fopdt
 from ..cost import Cost
 from ..dataset import FloatArray
 from ..errors import DataError, FitError
-from ..machine import VirtualMachine
 from ..gains import Gains
+from ..machine import VirtualMachine
 from ..models import Ensemble, Model
 from ..robustness import margins
 from ..rules import Rule, eq_12, simc

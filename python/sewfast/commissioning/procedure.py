@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -246,9 +246,7 @@ def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal
     ensemble, controller = _tuned(trained, plan, journal)
 
     journal.enter("verification")
-    controller, swing = cautious(
-        bench, controller, asked, fastest, "hold_tuned", small, ensemble
-    )
+    controller, swing = cautious(bench, controller, asked, fastest, "hold_tuned", small, ensemble)
     if swing is not None:
         note = (
             f"{controller.notes}; gains lowered, as the machine swung at {swing.frequency:.3g} Hz "

@@ -167,9 +167,7 @@ def _resonance(core: _core.LinearModel, Ts: float) -> Resonance | None:
 
 def _first_order(core: _core.LinearModel, Ts: float, recorded: Fopdt) -> Fopdt | None:
     """First order with dead time of the model's step response, over five recorded constants."""
-    u = _core.step(
-        duration=6.0 * recorded.T, Ts=Ts, at=0.5 * recorded.T, low=0.0, high=1.0
-    )
+    u = _core.step(duration=6.0 * recorded.T, Ts=Ts, at=0.5 * recorded.T, low=0.0, high=1.0)
     try:
         y = core.simulate(u[:, None], np.zeros(core.na)) - core.simulate(
             np.zeros((len(u), 1)), np.zeros(core.na)

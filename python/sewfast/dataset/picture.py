@@ -14,7 +14,7 @@ from .arrays import FloatArray
 from .checks import LARGEST
 from .outliers import distances, usual_threshold
 from .spectrum import band, power_spectrum
-from .units import labelled
+from .units import labelled, lettered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -56,6 +56,7 @@ def figure(data: Dataset) -> Figure:
     names = [*map(labelled, data.input_names, data.input_units)]
     names = [*names[: MOST_PANELS - 1], labelled(data.output_name, data.output_unit)]
     drawn = Figure(figsize=(9.2, 0.7 + 1.9 * len(names)), layout="constrained")
+    names = [*map(lettered, names)]
     axes = drawn.subplots(
         len(names), 2, squeeze=False, sharex="col", gridspec_kw={"width_ratios": [2.6, 1.0]}
     )

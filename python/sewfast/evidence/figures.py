@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..dataset import FloatArray, labelled
+from ..dataset.units import lettered
 from ..errors import SettingError
 from .card import ReportCard
 
@@ -128,16 +129,16 @@ def band_figure(card: ReportCard) -> Figure:
         _envelope(top, t, low, high)
         _line(top, t, b.simulated[i], color="#D55E00", lw=1.1, ls=(0, (4, 1.6)), label="free run")
         _line(top, t, run.y, color="#0072B2", lw=0.9, label="measured")
-        top.set_ylabel(labelled(card.output_name, card.unit))
+        top.set_ylabel(lettered(labelled(card.output_name, card.unit)))
         share = 100.0 * b.inside[i]
         top.set_title(
-            f"{run.name} [{run.range_text}]: {share:.1f} % of samples inside the "
+            f"{lettered(run.name)} [{run.range_text}]: {share:.1f} % of samples inside the "
             f"{100 * b.level:g} % band"
         )
         top.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, fontsize=8)
         _envelope(bottom, t, low - run.yhat, high - run.yhat)
         _line(bottom, t, run.y - run.yhat, color="#0072B2", lw=0.8)
-        bottom.set_ylabel(labelled("error", card.unit))
+        bottom.set_ylabel(lettered(labelled("error", card.unit)))
         bottom.set_xlabel("time [s]")
         bottom.sharex(top)
     return figure
@@ -163,14 +164,14 @@ def bode_figure(card: ReportCard) -> Figure:
             g = o.points[k].response(hertz)[:, i]
             if not np.abs(g).any():
                 continue
-            value = labelled(f"{o.points[k].u[i]:.3g}", o.input_units[i])
-            label = f"{o.input_names[i]} = {value}".replace("[", "").replace("]", "")
+            value = lettered(labelled(f"{o.points[k].u[i]:.3g}", o.input_units[i]))
+            label = f"{lettered(o.input_names[i])} = {value}".replace("[", "").replace("]", "")
             axes[0, i].loglog(hertz, np.abs(g), label=label, **look)
             axes[1, i].semilogx(hertz, np.degrees(np.unwrap(np.angle(g))), **look)
             _member_bands(axes[:, i], o.members, k, i, hertz, look["color"])
-        gain = f"{o.output_unit or '1'}/{o.input_units[i] or '1'}"
+        gain = lettered(f"{o.output_unit or '1'}/{o.input_units[i] or '1'}")
         axes[0, i].set_ylabel(f"gain [{gain}]")
-        axes[0, i].set_title(f"from {o.input_names[i]} to {o.output_name}")
+        axes[0, i].set_title(lettered(f"from {o.input_names[i]} to {o.output_name}"))
         axes[0, i].legend(fontsize=8, loc="lower left")
         axes[1, i].set_ylabel("phase [°]")
         axes[1, i].set_xlabel("frequency [Hz]")
@@ -210,11 +211,11 @@ def pole_figure(card: ReportCard) -> Figure:
     plane.set_ylabel("imaginary part of z")
     plane.set_title("poles; dark: low input, light: high input")
     steady_note = "steady output; filled: in the training data"
-    label = labelled(o.input_names[0], o.input_units[0])
+    label = lettered(labelled(o.input_names[0], o.input_units[0]))
     rows = (
-        (steady, steady_note, lambda p: p.y, labelled(o.output_name, o.output_unit)),
+        (steady, steady_note, lambda p: p.y, lettered(labelled(o.output_name, o.output_unit))),
         (gain, "steady gain", lambda p: float(p.dc_gain[0]),
-         f"gain [{o.output_unit or '1'}/{o.input_units[0] or '1'}]"),
+         lettered(f"gain [{o.output_unit or '1'}/{o.input_units[0] or '1'}]")),
         (slow, "slowest time constant", lambda p: float(p.time_constants.max(initial=0.0)),
          "time constant [s]"),
     )  # fmt: skip
@@ -250,7 +251,7 @@ def region_figure(card: ReportCard) -> Figure:
         ax.axhline(1.0, color="#333333", lw=0.9, ls=(0, (4, 2)))
         _line(ax, t, d, color="#0072B2", lw=0.9)
         outside = 100.0 * float(np.mean(d[run.first :] > 1.0))
-        ax.set_title(f"{run.name} [{run.range_text}]: {outside:.2f} % of samples outside")
+        ax.set_title(f"{lettered(run.name)} [{run.range_text}]: {outside:.2f} % of samples outside")
         ax.set_ylabel("distance / radius")
         ax.set_xlabel("time [s]")
         ax.set_ylim(0.0, min(max(1.2, 1.05 * float(d.max())), _FARTHEST))

@@ -594,7 +594,9 @@ class Search:
             except FitError:
                 return None
 
-        for (key, _), model in zip(missing, self.pool.map(fit, missing, until=self.until), strict=True):
+        for (key, _), model in zip(
+            missing, self.pool.map(fit, missing, until=self.until), strict=True
+        ):
             self._starts[key] = model
 
     # --- effort ---------------------------------------------------------------------------------

@@ -129,6 +129,7 @@ _TRIPS = {
     "no motion": "the motor did not move; check motor cable, drive supply and encoder",
     "stop input": "the stop input is active; release it",
     "late": "a control period came late; see the counters below",
+    "swinging": "the loop swung between its limits; lower the gains, look for a shaft resonance",
 }
 
 

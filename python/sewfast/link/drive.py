@@ -163,7 +163,7 @@ class Drive(Unique):
 
     def arm(self) -> None:
         """Make it ready to start; its watchdog takes it back to idle when the host falls silent."""
-        self._link.ask(Kind.ARM, wire.watchdog(self._link.watchdog_us))
+        self._link.ask(Kind.ARM, wire.arm(self._link.watchdog_us, self._link.identity.key))
 
     def stop(self) -> None:
         """Command 0 and drive disabled, at once; returns when the device has confirmed it.

@@ -115,8 +115,9 @@ def run_on_host(
     with drive.lent() as session, _scheduling(real_time) as scheduling:
         found = _core.host_loop(
             session.descriptor, controller.core(), r, tag=drive.identity.tag,
-            session=session.session, command=session.command, heartbeat=session.heartbeat,
-            device_period=drive.identity.period_us, ratio=ratio, watchdog=round(1e6 * wait),
+            session=session.session, key=drive.identity.key, command=session.command,
+            heartbeat=session.heartbeat, device_period=drive.identity.period_us,
+            ratio=ratio, watchdog=round(1e6 * wait),
             batch=streamed.batch, mask=streamed.mask,
             channels=[(c.encoding, c.steps_per_unit) for c in streamed.channels],
             counts_per_unit=_scale(drive, controller), lock_memory=real_time, progress=progress,

@@ -8,7 +8,7 @@ _FIELDS: dict[int, tuple[str, ...]] = {
     wire.Kind.HELLO: ("version from", "version to", "session"),
     wire.Kind.DESCRIBE: ("channel",),
     wire.Kind.LIMITS: ("volt", "speed", "acceleration", "current"),
-    wire.Kind.ARM: ("watchdog",),
+    wire.Kind.ARM: ("watchdog", "key"),
     wire.Kind.GAINS: (
         "Kp", "Ti", "Td", "alpha", "beta", "N", "Tt", "u_min", "u_max", "slew", "filter_time",
         "counts per unit", "filter_samples", "observer_time", "r_rate", "schedule",
@@ -42,6 +42,7 @@ def _refused(kind: int, result: int, detail: int) -> str:
         10: f"it speaks protocol version {detail}, sewfast {wire.VERSION}; update the older one",
         11: "the motor is moving; wait for rest",
         12: "no limits were set in this session; set them first",
+        13: "the key is not that of its reply to HELLO; connect again",
     }
     return texts.get(result, f"result {result} (detail {detail}), which this sewfast does not know")
 

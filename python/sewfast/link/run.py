@@ -98,7 +98,7 @@ class Run:
         link.events.clear()
         link.resumable = True
         link.each_turn = self._each_turn
-        link.ask(Kind.ARM, wire.watchdog(link.watchdog_us))
+        link.ask(Kind.ARM, wire.arm(link.watchdog_us, link.identity.key))
         mode = wire.MODES[self.plan.mode]
         body = wire.start(mode, link.watchdog_us, 0, self.length, layout.mask, layout.batch)
         self.run, start_us = wire.started(link.ask(Kind.START, body))

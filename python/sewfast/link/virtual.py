@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
 import shutil
 import tempfile
+import warnings
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
@@ -53,6 +55,9 @@ class VirtualDevice(Unique):
         port was unplugged.
     address
         HOST:PORT to listen on; port 0 takes a free one.
+    anyone
+        Whether `address` may be one that other computers reach. Whoever reaches the port can start
+        the motor; there is no password.
     once
         End when the first host has gone.
     duration
@@ -66,7 +71,13 @@ class VirtualDevice(Unique):
     SettingError
         For a setting that cannot be used.
     LinkError
-        Where the port or a file cannot be had, or `link` names something that is there.
+        Where the port or a file cannot be had, `link` names something that is there, or `address`
+        is reached by others and `anyone` is not set.
+
+    Warns
+    -----
+    UserWarning
+        Where other computers reach the port.
     """
 
     def __init__(
@@ -80,6 +91,7 @@ class VirtualDevice(Unique):
         endpoint: Literal["pty", "tcp"] | None = None,
         link: str | os.PathLike[str] | None = None,
         address: str = "127.0.0.1:0",
+        anyone: bool = False,
         once: bool = False,
         duration: float | None = None,
         fault_log: str | os.PathLike[str] | None = None,
@@ -92,7 +104,7 @@ class VirtualDevice(Unique):
             _check_range("baud", baud, *_BAUD)
         if duration is not None and not 0.0 < real("duration", duration) < 1e9:
             raise SettingError(f"expected a duration above 0 s, got {duration!r}")
-        _require_switches(fast=fast, once=once)
+        _require_switches(fast=fast, once=once, anyone=anyone)
         if not isinstance(address, str):
             raise SettingError(f"expected HOST:PORT as address, got {address!r}; port 0 is any")
         for name, place in (("link", link), ("fault_log", fault_log), ("trace", trace)):
@@ -107,6 +119,7 @@ class VirtualDevice(Unique):
                 pty=pty,
                 link=Path(folder, "port") if folder is not None else _path(link),
                 address=address,
+                anyone=anyone,
                 fast=fast,
                 baud=baud,
                 faults=_faults_text(faults),
@@ -120,6 +133,12 @@ class VirtualDevice(Unique):
             _end(None, folder)
             raise
         self._end = weakref.finalize(self, _end, self._server, folder)
+        if anyone and not pty and not _is_loopback(self.port):
+            warnings.warn(
+                f"{self.port}: whoever reaches this port can start the motor; let a firewall or an "
+                "SSH tunnel decide who does",
+                stacklevel=2,
+            )
 
     @property
     def port(self) -> str:
@@ -220,6 +239,11 @@ def _end(server: DeviceServer | None, folder: str | None) -> None:
     finally:
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_loopback(port: str) -> bool:
+    host = port.removeprefix("socket://").rpartition(":")[0].strip("[]")
+    return ipaddress.ip_address(host).is_loopback
 
 
 def _path(path: str | os.PathLike[str] | None) -> Path | None:

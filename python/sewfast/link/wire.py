@@ -12,7 +12,7 @@ from zlib import crc32
 
 from ..errors import LinkError
 
-VERSION = 2
+VERSION = 3
 MAX_BODY = 231
 LARGEST = 3.4028234e38
 """Of single precision."""
@@ -43,7 +43,7 @@ SAMPLES, EVENT, BEAT = 0xC0, 0xC1, 0xC2
 STATES = ("boot", "idle", "armed", "running", "tripped")
 REASONS = (
     "none", "watchdog", "speed", "acceleration", "current", "underrun", "bad command",
-    "host changed", "measurement", "no motion", "stop input", "late",
+    "host changed", "measurement", "no motion", "stop input", "late", "swinging",
 )  # fmt: skip
 EVENTS = ("", "boot", "armed", "started", "finished", "stopped", "tripped", "cleared")
 MODES = {"commands": 0, "controller": 1, "direct": 2}
@@ -86,6 +86,8 @@ class Identity:
         Counts of its encoder in one turn.
     session : int
         Whose HELLO it has answered.
+    key : int
+        What ARM repeats: only a host that hears the device knows it.
     """
 
     name: str
@@ -100,6 +102,7 @@ class Identity:
     capacity: int
     counts_per_rev: float
     session: int = 0
+    key: int = 0
 
     @property
     def Ts(self) -> float:
@@ -224,7 +227,8 @@ class Reply:
 
 _REPLY = struct.Struct("<IB")
 _HELLO = struct.Struct("<BIIBBIIIf")
-_SESSION = struct.Struct("<I")
+_SESSION = struct.Struct("<II")
+"""At the end of the reply to HELLO: session and key."""
 _CHANNEL = struct.Struct("<BBI")
 _STATUS = struct.Struct("<BBBHIQIIIfiIIIIII")
 _LIMITS = struct.Struct("<8f")
@@ -253,7 +257,7 @@ def identity(body: bytes) -> Identity:
     version, boot, schema, state, channels, period, capabilities, capacity, counts = values
     name, rest = _text(rest, "HELLO")
     firmware, rest = _text(rest, "HELLO")
-    (session,), _ = _start(_SESSION, rest, "HELLO")
+    (session, key), _ = _start(_SESSION, rest, "HELLO")
     if not 2 <= channels <= 16 or period == 0 or not (math.isfinite(counts) and counts >= 0):
         raise LinkError(
             "expected a device with 2 to 16 channels, a control period and counts per turn, got "
@@ -261,13 +265,13 @@ def identity(body: bytes) -> Identity:
         )
     return Identity(
         name, firmware, version, boot, schema, name_of(STATES, state), channels, period,
-        capabilities, capacity, counts, session,
+        capabilities, capacity, counts, session, key,
     )  # fmt: skip
 
 
 def greets(reply: Reply, session: int) -> bool:
     """Whether a reply to HELLO is to that of `session`, not to another host's before."""
-    return reply.result != 0 or reply.body.endswith(_SESSION.pack(session))
+    return reply.result != 0 or reply.body[-8:-4] == struct.pack("<I", session)
 
 
 def channel(body: bytes) -> Channel:
@@ -337,6 +341,10 @@ def hello(session: int) -> bytes:
 
 def watchdog(us: int) -> bytes:
     return struct.pack("<I", us)
+
+
+def arm(us: int, key: int) -> bytes:
+    return struct.pack("<II", us, key)
 
 
 def credit(us: int, until: int) -> bytes:

@@ -8,6 +8,7 @@ from typing import Any
 
 from ..errors import SettingError
 from .feed import Feed
+from .gate import Gate, hidden_address
 from .stream import PERIOD_S, Tail, encode
 
 _LOG = {
@@ -55,12 +56,14 @@ class FoxgloveView:
         logging.getLogger("foxglove").addHandler(logging.NullHandler())
         self._sdk: Any = foxglove
         self._context = foxglove.Context()
+        # for a client that does not read, the server keeps 1,024 messages and drops the oldest
+        behind = hidden_address()
+        self._server = foxglove.start_server(name=name, host=behind, port=0, context=self._context)
         try:
-            # for a client that does not read, the server keeps 1,024 messages and drops the oldest
-            self._server = foxglove.start_server(
-                name=name, host=host, port=port, context=self._context
-            )
-        except RuntimeError as e:
+            # it would serve any web page
+            self._gate = Gate(host, port, (behind, int(self._server.port)))
+        except OSError as e:
+            self._server.stop()
             raise SettingError(
                 f"foxglove: expected port {port} of {host} to be free, received {str(e)!r}; "
                 "choose another one: foxglove:PORT"
@@ -69,7 +72,7 @@ class FoxgloveView:
     @property
     def port(self) -> int:
         """Where clients connect."""
-        return int(self._server.port)
+        return self._gate.port
 
     def run(self, feed: Feed) -> None:
         """Send until the feed is closed, then what is left."""
@@ -81,6 +84,7 @@ class FoxgloveView:
                 _send(tail, drive, log)
             _send(tail, drive, log)
         finally:
+            self._gate.close()
             # waits for a client that does not read, for as long as that stays connected: it must
             # not be called from the thread that owns the link
             self._server.stop()

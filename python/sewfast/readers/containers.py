@@ -10,18 +10,30 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..errors import DataError, SettingError
-from .table import MAX_COLUMNS, Table, freeze, printable
+from ..errors import DataError, SettingError, printable
+from .table import MAX_COLUMNS, Table, freeze
 
 _MAX_DEPTH = 16
+MAX_UNPACKED = 1 << 30
+"""Bytes: 64 columns of two million samples."""
 Value: TypeAlias = Any
 """An array, a mapping of field to value (a struct) or a list of values (struct array, cell)."""
 
 
 def read_npz(path: Path, raw: bytes) -> Table:
-    """Read the arrays of an `.npz` archive; pickled objects are never loaded."""
+    """Read the arrays of an `.npz` archive; pickled objects are never loaded.
+
+    An archive may unpack to a thousand times its size: what its members claim is bounded before any
+    of them is unpacked, and a member gives no more than it claims.
+    """
     try:
         with np.load(io.BytesIO(raw), allow_pickle=False) as archive:
+            claimed = sum(member.file_size for member in archive.zip.infolist())
+            if claimed > MAX_UNPACKED:
+                raise DataError(
+                    f"{path}: expected arrays of at most {MAX_UNPACKED >> 20} MB in all, received "
+                    f"{claimed >> 20} MB; save the columns that are needed, or a part of the time"
+                )
             return _table(path, {name: _npz_member(archive, name) for name in archive.files})
     except DataError:
         raise
@@ -122,7 +134,7 @@ def _table(path: Path, values: Mapping[str, Value]) -> Table:
     columns: dict[str, Any] = {}
     unusable: dict[str, str] = {}
     for name, value in values.items():
-        _flatten(name, value, columns, unusable, 0)
+        _flatten(printable(name), value, columns, unusable, 0)
     if len(columns) > MAX_COLUMNS:
         raise DataError(f"{path}: expected at most {MAX_COLUMNS} columns, received {len(columns)}")
     if not columns:
@@ -139,7 +151,7 @@ def _flatten(
     if isinstance(value, (dict, list)) and depth <= _MAX_DEPTH:
         items = value.items() if isinstance(value, dict) else enumerate(value)
         for key, item in items:
-            _flatten(f"{name}.{key}", item, columns, unusable, depth + 1)
+            _flatten(printable(f"{name}.{key}"), item, columns, unusable, depth + 1)
         return
     name, reason = printable(name), _reason(value)
     if reason is not None:

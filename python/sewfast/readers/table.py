@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import re
-import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..dataset import FloatArray
-from ..errors import DataError
+from ..errors import DataError, printable
 
 MAX_COLUMNS = 10_000
 
@@ -68,7 +67,8 @@ class Table:
         DataError
             Where the file has no such column, or it cannot be used.
         """
-        for candidate in (name, split_unit(name)[0], printable(split_unit(name)[0])):
+        name = printable(name)
+        for candidate in (name, split_unit(name)[0]):
             if candidate in self.columns:
                 return candidate
             if candidate in self.unusable:
@@ -100,12 +100,6 @@ def split_unit(header: str) -> tuple[str, str]:
     if match is None:
         return header.strip(), ""
     return match[1], (match[2] or match[3] or "").strip()
-
-
-def printable(name: str) -> str:
-    """A name without control characters: a file must not steer the terminal that it is shown on."""
-    shown = (c.isprintable() or unicodedata.category(c) == "Zs" for c in name)
-    return "".join(c if keep else ascii(c)[1:-1] for c, keep in zip(name, shown, strict=True))
 
 
 def split_units(headers: Sequence[str]) -> tuple[list[str], list[str]]:

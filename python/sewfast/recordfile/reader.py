@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..dataset import FloatArray, labelled
-from ..errors import DataError
+from ..errors import DataError, printable
 from ..runs import runs
 from . import walk
 from .container import MAGIC, Message
@@ -113,15 +113,10 @@ class RecordedFile:
         lines += [f"  event     {_event(e)}" for e in self.events[:_SHOWN]]
         lines += _more(len(self.events), "events")
         lines += [f"  damage    {text}" for text in self.damage[:_SHOWN]]
-        return "\n".join(map(_printable, lines + _more(len(self.damage), "places of damage")))
+        return "\n".join(map(printable, lines + _more(len(self.damage), "places of damage")))
 
 
 _SHOWN = 20
-
-
-def _printable(line: str) -> str:
-    """A file must not be able to steer the terminal that it is shown on."""
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
 def _described(label: str, content: Mapping[str, Any]) -> list[str]:
@@ -221,7 +216,7 @@ def decode_recording(path: Path, raw: bytes) -> RecordedFile:
     """As `read_recording`, from the file's bytes."""
     found = _Contents()
     stop: int | None = None
-    for chunk in walk.chunks(raw):
+    for chunk in _chunks(path, raw):
         whole = (
             walk.is_start(raw, chunk.start)
             if stop is None
@@ -237,6 +232,13 @@ def decode_recording(path: Path, raw: bytes) -> RecordedFile:
     if stop is not None and (fault := walk.ending_fault(raw, stop, damaged=bool(found.damage))):
         found.damage.append(fault)
     return found.assemble(path, found.header)
+
+
+def _chunks(path: Path, raw: bytes) -> Iterator[walk.Chunk]:
+    try:
+        yield from walk.chunks(raw)
+    except DataError as e:
+        raise DataError(f"{path}: {e}") from e
 
 
 def _headless(path: Path, raw: bytes, damage: list[str]) -> DataError:

@@ -2,6 +2,7 @@
 
 Nothing is believed that no checksum covers: a chunk is searched for, not reached by the lengths of
 the records before it. Its own head states its size three times, and its CRC-32 covers the rest.
+The search has a budget: a file that is made of heads alone would cost a checksum of megabytes each.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import zlib
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from ..errors import DataError
 from .container import (
     CHANNEL,
     CHUNK,
@@ -31,6 +33,8 @@ from .topics import Topic
 
 LARGEST_CHUNK = 4 << 20
 """Bytes; a recording's own chunks are far smaller."""
+BUDGET = 4
+"""Checksums that fail may cover so many times the file; each damaged chunk is covered by one."""
 
 
 class Chunk(NamedTuple):
@@ -42,27 +46,50 @@ class Chunk(NamedTuple):
 
 
 def chunks(raw: bytes) -> Iterator[Chunk]:
-    """Every chunk that is whole, in the file's order."""
-    at = 0
+    """Every chunk that is whole, in the file's order.
+
+    Raises
+    ------
+    DataError
+        For a file of so many heads without their chunks that no damage explains them.
+    """
+    at, left = 0, BUDGET * len(raw) + LARGEST_CHUNK
     while (at := raw.find(CHUNK.to_bytes(1, "little"), at)) >= 0:
-        chunk = _chunk_at(raw, at)
+        size = _claimed(raw, at)
+        chunk = None if size is None else _chunk_at(raw, at, size)
         if chunk is not None:
             yield chunk
+        elif size is not None:
+            left -= size
+            if left < 0:
+                raise DataError(
+                    "expected heads of chunks with their chunks, received "
+                    f"{at} bytes with heads alone; the file is no recording that was damaged"
+                )
         at = at + 1 if chunk is None else chunk.stop
 
 
-def _chunk_at(raw: bytes, at: int) -> Chunk | None:
+def _claimed(raw: bytes, at: int) -> int | None:
+    """The size that a head states; None where there is no head."""
     if at + CHUNK_HEAD.size > len(raw):
         return None
-    _, length, _, _, size, crc, compression, stored = CHUNK_HEAD.unpack_from(raw, at)
+    _, length, _, _, size, _, compression, stored = CHUNK_HEAD.unpack_from(raw, at)
     stop = at + CHUNK_HEAD.size + size
     if compression != 0 or stored != size or length != CHUNK_HEAD.size - RECORD.size + size:
         return None
     if size > LARGEST_CHUNK or stop > len(raw):
         return None
-    body = raw[at + CHUNK_HEAD.size : stop]
-    if zlib.crc32(body) != crc:
+    return int(size)
+
+
+def _chunk_at(raw: bytes, at: int, size: int) -> Chunk | None:
+    stop = at + CHUNK_HEAD.size + size
+    if (
+        zlib.crc32(memoryview(raw)[at + CHUNK_HEAD.size : stop])
+        != CHUNK_HEAD.unpack_from(raw, at)[5]
+    ):
         return None
+    body = raw[at + CHUNK_HEAD.size : stop]
     messages = _messages(body)
     return None if messages is None else Chunk(at, stop, messages)
 

@@ -34,7 +34,7 @@ extern "C" {
 #define SEWFAST_CAN_PROFILE 1u  /* plays uploaded commands */
 #define SEWFAST_CAN_PID 2u      /* runs the PID along uploaded references */
 #define SEWFAST_CAN_DRIVE 4u    /* holds the command that the host sends */
-#define SEWFAST_CAN_CREDIT 8u   /* computed devices only: time advances by the host's credit */
+#define SEWFAST_CAN_CREDIT 8u   /* computed devices only: time advances by the host's credit, sewfast_device_credit */
 #define SEWFAST_CAN_CURRENT 16u /* measures the current */
 #define SEWFAST_COMPUTED 32u    /* computed devices only: ARM takes them back to their initial state */
 #define SEWFAST_CAN_DESIGN 64u  /* its PID has observer, reference ramp and gain schedule */
@@ -75,6 +75,7 @@ typedef struct sewfast_limits {
 /* Texts must stay where they are for as long as the device is used; the rest is copied. */
 typedef struct sewfast_identity {
     uint32_t boot_id;     /* its low 16 bits differ from those of the boot before: count in non-volatile memory, or entropy */
+    uint32_t entropy;     /* of a random generator, or the noise of a converter; any where there is none: see ARM in PROTOCOL.md */
     const char *name;     /* UTF-8, at most 24 bytes */
     const char *firmware; /* UTF-8, at most 16 bytes */
     uint32_t period;      /* us, 10 to 1,000,000 */
@@ -119,7 +120,8 @@ enum sewfast_reason {
     SEWFAST_MEASUREMENT = 8,
     SEWFAST_NO_MOTION = 9,
     SEWFAST_STOP_INPUT = 10,
-    SEWFAST_LATE = 11
+    SEWFAST_LATE = 11,
+    SEWFAST_SWINGING = 12
 };
 
 /* ---- the device ------------------------------------------------------------------------------------------------------ */
@@ -169,6 +171,14 @@ size_t sewfast_device_transmit(sewfast_device *device, uint8_t *out, size_t size
 /* The firmware's own reasons to stop: its stop input, a fault of the drive. Only the host's CLEAR, ARM, START lead on. Call it each
  * time round for as long as the reason stands, not at its edge only: CLEAR does not know of a stop input that is still pressed. */
 void sewfast_device_trip(sewfast_device *device, uint64_t now, int32_t reason);
+
+/* SEWFAST_CAN_CREDIT only: true where the host lets the time of a computed device advance, until `*until` us, the time of the last
+ * sample that may be taken; false where its time runs by itself. */
+bool sewfast_device_credit(sewfast_device *device, uint64_t *until);
+
+/* SEWFAST_COMPUTED only: how often ARM was executed since boot. Where this has changed, the machine returns to its initial state
+ * before the next sample. */
+uint32_t sewfast_device_armed_count(sewfast_device *device);
 
 /* The transport knows that the host has gone (a closed socket, a USB port without terminal). */
 void sewfast_device_disconnect(sewfast_device *device);

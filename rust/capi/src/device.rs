@@ -57,6 +57,8 @@ pub struct CLimits {
 pub struct CIdentity {
     /// Another one at each boot.
     pub boot_id: u32,
+    /// Bits that nobody outside knows.
+    pub entropy: u32,
     /// UTF-8, closed by a zero.
     pub name: *const c_char,
     /// UTF-8, closed by a zero.
@@ -198,6 +200,7 @@ unsafe fn init(storage: *mut Storage, identity: &CIdentity) -> Result<(), Refusa
     } = identity.ceilings;
     let identity = Identity {
         boot_id: identity.boot_id,
+        entropy: identity.entropy,
         // SAFETY: by contract.
         name: unsafe { text(identity.name)? },
         // SAFETY: by contract.
@@ -380,12 +383,39 @@ pub unsafe extern "C" fn sewfast_device_trip(device: *mut Storage, now: u64, rea
         8 => Reason::Measurement,
         9 => Reason::NoMotion,
         11 => Reason::Late,
+        12 => Reason::Swinging,
         _ => Reason::StopInput,
     };
     // SAFETY: by contract.
     if let Some(device) = unsafe { self::device(device) } {
         device.trip(now, reason);
     }
+}
+
+/// [`Device::credit`]: whether there is one, and until when.
+///
+/// # Safety
+/// `device` as above; `until` is null or can be written to.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn sewfast_device_credit(device: *mut Storage, until: *mut u64) -> bool {
+    // SAFETY: by contract.
+    let credit = unsafe { self::device(device) }.and_then(|device| device.credit());
+    if let (Some(credit), false) = (credit, until.is_null()) {
+        // SAFETY: not null, and by contract.
+        unsafe { until.write(credit) };
+    }
+    credit.is_some()
+}
+
+/// [`Device::armed_count`]; 0 where there is no device.
+///
+/// # Safety
+/// `device` as above.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn sewfast_device_armed_count(device: *mut Storage) -> u32 {
+    // SAFETY: by contract.
+    let device = unsafe { self::device(device) };
+    device.map_or(0, |device| device.armed_count())
 }
 
 /// [`Device::disconnect`].

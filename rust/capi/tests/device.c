@@ -90,7 +90,7 @@ static bool decode(const uint8_t *block, size_t count, frame *frame) {
 /* ---- board ---- */
 
 static uint64_t now;
-static int32_t counts;
+static int32_t counts, pace; /* now, and in a period */
 static sewfast_output applied;
 static uint8_t to_device[1024];
 static size_t to_device_count;
@@ -100,10 +100,28 @@ static frame last[256]; /* by kind */
 static uint32_t heard[256];
 static uint64_t samples_heard;
 
+void board_identity(sewfast_identity *identity) {
+    static const sewfast_channel channels[] = {
+        {SEWFAST_COUNTS, SEWFAST_FROM_COUNTS, 0, 1, "counts", "1"},
+        {SEWFAST_STEPS, SEWFAST_FROM_COMMAND, 0, 1000, "u", "V"},
+    };
+    identity->boot_id = 0x10042;
+    identity->entropy = 0x2B7E1516u;
+    identity->name = "example drive";
+    identity->firmware = "1.0";
+    identity->period = 1000;
+    identity->counts_per_rev = 1572.0f;
+    identity->capabilities = SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN;
+    identity->ceilings = (sewfast_limits){20.0f, 4000.0f, 60000.0f, INFINITY};
+    identity->channels = channels;
+    identity->channel_count = sizeof channels / sizeof channels[0];
+}
+
 uint64_t board_time(void) { return now; }
 
 bool board_measure(sewfast_measurement *measurement, uint64_t *when) {
     if (now % 1000 != 0) return false;
+    counts += pace;
     *when = now;
     measurement->counts = counts;
     measurement->current = NAN;
@@ -149,6 +167,7 @@ size_t board_write(const uint8_t *bytes, size_t count) {
 static const uint16_t TAG = 0x0042;
 static uint32_t session = 9;
 static uint32_t commands, beats;
+static uint32_t key; /* of HELLO's reply */
 
 static void say(uint8_t kind, const uint8_t *body, size_t length) {
     uint32_t sequence = kind == 1 ? 0 : kind < 0x20 ? ++commands : ++beats;
@@ -183,9 +202,9 @@ static void drive(float u) {
 /* ---- tests ---- */
 
 static void codec_is_that_of_the_golden_vectors(void) {
-    static const uint8_t hello[] = {2, 2, 0x78, 0x56, 0x34, 0x12};
+    static const uint8_t hello[] = {3, 3, 0x78, 0x56, 0x34, 0x12};
     static const uint8_t golden[] = {0x02, 0x01, 0x01, 0x01, 0x01, 0x01, 0x01, 0x04, 0x40, 0x42, 0x0f, 0x01, 0x01, 0x01, 0x01,
-                                     0x0b, 0x02, 0x02, 0x78, 0x56, 0x34, 0x12, 0xd0, 0xa0, 0x03, 0x89, 0x00};
+                                     0x0b, 0x03, 0x03, 0x78, 0x56, 0x34, 0x12, 0xc5, 0x5a, 0x3f, 0x7f, 0x00};
     uint8_t wire[256];
     CHECK(encode(wire, 1, 0, 0, 1000000, hello, 6) == sizeof golden);
     CHECK(memcmp(wire, golden, sizeof golden) == 0);
@@ -200,7 +219,7 @@ static void storage_is_checked(void) {
         {SEWFAST_COUNTS, SEWFAST_FROM_COUNTS, 0, 1, "counts", "1"},
         {SEWFAST_STEPS, SEWFAST_FROM_COMMAND, 0, 1000, "u", "V"},
     };
-    sewfast_identity identity = {1, "x", "1", 1000, 1572.0f, SEWFAST_CAN_DRIVE, {20, 4000, INFINITY, INFINITY}, channels, 2};
+    sewfast_identity identity = {1, 0, "x", "1", 1000, 1572.0f, SEWFAST_CAN_DRIVE, {20, 4000, INFINITY, INFINITY}, channels, 2};
     int32_t refusal = -1;
     CHECK(sewfast_device_size() <= SEWFAST_DEVICE_SIZE && sewfast_device_alignment() <= 8);
     CHECK(sewfast_device_init(&place, SEWFAST_DEVICE_SIZE, &identity, &refusal) != NULL && refusal == SEWFAST_DONE);
@@ -230,14 +249,15 @@ static void storage_is_checked(void) {
 }
 
 static void host_is_heard(void) {
-    static const uint8_t hello[] = {2, 2, 9, 0, 0, 0};
+    static const uint8_t hello[] = {3, 3, 9, 0, 0, 0};
     uint8_t limits[16];
-    CHECK(firmware_init(0x10042));
+    CHECK(firmware_init());
     steps(150);
     CHECK(heard[0xC1] == 1 && last[0xC1].bytes[15] == 1); /* boot */
     CHECK(command(1, hello, 6) == 0);
     CHECK(get(last[0x81].bytes + 21, 4) == 0x10042);
     CHECK(memcmp(last[0x81].bytes + 20 + 27, "\x0d" "example drive", 14) == 0);
+    key = (uint32_t)get(last[0x81].bytes + 15 + last[0x81].length - 4, 4);
     put_float(limits, 10.0f);
     put_float(limits + 4, 3000.0f);
     put_float(limits + 8, 50000.0f);
@@ -246,9 +266,12 @@ static void host_is_heard(void) {
 }
 
 static void arm_and_start(void) {
-    uint8_t arm[4], start[20] = {2};
+    uint8_t arm[8], start[20] = {2};
     put(arm, 50000, 4);
-    CHECK(command(5, arm, 4) == 0);
+    put(arm + 4, key ^ 1, 4);
+    CHECK(command(5, arm, 8) == 13);
+    put(arm + 4, key, 4);
+    CHECK(command(5, arm, 8) == 0);
     put(start + 1, 50000, 4);
     put(start + 17, 3, 2);
     start[19] = 10;
@@ -275,7 +298,7 @@ static void motor_runs_while_the_host_watches(void) {
     arm_and_start();
     for (int k = 0; k < 500; k++) {
         drive(3.0f);
-        counts += 5;
+        pace = k < 50 ? k / 10 : 5; /* from rest: 190 RPM within a millisecond would be an acceleration that trips */
         steps(1);
         CHECK(applied.enabled && (k < 2 || applied.u == 3.0f));
     }
@@ -290,10 +313,8 @@ static void motor_runs_while_the_host_watches(void) {
 
 static void silence_stops_it(void) {
     uint64_t fed = now - 2000;
-    while (applied.enabled && now < fed + 1000000) {
-        counts += 5;
-        steps(1);
-    }
+    while (applied.enabled && now < fed + 1000000) steps(1);
+    pace = 0;
     CHECK(!applied.enabled && now - fed <= 50000 + 2000);
     steps(20);
     CHECK(last[0xC1].bytes[15] == 6 && last[0xC1].bytes[17] == SEWFAST_WATCHDOG);
@@ -354,6 +375,44 @@ static void pid_is_its_equation(void) {
     CHECK(sewfast_pid_init(&place, 8, &settings, &refusal) == NULL && refusal == -1);
 }
 
+static sewfast_device *computed;
+
+/* A frame to the computed device, which is no part of the firmware. */
+static void tell_computed(uint8_t kind, uint16_t tag, const uint8_t *body, size_t length) {
+    static uint32_t sequence;
+    uint8_t wire[256];
+    const uint64_t told = kind == 1 ? 0 : (uint64_t)9 << 32;
+    const size_t count = encode(wire, kind, tag, kind == 1 ? 0 : ++sequence, told, body, length);
+    sewfast_device_receive(computed, 0, wire, count);
+    sewfast_device_poll(computed, 0);
+}
+
+static void credit_lets_a_computed_device_advance(void) {
+    static union {
+        uint64_t align;
+        unsigned char bytes[SEWFAST_DEVICE_SIZE];
+    } place;
+    static const uint8_t hello[] = {3, 3, 9, 0, 0, 0};
+    uint8_t credit[12];
+    uint64_t until = 77;
+    sewfast_identity identity;
+    board_identity(&identity);
+    identity.capabilities |= SEWFAST_CAN_CREDIT | SEWFAST_COMPUTED;
+    computed = sewfast_device_init(&place, sizeof place, &identity, NULL);
+    CHECK(computed != NULL && sewfast_device_armed_count(computed) == 0);
+    CHECK(!sewfast_device_credit(computed, &until) && until == 77); /* runs by itself */
+    tell_computed(1, 0, hello, sizeof hello);
+    CHECK(sewfast_device_credit(computed, &until) && until == 0);
+    put(credit, 50000, 4);
+    put(credit + 4, 123000, 8);
+    tell_computed(0x22, TAG, credit, sizeof credit);
+    CHECK(sewfast_device_credit(computed, &until) && until == 123000);
+    CHECK(sewfast_device_credit(computed, NULL));
+    sewfast_device_disconnect(computed);
+    CHECK(!sewfast_device_credit(computed, &until) && !sewfast_device_credit(NULL, &until));
+    CHECK(sewfast_device_armed_count(NULL) == 0);
+}
+
 int main(void) {
     codec_is_that_of_the_golden_vectors();
     storage_is_checked();
@@ -362,6 +421,7 @@ int main(void) {
     silence_stops_it();
     stop_is_safe_before_it_is_answered();
     pid_is_its_equation();
+    credit_lets_a_computed_device_advance();
     printf("a device takes %zu bytes, a controller %zu\n", sewfast_device_size(), sewfast_pid_size());
     return 0;
 }

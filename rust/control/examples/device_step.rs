@@ -43,6 +43,7 @@ impl Host {
     fn new() -> Self {
         let identity = Identity {
             boot_id: 7,
+            entropy: 0,
             name: "bench",
             firmware: "1",
             period: 1000,
@@ -112,7 +113,7 @@ impl Host {
     fn run(mode: u8, whole: bool) -> Self {
         let mut host = Self::new();
         (0..150).for_each(|_| host.period(0));
-        host.say(0x01, Body::new().u8(2).u8(2).u32(1));
+        host.say(0x01, Body::new().u8(3).u8(3).u32(1));
         host.say(
             0x04,
             Body::new()

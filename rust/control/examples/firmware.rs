@@ -55,9 +55,10 @@ struct Firmware<B> {
 }
 
 impl<B: Board> Firmware<B> {
-    fn new(boot_id: u32, board: B) -> Result<Self, sewfast_control::Refused> {
+    fn new(boot_id: u32, entropy: u32, board: B) -> Result<Self, sewfast_control::Refused> {
         let device = Device::new(Identity {
             boot_id,
+            entropy,
             name: "example drive",
             firmware: "1.0",
             period: 1000,
@@ -161,7 +162,7 @@ impl Board for Desk {
 }
 
 fn main() -> Result<(), sewfast_control::Refused> {
-    let mut firmware = Firmware::new(1, Desk::default())?;
+    let mut firmware = Firmware::new(1, 0x1F2E_3D4C, Desk::default())?;
     assert_eq!(firmware.device.state(), State::Boot);
     for _ in 0..10_000 {
         firmware.step();

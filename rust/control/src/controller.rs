@@ -68,7 +68,9 @@ impl<T: Real> Controller<T> {
 
     /// From reference and measured output to the command: filter, control, limit.
     ///
-    /// A measurement that is not finite is skipped: the filter keeps its memory, the command its value.
+    /// Whatever comes, the command is finite, within the limits and no further from the last one than slew allows.
+    /// A measurement that is not finite is skipped: the filter keeps its memory, the command its value. One at which the
+    /// filter's sum leaves the numbers is skipped too, and the filter begins again with the next.
     pub fn step(&mut self, r: T, y: T) -> T {
         // x + (-0) is x for every x, even for -0
         self.step_with(r, y, -T::ZERO)
@@ -79,7 +81,12 @@ impl<T: Real> Controller<T> {
         if !y.is_finite() {
             return self.pid.hold();
         }
-        self.filtered = self.filter.step(y);
+        let filtered = self.filter.step(y);
+        if !filtered.is_finite() {
+            self.filter.reset();
+            return self.pid.hold();
+        }
+        self.filtered = filtered;
         let r = self.ramp.step(r, self.filtered);
         let terms = match &self.table {
             Some(table) => table.at(self.filtered),

@@ -145,7 +145,10 @@ pub struct Pid<T> {
     u: T,
     /// The operator's command in manual.
     manual: Option<T>,
+    /// Whether `r` and `e` are those of a sample.
     started: bool,
+    /// Whether a command was given without a sample: slew counts from it.
+    held: bool,
 }
 
 impl<T: Real> Pid<T> {
@@ -166,6 +169,7 @@ impl<T: Real> Pid<T> {
             u: T::ZERO,
             manual: None,
             started: false,
+            held: false,
         };
         pid.reset();
         Ok(pid)
@@ -179,11 +183,13 @@ impl<T: Real> Pid<T> {
         self.u = T::ZERO.limit(self.settings.u_min, self.settings.u_max);
         self.manual = None;
         self.started = false;
+        self.held = false;
     }
 
     /// From reference `r` and filtered output `y` to the command.
     ///
-    /// Where the command would not be finite, as after a lost measurement, state and output stay as they are.
+    /// Whatever comes, the command is finite, within the limits and no further from the last one than slew allows. Where it
+    /// would not be finite, as after a lost measurement, state and output stay as they are.
     pub fn step(&mut self, r: T, y: T) -> T {
         // x + (-0) is x for every x, even for -0
         self.step_by(self.terms, r, y, -T::ZERO)
@@ -203,6 +209,9 @@ impl<T: Real> Pid<T> {
         let proportional = terms.kp * (e - alpha * r);
         let wanted = proportional + integral + derivative + feedforward;
         if !(wanted.is_finite() && rate_input.is_finite()) {
+            if rate_input.is_finite() && feedforward.is_finite() {
+                self.begin_again(r, e);
+            }
             return self.hold();
         }
         self.u = self.limited(self.manual.unwrap_or(wanted));
@@ -215,8 +224,21 @@ impl<T: Real> Pid<T> {
         self.u
     }
 
+    /// From numbers the step made none, so that its memory is to blame: a measurement near the largest number stands in it, or
+    /// settings that came since magnify it. Kept as it is, it would hold the command for ever. The derivative begins again
+    /// at this sample, and an integral term that is no number is the last command.
+    #[cold]
+    fn begin_again(&mut self, r: T, e: T) {
+        (self.r, self.e, self.started) = (r, e, true);
+        self.derivative = T::ZERO;
+        if !self.integral.is_finite() {
+            self.integral = self.u;
+        }
+    }
+
     /// A sample without measurement: the command and the memory stay; in manual the command is still the operator's.
     pub(crate) fn hold(&mut self) -> T {
+        self.held = true;
         if let Some(manual) = self.manual {
             let u = self.limited(manual);
             self.integral += u - self.u;
@@ -238,7 +260,7 @@ impl<T: Real> Pid<T> {
                 before.kp * shown(self.settings.alpha) - terms.kp * shown(settings.alpha);
             self.integral += proportional + (self.derivative - derivative);
             self.derivative = derivative;
-        } else {
+        } else if !self.held {
             self.u = T::ZERO.limit(settings.u_min, settings.u_max);
         }
         self.tracking = settings.tracking();
@@ -280,6 +302,10 @@ impl<T: Real> Pid<T> {
         &self.settings
     }
 
+    /// The one way to the command. Limits that were narrowed since the last command are reached at the slew rate.
+    ///
+    /// The last command is finite: at first it is 0 or a limit next to it, and later it came from here. No comparison holds
+    /// for NaN, which passes any clamp; what is not finite is the last command again.
     fn limited(&self, wanted: T) -> T {
         let Settings {
             u_min,
@@ -289,9 +315,10 @@ impl<T: Real> Pid<T> {
             ..
         } = self.settings;
         let change = slew * ts;
-        wanted
+        let limited = wanted
             .limit(u_min, u_max)
-            .limit(self.u - change, self.u + change)
+            .limit(self.u - change, self.u + change);
+        if limited.is_finite() { limited } else { self.u }
     }
 
     /// The integral to keep when the limits moved the output by `excess`.

@@ -50,6 +50,11 @@ const BEYOND: f64 = 0.005;
 const GRID: usize = 21;
 /// Times that the search is narrowed about the best point, each time to a half.
 const ROUNDS: usize = 26;
+/// Shares of `T` in the sum of `T` and `L` from which the polish begins, too.
+const SHARES: [f64; 9] = [0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0];
+/// Most steps of the polish, and halvings of one.
+const STEPS: usize = 30;
+const HALVINGS: usize = 12;
 
 /// Fits the response to the first step in a record with one input.
 ///
@@ -271,6 +276,49 @@ impl<'a> Step<'a> {
             }
             ln_t = narrowed(ln_t, best.t.ln(), f64::NEG_INFINITY);
             l = narrowed(l, best.l, 0.0);
+        }
+        // The sum of T and L is what a response tells best; how it is shared between them the grid can miss by a whole basin where
+        // T is a small part of it.
+        let sum = best.t + best.l;
+        let shared = SHARES.map(|share| self.candidate(share * sum, (1.0 - share) * sum));
+        let other = shared
+            .into_iter()
+            .reduce(|x, y| if y.cost < x.cost { y } else { x });
+        let other = other.map(|other| self.polished(other));
+        let best = self.polished(best);
+        other.filter(|other| other.cost < best.cost).unwrap_or(best)
+    }
+
+    /// Gauss and Newton's steps from where the grid has ended, for as long as they lower the squares.
+    ///
+    /// `T` and `L` are exchanged for each other along a narrow valley. A grid that is narrowed about its best point can leave the
+    /// lowest place of one beside it: of an exact response 1 in some 5,000 was found with a gain that was 1e-4 off.
+    fn polished(&self, mut best: Candidate) -> Candidate {
+        for _ in 0..STEPS {
+            if self.monitor.stopped() {
+                return best;
+            }
+            let Some((t, l)) = confidence::step(self, &best, false) else {
+                return best;
+            };
+            let held = best.l + l < 0.0 || best.l + l > self.length() / 2.0;
+            // at the edge of dead times T goes alone
+            let (t, l) = if held {
+                confidence::step(self, &best, true).unwrap_or((t, l))
+            } else {
+                (t, l)
+            };
+            let at = |share: f64| {
+                let l = (best.l + share * l).clamp(0.0, self.length() / 2.0);
+                let t = best.t + share * t;
+                (t > 0.0).then(|| self.candidate(t, l))
+            };
+            let shares = (0..HALVINGS).map(|halving| 0.5_f64.powi(halving as i32));
+            let lower = |found: &Candidate| found.cost < best.cost * (1.0 - 1e-9);
+            let Some(found) = shares.filter_map(at).find(lower) else {
+                return best;
+            };
+            best = found;
         }
         best
     }

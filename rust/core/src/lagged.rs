@@ -24,6 +24,8 @@ pub struct Lags {
 const MOST_LAGS: usize = 1_000;
 /// How often the prior of the initial state may be loosened; on a clean record each time gains two digits or more.
 const RELAXATIONS: usize = 6;
+/// In so short a record other starts are tried too, as two basins may look alike.
+const SHORT: usize = 1000;
 
 impl Lags {
     /// Orders that make a model.
@@ -253,8 +255,34 @@ pub trait Lagged {
             }
             best = search.descend(best.1.clone()).unwrap_or(best);
         }
+        if known.len() <= SHORT {
+            // a network need not be monotone: starts with all past outputs alike can all lead to a state that is not the nearest
+            for start in spread_starts(lags.na, level, &known) {
+                best = match search.descend(start) {
+                    // what noise alone makes of another start is left
+                    Some(found) if found.0 < 0.5 * best.0 => found,
+                    _ => best,
+                };
+            }
+        }
         Ok(best.1)
     }
+}
+
+/// Past outputs that differ from each other, as far from `level` as the outputs go, and three times as far.
+fn spread_starts(na: usize, level: f64, known: &[f64]) -> Vec<Vec<f64>> {
+    let width = known.iter().map(|y| (y - level).abs()).fold(0.0, f64::max);
+    let patterns: [fn(usize) -> f64; 4] = [
+        |_| 1.0,
+        |i| if i % 2 == 0 { 1.0 } else { -1.0 },
+        |i| f64::from(u8::from(i == 0)),
+        |i| f64::from(u8::from(i > 0)),
+    ];
+    let sizes = [width, -width, 3.0 * width, -3.0 * width];
+    let starts = sizes.into_iter().flat_map(|size| {
+        patterns.map(|pattern| (0..na).map(|i| level + size * pattern(i)).collect())
+    });
+    starts.collect()
 }
 
 fn best_of(found: impl Iterator<Item = (f64, Vec<f64>)>) -> Result<(f64, Vec<f64>)> {

@@ -15,6 +15,8 @@ mod gram;
 pub mod guard;
 pub mod iv;
 pub mod lagged;
+#[cfg(test)]
+mod laws;
 pub mod least_squares;
 mod limit;
 pub mod linear;

@@ -306,7 +306,7 @@ mod tests {
     }
 
     proptest! {
-        #![proptest_config(ProptestConfig::with_cases(40))]
+        #![proptest_config(crate::laws::cases(40))]
         #[test]
         fn sensitivities_agree_with_differences(seed in any::<u64>(), hidden in 1usize..10, bypass in any::<bool>()) {
             let model = random_model(seed, hidden, bypass, false);

@@ -241,7 +241,8 @@ impl NeuralSS {
             y: &self.scaling.outputs(y),
             each: |_: usize, _: &[f64], x: &[f64]| filtered.extend_from_slice(x),
         });
-        let mut trajectory = Trajectory::new(&self.network, horizon + 1);
+        // no longer than the record, whatever was asked for
+        let mut trajectory = Trajectory::new(&self.network, first + 1);
         let mut scratch = Scratch::new(shape);
         for k in first..samples {
             let state = &filtered[(k - horizon) * shape.nx..][..shape.nx];

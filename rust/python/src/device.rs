@@ -50,7 +50,7 @@ fn entry<'py>(py: Python<'py>, entry: &Entry) -> PyResult<Bound<'py, PyDict>> {
 impl DeviceServer {
     #[new]
     #[pyo3(signature = (
-        machine, *, name, pty, link, address, fast, baud, faults, seed, once, duration, fault_log, trace
+        machine, *, name, pty, link, address, anyone, fast, baud, faults, seed, once, duration, fault_log, trace
     ))]
     #[allow(
         clippy::too_many_arguments,
@@ -63,6 +63,7 @@ impl DeviceServer {
         pty: bool,
         link: Option<PathBuf>,
         address: String,
+        anyone: bool,
         fast: bool,
         baud: Option<u32>,
         faults: &str,
@@ -79,7 +80,7 @@ impl DeviceServer {
             name,
             endpoint: match pty {
                 true => Endpoint::Pty(link),
-                false => Endpoint::Tcp(address),
+                false => Endpoint::Tcp { address, anyone },
             },
             fast,
             baud,

@@ -17,7 +17,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
 }
 
 #[pyfunction]
-#[pyo3(signature = (port, controller, reference, *, tag, session, command, heartbeat, device_period, ratio, watchdog, batch,
+#[pyo3(signature = (port, controller, reference, *, tag, session, key, command, heartbeat, device_period, ratio, watchdog, batch,
     mask, channels, counts_per_unit, lock_memory=false, progress=None))]
 #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
 fn host_loop<'py>(
@@ -27,6 +27,7 @@ fn host_loop<'py>(
     reference: PyReadonlyArray1<'py, f64>,
     tag: u16,
     session: u32,
+    key: u32,
     command: u32,
     heartbeat: u32,
     device_period: u32,
@@ -42,6 +43,7 @@ fn host_loop<'py>(
     let settings = Settings {
         tag,
         session,
+        key,
         command,
         heartbeat,
         device_period,

@@ -118,6 +118,18 @@ fn options(evaluations: usize, seed: u64, tolerance: f64) -> Options {
     }
 }
 
+/// The most coordinates and objectives.
+const MOST: usize = 1000;
+
+fn bounded(count: usize) -> sewfast_core::Result<()> {
+    if count <= MOST {
+        return Ok(());
+    }
+    Err(Error::setting(format!(
+        "expected at most {MOST} coordinates and objectives, got {count}"
+    )))
+}
+
 /// The least value of a function over the unit box.
 #[pyfunction]
 #[pyo3(signature = (function, dimensions, *, method, evaluations, seed, start=None, tolerance=1e-8))]
@@ -139,6 +151,7 @@ fn search_least<'py>(
         raised: Mutex::new(None),
     };
     let inside = |s: &Vec<f64>| s.len() == dimensions && s.iter().all(|x| (0.0..=1.0).contains(x));
+    bounded(dimensions).map_err(|e| raise(py, e))?;
     if dimensions == 0 || !start.as_ref().is_none_or(inside) {
         let message = format!(
             "expected {dimensions} coordinates, 1 or more, from 0 to 1 as a start, got {start:?}"
@@ -182,6 +195,9 @@ fn search_front<'py>(
         objectives,
         raised: Mutex::new(None),
     };
+    bounded(dimensions)
+        .and(bounded(objectives))
+        .map_err(|e| raise(py, e))?;
     let options = options(evaluations, seed, 0.0);
     let front = nsga2::search(&problem, &[], size, options, &Monitor::default())
         .map_err(|e| raise(py, e))?;

@@ -6,6 +6,7 @@ use crate::{Point, Schedule, Standard};
 use proptest::prelude::*;
 use std::vec::Vec;
 
+mod any;
 mod golden;
 
 const TS: f64 = 1e-3;

@@ -59,6 +59,7 @@ impl Refusal {
     }
     pub(super) const MOVING: Self = Self::new(11, 0);
     pub(super) const NO_LIMITS: Self = Self::new(12, 0);
+    pub(super) const KEY: Self = Self::new(13, 0);
 
     /// `Ok` where `holds`.
     pub(super) fn unless(self, holds: bool) -> Result<(), Self> {
@@ -167,7 +168,7 @@ pub(super) enum Command<'a> {
     Describe { channel: u8 },
     Status,
     Limits(Limits),
-    Arm { watchdog: u32 },
+    Arm { watchdog: u32, key: u32 },
     Stop,
     Clear,
     Upload(Upload<'a>),
@@ -186,7 +187,7 @@ impl<'a> Command<'a> {
             0x02 => fields.u8().map(|channel| Self::Describe { channel }),
             0x03 => Some(Self::Status),
             0x04 => limits(&mut fields),
-            0x05 => fields.u32().map(|watchdog| Self::Arm { watchdog }),
+            0x05 => arm(&mut fields),
             STOP => Some(Self::Stop),
             0x07 => Some(Self::Clear),
             0x08 => upload(&mut fields),
@@ -205,6 +206,13 @@ fn hello<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
         from: fields.u8()?,
         to: fields.u8()?,
         session: fields.u32()?,
+    })
+}
+
+fn arm<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
+    Some(Command::Arm {
+        watchdog: fields.u32()?,
+        key: fields.u32()?,
     })
 }
 

@@ -9,6 +9,7 @@
 //! ];
 //! let mut device = Device::<1000>::new(Identity {
 //!     boot_id: 1,
+//!     entropy: 0x3D8A_51C7,
 //!     name: "my drive",
 //!     firmware: "0.1",
 //!     period: 1000,

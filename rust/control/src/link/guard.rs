@@ -1,4 +1,14 @@
-//! The device's eye on the motor: speed and acceleration from counts, limits, motion.
+//! The device's eye on the motor: speed and acceleration from counts, limits, motion, swinging.
+//!
+//! **Acceleration.** The difference of two speeds over `W` samples that lie `D` samples apart shows a swing of frequency `f`
+//! by `sinc(f W Ts) sinc(f D Ts)` of its size: with 8 and 16 samples it is exact where the motor speeds up, and blind to a
+//! swing of 62.5 Hz. So shorter spans look as well, `c(k) - 2 c(k-s) + c(k-2s)` over `(s Ts)^2` for `s` of 8, 4 and 2, and over
+//! one sample the difference of fourth order, `(-1, 16, -30, 16, -1)/12`, which falls to no less than 3/4 up to 400 Hz at a
+//! period of 1 ms. The largest counts.
+//!
+//! A count is a floor, and its error below 1: a difference with weights `w` is wrong by less than the sum of its positive
+//! weights, which is 2 counts, or 32/12 for the fourth order. That much is taken off, so that steps of the encoder
+//! alone are never an acceleration. The price: a swing that moves the encoder by a few counts only is seen too small.
 
 use super::device::Reason;
 use super::identity::Limits;
@@ -7,7 +17,19 @@ use super::identity::Limits;
 const WINDOW: usize = 8;
 /// Samples between the speeds of which an acceleration is the difference.
 const APART: usize = 16;
-/// A power of two above both together.
+/// Samples of the spans of second differences.
+const SPANS: [usize; 3] = [8, 4, 2];
+/// What the steps of an encoder can make of a second difference \[counts\].
+const STEPS: i64 = 2;
+/// The same for the difference of fourth order \[counts/12\].
+const STEPS_OF_4: i64 = 32;
+/// Part of the range between its limits within which a command is at one of them.
+const NEAR: f32 = 0.05;
+/// So many ways from one limit to the other in a row are a swing.
+const SWINGS: u32 = 8;
+/// Two of them that are further apart are not in a row \[us\].
+const SWING: u64 = 250_000;
+/// A power of two above all spans together.
 const HISTORY: usize = 32;
 /// ARM needs this long a standstill \[us\].
 const STANDSTILL: u64 = 100_000;
@@ -28,10 +50,19 @@ pub(super) struct Guard {
     rpm: f32,
     /// RPM/s of one RPM between the speeds, `1/(16 Ts)`.
     rate: f32,
+    /// RPM/s of one count of a second difference over one sample, `60/(Ts^2 counts_per_rev)`.
+    bend: f32,
     /// Samples since the last count.
     still: u32,
     /// Samples in a row with a large command and without a count.
     stuck: u32,
+    /// The limit at which the command was last: below 0, above 0, or none yet.
+    side: i8,
+    /// Ways from limit to limit in a row.
+    swings: u32,
+    /// Samples since the last of them, and since the first.
+    since: u32,
+    swinging: u32,
 }
 
 impl Guard {
@@ -43,8 +74,13 @@ impl Guard {
             period: period as u64,
             rpm: 60.0 / (WINDOW as f32 * ts * counts_per_rev),
             rate: 1.0 / (APART as f32 * ts),
+            bend: 60.0 / (ts * ts * counts_per_rev),
             still: 0,
             stuck: 0,
+            side: 0,
+            swings: 0,
+            since: 0,
+            swinging: 0,
         }
     }
 
@@ -98,10 +134,36 @@ impl Guard {
         self.window(0) as f32 * self.rpm
     }
 
-    /// Difference of two speeds 16 samples apart \[RPM/s\]; exact in counts, where speeds would cancel.
+    /// The largest acceleration that any span shows \[RPM/s\].
     pub(super) fn acceleration(&self) -> f32 {
+        let mut largest = self.slow_acceleration();
+        let mut consider = |seen: f32| {
+            if seen.abs() > largest.abs() {
+                largest = seen;
+            }
+        };
+        for span in SPANS {
+            let bend = self.moved(0, span).wrapping_sub(self.moved(span, span));
+            let scale = self.bend / (span * span) as f32;
+            consider(beyond(bend, STEPS) * scale);
+        }
+        let [a, b, c, d] = [0, 1, 2, 3].map(|ago| self.moved(ago, 1));
+        let inner = b.wrapping_sub(c).wrapping_mul(15);
+        let fourth = inner.wrapping_sub(a.wrapping_sub(d));
+        consider(beyond(fourth, STEPS_OF_4) * (self.bend / 12.0));
+        largest
+    }
+
+    /// Difference of two speeds 16 samples apart \[RPM/s\]; exact in counts, where speeds would cancel.
+    fn slow_acceleration(&self) -> f32 {
         let change = i64::from(self.window(0)).wrapping_sub(self.window(APART).into());
         change as f32 * self.rpm * self.rate
+    }
+
+    /// Counts in the `span` samples that ended `ago` samples before.
+    fn moved(&self, ago: usize, span: usize) -> i64 {
+        let start = self.before(ago.wrapping_add(span));
+        self.before(ago).wrapping_sub(start).into()
     }
 
     /// No count for long enough to arm.
@@ -132,6 +194,37 @@ impl Guard {
     /// The run begins: patience starts anew.
     pub(super) fn begin(&mut self) {
         self.stuck = 0;
+        (self.side, self.swings) = (0, 0);
+    }
+
+    /// Watches a loop's command `u` between its limits `low` and `high`: one that goes from one to the other again and again
+    /// swings at them, and no limit of speed or acceleration need pass for a shaft to suffer.
+    ///
+    /// # Errors
+    /// The frequency \[Hz\], after eight ways from limit to limit with at most 250 ms from each to the next.
+    pub(super) fn expect_calm(&mut self, low: f32, high: f32, u: f32) -> Result<(), Trip> {
+        let near = NEAR * (high - low);
+        let side = i8::from(u >= high - near) - i8::from(u <= low + near);
+        self.since = self.since.saturating_add(1);
+        self.swinging = self.swinging.saturating_add(1);
+        if side == 0 || side == self.side {
+            return Ok(());
+        }
+        let first = self.side == 0;
+        self.side = side;
+        let in_row = u64::from(self.since).saturating_mul(self.period) <= SWING;
+        if first || !in_row || self.swings == 0 {
+            (self.swings, self.swinging) = (u32::from(!first), 0);
+        } else {
+            self.swings = self.swings.saturating_add(1);
+        }
+        self.since = 0;
+        if self.swings < SWINGS {
+            return Ok(());
+        }
+        let ways = self.swings.saturating_sub(1) as f32;
+        let seconds = self.swinging as f32 * self.period as f32 * 1e-6;
+        Err((Reason::Swinging, ways / (2.0 * seconds)))
     }
 
     /// # Errors
@@ -150,10 +243,17 @@ impl Guard {
     }
 }
 
+/// What of `value` lies beyond `tolerance` to either side.
+fn beyond(value: i64, tolerance: i64) -> f32 {
+    let beyond = value.saturating_abs().saturating_sub(tolerance).max(0);
+    (beyond * value.signum()) as f32
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use proptest::prelude::*;
+    use std::vec::Vec;
 
     const FREE: Limits = Limits {
         volt: 20.0,
@@ -177,6 +277,144 @@ mod tests {
         assert_eq!(guard.speed(), window(39) * per_count);
         let expected = (window(39) - window(23)) * per_count / 16e-3;
         assert!((guard.acceleration() - expected).abs() < 1e-4 * expected);
+    }
+
+    /// The largest acceleration that is seen of a swing of the speed, over its largest true one.
+    ///
+    /// `size` is the true acceleration [RPM/s], `phase` the part of a period at the first sample.
+    fn seen(counts_per_rev: f64, frequency: f64, size: f64, base: f64, phase: f64) -> f64 {
+        let mut guard = Guard::new(1000, 1e-3, counts_per_rev as f32);
+        let omega = core::f64::consts::TAU * frequency;
+        let turns = size / 60.0 / (omega * omega);
+        let count = |k: i32| {
+            let t = 1e-3 * f64::from(k);
+            let angle = omega * t + core::f64::consts::TAU * phase;
+            (counts_per_rev * (base / 60.0 * t + turns * angle.sin())).floor() as i32
+        };
+        // the first second: the history is full, and a swing of 1 Hz has shown its largest
+        let samples = (0..1100).map(|k| {
+            guard.take(count(k));
+            if k < 40 {
+                0.0
+            } else {
+                guard.acceleration().abs()
+            }
+        });
+        f64::from(samples.fold(0.0, f32::max)) / size
+    }
+
+    /// Frequencies from 1 to 400 Hz, the blind one and fractions of the sample rate among them.
+    fn frequencies() -> impl Iterator<Item = f64> {
+        let odd = [
+            62.5,
+            83.333_333,
+            125.0,
+            142.857,
+            166.666_667,
+            333.333_333,
+            0.5 * 62.5,
+        ];
+        (1..=400).map(f64::from).chain(odd)
+    }
+
+    #[test]
+    fn sees_two_thirds_of_any_acceleration_from_1_to_400_hz_and_no_more_than_all() {
+        // So large a swing that the encoder's steps are nothing beside it.
+        let (mut least, mut most) = (f64::INFINITY, 0.0_f64);
+        for frequency in frequencies() {
+            for phase in 0..8 {
+                // 2000 RPM to either side at most: its counter wraps beyond what a test counts
+                let size = (2000.0 * core::f64::consts::TAU * frequency).min(5e6);
+                let ratio = seen(1572e3, frequency, size, 500.0, f64::from(phase) / 16.0);
+                assert!(ratio > 1.0 / 1.5 && ratio < 1.02, "{frequency} Hz: {ratio}");
+                (least, most) = (least.min(ratio), most.max(ratio));
+            }
+        }
+        std::println!("seen over true: {least:.3} to {most:.3}");
+    }
+
+    #[test]
+    fn sees_a_shaft_that_swings_at_62_hz_on_the_encoder_of_the_machine() {
+        // 138,000 RPM/s at 62.5 Hz, of which 3,600 were seen
+        for phase in 0..32 {
+            let ratio = seen(1572.0, 62.5, 138_000.0, 300.0, f64::from(phase) / 64.0);
+            assert!(ratio > 1.0 / 1.5 && ratio < 1.02, "{ratio}");
+        }
+        for frequency in 1..=80 {
+            let ratio = seen(1572.0, frequency.into(), 138_000.0, 300.0, 0.1);
+            assert!(ratio > 1.0 / 1.5 && ratio < 1.02, "{frequency} Hz: {ratio}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn steps_of_the_encoder_are_no_acceleration(
+            counts_per_rev in 4.0..5000.0_f64, speed in -6000.0..6000.0_f64, phase in 0.0..1.0_f64, wobble in 0.0..20_000.0_f64,
+            frequency in 1.0..400.0_f64,
+        ) {
+            // what is seen is at most what is there, and the step of the widest span
+            let mut guard = Guard::new(1000, 1e-3, counts_per_rev as f32);
+            let omega = core::f64::consts::TAU * frequency;
+            let turns = wobble / 60.0 / (omega * omega);
+            for k in 0..200 {
+                let t = 1e-3 * f64::from(k);
+                let place = speed / 60.0 * t + turns * (omega * t).sin();
+                guard.take((counts_per_rev * place + phase).floor() as i32);
+                if k >= 40 {
+                    let step = 2.0 * 60.0 / (128e-6 * counts_per_rev);
+                    let most = (wobble * 1.02).max(wobble + step);
+                    prop_assert!(f64::from(guard.acceleration().abs()) <= most * 1.0001, "{}", guard.acceleration());
+                }
+            }
+        }
+
+        #[test]
+        fn a_command_that_does_not_reach_both_limits_may_swing(
+            u in prop::collection::vec(-8.9_f32..10.0, 400), high in 10.0_f32..20.0,
+        ) {
+            let mut guard = guard();
+            guard.take(0);
+            for u in u {
+                prop_assert_eq!(guard.expect_calm(-high, high, u), Ok(()));
+            }
+        }
+    }
+
+    /// The sample at which a square wave of `half` samples a side trips, and the frequency that is named.
+    fn swung(half: u32, size: f32) -> Option<(u32, f32)> {
+        let mut guard = guard();
+        guard.begin();
+        (0..20 * half).find_map(|k| {
+            let u = if (k / half).is_multiple_of(2) {
+                size
+            } else {
+                -size
+            };
+            guard.expect_calm(-10.0, 10.0, u).err().map(|(reason, f)| {
+                assert_eq!(reason, Reason::Swinging);
+                (k, f)
+            })
+        })
+    }
+
+    #[test]
+    fn swinging_between_the_limits_trips_and_its_frequency_is_named() {
+        for half in [1, 8, 60, 250] {
+            let (at, frequency) = swung(half, 9.5).unwrap();
+            assert_eq!(at, 8 * half);
+            assert!(
+                (frequency * 2e-3 * half as f32 - 1.0).abs() < 1e-5,
+                "{frequency}"
+            );
+        }
+        assert_eq!(swung(251, 10.0), None);
+        assert_eq!(swung(8, 8.9), None);
+        let mut guard = guard();
+        // a command that stays at one limit, or comes back to it, does not swing
+        let calm: Vec<_> = (0..400)
+            .map(|k| guard.expect_calm(0.0, 10.0, [10.0, 5.0][k % 2]))
+            .collect();
+        assert!(calm.iter().all(Result::is_ok));
     }
 
     #[test]

@@ -5,7 +5,7 @@ use super::crc::Crc;
 use crate::Refused;
 
 /// The version of the protocol that is spoken here.
-pub const VERSION: u8 = 2;
+pub const VERSION: u8 = 3;
 /// As many channels as the mask of START has bits.
 pub const MAX_CHANNELS: usize = 16;
 
@@ -117,6 +117,9 @@ impl Limits {
 pub struct Identity {
     /// Another one, in its low 16 bits, than at the boot before.
     pub boot_id: u32,
+    /// Bits that nobody outside knows: of a random generator, of the noise of a converter; any where there is none. HELLO's key
+    /// is made of them, of the boot id and of when HELLO came.
+    pub entropy: u32,
     /// At most 24 bytes.
     pub name: &'static str,
     /// At most 16 bytes.
@@ -137,6 +140,7 @@ impl Identity {
     /// Of a device that is off.
     pub(super) const NONE: Self = Self {
         boot_id: 0,
+        entropy: 0,
         name: "",
         firmware: "",
         period: 1,

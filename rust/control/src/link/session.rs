@@ -33,6 +33,8 @@ pub(super) struct Reply {
 pub(super) struct Session {
     /// As the host chose it.
     pub(super) number: u32,
+    /// What ARM must repeat: only who hears the device knows it.
+    pub(super) key: u32,
     /// The last command's.
     pub(super) command: u32,
     /// The last heartbeat's.
@@ -44,9 +46,10 @@ pub(super) struct Session {
 }
 
 impl Session {
-    pub(super) const fn new(number: u32, foreign: u32) -> Self {
+    pub(super) const fn new(number: u32, key: u32, foreign: u32) -> Self {
         Self {
             number,
+            key,
             command: 0,
             heartbeat: 0,
             reply: None,
@@ -64,9 +67,40 @@ impl Session {
     }
 }
 
+/// A key out of what an outsider does not know; each bit of it hangs on every bit of `entropy`, `boot`, `session` and `now`
+/// (SplitMix64, twice).
+pub(super) const fn key(entropy: u32, boot: u32, session: u32, now: u64) -> u32 {
+    let first = mixed(((entropy as u64) << 32) | boot as u64);
+    (mixed(first ^ now.rotate_left(32) ^ session as u64) >> 32) as u32
+}
+
+const fn mixed(seed: u64) -> u64 {
+    let z = seed.wrapping_add(0x9E37_79B9_7F4A_7C15);
+    let z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    z ^ (z >> 31)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_key_hangs_on_all_that_it_is_made_of() {
+        let base = key(1, 2, 3, 4);
+        for bit in 0..32 {
+            let others = [
+                key(1 ^ 1 << bit, 2, 3, 4),
+                key(1, 2 ^ 1 << bit, 3, 4),
+                key(1, 2, 3 ^ 1 << bit, 4),
+                key(1, 2, 3, 4 ^ 1 << bit),
+            ];
+            for other in others {
+                let changed = (base ^ other).count_ones();
+                assert!((6..=26).contains(&changed), "{changed}");
+            }
+        }
+    }
 
     #[test]
     fn numbers_compare_in_half_ranges() {

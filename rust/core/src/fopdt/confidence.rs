@@ -22,6 +22,16 @@ pub(super) fn errors(step: &Step<'_>, found: &Candidate) -> [f64; 3] {
     })
 }
 
+/// Gauss and Newton's step from a candidate, in `t` and `l`; `held`: with its `l`, and 0 for it.
+pub(super) fn step(step: &Step<'_>, found: &Candidate, held: bool) -> Option<(f64, f64)> {
+    let (rows, residual) = slopes(step, found);
+    let rows = if held { rows.remove_column(2) } else { rows };
+    let squares = rows.transpose() * &rows;
+    let x = squares.cholesky()?.solve(&(rows.transpose() * residual));
+    let (t, l) = (x[1], if held { 0.0 } else { x[2] });
+    (t.is_finite() && l.is_finite()).then_some((t, l))
+}
+
 /// Variances of rise, `t`, `l`, level and, where it is fitted, the free response, for residuals of any colour and of a size that may change: `P S P`,
 /// `P = (J'J)^-1`, with `S` the covariance of the sums `J'e`. The residuals are whitened by an autoregression, and the slopes
 /// are carried back through it:

@@ -42,7 +42,7 @@ fn fit(u: &[f64], y: &[f64]) -> Result<Fopdt> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(48))]
+    #![proptest_config(crate::laws::cases(48))]
     #[test]
     fn recovers_an_exact_response(
         k in prop_oneof![1.0..1000.0, -1000.0..-1.0], t in 0.01..0.4, l in 0.0..0.2,

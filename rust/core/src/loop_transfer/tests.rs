@@ -293,7 +293,7 @@ fn refuses_what_is_no_loop() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(200))]
+    #![proptest_config(crate::laws::cases(200))]
     /// The argument principle on the locus and the eigenvalues of the state space count the same.
     #[test]
     fn the_locus_and_the_poles_agree(

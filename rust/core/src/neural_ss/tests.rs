@@ -79,7 +79,7 @@ fn functions() -> impl Strategy<Value = OutputFunction> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(60))]
+    #![proptest_config(crate::laws::cases(60))]
     #[test]
     fn sensitivities_agree_with_differences(seed in any::<u64>(), shape in shapes(), output in functions()) {
         let model = random_model(seed, shape, output);

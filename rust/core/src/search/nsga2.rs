@@ -79,13 +79,15 @@ pub struct Front {
 /// Distribution indices of crossover and mutation; the larger, the closer children are to their parents.
 const CROSSOVER: f64 = 15.0;
 const MUTATION: f64 = 20.0;
+/// The largest population: ranks compare each with each, and are kept.
+const MOST: usize = 2000;
 /// Probability that parents are crossed at all.
 const CROSSED: f64 = 0.9;
 
 /// Searches the box with a population of `size`, of which `starts` are the first members.
 ///
 /// # Errors
-/// `ErrorKind::Setting` without evaluations or threads, or for a population below 4.
+/// `ErrorKind::Setting` without evaluations or threads, or for a population that is not from 4 to 2,000.
 pub fn search<P: Objectives>(
     problem: &P,
     starts: &[Vec<f64>],
@@ -94,9 +96,9 @@ pub fn search<P: Objectives>(
     monitor: &Monitor,
 ) -> Result<Front> {
     options.check()?;
-    if size < 4 {
+    if !(4..=MOST).contains(&size) {
         return Err(Error::setting(format!(
-            "expected a population of 4 or more, got {size}; 40 is usual"
+            "expected a population of 4 to {MOST}, got {size}; 40 is usual"
         )));
     }
     let mut random = Random::new(options.seed);

@@ -248,7 +248,7 @@ mod tests {
     }
 
     proptest! {
-        #![proptest_config(ProptestConfig::with_cases(2000))]
+        #![proptest_config(crate::laws::cases(2000))]
 
         #[test]
         fn whatever_comes_in_stays_within(

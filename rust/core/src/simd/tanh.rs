@@ -365,7 +365,7 @@ mod tests {
     }
 
     proptest! {
-        #![proptest_config(ProptestConfig::with_cases(5_000))]
+        #![proptest_config(crate::laws::cases(5_000))]
         #[test]
         fn agrees_with_the_library_at_any_scale(x in prop::array::uniform8(-25.0f64..25.0), scale in -12i32..1) {
             agrees_with_the_library(x.map(|x| x * 10f64.powi(scale)));

@@ -14,6 +14,8 @@ pub struct Settings {
     pub tag: u16,
     /// The session's number.
     pub session: u32,
+    /// What the device gave in its reply to HELLO, for ARM to repeat.
+    pub key: u32,
     /// Sequence of the session's last command.
     pub command: u32,
     /// Sequence of the session's last heartbeat.
@@ -116,6 +118,7 @@ mod tests {
         Settings {
             tag: 1,
             session: 5,
+            key: 0,
             command: 0,
             heartbeat: 0,
             device_period: 1000,

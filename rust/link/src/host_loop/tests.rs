@@ -188,6 +188,7 @@ fn host_loop(ticks: usize) -> HostLoop {
     let settings = Settings {
         tag: TAG,
         session: SESSION,
+        key: 0,
         command: 3,
         heartbeat: 8,
         device_period: 1000,

@@ -85,7 +85,7 @@ impl HostLoop {
         receiver.expect(channels, settings.device_period)?;
         let samples = (reference.len() * settings.ratio as usize).min(super::ROOM);
         let mut body = Body::new();
-        body.u32(settings.watchdog);
+        body.u32(settings.watchdog).u32(settings.key);
         let state = State {
             settings,
             controller,

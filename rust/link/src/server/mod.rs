@@ -6,6 +6,7 @@
 mod bucket;
 mod clock;
 mod faults;
+mod gate;
 mod line;
 mod log;
 mod port;
@@ -45,8 +46,13 @@ use trace::Trace;
 pub enum Endpoint {
     /// A pseudo-terminal, with a symbolic link to it where one is named.
     Pty(Option<PathBuf>),
-    /// A TCP port, as `127.0.0.1:0`.
-    Tcp(String),
+    /// A TCP port.
+    Tcp {
+        /// As `127.0.0.1:0`.
+        address: String,
+        /// Whether it may be one that other computers reach: whoever reaches it can start the motor.
+        anyone: bool,
+    },
 }
 
 /// What is served, where and how.
@@ -191,7 +197,7 @@ fn opened(endpoint: &Endpoint) -> io::Result<Box<dyn Port>> {
             io::ErrorKind::Unsupported,
             "this system has no pseudo-terminals; serve on TCP",
         )),
-        Endpoint::Tcp(address) => Ok(Box::new(tcp::Tcp::listen(address)?)),
+        Endpoint::Tcp { address, anyone } => Ok(Box::new(tcp::Tcp::listen(address, *anyone)?)),
     }
 }
 

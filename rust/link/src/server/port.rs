@@ -39,7 +39,15 @@ pub trait Port: Debug + Send {
     /// Where the system does not give it.
     fn plug(&mut self) -> io::Result<()>;
 
-    /// Hosts that were sent away because one was there.
+    /// Whether others than this computer's users may reach it, a web page among them.
+    fn is_network(&self) -> bool {
+        false
+    }
+
+    /// Sends the host that is there away.
+    fn hang_up(&mut self) {}
+
+    /// Hosts that were sent away, as one was there or as they were none.
     fn refused(&self) -> u64 {
         0
     }

@@ -63,6 +63,7 @@ impl Rig {
     pub fn new(machine: Machine, name: &'static str, boot_id: u32, credit: bool) -> Result<Self> {
         let identity = Identity {
             boot_id,
+            entropy: entropy(),
             name,
             firmware: env!("CARGO_PKG_VERSION"),
             period: PERIOD,
@@ -91,6 +92,7 @@ impl Rig {
         let identity = *self.device.identity();
         if let Ok(device) = booted(Identity {
             boot_id,
+            entropy: entropy(),
             ..identity
         }) {
             *self.device = device;
@@ -173,6 +175,12 @@ impl Rig {
 fn booted(identity: Identity) -> Result<Device<CAPACITY>> {
     let device = Device::new(identity);
     device.map_err(|refused| Error::setting(refused.to_string()))
+}
+
+/// Random bits of the system, by way of the keys that it gives to hash tables.
+fn entropy() -> u32 {
+    use std::hash::{BuildHasher, RandomState};
+    RandomState::new().hash_one(0) as u32
 }
 
 /// The next boot id whose low 16 bits are neither those of this one nor 0, the tag of HELLO.

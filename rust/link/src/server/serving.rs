@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use super::Settings;
 use super::clock::Clock;
 use super::faults::{Fault, Faults};
+use super::gate::Gate;
 use super::line::{Direction, Line};
 use super::log::FaultLog;
 use super::port::{Interest, Port};
@@ -46,6 +47,8 @@ pub struct Serving<'a> {
     ends: Option<Instant>,
     room: usize,
     connected: bool,
+    /// Of the connection, where it comes by a network.
+    gate: Option<Gate>,
     /// A host has gone by itself, and none has come since.
     left: bool,
     stalled: Option<Instant>,
@@ -95,6 +98,7 @@ impl<'a> Serving<'a> {
                 (false, None) => WAITING,
             },
             connected: false,
+            gate: None,
             left: false,
             stalled: None,
             unplugged: None,
@@ -163,6 +167,7 @@ impl<'a> Serving<'a> {
         self.left = !connected && self.unplugged.is_none();
         self.inbound.clear();
         self.outbound.clear();
+        self.gate = (connected && self.port.is_network()).then(Gate::new);
         if connected {
             // what the last host did not read to its end stops here
             self.outbound
@@ -190,6 +195,12 @@ impl<'a> Serving<'a> {
                 0
             };
             self.inbound.spend(length);
+            let tag = self.rig.boot_id() as u16;
+            let gate = self.gate.as_mut();
+            if gate.is_some_and(|gate| !gate.admits(&buffer[..length], tag)) {
+                self.port.hang_up();
+                return self.presence();
+            }
             self.inbound
                 .push(&buffer[..length], now, &mut self.log, &mut self.events);
         }

@@ -12,23 +12,33 @@ pub struct Tcp {
     address: SocketAddr,
     listener: Option<TcpListener>,
     client: Option<TcpStream>,
+    /// The client has gone and nobody has looked since.
+    gone: bool,
     refused: u64,
 }
 
 impl Tcp {
-    /// Listens on `address`, as `127.0.0.1:5000`; port 0 takes a free one.
+    /// Listens on `address`, as `127.0.0.1:5000`; port 0 takes a free one. `anyone`: on one that other computers reach, too.
     ///
     /// # Errors
-    /// Where the address is none of this computer, in use or not allowed.
-    pub fn listen(address: &str) -> io::Result<Self> {
+    /// Where the address is none of this computer, in use or not allowed; where others reach it and that was not said.
+    pub fn listen(address: &str, anyone: bool) -> io::Result<Self> {
         let resolved = address
             .to_socket_addrs()
             .and_then(|mut found| found.next().ok_or_else(|| ErrorKind::NotFound.into()))
             .map_err(|e| explained(&e, &format!("expected HOST:PORT, got {address:?}")))?;
+        if !(anyone || resolved.ip().is_loopback()) {
+            let what = format!(
+                "expected an address that only this computer reaches, as 127.0.0.1:5000, got {address:?}; whoever reaches \
+                 the port can start the motor: where that is meant, say so (anyone=True, --anyone)"
+            );
+            return Err(io::Error::new(ErrorKind::PermissionDenied, what));
+        }
         let mut tcp = Self {
             address: resolved,
             listener: None,
             client: None,
+            gone: false,
             refused: 0,
         };
         tcp.plug()?;
@@ -49,12 +59,16 @@ impl Tcp {
         }
     }
 
+    fn leave(&mut self) {
+        self.gone |= self.client.take().is_some();
+    }
+
     fn outcome(&mut self, result: io::Result<usize>) -> usize {
         match result {
             Ok(length) if length > 0 => length,
             Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => 0,
             _ => {
-                self.client = None;
+                self.leave();
                 0
             }
         }
@@ -90,6 +104,10 @@ impl Port for Tcp {
     }
 
     fn connected(&mut self) -> bool {
+        // one that comes as another goes is another one: what that one has said must not count for it
+        if std::mem::take(&mut self.gone) {
+            return false;
+        }
         self.accept();
         self.client.is_some()
     }
@@ -131,7 +149,7 @@ impl Port for Tcp {
     }
 
     fn unplug(&mut self) {
-        self.client = None;
+        self.leave();
         self.listener = None;
     }
 
@@ -152,6 +170,15 @@ impl Port for Tcp {
         let (address, listener) = opened?;
         (self.address, self.listener) = (address, Some(listener));
         Ok(())
+    }
+
+    fn is_network(&self) -> bool {
+        true
+    }
+
+    fn hang_up(&mut self) {
+        self.leave();
+        self.refused += 1;
     }
 
     fn refused(&self) -> u64 {

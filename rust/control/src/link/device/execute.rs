@@ -6,7 +6,7 @@ use crate::link::command::{
 };
 use crate::link::identity::{Limits, VERSION, capability};
 use crate::link::profile::Table;
-use crate::link::session::{Order, Reply, Session};
+use crate::link::session::{Order, Reply, Session, key};
 use crate::link::{Body, Fields, Frame};
 
 /// How far ahead a run can be planned \[us\].
@@ -115,7 +115,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
                 Ok(())
             }
             Command::Limits(limits) => self.set_limits(limits, body),
-            Command::Arm { watchdog } => self.arm(watchdog),
+            Command::Arm { watchdog, key } => self.arm(watchdog, key),
             Command::Stop => {
                 if matches!(self.state, State::Armed | State::Running) {
                     self.stop(Reason::None);
@@ -151,6 +151,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         body.f32(self.identity.counts_per_rev);
         body.text(self.identity.name, 24);
         body.text(self.identity.firmware, 16).u32(number);
+        body.u32(self.session.as_ref().map_or(0, |session| session.key));
         Ok(())
     }
 
@@ -162,7 +163,9 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             _ => {}
         }
         let foreign = self.foreign();
-        self.session = Some(Session::new(number, foreign));
+        let (entropy, boot) = (self.identity.entropy, self.identity.boot_id);
+        let key = key(entropy, boot, number, self.now);
+        self.session = Some(Session::new(number, key, foreign));
         self.credit = None;
         self.limits = None;
         self.gains = None;
@@ -218,9 +221,11 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         Refusal::state(self.state).unless(states.contains(&self.state))
     }
 
-    fn arm(&mut self, watchdog: u32) -> Done {
+    fn arm(&mut self, watchdog: u32, key: u32) -> Done {
         self.allow(&[State::Idle])?;
         check_watchdog(watchdog, 0)?;
+        let greeted = self.session.as_ref().map(|session| session.key);
+        Refusal::KEY.unless(greeted == Some(key))?;
         Refusal::NO_LIMITS.unless(self.limits.is_some())?;
         Refusal::MOVING.unless(self.guard.at_rest())?;
         if self.can(capability::COMPUTED) {

@@ -113,9 +113,20 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         }
         let u = self.in_whole_steps(wanted.max(-limits.volt).min(limits.volt), limits.volt);
         self.guard.expect_motion(&limits, u)?;
+        // a profile that swings is as its author wants it
+        if self.run.start.mode != 0 {
+            let (low, high) = self.range(limits.volt);
+            self.guard.expect_calm(low, high, u)?;
+        }
         let bound = limits.volt - 1.0 / self.identity.steps_per_volt();
         let limited = self.run.controller.is_some() && u.abs() > bound;
         Ok((u, reference, wanted.abs() > limits.volt || limited))
+    }
+
+    /// The limits of the loop's command: the controller's own, which lie within the volt limit, where it is here.
+    fn range(&self, volt: f32) -> (f32, f32) {
+        let own = self.run.controller.as_ref().map(|c| c.settings());
+        own.map_or((-volt, volt), |s| (s.u_min, s.u_max))
     }
 
     /// The command as it is recorded: what is applied is what the host gets to see.

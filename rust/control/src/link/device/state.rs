@@ -42,6 +42,8 @@ pub enum Reason {
     StopInput = 10,
     /// A control period was late, early or lost.
     Late = 11,
+    /// The command of a loop swings between its limits.
+    Swinging = 12,
 }
 
 /// What is worth a frame of its own; values as in the protocol.

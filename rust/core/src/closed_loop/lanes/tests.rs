@@ -213,7 +213,7 @@ fn summed((_, [u, y, _]): &Recorded, reference: &[f64], design: &Design<f64>) ->
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(60))]
+    #![proptest_config(crate::laws::cases(60))]
     #[test]
     fn a_lane_is_its_loop_to_the_bit(
         designs in prop::collection::vec(designs(), 1..=MOST),

@@ -58,7 +58,7 @@ impl Equations {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(64))]
+    #![proptest_config(crate::laws::cases(64))]
     #[test]
     fn the_whole_loop_equals_its_linear_equations(
         kp in 1e-4..2e-3, ti in 0.05..1.0, td in 0.0..0.01, alpha in -0.5..1.0, beta in -0.5..1.0, n in 1.0..20.0,

@@ -1,7 +1,7 @@
 //! The loop against the state machine of a real device and the virtual sewing machine, in computed time.
 
 use sewfast_control::link::{
-    Body, Device, Header, Identity, Limits, MAX_WIRE, Measurement, Reason, Source, State,
+    Body, Deframer, Device, Header, Identity, Limits, MAX_WIRE, Measurement, Reason, Source, State,
 };
 use sewfast_control::link::{Channel as Streamed, Encoding, capability, encode};
 use sewfast_control::{Controller, Design, Settings as Pid, Standard};
@@ -74,12 +74,15 @@ struct Bench {
     device: Device<8>,
     machine: Machine,
     now: u64,
+    /// Of the reply to HELLO.
+    key: u32,
 }
 
 impl Bench {
     fn new() -> Self {
         let device = Device::new(Identity {
             boot_id: 3,
+            entropy: 0,
             name: "bench",
             firmware: "1",
             period: 1000,
@@ -97,11 +100,13 @@ impl Bench {
             device: device.unwrap(),
             machine: Machine::new(Parameters::default()).unwrap(),
             now: OFFSET,
+            key: 0,
         };
         bench.pass(200);
         let mut hello = Body::new();
-        hello.u8(2).u8(2).u32(99);
+        hello.u8(3).u8(3).u32(99);
         bench.say(0x01, 0, 0, &hello);
+        bench.key = greeted(&bench.pass(1));
         let mut limits = Body::new();
         limits
             .f32(20.0)
@@ -151,10 +156,29 @@ impl Bench {
     }
 }
 
-fn host_loop() -> HostLoop {
+/// The key at the end of a reply to HELLO.
+fn greeted(mut said: &[u8]) -> u32 {
+    let mut deframer = Deframer::new();
+    while let Some(frame) = deframer.next(&mut said) {
+        let Ok(frame) = frame else { continue };
+        if let (0x81, Some(key)) = (frame.header.kind, frame.body.last_chunk()) {
+            return u32::from_le_bytes(*key);
+        }
+    }
+    panic!("HELLO is not answered")
+}
+
+fn pair() -> (Bench, HostLoop) {
+    let bench = Bench::new();
+    let looped = host_loop(bench.key);
+    (bench, looped)
+}
+
+fn host_loop(key: u32) -> HostLoop {
     let settings = Settings {
         tag: 3,
         session: 99,
+        key,
         command: 1,
         heartbeat: 0,
         device_period: 1000,
@@ -185,7 +209,7 @@ fn serve(bench: &mut Bench, looped: &mut HostLoop, mut disturb: impl FnMut(&mut 
 
 #[test]
 fn tracks_as_the_simulated_loop_does() {
-    let (mut bench, mut looped) = (Bench::new(), host_loop());
+    let (mut bench, mut looped) = pair();
     serve(&mut bench, &mut looped, |_, _| {});
     assert_eq!(looped.outcome(), Some(&Outcome::Completed));
     let taken = looped.status().map(|status| status.samples as usize);
@@ -206,7 +230,7 @@ fn tracks_as_the_simulated_loop_does() {
 
 #[test]
 fn a_trip_of_the_device_ends_the_loop_with_its_reason() {
-    let (mut bench, mut looped) = (Bench::new(), host_loop());
+    let (mut bench, mut looped) = pair();
     serve(&mut bench, &mut looped, |bench, k| {
         if k == 700 {
             bench.device.trip(bench.now - OFFSET, Reason::StopInput);
@@ -223,7 +247,7 @@ fn a_trip_of_the_device_ends_the_loop_with_its_reason() {
 
 #[test]
 fn a_stop_leaves_the_device_idle_and_its_samples_here() {
-    let (mut bench, mut looped) = (Bench::new(), host_loop());
+    let (mut bench, mut looped) = pair();
     for _ in 0..600 {
         let received = bench.pass(1);
         let said = looped.tick(bench.now, &received).to_vec();
@@ -239,7 +263,7 @@ fn a_stop_leaves_the_device_idle_and_its_samples_here() {
 
 #[test]
 fn a_host_that_stops_calling_is_stopped_by_the_watchdog() {
-    let (mut bench, mut looped) = (Bench::new(), host_loop());
+    let (mut bench, mut looped) = pair();
     for _ in 0..600 {
         let received = bench.pass(1);
         let said = looped.tick(bench.now, &received).to_vec();

@@ -37,7 +37,7 @@ fn number(dice: &mut Dice, out: &mut Vec<u8>) {
 fn body(dice: &mut Dice, kind: u8, now: u64) -> Vec<u8> {
     let watchdog = (1000 + dice.below(100_000) as u32).to_le_bytes();
     let mut body = match kind {
-        0x01 => [&[2, 2], &(1 + dice.below(2) as u32).to_le_bytes()[..]].concat(),
+        0x01 => [&[3, 3], &(1 + dice.below(2) as u32).to_le_bytes()[..]].concat(),
         0x02 => std::vec![dice.below(7) as u8],
         0x04 => [10f32, 4000.0, f32::INFINITY, 20.0]
             .map(f32::to_le_bytes)
@@ -134,7 +134,10 @@ fn bytes(dice: &mut Dice, rig: &mut Rig) -> Vec<u8> {
     } else {
         rig.tag
     };
-    let body = body(dice, kind, rig.now);
+    let mut body = body(dice, kind, rig.now);
+    if kind == 0x05 && body.len() == 4 {
+        body.extend(rig.key().to_le_bytes());
+    }
     let session = rig.session;
     if dice.below(64) == 0 {
         rig.session = dice.next() as u32;

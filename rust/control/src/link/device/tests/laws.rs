@@ -94,13 +94,16 @@ impl Bystander {
     }
 
     fn hello(&mut self, session: u32) {
-        let mut body = vec![2, 2];
+        let mut body = vec![3, 3];
         body.extend(session.to_le_bytes());
         self.rig.session = session;
         self.deliver((0x01, 0, session, 0, body));
     }
 
-    fn say(&mut self, kind: u8, body: Vec<u8>, fate: Fate) {
+    fn say(&mut self, kind: u8, mut body: Vec<u8>, fate: Fate) {
+        if kind == 0x05 {
+            body.extend(self.rig.key().to_le_bytes());
+        }
         let counter = if kind < 0x20 {
             &mut self.rig.commands
         } else {

@@ -38,6 +38,7 @@ pub static CHANNELS: [Channel; 6] = [
 pub fn identity() -> Identity {
     Identity {
         boot_id: 0x1_2345,
+        entropy: 0x5EED,
         name: "rig",
         firmware: "test",
         period: PERIOD as u32,
@@ -201,8 +202,20 @@ impl Rig {
         self.command(0x04, body.bytes().unwrap())
     }
 
+    /// The key of the session.
+    pub fn key(&self) -> u32 {
+        let session = self.device.core.session.as_ref();
+        session.map_or(0, |session| session.key)
+    }
+
+    /// The body of ARM.
+    pub fn arming(&self, watchdog: u32) -> Vec<u8> {
+        [watchdog.to_le_bytes(), self.key().to_le_bytes()].concat()
+    }
+
     pub fn arm(&mut self) -> Answer {
-        self.command(0x05, &50_000u32.to_le_bytes())
+        let body = self.arming(50_000);
+        self.command(0x05, &body)
     }
 
     pub fn stop(&mut self) -> Answer {

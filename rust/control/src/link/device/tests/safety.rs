@@ -148,7 +148,7 @@ fn a_new_host_starts_nothing_that_the_old_one_left() {
 #[test]
 fn nonsense_from_the_host_trips() {
     let nonsense: [(u8, &[u8]); 6] = [
-        (0x05, &[0; 4]),
+        (0x05, &[0; 8]),
         (0x1F, &[]),
         (0x0A, &[1]),
         (0x04, &[0x41; 16]),
@@ -295,7 +295,7 @@ fn time_at_its_end_is_safe() {
 #[test]
 fn half_a_frame_is_no_command_and_the_next_one_is() {
     let mut rig = Rig::ready();
-    let arm = rig.wire(0x05, rig.tag, rig.commands + 1, &50_000u32.to_le_bytes());
+    let arm = rig.wire(0x05, rig.tag, rig.commands + 1, &rig.arming(50_000));
     rig.put(&arm[..arm.len() - 1]);
     assert_eq!(rig.device.state(), State::Idle);
     rig.put(&[0]);

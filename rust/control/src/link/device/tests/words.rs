@@ -24,7 +24,7 @@ fn hello_tells_the_identity() {
     let mut fields = Fields::new(&body);
     assert_eq!(
         (result, fields.u8(), fields.u32()),
-        (0, Some(2), Some(0x1_2345))
+        (0, Some(3), Some(0x1_2345))
     );
     // zlib.crc32 of the same fields, packed by Python
     assert_eq!(fields.u32(), Some(SCHEMA));
@@ -35,18 +35,46 @@ fn hello_tells_the_identity() {
         (fields.text(24), fields.text(16)),
         (Some("rig"), Some("test"))
     );
-    assert_eq!((fields.u32(), fields.end()), (Some(9), Some(())));
+    let key = rig.key();
+    assert_eq!((fields.u32(), fields.u32()), (Some(9), Some(key)));
+    assert_eq!(fields.end(), Some(()));
 }
 
-const SCHEMA: u32 = 0x8CD8_E9B9;
+#[test]
+fn arm_repeats_the_key_of_the_last_hello() {
+    let mut rig = Rig::ready();
+    let (key, watchdog) = (rig.key(), 50_000u32.to_le_bytes());
+    for wrong in [0, !key, key ^ 1, key.swap_bytes()] {
+        let body = [watchdog, wrong.to_le_bytes()].concat();
+        assert_eq!(rig.command(0x05, &body), (13, vec![0; 4]));
+    }
+    assert_eq!(rig.command(0x05, &watchdog), (2, vec![4, 0, 0, 0]));
+    // the session again keeps its key, another one and another boot have their own
+    rig.hello(77);
+    assert_eq!(rig.key(), key);
+    let old = rig.arming(50_000);
+    assert_eq!(rig.command(0x05, &old).0, 0);
+    rig.new_session(78);
+    rig.limits(10.0, 4000.0, INF, 20.0);
+    assert_ne!(rig.key(), key);
+    assert_eq!(rig.command(0x05, &old), (13, vec![0; 4]));
+    let mut other = Rig::with(Identity {
+        entropy: 0x5EEE,
+        ..identity()
+    });
+    other.hello(77);
+    assert_ne!(other.key(), key);
+}
+
+const SCHEMA: u32 = 0x6B97_08E2;
 
 #[test]
 fn hello_needs_a_common_version() {
     let mut rig = Rig::new();
-    for (from, to) in [(0, 0), (1, 1), (3, 9), (3, 1)] {
+    for (from, to) in [(0, 0), (1, 2), (4, 9), (4, 1)] {
         rig.say(0x01, 0, 0, &[from, to, 1, 0, 0, 0]);
         let reply = rig.listen().pop().unwrap();
-        assert_eq!(reply.body, [0, 0, 0, 0, 10, 2, 0, 0, 0]);
+        assert_eq!(reply.body, [0, 0, 0, 0, 10, 3, 0, 0, 0]);
     }
     rig.say(0x01, 0, 0, &[1]);
     assert_eq!(rig.listen().pop().unwrap().body[4..], [2, 1, 0, 0, 0]);
@@ -149,7 +177,7 @@ fn numbers_of_frames_have_no_gap_but_for_dropped_ones() {
 #[test]
 fn the_same_number_gets_the_same_reply_and_is_not_executed_again() {
     let mut rig = Rig::ready();
-    let body = 50_000u32.to_le_bytes();
+    let body = rig.arming(50_000);
     let first = rig.command(0x05, &body);
     let count = rig.device.armed_count();
     assert_eq!(rig.again(0x05, &body), Some(first));
