@@ -240,11 +240,13 @@ def figures(drive: Drive, seed: int, **settings: Any) -> Figures:
     """Commission one machine; `railed` is the time at a limit of the command in all [s]."""
     simulator = Simulator(drive)
     used = time.process_time()
-    verdict, stage, reason = "verified", "", ""
+    stage, reason = "", ""
     try:
         found = commission(bench_of(simulator), seed=seed, **settings)
+        verdict = found.verdict
     except Refusal as refusal:
-        assert refusal.so_far is not None
+        if refusal.so_far is None:
+            raise
         found, verdict, stage, reason = refusal.so_far, "refused", refusal.stage, str(refusal)
     return Figures(
         drive.name, seed, verdict, stage, reason, None, found.predicted_cost, found.measured_cost,
@@ -256,8 +258,8 @@ def line(f: Figures) -> str:
     """For progress."""
     costs = " ".join(f"{'-' if c is None else f'{c:.2f}':>8}" for c in (f.predicted, f.measured))
     return (
-        f"{f.machine:12}{f.seed:3} {f.verdict:9}{costs}  railed {f.railed:6.2f} s of {f.moved:6.1f}  "
-        f"cpu {f.cpu:6.1f}  {f.stage} {f.reason[:150]}"
+        f"{f.machine:12}{f.seed:3} {f.verdict:9}{costs}  railed {f.railed:6.2f} s of "
+        f"{f.moved:6.1f}  cpu {f.cpu:6.1f}  {f.stage} {f.reason[:150]}"
     )
 
 

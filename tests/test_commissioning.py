@@ -135,7 +135,7 @@ def test_a_rule_that_no_member_bears_is_no_measure(whole: Commissioning) -> None
     runaway = _core.LinearModel(np.array([-2.0]), np.array([[500.0]]), 1, 0.0)
     good = whole.models.members[0]
     unstable = LinearOE(runaway, good.Ts, good.input_names, good.output_name, ("V",), "RPM")
-    found = Requirements.of(Ensemble.of([unstable]), whole.fopdt, wild, asked)
+    found = Requirements.of(Ensemble.of([unstable]), whole.fopdt, 2e4, wild, asked, None)
     assert (found.loads, found.rival, found.constraints.recovery) == ((), None, None)
 
 
@@ -144,7 +144,12 @@ def test_nothing_is_learned_from_the_true_speed_or_the_recording_judged_by(
 ) -> None:
     assert whole.models is not None
     for member in whole.models.members:
-        assert {d["name"] for d in member.training["data"]} <= {"pulses", "trapezoids"}
+        assert {d["name"] for d in member.training["data"]} <= {
+            "step",
+            "pulses",
+            "pulses_limited",
+            "trapezoids",
+        }
     for name in ("pulses", "trapezoids", "levels"):
         recording = whole.recordings[name]
         np.testing.assert_array_equal(recording.y, recording.speed("kalman"))

@@ -162,10 +162,9 @@ class SteppedBench:
 
         recording = self._recording(u, *self._played(decide, len(r)), name)
         truth = recording.speed_true
-        found = ClosedLoopRun(
-            np.arange(len(r)) * self.Ts, np.array(r), u, recording.y if truth is None else truth,
-            feedback, controller, self.name, name,
-        )  # fmt: skip
+        t = np.arange(len(r), dtype=np.float64) * self.Ts
+        y = recording.y if truth is None else truth
+        found = ClosedLoopRun(t, np.array(r), u, y, feedback, controller, self.name, name)
         return Followed(found, recording)
 
     def _played(

@@ -25,7 +25,7 @@ HOLD = 0.4
 PERIODS = 100
 """Samples that it is held at the least."""
 CHATTER = 0.12
-"""Standard deviation of a quiet loop's command at a held speed, in shares of the largest command."""
+"""Standard deviation of a quiet loop's command at a held speed, over the largest command."""
 EXPECTED = 2.0
 """Times the models' own, which is the encoder's, that it may be in any case."""
 RAILED = 0.05
@@ -93,7 +93,7 @@ def cautious(
     small: SmallSignal | None,
     models: Ensemble | None = None,
 ) -> tuple[Controller, Swing | None]:
-    """The gains that hold a speed quietly, of those that were asked for, and the swing that was met.
+    """The gains that hold a speed quietly, of those asked for, and the swing that was met.
 
     `models` know how far the encoder's counts alone move the command.
 

@@ -62,7 +62,7 @@ def first_motion(bench: Bench, demands: Demands) -> Motion:
         recording = bench.excite(_pulse(u, bench.Ts), f"motion_{100 * share:g}")
         speed = _judged(recording, u, may_stall=stalls < STALLS and share < STALLING)
         if speed is None:
-            stalls += np.ptp(recording.counts) >= MOVED * bench.counts_per_rev
+            stalls += int(np.ptp(recording.counts) >= MOVED * bench.counts_per_rev)
             continue
         levels.append((u, speed))
         if speed >= ENOUGH * demands.speed:

@@ -25,6 +25,8 @@ def numbers(c: Commissioning) -> dict[str, Any]:
         "recordings": {name: len(r) * r.Ts for name, r in c.recordings.items()},
         "motion": None if c.motion is None else dict(vars(c.motion)),
         "fopdt": None if c.fopdt is None else {n: getattr(c.fopdt, n) for n in _FOPDT},
+        "small_signals": _small_signals(c),
+        "turn_load_v_rms": None if c.turn_load is None else c.turn_load.rms,
         "models": {"members": 0 if c.models is None else len(c.models.members)}
         | {"levels_rmse_rpm": list(c.rmse)},
         "controllers": {
@@ -51,6 +53,19 @@ def numbers(c: Commissioning) -> dict[str, Any]:
         "predicted_cost": c.predicted_cost,
         "measured_cost": c.measured_cost,
         "references": {x.reference: _comparison(x) for x in c.comparisons},
+    }
+
+
+def _small_signals(c: Commissioning) -> dict[str, Any] | None:
+    """Order and first-order description of the machine about a working speed; its resonance."""
+    found = c.small_signal
+    if found is None:
+        return None
+    fopdt, resonance = found.fopdt, found.resonance
+    return {
+        "order": found.model.orders["na"],
+        "fopdt": None if fopdt is None else {n: getattr(fopdt, n) for n in ("K", "T", "L")},
+        "resonance": None if resonance is None else dict(vars(resonance)),
     }
 
 

@@ -79,8 +79,9 @@ def commission(
     gains by rule, pulses up to the command's limit, a closed loop under the first gains, an
     ensemble of networks from all of these, gains by search on all members with encoder, feedback
     filter, gain spread and delay in the loop, and the machine under these beside what was
-    predicted. New gains meet the machine in steps, and a loop that swings is left at once. Every stage begins and ends at rest, and stops with a reason where the
-    evidence is not good enough (docs/commissioning.md).
+    predicted. New gains meet the machine in steps, and a loop that swings is left at once. Every
+    stage begins and ends at rest, and stops with a reason where the evidence is not good enough
+    (docs/commissioning.md).
 
     Parameters
     ----------

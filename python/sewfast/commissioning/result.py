@@ -158,6 +158,8 @@ class Commissioning:
             lines.append(f"  at {self.stage}: {self.reason}")
         if self.fopdt is not None:
             lines.append(f"  step response  {self.fopdt}")
+        if self.small_signal is not None and self.small_signal.resonance is not None:
+            lines.append(f"  small signals  {self.small_signal.resonance}")
         if self.models is not None:
             worst = f"{min(self.rmse):.3g} to {max(self.rmse):.3g}"
             lines.append(

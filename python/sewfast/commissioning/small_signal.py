@@ -18,7 +18,7 @@ from ..dataset import Dataset, FloatArray
 from ..errors import DataError, FitError
 from ..identification.folds import Errors, Split, compared, errors_of, folds, free_runs
 from ..identification.task import arrays, wrap
-from ..models import LinearOE
+from ..models import LinearOE, Model
 from ..recording import Recording
 from .bench import Bench
 from .demands import Demands
@@ -32,6 +32,7 @@ SAMPLES, LONGEST = 4_000, 12.0
 """Samples that are shaken; not longer than that [s]."""
 HOLD = 2
 """Samples that each random value is held: power up to a quarter of the sample rate."""
+ITERATIONS = 60
 ORDERS = (1, 2, 3, 4, 5)
 LEAST_GAIN = math.log(1.005)
 """A difference in error that counts as none, however well it is known."""
@@ -68,7 +69,7 @@ class SmallSignal:
 
     Attributes
     ----------
-    model : LinearOE
+    model : Model
         Command [V] to speed [RPM], of the simplest order that explains the record.
     resonance : Resonance or None
         The least damped one.
@@ -76,7 +77,7 @@ class SmallSignal:
         The model's step response as first order with dead time; None where it is none.
     """
 
-    model: LinearOE
+    model: Model
     resonance: Resonance | None
     fopdt: Fopdt | None
 
@@ -113,11 +114,9 @@ def explained(recording: Recording, settled: int, fopdt: Fopdt) -> SmallSignal |
         input_units="V", output_unit="RPM", name=recording.name,
     )  # fmt: skip
     part = folds(data)[0]
-    found = {order: best for order in ORDERS if (best := _fitted(part, order)) is not None}
-    if not found:
-        return None
-    best = min(errors.rmse for _, errors in found.values())
-    if not best < part.spread:
+    tried = {order: _fitted(part, order) for order in ORDERS}
+    found = {order: fit for order, fit in tried.items() if fit is not None}
+    if not found or not min(errors.rmse for _, errors in found.values()) < part.spread:
         return None
     order = _simplest(found)
     core = found[order][0]
@@ -128,11 +127,12 @@ def explained(recording: Recording, settled: int, fopdt: Fopdt) -> SmallSignal |
 
 def _fitted(part: Split, order: int) -> tuple[_core.LinearModel, Errors] | None:
     """The better of output error and instrumental variables: a resonance makes local minima."""
-    settings = {"na": order, "nb": order + 1, "nk": 1, "max_iterations": 60}
     tried = []
     for fit in (_core.fit_oe, _core.fit_iv):
         try:
-            model = fit(arrays(part.fitted), **settings).model  # type: ignore[operator]
+            model = fit(
+                arrays(part.fitted), na=order, nb=order + 1, nk=1, max_iterations=ITERATIONS
+            ).model
         except (DataError, FitError):
             continue
         tried.append((model, errors_of(free_runs(model, part), part)))

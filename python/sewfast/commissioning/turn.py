@@ -14,7 +14,7 @@ import numpy as np
 
 from ..dataset import FloatArray
 from ..errors import FitError
-from ..models import Ensemble, LinearOE
+from ..models import Ensemble, Model
 from ..recording import Recording
 
 HARMONICS = 6
@@ -40,7 +40,8 @@ class TurnLoad:
 
     def at(self, turns: FloatArray) -> FloatArray:
         """The command [V] at these angles [turns]."""
-        return basis(turns) @ np.concatenate([self.cosine, self.sine])
+        command: FloatArray = basis(turns) @ np.concatenate([self.cosine, self.sine])
+        return command
 
     def along(self, r: FloatArray, Ts: float) -> FloatArray:
         """The command [V] of a machine that follows a reference [RPM], from angle 0."""
@@ -60,7 +61,7 @@ def basis(turns: FloatArray) -> FloatArray:
 
 def turn_load(
     ensemble: Ensemble,
-    plant: LinearOE,
+    plant: Model,
     learned: Sequence[Recording],
     judge: Recording,
 ) -> TurnLoad | None:
@@ -70,7 +71,7 @@ def turn_load(
     ----------
     ensemble : Ensemble
         Its median's free run is what is explained.
-    plant : LinearOE
+    plant : Model
         From command to speed about a working speed: what a push does.
     learned, judge : Recordings
         To take it from, and to ask whether it is there.
@@ -88,7 +89,7 @@ def turn_load(
 
 
 def _explained(
-    ensemble: Ensemble, plant: LinearOE, recording: Recording
+    ensemble: Ensemble, plant: Model, recording: Recording
 ) -> tuple[FloatArray, FloatArray]:
     """What each harmonic would do to the speed, and what the models leave unexplained [RPM].
 
