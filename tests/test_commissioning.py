@@ -348,5 +348,5 @@ def test_a_member_that_parts_from_the_others_is_left_out(whole: Commissioning) -
     stuck = LinearOE(linear, good.Ts, good.input_names, good.output_name, ("V",), "RPM")
     kept = agreement.agreeing(whole.controller, Ensemble.of([good, stuck, good]), r)
     assert kept.members == (good, good)
-    with pytest.raises(Refusal, match="more than half of 2 networks"):
+    with pytest.raises(Refusal, match="at least half of 2 networks"):
         agreement.agreeing(whole.controller, Ensemble.of([good, stuck]), r)

@@ -25,7 +25,7 @@ def agreeing(
     Raises
     ------
     Refusal
-        Where not more than half of the members agree.
+        Where less than half of the members agree.
     """
     members = list(ensemble.members)
     apart = np.zeros(len(members))
@@ -37,8 +37,8 @@ def agreeing(
         apart = np.maximum(apart, np.where(known, distances, np.inf))
     kept = [m for m, share in zip(members, apart, strict=True) if share <= DISAGREE]
     require(
-        2 * len(kept) > len(members),
-        f"expected more than half of {len(members)} networks within {100 * DISAGREE:g} % of the "
+        2 * len(kept) >= len(members),
+        f"expected at least half of {len(members)} networks within {100 * DISAGREE:g} % of the "
         f"span from their median in closed loop, {len(kept)} are; record longer, or raise members",
     )
     return ensemble if len(kept) == len(members) else Ensemble.of(kept)

@@ -22,6 +22,8 @@ SHARES = (0.25, 0.5, 1.0)
 """Of the gains, one hold after the other."""
 HOLD = 0.4
 """How long the level is held [s], at least; a swing is told from that."""
+SETTLE = 0.2
+"""Least time after the ramp, before that [s]."""
 PERIODS = 100
 """Samples that it is held at the least."""
 CHATTER = 0.12
@@ -58,7 +60,7 @@ def held(demands: Demands, fastest: float, Ts: float) -> tuple[FloatArray, int]:
     """A reference to a working speed [RPM], and the sample from which it has settled."""
     level = LEVEL * demands.speed
     rise = max(round(2.0 * level / fastest / Ts), 20)
-    settle = rise + max(round(0.5 * rise), PERIODS // 2)
+    settle = rise + max(round(0.5 * rise), round(SETTLE / Ts), PERIODS // 2)
     hold = max(round(HOLD / Ts), PERIODS)
     return level * np.minimum(1.0, np.arange(settle + hold) / rise), settle
 
@@ -74,11 +76,12 @@ def swing_of(
     u = u[np.isfinite(u)]
     reach = 0.5 * (limits.u_max - limits.u_min)
     railed = float(np.mean((u >= limits.u_max - 1e-9) | (u <= limits.u_min + 1e-9)))
-    deviation = float(u.std())
+    k = np.arange(len(u))
+    # what still settles is no swing
+    rest = u - np.polyval(np.polyfit(k, u, 2), k)
+    deviation = float(rest.std())
     if deviation <= max(CHATTER * reach, EXPECTED * expected) and railed <= RAILED:
         return None
-    k = np.arange(len(u))
-    rest = u - np.polyval(np.polyfit(k, u, 1), k)
     power = np.abs(np.fft.rfft(rest * np.hanning(len(rest)))) ** 2
     at = 1 + int(np.argmax(power[1:]))
     return Swing(share, at / (len(u) * found.Ts), deviation, railed)
