@@ -14,19 +14,25 @@ import numpy as np
 import pytest
 
 from cli import PROGRAM, environment, refused, sewfast
+from commissioned import SMALL, short
 from moments import PATIENCE, until
 from sewfast import (
     Commissioning,
     Controller,
     Gains,
+    LinkError,
     SettingError,
     VirtualMachine,
     commission,
     read_table,
 )
+from sewfast.commissioning import Followed
+from sewfast.commissioning.bench import MachineBench
 from sewfast.commissioning.folder import require_own
 from sewfast.commissioning.taken import Taken, prepare
+from sewfast.dataset import FloatArray
 from sewfast.link import VirtualDevice
+from sewfast.loop import run as closed_loop
 from sewfast.recordfile import read_recording
 from sewfast.recording import Recording, record
 
@@ -82,7 +88,7 @@ def test_ctrl_c_says_at_once_that_it_writes(tmp_path: Path) -> None:
     said = [line for line in told.splitlines() if "interrupted" in line or "best" in line]
     assert said[0] == "interrupted; writing what there is to out"
     assert said[1].startswith("the best so far is kept: ")
-    assert not list((tmp_path / "out").rglob("*.mcap"))
+    assert (tmp_path / "out/unfinished/trapezoids.mcap").exists()
     assert (tmp_path / "out/recordings/trapezoids.csv").exists()
 
 
@@ -112,7 +118,7 @@ def taken(folder: Path, kind: str = "virtual") -> Recording:
     prepare(folder)
     files = Taken(folder, {"kind": kind, "name": "bench 2"}, {"u_max": 9.0})
     files.begin()
-    files.keep("step response", "step", recording, None)
+    files.keep("step response", "step", "key", recording, None)
     return recording
 
 
@@ -122,7 +128,9 @@ def test_what_is_written_is_what_was_recorded(tmp_path: Path) -> None:
     for name in ("u", "counts", "y", "speed_true"):
         np.testing.assert_array_equal(found.columns[name], recording.columns()[name])
     assert found.header.device["name"] == "bench 2"
-    assert found.header.settings == {"commissioning": {"stage": "step response", "u_max": 9.0}}
+    assert found.header.settings == {
+        "commissioning": {"stage": "step response", "key": "key", "u_max": 9.0}
+    }
 
 
 def test_recordings_of_a_drive_are_kept(tmp_path: Path) -> None:
@@ -162,6 +170,9 @@ def test_a_whole_commissioning_stays_beside_an_unfinished_one(
     monkeypatch.chdir(tmp_path.parent)
     own = replace(drive, taken_in=Path(tmp_path.name))
     own.save(tmp_path, overwrite=True)
+    # a refused one may be resumed, of a verified one the tables hold the same
+    assert (tmp_path / "unfinished/step.mcap").exists()
+    replace(own, verdict="verified").save(tmp_path, overwrite=True)
     assert not (tmp_path / "unfinished").exists()
 
 
@@ -169,9 +180,9 @@ def test_a_recording_that_cannot_be_written_does_not_end_a_commissioning(tmp_pat
     recording = taken(tmp_path)
     files = Taken(tmp_path / "missing", {"kind": "virtual"}, {})
     with pytest.warns(RuntimeWarning, match="goes on, its recordings are in memory alone"):
-        files.keep("limits", "pulses", recording, None)
+        files.keep("limits", "pulses", "key", recording, None)
     # once: a second warning would be an error here
-    files.keep("limits", "again", recording, None)
+    files.keep("limits", "again", "key", recording, None)
 
 
 @pytest.mark.parametrize(
@@ -185,8 +196,64 @@ def test_references_have_files_of_their_own(names: list[str], message: str) -> N
 
 def test_a_reference_does_not_replace_a_recording_of_its_name(tmp_path: Path) -> None:
     recording = taken(tmp_path)
-    controller = Controller(Gains.standard(0.01, 0.1))
+    controller, machine = Controller(Gains.standard(0.01, 0.1)), VirtualMachine()
     files = Taken(tmp_path, {"kind": "virtual"}, {})
-    files.keep("verification", "step", recording, controller)
+    files.keep(
+        "verification", "step", "key", recording, closed_loop(controller, machine, np.zeros(300))
+    )
     names = {file.name for file in (tmp_path / "unfinished").iterdir()}
     assert names == {"step.mcap", "verification_step.mcap"}
+
+
+# --- going on after a trip ------------------------------------------------------------------------
+
+
+class Trips(MachineBench):
+    """The virtual machine, whose link fails once, as it is asked for a signal of this name."""
+
+    def __init__(self, at: str | None) -> None:
+        super().__init__(VirtualMachine())
+        object.__setattr__(self, "at", at)
+        object.__setattr__(self, "played", [])
+
+    def _next(self, name: str) -> None:
+        self.played.append(name)  # type: ignore[attr-defined]
+        if name == self.at:  # type: ignore[attr-defined]
+            raise LinkError(f"{name}: the cable fell out")
+
+    def excite(self, u: FloatArray, name: str) -> Recording:
+        self._next(name)
+        return super().excite(u, name)
+
+    def follow(self, controller: Controller, r: FloatArray, name: str) -> Followed:
+        self._next(name)
+        return super().follow(controller, r, name)
+
+
+@pytest.mark.parametrize("at", ["step", "pulses", "levels", "chirp_lo_hi"])
+def test_it_goes_on_after_a_trip_to_the_same_controller(tmp_path: Path, at: str) -> None:
+    with short():
+        whole = Trips(None)
+        expected = commission(whole, **SMALL)
+        tripping, again = Trips(at), Trips(None)
+        with pytest.raises(LinkError, match="fell out"):
+            commission(tripping, **SMALL, folder=tmp_path)
+        found = commission(again, **SMALL, folder=tmp_path, resume=True)
+    assert expected.controller is not None
+    assert found.controller is not None
+    assert found.controller.to_dict() == expected.controller.to_dict()
+    assert found.measured_cost == expected.measured_cost
+    # nothing is recorded twice but what had failed
+    assert tripping.played[:-1] + again.played == whole.played  # type: ignore[attr-defined]
+
+
+def test_what_was_recorded_under_other_settings_is_not_taken(tmp_path: Path) -> None:
+    with short():
+        with pytest.raises(LinkError):
+            commission(Trips("pulses"), **SMALL, folder=tmp_path)
+        other = Trips("pulses")
+        with pytest.raises(LinkError):
+            commission(other, **{**SMALL, "seed": 2}, folder=tmp_path, resume=True)
+    assert other.played[0] == "motion_1"  # type: ignore[attr-defined]
+    with pytest.raises(SettingError, match="folder of the attempt"):
+        commission(VirtualMachine(), resume=True)

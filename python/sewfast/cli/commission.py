@@ -75,6 +75,10 @@ def add(commands: Commands) -> None:
         "--seed", type=int, default=0, metavar="N",
         help="of the random signals, the networks and the search (0)",
     )  # fmt: skip
+    parser.add_argument(
+        "--resume", action="store_true",
+        help="go on from what an attempt with the same settings has left in DIR",
+    )  # fmt: skip
     add_overwrite(parser)
     add_drive(parser)
 
@@ -85,7 +89,7 @@ def command(args: argparse.Namespace) -> int | None:
 
     if not is_port(args.on):
         require_no_drive_options(args)
-    require_own(args.out, overwrite=args.overwrite)
+    require_own(args.out, overwrite=args.overwrite or args.resume)
     prepare(args.out)
     if is_port(args.on):
         # what a virtual machine did can be had again
@@ -144,6 +148,7 @@ def _commissioned(args: argparse.Namespace) -> Commissioning:
             "progress": lambda done, total, stage: progress.say(stage),
             "folder": args.out,
             "overwrite": args.overwrite,
+            "resume": args.resume,
         }
         if is_port(args.on):
             with opened(args) as drive:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -246,10 +248,16 @@ class DriveBench:
 
 @dataclass(frozen=True)
 class NotedBench:
-    """A bench that tells `note` of every recording as it comes, with the controller that ran."""
+    """A bench that hands every recording to `note` as it comes, with the run where a loop ran.
+
+    What an earlier attempt has recorded under the same name of the very same command, or of the
+    same controller and reference, is not recorded again: `kept` finds it by its key.
+    """
 
     inner: Bench
-    note: Callable[[str, Recording, Controller | None], object]
+    note: Callable[[str, str, Recording, ClosedLoopRun | None], object]
+    kept: Callable[[str, str], Recording | None]
+    kept_run: Callable[[str, str, Controller], Followed | None]
 
     @property
     def name(self) -> str:
@@ -272,14 +280,22 @@ class NotedBench:
         return self.inner.speed
 
     def excite(self, u: FloatArray, name: str) -> Recording:
-        recording = self.inner.excite(u, name)
-        self.note(name, recording, None)
+        key = key_of(u)
+        recording = self.kept(name, key) or self.inner.excite(u, name)
+        self.note(name, key, recording, None)
         return recording
 
     def follow(self, controller: Controller, r: FloatArray, name: str) -> Followed:
-        found = self.inner.follow(controller, r, name)
-        self.note(name, found.recording, controller)
+        key = key_of(r, controller)
+        found = self.kept_run(name, key, controller) or self.inner.follow(controller, r, name)
+        self.note(name, key, found.recording, found.run)
         return found
+
+
+def key_of(signal: FloatArray, controller: Controller | None = None) -> str:
+    """What tells a command, or a reference with its controller, from any other."""
+    design = "" if controller is None else json.dumps(controller.to_dict(), sort_keys=True)
+    return hashlib.sha256(np.ascontiguousarray(signal).tobytes() + design.encode()).hexdigest()
 
 
 def told_of(bench: Bench) -> tuple[dict[str, Any], dict[str, Any]]:

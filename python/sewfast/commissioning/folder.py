@@ -94,7 +94,9 @@ def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
     _artefacts(found, folder)
     _analysis(found, folder)
     jsonfile.write(folder / NUMBERS, FORMAT, VERSION, {"sewfast": __version__, **numbers(found)})
-    if found.taken_in is not None and found.taken_in.resolve() == folder.resolve():
+    own = found.taken_in is not None and found.taken_in.resolve() == folder.resolve()
+    if own and found.is_verified:
+        # of any other there is something to resume
         with suppress(OSError):
             # they hold nothing that the tables have not; the page is worth more than their absence
             clear(folder)

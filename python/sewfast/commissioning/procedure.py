@@ -16,6 +16,7 @@ from ..control import Controller, Fopdt, vector
 from ..cost import Cost
 from ..dataset import FloatArray
 from ..errors import DataError, Interrupted, SettingError
+from ..loop import ClosedLoopRun
 from ..machine import VirtualMachine
 from ..models import Ensemble
 from ..recording import Recording
@@ -23,7 +24,7 @@ from ..threads import available
 from ..tuning import TuningResult
 from . import excitations
 from .agreement import agreeing
-from .bench import Bench, NotedBench, bench_of, told_of
+from .bench import Bench, Followed, NotedBench, bench_of, told_of
 from .caution import cause, cautious
 from .demands import MS, Demands, demands
 from .first_order import step_response
@@ -72,6 +73,7 @@ def commission(
     progress: Progress | None = None,
     folder: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
+    resume: bool = False,
 ) -> Commissioning:
     """From a machine at rest to a controller that was verified on it.
 
@@ -127,6 +129,10 @@ def commission(
         tables in their place. One that cannot be written is warned of.
     overwrite : bool
         See `Commissioning.save`.
+    resume : bool
+        Go on from what an earlier attempt has left in `folder`: what it has recorded of the very
+        same commands and references is not recorded again. With the same settings the controller
+        is, bit by bit, that of an attempt without interruption on the same recordings.
 
     Returns
     -------
@@ -162,17 +168,33 @@ def commission(
             time_budget=time_budget,
         )
         journal = Journal(bench.name, progress)
-        taken = None if folder is None else _place(folder, bench, asked, overwrite=overwrite)
+        if resume and folder is None:
+            raise SettingError(
+                "expected the folder of the attempt to resume, got none; give folder='DIR'"
+            )
+        taken = (
+            None
+            if folder is None
+            else _place(folder, bench, asked, overwrite=overwrite, resume=resume)
+        )
         if taken is not None:
             journal.keep(taken_in=taken.folder)
 
-        def note(name: str, recording: Recording, controller: Controller | None) -> None:
+        def note(name: str, key: str, recording: Recording, run: ClosedLoopRun | None) -> None:
             journal.note(name, recording)
             if taken is not None:
-                taken.keep(journal.stage, name, recording, controller)
+                taken.keep(journal.stage, name, key, recording, run)
+
+        def kept(name: str, key: str) -> Recording | None:
+            return None if taken is None else taken.found(journal.stage, name, key)
+
+        def kept_run(name: str, key: str, controller: Controller) -> Followed | None:
+            if taken is None:
+                return None
+            return taken.found_run(journal.stage, name, key, controller, bench.name)
 
         try:
-            return _carry_out(NotedBench(bench, note), asked, cost, journal)
+            return _carry_out(NotedBench(bench, note, kept, kept_run), asked, cost, journal)
         except Refusal as refusal:
             refusal.stage = journal.stage
             refusal.so_far = journal.result("refused", str(refusal))
@@ -184,7 +206,9 @@ def commission(
             raise Interrupted(journal.result("interrupted", "Ctrl-C")) from stop
 
 
-def _place(name: str | os.PathLike[str], bench: Bench, asked: Demands, *, overwrite: bool) -> Taken:
+def _place(
+    name: str | os.PathLike[str], bench: Bench, asked: Demands, *, overwrite: bool, resume: bool
+) -> Taken:
     """Where the recordings go as they come, made before anything moves."""
     if not isinstance(name, (str, os.PathLike)) or not str(name) or "\0" in str(name):
         raise SettingError(
@@ -192,10 +216,10 @@ def _place(name: str | os.PathLike[str], bench: Bench, asked: Demands, *, overwr
             "present one"
         )
     folder = Path(name)
-    require_own(folder, overwrite=overwrite)
+    require_own(folder, overwrite=overwrite or resume)
     device, conditions = told_of(bench)
     own = {"u_max": asked.u_max, "speed": asked.speed, "seed": asked.seed}
-    taken = Taken(folder, device, {**own, **conditions})
+    taken = Taken(folder, device, {**own, **conditions}, resume)
     taken.begin()
     return taken
 

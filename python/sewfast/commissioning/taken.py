@@ -5,17 +5,21 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..control import Controller
 from ..errors import DataError, SettingError
+from ..loop import ClosedLoopRun
 from ..recordfile import save_columns
 from ..recordfile.keeping import ENDING, require_replaceable
-from ..recordfile.reader import read_header
+from ..recordfile.reader import RecordedFile, read_header, read_recording
 from ..recording import Recording
 from ..report.commissioned import file_name
+from .bench import Followed
 from .journal import STAGES
 
 FOLDER = "unfinished"
@@ -35,11 +39,14 @@ class Taken:
         the tables that hold the same.
     device, conditions : mapping
         What the recordings are made on, and under which settings.
+    resume : bool
+        Whether what lies there is of an attempt that this one goes on from.
     """
 
     folder: Path
     device: Mapping[str, Any]
     conditions: Mapping[str, Any]
+    resume: bool = False
     _has_warned: bool = field(default=False, init=False)
 
     def begin(self) -> None:
@@ -50,7 +57,8 @@ class Taken:
         DataError
         """
         try:
-            clear(self.folder)
+            if not self.resume:
+                clear(self.folder)
         except OSError as error:
             raise DataError(
                 f"{self.folder / FOLDER}: recordings of an earlier commissioning cannot be taken "
@@ -59,22 +67,24 @@ class Taken:
         prepare(self.folder / FOLDER)
 
     def keep(
-        self, stage: str, name: str, recording: Recording, controller: Controller | None
+        self, stage: str, name: str, key: str, recording: Recording, run: ClosedLoopRun | None
     ) -> None:
         """Write one; an earlier one of that name was not good enough.
 
         A file that cannot be written is warned of, once: what the machine did is in memory as well.
         """
-        if stage == STAGES[-1]:
-            # a reference may have the name of an excitation
-            name = f"{stage}_{name}"
         columns = recording.columns()
         del columns["t"]
-        own = {} if controller is None else {"controller": controller.to_dict()}
-        settings = {_MARK: {"stage": stage, **self.conditions}, **own}
+        own: dict[str, Any] = {}
+        if run is not None:
+            own = {"controller": run.controller.to_dict()}
+            columns |= {"r": run.r, "speed": run.y, "feedback": run.feedback}
+        settings = {_MARK: {"stage": stage, "key": key, **self.conditions}, **own}
         header = recording.header(device=self.device, **settings)
+        units = {"r": "RPM", "speed": "RPM", "feedback": "RPM"}
+        known = {**header.columns, **{n: u for n, u in units.items() if n in columns}}
         try:
-            save_columns(self.folder / FOLDER / f"{file_name(name)}{ENDING}", header, columns)
+            save_columns(self._place(stage, name), replace(header, columns=known), columns)
         except DataError as error:
             if not self._has_warned:
                 self._has_warned = True
@@ -83,6 +93,49 @@ class Taken:
                     RuntimeWarning,
                     stacklevel=2,
                 )
+
+    def _place(self, stage: str, name: str) -> Path:
+        if stage == STAGES[-1]:
+            # a reference may have the name of an excitation
+            name = f"{stage}_{name}"
+        return self.folder / FOLDER / f"{file_name(name)}{ENDING}"
+
+    def found(self, stage: str, name: str, key: str) -> Recording | None:
+        """What an earlier attempt has recorded of the very same, whole; None where it has not."""
+        file = self._found(stage, name, key)
+        if file is None:
+            return None
+        c, header = file.columns, file.header
+        return Recording(
+            c["u"], c["counts"], c["y"], c.get("speed_true"), header.Ts,
+            float(header.counts_per_rev or 0.0), name,
+        )  # fmt: skip
+
+    def found_run(
+        self, stage: str, name: str, key: str, controller: Controller, plant: str
+    ) -> Followed | None:
+        """The same of a closed loop."""
+        file, recording = self._found(stage, name, key), self.found(stage, name, key)
+        if file is None or recording is None:
+            return None
+        c = file.columns
+        t = np.arange(len(c["u"]), dtype=np.float64) * recording.Ts
+        run = ClosedLoopRun(
+            t, c["r"], c["u"], c["speed"], c["feedback"], controller, plant, name
+        )  # fmt: skip
+        return Followed(run, recording)
+
+    def _found(self, stage: str, name: str, key: str) -> RecordedFile | None:
+        if not self.resume:
+            return None
+        try:
+            file = read_recording(self._place(stage, name))
+        except (DataError, OSError):
+            return None
+        known = file.header.settings.get(_MARK, {})
+        same = {"key": key, **self.conditions}
+        is_same = all(known.get(name) == value for name, value in same.items())
+        return file if file.complete and is_same else None
 
 
 def prepare(folder: Path) -> None:
