@@ -15,7 +15,7 @@ model = sewfast.identify(data, model="neural_oe", starts=2)
 t = machine.Ts * np.arange(2000)
 reference = np.interp(t, [0.2, 0.7, 1.2, 1.7], [300.0, 1500.0, 1500.0, 300.0])
 
-tuned = sewfast.tune(model, reference, u_min=-10, u_max=10, evaluations=400)
+tuned = sewfast.tune(model, reference, u_min=-10, u_max=10, counts_per_rev=1572, evaluations=400)
 for form in ("standard", "parallel", "per_sample"):
     print(tuned.controller.gains.to(form, Ts=machine.Ts))
 

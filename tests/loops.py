@@ -28,4 +28,5 @@ def drive(
     p, q = math.exp(-0.001 / T1), math.exp(-0.001 / T2)
     b = gain * (1 - p) * (1 - q) / 2
     core = _core.LinearModel(np.array([-p - q, p * q]), np.array([[b, b]]), 1, 0.0)
-    return LinearOE(core, 0.001, ("u",), "y", ("V",), "RPM", training=training or {})
+    record = {"input_range": [[-20.0, 20.0]]} if training is None else training
+    return LinearOE(core, 0.001, ("u",), "y", ("V",), "RPM", training=record)

@@ -25,7 +25,8 @@ from sewfast.tuning import costs, default_variations, first_controller, tune
 
 def linear(a: list[float], b: list[float]) -> LinearOE:
     core = _core.LinearModel(np.array(a), np.array([b]), 1, 0.0)
-    return LinearOE(core, 0.001, ("u",), "y", ("V",), "RPM")
+    record = {"input_range": [[-20.0, 20.0]]}
+    return LinearOE(core, 0.001, ("u",), "y", ("V",), "RPM", ("counts", 1572.0), record)
 
 
 def drive(T1: float = 0.252, T2: float = 0.0074, gain: float = 490.0) -> LinearOE:
@@ -335,17 +336,18 @@ def test_references_that_cannot_be_run_are_refused(references: Any) -> None:
         tune(drive(), references, evaluations=2)
 
 
-def test_a_model_without_units_is_taken_in_volt_and_rpm_and_says_so() -> None:
+def test_a_unit_that_nobody_stated_stays_open_until_it_is_needed() -> None:
     u = np.repeat([0.0, 2.0, 1.0, 3.0], 600)
     y = np.zeros_like(u)
     for k in range(1, len(u)):
         y[k] = 0.99 * y[k - 1] + 4.9 * u[k - 1]
     model = identify(Dataset.from_arrays(u, y, 1e-3), model="arx", na=1, nb=1)
-    found = tune(model, "trapezoid", evaluations=40).controller
-    assert (found.gains.u_unit, found.gains.y_unit) == ("V", "RPM")
-    assert "command in V, output in RPM" in found.notes
-    stated = Dataset.from_arrays(u, y, 1e-3, input_units="V", output_unit="RPM")
-    assert (
-        "taken"
-        not in tune(identify(stated, model="arx", na=1, nb=1), evaluations=40).controller.notes
-    )
+    found = tune(model, "trapezoid", evaluations=40)
+    assert (found.controller.gains.u_unit, found.controller.gains.y_unit) == ("", "")
+    assert "u/y" in str(found)
+    with pytest.raises(SettingError, match=r"unit of the output 'y'.*--unit RPM"):
+        tune(model, counts_per_rev=1572.0)
+    stated = tune(model, counts_per_rev=1572.0, output_unit="rad/s", evaluations=20).controller
+    assert (stated.gains.y_unit, stated.counts_per_rev) == ("rad/s", 1572.0)
+    with pytest.raises(SettingError, match=r"model's unit 'RPM', got output_unit = 'rad/s'"):
+        tune(drive(), output_unit="rad/s")

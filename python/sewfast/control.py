@@ -193,7 +193,7 @@ class Controller:
         }
 
     def __str__(self) -> str:
-        u, y = self.gains.u_unit, self.gains.y_unit
+        u, y = self.gains.u_unit or "u", self.gains.y_unit or "y"
         lag = f", then a lag of {self.filter_time:g} s" if self.filter_time else ""
         if self.observer_time:
             lag += f", then an observer of {self.observer_time:g} s"

@@ -207,8 +207,8 @@ class Gains:
 
     @property
     def units(self) -> dict[str, str]:
-        """The unit of each number by name."""
-        u, y = self.u_unit, self.y_unit
+        """The unit of each number by name; u and y stand for units that nobody stated."""
+        u, y = self.u_unit or "u", self.y_unit or "y"
         ratio = f"{u}/{y}"
         if self.form == "standard":
             return {"Kp": ratio, "Ti": "s", "Td": "s"}

@@ -95,6 +95,16 @@ def read(path: str | os.PathLike[str], format: str, versions: Collection[int]) -
     return document
 
 
+def format_of(path: str | os.PathLike[str]) -> str:
+    """The format that a file states; empty where it is no such document."""
+    try:
+        document = _parse(path, _text(path))
+    except ModelFileError:
+        return ""
+    found = document.get("format") if isinstance(document, dict) else None
+    return found if isinstance(found, str) else ""
+
+
 def _text(path: str | os.PathLike[str]) -> str:
     try:
         with Path(path).open("rb") as file:

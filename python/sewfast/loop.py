@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import _core, signals
 from .control import Controller, vector
+from .drive_defaults import default_references, drive_references, pace_of
 from .errors import DataError, SettingError
 from .gains import Gains
 from .machine import VirtualMachine
@@ -104,7 +105,7 @@ class ClosedLoopRun:
         return {name: None if math.isnan(value) else value for name, value in found.items()}
 
     def __str__(self) -> str:
-        unit = self.units
+        unit = self.units | {n: unit or n for n, unit in self.units.items() if n in "uy"}
         told = self.metrics()
         lines = [f"{self.reference} on {self.plant}, {len(self.t) * self.Ts:g} s"]
         if told["rmse"] is None:
@@ -129,7 +130,7 @@ class ClosedLoopRun:
 def run(
     controller: Controller,
     on: Plant | Drive,
-    reference: str | ArrayLike,
+    reference: str | ArrayLike | None = None,
     *,
     feedforward: ArrayLike | None = None,
     disturbance: ArrayLike | None = None,
@@ -151,8 +152,10 @@ def run(
         The plant. A model needs one input and is not changed; so is a virtual machine. A drive
         (`sewfast.link`) runs the controller itself, in single precision; its limits must have been
         set.
-    reference : str or array, shape (N,)
+    reference : str or array, shape (N,), optional
         Name of a reference (`sewfast.signals`) or its samples at the controller's sample time [y].
+        On a model that is not in RPM at 1 ms a name is the same shape over the model's recorded
+        range. By default a trapezoid that suits the plant; a drive has to be given one.
     feedforward : array, shape (N,), optional
         A command that is added before the limits [u]; a drive takes none.
     disturbance : array, shape (N,), optional
@@ -191,7 +194,9 @@ def run(
         On Ctrl-C, of a drive; the motor is stopped, `best` is the run up to there.
     """
     require_controller(controller, on, "run(controller, plant, reference)")
-    r = reference_samples(reference, controller, seed)
+    if reference is None:
+        reference, name = _usual_reference(on, controller), name or "trapezoid"
+    r = reference_samples(reference, controller, seed, plant=on)
     title = name or (reference if isinstance(reference, str) else "reference")
     beside = _beside(on, feedforward, disturbance)
     if not isinstance(on, (Model, VirtualMachine)):
@@ -213,6 +218,16 @@ def run(
         plant=plant_name(on),
         reference=title,
     )
+
+
+def _usual_reference(on: Any, controller: Controller) -> str | FloatArray:
+    """A trapezoid for a plant whose range is known; a motor does not move without being asked."""
+    if not isinstance(on, (Model, VirtualMachine)):
+        raise SettingError(
+            "expected a reference for a drive, got none; give its name or its samples"
+        )
+    (usual,) = default_references(on, controller, ("trapezoid",))
+    return usual
 
 
 def _beside(
@@ -310,14 +325,18 @@ def run_of_drive(
 
 
 def reference_samples(
-    reference: str | ArrayLike, controller: Controller, seed: int = 0
+    reference: str | ArrayLike, controller: Controller, seed: int = 0, *, plant: Any = None
 ) -> FloatArray:
     """The samples of a reference given by name or as they are, shape (N,), never the caller's own.
+
+    A name is the signal of the catalogue for a controller in RPM at 1 ms; with a model the same
+    shape over the model's recorded range (`sewfast.drive_defaults.drive_references`) otherwise.
 
     Raises
     ------
     SettingError
-        For an unknown name, or a name where the controller is not in RPM at 1 ms.
+        For an unknown name, or a name where the controller is not in RPM at 1 ms and no model with
+        one input says what range to draw it over.
     DataError
         For samples that are no vector of numbers.
     """
@@ -325,12 +344,18 @@ def reference_samples(
         return vector("reference", reference).copy()
     samples = signals.reference(reference, seed)
     unit, Ts = controller.gains.y_unit, controller.Ts
-    if unit.lower() != "rpm" or not math.isclose(Ts, signals.TS, rel_tol=1e-9):
-        raise SettingError(
-            f"expected a controller in RPM at {signals.TS} s for the reference {reference!r}, "
-            f"got {unit!r} at {Ts} s; give the reference as samples"
+    if unit.lower() == "rpm" and math.isclose(Ts, signals.TS, rel_tol=1e-9):
+        return samples
+    if isinstance(plant, Model):
+        made = drive_references(
+            plant, controller.u_min, controller.u_max, pace=pace_of(controller), seed=seed
         )
-    return samples
+        return made[reference.replace("-", "_").lower()]
+    raise SettingError(
+        f"expected a controller in RPM at {signals.TS} s for the reference {reference!r}, "
+        f"got {unit or 'an unknown unit'!r} at {Ts} s; give the reference as samples, such as the "
+        "column r of a run on the drive's model (run --on MODEL.json -o FILE, --reference FILE)"
+    )
 
 
 def check_fits(controller: Controller, plant: Any) -> None:

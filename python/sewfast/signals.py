@@ -172,7 +172,7 @@ _SLOW_RPM = 400.0
 """Speed between the trapezoids of the training reference."""
 
 #: Height [RPM], rise, hold, fall and pause after it [s] of the reference `trapezoids`.
-_TRAPEZOIDS = (
+TRAPEZOIDS = (
     (1500.0, 0.25, 0.40, 0.25, 0.3),
     (3000.0, 0.20, 0.50, 0.30, 0.3),
     (700.0, 0.15, 0.30, 0.15, 0.2),
@@ -202,7 +202,7 @@ def _trapezoid(
 def _trapezoids(seed: int) -> FloatArray:
     # Down to a slow run, not to rest: a crank that friction holds tells nothing of the drive.
     rise = np.linspace(0.0, _SLOW_RPM, round(0.1 / TS))
-    return np.concatenate([rise, *(_trapezoid(*shape, low=_SLOW_RPM) for shape in _TRAPEZOIDS)])
+    return np.concatenate([rise, *(_trapezoid(*shape, low=_SLOW_RPM) for shape in TRAPEZOIDS)])
 
 
 def _table(*signals: Signal) -> Mapping[str, Signal]:
@@ -295,7 +295,7 @@ REFERENCES = _table(
     ),
     _reference(
         "trapezoids",
-        0.1 + sum(0.1 + sum(shape[1:]) for shape in _TRAPEZOIDS),
+        0.1 + sum(0.1 + sum(shape[1:]) for shape in TRAPEZOIDS),
         "seven trapezoids from 400 to 700-3,500 RPM, rises of 150 to 400 ms; to train on",
         _trapezoids,
     ),

@@ -3,42 +3,40 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal, TypeAlias
 
-import numpy as np
-
-from .control import Controller, Fopdt, Gains, fit_fopdt, table_1
-from .errors import DataError, FitError, SettingError
-from .evidence.linearised import linearise
-from .evidence.residuals import representative
+from .control import Controller, Gains, table_1
+from .drive_defaults import command_limits, drive_step, filter_length, require_one_input
+from .errors import SettingError
+from .gains import whole
 from .loop import Plant, plant_units
 from .models import Model
 from .units import REVOLUTIONS_PER_SECOND
 
 DERIVATIVE_FILTER = 10.0
 """N to begin with."""
-_STEP_SHARES = (0.25, 0.5, 0.1)
-"""Shares of u_max that the first step response is looked for at."""
-_STEP_SAMPLES = (4_000, 16_000)
-_INTEGRATES = 1e-5
-"""Distance of a pole from 1 below which a step takes far longer than these."""
+
+Encoder: TypeAlias = float | Literal["model"] | None
 
 
 def first_controller(
     plant: Plant,
     *,
-    u_min: float = -20.0,
-    u_max: float = 20.0,
-    counts_per_rev: float | None = 1572.0,
-    filter_samples: int = 8,
+    u_min: float | None = None,
+    u_max: float | None = None,
+    counts_per_rev: Encoder = "model",
+    filter_samples: int | None = None,
+    output_unit: str | None = None,
 ) -> Controller:
     """A conservative controller from a model's own step response by Table 1 (nearest row).
 
-    The moving average's delay counts as dead time.
+    The moving average's delay counts as dead time. Parameters are those of `tune`.
 
     Raises
     ------
     SettingError
-        For a machine: record its step response and use `fit_fopdt` and `table_1`.
+        For a machine: record its step response and use `fit_fopdt` and `table_1`. For limits that
+        are neither stated nor recorded, and for an encoder on an output of unknown unit.
     FitError
         Where no step of the model settles.
     """
@@ -46,77 +44,60 @@ def first_controller(
         raise SettingError(
             "expected a model to find a start from, got a machine; give start=, or tune on a model"
         )
-    if not np.isfinite(u_max) or u_max == 0:
-        raise SettingError(
-            f"expected a finite u_max other than 0 to size the step by, got {u_max}; give the "
-            "amplifier's limit"
-        )
-    u_unit, y_unit = _stated_units(plant)
-    fopdt = _step_fit(plant, u_max)
-    delayed = replace(fopdt, L=fopdt.L + (filter_samples - 1) / 2 * plant.Ts)
-    rule = table_1(delayed, outside="nearest")
+    require_one_input(plant)
+    low, high, note = command_limits([plant], u_min, u_max)
+    u_unit, y_unit = _units(plant, output_unit)
+    step = drive_step(plant, low, high)
+    if filter_samples is None:
+        filter_samples = filter_length(plant.Ts, step.slowest)
+    average = (max(1, whole("filter_samples", filter_samples)) - 1) / 2 * plant.Ts
+    rule = table_1(replace(step.fopdt, L=step.fopdt.L + average), outside="nearest")
     gains = Gains.standard(
         rule.gains.Kp, rule.gains.Ti, rule.gains.Td, u_unit=u_unit, y_unit=y_unit
     )
-    turns = y_unit.lower() in REVOLUTIONS_PER_SECOND
     return Controller(
         gains=gains,
         Ts=plant.Ts,
         alpha=rule.alpha,
         beta=rule.beta,
         N=DERIVATIVE_FILTER,
-        u_min=u_min,
-        u_max=u_max,
+        u_min=low,
+        u_max=high,
         filter_samples=filter_samples,
-        counts_per_rev=counts_per_rev if turns else None,
-        notes="Table 1 on the model's step response" + assumed(plant),
+        counts_per_rev=_encoder(plant, counts_per_rev, y_unit),
+        notes="; ".join(n for n in ("Table 1 on the model's step response", note) if n),
     )
 
 
-def _stated_units(plant: Plant) -> tuple[str, str]:
-    """Units of command and output; what a model leaves open counts as volt and RPM."""
+def _units(plant: Model, stated: str | None) -> tuple[str, str]:
+    """Units of command and output; empty where nobody says them."""
     u_unit, y_unit = plant_units(plant)
-    return u_unit or "V", y_unit or "RPM"
-
-
-def assumed(plant: Plant) -> str:
-    """What was taken for granted about the units, for a controller's notes."""
-    names = ("command in V", "output in RPM")
-    open_ = [n for n, unit in zip(names, plant_units(plant), strict=True) if not unit]
-    return f"; the model states no unit, taken: {', '.join(open_)}" if open_ else ""
-
-
-def _step_fit(model: Model, u_max: float) -> Fopdt:
-    """The model's step response, at the first size and length at which it settles."""
-    if len(model.input_names) != 1:
+    if stated is not None and not isinstance(stated, str):
+        raise SettingError(f"expected a unit as text for output_unit, got {stated!r}")
+    if stated and y_unit and stated.lower() != y_unit.lower():
         raise SettingError(
-            f"expected a model with one input to tune on, got {len(model.input_names)}; identify "
-            "it from the command alone"
+            f"expected the output in the model's unit {y_unit!r}, got output_unit = {stated!r}; "
+            "leave it out, or identify the model from converted data"
         )
-    reason: Exception | None = None
-    for share in _STEP_SHARES:
-        for samples in _STEP_SAMPLES:
-            u = np.zeros(samples)
-            u[samples // 20 :] = share * u_max
-            try:
-                y = model.core.simulate(u[:, None], model.core.rest_state())
-                return fit_fopdt(u, y, Ts=model.Ts)
-            except (DataError, FitError) as error:
-                reason = error
-    if _integrates(model):
-        raise FitError(
-            "expected a model whose step response settles, received one that integrates its input, "
-            "as a position does; give a controller to start from, or identify the rate: "
-            "differentiate the recorded output"
-        ) from reason
-    raise FitError(
-        f"expected a model whose step response settles, got none up to u = {0.5 * u_max:g} "
-        f"({reason}); give a controller to start from"
-    ) from reason
+    return u_unit, y_unit or stated or ""
 
 
-def _integrates(model: Model) -> bool:
-    """Whether a pole lies at 1, or so near that no step within reach settles."""
-    small = linearise(representative(model).core, np.zeros(1))
-    finite = bool(np.isfinite(small.A).all())
-    return finite and bool(np.any(np.abs(np.linalg.eigvals(small.A) - 1.0) < _INTEGRATES))
+def _encoder(plant: Model, stated: Encoder, unit: str) -> float | None:
+    """Counts of one turn: as stated, else of the counts that the model's output came from."""
+    counts = stated
+    if isinstance(stated, str):
+        if stated != "model":
+            raise SettingError(
+                f"expected counts_per_rev as a number, None for ideal feedback, or 'model', got "
+                f"{stated!r}"
+            )
+        counts = plant.counts[1] if plant.counts else None
+        if unit.lower() not in REVOLUTIONS_PER_SECOND:
+            return None
+    if counts is not None and not unit:
+        raise SettingError(
+            f"expected the unit of the output {plant.output_name!r} for an encoder, as the model "
+            "states none; give it, output_unit='RPM' (--unit RPM), or name the column "
+            f"'{plant.output_name} [RPM]' in the recording"
+        )
+    return counts  # type: ignore[return-value]

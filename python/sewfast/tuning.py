@@ -18,7 +18,7 @@ from .gains import whole
 from .load_step import LoadStep
 from .loop import check_fits
 from .plants import Plants, References
-from .starting import first_controller
+from .starting import Encoder, first_controller
 from .tuning_task import (
     Aggregate,
     Deadline,
@@ -84,7 +84,7 @@ class TuningResult:
         return len(self.trace)
 
     def __str__(self) -> str:
-        unit = self.controller.gains.y_unit
+        unit = self.controller.gains.y_unit or "y"
         lines = [
             f"cost {self.cost:.4g} {unit} (start {self.start_cost:.4g}) after {self.evaluations} "
             f"evaluations, {self.termination}",
@@ -99,10 +99,11 @@ def tune(
     models: Plants,
     references: References = None,
     *,
-    u_min: float = -20.0,
-    u_max: float = 20.0,
-    counts_per_rev: float | None = 1572.0,
-    filter_samples: int = 8,
+    u_min: float | None = None,
+    u_max: float | None = None,
+    counts_per_rev: Encoder = "model",
+    filter_samples: int | None = None,
+    output_unit: str | None = None,
     start: Controller | None = None,
     variables: Sequence[Wanted] | None = None,
     cost: Cost | None = None,
@@ -130,15 +131,22 @@ def tune(
         Plants that one controller has to serve, with one input, one sample time, the same units;
         every member of an ensemble is one.
     references : str, array of shape (N,), or sequence of them, optional
-        Names (`sewfast.signals`) or samples [y]; trapezoid, trapezoids and random by default.
-    u_min, u_max : float
-        Limits of the command [u].
-    counts_per_rev : float or None
-        Encoder in the loop of the models; None for ideal feedback.
-    filter_samples : int
-        Moving average in the feedback.
+        Names (`sewfast.signals`) or samples [y]; trapezoid, trapezoids and random by default. A
+        name is the signal of the catalogue for a drive in RPM at 1 ms, on any other the same shape
+        over the first model's recorded range, at its own pace (`drive_references`). So are the
+        defaults wherever the catalogue does not suit the drive.
+    u_min, u_max : float, optional
+        Limits of the command [u]. By default the range of the input that the first model was
+        identified on, with 0: a controller may not do what nobody has seen the drive stand.
+    counts_per_rev : float, None or "model"
+        Encoder in the loop of the models; None for ideal feedback, "model" for that of the counts
+        that the first model's output was computed from, if it was.
+    filter_samples : int, optional
+        Moving average in the feedback. By default 8 ms, at most a tenth of the time constant.
+    output_unit : str, optional
+        Unit of the output where the model states none: an encoder needs it.
     start : Controller, optional
-        What to begin with; what is not searched is kept, and the four settings above are not used.
+        What to begin with; what is not searched is kept, and the five settings above are not used.
         By default Table 1 on the first model's own step response.
     variables : sequence of str or (str, float, float), optional
         What to search, by name or with its bounds: ``Kp``, ``Ti``, ``Td``, ``alpha``, ``beta``,
@@ -189,6 +197,7 @@ def tune(
         "u_max": u_max,
         "counts_per_rev": counts_per_rev,
         "filter_samples": filter_samples,
+        "output_unit": output_unit,
     }
     if not isinstance(method, str):
         raise SettingError(f"expected method 'genetic' or 'cma-es', got {method!r}")

@@ -15,20 +15,19 @@ from . import _core
 from .constraints import Constraints
 from .control import Controller, vector
 from .cost import Cost
+from .drive_defaults import beyond_record, default_references
 from .errors import SettingError
 from .gains import real, whole
 from .load_step import LoadStep
 from .loop import check_fits, reference_samples
 from .plants import Plants, References, each_plant, each_reference
-from .starting import assumed, first_controller
+from .starting import first_controller
 from .threads import available
-from .variables import Wanted, wanted
+from .variables import Wanted, usual_variables, wanted
 
 Progress: TypeAlias = Callable[[int, int, float], object]
 Aggregate: TypeAlias = Literal["mean", "worst"]
 
-REFERENCES = ("trapezoid", "trapezoids", "random")
-"""References to tune on unless others are given."""
 GAINS = (0.8, 1.25)
 """Plant gains beside the identified one that a controller has to bear, so that it transfers."""
 
@@ -73,14 +72,17 @@ class TuningTask:
                 f"expected a Controller to start from, got {type(start).__name__}; read a file "
                 "with load_controller"
             )
+        derived = start is None
         if start is None:
             start = first_controller(given[0], **first)
         for plant in given:
             check_fits(start, plant)
+        if references is None:
+            references = default_references(given[0], start)
         return cls(
             plants=plants,
             references=[
-                reference_samples(r, start) for r in each_reference(references, REFERENCES)
+                reference_samples(r, start, plant=given[0]) for r in each_reference(references, ())
             ],
             loads=_load_steps(loads),
             disturbances=[vector("disturbance", d) for d in disturbances or ()],
@@ -89,7 +91,7 @@ class TuningTask:
             cost=_instance(cost, Cost, "Cost(chatter=5.0)"),
             aggregate=aggregate,
             constraints=_instance(constraints, Constraints, "Constraints(overshoot=2.0)"),
-            assumed=assumed(given[0]),
+            assumed=_assumed(start, given, derived=derived),
         )
 
     def core(self, names: Sequence[Wanted] | None = None, *, ms: bool = False) -> _core._Task:
@@ -103,7 +105,9 @@ class TuningTask:
             "start": self.start.core(),
             "counts_per_unit": self.start.counts_per_unit,
             "variations": self.variations,
-            "variables": wanted(names, self.start),
+            "variables": wanted(
+                usual_variables(self.start) if names is None else names, self.start
+            ),
             "cost": self.cost.named(),
             "aggregate": self.aggregate,
             "limits": self.constraints.limits,
@@ -125,6 +129,15 @@ class TuningTask:
                 "model of the same drive to them"
             )
         return [sampled(plant, self.start.Ts, self.constraints.speed) for plant in plants]
+
+
+def _assumed(start: Controller, given: list[Any], *, derived: bool) -> str:
+    """What of the limits has to be said in a controller's notes."""
+    if derived:
+        _, _, said = start.notes.partition("; ")
+    else:
+        said = beyond_record(given, start.u_min, start.u_max)
+    return f"; {said}" if said else ""
 
 
 def threads_or_all(threads: int | None) -> int:

@@ -72,6 +72,19 @@ def wanted(
     return [one for given in variables for one in _one(given, start)]
 
 
+def usual_variables(start: Controller) -> list[Wanted] | None:
+    """What is searched unless it is named, where the core's usual bounds do not hold it; else None.
+
+    These leave Ti at 4 sample times or more. A drive whose time constant is a few sample times
+    begins below that.
+    """
+    Ti = start.gains.to("standard").Ti
+    if start.schedule or not 0.0 < Ti < 8.0 * start.Ts:
+        return None
+    names: list[Wanted] = ["Kp", ("Ti", 0.1 * Ti, 1e3 * Ti), "Td", "alpha", "beta"]
+    return [*names, "N"] if np.isfinite(start.N) else names
+
+
 def _one(given: Any, start: Controller) -> list[tuple[str, tuple[float, float] | None]]:
     if given == "schedule":
         points = len(start.schedule)

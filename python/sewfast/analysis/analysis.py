@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import signals
 from ..control import Controller
 from ..cost import Cost
+from ..drive_defaults import catalogue_fits
 from ..errors import FitError, SettingError
 from ..loop import check_fits, require_controller
 from ..plants import Plants, References, each_plant, each_reference, titles
@@ -194,8 +194,8 @@ def analyse(
         How long the steps are looked at; by default five times the slowest closed-loop pole's time
         constant.
     references : str, array of shape (N,), or sequence of them, optional
-        What the cost is taken over; `REFERENCES` by default where the controller is in RPM at 1 ms,
-        else the reference step.
+        What the cost is taken over; `REFERENCES` by default where these suit the first plant (RPM
+        at 1 ms, its recorded range), else the reference step.
     cost : Cost, optional
         As for `sewfast.tune`.
     changes : sequence of Change, optional
@@ -237,7 +237,7 @@ def analyse(
         controller, points[main], slowest,
         level=level, step=step, disturbance=disturbance, seconds=seconds,
     )  # fmt: skip
-    wanted = each_reference(references, _default_references(controller, steps))
+    wanted = each_reference(references, _default_references(controller, plants[0], steps))
     task = Task(
         tuple(plants[:MOST]), tuple(names[:MOST]), points[main][:MOST], tuple(wanted),
         cost, seed,
@@ -275,9 +275,8 @@ def _slowest(controller: Controller, row: Sequence[PlantPoint]) -> float:
     return float(-controller.Ts / math.log(largest))
 
 
-def _default_references(controller: Controller, steps: Steps) -> Sequence[Any]:
-    rpm = controller.gains.y_unit.lower() == "rpm"
-    if rpm and math.isclose(controller.Ts, signals.TS, rel_tol=1e-9):
+def _default_references(controller: Controller, plant: Any, steps: Steps) -> Sequence[Any]:
+    if catalogue_fits(plant, controller.u_min, controller.u_max, controller.gains.y_unit):
         return REFERENCES
     n = steps.samples
     return [np.concatenate([np.full(n, steps.level), np.full(n, steps.level + steps.step)])]

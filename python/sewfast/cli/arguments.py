@@ -48,8 +48,9 @@ def add_columns(parser: argparse.ArgumentParser, *, from_model: bool) -> None:
     )  # fmt: skip
     parser.add_argument("--output", metavar="COL", help=f"column of the output{default}")
     parser.add_argument(
-        "--ts", type=float, metavar="S",
-        help="sample time [s]; default: from the column t or time, which must agree within 1 %%",
+        "--ts", "--Ts", type=float, metavar="S",
+        help="sample time [s]; default: from the time column; even time stamps must agree within "
+        "1 %%, uneven ones are resampled to it",
     )  # fmt: skip
     parser.add_argument(
         "--counts", metavar="COL",

@@ -45,7 +45,8 @@ another ending of -o is made from it afterwards. Ctrl-C stops the motor and keep
 
 RUN_EXAMPLES = """\
 examples:
-  sewfast run controller.json --on drive.json --reference trapezoid -o predicted.csv
+  sewfast run controller.json drive.json -o predicted.csv
+  sewfast run controller.json --on drive.json --reference random -o predicted.csv
   sewfast run controller.json --on virtual --reference trapezoid -o measured.csv
   sewfast run controller.json --on virtual:7 --reference cycle.csv --json
   sewfast run controller.json --on /dev/ttyUSB0 --reference trapezoid -o measured.mcap \\
@@ -62,9 +63,15 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument("controller", metavar="CONTROLLER.json", help="file that tune wrote")
     parser.add_argument(
-        "--on", required=True, metavar="MODEL.json|virtual[:SEED]|PORT", help="what to run on"
-    )
-    parser.add_argument("--reference", required=True, metavar="FILE|NAME", help="what to track")
+        "plant", nargs="?", metavar="MODEL.json|virtual[:SEED]",
+        help="what to run on, where it is no drive; both files in any order",
+    )  # fmt: skip
+    parser.add_argument("--on", metavar="MODEL.json|virtual[:SEED]|PORT", help="what to run on")
+    parser.add_argument(
+        "--reference", metavar="FILE|NAME",
+        help="what to track; default: a trapezoid over the recorded range of the model (a drive "
+        "has to be given one)",
+    )  # fmt: skip
     add_output(
         parser, "OUT",
         "CSV, .npz, .mat or Parquet, of a drive .mcap too; default: CSV to standard output",
@@ -78,12 +85,13 @@ def run_command(args: argparse.Namespace) -> int | None:
     from ..control import load_controller
     from ..loop import run
 
+    _settle_plant(args)
     if args.host_loop is not None:
         controller = at_loops_period(args, load_controller(args.controller))
         return run_host_loop(args, controller, _wanted(args, controller))
     require_place(args.out, RECORDINGS if is_port(args.on) else TABLES)
     controller = load_controller(args.controller)
-    name = Path(args.reference).stem
+    name = None if args.reference is None else Path(args.reference).stem
     if not is_port(args.on):
         require_no_drive_options(args)
         plant = plant_of(args.on)
@@ -102,6 +110,38 @@ def run_command(args: argparse.Namespace) -> int | None:
         return say_interrupted(len(e.best.t), place)
     _show_run(args, found, place)
     return None
+
+
+def _settle_plant(args: argparse.Namespace) -> None:
+    """One plant in `args.on`, the controller in `args.controller`, however they were given.
+
+    Raises
+    ------
+    SettingError
+        For no plant or two, or for a drive without a reference or without --on: a motor is not
+        moved by a slip.
+    """
+    from .. import jsonfile
+    from ..control import FORMAT
+    from ..models.base import FORMAT as MODEL
+
+    if (args.on is None) == (args.plant is None):
+        received = "neither" if args.on is None else "both"
+        raise SettingError(
+            f"expected one plant, {args.controller} MODEL.json or --on PORT, received {received}"
+        )
+    if args.plant is not None:
+        formats = tuple(jsonfile.format_of(path) for path in (args.controller, args.plant))
+        if formats == (MODEL, FORMAT):
+            args.controller, args.plant = args.plant, args.controller
+        if is_port(args.plant):
+            raise SettingError(
+                f"{args.plant}: expected a model or a virtual machine beside the controller; a "
+                f"drive is given by --on {args.plant}"
+            )
+        args.on = args.plant
+    if args.reference is None and (is_port(args.on) or args.host_loop is not None):
+        raise SettingError("--reference: expected what the drive is to track, received nothing")
 
 
 def _show_run(
@@ -137,8 +177,10 @@ def plant_of(text: str) -> Plant:
     return load_model(text)
 
 
-def _wanted(args: argparse.Namespace, controller: Controller) -> str | FloatArray:
-    """The reference of a run."""
+def _wanted(args: argparse.Namespace, controller: Controller) -> Any:
+    """The reference of a run; None for the plant's usual one."""
+    if args.reference is None:
+        return None
     return reference_of(args.reference, controller.Ts, controller.gains.y_unit)
 
 

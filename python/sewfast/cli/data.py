@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import TYPE_CHECKING, Any
 
 from ..errors import DataError, SettingError
@@ -33,15 +34,24 @@ def _read_named(source: str, args: argparse.Namespace) -> Dataset:
         raise _unnamed(table, "input", "--input COL")
     if not output and not counts:
         raise _unnamed(table, "output", "--output COL, or --counts COL --counts-per-rev N")
-    return read(
-        table,
-        inputs=inputs,
-        output=output,
-        Ts=args.ts,
-        counts=counts,
-        counts_per_rev=args.counts_per_rev,
-        channels=_references(table, (*inputs, output, counts)),
+    return _with_notes(
+        read(
+            table,
+            inputs=inputs,
+            output=output,
+            Ts=args.ts,
+            counts=counts,
+            counts_per_rev=args.counts_per_rev,
+            channels=_references(table, (*inputs, output, counts)),
+        )
     )
+
+
+def _with_notes(data: Dataset) -> Dataset:
+    """The data; what was done in reading them goes to standard error."""
+    for note in data.notes:
+        print(note, file=sys.stderr)
+    return data
 
 
 def _references(table: Table, taken: tuple[str | None, ...]) -> list[str]:
@@ -86,7 +96,7 @@ def read_for_model(
     columns |= _recorded_columns(table, columns, args, chosen=output or args.output)
     if not needs_output and not _has_output(table, columns):
         columns |= {"output": None, "counts": None, "counts_per_rev": None}
-    return read(table, Ts=_sample_time(args.ts, table, model), **columns), table
+    return _with_notes(read(table, Ts=_sample_time(args.ts, table, model), **columns)), table
 
 
 def _output_columns(
@@ -127,8 +137,10 @@ def _has_output(table: Table, columns: dict[str, Any]) -> bool:
 
 def _sample_time(given: float | None, table: Table, model: Model) -> float | None:
     """The model's own sample time where neither the caller nor the file says another."""
-    has_time = any(n.lower() in ("t", "time") for n in table.names)
-    return given if given is not None or has_time else model.Ts
+    from ..readers.timebase import time_column
+
+    says = table.Ts is not None or time_column(table) is not None
+    return given if given is not None or says else model.Ts
 
 
 def split(data: Dataset, train: str | None, held_out: str | None) -> tuple[Dataset, Dataset | None]:

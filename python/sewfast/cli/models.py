@@ -134,7 +134,8 @@ def _time(table: Table, data: Dataset) -> FloatArray:
     import numpy as np
 
     for name in table.names:
-        if name.lower() in ("t", "time") and table.unit(name) in ("", "s"):
+        seconds = name.lower() in ("t", "time") and table.unit(name) in ("", "s")
+        if seconds and len(table[name]) == len(data) and not data.notes:
             return table[name]
     return np.arange(len(data), dtype=np.float64) * data.Ts
 

@@ -30,8 +30,15 @@ Tune a 2-DOF PID on identified models, by simulating the loop with the encoder, 
 filter and the command's limits in it. The models alone are used; no machine is touched. Several
 models are plants that one controller has to serve; of an ensemble every member is one.
 
+Nothing but the model is needed. References cover the range that the drive was recorded over, at
+the pace of its step response; the command's limits are the recorded range of the input, with 0;
+the feedback is filtered over 8 ms, at most a tenth of the time constant; an encoder is in the
+loop where the model's speed comes from counts. What the drive can do beyond its record is yours
+to say: --u-min, --u-max.
+
 A reference is a named one (`sewfast signals`) or a CSV with columns t [s], r [output unit].
-Named ones are in RPM at 1 ms. Several references are tuned for together.
+Named ones are signals in RPM at 1 ms; on any other drive the same shapes over its own range.
+Several references are tuned for together.
 
 The cost of a run is a weighted sum of tracking [y], chatter [u], effort [u], overshoot [%], rise
 [ms], lag [ms], saturation (a share), and under load steps (--load) recovery [ms] and load (rms
@@ -43,6 +50,7 @@ searches for the front of what can be had instead, and takes its knee.
 TUNE_EXAMPLES = """\
 examples:
   sewfast tune drive.json -o controller.json
+  sewfast tune drive.json --u-min -10 --u-max 10 --counts-per-rev 4096 -o controller.json
   sewfast tune drive.json --reference trapezoid --reference random -o controller.json
   sewfast tune drive.json --reference cycle.csv --u-min -10 --u-max 10 --filter 4 -o controller.json
   sewfast tune drive.json --cost chatter=50 --constraint overshoot=2 -o calm.json
@@ -64,20 +72,24 @@ def add(commands: Commands) -> None:
         "--reference", action="append", metavar="FILE|NAME",
         help="what to track; may repeat (trapezoid, trapezoids, random)",
     )  # fmt: skip
-    parser.add_argument("--u-min", type=float, metavar="V", help="least command (-20)")
-    parser.add_argument("--u-max", type=float, metavar="V", help="largest command (20)")
+    parser.add_argument("--u-min", type=float, metavar="V", help="least command (as recorded)")
+    parser.add_argument("--u-max", type=float, metavar="V", help="largest command (as recorded)")
     parser.add_argument(
         "--limits-of", metavar="RECORDING.mcap",
         help="take the volt limit that a drive had in a recording, both ways, for those not given",
     )  # fmt: skip
     parser.add_argument(
         "--counts-per-rev", type=float, metavar="N",
-        help="encoder in the loop; default: the model's own, else 1572 where the output is a speed",
+        help="encoder in the loop; default: that of the counts that the output comes from, if any",
     )  # fmt: skip
     parser.add_argument(
         "--filter", type=int, metavar="N",
-        help="moving average over N samples of the feedback (8); 1: none",
+        help="moving average over N samples of the feedback; 1: none; default: 8 ms, at most a "
+        "tenth of the time constant",
     )  # fmt: skip
+    parser.add_argument(
+        "--unit", metavar="UNIT", help="of the output, where the model states none: RPM, rad/s, .."
+    )
     parser.add_argument(
         "--start", metavar="CONTROLLER.json",
         help="what the search begins with, its limits, encoder and filters included; default: "
@@ -184,7 +196,7 @@ def _settings(args: argparse.Namespace) -> dict[str, Any]:
     return settings
 
 
-def _first(args: argparse.Namespace, model: Any) -> dict[str, Any]:
+def _first(args: argparse.Namespace) -> dict[str, Any]:
     """The controller to begin with, or limits, encoder and filter of the one to be found.
 
     Raises
@@ -193,12 +205,12 @@ def _first(args: argparse.Namespace, model: Any) -> dict[str, Any]:
         For both.
     """
     if args.start is None:
-        return _loop(args, model)
+        return _loop(args)
     from ..control import load_controller
 
     given = [
         "--" + option.replace("_", "-")
-        for option in ("u_min", "u_max", "limits_of", "counts_per_rev", "filter")
+        for option in ("u_min", "u_max", "limits_of", "counts_per_rev", "filter", "unit")
         if getattr(args, option) is not None
     ]
     if given:
@@ -209,15 +221,15 @@ def _first(args: argparse.Namespace, model: Any) -> dict[str, Any]:
     return {"start": load_controller(args.start)}
 
 
-def _loop(args: argparse.Namespace, model: Any) -> dict[str, Any]:
-    """Limits, encoder and filter of the first controller."""
+def _loop(args: argparse.Namespace) -> dict[str, Any]:
+    """Limits, encoder and filter of the first controller, where they are stated."""
     u_min, u_max = _command_limits(args)
-    counts = args.counts_per_rev or (model.counts[1] if model.counts else 1572.0)
     return {
         "u_min": u_min,
         "u_max": u_max,
-        "counts_per_rev": counts,
-        "filter_samples": 8 if args.filter is None else args.filter,
+        "counts_per_rev": "model" if args.counts_per_rev is None else args.counts_per_rev,
+        "filter_samples": args.filter,
+        "output_unit": args.unit,
     }
 
 
@@ -228,7 +240,7 @@ def _tuned(
 
     with Progress("tune") as progress:
         return tune(
-            models, references, **_first(args, models[0]), **settings, method=args.method,
+            models, references, **_first(args), **settings, method=args.method,
             time_budget=args.time_budget, progress=progress,
         )  # fmt: skip
 
@@ -239,7 +251,7 @@ def _front(
     from ..front import pareto
     from ..starting import first_controller
 
-    first = _first(args, models[0])
+    first = _first(args)
     start = first.get("start") or first_controller(models[0], **first)
     with Progress("tune") as progress:
         return pareto(
@@ -325,15 +337,17 @@ def _variables(text: str | None) -> list[Wanted] | None:
     return found
 
 
-def _command_limits(args: argparse.Namespace) -> tuple[float, float]:
-    """Least and largest command [V]: as given, else of a recording, else those of +-20 V.
+def _command_limits(args: argparse.Namespace) -> tuple[float | None, float | None]:
+    """Least and largest command [V]: as given, else of a recording's drive, else as recorded.
 
     Raises
     ------
     SettingError, DataError
         For a recording without a volt limit, or one that cannot be read.
     """
-    volt = 20.0 if args.limits_of is None else _volt_limit(args.limits_of)
+    if args.limits_of is None:
+        return args.u_min, args.u_max
+    volt = _volt_limit(args.limits_of)
     return (
         -volt if args.u_min is None else args.u_min,
         volt if args.u_max is None else args.u_max,
@@ -411,8 +425,18 @@ def _controller(controller: Controller) -> dict[str, Any]:
 def _show_gains(args: argparse.Namespace, controller: Controller) -> None:
     print("the same gains in every form:")
     print_rows([gain_row(g) for g in forms_of(controller)])
-    print(f"written to {args.out}; try it: sewfast run {args.out} --on MODEL.json|virtual "
-          "--reference NAME")  # fmt: skip
+    if "from the recorded input" in controller.notes:
+        unit = controller.gains.u_unit or "u"
+        print(
+            f"limits: {controller.u_min:g} to {controller.u_max:g} {unit}, all that the drive was "
+            "recorded with; --u-min, --u-max say what else it can take"
+        )
+    if controller.counts_per_rev is None and args.start is None:
+        print(
+            "feedback: free of noise and of an encoder's steps, as the model knows of none; "
+            "--counts-per-rev puts an encoder in the loop"
+        )
+    print(f"written to {args.out}; try it: sewfast run {args.out} {args.model[0]}")
 
 
 def forms_of(controller: Controller) -> list[Gains]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -133,8 +134,9 @@ def _missing_extra(module: str) -> SettingError:
 def _table(path: Path, values: Mapping[str, Value]) -> Table:
     columns: dict[str, Any] = {}
     unusable: dict[str, str] = {}
+    stated: dict[str, float] = {}
     for name, value in values.items():
-        _flatten(printable(name), value, columns, unusable, 0)
+        _flatten(printable(name), value, columns, unusable, stated, 0)
     if len(columns) > MAX_COLUMNS:
         raise DataError(f"{path}: expected at most {MAX_COLUMNS} columns, received {len(columns)}")
     if not columns:
@@ -142,18 +144,46 @@ def _table(path: Path, values: Mapping[str, Value]) -> Table:
         raise DataError(
             f"{path}: expected variables with series of numbers, received none; {reason}"
         )
-    return Table(path, {n: freeze(c) for n, c in columns.items()}, {}, unusable)
+    Ts, source = _period(stated)
+    return Table(
+        path, {n: freeze(c) for n, c in columns.items()}, {}, unusable, Ts=Ts, Ts_source=source
+    )
+
+
+_PERIODS = ("ts", "dt", "t_s", "sample_time", "sampletime", "sampling_time")
+_RATES = ("fs", "f_s", "sample_rate", "samplerate", "sampling_rate")
+
+
+def _period(stated: Mapping[str, float]) -> tuple[float | None, str]:
+    """The sample time [s] that single numbers of a file state with one voice, and which does."""
+    found = {}
+    for name, value in stated.items():
+        last = name.rsplit(".", 1)[-1].lower()
+        if math.isfinite(value) and value > 0.0 and last in (*_PERIODS, *_RATES):
+            period = value if last in _PERIODS else 1.0 / value
+            if 0.0 < period < math.inf:
+                found[name] = period
+    agree = found and max(found.values()) <= 1.01 * min(found.values())
+    name = next(iter(found), "")
+    return (found[name], f"variable {name!r}") if agree else (None, "the header")
 
 
 def _flatten(
-    name: str, value: Value, columns: dict[str, Any], unusable: dict[str, str], depth: int
+    name: str,
+    value: Value,
+    columns: dict[str, Any],
+    unusable: dict[str, str],
+    stated: dict[str, float],
+    depth: int,
 ) -> None:
     if isinstance(value, (dict, list)) and depth <= _MAX_DEPTH:
         items = value.items() if isinstance(value, dict) else enumerate(value)
         for key, item in items:
-            _flatten(printable(f"{name}.{key}"), item, columns, unusable, depth + 1)
+            _flatten(printable(f"{name}.{key}"), item, columns, unusable, stated, depth + 1)
         return
     name, reason = printable(name), _reason(value)
+    if reason == "a single number":
+        stated[name] = float(value.ravel()[0])
     if reason is not None:
         unusable[name] = f"variable {name!r} is {reason}; expected a series of real numbers"
     elif value.ndim == 1 or 1 in value.shape:

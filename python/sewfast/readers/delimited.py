@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,16 @@ from ..errors import DataError
 from .table import MAX_COLUMNS, Table, from_headers
 
 MAX_LINE = 1_000_000
+_PREAMBLE = 200
+"""Lines within which the numbers of a table must begin for lines above its header to be skipped."""
+_UNITS = frozenset(
+    re.split(
+        " ",
+        "s sec second seconds ms us µs ns v volt volts mv a amp ampere amperes ma rpm rev rev/s "
+        "rad rad/s deg deg/s nm n m mm m/s mm/s w hz khz % °c degc counts counts/s 1/min",
+    )
+)
+"""Units that oscilloscopes and loggers write into a row of their own, in lower case."""
 _MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
 
 
@@ -28,12 +39,15 @@ class _Layout:
     skipped: int
     delimiter: str
     decimal: str
+    notes: tuple[str, ...] = ()
 
 
 def read_delimited(path: Path, raw: bytes) -> Table:
     """Read delimited text with a header row.
 
-    The delimiter is comma, semicolon or tab; with the last two, numbers may have decimal commas.
+    Lines above the header, as oscilloscopes write them, are skipped, which `Table.notes` says, and
+    a row of units below it gives the units. The delimiter is comma, semicolon or tab; with the last
+    two, numbers may have decimal commas.
     Empty cells are NaN. Columns with text are kept as unusable, each with the line and the cell,
     so that they only matter to who asks for them.
 
@@ -46,7 +60,8 @@ def read_delimited(path: Path, raw: bytes) -> Table:
     fast = _fast_pass(layout)
     if fast is not None:
         first = layout.skipped + 1
-        return from_headers(path, layout.header, fast, {}, range(first, first + len(fast[0])))
+        lines = range(first, first + len(fast[0]))
+        return replace(from_headers(path, layout.header, fast, {}, lines), notes=layout.notes)
     return _slow_pass(layout)
 
 
@@ -94,7 +109,14 @@ def _is_numeric(cells: list[str]) -> bool:
 
 
 def _layout(path: Path, text: str) -> _Layout:
-    """Find the header: the first line with content, or the comment above bare numbers."""
+    """Find the header: the first line with content, or the comment above bare numbers.
+
+    Where numbers begin farther down, below a line of names that fits them, what is above is no
+    table: the header of an oscilloscope's export.
+    """
+    below = _below_preamble(path, text)
+    if below is not None:
+        return _checked(below)
     comment = ""
     for skipped, (offset, line) in enumerate(_lines(text)):
         if len(line) > MAX_LINE:
@@ -116,6 +138,105 @@ def _layout(path: Path, text: str) -> _Layout:
             header, body, above = named, text[offset - len(line) - 1 :], skipped
         return _checked(_Layout(path, header, body, above, delimiter, _decimal(delimiter, body)))
     raise DataError(f"{path}: the file is empty; expected a header and rows of numbers")
+
+
+def _below_preamble(path: Path, text: str) -> _Layout | None:
+    """The layout of a table that does not begin in the file's first line with content.
+
+    None where it does, or where it is not clear where it begins: then the first line is the header.
+    """
+    lines: list[tuple[int, str]] = []
+    for offset, line in _lines(text):
+        if len(line) > MAX_LINE or len(lines) >= _PREAMBLE:
+            return None
+        lines.append((offset, line))
+        at = len(lines) - 1
+        found = _numbers(line)
+        if found is None:
+            continue
+        # a line of numbers within a preamble has no other of its width below it
+        following = text[offset : offset + MAX_LINE].lstrip("\n").partition("\n")[0]
+        again = _numbers(following)
+        if following.strip() and (again is None or again[1] != found[1]):
+            continue
+        return _above_numbers(path, text, lines, at, *found)
+    return None
+
+
+def _above_numbers(
+    path: Path, text: str, lines: list[tuple[int, str]], at: int, delimiter: str, width: int
+) -> _Layout | None:
+    """Names, and units if there are any, in the lines above the first numbers in line `at`."""
+    above = [k for k in range(at) if lines[k][1].strip() and lines[k][1].lstrip()[0] != "#"]
+    heads: list[list[str]] = []
+    for k in reversed(above):
+        names = _texts(lines[k][1], delimiter, width)
+        if names is None or len(heads) == 2:
+            break
+        heads.insert(0, names)
+    if not heads or len(above) == 1:
+        return None
+    units: tuple[str, ...] = ()
+    if len(heads) == 2 and all(_looks_like_unit(cell) for cell in heads[1]):
+        units = tuple(cell.strip("()[] ") for cell in heads[1])
+        heads.pop()
+        header = heads[0]
+    elif len(heads) == len(above):
+        # names and a row of text: an ordinary table, whose columns with text are told later
+        return None
+    else:
+        header = heads[-1]
+        heads = heads[-1:]
+    used = len(heads) + bool(units)
+    skipped = above[: len(above) - used]
+    if units:
+        pairs = zip(header, units, strict=True)
+        header = [f"{n} [{u}]" if u and "[" not in n else n for n, u in pairs]
+    notes = []
+    if skipped:
+        shown = _short(lines[skipped[0]][1].strip())
+        notes.append(f"{path.name}: {len(skipped)} lines above the header are skipped: {shown} ...")
+    start = lines[at][0] - len(lines[at][1]) - 1
+    body = text[max(start, 0) :]
+    return _Layout(
+        path, header, body, at, delimiter, _decimal(delimiter, body),
+        tuple(notes),
+    )  # fmt: skip
+
+
+def _numbers(line: str) -> tuple[str, int] | None:
+    """Delimiter and number of cells of a line that holds numbers and nothing else."""
+    if not line.strip() or len(line) > MAX_LINE:
+        return None
+    for delimiter in ";\t,":
+        try:
+            cells = _cells(line, delimiter)
+        except csv.Error:
+            return None
+        while len(cells) > 1 and not cells[-1]:
+            cells.pop()
+        if len(cells) > 1 and _is_numeric(cells) and any(cells):
+            return delimiter, len(cells)
+    return None
+
+
+def _texts(line: str, delimiter: str, width: int) -> list[str] | None:
+    """The cells of a line of names: as many as there are columns, none of them a number."""
+    cells = _cells(line, delimiter)
+    while len(cells) > width and not cells[-1]:
+        cells.pop()
+    named = len(cells) == width and all(
+        c and _number(c.replace(",", "."), ".") is None for c in cells
+    )
+    return cells if named else None
+
+
+def _looks_like_unit(cell: str) -> bool:
+    """Whether a cell below a name is its unit: in brackets, or one that measurements have."""
+    text = cell.strip()
+    if len(text) > 2 and text[0] + text[-1] in ("()", "[]"):
+        return True
+    return text.lower() in _UNITS
 
 
 def _decimal(delimiter: str, body: str) -> str:
@@ -160,7 +281,8 @@ def _slow_pass(layout: _Layout) -> Table:
         lines.append(number)
     if not rows:
         raise DataError(f"{layout.path}: a header but no rows; expected rows of numbers below it")
-    return from_headers(layout.path, layout.header, list(np.array(rows).T), bad, lines)
+    table = from_headers(layout.path, layout.header, list(np.array(rows).T), bad, lines)
+    return replace(table, notes=layout.notes)
 
 
 def _rows(layout: _Layout) -> Iterator[tuple[int, list[str]]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from ..dataset import Dataset, Experiment, FloatArray
 from ..errors import DataError, SettingError
 from .files import read_table
 from .table import Table
-from .timebase import sample_time
+from .timebase import TOLERANCE, Grid, time_base
 
 
 def read(
@@ -39,14 +40,17 @@ def read(
         Column name of the output. None, without `counts`, leaves the output NaN: enough to
         simulate from rest.
     Ts : float or None
-        Sample time [s]. Where the file has a column `t` or `time`, the two must agree within 1 %
-        and this one is used.
+        Sample time [s]. Where the file has a time column with even steps, the two must agree
+        within 1 % and this one is used. Where its steps are uneven, the rows are resampled to it
+        (by default to the median step): outputs by straight lines, inputs as held; steps of more
+        than 3.5 periods are gaps, NaN in all columns. Notes say what was done.
     counts, counts_per_rev : str and float, or None
         Column of encoder counts. The output is then the speed [RPM] computed from it by a Kalman
         smoother, each piece between gaps (NaN) for itself, and `output` only names it (`speed` by
         default). A recording (MCAP) states the counts of one turn itself.
     time : str or None
-        Name of the time column [s] where it is neither `t` nor `time`.
+        Name of the time column where it is none of t, time, timestamp, seconds, alone or with a
+        unit (`t [ms]`, `time_us`). Without any, a file's variable Ts or fs is used.
     channels : sequence of str
         Further columns to carry along.
     name : str or None
@@ -77,16 +81,35 @@ def read(
         )
     names = tuple(table.resolve(n) for n in names)
     _require_distinct(names, None if output is None or counts else table.resolve(output))
-    period = sample_time(table, Ts, time)
+    base = time_base(table, Ts, time)
+    slower = base.grid is not None and base.Ts > (1.0 + TOLERANCE) * base.grid.period
+    if slower and base.grid is not None:
+        # at the recording's own pace first: what a slower one cannot show has to be filtered out
+        wanted, base = base.Ts, time_base(table, base.grid.period, time)
+    if base.grid is not None:
+        measured = (counts,) if counts else (output,) if output else ()
+        table = _on_grid(table, base.grid, names, (*measured, *channels))
     u = _side_by_side(table, names)
-    y, label, unit, source = _output(table, output, counts, counts_per_rev, period, len(u))
+    y, label, unit, source = _output(table, output, counts, counts_per_rev, base.Ts, len(u))
     _require_length(table, label, y, names[0], len(u))
     extra = {c: table[c] for c in channels}
     experiment = Experiment(u, y, extra, name or table.path.name)
-    units = tuple(table.unit(n) for n in names)
-    return Dataset(
-        (experiment,), period, names, label, units, unit, source, looks_ahead=source is not None
-    )
+    data = Dataset(
+        (experiment,), base.Ts, names, label, tuple(table.unit(n) for n in names), unit, source,
+        (*table.notes, *base.notes),
+        looks_ahead=source is not None or (base.grid is not None and not base.grid.exact),
+    )  # fmt: skip
+    return data.resample(wanted) if slower else data
+
+
+def _on_grid(table: Table, grid: Grid, inputs: Sequence[str], measured: Sequence[str]) -> Table:
+    """The table with its inputs and measured columns at even times."""
+    made = {}
+    for name in (*inputs, *measured):
+        column = table[name]
+        _require_length(table, name, column, "time", grid.count)
+        made[table.resolve(name)] = grid.held(column) if name in inputs else grid.output(column)
+    return replace(table, columns={**table.columns, **made}, lines=None)
 
 
 def _require_distinct(inputs: tuple[str, ...], output: str | None) -> None:

@@ -34,6 +34,10 @@ class Table:
         Line of each row in a text file, 1-based.
     Ts : float or None
         Sample time [s] where the file states it.
+    Ts_source : str
+        Where it states it, for messages.
+    notes : sequence of str
+        What was left out when the file was read.
     counts_per_rev : float or None
         Encoder counts of one turn, of the column `counts`, where the file states it.
     """
@@ -45,6 +49,8 @@ class Table:
     lines: Sequence[int] | None = None
     Ts: float | None = None
     counts_per_rev: float | None = None
+    Ts_source: str = "the header"
+    notes: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:

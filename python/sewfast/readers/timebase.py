@@ -1,104 +1,298 @@
-"""The sample time of a table: from its time column, from the caller, or agreed between both."""
+"""The sample time of a table, and an even grid for time stamps that are not even."""
 
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..dataset import FloatArray
 from ..errors import DataError, SettingError
 from .table import Table
 
 TOLERANCE = 0.01
-_SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
+"""Of the period: how far steps may be from it to count as even."""
+GAP = 3.5
+"""Steps of more periods than that are gaps: what happened in them is not known."""
+_MOST_PER_ROW = 100
+_SECONDS = {
+    "": 1.0, "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3,
+    "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "usec": 1e-6, "ns": 1e-9, "min": 60.0,
+}  # fmt: skip
+_TIME = re.compile(r"(?:t|time|timestamp|seconds?|zeit)(?:[_ ](s|sec|ms|msec|us|µs|usec|ns))?")
 
 
-def sample_time(table: Table, given: float | None, column: str | None = None) -> float:
-    """Sample time [s] from column `t` or `time`, checked against `given`, which wins.
+@dataclass(frozen=True, eq=False)
+class TimeBase:
+    """Where samples lie in time.
+
+    Attributes
+    ----------
+    Ts : float
+        Sample time [s].
+    grid : Grid or None
+        How rows become samples; None where every row is one.
+    notes : tuple of str
+        What was taken for granted.
+    """
+
+    Ts: float
+    grid: Grid | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """An even grid over uneven time stamps.
+
+    Attributes
+    ----------
+    count : int
+        Rows of the table.
+    rows : array of int
+        Those that are used: of several with one time stamp the last.
+    t : array, shape (rows,)
+        Their times [s], the first at 0.
+    Ts : float
+        Step of the grid [s].
+    period : float
+        Median step of the time stamps [s].
+    exact : bool
+        Whether every row lies on the grid: nothing is interpolated, rows are missing.
+    """
+
+    count: int
+    rows: NDArray[np.intp]
+    t: FloatArray
+    Ts: float
+    period: float
+    exact: bool
+
+    @property
+    def times(self) -> FloatArray:
+        """Of the grid [s]."""
+        return np.arange(1 + math.floor(self.t[-1] / self.Ts + 0.01)) * self.Ts
+
+    @property
+    def gaps(self) -> FloatArray:
+        """Lengths of the gaps [s]."""
+        steps = np.diff(self.t)
+        found: FloatArray = steps[steps > GAP * self.period]
+        return found
+
+    def output(self, column: FloatArray) -> FloatArray:
+        """A measured column at the grid's times: straight lines between rows, NaN in gaps."""
+        known, at = column[self.rows], self.times
+        if self.exact:
+            found = np.full(len(at), np.nan)
+            found[np.rint(self.t / self.Ts).astype(np.intp)] = known
+            return found
+        after = np.clip(np.searchsorted(self.t, at, side="left"), 1, len(self.t) - 1)
+        before = after - 1
+        length = self.t[after] - self.t[before]
+        share = np.clip((at - self.t[before]) / length, 0.0, 1.0)
+        line = known[before] + share * (known[after] - known[before])
+        # a row that is hit needs no other, nor is anything known of the inside of a gap
+        line = np.where(length > GAP * self.period, np.nan, line)
+        line = np.where(share < TOLERANCE, known[before], line)
+        found = np.where(share > 1.0 - TOLERANCE, known[after], line)
+        return found
+
+    def held(self, column: FloatArray) -> FloatArray:
+        """The mean over each step of the grid of a column that is held from row to row.
+
+        So as much acts on the plant as before, as in `Dataset.resample`. NaN where a part of the
+        step lies in a gap or belongs to a row without a value.
+        """
+        if self.exact:
+            return self.output(column)
+        cut = self.t[:-1][np.diff(self.t) > GAP * self.period] + self.period
+        starts = np.concatenate([self.t, cut])
+        order = np.argsort(starts, kind="stable")
+        values = np.concatenate([column[self.rows], np.full(len(cut), np.nan)])[order]
+        edges = np.append(starts[order], self.t[-1] + max(self.period, self.Ts))
+        unknown = ~np.isfinite(values)
+        middle = 0.0 if unknown.all() else float(np.mean(values[~unknown]))
+        filled = np.where(unknown, 0.0, values - middle)
+        ends = np.append(self.times, self.times[-1] + self.Ts)
+        means = middle + _means(filled, edges, ends)
+        missing = _means(unknown.astype(np.float64), edges, ends) > TOLERANCE
+        return np.where(missing, np.nan, means)
+
+    def says(self, name: str) -> str:
+        """What was done, for the notes."""
+        steps = np.diff(self.t)
+        gaps = self.gaps
+        text = f"{name}: "
+        if self.exact:
+            text += f"rows are missing in the even time stamps of {self.Ts:g} s"
+        else:
+            inside = steps[steps <= GAP * self.period]
+            text += (
+                f"time stamps are uneven (steps of {inside.min():.4g} to {inside.max():.4g} s, "
+                f"median {self.period:.4g} s); resampled to Ts = {self.Ts:.6g} s, outputs by "
+                "straight lines between rows, inputs as held and averaged"
+            )
+        if len(gaps):
+            text += f"; {len(gaps)} gaps, the longest {gaps.max():.4g} s, are not known (NaN)"
+        elif self.exact:
+            text += ": these samples are not known (NaN)"
+        return text
+
+
+def _means(values: FloatArray, edges: FloatArray, ends: FloatArray) -> FloatArray:
+    """Means between `ends` of values that each hold from one edge to the next."""
+    total = np.concatenate([[0.0], np.cumsum(values * np.diff(edges))])
+    found: FloatArray = np.diff(np.interp(ends, edges, total)) / np.diff(ends)
+    return found
+
+
+def time_column(table: Table) -> str | None:
+    """The column that is named as time: t, time, timestamp, seconds, also time_ms and the like."""
+    names = [n for n in table.names if _TIME.fullmatch(n.lower())]
+    return next((n for n in names if n.lower() in ("t", "time")), next(iter(names), None))
+
+
+def time_base(table: Table, given: float | None, column: str | None = None) -> TimeBase:
+    """Sample time and, where its time stamps are uneven, a grid for a table.
 
     Parameters
     ----------
     table : Table
     given : float or None
-        Sample time [s] by the caller.
+        Sample time [s] by the caller: checked against even time stamps, the step of the grid for
+        uneven ones.
     column : str or None
-        Name of the time column; found by its name (`t` or `time`) where None.
+        Name of the time column; found by its name where None.
 
     Raises
     ------
     DataError
-        Where the time is not even to 1 % of the period, or disagrees with `given` by more.
+        Where time goes back, or even time stamps disagree with `given` by more than 1 %, or are
+        such that a grid would have far more samples than there are rows.
     SettingError
         Where there is neither a time column nor a sample time.
     """
     if given is not None and not (math.isfinite(given) and given > 0):
         raise SettingError(f"Ts: expected a positive sample time in seconds, received {given}")
-    if table.Ts is not None and column is None:
-        return table.Ts if given is None else _agreed(table, "the header", table.Ts, given)
-    name = table.resolve(column) if column is not None else _find(table)
+    name = table.resolve(column) if column is not None else time_column(table)
+    stated = table.Ts is not None and column is None
+    if stated and (table.Ts_source == "the header" or name is None):
+        assert table.Ts is not None
+        if given is None:
+            notes = (f"{table.path.name}: Ts = {table.Ts:g} s, from {table.Ts_source}",)
+            return TimeBase(table.Ts, None, () if table.Ts_source == "the header" else notes)
+        return TimeBase(_agreed(table, table.Ts_source, table.Ts, given))
     if name is None:
         if given is None:
             raise SettingError(
-                f"{table.path}: no column t or time; state the sample time in seconds (Ts, --ts)"
+                f"{table.path}: no column t or time; state the sample time in seconds (Ts, --ts), "
+                f"or name the column (time=...); available: {', '.join(table.names[:30])}"
             )
-        return float(given)
-    found = _even_period(table, name)
-    return found if given is None else _agreed(table, f"column {name!r}", found, given)
+        return TimeBase(float(given))
+    t = _seconds(table, name)
+    steps = np.diff(t)
+    period = float(np.median(steps[steps > 0.0]))
+    if np.abs(steps - period).max() <= TOLERANCE * period:
+        # the mean is exact where every printed time is rounded
+        found = float(t[-1] / len(steps))
+        Ts = found if given is None else _agreed(table, f"column {name!r}", found, given)
+        return TimeBase(Ts)
+    grid = _grid(table, name, t, period, given)
+    return TimeBase(grid.Ts, grid, (grid.says(table.path.name),))
 
 
 def _agreed(table: Table, source: str, found: float, given: float) -> float:
     if abs(found - given) > TOLERANCE * given:
         raise DataError(
             f"{table.path}: {source} says Ts = {found:.6g} s, but {given:.6g} s was given; "
-            "they must agree within 1 %"
+            "they must agree within 1 %; for another sample time resample (--resample)"
         )
     return float(given)
 
 
-def _find(table: Table) -> str | None:
-    return next((n for n in table.names if n.lower() in ("t", "time")), None)
-
-
-def _even_period(table: Table, name: str) -> float:
+def _unit(table: Table, name: str) -> float:
+    """Seconds of one unit of a time column: of its header, else of its name (time_ms)."""
     unit = table.unit(name)
+    if not unit:
+        match = _TIME.fullmatch(name.lower())
+        unit = (match[1] or "") if match else ""
     if unit.lower() not in _SECONDS:
-        raise DataError(f"{table.path}: time in {unit!r} is not understood; expected s, ms or us")
-    t = table[name]
-    if len(t) < 2:
         raise DataError(
-            f"{table.path}: column {name!r}: expected at least 2 samples, received {len(t)}"
+            f"{table.path}: time in {unit!r} is not understood; expected s, ms, us or ns"
         )
-    _require_finite(table, name, t)
-    return _SECONDS[unit.lower()] * _period(table, name, t)
+    return _SECONDS[unit.lower()]
 
 
-def _require_finite(table: Table, name: str, t: FloatArray) -> None:
-    bad = np.flatnonzero(~np.isfinite(t))
+def _seconds(table: Table, name: str) -> FloatArray:
+    """Times [s] from 0 on, which never go back.
+
+    Raises
+    ------
+    DataError
+        For fewer than two, values that are not finite, or a time that goes back.
+    """
+    unit, raw = _unit(table, name), table[name]
+    if len(raw) < 2:
+        raise DataError(
+            f"{table.path}: column {name!r}: expected at least 2 samples, received {len(raw)}"
+        )
+    bad = np.flatnonzero(~np.isfinite(raw))
     if len(bad):
         raise DataError(
-            f"{table.path}: column {name!r}: expected a time in every row, received {t[bad[0]]} at "
-            f"{table.row(int(bad[0]))}"
+            f"{table.path}: column {name!r}: expected a time in every row, received {raw[bad[0]]} "
+            f"at {table.row(int(bad[0]))}"
         )
+    with np.errstate(over="ignore", invalid="ignore"):
+        t: FloatArray = (raw - raw[0]) * unit
+        steps = np.diff(t)
+    if not np.isfinite(t).all():
+        raise DataError(
+            f"{table.path}: column {name!r}: expected times within the numbers, received "
+            f"{raw.min():g} to {raw.max():g}; check the column"
+        )
+    back = np.flatnonzero(steps < 0.0)
+    same = int(np.sum(steps == 0.0))
+    if len(back) or 2 * same > len(steps):
+        k = int(back[0] if len(back) else np.flatnonzero(steps == 0.0)[0]) + 1
+        why = "" if len(back) else f" (so are {same} of {len(steps)} steps: too coarse a clock)"
+        raise DataError(
+            f"{table.path}: column {name!r}: expected increasing time, received {raw[k]:.9g} after "
+            f"{raw[k - 1]:.9g} at {table.row(k)}{why}; sort the rows or split the recording"
+        )
+    return t
 
 
-def _period(table: Table, name: str, t: FloatArray) -> float:
-    steps = np.diff(t)
-    back = np.flatnonzero(steps <= 0)
-    if len(back):
-        k = int(back[0]) + 1
+def _grid(table: Table, name: str, t: FloatArray, period: float, given: float | None) -> Grid:
+    count = len(t)
+    rows = np.flatnonzero(np.append(np.diff(t) > 0.0, True))
+    t = t[rows] - t[rows[0]]
+    # rows that lie on a grid with places left empty: the period that fits them best
+    with np.errstate(over="ignore", invalid="ignore"):
+        place = np.cumsum(np.append(0.0, np.rint(np.diff(t) / period)))
+        fitted = float(t @ place / (place @ place)) if place[-1] > 0.0 else period
+        off = np.abs(t - place * fitted).max()
+    exact = bool(
+        off <= TOLERANCE * fitted
+        and (np.diff(place) > 0.0).all()
+        and (given is None or abs(given - fitted) <= TOLERANCE * given)
+    )
+    Ts = fitted if exact else period if given is None else float(given)
+    most = max(_MOST_PER_ROW * len(t), 10_000)
+    if not t[-1] / Ts < most:
+        k = int(np.argmax(np.diff(t)))
         raise DataError(
-            f"{table.path}: column {name!r}: expected increasing time, received {t[k]:.9g} after "
-            f"{t[k - 1]:.9g} at {table.row(k)}; sort the rows or split the recording"
+            f"{table.path}: column {name!r}: expected time stamps that a grid of Ts = {Ts:.4g} s "
+            f"has up to {most} samples for, received {len(t)} over {t[-1]:.4g} s, with a step of "
+            f"{t[k + 1] - t[k]:.4g} s at {table.row(int(rows[k + 1]))}; take that row out, or "
+            "give a longer sample time (Ts, --ts)"
         )
-    period = float(np.median(steps))
-    off = np.abs(steps - period)
-    if off.max() > TOLERANCE * period:
-        k = int(np.argmax(off > TOLERANCE * period)) + 1
+    if t[-1] < 2.0 * Ts:
         raise DataError(
-            f"{table.path}: column {name!r}: expected even steps of {period:.6g} within 1 %, "
-            f"received {steps[k - 1]:.6g} at {table.row(k)}; resample, or leave the "
-            "column out and state Ts"
+            f"{table.path}: column {name!r}: expected time stamps over at least 2 sample times of "
+            f"{Ts:.4g} s, received {t[-1]:.4g} s; give a shorter sample time (Ts, --ts)"
         )
-    # the mean is exact where every printed time is rounded
-    return float((t[-1] - t[0]) / len(steps))
+    return Grid(count, rows, t, Ts, period, exact)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..control import Controller
 from ..dataset import Dataset
+from ..drive_defaults import default_references
 from ..errors import FitError, SettingError, SewfastError
 from ..evidence.region import placed
 from ..loop import ClosedLoopRun, Plant, check_fits
@@ -60,7 +61,8 @@ def judge(
         own models, unless others are given. With runs: the models in whose training region they
         are to lie.
     references : str, array of shape (N,), or sequence of them, optional
-        Of a controller; `REFERENCES` by default, where it is in RPM at 1 ms.
+        Of a controller; `REFERENCES` by default, which is the same shapes over the first plant's
+        recorded range where the catalogue does not suit it.
     limits : Limits, optional
         The bounds.
     seed : int
@@ -120,9 +122,11 @@ def _runs(
             raise SettingError(
                 "expected plants to run the controller on, got none; give judge(controller, models)"
             )
+        if references is None:
+            references = default_references(plants[0], controller, REFERENCES)
         return [
             (trial(controller, plant, r, title, seed), plant)
-            for r in each_reference(references, REFERENCES)
+            for r in each_reference(references, ())
             for plant, title in zip(plants, titles(plants), strict=True)
         ]
     if isinstance(what, Sequence) and what and all(isinstance(r, ClosedLoopRun) for r in what):

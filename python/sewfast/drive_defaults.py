@@ -1,0 +1,410 @@
+"""What is taken for a drive where nothing is stated: limits, feedback filter and references.
+
+All of it comes from the model and from what it stores of its record: the range of the input, the
+range of the output, the sample time, and the step response. The catalogue of `sewfast.signals` is
+made for one drive, in RPM at 1 ms; here its shapes are drawn anew for any other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from . import _core, signals
+from .control import Controller
+from .dataset import FloatArray
+from .errors import DataError, FitError, SettingError
+from .evidence.linearised import linearise
+from .evidence.residuals import representative
+from .fopdt import Fopdt, fit_fopdt
+from .gains import real
+from .models import Model
+
+NAMES = ("trapezoid", "trapezoids", "random")
+"""References to tune on unless others are given."""
+FILTER_TIME = 0.008
+"""Length of the moving average in the feedback, where the drive is slow enough for it [s]."""
+_FILTER_SHARE = 0.1
+"""Its longest length in shares of the time constant."""
+_MOST_FILTERED = 64
+"""Samples of the moving average that a controller has room for."""
+_STEP_SHARES = (0.25, 0.5, 0.1)
+"""Shares of the larger limit that the step response is looked for at."""
+_STEP_SAMPLES = (4_000, 16_000)
+_INTEGRATES = 1e-5
+"""Distance of a pole from 1 below which a step takes far longer than these."""
+_REACHED = 0.7
+"""Top of the references in shares of the steady output at the limit: the rest accelerates."""
+_RECORDED = 0.9
+"""Top of the references in shares of the recorded output, beyond which the model is a guess."""
+_SLOW_RUN = 0.3
+"""Lowest level in shares of the top for a drive that cannot brake: it coasts down to that."""
+_MARGIN = 0.1
+"""Share of the output at the limit that the ramps leave to the controller."""
+_EDGES = 8
+"""Edges that a random reference is shortened to at most."""
+_MOST_SAMPLES = 20_000
+"""Samples of the random reference from which on it is shortened to `_EDGES`: tuning runs it
+thousands of times."""
+_MOST_TUNED = 60_000
+"""Samples from which on a reference is left out of those to tune on."""
+
+
+def recorded_limits(models: Sequence[Any]) -> tuple[float, float] | None:
+    """Least and largest command that the models were identified on, 0 included; None if unknown.
+
+    0 is the command of a drive at rest, which a controller has to be able to give.
+    """
+    known = [
+        m.training["input_range"][0]
+        for m in models
+        if isinstance(m, Model) and m.training.get("input_range")
+    ]
+    ends = [float(end) for pair in known for end in pair]
+    if not ends or not np.isfinite(ends).all() or not any(ends):
+        return None
+    return min(0.0, *ends), max(0.0, *ends)
+
+
+def command_limits(
+    models: Sequence[Any], u_min: float | None, u_max: float | None
+) -> tuple[float, float, str]:
+    """Limits of the command [u]: as stated, else as recorded; and what to say of them.
+
+    Raises
+    ------
+    SettingError
+        Where one is not stated and the models do not know what they were identified on: a limit
+        must not be made up.
+    """
+    recorded = recorded_limits(models)
+    missing = [name for name, value in (("u_min", u_min), ("u_max", u_max)) if value is None]
+    if missing and recorded is None:
+        raise SettingError(
+            f"expected {' and '.join(missing)}, as the model does not store the range of its "
+            "training inputs; give the limits of the command that the drive can take (--u-min, "
+            "--u-max)"
+        )
+    low = recorded[0] if u_min is None and recorded else real("u_min", u_min)
+    high = recorded[1] if u_max is None and recorded else real("u_max", u_max)
+    if missing:
+        return low, high, f"{' and '.join(missing)} from the recorded input"
+    return low, high, beyond_record(models, low, high)
+
+
+def beyond_record(models: Sequence[Any], u_min: float, u_max: float) -> str:
+    """What to say of limits that the drive has not been recorded at; empty where it has."""
+    recorded = recorded_limits(models)
+    if recorded is None:
+        return ""
+    room = 1e-6 * (recorded[1] - recorded[0])
+    if u_min >= recorded[0] - room and u_max <= recorded[1] + room:
+        return ""
+    return f"limits beyond the recorded input of {recorded[0]:g} to {recorded[1]:g}"
+
+
+def filter_length(Ts: float, time_constant: float) -> int:
+    """Samples of the feedback's moving average: 8 ms, at most a tenth of the time constant.
+
+    It is 1, no filter, where the sample time is longer than that.
+    """
+    wanted = min(FILTER_TIME, _FILTER_SHARE * time_constant) / Ts
+    return int(min(max(1, round(wanted)), _MOST_FILTERED))
+
+
+@dataclass(frozen=True)
+class DriveStep:
+    """A model's step response from rest.
+
+    Attributes
+    ----------
+    fopdt : Fopdt
+        First order with dead time.
+    rest : float
+        Output at a command of 0 [y].
+    slowest : float
+        The time constant that counts [s]: of a response that swings, a third of the time until it
+        stays within 5 %.
+    """
+
+    fopdt: Fopdt
+    rest: float
+    slowest: float
+
+
+def require_one_input(model: Model) -> None:
+    """Refuse a model with several inputs."""
+    if len(model.input_names) != 1:
+        raise SettingError(
+            f"expected a model with one input to tune on, got {len(model.input_names)}; identify "
+            "it from the command alone"
+        )
+
+
+def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
+    """The step response at the first size and length at which it settles.
+
+    Raises
+    ------
+    SettingError
+        For a model with several inputs, or limits that are no size.
+    FitError
+        Where no step settles.
+    """
+    require_one_input(model)
+    size = u_max if u_max >= -u_min else u_min
+    if not np.isfinite(size) or size == 0.0:
+        raise SettingError(
+            f"expected finite limits of the command, not both 0, to size a step by, got u_min = "
+            f"{u_min} and u_max = {u_max}; give the amplifier's limits"
+        )
+    reason: Exception | None = None
+    for share in _STEP_SHARES:
+        for samples in _STEP_SAMPLES:
+            u = np.zeros(samples)
+            at = samples // 20
+            u[at:] = share * size
+            try:
+                y = model.core.simulate(u[:, None], model.core.rest_state())
+                fopdt = fit_fopdt(u, y, Ts=model.Ts)
+            except (DataError, FitError) as error:
+                reason = error
+                continue
+            return DriveStep(fopdt, float(y[at - 1]), _slowest(fopdt, y[at:], model.Ts))
+    if _integrates(model):
+        raise FitError(
+            "expected a model whose step response settles, received one that integrates its input, "
+            "as a position does; give a controller to start from, or identify the rate: "
+            "differentiate the recorded output"
+        ) from reason
+    raise FitError(
+        f"expected a model whose step response settles, got none up to u = {0.5 * size:g} "
+        f"({reason}); give a controller to start from"
+    ) from reason
+
+
+def _slowest(fopdt: Fopdt, y: FloatArray, Ts: float) -> float:
+    if not fopdt.overshoot_percent:
+        return fopdt.T
+    outside = np.flatnonzero(np.abs(y - y[-1]) > 0.05 * abs(y[-1] - y[0]))
+    return max(fopdt.T, (int(outside[-1]) + 1) * Ts / 3.0 if len(outside) else 0.0)
+
+
+def _integrates(model: Model) -> bool:
+    """Whether a pole lies at 1, or so near that no step within reach settles."""
+    small = linearise(representative(model).core, np.zeros(1))
+    finite = bool(np.isfinite(small.A).all())
+    return finite and bool(np.any(np.abs(np.linalg.eigvals(small.A) - 1.0) < _INTEGRATES))
+
+
+@dataclass(frozen=True)
+class _Span:
+    """Levels that references use [y], seen from rest, and the time of their fastest edge [s]."""
+
+    rest: float
+    low: float
+    top: float
+    other: float
+    edge: float
+
+
+def catalogue_fits(model: Any, u_min: float, u_max: float, unit: str) -> bool:
+    """Whether the references of `sewfast.signals` suit a drive: its unit, sample time and range.
+
+    A plant that stores no range of its record is taken for one that they suit.
+    """
+    if unit.lower() != "rpm" or not math.isclose(model.Ts, signals.TS, rel_tol=1e-9):
+        return False
+    known = getattr(model, "training", {}).get("output_range")
+    if not known:
+        return True
+    try:
+        fopdt = drive_step(model, u_min, u_max).fopdt
+    except (FitError, SettingError):
+        return True
+    # the steepest edge of the catalogue is that of the trapezoid
+    top, rate = 3000.0, 3000.0 / 0.15
+    needed = (top + fopdt.T * rate - fopdt.offset) / fopdt.K
+    return bool(known[1] >= top and u_min <= needed <= u_max)
+
+
+def drive_references(
+    model: Model, u_min: float, u_max: float, *, pace: float | None = None, seed: int = 0
+) -> dict[str, FloatArray]:
+    """The shapes of the catalogue of references over a drive's own range, at its own pace.
+
+    The top is .9 of the recorded output or .7 of the steady output at the limit of the command,
+    whichever is less; the fastest edge takes what the command has left, and at least half a
+    time constant and ten dead times. Where the command cannot brake (limits on one side of 0), the
+    references stay above .3 of the top and fall no faster than the drive coasts. Where the record
+    goes both ways, `random` does as well.
+
+    Parameters
+    ----------
+    model : Model
+        With one input.
+    u_min, u_max : float
+        Limits of the command [u].
+    pace : float, optional
+        Time constant for a model whose step response does not settle [s].
+    seed : int
+        Chooses the random levels.
+
+    Returns
+    -------
+    dict of str to array, shape (N,)
+        `trapezoid`, `chirp_hi_lo`, `chirp_lo_hi`, `random`, `trapezoids` at the model's sample
+        time [y].
+
+    Raises
+    ------
+    SettingError, FitError
+        Where the model tells too little: neither a step response that settles nor a record.
+    """
+    return _shapes(_span(model, u_min, u_max, pace), model.Ts, seed)
+
+
+def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span:
+    u_min, u_max = _finite_limits(model, u_min, u_max)
+    recorded = model.training.get("output_range")
+    low, high = recorded if recorded and np.isfinite(recorded).all() else (-math.inf, math.inf)
+    try:
+        step = drive_step(model, u_min, u_max)
+    except FitError:
+        if pace is None or not math.isfinite(high - low):
+            raise
+        # nothing is known of what holds a level: the record alone says where to go
+        top = _RECORDED * (high if abs(high) >= abs(low) else low)
+        return _Span(0.0, 0.0, top, 0.0, 4.0 * pace)
+    fopdt, rest = step.fopdt, step.rest
+    reach = [fopdt.K * u + fopdt.offset - rest for u in (u_min, u_max)]
+    up = max(0.0, min(_RECORDED * (high - rest), _REACHED * max(reach)))
+    down = max(0.0, min(_RECORDED * (rest - low), _REACHED * -min(reach)))
+    sign, x, other = (1.0, up, down) if up >= down else (-1.0, down, up)
+    if x == 0.0:
+        raise SettingError(
+            "expected limits of the command that move the drive within its recorded range, got "
+            f"{u_min:g} to {u_max:g}; give wider ones, or the references as samples"
+        )
+    strong, weak = (max(reach), -min(reach)) if sign > 0 else (-min(reach), max(reach))
+    slow = 0.0 if weak > 0.25 * x else _SLOW_RUN * x
+    # a record that never came near rest: no lower than it went
+    floor = (low - rest if sign > 0 else rest - high) + 0.1 * (high - low)
+    slow = min(max(slow, floor), 0.6 * x) if math.isfinite(floor) else slow
+    upward = max(strong - x - _MARGIN * strong, 0.05 * strong)
+    downward = max(slow + weak - _MARGIN * strong, 0.05 * strong)
+    average = max(1, filter_length(model.Ts, step.slowest)) * model.Ts
+    edge = max(
+        step.slowest * (x - slow) / min(upward, downward),
+        0.5 * step.slowest,
+        10.0 * (fopdt.L + model.Ts) + 4.0 * average,
+    )
+    both = other if other > 0.25 * x else 0.0
+    return _Span(rest, rest + sign * slow, rest + sign * x, rest - sign * both, edge)
+
+
+def _finite_limits(model: Model, u_min: float, u_max: float) -> tuple[float, float]:
+    """The limits, with the recorded ones in place of infinite ones."""
+    recorded = recorded_limits([model]) or (-math.inf, math.inf)
+    low = u_min if math.isfinite(u_min) else recorded[0]
+    high = u_max if math.isfinite(u_max) else recorded[1]
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise SettingError(
+            "expected a controller with limits, or a model that stores the range of its training "
+            "inputs, to size a reference by, got neither; give the reference as samples"
+        )
+    return low, high
+
+
+def _shapes(span: _Span, Ts: float, seed: int) -> dict[str, FloatArray]:
+    """The catalogue's shapes; its fastest edge, .15 s of the trapezoid, takes `span.edge`."""
+    pace = span.edge / 0.15
+    most = _MOST_SAMPLES * Ts
+    # rates are kept: the way from rest is longer than that from the slow run
+    height = span.top - span.low
+    first = span.edge * (span.top - span.rest) / height
+    begin = span.edge * abs(span.low - span.rest) / abs(height)
+
+    def drawn(points: Sequence[tuple[float, float]]) -> FloatArray:
+        """Straight lines through (time since the last point, level), from rest."""
+        lasts, levels = zip((0.0, span.rest), *points, strict=True)
+        t = np.cumsum(lasts)
+        found: FloatArray = np.interp(np.arange(max(2, round(t[-1] / Ts))) * Ts, t, levels)
+        return found
+
+    def levels(share: FloatArray) -> FloatArray:
+        """From the slow run at 0 to the top at 1, approached from rest."""
+        approach = np.linspace(span.rest, span.low, 1 + round(2.0 * begin / Ts))[:-1]
+        return np.concatenate([approach, span.low + np.clip(share, 0.0, 1.0) * height])
+
+    steps = [(2.0 * begin + 0.01 * pace, span.low)]
+    # as in the catalogue, from its slow run of 400 RPM to 3,500
+    for tall, rise, hold, fall, after in signals.TRAPEZOIDS:
+        top = span.low + height * (tall - 400.0) / 3100.0
+        steps += [(0.1 * pace, span.low), (rise * pace, top), (hold * pace, top)]
+        steps += [(fall * pace, span.low), (after * pace, span.low)]
+
+    def chirp(amplitude: tuple[float, float], offset: tuple[float, float]) -> FloatArray:
+        return levels(
+            _core.chirp(
+                duration=20.0 * pace, Ts=Ts, f_start=0.1 / pace, f_end=3.0 / pace,
+                amplitude_start=amplitude[0] / 2160.0, amplitude_end=amplitude[1] / 2160.0,
+                offset_start=offset[0] / 2160.0, offset_end=offset[1] / 2160.0,
+            )
+        )  # fmt: skip
+
+    between = sorted((span.other if span.other != span.rest else span.low, span.top))
+    lowest = between[0] + (0.1 * (between[1] - between[0]) if between[0] == span.rest else 0.0)
+    highest = between[1] - (0.1 * (between[1] - between[0]) if between[1] == span.rest else 0.0)
+    # a change over both directions is longer than the catalogue's, and so is what follows it
+    wider = max(1.0, (between[1] - between[0]) / abs(height))
+    holds = 0.25 * pace * wider, 0.9 * pace * wider
+    usual = 10.0 * pace * wider
+    least = _EDGES * 0.5 * sum(holds)
+    return {
+        "trapezoid": drawn(
+            [
+                (0.1 * pace, span.rest), (first, span.top), (0.6 * pace, span.top),
+                (span.edge, span.low), (0.5 * pace, span.low),
+            ]
+        ),
+        "chirp_hi_lo": chirp((1080.0, 150.0), (1080.0, 400.0)),
+        "chirp_lo_hi": chirp((50.0, 250.0), (50.0, 350.0)),
+        "random": _core.random_steps(
+            duration=min(usual, max(least, most)), Ts=Ts, low=lowest, high=highest,
+            hold_min=max(holds[0], Ts), hold_max=max(holds[1], 2.0 * Ts),
+            smoothing=0.2 * pace * wider, seed=seed, start=span.rest,
+        ),
+        "trapezoids": drawn(steps),
+    }  # fmt: skip
+
+
+def default_references(
+    plant: Any, controller: Controller, names: Sequence[str] = NAMES
+) -> list[str | FloatArray]:
+    """References for a controller on a plant that nobody gave any for: names, or samples [y].
+
+    The names where the catalogue suits the plant, else the same shapes over its own range; of
+    these the longer ones are left out where they take too many samples to tune on.
+
+    Raises
+    ------
+    SettingError, FitError
+        As for `drive_references`.
+    """
+    low, high = controller.u_min, controller.u_max
+    if not isinstance(plant, Model) or catalogue_fits(plant, low, high, controller.gains.y_unit):
+        return list(names)
+    made = drive_references(plant, low, high, pace=pace_of(controller))
+    first, *others = (made[name] for name in names)
+    return [first, *(r for r in others if len(r) <= _MOST_TUNED)]
+
+
+def pace_of(controller: Controller) -> float:
+    """A time constant for a plant of which only its controller is known [s]."""
+    Ti = controller.gains.to("standard").Ti
+    return Ti if math.isfinite(Ti) else 50.0 * controller.Ts

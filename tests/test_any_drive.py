@@ -1,0 +1,240 @@
+"""`tune` and `run` on drives that nobody named: limits, filter, references from the record."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import sewfast
+from documents import Command
+from sewfast.control import Controller, Gains, load_controller
+from sewfast.drive_defaults import (
+    catalogue_fits,
+    default_references,
+    drive_references,
+    drive_step,
+    filter_length,
+    recorded_limits,
+)
+from sewfast.errors import FitError, SettingError
+from sewfast.models import LinearOE
+from sewfast.tuning import first_controller
+from terminal import Terminal
+
+TS = (0.0002, 0.001, 0.005, 0.02, 0.05)
+FAMILY = [
+    # sample time [s], time constant in samples, gain [y/u], command [u], damping, unit
+    pytest.param(Ts, samples, gain, u, damping, unit, id=f"{Ts:g} s, {unit}, gain {gain:g}, {u}")
+    for (Ts, samples, gain, u, damping, unit) in [
+        (TS[0], 100, 0.05, (-24.0, 24.0), None, "rad/s"),
+        (TS[0], 60, 500.0, (0.0, 3.0), 1.2, "deg/s"),
+        (TS[0], 250, -5.0, (-10.0, 10.0), None, "RPM"),
+        (TS[1], 40, 490.0, (0.0, 5.0), None, "RPM"),
+        (TS[1], 250, 3.0, (-1.0, 1.0), 1.5, "rad/s"),
+        (TS[1], 30, 5.0, (-12.0, 12.0), 0.6, "RPM"),
+        (TS[2], 20, 5.0, (-1.0, 1.0), None, "rad/s"),
+        (TS[2], 60, 0.3, (0.0, 24.0), 1.2, "rev/s"),
+        (TS[2], 40, 60.0, (-6.0, -1.0), None, "deg/s"),
+        (TS[3], 8, 162.0, (1.45, 2.7), None, "rad/s"),
+        (TS[3], 30, 20.0, (-10.0, 10.0), 0.8, "mm/s"),
+        (TS[4], 10, 0.05, (-5.0, 5.0), None, "RPM"),
+        (TS[4], 20, 500.0, (0.0, 10.0), 1.0, "counts/s"),
+    ]
+]
+
+
+def drive(
+    Ts: float,
+    T: float,
+    gain: float,
+    u: tuple[float, float],
+    damping: float | None = None,
+    unit: str = "rad/s",
+) -> LinearOE:
+    """A lag, or two with a damping, that was recorded between the commands u."""
+    if damping is None:
+        den = np.array([1.0, -math.exp(-Ts / T)])
+    else:
+        roots = np.roots([T**2, 2.0 * damping * T, 1.0])
+        den = np.poly(np.exp(roots * Ts)).real
+    b = gain * den.sum() / (len(den) - 1)
+    num = np.r_[0.0, np.full(len(den) - 1, b)]
+    model = LinearOE.from_tf(num, den, Ts, input_units=["V"], output_unit=unit)
+    went = sorted(gain * end for end in (min(0.0, *u), max(0.0, *u)))
+    return replace(model, training={"input_range": [list(u)], "output_range": went})
+
+
+@pytest.mark.parametrize(("Ts", "samples", "gain", "u", "damping", "unit"), FAMILY)
+def test_tune_with_no_option_ends_with_a_loop_that_tracks(
+    Ts: float,
+    samples: float,
+    gain: float,
+    u: tuple[float, float],
+    damping: float | None,
+    unit: str,
+) -> None:
+    model = drive(Ts, samples * Ts, gain, u, damping, unit)
+    found = sewfast.tune(model, evaluations=300, threads=2)
+    controller = found.controller
+    assert (controller.u_min, controller.u_max) == (min(0.0, *u), max(0.0, *u))
+    assert "from the recorded input" in controller.notes
+    assert controller.gains.y_unit == unit
+    assert controller.counts_per_rev is None
+    assert controller.filter_samples * Ts <= max(Ts, 0.1001 * drive_step(model, *u).slowest)
+    for reference in default_references(model, controller, ("trapezoid", "random")):
+        told = sewfast.run(controller, model, reference)
+        metrics = told.metrics()
+        span = float(np.ptp(told.r))
+        assert span > 0.3 * abs(gain) * max(map(abs, u))
+        assert metrics["rmse"] is not None
+        assert metrics["rmse"] < 0.03 * span
+        assert metrics["saturated"] is not None
+        assert metrics["saturated"] < 0.25
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    Ts=st.floats(1e-4, 0.1),
+    samples=st.floats(2.0, 60.0),
+    gain=st.floats(-2.0, 3.0),
+    sign=st.sampled_from([-1.0, 1.0]),
+    low=st.floats(-20.0, 20.0),
+    width=st.floats(0.1, 20.0),
+    damping=st.none() | st.floats(0.3, 2.0),
+)
+def test_references_stay_within_what_was_recorded_at_a_pace_within_the_limits(
+    Ts: float,
+    samples: float,
+    gain: float,
+    sign: float,
+    low: float,
+    width: float,
+    damping: float | None,
+) -> None:
+    model = drive(Ts, samples * Ts, sign * 10.0**gain, (low, low + width), damping)
+    limits = recorded_limits([model])
+    assert limits is not None
+    assert limits[0] <= 0.0 <= limits[1]
+    first, last = model.training["output_range"]
+    step = drive_step(model, *limits)
+    room = 1e-6 * (last - first)
+    for name, r in drive_references(model, *limits).items():
+        assert np.isfinite(r).all(), name
+        assert len(r) > 20, name
+        assert r.min() >= first - room, name
+        assert r.max() <= last + room, name
+        assert np.ptp(r) > 0.08 * (last - first), name
+        # the command that the plant would ask for, had it only the gain and the time constant
+        u = (r[1:] + step.fopdt.T * np.diff(r) / Ts - step.fopdt.offset) / step.fopdt.K
+        over = max(u.max() - limits[1], limits[0] - u.min())
+        assert over < 0.35 * (limits[1] - limits[0]), name
+
+
+@pytest.mark.parametrize(
+    ("Ts", "T", "samples"),
+    [(1e-3, 0.25, 8), (1e-3, 0.02, 2), (2e-4, 1.0, 40), (0.02, 0.037, 1), (1e-5, 1.0, 64)],
+)
+def test_the_filter_is_8_ms_or_a_tenth_of_the_time_constant(
+    Ts: float, T: float, samples: int
+) -> None:
+    assert filter_length(Ts, T) == samples
+
+
+def test_the_catalogue_is_for_a_drive_that_it_suits() -> None:
+    sewing = drive(1e-3, 0.25, 490.0, (-20.0, 20.0), unit="RPM")
+    assert catalogue_fits(sewing, -20.0, 20.0, "RPM")
+    controller = first_controller(sewing)
+    assert default_references(sewing, controller) == ["trapezoid", "trapezoids", "random"]
+    for other in (
+        drive(1e-3, 0.25, 49.0, (-20.0, 20.0), unit="RPM"),
+        drive(1e-3, 0.25, 490.0, (0.0, 3.0), unit="RPM"),
+        drive(2e-3, 0.25, 490.0, (-20.0, 20.0), unit="RPM"),
+        drive(1e-3, 0.25, 490.0, (-20.0, 20.0), unit="rad/s"),
+        drive(1e-3, 5.0, 490.0, (-20.0, 20.0), unit="RPM"),
+    ):
+        low, high = recorded_limits([other]) or (0.0, 0.0)
+        assert not catalogue_fits(other, low, high, other.output_unit)
+
+
+def test_limits_are_not_made_up_and_wide_ones_are_remarked_on() -> None:
+    model = drive(0.01, 0.2, 10.0, (1.0, 3.0))
+    assert recorded_limits([model]) == (0.0, 3.0)
+    wide = sewfast.tune(model, u_min=-20.0, u_max=20.0, evaluations=20).controller
+    assert (wide.u_min, wide.u_max) == (-20.0, 20.0)
+    assert "limits beyond the recorded input of 0 to 3" in wide.notes
+    half = sewfast.tune(model, u_max=5.0, evaluations=20).controller
+    assert (half.u_min, half.u_max) == (0.0, 5.0)
+    assert "u_min from the recorded input" in half.notes
+    unknown = replace(model, training={})
+    with pytest.raises(SettingError, match=r"expected u_min and u_max.*--u-min"):
+        sewfast.tune(unknown)
+    assert sewfast.tune(unknown, u_min=-3.0, u_max=3.0, evaluations=20).controller.u_max == 3.0
+
+
+def test_a_drive_without_a_brake_is_not_asked_to_fall_faster_than_it_coasts() -> None:
+    model = drive(0.01, 0.3, 10.0, (0.0, 5.0))
+    r = drive_references(model, 0.0, 5.0)["trapezoid"]
+    peak = int(np.argmax(r))
+    assert np.all(r[peak:] >= 0.3 * r.max() - 1e-9)
+    assert np.all(np.diff(r[peak:]) / 0.01 >= -r[peak + 1 :] / 0.3 - 1e-9)
+
+
+def test_what_does_not_settle_needs_a_start_and_then_runs() -> None:
+    integrator = LinearOE.from_tf([0.0, 0.02], [1.0, -1.0], 0.01, output_unit="deg")
+    integrator = replace(
+        integrator, training={"input_range": [[-2.0, 2.0]], "output_range": [-90.0, 90.0]}
+    )
+    with pytest.raises(FitError, match="integrates"):
+        sewfast.tune(integrator)
+    start = Controller(
+        Gains.standard(2.0, 1.0, u_unit="", y_unit="deg"), Ts=0.01, u_min=-2.0, u_max=2.0
+    )
+    found = sewfast.tune(integrator, start=start, evaluations=40)
+    r = default_references(integrator, start)[0]
+    assert isinstance(r, np.ndarray)
+    assert r.max() == pytest.approx(81.0)
+    assert found.cost <= found.start_cost
+
+
+def test_a_drive_is_not_moved_without_a_reference() -> None:
+    controller = first_controller(drive(0.01, 0.2, 10.0, (-3.0, 3.0)))
+    with pytest.raises(SettingError, match="reference for a drive"):
+        sewfast.run(controller, object())  # type: ignore[arg-type]
+
+
+def test_the_commands_need_nothing_but_the_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(1.0, 2.7, 80), 15)
+    y = np.zeros(len(u))
+    for k in range(1, len(u)):
+        y[k] = 0.8 * y[k - 1] + 0.2 * 160.0 * u[k - 1]
+    y += 0.1 * rng.standard_normal(len(y))
+    t = 0.02 * np.arange(len(u))
+    sewfast.write_table(
+        "drive.csv", {"t": t, "u": u, "y": y}, units={"t": "s", "u": "V", "y": "rad/s"}
+    )
+    with Terminal("any drive", monkeypatch.setenv) as terminal:
+        for line in (
+            "sewfast identify drive.csv --input u --output y --model oe -o drive.json",
+            "sewfast tune drive.json --evaluations 200 -o controller.json",
+            "sewfast run controller.json drive.json -o one.csv",
+            "sewfast run drive.json controller.json -o other.csv",
+            "sewfast run controller.json --on drive.json --reference random -o random.csv",
+        ):
+            terminal.run(Command(line, ""))
+    controller = load_controller("controller.json")
+    assert (controller.u_min, controller.u_max) == (0.0, pytest.approx(u.max()))
+    assert controller.gains.y_unit == "rad/s"
+    assert Path("one.csv").read_bytes() == Path("other.csv").read_bytes()
+    found = sewfast.read_table("random.csv")
+    assert found.unit("r") == "rad/s"
+    assert np.sqrt(np.mean((found["r"] - found["y"]) ** 2)) < 0.03 * np.ptp(found["r"])
+    assert json.loads(Path("controller.json").read_text())["filter_samples"] == 1
