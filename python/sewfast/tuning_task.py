@@ -125,8 +125,9 @@ class TuningTask:
             plants = list(given) if isinstance(given, (list, tuple)) else [given]
         if not plants:
             raise SettingError(
-                "expected a linear plant to take Ms on, got none among the plants; add a linear "
-                "model of the same drive to them"
+                "expected a linear plant to take Ms on, got none among the plants; give "
+                "Constraints(plant=...), for example a linear model of the same drive, or add one "
+                "to the plants"
             )
         return [sampled(plant, self.start.Ts, self.constraints.speed) for plant in plants]
 
