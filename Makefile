@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo accuracy battery commissioning laws bench bench-parts counts bench-device clean $(MARKED)
+.PHONY: help demo accuracy battery commissioning drives laws bench bench-parts counts bench-device clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -116,6 +116,9 @@ battery: $(VENV)/bench.stamp ## identify on simulated systems of known truth (SP
 
 commissioning: $(DEV) ## figures of commissioning on five virtual machines, beside an oracle (docs/RESULTS.md)
 	$(BIN)/python benches/commissioning.py
+
+drives: $(VENV)/bench.stamp ## commissioning on drives of another simulator (ONLY="shaft60 lash", SEEDS=)
+	$(BIN)/python benches/drives.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))
 
 SOAKED := tests/test_soak.py tests/test_watchdog.py tests/test_recordfile_kill.py tests/test_recordfile_damage.py \
   tests/test_link_connection.py tests/test_link_drive.py tests/test_link_virtual.py

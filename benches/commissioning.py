@@ -108,7 +108,7 @@ def _figures(name: str, seed: int, oracle_seeds: int, effort: Mapping[str, int])
     assert found.first is not None
     assert found.models is not None
     asked = _asked(machine, seed, found)
-    references = standard(found.fopdt, asked, machine.Ts, short=False)
+    references = standard(found.acceleration, asked, machine.Ts, short=False)
     oracle = _oracle(machine, found, asked, references, oracle_seeds)
     costs = {
         key: _cost(controller, machine, references)
@@ -180,7 +180,7 @@ def _oracle(
     """The best of the same searches on the machine itself."""
     assert found.first is not None
     assert found.cost is not None
-    practice = standard(found.fopdt, asked, machine.Ts, short=True)
+    practice = standard(found.acceleration, asked, machine.Ts, short=True)
     assert found.fopdt is not None
     rule = ruled(found.fopdt, found.first)
     start = start_of(rule, machine, practice, found.cost, asked.threads)

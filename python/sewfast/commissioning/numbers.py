@@ -26,6 +26,7 @@ def numbers(c: Commissioning) -> dict[str, Any]:
         "motion": None if c.motion is None else dict(vars(c.motion)),
         "fopdt": None if c.fopdt is None else {n: getattr(c.fopdt, n) for n in _FOPDT},
         "small_signals": _small_signals(c),
+        "acceleration_rpm_per_s": c.acceleration,
         "turn_load_v_rms": None if c.turn_load is None else c.turn_load.rms,
         "models": {"members": 0 if c.models is None else len(c.models.members)}
         | {"levels_rmse_rpm": list(c.rmse)},

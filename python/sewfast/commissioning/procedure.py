@@ -244,6 +244,7 @@ def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal
 
     journal.enter("limits")
     fastest, pulses = _pulses(bench, step, asked)
+    journal.keep(acceleration=fastest)
 
     journal.enter("closed loop")
     first, _ = cautious(bench, first, asked, fastest, "hold_first", small)

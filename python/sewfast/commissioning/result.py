@@ -47,6 +47,8 @@ class Commissioning:
         From the step response.
     small_signal : SmallSignal or None
         The machine about a working speed, with its resonance where it has one.
+    acceleration : float or None
+        What the machine has shown at the limit of its command [RPM/s].
     turn_load : TurnLoad or None
         The load over the turn, as a command; None where none was seen.
     first : Controller or None
@@ -81,6 +83,7 @@ class Commissioning:
     motion: Motion | None = None
     fopdt: Fopdt | None = None
     small_signal: SmallSignal | None = None
+    acceleration: float | None = None
     turn_load: TurnLoad | None = None
     first: Controller | None = None
     models: Ensemble | None = None
