@@ -113,8 +113,8 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         }
         let u = self.in_whole_steps(wanted.max(-limits.volt).min(limits.volt), limits.volt);
         self.guard.expect_motion(&limits, u)?;
-        // a profile that swings is as its author wants it
-        if self.run.start.mode != 0 {
+        // a profile that swings is as its author wants it; without a limit of acceleration nothing is
+        if self.run.start.mode != 0 && limits.acceleration.is_finite() {
             let (low, high) = self.range(limits.volt);
             self.guard.expect_calm(low, high, u)?;
         }
