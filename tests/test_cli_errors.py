@@ -64,7 +64,6 @@ def spoiled(name: str, at: int | slice, value: float) -> dict[str, np.ndarray]:
         (spoiled("u", slice(None), 2.0), ["'u'", "constant"]),
         (spoiled("y", slice(None), 2.0), ["'y'", "constant"]),
         (spoiled("t", 9, 0.0), ["'t'", "increasing", "line 11"]),
-        (spoiled("t", 9, 0.0095), ["'t'", "even steps", "1 %"]),
     ],
     ids=[
         "all-nan",
@@ -74,7 +73,6 @@ def spoiled(name: str, at: int | slice, value: float) -> dict[str, np.ndarray]:
         "constant-input",
         "constant-output",
         "backwards",
-        "uneven",
     ],
 )
 def test_unusable_columns(
@@ -368,7 +366,8 @@ def test_ctrl_c_keeps_the_best_controller(folder: Path) -> None:
     api.write_table(folder / "long.npz", {"t": t, "r": 1000.0 + 500.0 * np.sin(t)})
     err = _interrupted(folder, "tune", "drive.json", "--reference", "long.npz", "-o", "new.json")
     assert "kept the best so far in new.json" in err
-    assert api.load_controller(folder / "new.json").u_max == 20.0
+    recorded = api.load_model(folder / "drive.json").training["input_range"][0][1]
+    assert api.load_controller(folder / "new.json").u_max == recorded
 
 
 def _interrupted(folder: Path, *arguments: str) -> str:
