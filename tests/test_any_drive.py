@@ -170,6 +170,8 @@ def test_limits_are_not_made_up_and_wide_ones_are_remarked_on() -> None:
     half = sewfast.tune(model, u_max=5.0, evaluations=20).controller
     assert (half.u_min, half.u_max) == (0.0, 5.0)
     assert "u_min from the recorded input" in half.notes
+    both = sewfast.Ensemble.of([model, drive(0.01, 0.2, 10.0, (-4.0, 2.0))])
+    assert recorded_limits([both]) == (-4.0, 3.0)
     unknown = replace(model, training={})
     with pytest.raises(SettingError, match=r"expected u_min and u_max.*--u-min"):
         sewfast.tune(unknown)

@@ -105,11 +105,9 @@ def test_a_controller_is_tuned_on_every_member_and_run_on_the_first() -> None:
     members = [lag(g, 0.95) for g in (4.0, 5.0, 6.0)]
     reference = np.repeat([0.0, 100.0, 0.0], 100)
     options: dict[str, Any] = {"counts_per_rev": None, "evaluations": 12, "threads": 1}
-    options |= {"u_min": -20.0, "u_max": 20.0}
-    together = tune(Ensemble.of(members), [reference], **options)
-    apart = tune(
-        members, [reference], start=together.start, counts_per_rev=None, evaluations=12, threads=1
-    )
+    limits = {"u_min": -20.0, "u_max": 20.0}
+    together = tune(Ensemble.of(members), [reference], **limits, **options)
+    apart = tune(members, [reference], start=together.start, **options)
     assert together.controller.gains == apart.controller.gains
     ran = run(together.controller, Ensemble.of(members), reference)
     alone = run(together.controller, members[0], reference)

@@ -59,15 +59,23 @@ def recorded_limits(models: Sequence[Any]) -> tuple[float, float] | None:
 
     0 is the command of a drive at rest, which a controller has to be able to give.
     """
-    known = [
-        m.training["input_range"][0]
-        for m in models
-        if isinstance(m, Model) and m.training.get("input_range")
-    ]
+    known = [r[0] for m in models if isinstance(m, Model) for r in _stored(m, "input_range")]
     ends = [float(end) for pair in known for end in pair]
     if not ends or not np.isfinite(ends).all() or not any(ends):
         return None
     return min(0.0, *ends), max(0.0, *ends)
+
+
+def _stored(model: Model, name: str) -> list[Any]:
+    """A range that a model stores of its training data; of an ensemble without, its members'."""
+    own = model.training.get(name)
+    return [own] if own else [m.training[name] for m in model.members if m.training.get(name)]
+
+
+def _output_range(model: Model) -> tuple[float, float] | None:
+    """Least and largest recorded output [y]; None if unknown."""
+    ends = [float(end) for pair in _stored(model, "output_range") for end in pair]
+    return (min(ends), max(ends)) if ends and np.isfinite(ends).all() else None
 
 
 def command_limits(
@@ -219,8 +227,8 @@ def catalogue_fits(model: Any, u_min: float, u_max: float, unit: str) -> bool:
     """
     if unit.lower() != "rpm" or not math.isclose(model.Ts, signals.TS, rel_tol=1e-9):
         return False
-    known = getattr(model, "training", {}).get("output_range")
-    if not known:
+    known = _output_range(model) if isinstance(model, Model) else None
+    if known is None:
         return True
     try:
         fopdt = drive_step(model, u_min, u_max).fopdt
@@ -270,8 +278,7 @@ def drive_references(
 
 def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span:
     u_min, u_max = _finite_limits(model, u_min, u_max)
-    recorded = model.training.get("output_range")
-    low, high = recorded if recorded and np.isfinite(recorded).all() else (-math.inf, math.inf)
+    low, high = _output_range(model) or (-math.inf, math.inf)
     try:
         step = drive_step(model, u_min, u_max)
     except FitError:
