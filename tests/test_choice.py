@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import sewfast
 from plants import bent_data, linear_data
 from sewfast import Dataset, LinearOE, NeuralOE, NeuralSS, _core, identify, validate
-from sewfast.errors import SettingError
+from sewfast.errors import FitError, SettingError
 from sewfast.identification.effort import Clock, Pool, Stopped
 from sewfast.identification.folds import (
     FOLDS,
@@ -324,6 +324,20 @@ def test_a_budget_leaves_a_model_of_the_kind_and_says_what_it_cut(kind: Any, bud
     if kind != "auto":
         assert {m.kind for m in model.members or (model,)} == {kind}
     assert validate(model, data).simulation.fit_percent > 50.0
+
+
+@pytest.mark.parametrize("kind", ["auto", "oe", "iv", "neural_oe", "neural_ss"])
+@pytest.mark.parametrize("budget", [1e-3, 0.03, 0.1, 0.3])
+def test_a_budget_too_short_gives_the_kind_or_says_so(kind: Any, budget: float) -> None:
+    data = bent_data(20_000, noise=0.05)
+    try:
+        model = identify(data, model=kind, time_budget=budget)
+    except FitError as e:
+        if not kind.startswith("neural") or "more" not in str(e):
+            raise
+    else:
+        assert kind in ("auto", *(m.kind for m in model.members or (model,)))
+        assert model.training.get("iterations") != 0 or kind not in ("neural_oe", "neural_ss")
 
 
 def test_the_command_line_writes_alternatives_and_trains_further(tmp_path: Any) -> None:

@@ -370,6 +370,27 @@ def test_ctrl_c_keeps_the_best_controller(folder: Path) -> None:
     assert api.load_controller(folder / "new.json").u_max == recorded
 
 
+@needs_sigint
+def test_ctrl_c_while_the_program_is_read_ends_it_without_a_traceback(folder: Path) -> None:
+    code = """
+import signal, sys
+from sewfast.__main__ import main
+
+class Pressed:
+    def find_spec(self, name, path, target=None):
+        if name == "sewfast.cli.parser":
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, Pressed())
+sys.exit(main())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, env=environment(), capture_output=True, text=True
+    )
+    assert done.returncode == -signal.SIGINT
+    assert done.stderr == ""
+
+
 def _interrupted(folder: Path, *arguments: str) -> str:
     """Start a command, press Ctrl-C once the compiled work is under way; its messages."""
     start_up = _start_up(folder)

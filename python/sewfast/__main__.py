@@ -1,9 +1,23 @@
-"""`python -m sewfast`: the command line."""
+"""`sewfast` and `python -m sewfast`: the command line."""
 
 from __future__ import annotations
 
+import signal
 import sys
 
-from .cli import main
 
-sys.exit(main())
+def main() -> int:
+    """Run one command, with the process's own arguments; its exit code."""
+    # While modules are read nothing is lost by Ctrl-C: the process ends as any other does, without
+    # a traceback. Where SIGINT is ignored (a job in the background) it stays ignored.
+    listening = signal.getsignal(signal.SIGINT)
+    if listening is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from .cli import main as run
+
+    signal.signal(signal.SIGINT, listening)
+    return run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

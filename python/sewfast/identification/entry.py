@@ -200,20 +200,24 @@ def identify(
 
 def _within_budget(identified: Callable[[Task], Model], task: Task) -> Model:
     """What is reached when the time is up, with a note; a Ctrl-C goes on to the caller."""
+    too_short = FitError(
+        f"time_budget: expected time for at least one iteration, received "
+        f"{task.clock.budget} s; give more, fewer data, or leave the budget out"
+    )
     try:
         return identified(task)
     except Interrupted as e:
         if not task.clock.over(SHARE_OF_FIT):
             raise
+        # a network without a step is still the linear model it began at
+        if e.best.kind in NETWORKS and e.best.training.get("iterations") == 0:
+            raise too_short from None
         note = f"the time budget of {task.clock.budget:g} s ended the training early"
         return with_provenance(e.best, {"notes": [*e.best.training.get("notes", []), note]})
     except KeyboardInterrupt:
         if not task.clock.over(SHARE_OF_FIT):
             raise
-        raise FitError(
-            f"time_budget: expected time for at least one iteration, received "
-            f"{task.clock.budget:g} s; give more, fewer data, or leave the budget out"
-        ) from None
+        raise too_short from None
 
 
 def _excerpt(model: Model, task: Task) -> Dataset:

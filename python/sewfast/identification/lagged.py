@@ -41,6 +41,8 @@ SAME = 1e-6
 NOTHING_LEFT = 1e-6
 """J, in scaled units, at which a linear model explains everything."""
 _USUAL_STARTS = 4
+LINEAR_SHARE = 0.4
+"""Of a time budget; linear fits that took it all would leave none for the network."""
 WORTH_IT = 0.98
 """The network must bring the free-run error below this part of the linear model's."""
 
@@ -80,8 +82,9 @@ def neural_oe(task: Task) -> Model:
     all data without them, and a note says so.
     """
     began = time.perf_counter()
-    linear = linear_fit(task, began).model
-    start = _start(task, linear)
+    brief = replace(task, progress=task.clock.limited(task.progress, LINEAR_SHARE))
+    linear = _linear(brief, began)
+    start = _start(brief, linear)
     if not task.select:
         fit = _network_fit(task, start, DECAYS[-1], began)
         return _network_model(task, fit, began, {"weight_decay": DECAYS[-1], "selected": False})
@@ -122,6 +125,19 @@ def _is_still_linear(choice: Provenance) -> bool:
 # --- fits -------------------------------------------------------------------------------------
 
 
+def _linear(task: Task, began: float) -> _core.LinearModel:
+    """Output error, as far as its share of the time budget goes; ARX where that is nowhere."""
+    try:
+        return linear_fit(task, began).model
+    except KeyboardInterrupt as e:
+        if not task.clock.over(LINEAR_SHARE):
+            raise
+        if isinstance(e, Interrupted):
+            best: _core.LinearModel = e.best.core
+            return best
+        return _core.fit_arx(arrays(task.data), **task.orders, offset=True)
+
+
 def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
     """Where the training begins: the linear model, or a smaller one that is misled less.
 
@@ -131,7 +147,7 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
     orders = task.orders
     na, nb = orders["na"] - 1, orders["nb"] - 1
     parts = folds(task.data, task.validation)
-    if na < 1 or nb < 1 or not parts:
+    if na < 1 or nb < 1 or not parts or task.clock.over(LINEAR_SHARE):
         return linear
     learned = arrays(parts[0].fitted)
     models = []
@@ -140,6 +156,10 @@ def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
         try:
             models.append(_core.fit_oe(learned, **options).model)
         except FitError:
+            return linear
+        except KeyboardInterrupt:
+            if not task.clock.over(LINEAR_SHARE):
+                raise
             return linear
     smaller, own = models
     return raised(smaller, orders["na"]) if is_misled(own, smaller, parts[0]) else linear

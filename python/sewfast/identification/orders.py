@@ -160,8 +160,12 @@ class LinearTable:
         squares, counts = [], []
         for i, errors in enumerate(c.errors):
             least = min(other.errors[i].rmse for other in self.candidates.values())
+            if not math.isfinite(least):  # a budget that ended before this fold's first fit
+                continue
             squares.append(errors.squares / max(least, 1e-300) ** 2)
             counts.append(errors.counts)
+        if not counts:
+            return c.errors[0]
         return Errors(np.concatenate(squares), np.concatenate(counts))
 
     def start(self, order: int, nk: int) -> _core.LinearModel | None:
