@@ -69,6 +69,27 @@ def test_a_short_record_has_fewer_folds() -> None:
     assert len(folds(linear_data(210))) == FOLDS
 
 
+def test_of_many_short_experiments_the_last_ones_are_held_out() -> None:
+    data = Dataset.concat([linear_data(60, seed=i, name=str(i)) for i in range(10)])
+    found = folds(data)
+    held = [[s["name"] for s in f.sources] for f in found]
+    assert held == [["8", "9"], ["6", "7"], ["4", "5"]]
+    assert [len(f.fitted.experiments) for f in found] == [8, 6, 4]
+
+
+def test_many_short_experiments_are_enough_for_a_network() -> None:
+    data = Dataset.concat([bent_data(120, seed=i, noise=0.01) for i in range(12)])
+    test = bent_data(1000, seed=99)
+    found = identify(data, threads=2)
+    linear = identify(data, model="oe")
+    assert found.kind != "oe"
+    assert rmse(found, test) < 0.2 * rmse(linear, test)
+
+
+def rmse(model: sewfast.Model, data: Dataset) -> float:
+    return validate(model, data).simulation.rmse
+
+
 # --- comparison with uncertainty ------------------------------------------------------------------
 
 

@@ -126,7 +126,7 @@ def test_a_short_experiment_does_not_keep_the_others_from_a_search() -> None:
     assert training["verdict"]["grade"] == "good"
     assert len(training["choice"]["candidates"]) > 1
     assert len(training["choice"]["held_out"]) == 2
-    few = identify(Dataset.concat([dataset(*record(40)) for _ in range(5)]), time_budget=1.0)
+    few = identify(Dataset.concat([dataset(*record(40)) for _ in range(2)]), time_budget=1.0)
     assert "too short" in few.training["choice"]["reason"]
 
 

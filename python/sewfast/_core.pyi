@@ -11,7 +11,7 @@ __version__: str
 cpu: Literal["baseline", "avx2", "avx512"]  # what the kernels run on; SEWFAST_CPU forces one
 
 _F: TypeAlias = NDArray[np.float64]
-_Experiments: TypeAlias = Sequence[tuple[_F, _F]]
+_Experiments: TypeAlias = Sequence[tuple[_F, ...]]  # (u, y) or (u, y, weights), weights (N,) >= 0
 _Progress: TypeAlias = Callable[[int, int, float], object] | None
 
 # --- signals.rs: every one returns float64 (N,); N = round(duration / Ts) ---------------------------------
@@ -290,13 +290,13 @@ class NeuralFit:
         """Past outputs before the first simulated sample of each training experiment, newest first, (n_experiments, na)."""
 
 def fit_arx(experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool) -> LinearModel:
-    """In every fit an output that is NaN has no weight; inputs are finite."""
+    """In every fit an output that is NaN has no weight; inputs are finite. Costs are sum w e^2 / (2 sum w)."""
 
 def fit_iv(
     experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool = True,
     max_iterations: int = 50, progress: _Progress = None,
 ) -> LinearFit:
-    """Refined instrumental variables (SRIV); "small_step" is the only success."""
+    """Refined instrumental variables (SRIV); "small_step" is the only success. Weights other than 1 are refused."""
 
 @final
 class NeuralSSFit:

@@ -10,6 +10,7 @@ import numpy as np
 
 from . import _core
 from .dataset import Dataset, FloatArray, require_dataset
+from .dataset.weights import in_effect
 from .errors import DataError, FitError, SettingError
 from .regression import LaggedRegression
 
@@ -133,7 +134,8 @@ def delay(
     Parameters
     ----------
     data : Dataset
-        Samples that were not measured are left out.
+        Samples that were not measured, or have weight 0, are left out; other weights are not looked
+        at.
     longest : int
         Largest delay looked at [samples].
     least : int
@@ -158,6 +160,7 @@ def delay(
     the estimate may be late by a sample or two. A model may then still begin at 1.
     """
     _require(data, longest, least, confidence)
+    data = in_effect(data)
     regression = LaggedRegression(data, ORDER, longest + ORDER)
     needed = 2 * regression.triangle.shape[1]
     if regression.samples < needed:

@@ -12,6 +12,7 @@ import numpy as np
 
 from . import _core
 from .dataset import Dataset, FloatArray, labelled, require_dataset
+from .dataset.weights import in_effect
 from .delays import LONGEST, DelayEstimate, delay
 from .errors import DataError, FitError, SettingError
 from .lipschitz import lipschitz_index
@@ -164,6 +165,7 @@ def orders(
     Parameters
     ----------
     data : Dataset
+        Samples of weight 0 are left out; other weights are not looked at.
     na, nb : int or iterable of int
         Orders to try; a number stands for 1 up to it.
     nk : int, iterable of int, or None
@@ -200,7 +202,7 @@ def orders(
     require_dataset(data, "data")
     data.require_inputs()
     data.require_excited()
-    train, later = _parts(data, validation, held_out)
+    train, later = (in_effect(part) for part in _parts(data, validation, held_out))
     found = delay(train, longest=_reach(train)) if nk is None else None
     grid = _Grid(_upto("na", na, 1), _upto("nb", nb, 1), _delays(nk, found))
     rows, errors = _tried(train, later, grid, progress)

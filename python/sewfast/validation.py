@@ -8,9 +8,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .dataset import Dataset, Experiment, FloatArray, require_dataset
 from .dataset.noise import white_noise
+from .dataset.weights import in_effect, without_weightless
 from .errors import DataError
 from .models.base import INIT, Model, require_init
 
@@ -32,6 +34,9 @@ class Scores:
         Root mean square and largest magnitude [output unit].
     fit_percent : float
         100 (1 - |y - yhat| / |y - mean(y)|), Euclidean norms; NaN where y is constant.
+
+    With weights, mean squares and means are weighted: rmse is sqrt(sum w e^2 / sum w), the norms
+    are of sqrt(w) times their argument. The largest magnitude is not.
     """
 
     rmse: float
@@ -39,11 +44,14 @@ class Scores:
     max_abs: float
 
     @classmethod
-    def of(cls, y: FloatArray, yhat: FloatArray) -> Scores:
-        """Scores of `yhat` against `y`, both of shape (N,)."""
-        error, spread = np.linalg.norm(y - yhat), np.linalg.norm(y - y.mean())
+    def of(cls, y: FloatArray, yhat: FloatArray, weights: FloatArray | None = None) -> Scores:
+        """Scores of `yhat` against `y`, both of shape (N,), as the weights, which are not all 0."""
+        root = 1.0 if weights is None else np.sqrt(weights)
+        total = len(y) if weights is None else weights.sum()
+        mean = y.mean() if weights is None else (weights * y).sum() / total
+        error, spread = np.linalg.norm(root * (y - yhat)), np.linalg.norm(root * (y - mean))
         fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else math.nan
-        return cls(float(error / math.sqrt(len(y))), float(fit), float(np.abs(y - yhat).max()))
+        return cls(float(error / math.sqrt(total)), float(fit), float(np.abs(y - yhat).max()))
 
     def to_json(self) -> dict[str, float | None]:
         """As JSON values: None where a score is undefined."""
@@ -61,6 +69,8 @@ class ExperimentErrors:
     y, simulated, one_step : array, shape (N,)
         What is scored against, the free run and the one-step prediction [output unit]. NaN in y
         is not scored.
+    weights : array, shape (N,), or None
+        How much each sample counts; None: all alike.
     """
 
     name: str
@@ -69,6 +79,7 @@ class ExperimentErrors:
     y: FloatArray
     simulated: FloatArray
     one_step: FloatArray
+    weights: FloatArray | None = None
 
     @property
     def error(self) -> FloatArray:
@@ -92,18 +103,25 @@ class ExperimentErrors:
 
     def scored(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """y, free run and one-step prediction at the samples that are scored."""
-        known = np.flatnonzero(~np.isnan(self.y[self.init :])) + self.init
+        known = self._known()
         return self.y[known], self.simulated[known], self.one_step[known]
+
+    def scored_weights(self) -> FloatArray | None:
+        """Weights of the samples that are scored; None where all count alike."""
+        return None if self.weights is None else self.weights[self._known()]
+
+    def _known(self) -> NDArray[np.intp]:
+        return np.flatnonzero(~np.isnan(self.y[self.init :])) + self.init
 
     @property
     def simulation_scores(self) -> Scores:
         y, simulated, _ = self.scored()
-        return Scores.of(y, simulated)
+        return Scores.of(y, simulated, self.scored_weights())
 
     @property
     def one_step_scores(self) -> Scores:
         y, _, one_step = self.scored()
-        return Scores.of(y, one_step)
+        return Scores.of(y, one_step, self.scored_weights())
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,6 +286,8 @@ def validate(
     model : Model
     data : Dataset
         Complete inputs. Samples whose output is NaN are not scored, and counted in `unmeasured`.
+        With weights, errors and fits are weighted (`Scores`), and a sample of weight 0 counts as
+        not measured; the measurement noise does not look at them.
     init : int
         The first `init` measured outputs of each experiment set the initial state; what comes up
         to the last of them is not scored. 0 starts from rest and scores every sample.
@@ -285,6 +305,7 @@ def validate(
     require_dataset(data, "data")
     require_init(init)
     data.require_measured()
+    given, data = data, in_effect(data)
     for e in data.experiments:
         if len(e) - e.unmeasured <= init:
             raise DataError(
@@ -293,6 +314,7 @@ def validate(
                 "longer range"
             )
     series = zip(
+        given.experiments,
         data.experiments,
         model.simulate(data, init=init),
         model.predict(data, init=init),
@@ -302,19 +324,22 @@ def validate(
         ExperimentErrors(
             e.name,
             e.range_text,
-            e.initial_samples(init),
-            _target(e, against, init),
+            first := e.initial_samples(init),
+            _target(whole, against, first),
             simulated,
             one_step,
+            e.weights,
         )
-        for e, simulated, one_step in series
+        for whole, e, simulated, one_step in series
     )
     y, simulated, one_step = (
         np.concatenate(c) for c in zip(*(e.scored() for e in found), strict=True)
     )
+    all_alike = all(e.weights is None for e in found)
+    weights = None if all_alike else np.concatenate([e.scored_weights() for e in found])
     return Validation(
-        Scores.of(y, simulated),
-        Scores.of(y, one_step),
+        Scores.of(y, simulated, weights),
+        Scores.of(y, one_step, weights),
         found,
         len(y),
         init,
@@ -325,9 +350,10 @@ def validate(
     )
 
 
-def _target(experiment: Experiment, against: str | None, init: int) -> FloatArray:
+def _target(experiment: Experiment, against: str | None, first: int) -> FloatArray:
+    """What is scored against, NaN where it has no weight."""
     if against is None:
-        return experiment.y
+        return without_weightless(experiment).y
     if against not in experiment.channels:
         raise DataError(
             f"{experiment.name}: no channel {against!r}; available: "
@@ -339,7 +365,9 @@ def _target(experiment: Experiment, against: str | None, init: int) -> FloatArra
             "taken off the output: compare it with data.restore(model.simulate(data))"
         )
     target = experiment.channels[against]
-    if np.isnan(target[experiment.initial_samples(init) :]).all():
+    if experiment.weights is not None:
+        target = np.where(experiment.weights == 0.0, np.nan, target)
+    if np.isnan(target[first:]).all():
         raise DataError(f"{experiment.name}: channel {against!r} is NaN at every scored sample")
     return target
 

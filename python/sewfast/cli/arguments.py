@@ -64,6 +64,14 @@ def add_columns(parser: argparse.ArgumentParser, *, from_model: bool) -> None:
     )
 
 
+def add_weights(parser: argparse.ArgumentParser) -> None:
+    """How much each sample counts, for the commands that look at it."""
+    parser.add_argument(
+        "--weights", metavar="COL",
+        help="column of weights: how much the squared error of each sample counts, 0 not at all",
+    )  # fmt: skip
+
+
 def add_view(parser: argparse._ActionsContainer) -> None:
     """How a running record or run is watched: `args.live` is a `sewfast.live.Kind`."""
     parser.add_argument(

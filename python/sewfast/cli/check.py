@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .arguments import Commands, add_columns, add_command, add_split
+from .arguments import Commands, add_columns, add_command, add_split, add_weights
 from .data import read_for_model
 from .models import whole
 from .output import print_json
@@ -49,6 +49,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument("--plot", metavar="DIR", type=Path, help="folder for a PNG per question")
     add_columns(parser, from_model=True)
+    add_weights(parser)
     add_split(parser)
     add_preparation(parser)
 

@@ -43,6 +43,7 @@ def _read_named(source: str, args: argparse.Namespace) -> Dataset:
             counts=counts,
             counts_per_rev=args.counts_per_rev,
             channels=_references(table, (*inputs, output, counts)),
+            weights=getattr(args, "weights", None),
         )
     )
 
@@ -96,6 +97,7 @@ def read_for_model(
     columns |= _recorded_columns(table, columns, args, chosen=output or args.output)
     if not needs_output and not _has_output(table, columns):
         columns |= {"output": None, "counts": None, "counts_per_rev": None}
+    columns["weights"] = getattr(args, "weights", None)
     return _with_notes(read(table, Ts=_sample_time(args.ts, table, model), **columns)), table
 
 

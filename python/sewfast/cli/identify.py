@@ -15,6 +15,7 @@ from .arguments import (
     add_command,
     add_output,
     add_split,
+    add_weights,
     require_place,
 )
 from .data import read_training, split
@@ -80,6 +81,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument("data", nargs="+", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
     add_columns(parser, from_model=False)
+    add_weights(parser)
     add_split(parser)
     add_preparation(parser)
     _add_model(parser)

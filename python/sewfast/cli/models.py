@@ -12,6 +12,7 @@ from .arguments import (
     add_command,
     add_output,
     add_split,
+    add_weights,
     require_place,
 )
 from .data import read_for_model
@@ -80,6 +81,7 @@ def _add_model_and_data(parser: argparse.ArgumentParser) -> None:
         help="first samples, which set the initial state and are not scored (20); 0: from rest",
     )  # fmt: skip
     add_columns(parser, from_model=True)
+    add_weights(parser)
 
 
 def whole(text: str) -> int:

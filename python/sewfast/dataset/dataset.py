@@ -14,6 +14,7 @@ from . import checks, derivative, gaps, outliers, pieces, rates, summary, trends
 from .arrays import range_of, texts
 from .experiment import Experiment
 from .units import labelled
+from .weights import require_some_weight
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -92,6 +93,7 @@ class Dataset:
         output_unit: str = "",
         name: str = "array",
         channels: Mapping[str, ArrayLike] | None = None,
+        weights: ArrayLike | None = None,
     ) -> Dataset:
         """One experiment from arrays, which are copied.
 
@@ -102,6 +104,10 @@ class Dataset:
             None where nothing was measured: enough to simulate from rest.
         Ts : float
             Sample time [s].
+        weights : array_like, shape (N,), or None
+            How much the squared error of each sample counts: finite, 0 or more, not all 0. What is
+            trusted less gets less, what is not to count 0; only their ratios matter. None: all
+            alike.
 
         Raises
         ------
@@ -109,7 +115,9 @@ class Dataset:
             As for `Experiment` and `Dataset`.
         """
         y = np.full(np.shape(u)[:1], np.nan) if y is None else y
-        experiment = Experiment(u, y, channels or {}, name)  # type: ignore[arg-type]
+        experiment = Experiment(u, y, channels or {}, name, weights=weights)  # type: ignore[arg-type]
+        if weights is not None:
+            require_some_weight(experiment)
         width = experiment.u.shape[1]
         default = ("u",) if width == 1 else tuple(f"u{i + 1}" for i in range(width))
         return cls(
@@ -215,6 +223,8 @@ class Dataset:
         lines.append(
             f"  output  {labelled(self.output_name, self.output_unit)}: {low:g} to {high:g}"
         )
-        lines += [f"  {e.name} [{e.range_text}]" for e in self.experiments]
+        for e in self.experiments:
+            weighted = "" if e.weights is None else ", weighted"
+            lines.append(f"  {e.name} [{e.range_text}]{weighted}")
         lines += [f"  note    {note}" for note in self.notes]
         return "\n".join(lines)

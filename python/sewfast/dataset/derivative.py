@@ -15,6 +15,7 @@ from .checks import require_sane
 from .gaps import interpolated
 from .noise import quantum, white_noise
 from .trends import Trend
+from .weights import without_weightless
 
 if TYPE_CHECKING:
     from ..speed import Method
@@ -52,9 +53,9 @@ def differentiate(data: Dataset, *, method: Method = "kalman") -> Dataset:
     Returns
     -------
     Dataset
-        NaN where the output was not measured. Up to 5 missing samples are bridged by a straight
-        line for the smoother; longer gaps part the record, and pieces shorter than the method needs
-        (5, 41 or 2 samples) become NaN.
+        NaN where the output was not measured, or has weight 0. Up to 5 missing samples are bridged
+        by a straight line for the smoother; longer gaps part the record, and pieces shorter than
+        the method needs (5, 41 or 2 samples) become NaN.
 
     Raises
     ------
@@ -110,6 +111,7 @@ def rate_unit(unit: str) -> str:
 
 
 def _differentiated(e: Experiment, data: Dataset, method: Method) -> Experiment:
+    e = without_weightless(e)
     known = np.isfinite(e.y)
     bridged = known.copy()
     for first, count in runs(~known):

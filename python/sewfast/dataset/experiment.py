@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import DataError
 from .arrays import FloatArray, as_column, as_inputs
+from .weights import as_weights
 
 if TYPE_CHECKING:
     from .trends import Trend
@@ -35,6 +36,12 @@ class Experiment:
         Index of its first sample in the recording that it was cut from.
     removed : Trend or None
         What `Dataset.detrend` has taken off; `Dataset.restore` puts it back on.
+    weights : array, shape (N,), or None
+        How much the squared error of each sample counts in `identify` and `validate`: finite, 0 or
+        more, not all 0. A sample of weight 0 counts as not measured wherever a model is fitted,
+        scored or checked, or starts from. None: all alike. Statistics, pictures and preparation do
+        not look at weights; only `resample` and `differentiate`, which mix neighbours, leave what
+        has weight 0 out.
 
     Raises
     ------
@@ -48,6 +55,7 @@ class Experiment:
     name: str = "array"
     start: int = 0
     removed: Trend | None = None
+    weights: FloatArray | None = None
 
     def __post_init__(self) -> None:
         y = as_column(self.y, "y")
@@ -57,6 +65,8 @@ class Experiment:
         object.__setattr__(self, "y", y)
         object.__setattr__(self, "u", as_inputs(self.u, len(y)))
         object.__setattr__(self, "channels", MappingProxyType(channels))
+        if self.weights is not None:
+            object.__setattr__(self, "weights", as_weights(self.weights, len(y)))
 
     def __len__(self) -> int:
         return len(self.y)
@@ -67,7 +77,7 @@ class Experiment:
     def __reduce__(self) -> tuple[Any, ...]:
         # a mappingproxy cannot be pickled
         values = (self.u, self.y, dict(self.channels), self.name, self.start, self.removed)
-        return Experiment, values
+        return Experiment, (*values, self.weights)
 
     @property
     def range_text(self) -> str:
@@ -137,4 +147,5 @@ class Experiment:
             self.name,
             self.start + start,
             self.removed,
+            None if self.weights is None else self.weights[start:stop],
         )

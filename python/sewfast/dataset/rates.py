@@ -14,6 +14,7 @@ from .arrays import FloatArray, frozen
 from .checks import require_sane
 from .gaps import interpolated
 from .trends import Trend
+from .weights import without_weightless
 
 if TYPE_CHECKING:
     from .dataset import Dataset
@@ -56,7 +57,8 @@ def resample(
     -------
     Dataset
         A new output is NaN where at most half of the old ones around it were measured; a new input
-        wherever a part of its period is unknown.
+        wherever a part of its period is unknown. An old output of weight 0 counts as not measured;
+        a new weight is the mean of the old ones around it.
 
     Raises
     ------
@@ -125,6 +127,7 @@ def _resampled(e: Experiment, ratio: float, inputs: str, antialias: bool) -> Exp
     def held(column: FloatArray) -> FloatArray:
         return _period_means(column, ratio, count)
 
+    e = without_weightless(e)
     u = np.column_stack([held(c) if inputs == "held" else output(c) for c in e.u.T])
     start = round(e.start / ratio)
     return replace(
@@ -134,6 +137,7 @@ def _resampled(e: Experiment, ratio: float, inputs: str, antialias: bool) -> Exp
         channels={name: output(c) for name, c in e.channels.items()},
         start=start,
         removed=_rescaled(e, ratio, start, inputs),
+        weights=None if e.weights is None else frozen(_around(e.weights, ratio, count)),
     )
 
 
@@ -178,18 +182,19 @@ def _at_times(column: FloatArray, ratio: float, count: int, antialias: bool) -> 
         values = _low_passed(filled, times, max(1.0, ratio))
     else:
         values = np.interp(times, np.arange(len(column)), filled)
-    return np.where(_measured_share(known, times, ratio) > 0.5, values, np.nan)
+    return np.where(_around(known, ratio, count) > 0.5, values, np.nan)
 
 
-def _measured_share(known: NDArray[np.bool_], times: FloatArray, ratio: float) -> FloatArray:
-    """Part of the old samples around each new one that were measured."""
+def _around(values: FloatArray | NDArray[np.bool_], ratio: float, count: int) -> FloatArray:
+    """Mean of the old samples' values around each new one."""
+    last = len(values) - 1
+    times = np.minimum(np.arange(count) * ratio, float(last))
     low = np.minimum(np.floor(times), np.ceil(times - 0.5 * ratio))
     high = np.maximum(np.ceil(times), np.floor(times + 0.5 * ratio))
-    low = np.clip(low, 0, len(known) - 1).astype(np.int64)
-    high = np.clip(high, 0, len(known) - 1).astype(np.int64)
-    total = np.concatenate([[0], np.cumsum(known)])
-    share: FloatArray = (total[high + 1] - total[low]) / (high + 1.0 - low)
-    return share
+    low, high = (np.clip(edge, 0, last).astype(np.int64) for edge in (low, high))
+    total = np.concatenate([[0], np.cumsum(values)])
+    mean: FloatArray = (total[high + 1] - total[low]) / (high + 1.0 - low)
+    return np.maximum(mean, 0.0)
 
 
 def _low_passed(column: FloatArray, times: FloatArray, scale: float) -> FloatArray:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..dataset import Dataset, require_dataset
+from ..dataset.weights import in_effect
 from ..errors import FitError, SewfastError
 from ..models.base import INIT, Model
 from ..validation import Scores, noise_of
@@ -47,7 +48,8 @@ def check(
     ----------
     model : Model
     data : Dataset
-        Best not the training data. Outputs after the first `init` samples may be NaN.
+        Best not the training data. Outputs after the first `init` samples may be NaN; those of
+        weight 0 count as such, other weights are not looked at.
     training : Dataset or None
         What the model was identified from: adds information criteria and the comparison of errors,
         and replaces what `identify` stored with the model (bands, region).
@@ -68,8 +70,11 @@ def check(
         Where the model runs away on these inputs.
     """
     require_dataset(data, "data")
+    weighed = in_effect(data)
     if training is not None:
         require_dataset(training, "training")
+        training = weighed if training is data else in_effect(training)
+    data = weighed
     free = Residuals.of(model, data, init, "free run")
     tested = free if model.kind != "arx" or _has_gaps(data) else Residuals.of(model, data, init)
     scores = horizon_scores(model, data, free)

@@ -15,13 +15,14 @@ import numpy as np
 
 from .. import _core
 from ..dataset import Dataset
+from ..dataset.weights import mean_square, weights_of
 from ..errors import FitError, Interrupted
 from ..models import Ensemble, LinearOE, Model, NeuralOE, NeuralSS
 from .effort import Look, Pool, Stopped
 from .folds import LEAST_HELD_OUT, SHARE, Split, compared, errors_of, folds, free_runs
 from .linear import linear_model
 from .orders import LinearCandidate, LinearTable
-from .search import Candidate, Search, counting, median_of
+from .search import Candidate, Search, counting, decayed, median_of
 from .task import Provenance, Task, arrays, documented, finite, with_provenance, wrap
 from .training import Network, Request, Start, Structure, train
 from .verdict import verdict
@@ -37,6 +38,9 @@ LEAST_PASSING = 0.5
 VERIFIED = 4
 """Structures that are learned again on the earlier fold."""
 FINALISTS = 3
+RELEASED = 0.01
+"""Weight decay makes the search surer, and biases what it finds: one finalist is trained with this
+part of it as well, and what is held out decides."""
 WITHIN, WITHIN_LARGE = 2.0, 1.3
 """How much larger than the best one's a finalist's error may be."""
 WORTH_AN_INTEGRATOR = 0.7
@@ -99,6 +103,7 @@ class Choice:
     search: Search
     began: float
     reasons: list[str] = field(default_factory=list)
+    is_linear: bool = False
 
     def __post_init__(self) -> None:
         self.task = self.search.task
@@ -121,6 +126,7 @@ class Choice:
                 break
         if self.wants_network:
             return self._network(self._any_network(), [])
+        self.is_linear = True
         return self._linear()
 
     # --- against the linear model ---------------------------------------------------------------
@@ -234,6 +240,9 @@ class Choice:
             plain = next((c for c in ranked if not c.structure.integrator), None)
             if plain is not None:
                 found[FINALISTS - 1 :] = [plain]
+        if self.search.is_released and not first.structure.integrator:
+            released = replace(first, structure=decayed(first.structure, RELEASED))
+            found[FINALISTS - 1 :] = [released]
         return found
 
     def _finish(self, finalists: Sequence[Candidate]) -> list[Candidate]:
@@ -556,7 +565,7 @@ class Choice:
         """What there is when Ctrl-C comes: the best candidate, else the linear model."""
         best, linear = self.search.best, self.linear
         bound = math.inf if linear is None else linear.rmse
-        if best is not None and best.error < WORTH_IT * bound:
+        if best is not None and best.error < WORTH_IT * bound and not self.is_linear:
             self.reasons = ["interrupted: the best candidate so far"]
             self._refitted = lambda c, most: c.models[:most]  # type: ignore[method-assign]
             model = self._network([best], [])
@@ -583,5 +592,6 @@ def _without_held_out(task: Task, began: float, wants_network: bool) -> Model:
 def cost_of(model: Model, data: Dataset) -> float:
     """J of the free run, in the output's unit squared."""
     runs = zip(model.simulate(data), data.experiments, strict=True)
-    errors = np.concatenate([e.y - run for run, e in runs])
-    return float(np.nanmean(errors**2) / 2.0)
+    pairs = [((e.y - run) ** 2, weights_of(e)) for run, e in runs]
+    squares, weights = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    return mean_square(squares, weights) / 2.0

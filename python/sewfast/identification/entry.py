@@ -8,6 +8,7 @@ from typing import Literal, TypeAlias
 
 from ..dataset import Dataset, require_dataset
 from ..dataset.checks import LARGEST_FITTED, require_fittable, require_sane
+from ..dataset.weights import in_effect
 from ..errors import DataError, FitError, Interrupted, SettingError
 from ..evidence import remembered
 from ..models import Model
@@ -78,6 +79,10 @@ def identify(
     ----------
     data : Dataset
         Training data: inputs complete; outputs that are NaN were not measured and have no weight.
+        With weights, the costs that are minimised and the errors on what is held out are weighted
+        (a sample of weight 0 counts as not measured); starts, scalings, output functions, the
+        guard and the evidence that is kept with the model do not look at them. `iv` takes no
+        weights between 0 and the largest.
     model : {"auto", "arx", "iv", "oe", "neural_oe", "neural_ss"} or Model
         `arx`: least squares of the one-step error. `iv`: refined instrumental variables, which
         measurement noise does not bias. `oe`: linear output error. `neural_oe`: the
@@ -170,8 +175,8 @@ def identify(
         raise SettingError(f"select: expected True or False, received {select!r}")
     clock = Clock(time_budget)
     task = Task(
-        data=data,
-        validation=validation,
+        data=_in_effect(data, "data"),
+        validation=None if validation is None else _in_effect(validation, "validation"),
         na=_LAGS if na is None else na,
         nb=_LAGS if nb is None else nb,
         nk=nk,
@@ -196,6 +201,11 @@ def identify(
         return remembered(found, _excerpt(found, task))
     except KeyboardInterrupt:
         raise Interrupted(found) from None
+
+
+def _in_effect(data: Dataset, what: str) -> Dataset:
+    require_dataset(data, what)
+    return in_effect(data)
 
 
 def _within_budget(identified: Callable[[Task], Model], task: Task) -> Model:
@@ -300,7 +310,6 @@ def _require_meaning(
 
 
 def _require_data(task: Task, kind: str) -> None:
-    require_dataset(task.data, "data")
     task.data.require_measured()
     task.data.require_excited()
     require_fittable(task.data)
@@ -308,7 +317,6 @@ def _require_data(task: Task, kind: str) -> None:
     if kind == "paper" and task.data.n_inputs != 1:
         raise DataError(f"preset 'paper' has one input, the data have {task.data.n_inputs}")
     if task.validation is not None:
-        require_dataset(task.validation, "validation")
         task.validation.require_measured()
         require_sane(task.validation, LARGEST_FITTED)
         Dataset.concat([task.data, task.validation])

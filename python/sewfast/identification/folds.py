@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..dataset import Dataset, Experiment, FloatArray
+from ..dataset.weights import mean_square, weights_of
 from ..errors import DataError, FitError
 from ..models.base import INIT, Core
 from .task import Provenance, sources
@@ -60,8 +62,10 @@ class Split:
         fitted = np.concatenate([e.y for e in self.fitted.experiments])
         low, high = np.nanquantile(fitted, [0.005, 0.995])
         mean = float(np.nanmean(np.clip(fitted, low, high)))
-        parts = [e.y[e.initial_samples(INIT) :] for e in self.held.experiments]
-        return float(np.sqrt(np.nanmean((np.concatenate(parts) - mean) ** 2)))
+        scored = [(e, e.initial_samples(INIT)) for e in self.held.experiments]
+        squares = np.concatenate([(e.y[first:] - mean) ** 2 for e, first in scored])
+        weights = np.concatenate([weights_of(e)[first:] for e, first in scored])
+        return math.sqrt(mean_square(squares, weights))
 
     def shortened(self, fitted: int, held: int) -> Split:
         """About so many samples, of every experiment its proportional part."""
@@ -72,6 +76,7 @@ def split(data: Dataset, skipped: float = 0.0) -> Split | None:
     """Hold out the end of every experiment that is long enough; None where none is.
 
     A short one is learned from as a whole: it must not keep the others from being compared on.
+    Where all are short, the last ones are held out as they are.
 
     Parameters
     ----------
@@ -96,10 +101,21 @@ def split(data: Dataset, skipped: float = 0.0) -> Split | None:
         held.append(_with_run_up(e, at, stop))
         parts.append(e.cut(at, stop))
     if not held:
+        fitted, held = _whole(data, skipped)
+        parts = held
+    if not held:
         return None
     pieces = (replace(data, experiments=tuple(p)) for p in (fitted, held, parts))
     fitted_data, held_data, scored = pieces
     return Split(fitted_data, held_data, sources=tuple(sources(scored)))
+
+
+def _whole(data: Dataset, skipped: float) -> tuple[list[Experiment], list[Experiment]]:
+    """Of many short experiments those before the last fifth, and that fifth."""
+    able = [e for e in data.experiments if _measured(e.y) >= LEAST_HELD_OUT]
+    stop = round((1.0 - skipped) * len(able))
+    at = stop - round(SHARE * len(able))
+    return able[:at], able[at:stop] if at > 0 else []
 
 
 def folds(data: Dataset, validation: Dataset | None = None) -> tuple[Split, ...]:
@@ -131,7 +147,8 @@ def _with_run_up(e: Experiment, at: int, stop: int) -> Experiment:
     begin = max(0, at - RUN_UP)
     y = e.y[begin:stop].copy()
     y[e.cut(begin, stop).initial_samples(INIT) : at - begin] = np.nan
-    return Experiment(e.u[begin:stop], y, {}, e.name, e.start + begin)
+    weights = None if e.weights is None else e.weights[begin:stop]
+    return Experiment(e.u[begin:stop], y, {}, e.name, e.start + begin, weights=weights)
 
 
 def _shortened(data: Dataset, samples: int) -> Dataset:
@@ -175,9 +192,9 @@ class Errors:
     Attributes
     ----------
     squares : array, shape (B,)
-        Sum of squared errors of each block.
+        Sum of squared errors of each block, each times its weight.
     counts : array, shape (B,)
-        Known outputs in it.
+        Sum of the weights of the known outputs in it: their number where all count alike.
     """
 
     squares: FloatArray
@@ -202,11 +219,12 @@ def errors_of(runs: Sequence[FloatArray] | None, held: Split) -> Errors:
     parts = max(2, round(ERROR_BLOCKS / len(experiments)))
     squares, counts = [], []
     for run, e in zip(runs, experiments, strict=True):
-        error = (e.y - run)[e.initial_samples(INIT) :]
-        known = np.flatnonzero(np.isfinite(error))
-        for block in np.array_split(error[known], parts):
-            squares.append(float(block @ block))
-            counts.append(float(len(block)))
+        error = e.y - run
+        error[: e.initial_samples(INIT)] = np.nan
+        known, weights = np.flatnonzero(np.isfinite(error)), weights_of(e)
+        for block in np.array_split(known, parts):
+            squares.append(float((weights[block] * error[block]) @ error[block]))
+            counts.append(float(weights[block].sum()))
     return Errors(np.array(squares), np.array(counts))
 
 

@@ -8,6 +8,7 @@ import time
 import numpy as np
 
 from .. import _core
+from ..dataset.weights import mean_square, weights_of
 from ..errors import Interrupted
 from ..models import ARX, IV, LinearOE, Model
 from ..models.base import INIT
@@ -20,9 +21,10 @@ def arx(task: Task) -> Model:
     core = _core.fit_arx(arrays(task.data), **task.orders, offset=True)
     provenance = {"cost_horizon": "one step", "initial_state": "measured", "termination": "solved"}
     model = documented(wrap(ARX, core, task.data), task, began, provenance)
-    pairs = zip(arrays(task.data), model.predict(task.data), strict=True)
-    one_step = np.concatenate([(y - yhat)[INIT:] for (_, y), yhat in pairs])
-    cost = float(np.nanmean(one_step**2) / 2)
+    pairs = list(zip(task.data.experiments, model.predict(task.data), strict=True))
+    squares = np.concatenate([(e.y - yhat)[INIT:] ** 2 for e, yhat in pairs])
+    weights = np.concatenate([weights_of(e)[INIT:] for e, _ in pairs])
+    cost = mean_square(squares, weights) / 2
     return with_provenance(model, {"cost": cost, "cost_unit": "output unit squared"})
 
 

@@ -134,7 +134,7 @@ def rectified_start(
     """
     share = min(1.0, SIGN_SAMPLES / len(data))
     lengths = [max(2 * INIT, round(share * len(e))) for e in data.experiments]
-    pairs = [(e.u[:n], e.y[:n]) for e, n in zip(data.experiments, lengths, strict=True)]
+    pairs: Pairs = [(e.u[:n], e.y[:n]) for e, n in zip(data.experiments, lengths, strict=True)]
     guesses = [[_sign(_low_pass(u, memory)) for u, _ in pairs] for memory in MEMORIES]
     tried = [_restored(pairs, g, order, nk, FIRST_ROUNDS, look) for g in guesses]
     likely = sorted(tried, key=lambda t: t.error)[:2]
@@ -172,7 +172,7 @@ def _restored(
             break
         error = sum(
             float(np.nansum((np.abs(run) - np.abs(y)) ** 2))
-            for run, (_, y) in zip(runs, pairs, strict=True)
+            for run, (_, y, *_) in zip(runs, pairs, strict=True)
         )
         following = [_sign(run) for run in runs]
         if error < best.error:
@@ -216,7 +216,7 @@ def rms_error(
     samples are not counted.
     """
     squares = []
-    for u, y in pairs:
+    for u, y, *_ in pairs:
         try:
             states = [model.estimate_initial_state(u[:INIT], s * y[:INIT]) for s in (1.0, -1.0)]
             runs = [(y - seen(model.simulate(u, x)))[INIT:] for x in states]

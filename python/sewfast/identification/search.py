@@ -38,7 +38,7 @@ SAMPLES_PER_PARAMETER = 4
 MOST_NX, MOST_HIDDEN, MOST_HIDDEN_SMALL = 8, 32, 16
 LEAST_DECAY, MOST_DECAY = 1e-10, 1e-1
 DECAY_MATTERS = 6_000
-"""Samples above which another weight decay hardly ever gains."""
+"""Samples from which on the climb does not ask for another weight decay; the end does."""
 HOPELESS = 0.98
 """Where the best network of the second halving is not below this part of the linear error."""
 WORTH_A_STEP = 0.97
@@ -159,7 +159,12 @@ class Search:
     @property
     def decay(self) -> float:
         """Weight decay to begin with."""
-        return 1e-4 if self.samples < 4_000 else 1e-5 if self.samples < 20_000 else 1e-7
+        return 1e-4 if self.samples < 4_000 else 1e-7 if self.is_large else 1e-5
+
+    @property
+    def is_released(self) -> bool:
+        """Whether a finalist is asked with less weight decay: the climb has not asked for it."""
+        return self.samples >= DECAY_MATTERS and not self.is_large
 
     # --- the steps ------------------------------------------------------------------------------
 
@@ -387,7 +392,7 @@ class Search:
                 moves.append(("fresh", replace(s, nx=s.nx + 1)))
         if self.samples < DECAY_MATTERS:
             step = 10.0 if self.is_small else 100.0
-            moves += [("decay", _decayed(s, f)) for f in (step, 1.0 / step)]
+            moves += [("decay", decayed(s, f)) for f in (step, 1.0 / step)]
         if is_first and task.nk is None and not s.integrator:
             later, at_once = replace(s, nk=s.nk + 1), replace(s, nk=0)
             moves += [("fresh", later)]
@@ -628,5 +633,6 @@ def _said(fault: str | None) -> str:
     return "not asked within the time budget" if fault is None else fault
 
 
-def _decayed(s: Structure, factor: float) -> Structure:
+def decayed(s: Structure, factor: float) -> Structure:
+    """The same with another weight decay."""
     return replace(s, decay=float(f"{s.decay * factor:.0e}"))

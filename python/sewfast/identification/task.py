@@ -16,7 +16,7 @@ from ..workers import Workers
 from .effort import Clock, Progress
 
 Provenance: TypeAlias = dict[str, Any]
-Pairs: TypeAlias = list[tuple[FloatArray, FloatArray]]
+Pairs: TypeAlias = list[tuple[FloatArray, ...]]
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class Task:
 
 
 def arrays(data: Dataset) -> Pairs:
-    """Inputs and output of each experiment."""
-    return [(e.u, e.y) for e in data.experiments]
+    """Inputs and output of each experiment, and its weights where it has some."""
+    return [(e.u, e.y) if e.weights is None else (e.u, e.y, e.weights) for e in data.experiments]
 
 
 def sources(data: Dataset) -> list[Provenance]:

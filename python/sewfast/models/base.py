@@ -21,6 +21,7 @@ from ..dataset import (
     require_dataset,
     require_same_units,
 )
+from ..dataset.weights import without_weightless
 from ..errors import DataError, SettingError, SewfastError
 from .choice import choice_lines, verdict_lines
 
@@ -326,8 +327,8 @@ class Model(ABC):
         Parameters
         ----------
         data : Dataset
-            Inputs are complete. In the place of an output that was not measured (NaN) stands the
-            model's own prediction of it.
+            Inputs are complete. In the place of an output that was not measured (NaN, or of weight
+            0) stands the model's own prediction of it.
         horizon : int
             1 is one-step prediction.
         init : int
@@ -349,7 +350,7 @@ class Model(ABC):
         data.require_measured(0)
         return [
             self.core.predict(e.u, e.y, self.initial_state(e, init), horizon)
-            for e in data.experiments
+            for e in map(without_weightless, data.experiments)
         ]
 
     def validate(
@@ -384,6 +385,7 @@ class Model(ABC):
         if init == 0:
             rest: FloatArray = self.core.rest_state()
             return rest
+        experiment = without_weightless(experiment)
         first = experiment.initial_samples(init)
         state: FloatArray = self.core.estimate_initial_state(
             experiment.u[:first], experiment.y[:first]

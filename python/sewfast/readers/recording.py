@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..dataset import Dataset, Experiment, FloatArray
+from ..dataset.weights import as_weights, require_some_weight
 from ..errors import DataError, SettingError
 from .files import read_table
 from .table import Table
@@ -27,6 +28,7 @@ def read(
     time: str | None = None,
     channels: Sequence[str] = (),
     name: str | None = None,
+    weights: str | None = None,
 ) -> Dataset:
     """Read inputs and an output from one recording.
 
@@ -55,6 +57,10 @@ def read(
         Further columns to carry along.
     name : str or None
         Of the experiment, for messages; the file's name where None.
+    weights : str or None
+        Column of weights: how much the squared error of each sample counts (`Experiment.weights`).
+        Rows of weight 0 leave no trace in an `output` that is resampled; in a speed that is
+        computed from counts they do.
 
     Returns
     -------
@@ -86,14 +92,21 @@ def read(
     if slower and base.grid is not None:
         # at the recording's own pace first: what a slower one cannot show has to be filtered out
         wanted, base = base.Ts, time_base(table, base.grid.period, time)
+    weigh = None if weights is None else _weights(table, weights, names[0])
     if base.grid is not None:
         measured = (counts,) if counts else (output,) if output else ()
+        if weigh is not None:
+            if output and not counts:
+                table = _without_weightless(table, output, weigh)
+            # what lies in a gap was not measured and needs no weight
+            weigh = np.nan_to_num(base.grid.output(weigh))
         table = _on_grid(table, base.grid, names, (*measured, *channels))
     u = _side_by_side(table, names)
     y, label, unit, source = _output(table, output, counts, counts_per_rev, base.Ts, len(u))
     _require_length(table, label, y, names[0], len(u))
     extra = {c: table[c] for c in channels}
-    experiment = Experiment(u, y, extra, name or table.path.name)
+    experiment = Experiment(u, y, extra, name or table.path.name, weights=weigh)
+    require_some_weight(experiment)
     data = Dataset(
         (experiment,), base.Ts, names, label, tuple(table.unit(n) for n in names), unit, source,
         (*table.notes, *base.notes),
@@ -110,6 +123,20 @@ def _on_grid(table: Table, grid: Grid, inputs: Sequence[str], measured: Sequence
         _require_length(table, name, column, "time", grid.count)
         made[table.resolve(name)] = grid.held(column) if name in inputs else grid.output(column)
     return replace(table, columns={**table.columns, **made}, lines=None)
+
+
+def _weights(table: Table, name: str, other: str) -> FloatArray:
+    column = table[name]
+    _require_length(table, name, column, other, len(table[other]))
+    try:
+        return as_weights(column, len(column))
+    except DataError as e:
+        raise DataError(f"{table.path}: column {name!r}: {e}") from e
+
+
+def _without_weightless(table: Table, output: str, weights: FloatArray) -> Table:
+    column = np.where(weights == 0.0, np.nan, table[output])
+    return replace(table, columns={**table.columns, table.resolve(output): column}, lines=None)
 
 
 def _require_distinct(inputs: tuple[str, ...], output: str | None) -> None:

@@ -163,21 +163,23 @@ fn changes<'a>(mut values: impl Iterator<Item = &'a f64>, name: &str) -> Result<
 }
 
 fn usable(records: &[Record], lags: &Lags) -> usize {
-    let whole = |r: &Record| match r.unmeasured {
-        0 => r.len().saturating_sub(lags.first_whole()),
+    let whole = |r: &Record| match (r.unmeasured, r.weights) {
+        (0, None) => r.len().saturating_sub(lags.first_whole()),
         _ => whole_rows(r, lags).count(),
     };
     records.iter().map(whole).sum()
 }
 
-/// Samples whose regressor lies inside the record and which, like the outputs in it, were measured.
+/// Samples that count, whose regressor lies inside the record and which, like the outputs in it, were measured.
 fn whole_rows<'r>(record: &'r Record<'r>, lags: &Lags) -> impl Iterator<Item = usize> + 'r {
     let (na, complete) = (lags.na, record.unmeasured == 0);
     (lags.first_whole()..record.len())
         .filter(move |&k| complete || record.y[k - na..=k].iter().all(|y| !y.is_nan()))
+        .filter(|&k| record.weight(k) > 0.0)
 }
 
-/// Calls `each(row, y)` for every sample of a record with a whole regressor; a last column is 1.
+/// Calls `each(row, y)` for every sample of a record with a whole regressor; a last column is 1. Both are multiplied by
+/// the root of the sample's weight.
 fn each_row(record: &Record, lags: &Lags, columns: usize, mut each: impl FnMut(&[f64], f64)) {
     let mut row = vec![1.0; columns];
     for k in whole_rows(record, lags) {
@@ -185,7 +187,14 @@ fn each_row(record: &Record, lags: &Lags, columns: usize, mut each: impl FnMut(&
             *past = record.y[k - 1 - i];
         }
         lags.write_inputs(record.u, k, &mut row[lags.na..lags.regressors()]);
-        each(&row, record.y[k]);
+        let Some(weights) = record.weights else {
+            each(&row, record.y[k]);
+            continue;
+        };
+        let root = weights[k].sqrt();
+        row[lags.regressors()..].fill(1.0);
+        row.iter_mut().for_each(|value| *value *= root);
+        each(&row, root * record.y[k]);
     }
 }
 
@@ -358,6 +367,45 @@ mod tests {
         let record = Record::with_gaps(&u, 1, &every_other).unwrap();
         let message = fit(&[record], 2, 2, 1, true).unwrap_err().message;
         assert!(message.contains("output error"), "{message}");
+    }
+
+    #[test]
+    fn counts_rows_by_their_weights() {
+        let truth = LinearModel::new(vec![-1.5, 0.7], vec![0.5, 0.3], 1, 1, 0.4).unwrap();
+        let u = noise(400, 1);
+        let clean = truth.simulate(&u, 1, &[3.0, 1.0]).unwrap();
+        let mut y: Vec<f64> = clean
+            .iter()
+            .zip(noise(400, 5))
+            .map(|(y, n)| y + 0.1 * n)
+            .collect();
+        let record = Record::new(&u, 1, &y).unwrap();
+        let fitted = |weights: &[f64]| {
+            let records = [record.with_weights(weights).unwrap(), record];
+            fit(&records, 2, 2, 1, true).unwrap()
+        };
+        // twice a record is a record of weight 2, and nothing counts with weight 0
+        let once = fit(&[record; 2], 2, 2, 1, true).unwrap();
+        let twice = fit(&[record; 3], 2, 2, 1, true).unwrap();
+        assert_eq!(fitted(&[1.0; 400]).a(), once.a());
+        assert!(worst(fitted(&[2.0; 400]).a(), twice.a()) < 1e-12);
+        let half: Vec<f64> = (0..400).map(|k| if k < 200 { 0.0 } else { 1.0 }).collect();
+        let later = Record::new(&u[198..], 1, &y[198..]).unwrap();
+        let later = fit(&[later, record], 2, 2, 1, true).unwrap();
+        assert!(worst(fitted(&half).a(), later.a()) < 1e-12);
+        // also on the way through the triangle, for columns that are nearly dependent
+        let rows = |weights: &[f64]| {
+            let weighted = record.with_weights(weights).unwrap();
+            let lags = check(&[weighted], 2, 2, 1).unwrap();
+            by_qr(&[weighted], &lags, 5, usable(&[weighted], &lags)).unwrap()
+        };
+        let by_rows = fit(&[record.with_weights(&half).unwrap()], 2, 2, 1, true).unwrap();
+        assert!((rows(&half)[0] + by_rows.a()[0]).abs() < 1e-12);
+        y[..200].fill(1e6);
+        let spoilt = Record::new(&u, 1, &y).unwrap();
+        let small: Vec<f64> = (0..400).map(|k| if k < 202 { 0.0 } else { 1.0 }).collect();
+        let found = fit(&[spoilt.with_weights(&small).unwrap()], 2, 2, 1, true).unwrap();
+        assert!(worst(found.a(), truth.a()) < 0.1, "{:?}", found.a());
     }
 
     #[test]

@@ -9,6 +9,7 @@ pub struct Samples<'a> {
     u: &'a [f64],
     channels: usize,
     y: &'a [f64],
+    weights: Option<&'a [f64]>,
 }
 
 impl<'a> Samples<'a> {
@@ -25,7 +26,24 @@ impl<'a> Samples<'a> {
                 u.len()
             )));
         }
-        Ok(Self { u, channels, y })
+        Ok(Self {
+            u,
+            channels,
+            y,
+            weights: None,
+        })
+    }
+
+    /// The same with a weight for each sample; see [`Record::with_weights`].
+    ///
+    /// # Errors
+    /// As [`Record::with_weights`].
+    pub fn with_weights(self, weights: &'a [f64]) -> Result<Self> {
+        check_weights(weights, self.y)?;
+        Ok(Self {
+            weights: unless_one(weights),
+            ..self
+        })
     }
 
     /// The record, once its values have been found usable; outputs may be NaN where not measured.
@@ -33,7 +51,7 @@ impl<'a> Samples<'a> {
     /// # Errors
     /// As [`Record::with_gaps`], but for lengths.
     pub fn record(&self) -> Result<Record<'a>> {
-        let Self { u, channels, y } = *self;
+        let Self { u, channels, y, .. } = *self;
         if let Some(i) = first_not_finite(u) {
             return Err(Error::data(format!(
                 "expected finite values in u, got {} at sample {}; a simulation needs every input: cut the recording there, or fill what is missing",
@@ -55,8 +73,34 @@ impl<'a> Samples<'a> {
             channels: self.channels,
             y: self.y,
             unmeasured: 0,
+            weights: self.weights,
         }
     }
+}
+
+/// Refuses weights that are not one for each output, finite, 0 or more, and above 0 for a measured one.
+pub(crate) fn check_weights(weights: &[f64], y: &[f64]) -> Result<()> {
+    if weights.len() != y.len() {
+        return Err(Error::data(format!(
+            "expected {} weights, one for each sample, got {}; cut both to the same range",
+            y.len(),
+            weights.len()
+        )));
+    }
+    let sound = |w: &f64| *w >= 0.0 && w.is_finite();
+    if let Some(k) = weights.iter().position(|w| !sound(w)) {
+        return Err(Error::data(format!(
+            "expected finite weights of 0 or more, got {} at sample {k}; 0 leaves a sample out, 1 counts it in full",
+            weights[k]
+        )));
+    }
+    let counts = |(w, y): (&f64, &f64)| *w > 0.0 && !y.is_nan();
+    if !weights.iter().zip(y).any(counts) {
+        return Err(Error::data(
+            "expected a weight above 0 where the output was measured, got none; leave that experiment out",
+        ));
+    }
+    Ok(())
 }
 
 /// Number of outputs that are NaN, not all and none infinite.
@@ -124,6 +168,8 @@ pub struct Record<'a> {
     pub y: &'a [f64],
     /// Samples whose output was not measured.
     pub unmeasured: usize,
+    /// How much the squared error of each sample counts, finite and 0 or more; all alike where there are none.
+    pub weights: Option<&'a [f64]>,
 }
 
 impl<'a> Record<'a> {
@@ -148,6 +194,42 @@ impl<'a> Record<'a> {
     /// none was measured.
     pub fn with_gaps(u: &'a [f64], channels: usize, y: &'a [f64]) -> Result<Self> {
         Samples::new(u, channels, y)?.record()
+    }
+
+    /// The same record with a weight for each sample: costs are `sum w e^2 / (2 sum w)`. What is no sum of squared errors
+    /// (scaling, starts, estimated states) does not look at them.
+    ///
+    /// # Errors
+    /// `ErrorKind::Data` for another number of weights, weights that are negative or not finite, or 0 at every measured
+    /// output.
+    pub fn with_weights(self, weights: &'a [f64]) -> Result<Self> {
+        check_weights(weights, self.y)?;
+        Ok(Self {
+            weights: unless_one(weights),
+            ..self
+        })
+    }
+
+    /// The weight of sample `k`.
+    pub fn weight(&self, k: usize) -> f64 {
+        self.weights.map_or(1.0, |weights| weights[k])
+    }
+
+    /// Sum of the weights of the samples whose output was measured.
+    pub fn total_weight(&self) -> f64 {
+        match self.weights {
+            None => self.measured() as f64,
+            Some(weights) => total_weight(weights, self.y),
+        }
+    }
+
+    /// Number of samples that count: measured, and of a weight above 0.
+    pub fn counting(&self) -> usize {
+        let counts = |k: &usize| !self.y[*k].is_nan() && self.weight(*k) > 0.0;
+        match self.weights {
+            None => self.measured(),
+            Some(_) => (0..self.len()).filter(counts).count(),
+        }
     }
 
     /// Number of samples whose output was measured.
@@ -175,6 +257,26 @@ impl<'a> Record<'a> {
         let k = k.max(0) as usize;
         &self.u[k * self.channels..(k + 1) * self.channels]
     }
+}
+
+/// Weights that are all 1 are none, so that nothing is computed otherwise than without.
+pub(crate) fn unless_one(weights: &[f64]) -> Option<&[f64]> {
+    weights.iter().any(|w| *w != 1.0).then_some(weights)
+}
+
+/// Sum of the weights of the outputs that were measured.
+pub(crate) fn total_weight(weights: &[f64], y: &[f64]) -> f64 {
+    let measured = weights.iter().zip(y).filter(|(_, y)| !y.is_nan());
+    measured.map(|(w, _)| w).sum()
+}
+
+/// Sum of squared errors, each times its weight, over the outputs that were measured.
+pub(crate) fn weighted_squares(weights: &[f64], y: &[f64], run: &[f64]) -> f64 {
+    let measured = weights.iter().zip(y.iter().zip(run));
+    let measured = measured.filter(|(_, (y, _))| !y.is_nan());
+    measured
+        .map(|(w, (y, run))| w * ((y - run) * (y - run)))
+        .sum()
 }
 
 /// Number of leading samples that hold `count` measured outputs; none where there are not as many.
@@ -214,6 +316,30 @@ mod tests {
         assert!(Record::with_gaps(&u, 1, &[nan; 4]).is_err());
         assert!(Record::with_gaps(&u, 1, &[1.0, f64::INFINITY, 0.0, 0.0]).is_err());
         assert!(Record::with_gaps(&[1.0, nan, 0.0, 0.0], 1, &y).is_err());
+    }
+
+    #[test]
+    fn takes_weights_and_refuses_those_that_are_none() {
+        let (nan, u) = (f64::NAN, [1.0, 2.0, 3.0, 4.0]);
+        let y = [nan, 5.0, 7.0, 6.0];
+        let record = Record::with_gaps(&u, 1, &y).unwrap();
+        assert_eq!((record.total_weight(), record.counting()), (3.0, 3));
+        let weighted = record.with_weights(&[9.0, 0.5, 0.0, 2.0]).unwrap();
+        assert_eq!((weighted.total_weight(), weighted.counting()), (2.5, 2));
+        assert_eq!((weighted.weight(3), record.weight(3)), (2.0, 1.0));
+        let refused = |weights: &[f64]| record.with_weights(weights).unwrap_err().message;
+        assert!(refused(&[1.0; 3]).contains("expected 4 weights"));
+        assert!(refused(&[1.0, 1.0, -1.0, 1.0]).contains("-1 at sample 2"));
+        assert!(refused(&[1.0, nan, 1.0, 1.0]).contains("NaN at sample 1"));
+        assert!(refused(&[1.0, 1.0, 1.0, f64::INFINITY]).contains("sample 3"));
+        assert!(refused(&[1.0, 0.0, 0.0, 0.0]).contains("above 0"));
+        let samples = Samples::new(&u, 1, &y).unwrap();
+        assert!(samples.with_weights(&[0.0; 4]).is_err());
+        let record = samples.with_weights(&[1.0; 4]).unwrap().record().unwrap();
+        assert!(record.weights.is_none());
+        // a run that has left the numbers has no sum
+        assert_eq!(weighted_squares(&[2.0, 3.0], &[1.0, nan], &[3.0, 4.0]), 8.0);
+        assert!(weighted_squares(&[2.0, 3.0], &[1.0, 2.0], &[nan, 4.0]).is_nan());
     }
 
     #[test]

@@ -27,8 +27,9 @@ pub(crate) struct Gram {
     base: usize,
     rows: Vec<f64>,
     sums: Vec<f64>,
-    /// Rows of the block that take part in the recursion alone.
-    weightless: Vec<usize>,
+    /// Rows of the block that do not count in full, and what they are multiplied by before they are summed: the root of
+    /// their weight, 0 where they take part in the recursion alone.
+    reduced: Vec<(usize, f64)>,
 }
 
 impl Gram {
@@ -55,7 +56,7 @@ impl Gram {
                 .min(LANES),
             rows,
             sums: vec![0.0; width * width],
-            weightless: Vec::with_capacity(block),
+            reduced: Vec::with_capacity(block),
         }
     }
 
@@ -64,7 +65,7 @@ impl Gram {
         self.filled = 0;
         self.rows.fill(0.0);
         self.sums.fill(0.0);
-        self.weightless.clear();
+        self.reduced.clear();
     }
 
     /// Numbers from one row to the next: the columns, and some more.
@@ -80,8 +81,14 @@ impl Gram {
 
     /// Appends a row: `write` fills it (it comes with old values), then `sum_m gains[m] row(-1-m)` is added to it and
     /// its column `last` is set to `value`, outside the recursion. A row whose `value` is NaN is part of the recursion
-    /// and not of the sum: a sample that was not measured.
-    pub fn push(&mut self, gains: &[f64], last: usize, value: f64, write: impl FnOnce(&mut [f64])) {
+    /// and not of the sum: a sample that was not measured. In the sum a row counts by its `weight`.
+    pub fn push(
+        &mut self,
+        gains: &[f64],
+        last: usize,
+        (value, weight): (f64, f64),
+        write: impl FnOnce(&mut [f64]),
+    ) {
         let (past, row) = self.place();
         write(row);
         for (gain, old) in gains.iter().zip(past.rchunks_exact(row.len())) {
@@ -90,7 +97,7 @@ impl Gram {
             }
         }
         row[last] = value;
-        self.keep_weighed(value);
+        self.keep_weighed(value, weight);
     }
 
     /// The rows before the next one, the oldest first, and room for it, which comes with old values.
@@ -107,9 +114,11 @@ impl Gram {
     /// Appends the row that was written into [`Gram::place`]. Where `value` is NaN it is part of the recursion alone: a
     /// sample that was not measured.
     #[inline(always)]
-    pub fn keep_weighed(&mut self, value: f64) {
+    pub fn keep_weighed(&mut self, value: f64, weight: f64) {
         if value.is_nan() {
-            self.weightless.push(self.filled);
+            self.reduced.push((self.filled, 0.0));
+        } else if weight != 1.0 {
+            self.reduced.push((self.filled, weight.sqrt()));
         }
         self.filled += 1;
         if self.filled == self.block {
@@ -127,11 +136,16 @@ impl Gram {
         &mut self.rows[start..start + (self.memory + count) * self.width]
     }
 
-    /// Appends the rows that were written into [`Gram::ahead`]. Those whose value is NaN are part of the recursion alone.
-    pub fn keep_all(&mut self, values: &[f64]) {
+    /// Appends the rows that were written into [`Gram::ahead`]. Those whose value is NaN are part of the recursion alone,
+    /// the others count by their weights, in full where there are none.
+    pub fn keep_all(&mut self, values: &[f64], weights: &[f64]) {
+        let measured = values.iter().zip(weights).enumerate();
+        let measured = measured.filter(|(_, (v, _))| !v.is_nan());
+        self.reduced
+            .extend(measured.map(|(i, (_, w))| (self.filled + i, w.sqrt())));
         let unmeasured = values.iter().enumerate().filter(|(_, v)| v.is_nan());
-        self.weightless
-            .extend(unmeasured.map(|(i, _)| self.filled + i));
+        self.reduced
+            .extend(unmeasured.map(|(i, _)| (self.filled + i, 0.0)));
         self.filled += values.len();
     }
 
@@ -162,12 +176,17 @@ impl Gram {
         let width = self.width;
         let start = self.base + self.memory * width;
         let end = start + self.filled * width;
-        // The rows that the next block sees are saved before those without weight are emptied.
+        // The rows that the next block sees are saved before weights are put on: sensitivities themselves have none.
         let kept = end - self.memory * width;
         self.rows.copy_within(kept..end, self.base);
         self.rows[self.base..start].iter_mut().for_each(forget);
-        for i in self.weightless.drain(..) {
-            self.rows[start + i * width..][..width].fill(0.0);
+        for (i, root) in self.reduced.drain(..) {
+            let row = &mut self.rows[start + i * width..][..width];
+            match root {
+                // the error is NaN where it is not known
+                0.0 => row.fill(0.0),
+                _ => row.iter_mut().for_each(|value| *value *= root),
+            }
         }
         simd::run(Fold {
             block: &self.rows[start..end],
@@ -350,15 +369,24 @@ mod tests {
 
     #[test]
     fn sums_outer_products_of_recursive_rows_across_blocks() {
-        check_sums(|_| true);
+        check_sums(|_| true, |_| 1.0);
     }
 
     #[test]
     fn leaves_rows_that_were_not_measured_out_of_the_sum_alone() {
-        check_sums(|k| k % 3 != 1 && !(60..70).contains(&k) && k != 149);
+        check_sums(
+            |k| k % 3 != 1 && !(60..70).contains(&k) && k != 149,
+            |_| 1.0,
+        );
     }
 
-    fn check_sums(measured: impl Fn(usize) -> bool) {
+    #[test]
+    fn puts_weights_on_the_rows_of_the_sum_alone() {
+        check_sums(|k| k % 3 != 1, |k| (k % 5) as f64);
+        check_sums(|_| true, |k| if (60..70).contains(&k) { 0.0 } else { 0.5 });
+    }
+
+    fn check_sums(measured: impl Fn(usize) -> bool, weight: impl Fn(usize) -> f64) {
         let (columns, gains) = (5, [0.5, -0.3]);
         let value = |k: usize, c: usize| ((k * 7 + c * 3) as f64).sin();
         let mut gram = Gram::new(columns + 1, 2);
@@ -368,7 +396,7 @@ mod tests {
         past[0][0] = 2.0;
         for k in 0..150 {
             let error = if measured(k) { k as f64 } else { f64::NAN };
-            gram.push(&gains, columns, error, |row| {
+            gram.push(&gains, columns, (error, weight(k)), |row| {
                 (0..columns).for_each(|c| row[c] = value(k, c));
             });
             let mut row: Vec<f64> = (0..columns)
@@ -378,7 +406,7 @@ mod tests {
             for (i, sums) in dense.iter_mut().enumerate().filter(|_| measured(k)) {
                 sums.iter_mut()
                     .zip(&row)
-                    .for_each(|(s, r)| *s += row[i] * r);
+                    .for_each(|(s, r)| *s += weight(k) * row[i] * r);
             }
             past.swap(0, 1);
             past[0] = row;

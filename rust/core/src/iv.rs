@@ -49,7 +49,7 @@ const ROUNDING: f64 = 1e-9;
 /// ```
 ///
 /// # Errors
-/// As [`arx::fit`] for unusable data and settings; `ErrorKind::Fit` where the first model has no finite free run.
+/// As [`arx::fit`] for unusable data and settings; `ErrorKind::Setting` for records with weights, `ErrorKind::Fit` where the first model has no finite free run.
 pub fn fit(
     records: &[Record],
     na: usize,
@@ -59,6 +59,11 @@ pub fn fit(
     max_iterations: usize,
     monitor: &Monitor,
 ) -> Result<LinearFit> {
+    if records.iter().any(|r| r.weights.is_some()) {
+        return Err(Error::setting(
+            "weights: expected none for instrumental variables, which take no weights between 0 and 1, got some; leave them out, mask what is not to count (weight 0), or fit arx or oe",
+        ));
+    }
     let lags = arx::check(records, na, nb, nk)?;
     require_enough(records, &lags, offset)?;
     let first = arx::fit(records, na, nb, nk, offset)?;

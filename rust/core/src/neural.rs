@@ -118,6 +118,7 @@ impl NeuralOE {
             run: &scaled,
             hidden: None,
             y: &scaled,
+            weights: &[],
             rows: &mut rows,
             monitor: None,
         }
@@ -178,8 +179,8 @@ impl Rows for Recording {
         self.gram.ahead(count)
     }
 
-    fn keep(&mut self, errors: &[f64]) {
-        self.gram.keep_all(errors);
+    fn keep(&mut self, errors: &[f64], weights: &[f64]) {
+        self.gram.keep_all(errors, weights);
         for back in (1..=errors.len()).rev() {
             let row = self.gram.past_mut(back);
             let scaled = self.columns.iter().map(|&c| row[c] * self.y_scale);

@@ -198,6 +198,7 @@ impl NeuralSS {
             run: &trajectory,
             v: &self.scaling.delayed_inputs(u, shape.nk),
             y: &known,
+            weights: &[],
             buffers: &mut Sensitivities::new(shape),
             rows: &mut dense,
             exact: true,

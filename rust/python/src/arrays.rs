@@ -1,8 +1,9 @@
 //! Arrays and errors across the seam: borrowed in, owned out, core errors as the package's exceptions.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::conversion::FromPyObjectOwned;
 use pyo3::prelude::*;
-use pyo3::types::PyType;
+use pyo3::types::{PyTuple, PyType};
 use sewfast_core::data::Samples;
 use sewfast_core::{Error, ErrorKind, Record};
 
@@ -51,14 +52,51 @@ fn not_contiguous(py: Python<'_>, name: &str) -> PyErr {
     raise(py, Error::data(message))
 }
 
-/// Borrowed experiments as Python hands them over: a list of `(u, y)`.
-pub type Experiments<'py> = Vec<(PyReadonlyArray2<'py, f64>, PyReadonlyArray1<'py, f64>)>;
+/// An experiment as Python hands it over, borrowed: `(u, y)`, or `(u, y, weights)` where its samples have weights.
+pub struct Experiment<'py, Y> {
+    /// Inputs, time first.
+    pub u: PyReadonlyArray2<'py, f64>,
+    /// Outputs.
+    pub y: Y,
+    weights: Option<PyReadonlyArray1<'py, f64>>,
+}
+
+impl<'a, 'py, Y: FromPyObjectOwned<'py>> FromPyObject<'a, 'py> for Experiment<'py, Y> {
+    type Error = PyErr;
+
+    fn extract(values: Borrowed<'a, 'py, PyAny>) -> PyResult<Self> {
+        let is_weighted = values.cast::<PyTuple>().is_ok_and(|v| v.len() == 3);
+        let (u, y, weights) = match is_weighted {
+            true => values
+                .extract::<(_, _, PyReadonlyArray1<'py, f64>)>()
+                .map(|(u, y, w)| (u, y, Some(w)))?,
+            false => values.extract().map(|(u, y)| (u, y, None))?,
+        };
+        Ok(Self { u, y, weights })
+    }
+}
+
+impl<Y> Experiment<'_, Y> {
+    /// Weights of the samples, where they have any.
+    pub fn weights(&self) -> PyResult<Option<&[f64]>> {
+        self.weights
+            .as_ref()
+            .map(|w| slice(w, "weights"))
+            .transpose()
+    }
+}
+
+/// A list of experiments of one output.
+pub type Experiments<'py> = Vec<Experiment<'py, PyReadonlyArray1<'py, f64>>>;
 
 /// The experiments with their shapes checked, their values not looked at.
 pub fn samples<'a>(py: Python<'_>, experiments: &'a Experiments<'_>) -> PyResult<Vec<Samples<'a>>> {
-    let samples = |(u, y): &'a (PyReadonlyArray2<'_, f64>, PyReadonlyArray1<'_, f64>)| {
-        let (u, channels) = rows(u, "u")?;
-        Samples::new(u, channels, slice(y, "y")?).map_err(|e| raise(py, e))
+    let samples = |experiment: &'a Experiment<'_, PyReadonlyArray1<'_, f64>>| {
+        let ((u, channels), y) = (rows(&experiment.u, "u")?, slice(&experiment.y, "y")?);
+        let weights = experiment.weights()?;
+        let samples = Samples::new(u, channels, y);
+        let weighted = samples.and_then(|s| weights.map_or(Ok(s), |w| s.with_weights(w)));
+        weighted.map_err(|e| raise(py, e))
     };
     experiments.iter().map(samples).collect()
 }

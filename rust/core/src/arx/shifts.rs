@@ -58,9 +58,10 @@ impl Shifts {
         }
     }
 
-    /// Whether a record is measured throughout and long enough to have samples between its ends.
+    /// Whether a record is measured throughout, has no weights and is long enough to have samples between its ends.
     pub fn suit(&self, record: &Record) -> bool {
-        record.unmeasured == 0 && record.len() > self.lags.first_whole() + self.longest()
+        let plain = record.unmeasured == 0 && record.weights.is_none();
+        plain && record.len() > self.lags.first_whole() + self.longest()
     }
 
     /// The longest span of lags of a signal.

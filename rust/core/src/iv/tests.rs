@@ -133,3 +133,13 @@ fn keeps_what_it_has_when_stopped_and_refuses_short_records() {
     monitor.request_stop();
     assert!(fit(&records, 2, 2, 1, true, 50, &monitor).is_err());
 }
+
+#[test]
+fn takes_no_weights() {
+    let (u, y) = ([1.0, 2.0, 0.0, 1.0], [0.0, 1.0, 2.0, 0.0]);
+    let record = Record::new(&u, 1, &y).unwrap();
+    let records = [record.with_weights(&[1.0, 0.5, 1.0, 1.0]).unwrap()];
+    let refused = fit(&records, 1, 1, 1, true, 20, &Monitor::default()).unwrap_err();
+    assert_eq!(refused.kind, crate::ErrorKind::Setting);
+    assert!(refused.message.contains("weights"), "{}", refused.message);
+}

@@ -6,6 +6,7 @@
 use super::network::Network;
 use super::regressor;
 use crate::Monitor;
+use crate::data::weighted_squares;
 use crate::limit::Limit;
 use crate::simd::{self, Eight, Group, Kernel, LANES};
 
@@ -36,6 +37,8 @@ pub(super) struct FreeRuns<'a, const RUNS: usize> {
     pub first: usize,
     /// Measured outputs of the simulated samples, NaN where there is none; empty where nothing is measured.
     pub y: &'a [f64],
+    /// Their weights; none where all count alike.
+    pub weights: &'a [f64],
     /// An output of this size has diverged.
     pub bound: f64,
     /// Asked whether to stop.
@@ -60,6 +63,7 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
             u,
             first,
             y,
+            weights,
             bound,
             monitor,
         } = self;
@@ -81,7 +85,8 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
             advance::<V, RUNS>(&mut chains, start, count);
             for chain in chains.iter_mut().filter(|chain| chain.runs) {
                 let measured = y.get(start..start + count).unwrap_or_default();
-                chain.conclude::<V>(start, measured, count, bound);
+                let weights = weights.get(start..start + count).unwrap_or_default();
+                chain.conclude::<V>(start, (measured, weights), count, bound);
             }
             if chains.iter().all(|chain| !chain.runs) {
                 break;
@@ -198,7 +203,13 @@ impl<'a> Chain<'a> {
 
     /// Hands the block's outputs on and measures them.
     #[inline(always)]
-    fn conclude<V: Eight>(&mut self, start: usize, measured: &[f64], count: usize, bound: f64) {
+    fn conclude<V: Eight>(
+        &mut self,
+        start: usize,
+        (measured, weights): (&[f64], &[f64]),
+        count: usize,
+        bound: f64,
+    ) {
         let na = self.run.state.len();
         let outputs = &self.outputs[na..na + count];
         self.run.outputs[start..start + count].copy_from_slice(outputs);
@@ -207,7 +218,11 @@ impl<'a> Chain<'a> {
             .iter()
             .fold(true, |sound, y| sound & (y.abs() < bound));
         self.runs = sound;
-        self.sum = squared_errors_on::<V>(&mut self.sums, measured, outputs);
+        if weights.is_empty() {
+            self.sum = squared_errors_on::<V>(&mut self.sums, measured, outputs);
+        } else {
+            self.sum += weighted_squares(weights, measured, outputs);
+        }
         self.runs &= !self.limit.is_reached(self.sum);
         self.outputs.copy_within(count..count + na, 0);
     }
@@ -339,6 +354,7 @@ pub(super) fn outputs(
         u,
         first,
         y: &[],
+        weights: &[],
         bound: f64::INFINITY,
         monitor: None,
     };

@@ -5,6 +5,7 @@ use super::network::{Network, Shape};
 use super::scaling::Scaling;
 use super::sensitivities::Recursion;
 use super::train::InitialState;
+use crate::data::{total_weight, weighted_squares};
 use crate::gram::Gram;
 use crate::limit::Limit;
 use crate::lm::Problem;
@@ -20,6 +21,8 @@ pub(super) struct Experiment {
     pub u: Vec<f64>,
     /// NaN where it was not measured.
     pub y: Vec<f64>,
+    /// Weights of the samples; none where all count alike.
+    pub weights: Vec<f64>,
     /// First simulated sample.
     pub first: usize,
     /// Past outputs before it; a guess where they are estimated.
@@ -36,6 +39,7 @@ impl Experiment {
         };
         Self {
             u: scaling.inputs(record.u),
+            weights: record.weights.map_or(Vec::new(), <[f64]>::to_vec),
             y,
             first,
             state,
@@ -55,6 +59,33 @@ impl Experiment {
         self.y.len() - self.first
     }
 
+    /// The weight of sample `k`.
+    pub fn weight(&self, k: usize) -> f64 {
+        self.weights.get(k).copied().unwrap_or(1.0)
+    }
+
+    /// Weights of the samples from `from` on; none where all count alike.
+    fn weights_from(&self, from: usize) -> &[f64] {
+        self.weights.get(from..).unwrap_or_default()
+    }
+
+    /// Sum of the weights of the samples from `from` on whose output was measured: their number where all count alike.
+    pub fn weight_from(&self, from: usize) -> f64 {
+        let y = &self.y[from..];
+        match self.weights_from(from) {
+            [] => y.iter().filter(|y| !y.is_nan()).count() as f64,
+            weights => total_weight(weights, y),
+        }
+    }
+
+    /// Sum of squared errors of a run over the samples from `from` on, by their weights.
+    pub fn squares_from(&self, from: usize, run: &[f64]) -> f64 {
+        match self.weights_from(from) {
+            [] => squared_errors(&self.y[from..], run),
+            weights => weighted_squares(weights, &self.y[from..], run),
+        }
+    }
+
     /// Simulated samples whose output was measured.
     pub fn measured(&self) -> usize {
         self.y[self.first..].iter().filter(|y| !y.is_nan()).count()
@@ -62,7 +93,7 @@ impl Experiment {
 }
 
 /// Over the samples that were measured; eight sums side by side, as one alone would wait for each addition.
-pub(super) fn squared_errors(measured: &[f64], run: &[f64]) -> f64 {
+fn squared_errors(measured: &[f64], run: &[f64]) -> f64 {
     let square = |(y, run): (&f64, &f64)| {
         let error = y - run;
         if error.is_nan() { 0.0 } else { error * error }
@@ -136,7 +167,7 @@ pub(super) struct FreeRun<'a> {
     shape: Shape,
     estimated: bool,
     decay: f64,
-    /// Measured samples.
+    /// Measured samples, each by its weight.
     samples: f64,
     /// The last simulations: one, and the one beside it where two at once pay.
     attempts: Vec<Attempt>,
@@ -159,7 +190,7 @@ impl<'a> FreeRun<'a> {
             monitor,
             estimated,
             decay,
-            samples: experiments.iter().map(Experiment::measured).sum::<usize>() as f64,
+            samples: experiments.iter().map(|e| e.weight_from(e.first)).sum(),
             attempts: (0..attempts)
                 .map(|_| Attempt::new(network.clone(), experiments))
                 .collect(),
@@ -244,6 +275,7 @@ impl<'a> FreeRun<'a> {
                 u: &data.u,
                 first: data.first,
                 y: &data.y[data.first..],
+                weights: data.weights_from(data.first),
                 bound: DIVERGED,
                 monitor: Some(self.monitor),
             }
@@ -282,6 +314,7 @@ impl<'a> FreeRun<'a> {
             run: &attempt.runs[experiment],
             hidden: Some(&attempt.hidden[experiment]),
             y: &data.y[data.first..],
+            weights: data.weights_from(data.first),
             rows: &mut self.gram,
             monitor: Some(self.monitor),
         }
@@ -354,6 +387,76 @@ impl Problem for FreeRun<'_> {
             let decay = self.decay_of(i);
             jtj[i * theta.len() + i] += decay;
             jte[i] -= decay * t;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lagged::Lags;
+    use crate::laws::{check_gradient, check_sum, weights};
+    use crate::random::Random;
+
+    #[test]
+    fn puts_weights_on_cost_and_normal_equations_alike() {
+        // the usual shape has a kernel of its own
+        for (na, nb, hidden) in [(2, 2, 8), (1, 2, 3), (3, 1, 11)] {
+            let lags = Lags::new(na, nb, 1, 1).unwrap();
+            let shape = Shape::new(lags, hidden, true).unwrap();
+            let mut random = Random::new(3);
+            let mut drawn = |n: usize| (0..n).map(|_| random.between(-0.3, 0.3)).collect();
+            let (u, mut y): (Vec<f64>, Vec<f64>) = (drawn(300), drawn(300));
+            y[..4].fill(f64::NAN);
+            y[150..180].fill(f64::NAN);
+            let theta: Vec<f64> = drawn(shape.parameters() + 2 * na);
+            let limits = (f64::NEG_INFINITY, f64::INFINITY);
+            let scaling = Scaling {
+                u_mean: vec![0.0],
+                u_scale: vec![1.0],
+                y_mean: 0.0,
+                y_scale: 1.0,
+            };
+            let record = Record::with_gaps(&u, 1, &y).unwrap();
+            let experiments = |weights: &[f64]| {
+                let weighted = record.with_weights(weights).unwrap();
+                let kind = InitialState::Estimated;
+                [weighted, record].map(|r| Experiment::new(&r, &scaling, na, kind))
+            };
+            let monitor = Monitor::default();
+            fn problem<'a>(
+                experiments: &'a [Experiment],
+                network: Network,
+                decay: f64,
+                monitor: &'a Monitor,
+            ) -> FreeRun<'a> {
+                FreeRun::new(experiments, network, true, decay, monitor)
+            }
+            let network = || Network::zero(shape, limits);
+            let drawn = experiments(&weights(300, 1));
+            let mut weighted = problem(&drawn, network(), 1e-3, &monitor);
+            check_gradient(&mut weighted, &theta);
+            let other: Vec<f64> = theta.iter().map(|t| 0.9 * t).collect();
+            if weighted.takes_two() {
+                let costs = weighted.costs_below([&theta, &other], f64::INFINITY);
+                assert_eq!(costs, [&theta, &other].map(|t| weighted.cost(t)));
+            }
+            let part = |k: usize| k % 7 < 3;
+            let tripled: Vec<f64> = (0..300).map(|k| if part(k) { 3.0 } else { 1.0 }).collect();
+            let only: Vec<f64> = (0..300).map(|k| f64::from(u8::from(part(k)))).collect();
+            let (tripled, plain) = (experiments(&tripled), experiments(&[1.0; 300]));
+            let mut only = experiments(&only);
+            only[1].weights = vec![0.0; 300];
+            let mut whole = problem(&tripled, network(), 0.0, &monitor);
+            let plain = problem(&plain, network(), 0.0, &monitor);
+            let part = problem(&only, network(), 0.0, &monitor);
+            let (total, all, of_part) = (whole.samples, plain.samples, part.samples);
+            assert_eq!(total, all + 2.0 * of_part);
+            check_sum(
+                &theta,
+                (&mut whole, total),
+                &mut [(plain, all, 1.0), (part, of_part, 2.0)],
+            );
         }
     }
 }

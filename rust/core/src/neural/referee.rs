@@ -2,7 +2,7 @@
 
 use super::free_run;
 use super::network::Network;
-use super::problem::{Experiment, squared_errors};
+use super::problem::Experiment;
 use super::train::{InitialState, Training};
 use crate::data::window;
 use crate::lagged::{Lagged, STATE_SAMPLES};
@@ -37,13 +37,13 @@ impl<'t> Referee<'t> {
     /// J over all validation experiments; infinite where one diverges.
     fn validation_cost(&self) -> f64 {
         let scores = self.training.validation.iter().map(|e| self.score(e));
-        let (sum, samples) = scores.fold((0.0, 0), |(sum, n), (s, m)| (sum + s, n + m));
-        let cost = 0.5 * sum / samples as f64;
+        let (sum, samples) = scores.fold((0.0, 0.0), |(sum, n), (s, m)| (sum + s, n + m));
+        let cost = 0.5 * sum / samples;
         if cost.is_nan() { f64::INFINITY } else { cost }
     }
 
-    /// Sum of squared errors and the number of measured samples it is taken over.
-    fn score(&self, experiment: &Experiment) -> (f64, usize) {
+    /// Sum of squared errors and of the weights of the measured samples it is taken over.
+    fn score(&self, experiment: &Experiment) -> (f64, f64) {
         let lags = self.network.shape.lags;
         let estimated = self.training.settings.initial_state == InitialState::Estimated;
         let half = (experiment.measured() / 2).max(1);
@@ -62,15 +62,14 @@ impl<'t> Referee<'t> {
             false => Ok(experiment.state.clone()),
         };
         let Ok(state) = state else {
-            return (f64::INFINITY, 1);
+            return (f64::INFINITY, 1.0);
         };
         let samples = experiment.y.len() - first;
         let run = free_run::outputs(&self.network, &experiment.u, first, &state, samples);
         if run.last().is_none_or(|y| y.is_nan()) {
-            return (f64::INFINITY, 1);
+            return (f64::INFINITY, 1.0);
         }
-        let judged = &experiment.y[skipped..];
-        let count = judged.iter().filter(|y| !y.is_nan()).count();
-        (squared_errors(judged, &run[skipped - first..]), count)
+        let squares = experiment.squares_from(skipped, &run[skipped - first..]);
+        (squares, experiment.weight_from(skipped))
     }
 }

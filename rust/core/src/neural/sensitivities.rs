@@ -15,8 +15,9 @@ use crate::simd::{self, Eight, Group, Kernel, LANES};
 pub(super) trait Rows {
     /// The last `na` rows, the oldest first, and behind them room for the next `count`.
     fn ahead(&mut self, count: usize) -> &mut [f64];
-    /// The next rows have been written; the error is NaN where the output was not measured.
-    fn keep(&mut self, errors: &[f64]);
+    /// The next rows have been written; the error is NaN where the output was not measured. Without weights all count
+    /// alike.
+    fn keep(&mut self, errors: &[f64], weights: &[f64]);
 }
 
 impl Rows for Gram {
@@ -24,8 +25,8 @@ impl Rows for Gram {
         Gram::ahead(self, count)
     }
 
-    fn keep(&mut self, errors: &[f64]) {
-        Gram::keep_all(self, errors);
+    fn keep(&mut self, errors: &[f64], weights: &[f64]) {
+        Gram::keep_all(self, errors, weights);
     }
 }
 
@@ -40,8 +41,9 @@ pub(super) struct Recursion<'a, R> {
     /// What the free run left behind; without hidden outputs the slopes are computed to their last digits.
     pub run: &'a [f64],
     pub hidden: Option<&'a [Group]>,
-    /// Measured outputs of the simulated samples.
+    /// Measured outputs of the simulated samples, and their weights; none where all count alike.
     pub y: &'a [f64],
+    pub weights: &'a [f64],
     pub rows: &'a mut R,
     pub monitor: Option<&'a Monitor>,
 }
@@ -71,7 +73,9 @@ impl<R: Rows> Recursion<'_, R> {
                 block: &mut block,
                 rows: self.rows.ahead(count),
             });
-            self.rows.keep(&block.errors[..count]);
+            let weights = self.weights.get(start..start + count);
+            self.rows
+                .keep(&block.errors[..count], weights.unwrap_or_default());
         }
     }
 }

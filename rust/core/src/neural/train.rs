@@ -369,11 +369,16 @@ fn limits(experiments: &[Experiment], widened: Option<f64>) -> (f64, f64) {
 
 /// J of the best constant output.
 fn constant_cost(experiments: &[Experiment]) -> f64 {
-    let simulated = || experiments.iter().flat_map(|e| &e.y[e.first..]);
-    let outputs = || simulated().filter(|y| !y.is_nan());
-    let count = outputs().count() as f64;
-    let mean = outputs().sum::<f64>() / count;
-    0.5 * outputs().map(|y| (y - mean) * (y - mean)).sum::<f64>() / count
+    let simulated = || {
+        experiments
+            .iter()
+            .flat_map(|e| (e.first..e.y.len()).map(move |k| (e.weight(k), e.y[k])))
+    };
+    let outputs = || simulated().filter(|(_, y)| !y.is_nan());
+    let count: f64 = outputs().map(|(w, _)| w).sum();
+    let mean = outputs().map(|(w, y)| w * y).sum::<f64>() / count;
+    let squares = outputs().map(|(w, y)| w * ((y - mean) * (y - mean)));
+    0.5 * squares.sum::<f64>() / count
 }
 
 fn check(settings: &Settings) -> Result<()> {
@@ -438,7 +443,7 @@ fn check_starts(experiments: &[Experiment], validation: &[Experiment], na: usize
     match experiments
         .iter()
         .chain(validation)
-        .find(|e| e.measured() == 0)
+        .find(|e| e.weight_from(e.first) == 0.0)
     {
         None => Ok(()),
         Some(_) => Err(Error::data(format!(

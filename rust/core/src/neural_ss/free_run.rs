@@ -49,6 +49,8 @@ pub(super) struct FreeRuns<'a, const RUNS: usize> {
     pub v: &'a [f64],
     /// Measured outputs, NaN where not known; empty where nothing is measured.
     pub y: &'a [f64],
+    /// A weight for each of them; none where all count alike.
+    pub weights: &'a [f64],
     /// No state may be larger.
     pub bound: f64,
     pub monitor: &'a Monitor,
@@ -82,6 +84,7 @@ pub(super) fn alone(
         runs: [run],
         v,
         y: &[],
+        weights: &[],
         bound: f64::MAX,
         monitor,
     };
@@ -121,7 +124,7 @@ impl<const RUNS: usize> FreeRuns<'_, RUNS> {
                 break;
             }
             for (run, sum) in self.runs.iter_mut().zip(&mut sums) {
-                run.conclude(start, end, self.y, sum, self.bound);
+                run.conclude(start, end, (self.y, self.weights), sum, self.bound);
             }
         }
         let mut reached = [None; RUNS];
@@ -198,15 +201,31 @@ impl Run<'_> {
     }
 
     /// Measures a block: adds its squared errors, and ends the run where it cannot win.
-    fn conclude(&mut self, start: usize, end: usize, y: &[f64], sum: &mut f64, bound: f64) {
+    fn conclude(
+        &mut self,
+        start: usize,
+        end: usize,
+        (y, weights): (&[f64], &[f64]),
+        sum: &mut f64,
+        bound: f64,
+    ) {
         let Some(limit) = self.limit else { return };
         let Shape { nx, outputs, .. } = self.network.shape;
         let output = self.network.output;
         let (first, behind) = (start * outputs, end * outputs);
         if let Some(y) = y.get(first..behind) {
             let pairs = self.run.sums[first..behind].iter().zip(y);
-            for (s, y) in pairs.filter(|(_, y)| !y.is_nan()) {
-                *sum += (y - output.value(*s)).powi(2);
+            match weights.get(first..behind) {
+                None => {
+                    for (s, y) in pairs.filter(|(_, y)| !y.is_nan()) {
+                        *sum += (y - output.value(*s)).powi(2);
+                    }
+                }
+                Some(weights) => {
+                    for ((s, y), w) in pairs.zip(weights).filter(|((_, y), _)| !y.is_nan()) {
+                        *sum += w * (y - output.value(*s)).powi(2);
+                    }
+                }
             }
         }
         let states = &self.run.states[start * nx..end * nx];

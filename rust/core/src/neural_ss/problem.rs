@@ -8,6 +8,7 @@ use super::sensitivities::{Columns, Recursion, Sensitivities};
 use super::shape::Shape;
 use super::single::MOST_STATES;
 use crate::Monitor;
+use crate::data::total_weight;
 use crate::gram::Gram;
 use crate::limit::Limit;
 use crate::lm::Problem;
@@ -23,6 +24,15 @@ pub(super) struct Experiment {
     pub v: Vec<f64>,
     /// Outputs, NaN where not known.
     pub y: Vec<f64>,
+    /// A weight for each output; none where all count alike.
+    pub weights: Vec<f64>,
+}
+
+impl Experiment {
+    /// The weight of output `i`.
+    pub fn weight(&self, i: usize) -> f64 {
+        self.weights.get(i).copied().unwrap_or(1.0)
+    }
 }
 
 /// Simulations of one point, with what the normal equations take from them.
@@ -98,7 +108,7 @@ pub(super) struct Training<'a> {
     monitor: &'a Monitor,
     pub network: Network,
     pub decay: Decay,
-    /// Known outputs.
+    /// Known outputs, each by its weight.
     samples: f64,
     attempts: &'a Attempts,
     gram: Gram,
@@ -117,10 +127,10 @@ impl<'a> Training<'a> {
     ) -> Self {
         let shape = network.shape;
         let columns = Columns::new(shape);
-        let known = experiments
-            .iter()
-            .flat_map(|e| &e.y)
-            .filter(|y| !y.is_nan());
+        let weight = |e: &Experiment| match &e.weights[..] {
+            [] => e.y.iter().filter(|y| !y.is_nan()).count() as f64,
+            weights => total_weight(weights, &e.y),
+        };
         Self {
             experiments,
             monitor,
@@ -129,7 +139,7 @@ impl<'a> Training<'a> {
                     .map(|i| decay * shape.decay(i))
                     .collect(),
             ),
-            samples: known.count() as f64,
+            samples: experiments.iter().map(weight).sum(),
             attempts,
             gram: Gram::new(columns.room, 0),
             columns: columns.of_theta(),
@@ -186,6 +196,7 @@ impl<'a> Training<'a> {
                 }),
                 v: &data.v,
                 y: &data.y,
+                weights: &data.weights,
                 bound: DIVERGED,
                 monitor,
             }
@@ -270,6 +281,7 @@ impl Problem for Training<'_> {
                 run: &self.attempts.at(theta)[i],
                 v: &data.v,
                 y: &data.y,
+                weights: &data.weights,
                 buffers: &mut self.buffers,
                 rows: &mut self.gram,
                 exact: false,
@@ -282,5 +294,70 @@ impl Problem for Training<'_> {
             jte[i] -= decay * t;
         }
         self.hold(jtj, jte);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::output::OutputFunction;
+    use super::super::tests::noise;
+    use super::*;
+    use crate::laws::{check_gradient, check_sum, weights};
+
+    #[test]
+    fn puts_weights_on_cost_and_normal_equations_alike() {
+        // with one output and up to four states rows are written block by block
+        for (nx, outputs, hidden) in [(2, 1, 3), (4, 1, 15), (5, 1, 8), (2, 2, 8)] {
+            let shape = Shape {
+                nx,
+                nk: 1,
+                inputs: 2,
+                outputs,
+                hidden,
+                integrator: false,
+            };
+            let output = OutputFunction::Abs { width: 0.3 };
+            let samples = 150;
+            let (v, mut y) = (noise(2 * samples, 1), noise(outputs * samples, 2));
+            y[..4].fill(f64::NAN);
+            y[90..111].fill(f64::NAN);
+            let parameters = shape.parameters() + 2 * nx;
+            let theta: Vec<f64> = noise(parameters, 3).iter().map(|t| 0.15 * t).collect();
+            let experiments = |weights: &[f64]| {
+                let repeated = |w: &f64| std::iter::repeat_n(*w, outputs);
+                let experiment = |weights: Vec<f64>| Experiment {
+                    v: v.clone(),
+                    y: y.clone(),
+                    weights,
+                };
+                let weighted = weights.iter().flat_map(repeated).collect();
+                [experiment(weighted), experiment(Vec::new())]
+            };
+            let network = Network::new(shape, output, &theta[..shape.parameters()]);
+            let monitor = Monitor::default();
+            let drawn = experiments(&weights(samples, 1));
+            let attempts = Attempts::new(&network, &drawn);
+            let mut weighted = Training::new(&drawn, network.clone(), 1e-3, &attempts, &monitor);
+            check_gradient(&mut weighted, &theta);
+            let part = |k: usize| k % 7 < 3;
+            let of = |inside: f64, outside: f64| {
+                let weight = |k| if part(k) { inside } else { outside };
+                experiments(&(0..samples).map(weight).collect::<Vec<f64>>())
+            };
+            let (tripled, plain, mut only) = (of(3.0, 1.0), of(1.0, 1.0), of(1.0, 0.0));
+            only[1].weights = vec![0.0; outputs * samples];
+            let attempts = [&tripled, &plain, &only].map(|e| Attempts::new(&network, e));
+            let problem =
+                |e, i: usize| Training::new(e, network.clone(), 0.0, &attempts[i], &monitor);
+            let mut whole = problem(&tripled, 0);
+            let (plain, part) = (problem(&plain, 1), problem(&only, 2));
+            let (total, all, of_part) = (whole.samples, plain.samples, part.samples);
+            assert_eq!(total, all + 2.0 * of_part);
+            check_sum(
+                &theta,
+                (&mut whole, total),
+                &mut [(plain, all, 1.0), (part, of_part, 2.0)],
+            );
+        }
     }
 }

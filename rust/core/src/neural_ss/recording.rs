@@ -4,6 +4,7 @@ use super::output::OutputFunction;
 use super::problem::Experiment;
 use super::scaling::{Scaling, moments};
 use super::shape::Shape;
+use crate::data::{check_weights, unless_one};
 use crate::{Error, Record, Result};
 
 /// One experiment as it was measured; outputs that are not known are NaN.
@@ -17,6 +18,8 @@ pub struct Recording<'a> {
     pub y: &'a [f64],
     /// Number of outputs.
     pub outputs: usize,
+    /// How much the squared errors of each sample count, finite and 0 or more; all alike where there are none.
+    pub weights: Option<&'a [f64]>,
 }
 
 impl<'a> From<&Record<'a>> for Recording<'a> {
@@ -26,6 +29,7 @@ impl<'a> From<&Record<'a>> for Recording<'a> {
             inputs: record.channels,
             y: record.y,
             outputs: 1,
+            weights: record.weights,
         }
     }
 }
@@ -62,7 +66,31 @@ impl<'a> Recording<'a> {
             inputs,
             y,
             outputs,
+            weights: None,
         })
+    }
+
+    /// The same recording with a weight for each sample: costs are `sum w e^2 / (2 sum w)`. What is no sum of squared
+    /// errors (scaling, starts, estimated states, the guard) does not look at them.
+    ///
+    /// # Errors
+    /// `ErrorKind::Data` for another number of weights, weights that are negative or not finite, or 0 wherever an output
+    /// is known.
+    pub fn with_weights(self, weights: &'a [f64]) -> Result<Self> {
+        let first_known = |y: &[f64]| y.iter().copied().find(|y| !y.is_nan()).unwrap_or(f64::NAN);
+        let known: Vec<f64> = self.y.chunks_exact(self.outputs).map(first_known).collect();
+        check_weights(weights, &known)?;
+        Ok(Self {
+            weights: unless_one(weights),
+            ..self
+        })
+    }
+
+    /// A weight for each output, those of a sample alike; none where all count alike.
+    pub(super) fn output_weights(&self) -> Vec<f64> {
+        let repeated = |w: &f64| std::iter::repeat_n(*w, self.outputs);
+        let weights = self.weights.unwrap_or_default();
+        weights.iter().flat_map(repeated).collect()
     }
 
     /// Number of samples.
@@ -125,10 +153,19 @@ pub(super) fn constant_cost(experiments: &[Experiment], shape: Shape) -> f64 {
     for p in 0..shape.outputs {
         let known = experiments
             .iter()
-            .flat_map(|e| e.y.iter().skip(p).step_by(shape.outputs))
-            .filter(|y| !y.is_nan());
-        let count = known.clone().count() as f64;
-        sum += count * moments(known.copied()).1.powi(2);
+            .flat_map(|e| {
+                (p..e.y.len())
+                    .step_by(shape.outputs)
+                    .map(move |i| (e.y[i], e.weight(i)))
+            })
+            .filter(|(y, _)| !y.is_nan());
+        let count: f64 = known.clone().map(|(_, w)| w).sum();
+        let mean = known.clone().map(|(y, w)| w * y).sum::<f64>() / count;
+        let variance = known
+            .map(|(y, w)| w * ((y - mean) * (y - mean)))
+            .sum::<f64>()
+            / count;
+        sum += count * variance.sqrt().powi(2);
         samples += count;
     }
     0.5 * sum / samples

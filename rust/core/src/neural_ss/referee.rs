@@ -77,23 +77,23 @@ impl<'a> Referee<'a> {
     /// diverges.
     fn validation_cost(&mut self, all: &[f64]) -> f64 {
         let statistics = statistics(&self.network, self.experiments, &self.attempts.at(all));
-        let (mut sum, mut samples) = (0.0, 0);
+        let (mut sum, mut samples) = (0.0, 0.0);
         for i in 0..self.validation.len() {
             let Some((squares, known)) = self.score(i, &statistics) else {
                 return f64::INFINITY;
             };
             (sum, samples) = (sum + squares, samples + known);
         }
-        let cost = 0.5 * sum / samples as f64;
+        let cost = 0.5 * sum / samples;
         if cost.is_nan() { f64::INFINITY } else { cost }
     }
 
-    /// Sum of squared errors and the number of outputs it is taken over.
-    fn score(&mut self, i: usize, statistics: &Statistics) -> Option<(f64, usize)> {
+    /// Sum of squared errors and of the weights of the outputs it is taken over.
+    fn score(&mut self, i: usize, statistics: &Statistics) -> Option<(f64, f64)> {
         let Shape {
             inputs, outputs, ..
         } = self.network.shape;
-        let Experiment { v, y } = &self.validation[i];
+        let Experiment { v, y, .. } = &self.validation[i];
         let skipped = STATE_SAMPLES.min(y.len() / outputs / 2);
         let (first_v, first_y) = (&v[..skipped * inputs], &y[..skipped * outputs]);
         let state = match self.states[i].take() {
@@ -117,11 +117,12 @@ impl<'a> Referee<'a> {
         if !found {
             return None;
         }
-        let pairs = run.sums.iter().zip(y).skip(skipped * outputs);
-        let errors = pairs
-            .filter(|(_, y)| !y.is_nan())
-            .map(|(s, y)| y - self.network.output.value(*s));
-        Some(errors.fold((0.0, 0), |(sum, known), e| (sum + e * e, known + 1)))
+        let (sums, output) = (&run.sums, self.network.output);
+        let known = (skipped * outputs..y.len()).filter(|&k| !y[k].is_nan());
+        let errors = known.map(|k| (y[k] - output.value(sums[k]), self.validation[i].weight(k)));
+        Some(errors.fold((0.0, 0.0), |(sum, known), (e, w)| {
+            (sum + w * (e * e), known + w)
+        }))
     }
 }
 
@@ -150,15 +151,14 @@ pub(super) fn statistics(
     }
     (0..nx).for_each(|i| (0..i).for_each(|j| covariance[j * nx + i] = covariance[i * nx + j]));
     let variance = |p: usize| {
-        let pairs = runs
-            .iter()
-            .zip(experiments)
-            .flat_map(|(run, e)| run.sums.iter().zip(&e.y).skip(p).step_by(outputs));
-        let errors = pairs
-            .filter(|(_, y)| !y.is_nan())
-            .map(|(s, y)| y - network.output.value(*s));
-        let (sum, known) = errors.fold((0.0, 0.0), |(sum, n), e| (sum + e * e, n + 1.0));
-        let variance: f64 = sum / f64::max(known, 1.0);
+        let pairs = runs.iter().zip(experiments).flat_map(|(run, e)| {
+            let known = (p..e.y.len())
+                .step_by(outputs)
+                .filter(|&i| !e.y[i].is_nan());
+            known.map(|i| (e.y[i] - network.output.value(run.sums[i]), e.weight(i)))
+        });
+        let (sum, known) = pairs.fold((0.0, 0.0), |(sum, n), (e, w)| (sum + w * (e * e), n + w));
+        let variance: f64 = if known > 0.0 { sum / known } else { 0.0 };
         if variance.is_finite() {
             variance.max(LEAST_VARIANCE)
         } else {

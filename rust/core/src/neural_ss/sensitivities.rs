@@ -162,6 +162,8 @@ pub(super) struct Recursion<'a> {
     pub v: &'a [f64],
     /// Measured outputs; an output that is NaN has no row.
     pub y: &'a [f64],
+    /// A weight for each of them, by whose root its row is multiplied once it is written; none where all count alike.
+    pub weights: &'a [f64],
     pub buffers: &'a mut Sensitivities,
     pub rows: &'a mut dyn Rows,
     /// Whether the slopes of saturated units keep their digits, for which their arguments are computed once more.
@@ -195,6 +197,7 @@ impl Recursion<'_> {
             run,
             v,
             y,
+            weights,
             buffers,
             rows,
             exact,
@@ -219,9 +222,23 @@ impl Recursion<'_> {
             buffers.prepare::<V>(network, h, (s, y), exact);
             let count = buffers.known.len();
             let width = rows.width();
-            buffers.advance::<V, NX>(network, h, rows.room(count), width);
+            let room = rows.room(count);
+            buffers.advance::<V, NX>(network, h, room, width);
+            if let Some(weights) = weights.get(k * outputs..(k + 1) * outputs) {
+                let known = buffers.known.iter().map(|&(p, ..)| weights[p]);
+                weigh(known, room, width);
+            }
             rows.keep(count);
         }
+    }
+}
+
+/// Multiplies each of the rows, `width` numbers apart, by the root of its weight.
+#[inline(never)]
+pub(super) fn weigh(weights: impl Iterator<Item = f64>, rows: &mut [f64], width: usize) {
+    for (row, weight) in rows.chunks_mut(width).zip(weights) {
+        let root = weight.sqrt();
+        row.iter_mut().for_each(|value| *value *= root);
     }
 }
 

@@ -3,7 +3,7 @@
 //! registers.
 
 use super::network::{Network, rises_of};
-use super::sensitivities::{Recursion, Sensitivities};
+use super::sensitivities::{Recursion, Sensitivities, weigh};
 use super::shape::Shape;
 use crate::simd::{Eight, Group, LANES};
 
@@ -295,6 +295,7 @@ impl Recursion<'_> {
             run,
             v,
             y,
+            weights,
             buffers,
             rows,
             exact,
@@ -312,13 +313,18 @@ impl Recursion<'_> {
                 hidden: &run.hidden[samples.start * groups..samples.end * groups],
                 sums: &run.sums[samples.clone()],
                 v: &v[samples.start * inputs..samples.end * inputs],
-                y: &y[samples],
+                y: &y[samples.clone()],
             };
-            let known = buffers.prepare_block::<V, NX>(network, &part, rows.width(), exact);
+            let width = rows.width();
+            let known = buffers.prepare_block::<V, NX>(network, &part, width, exact);
             let room = rows.room(count);
             buffers.pass_arguments::<V, NX>(count, room);
             buffers.pass_units::<V, NX>(&part, room);
             buffers.pass_rest::<V, NX>(&part, room);
+            if let Some(weights) = weights.get(samples) {
+                let known = weights.iter().zip(part.y).filter(|(_, y)| !y.is_nan());
+                weigh(known.map(|(w, _)| *w), room, width);
+            }
             rows.keep(known);
         }
     }

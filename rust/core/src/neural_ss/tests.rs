@@ -342,6 +342,7 @@ impl simd::Kernel for Whole<'_> {
         let monitor = Monitor::default();
         let mut run = Trajectory::new(self.network, self.v.len() / shape.inputs);
         let free = free_run::FreeRuns {
+            weights: &[],
             runs: [free_run::Run {
                 network: self.network,
                 state: self.state,
@@ -363,6 +364,7 @@ impl simd::Kernel for Whole<'_> {
             rows: Vec::new(),
         };
         let recursion = Recursion {
+            weights: &[],
             network: self.network,
             run: &run,
             v: self.v,

@@ -171,6 +171,7 @@ impl<'a> Task<'a> {
         let scaled = |r: &Recording| Experiment {
             v: scaling.delayed_inputs(r.u, shape.nk),
             y: scaling.outputs(r.y),
+            weights: r.output_weights(),
         };
         let experiments: Vec<Experiment> = recordings.iter().map(scaled).collect();
         let linear = settings.linear.as_ref();
@@ -265,7 +266,7 @@ impl<'a> Task<'a> {
         let Shape {
             inputs, outputs, ..
         } = self.shape;
-        for Experiment { v, y } in &self.experiments {
+        for Experiment { v, y, .. } in &self.experiments {
             let samples = STATE_SAMPLES.min(y.len() / outputs);
             let (v, y) = (&v[..samples * inputs], &y[..samples * outputs]);
             let mean = std::slice::from_ref(&prior.state_mean);

@@ -25,7 +25,7 @@ pub(super) fn excerpt<'a>(records: &[Record<'a>]) -> Option<Vec<Record<'a>>> {
     (!pieces.is_empty()).then_some(pieces)
 }
 
-/// Pieces of about `share` samples together; those without any measured output are left out.
+/// Pieces of about `share` samples together; those without any measured output of some weight are left out.
 fn pieces_of<'a>(record: &Record<'a>, share: usize) -> Vec<Record<'a>> {
     let count = share.div_ceil(PIECE).max(1);
     let length = share / count;
@@ -39,7 +39,11 @@ fn pieces_of<'a>(record: &Record<'a>, share: usize) -> Vec<Record<'a>> {
         };
         let (from, to) = (start * record.channels, (start + length) * record.channels);
         let y = &record.y[start..start + length];
-        Record::with_gaps(&record.u[from..to], record.channels, y).ok()
+        let piece = Record::with_gaps(&record.u[from..to], record.channels, y).ok()?;
+        match record.weights {
+            None => Some(piece),
+            Some(weights) => piece.with_weights(&weights[start..start + length]).ok(),
+        }
     };
     (0..count).filter_map(piece).collect()
 }

@@ -2,6 +2,7 @@
 
 use nalgebra::DMatrix;
 
+use crate::data::weighted_squares;
 use crate::gram::Gram;
 use crate::lagged::{Lagged, Lags, push_past};
 use crate::linear::{LinearModel, is_stable};
@@ -21,8 +22,9 @@ pub(super) struct OutputError<'a> {
     records: &'a [Record<'a>],
     monitor: &'a Monitor,
     offset: bool,
-    /// Measured samples.
+    /// Samples that count, and the sum of their weights: as many where they count alike.
     samples: f64,
+    weight: f64,
     /// Where each free run begins: at the first measured sample, for a state before a gap would leave no trace.
     firsts: Vec<usize>,
     /// Free runs from there on.
@@ -38,7 +40,7 @@ impl<'a> OutputError<'a> {
         offset: bool,
         monitor: &'a Monitor,
     ) -> Result<Self> {
-        let samples: usize = records.iter().map(Record::measured).sum();
+        let samples: usize = records.iter().map(Record::counting).sum();
         let shared = lags.regressors() + usize::from(offset);
         let parameters = shared + lags.na * records.len();
         if samples <= parameters {
@@ -52,6 +54,7 @@ impl<'a> OutputError<'a> {
             monitor,
             offset,
             samples: samples as f64,
+            weight: records.iter().map(Record::total_weight).sum(),
             firsts: records.iter().map(Record::first_measured).collect(),
             runs: records
                 .iter()
@@ -133,7 +136,7 @@ impl<'a> OutputError<'a> {
         let is_valid = self.cost(theta).is_some();
         self.normal_equations(theta, &mut jtj, &mut jte);
         let information = DMatrix::from_fn(n, n, |i, j| jtj[i.max(j) * n + i.min(j)]);
-        // jtj is a mean over the samples, the cost half of one
+        // jtj is a mean over the samples, the cost half of one; weights are inverse variances but for a factor
         let variance = 2.0 * cost / (self.samples - n as f64);
         let shared = self.shared();
         let found = without_nuisance(&information, shared)
@@ -160,7 +163,17 @@ impl<'a> OutputError<'a> {
                 sum += (record.y[k] - y) * (record.y[k] - y);
             }
         }
-        Some(sum)
+        Some(match record.weights {
+            None => sum,
+            Some(weights) => {
+                let first = self.firsts[experiment];
+                weighted_squares(
+                    &weights[first..],
+                    &record.y[first..],
+                    &self.runs[experiment],
+                )
+            }
+        })
     }
 
     fn sensitivities(&mut self, theta: &[f64], experiment: usize) {
@@ -177,13 +190,16 @@ impl<'a> OutputError<'a> {
             self.gram.past_mut(i + 1)[shared + i] = 1.0;
         }
         let look = look((shared + na).pow(2));
+        let weights = record.weights;
         for (k, &y) in (self.firsts[experiment]..).zip(run) {
             if k & (look - 1) == 0 && self.monitor.stopped() {
                 return;
             }
             lags.write_inputs(record.u, k, &mut self.phi[na..]);
             let phi = &self.phi;
-            self.gram.push(&gains, shared + na, record.y[k] - y, |row| {
+            let weight = weights.map_or(1.0, |w| w[k]);
+            let error = (record.y[k] - y, weight);
+            self.gram.push(&gains, shared + na, error, |row| {
                 for (value, y) in row[..na].iter_mut().zip(&phi[..na]) {
                     *value = -y;
                 }
@@ -210,7 +226,7 @@ impl Problem for OutputError<'_> {
         for experiment in 0..self.records.len() {
             sum += self.simulate(theta, &model, experiment)?;
         }
-        Some(0.5 * sum / self.samples).filter(|c| c.is_finite())
+        Some(0.5 * sum / self.weight).filter(|c| c.is_finite())
     }
 
     fn normal_equations(&mut self, theta: &[f64], jtj: &mut [f64], jte: &mut [f64]) {
@@ -222,11 +238,52 @@ impl Problem for OutputError<'_> {
             let place = |i: usize| if i < shared { i } else { i + experiment * na };
             let (sums, width) = self.gram.finish();
             for i in 0..shared + na {
-                jte[place(i)] += sums[(shared + na) * width + i] / self.samples;
+                jte[place(i)] += sums[(shared + na) * width + i] / self.weight;
                 for j in 0..=i {
-                    jtj[place(i) * n + place(j)] += sums[i * width + j] / self.samples;
+                    jtj[place(i) * n + place(j)] += sums[i * width + j] / self.weight;
                 }
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::laws::{check_gradient, check_sum, weights};
+    use crate::random::Random;
+
+    #[test]
+    fn puts_weights_on_cost_and_normal_equations_alike() {
+        let mut random = Random::new(3);
+        let u: Vec<f64> = (0..400).map(|_| random.normal()).collect();
+        let mut y: Vec<f64> = (0..400).map(|_| random.normal()).collect();
+        y[..4].fill(f64::NAN);
+        y[200..230].fill(f64::NAN);
+        let (records, monitor) = (
+            [Record::with_gaps(&u, 1, &y).unwrap(); 2],
+            Monitor::default(),
+        );
+        let lags = Lags::new(2, 2, 1, 1).unwrap();
+        let theta = [-1.2, 0.5, 0.4, -0.3, 0.1, 0.3, -0.2, 0.7, 0.4];
+        let w = weights(400, 1);
+        let weighted = [records[0].with_weights(&w).unwrap(), records[1]];
+        let problem = |records| OutputError::new(records, lags, true, &monitor).unwrap();
+        check_gradient(&mut problem(&weighted), &theta);
+        // weights of 1 and, on a part, of 3
+        let part = |k: usize| k % 7 < 3;
+        let tripled: Vec<f64> = (0..400).map(|k| if part(k) { 3.0 } else { 1.0 }).collect();
+        let weighted = records.map(|r| r.with_weights(&tripled).unwrap());
+        let only: Vec<f64> = (0..400).map(|k| f64::from(u8::from(part(k)))).collect();
+        let parts = records.map(|r| r.with_weights(&only).unwrap());
+        let mut whole = problem(&weighted);
+        let (plain, part) = (problem(&records), problem(&parts));
+        let (total, all, of_part) = (whole.weight, plain.weight, part.weight);
+        assert_eq!(total, all + 2.0 * of_part);
+        check_sum(
+            &theta,
+            (&mut whole, total),
+            &mut [(plain, all, 1.0), (part, of_part, 2.0)],
+        );
     }
 }

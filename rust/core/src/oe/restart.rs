@@ -17,7 +17,7 @@ const SHORTEST: usize = 5;
 /// fails whenever it is started anew, which is what a model is for. Infinite where a run leaves the finite numbers, and
 /// after a stop.
 pub(super) fn restart_error(model: &LinearModel, records: &[Record], monitor: &Monitor) -> f64 {
-    let (mut sum, mut count) = (0.0, 0);
+    let (mut sum, mut count) = (0.0, 0.0);
     for record in records {
         let length = (record.len() / SEGMENTS)
             .max(SHORTEST * STATE_SAMPLES)
@@ -37,31 +37,31 @@ pub(super) fn restart_error(model: &LinearModel, records: &[Record], monitor: &M
             count += samples;
         }
     }
-    if count == 0 {
+    if count == 0.0 {
         f64::INFINITY
     } else {
-        sum / count as f64
+        sum / count
     }
 }
 
-/// Sum of squared errors and number of measured samples behind those that set the state.
+/// Sum of squared errors and of the weights of the measured samples behind those that set the state.
 fn segment_error(
     model: &LinearModel,
     record: &Record,
     start: usize,
     length: usize,
-) -> Option<(f64, usize)> {
+) -> Option<(f64, f64)> {
     let channels = record.channels;
     let u = &record.u[start * channels..(start + length) * channels];
     let y = &record.y[start..start + length];
     let Some(init) = window(y, STATE_SAMPLES.min(length.div_ceil(SHORTEST))) else {
-        return Some((0.0, 0));
+        return Some((0.0, 0.0));
     };
     let state = model
         .estimate_initial_state(&u[..init * channels], channels, &y[..init])
         .ok()?;
     let run = model.simulate(u, channels, &state).ok()?;
-    let scored = y.iter().zip(&run).skip(init).filter(|(y, _)| !y.is_nan());
-    let count = scored.clone().count();
-    Some((scored.map(|(y, r)| (y - r).powi(2)).sum(), count))
+    let scored = (init..length).filter(|&k| !y[k].is_nan());
+    let weighted = scored.map(|k| (record.weight(start + k), (y[k] - run[k]).powi(2)));
+    Some(weighted.fold((0.0, 0.0), |(sum, count), (w, e)| (sum + w * e, count + w)))
 }

@@ -7,7 +7,7 @@ use sewfast_core::linear;
 
 use super::linear::LinearModel;
 use super::neural::NeuralOE;
-use super::neural_ss::{NeuralSS, Pairs, recordings};
+use super::neural_ss::{Experiments, NeuralSS, recordings};
 use crate::watch::watched;
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -19,7 +19,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
 fn guard(
     py: Python<'_>,
     model: &Bound<'_, PyAny>,
-    experiments: Pairs<'_>,
+    experiments: Experiments<'_>,
     linear: Vec<PyRef<'_, LinearModel>>,
 ) -> PyResult<&'static str> {
     let experiments = recordings(py, &experiments)?;

@@ -10,7 +10,7 @@ use sewfast_core::{Error, Result};
 
 use super::linear::LinearModel;
 use super::{Matrices, Rows, Values};
-use crate::arrays::{array1, array2, raise, rows, slice};
+use crate::arrays::{Experiment, array1, array2, raise, rows, slice};
 use crate::watch::watched;
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -21,7 +21,8 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
 
 /// Outputs: one per sample, or rows of several.
 pub(super) type Outputs<'py> = PyReadonlyArrayDyn<'py, f64>;
-pub(super) type Pairs<'py> = Vec<(Rows<'py>, Outputs<'py>)>;
+/// A list of experiments of any number of outputs.
+pub(super) type Experiments<'py> = Vec<Experiment<'py, Outputs<'py>>>;
 type Array<'py> = Bound<'py, PyArrayDyn<f64>>;
 
 /// Neural state-space model.
@@ -259,12 +260,18 @@ fn outputs<'a>(py: Python<'_>, y: &'a Outputs<'_>) -> PyResult<(&'a [f64], usize
     Ok((values, count))
 }
 
-pub(super) fn recordings<'a>(py: Python<'_>, pairs: &'a Pairs<'_>) -> PyResult<Vec<Recording<'a>>> {
-    let recording = |(u, y): &'a (Rows<'_>, Outputs<'_>)| {
-        let ((u, inputs), (y, count)) = (rows(u, "u")?, outputs(py, y)?);
-        Recording::new(u, inputs, y, count).map_err(|e| raise(py, e))
+pub(super) fn recordings<'a>(
+    py: Python<'_>,
+    experiments: &'a Experiments<'_>,
+) -> PyResult<Vec<Recording<'a>>> {
+    let recording = |experiment: &'a Experiment<'_, Outputs<'_>>| {
+        let (u, inputs) = rows(&experiment.u, "u")?;
+        let ((y, count), weights) = (outputs(py, &experiment.y)?, experiment.weights()?);
+        let recording = Recording::new(u, inputs, y, count);
+        let weighted = recording.and_then(|r| weights.map_or(Ok(r), |w| r.with_weights(w)));
+        weighted.map_err(|e| raise(py, e))
     };
-    pairs.iter().map(recording).collect()
+    experiments.iter().map(recording).collect()
 }
 
 /// A trained model with the story of its training.
@@ -316,8 +323,8 @@ started_fit_methods!(NeuralSSFit {
 #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
 fn fit_neural_ss(
     py: Python<'_>,
-    experiments: Pairs<'_>,
-    validation: Pairs<'_>,
+    experiments: Experiments<'_>,
+    validation: Experiments<'_>,
     nx: usize,
     nk: usize,
     hidden: usize,

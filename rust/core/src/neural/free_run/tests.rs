@@ -36,6 +36,7 @@ fn side_by_side<const RUNS: usize>(
         ..Limit::NONE
     };
     let sums = FreeRuns {
+        weights: &[],
         runs: kept.each_mut().map(|(outputs, hidden)| Run {
             network: left.next().unwrap(),
             state,

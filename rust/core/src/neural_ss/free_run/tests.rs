@@ -31,6 +31,7 @@ fn runs(shape: Shape, limits: [f64; 2], together: bool) -> ([Option<f64>; 2], [T
     let monitor = Monitor::default();
     let reached = if together {
         let both = FreeRuns {
+            weights: &[],
             runs,
             v: &v,
             y: &y,
@@ -41,6 +42,7 @@ fn runs(shape: Shape, limits: [f64; 2], together: bool) -> ([Option<f64>; 2], [T
     } else {
         runs.map(|run| {
             let single = FreeRuns {
+                weights: &[],
                 runs: [run],
                 v: &v,
                 y: &y,
