@@ -22,7 +22,7 @@ from .effort import Look, Pool, Stopped
 from .folds import LEAST_HELD_OUT, SHARE, Split, compared, errors_of, folds, free_runs
 from .linear import linear_model
 from .orders import LinearCandidate, LinearTable
-from .search import Candidate, Search, counting, decayed, median_of
+from .search import BY_FAR, Candidate, Search, counting, decayed, median_of
 from .task import Provenance, Task, arrays, documented, finite, with_provenance, wrap
 from .training import Network, Request, Start, Structure, train
 from .verdict import verdict
@@ -31,8 +31,6 @@ WORTH_IT = 0.9
 """Every start of a network must bring the error below this part of the best linear model's."""
 WORTH_LOOKING = 0.97
 """Where the median of the starts does not even reach this, nothing is asked."""
-BY_FAR = 0.2
-"""Below this part of the linear model's error the network has won without a second fold."""
 LEAST_PASSING = 0.5
 """Part of the network sizes that must beat linear models on the earlier part, too."""
 VERIFIED = 4
@@ -66,7 +64,7 @@ BEHIND_LARGE = 1.01
 """The same on much data, where held-out errors are sure and iterations dear."""
 FINISHED = 0.995
 """A leg that does not bring the error below this part ends the training."""
-SHARE_OF_VERIFYING, SHARE_OF_FINAL, SHARE_OF_REFIT = 0.55, 0.74, 0.8
+SHARE_OF_VERIFYING, SHARE_OF_FINAL, SHARE_OF_REFIT = 0.64, 0.84, 0.9
 """Parts of a time budget at which each stage has to be done."""
 
 
@@ -176,30 +174,30 @@ class Choice:
         for c in ranked:
             best_of.setdefault((c.structure.nx, c.structure.integrator, c.structure.kind), c)
         asked = list(best_of.values())[:VERIFIED]
-        passed: list[tuple[float, Candidate]] = []
         newest = search.trials[0]
         winning = [c for c in asked if self._worst(c, newest) < WORTH_IT * linear.rmse]
-        if len(search.trials) < 2:
-            passed = [(c.error, c) for c in winning]
-        elif winning:
+        passed, parts = [(c.error, c) for c in winning], 1
+        if winning and len(search.trials) > 1:
+            search.share = SHARE_OF_VERIFYING
             earlier = LinearTable(self.task, [search.folds[1]], search.pool)
             nk = linear.nk
             # another part may ask for another order, and the network has to beat that one, too
             orders = {1, 2, 3, search.linear.choice.order, linear.order}
-            earlier.add([(o, nk) for o in sorted(orders)], self.clock.until(SHARE_OF_VERIFYING))
+            earlier.add([(o, nk) for o in sorted(orders)], search.until)
             bound = earlier.best.rmse if earlier.candidates else math.inf
             able = [c for c in winning if search.is_affordable(c.structure, 1)]
-            passed = [(c.error, c) for c in winning if c not in able]
-            starts = 3 if search.is_large else 6
-            until = self.clock.until(SHARE_OF_VERIFYING)
-            again = search.tried([(c.structure, 80, starts) for c in able], 1, until=until)
-            for c, other in zip(able, again, strict=True):
+            again = [(c, other) for c, other in self._learned_again(able) if other.starts]
+            # what the time budget has left unasked has not failed; where it is all, one part counts
+            if again or not able:
+                asked = [c for c in asked if c not in able or c in [a for a, _ in again]]
+                passed, parts = [(c.error, c) for c in winning if c not in able], 2
+            for c, other in again:
                 if self._worst(other, search.trials[1]) < WORTH_IT * bound:
                     passed.append((math.sqrt(c.error * other.error), c))
         passed.sort(key=lambda p: p[0])
         self.reasons.append(
             f"{len(passed)} of {len(asked)} network sizes beat it with every start on "
-            f"{min(2, len(search.trials))} later part(s)"
+            f"{parts} later part(s)"
         )
         if len(passed) < LEAST_PASSING * len(asked):
             # one of four sizes passes by luck now and then; what the data show, most sizes can see
@@ -212,6 +210,23 @@ class Choice:
                 kept.append(c)
         order = [id(c) for _, c in passed]
         return sorted(kept, key=lambda c: order.index(id(c)) if id(c) in order else len(order))
+
+    def _learned_again(self, able: Sequence[Candidate]) -> list[tuple[Candidate, Candidate]]:
+        """The structures learned afresh from what is before the earlier fifth.
+
+        With a time budget in as many starts as there is time for; if not even two of each, then the
+        best structures alone.
+        """
+        search = self.search
+        starts, least = 3 if search.is_large else 6, 2
+        samples = len(search.trials[1].fitted)
+        wanted = [80 * c.structure.operations(search.inputs, samples) for c in able]
+        share = search.able(starts * sum(wanted))
+        starts = max(least, int(share * starts))
+        ends = [n for n in range(1, len(able) + 1) if search.able(starts * sum(wanted[:n])) == 1.0]
+        some = able[: max(ends, default=1)]
+        found = search.tried([(c.structure, 80, starts) for c in some], 1)
+        return list(zip(some, found, strict=True))
 
     def _worst(self, c: Candidate, held: Split) -> float:
         """The largest error of the median and of its members alone."""
@@ -248,11 +263,10 @@ class Choice:
     def _finish(self, finalists: Sequence[Candidate]) -> list[Candidate]:
         """More starts, then all fitted data, until nothing is gained any more."""
         search = self.search
+        search.share = SHARE_OF_FINAL
+        until = search.until
         budget = FINAL_OPERATIONS_LARGE if search.is_large else FINAL_OPERATIONS
-        until = self.clock.until(SHARE_OF_FINAL)
-        if until is not None:
-            left = until - time.perf_counter()
-            budget = min(budget, max(0.0, left) * search.rate)
+        budget *= search.able(budget)
         alive = self._with_more_starts(finalists, budget / 3.0)
         alive = [self._rejudged(c) for c in alive]
         spent = 0.0
@@ -293,7 +307,7 @@ class Choice:
             request = search.request(c.structure, 60, starts=1, first=20)
             can = int(budget / len(finalists) / request.operations)
             requests.append(replace(request, starts=max(0, min(wanted - len(c.starts), can))))
-        added = search.trained(requests, 0.6, self.clock.until(SHARE_OF_FINAL - 0.15))
+        added = search.trained(requests, 0.6)
         return [
             search.judged(c.structure, [*c.starts, *starts], c.iterations)
             for c, starts in zip(finalists, added, strict=True)

@@ -35,7 +35,7 @@ _KINDS: dict[str, Callable[[Task], Model]] = {
     "neural_ss": choice.neural_ss,
     "paper": lagged.paper,
 }
-SHARE_OF_FIT = 0.8
+SHARE_OF_FIT = 0.9
 """Of a time budget; the rest is for the evidence that is kept with the model."""
 NETWORKS = ("neural_oe", "neural_ss")
 LINEAR_WIDTH = 10

@@ -41,6 +41,8 @@ DECAY_MATTERS = 6_000
 """Samples from which on the climb does not ask for another weight decay; the end does."""
 HOPELESS = 0.98
 """Where the best network of the second halving is not below this part of the linear error."""
+BY_FAR = 0.2
+"""Below this part of the linear error on the newest part a network needs no other evidence."""
 WORTH_A_STEP = 0.97
 """A step of the climb must bring the error below this part."""
 LEAST_STEP = 0.01
@@ -138,6 +140,8 @@ class Search:
         self.linear = LinearTable(self.task, self.folds[:1], self.pool)
         self.most = SEARCH_OPERATIONS_LARGE if self.is_large else SEARCH_OPERATIONS
         self.budget, self.rate = self.most, 0.0
+        # part of a time budget at which the present stage has to be done; 0 for the search's own
+        self.share = 0.0
         self._starts: dict[tuple[int, int, str, int], _core.LinearModel | None] = {}
         self._guarded = arrays(self.task.data)
 
@@ -153,8 +157,25 @@ class Search:
 
     @property
     def until(self) -> float | None:
-        """When the search has to end, on `time.perf_counter`."""
-        return self.pool.clock.until(SHARE_OF_SEARCH)
+        """When the present stage has to end, on `time.perf_counter`."""
+        return self.pool.clock.until(self.share or self._share_of_search)
+
+    @property
+    def _share_of_search(self) -> float:
+        """Networks that will not be better by far are verified, which takes time as well."""
+        best, linear = self.best, self.linear
+        if self.wants_network or best is None or not linear.eligible:
+            return SHARE_OF_SEARCH
+        # the climb can be expected to halve the error
+        is_by_far = best.error <= 2.0 * BY_FAR * linear.best.rmse
+        return SHARE_OF_SEARCH if is_by_far else SHARE_OF_SEARCH_VERIFIED
+
+    def able(self, operations: float) -> float:
+        """The part of these operations for which the present stage has time, at most 1."""
+        if self.until is None:
+            return 1.0
+        left = max(0.0, self.until - time.perf_counter())
+        return min(1.0, left * self.rate / max(operations, 1.0))
 
     @property
     def decay(self) -> float:
@@ -261,10 +282,12 @@ class Search:
     @property
     def is_over(self) -> bool:
         """Whether the search has had its share of operations or of the time budget."""
-        until = self.until
-        is_late = until is not None and time.perf_counter() >= until
-        self.pool.clock.truncated |= is_late
-        return is_late or self.operations >= self.budget
+        self.pool.clock.truncated |= self._is_late
+        return self._is_late or self.operations >= self.budget
+
+    @property
+    def _is_late(self) -> bool:
+        return self.until is not None and time.perf_counter() >= self.until
 
     # --- what is tried --------------------------------------------------------------------------
 
@@ -456,12 +479,11 @@ class Search:
         wanted: Sequence[tuple[Structure, int, int]],
         fold: int = 0,
         share: float | None = None,
-        until: float | None = None,
     ) -> list[Candidate]:
         """Candidates of (structure, iterations, starts), trained afresh side by side."""
         self._prepare([s for s, _, _ in wanted], fold)
         requests = [self.request(s, i, starts=n, fold=fold) for s, i, n in wanted]
-        found = self.trained(requests, share, until)
+        found = self.trained(requests, share)
         pairs = zip(wanted, found, strict=True)
         return [self.judged(s, starts, i, fold) for (s, i, _), starts in pairs]
 
@@ -512,7 +534,6 @@ class Search:
         self,
         requests: Sequence[Request],
         share: float | None = None,
-        until: float | None = None,
     ) -> list[list[Start]]:
         """Starts of every request, looked at by the guard."""
         wanted = sum(r.operations for r in requests)
@@ -525,10 +546,11 @@ class Search:
             self.pool,
             self.task.seed,
             workers=self.task.workers,
-            until=self.until if until is None else until,
+            until=self.until,
             share=share,
         )
-        self._calibrate(time.perf_counter() - began, wanted)
+        if not self._is_late:
+            self._calibrate(time.perf_counter() - began, wanted)
         return self.guarded(found)
 
     def guarded(self, found: Sequence[Sequence[Start]]) -> list[list[Start]]:
@@ -624,8 +646,8 @@ class Search:
         yield from (c.to_json() for c in self.candidates.values())
 
 
-SHARE_OF_GUARD = 0.82
-SHARE_OF_LINEAR, SHARE_OF_SEARCH = 0.12, 0.48
+SHARE_OF_GUARD = 0.92
+SHARE_OF_LINEAR, SHARE_OF_SEARCH, SHARE_OF_SEARCH_VERIFIED = 0.12, 0.58, 0.45
 """Parts of a time budget after which no linear model, and no network, is tried any more."""
 
 
