@@ -10,6 +10,7 @@ import json
 import signal
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,7 @@ from sewfast.commissioning import (
 from sewfast.commissioning.bench import DriveBench, MachineBench, bench_of
 from sewfast.commissioning.demands import demands
 from sewfast.commissioning.requirements import Requirements
+from sewfast.errors import LinkError
 from sewfast.link import VirtualDevice, connect
 from sewfast.report import report
 
@@ -202,6 +204,32 @@ def test_a_drives_volt_limit_is_lowered_as_long_as_it_lasts() -> None:
             assert isinstance(bench, DriveBench)
             assert bench.volt == pytest.approx(7.0)
         assert drive.limits().volt == before
+
+
+def test_a_run_of_which_the_link_lost_samples_is_made_once_more() -> None:
+    made: list[int] = []
+    with (
+        VirtualDevice(fast=True, faults="drop=.004", seed=3) as device,
+        connect(device.port) as drive,
+    ):
+        drive.set_limits()
+        stream = drive.stream
+
+        def counted(*told: Any) -> Any:
+            made[-1] += 1
+            return stream(*told)
+
+        drive.stream = counted  # type: ignore[method-assign]
+        repeated = 0
+        with bench_of(drive, None) as bench:
+            for _ in range(100):
+                made.append(0)
+                with suppress(LinkError):  # lost twice
+                    assert np.isfinite(bench.excite(np.full(400, 2.0), "step").counts).all()
+                    repeated += made[-1] == 2
+                if repeated:
+                    break
+    assert repeated
 
 
 # --- Ctrl-C -------------------------------------------------------------------------------------
