@@ -183,7 +183,9 @@ class Figures:
         return self.measured / self.oracle
 
 
-def figures(motor: Motor, seed: int, evaluations: int | None, **settings: Any) -> Figures:
+def figures(
+    motor: Motor, seed: int, evaluations: int | None, cost_alone: bool = False, **settings: Any
+) -> Figures:
     """Commission one motor; `evaluations` of the oracle, 0 for none."""
     from oracle import EVALUATIONS, oracle
 
@@ -197,7 +199,9 @@ def figures(motor: Motor, seed: int, evaluations: int | None, **settings: Any) -
         found, reason = refusal.so_far, f"{refusal.stage}: {refusal}"
     used, began = time.process_time() - began, time.process_time()
     if found.measured_cost is not None and evaluations != 0:
-        best = oracle(bench, found, seed=seed, evaluations=evaluations or EVALUATIONS).cost
+        best = oracle(
+            bench, found, seed=seed, evaluations=evaluations or EVALUATIONS, cost_alone=cost_alone
+        ).cost
     small = found.small_signal
     described = (
         f"{motor.volt:g} V, {1e3 * motor.lag:.0f} ms, 1:{motor.gear:g}, {motor.counts:g} counts"
@@ -246,6 +250,9 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=1, help="commissionings of each")
     parser.add_argument("--draw", type=int, default=0, help="seed that the motors are drawn by")
     parser.add_argument("--oracle", type=int, help="evaluations of the oracle (0: none)")
+    parser.add_argument(
+        "--cost-alone", action="store_true", help="an oracle that need not bear a load, nor any Ms"
+    )
     parser.add_argument("-o", dest="out", type=Path, help="JSON to write, and to go on with")
     args = parser.parse_args()
     kept: dict[str, dict[str, Any]] = {}
@@ -257,7 +264,7 @@ def main() -> int:
         for seed in range(args.seeds):
             key = f"{args.draw}/{number}/{seed}"
             if key not in kept:
-                one = figures(drawn(number, args.draw), seed, args.oracle)
+                one = figures(drawn(number, args.draw), seed, args.oracle, args.cost_alone)
                 kept[key] = vars(one)
             found.append(Figures(**kept[key]))
             print(line(found[-1]), flush=True)
