@@ -7,6 +7,7 @@ others with several differences at once.
 
     python benches/drives.py                    one commissioning on each, with its figures
     python benches/drives.py --only shaft60     one of them
+    python benches/drives.py --oracle 200       beside gains tuned on the drive itself
 """
 
 from __future__ import annotations
@@ -228,19 +229,22 @@ class Figures:
     verdict: str
     stage: str
     reason: str
-    cost: float | None
     predicted: float | None
     measured: float | None
+    oracle: float | None
     railed: float
     moved: float
     cpu: float
 
 
-def figures(drive: Drive, seed: int, **settings: Any) -> Figures:
-    """Commission one machine; `railed` is the time at a limit of the command in all [s]."""
+def figures(drive: Drive, seed: int, evaluations: int = 0, **settings: Any) -> Figures:
+    """Commission one machine; `railed` is the time at a limit of the command in all [s].
+
+    `evaluations` are the oracle's; 0 for none.
+    """
     simulator = Simulator(drive)
     used = time.process_time()
-    stage, reason = "", ""
+    stage, reason, best = "", "", None
     try:
         found = commission(bench_of(simulator), seed=seed, **settings)
         verdict = found.verdict
@@ -248,15 +252,23 @@ def figures(drive: Drive, seed: int, **settings: Any) -> Figures:
         if refusal.so_far is None:
             raise
         found, verdict, stage, reason = refusal.so_far, "refused", refusal.stage, str(refusal)
+    used = time.process_time() - used
+    railed, moved = simulator.railed * drive.Ts, simulator.samples * drive.Ts
+    if evaluations and found.measured_cost is not None:
+        from oracle import oracle
+
+        best = oracle(bench_of(simulator), found, seed=seed, evaluations=evaluations).cost
     return Figures(
-        drive.name, seed, verdict, stage, reason, None, found.predicted_cost, found.measured_cost,
-        simulator.railed * drive.Ts, simulator.samples * drive.Ts, time.process_time() - used,
+        drive.name, seed, verdict, stage, reason, found.predicted_cost, found.measured_cost, best,
+        railed, moved, used,
     )  # fmt: skip
 
 
 def line(f: Figures) -> str:
     """For progress."""
-    costs = " ".join(f"{'-' if c is None else f'{c:.2f}':>8}" for c in (f.predicted, f.measured))
+    costs = " ".join(
+        f"{'-' if c is None else f'{c:.2f}':>8}" for c in (f.predicted, f.measured, f.oracle)
+    )
     return (
         f"{f.machine:12}{f.seed:3} {f.verdict:9}{costs}  railed {f.railed:6.2f} s of "
         f"{f.moved:6.1f}  cpu {f.cpu:6.1f}  {f.stage} {f.reason[:150]}"
@@ -267,6 +279,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="+", help="machines by name, drawnN among them")
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--oracle", type=int, default=0, help="evaluations of an oracle")
     parser.add_argument("-o", dest="out", type=Path, help="JSON to write")
     args = parser.parse_args()
     named = {d.name: d for d in FAMILY}
@@ -275,7 +288,7 @@ def main() -> int:
     found = []
     for drive in drives:
         for seed in range(args.seeds):
-            found.append(figures(drive, seed))
+            found.append(figures(drive, seed, args.oracle))
             print(line(found[-1]), flush=True)
     if args.out is not None:
         args.out.write_text(json.dumps([vars(f) for f in found], indent=1) + "\n")

@@ -127,6 +127,8 @@ class Stepped(Protocol):
 class SteppedBench:
     """Any machine that can be advanced sample by sample, with sewfast's own controller around it.
 
+    Every run ends with a sample at 0 V, also one that is broken off.
+
     Parameters
     ----------
     machine : Stepped
@@ -176,9 +178,13 @@ class SteppedBench:
         machine = self.machine
         machine.reset()
         first, counts, speed = machine.counts, np.zeros(samples), np.zeros(samples)
-        for k in range(samples):
-            counts[k], speed[k] = machine.counts - first, getattr(machine, "speed_rpm", np.nan)
-            machine.step(min(max(decide(k, float(counts[k])), -self.volt), self.volt))
+        try:
+            for k in range(samples):
+                counts[k], speed[k] = machine.counts - first, getattr(machine, "speed_rpm", np.nan)
+                machine.step(min(max(decide(k, float(counts[k])), -self.volt), self.volt))
+        finally:
+            # a rig holds its last command: no run leaves it turning, however it ends
+            machine.step(0.0)
         return counts, speed if hasattr(machine, "speed_rpm") else None
 
     def _recording(

@@ -1,0 +1,188 @@
+"""The best that gains do on a machine itself: what a commissioning's cost is held against.
+
+Same variables and bounds, same cost and same references as the commissioning's search, but every
+loop runs on the machine. Unless it is to look at the cost alone it must bear what the commissioned
+gains bear: a load step deviates the speed no more than under them, and Ms on the small signals is
+within the same limit. Nothing in the package knows it. The machine is any that can be advanced
+sample by sample, so the search is pycma's; `tune` runs models only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cma
+import numpy as np
+
+from sewfast import Commissioning, Controller
+from sewfast.commissioning import SteppedBench
+from sewfast.commissioning.demands import demands
+from sewfast.commissioning.references import standard
+from sewfast.cost import Cost
+from sewfast.loop import ClosedLoopRun
+from sewfast.robustness import margins
+from sewfast.tuning import Variable
+from sewfast.variables import applied
+
+EVALUATIONS = 200
+"""From the tuned gains; two thirds of it in a first search, the rest close to its best."""
+FINALISTS = 3
+"""Of the search over the short references, which then run the long ones."""
+LINEAR = ("alpha", "beta", "filter_time")
+BEARS = 1.02
+"""Times the commissioned gains' deviation under the load that the oracle's may have."""
+REFUSED = 10.0
+"""Times the best cost: of a candidate that does not bear what it must."""
+HOPELESS = 3.0
+"""Times the best cost: a candidate whose first references cost more runs no others."""
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Its controller, and what that costs on the references of the verification."""
+
+    controller: Controller
+    cost: float
+    evaluations: int
+
+
+def oracle(
+    bench: SteppedBench,
+    found: Commissioning,
+    *,
+    seed: int = 0,
+    evaluations: int = EVALUATIONS,
+    cost_alone: bool = False,
+) -> Oracle:
+    """The least cost that a search on the machine finds; never above the commissioned one's."""
+    assert found.controller is not None
+    assert found.tuning is not None
+    assert found.cost is not None
+    own, box, cost = found.controller, found.tuning.variables, found.cost
+    verify = {c.reference: c.predicted.r for c in found.comparisons}
+    asked = demands(
+        bench, u_max=own.u_max, speed=float(verify["trapezoid"].max()), references=None, members=1,
+        evaluations=evaluations, seed=seed, threads=1,
+    )  # fmt: skip
+    practice = standard(found.acceleration, asked, bench.Ts, short=True)
+    bears = (lambda controller: True) if cost_alone else _requirement(bench, found)
+    tried: list[tuple[float, Controller]] = [(_cost(bench, own, practice, cost), own)]
+
+    def value(point: Sequence[float]) -> float:
+        controller = _at(point, box, own)
+        best = min(c for c, _ in tried)
+        if bears(controller):
+            tried.append((_cost(bench, controller, practice, cost, HOPELESS * best), controller))
+        else:
+            tried.append((REFUSED * best, controller))
+        return tried[-1][0]
+
+    start, first = _place(own, box), round(evaluations * 2 / 3)
+    for spread, until in ((0.12, first), (0.04, evaluations)):
+        options = {"bounds": [0, 1], "seed": seed + 1, "verbose": -9}
+        strategy = cma.CMAEvolutionStrategy(list(start), spread, options)
+        while len(tried) < until and not strategy.stop():
+            points = strategy.ask()
+            strategy.tell(points, [value(p) for p in points])
+        start = _place(min(tried, key=lambda t: t[0])[1], box)
+    finalists = [c for _, c in sorted(tried, key=lambda t: t[0])[:FINALISTS]]
+    whole = [(_cost(bench, c, verify, cost), c) for c in (own, *finalists)]
+    least, controller = min(whole, key=lambda t: t[0])
+    return Oracle(controller, least, len(tried))
+
+
+def _requirement(bench: SteppedBench, found: Commissioning) -> Callable[[Controller], bool]:
+    """Whether a controller bears what the commissioned one does."""
+    assert found.controller is not None
+    met = found.met or {}
+    load, limit, small = met.get("load"), met.get("Ms_limit"), found.small_signal
+    most = BEARS * deviation(bench, found.controller, load) if load else np.inf
+
+    def bears(controller: Controller) -> bool:
+        if small is not None and limit is not None and margins(controller, small.model).Ms > limit:
+            return False
+        return not load or deviation(bench, controller, load) <= most
+
+    return bears
+
+
+def deviation(bench: SteppedBench, controller: Controller, load: Mapping[str, float]) -> float:
+    """What a load that brakes does to a held speed [RPM rms]: beside the same loop without it."""
+    ramp, settle, look = 300, 300, 200
+    r = load["level"] * np.minimum(1.0, np.arange(ramp + settle + look) / ramp)
+    push = np.where(np.arange(len(r)) >= ramp + settle, load["disturbance"], 0.0)
+    loops = [driven(bench, controller, r, "load", p).y for p in (push, 0.0 * push)]
+    return float(np.sqrt(np.mean((loops[0] - loops[1])[-look:] ** 2)))
+
+
+def driven(
+    bench: SteppedBench,
+    controller: Controller,
+    r: np.ndarray,
+    name: str,
+    disturbance: np.ndarray | None = None,
+) -> ClosedLoopRun:
+    """A loop on the machine, of its true speed: what `SteppedBench.follow` does without recording.
+
+    A disturbance [V] comes on behind the controller's limits.
+    """
+    machine, core = bench.machine, controller.core()
+    per_count, before = 60.0 / (bench.counts_per_rev * bench.Ts), 0.0
+    u, y, feedback = (np.zeros(len(r)) for _ in range(3))
+    machine.reset()
+    first = machine.counts
+    push = [0.0] * len(r) if disturbance is None else disturbance.tolist()
+    for k, wanted in enumerate(r.tolist()):
+        counts = machine.counts - first
+        y[k] = machine.speed_rpm  # type: ignore[attr-defined]
+        u[k] = command = core.step(wanted, (counts - before) * per_count)
+        feedback[k], before = core.filtered, counts
+        machine.step(command + push[k])
+    machine.step(0.0)
+    t = np.arange(len(r)) * bench.Ts
+    return ClosedLoopRun(t, np.array(r), u, y, feedback, controller, bench.name, name)
+
+
+def _cost(
+    bench: SteppedBench,
+    controller: Controller,
+    references: Mapping[str, np.ndarray],
+    cost: Cost,
+    hopeless: float = np.inf,
+) -> float:
+    """Mean over the references; no more of these once the mean is above `hopeless` anyway."""
+    total = 0.0
+    for name, r in sorted(references.items(), key=lambda item: len(item[1])):
+        # weights are numbers, so the mean of single costs is the cost of all runs
+        total += cost.of(driven(bench, controller, r, name)) / len(references)
+        if not total <= hopeless:
+            break
+    return total if np.isfinite(total) else 1e9
+
+
+def _at(point: Sequence[float], box: Sequence[Variable], like: Controller) -> Controller:
+    """At a point of the unit box."""
+    values = {}
+    for place, v in zip(np.clip(point, 0.0, 1.0), box, strict=True):
+        is_linear = v.name in LINEAR or v.low <= 0.0
+        values[v.name] = (
+            v.low + place * (v.high - v.low) if is_linear else v.low * (v.high / v.low) ** place
+        )
+        if v.name == "filter_samples":
+            values[v.name] = round(values[v.name])
+    return replace(applied(values, like, "oracle"), notes="oracle")
+
+
+def _place(controller: Controller, box: Sequence[Variable]) -> np.ndarray:
+    """The point of the unit box where a controller lies."""
+    gains, places = controller.gains.to("standard"), []
+    for v in box:
+        own = (
+            getattr(gains, v.name) if v.name in ("Kp", "Ti", "Td") else getattr(controller, v.name)
+        )
+        if v.name in LINEAR or v.low <= 0.0:
+            places.append((own - v.low) / (v.high - v.low))
+        else:
+            places.append(np.log(max(own, v.low) / v.low) / np.log(v.high / v.low))
+    return np.clip(places, 0.0, 1.0)
