@@ -161,8 +161,11 @@ def search(
     requirements: Requirements | None = None,
     variations: Sequence[tuple[float, int]] | None = None,
     disturbances: Sequence[FloatArray] | None = None,
+    rival: Model | None = None,
 ) -> TuningResult:
     """The gains of least cost over all members, each with the usual gain spread and delay.
+
+    A `rival` gives its second opinion on them.
 
     Raises
     ------
@@ -182,6 +185,7 @@ def search(
             constraints=asked.constraints,
             loads=asked.loads,
             disturbances=disturbances,
+            rival=rival,
             variations=variations,
             evaluations=demands.evaluations,
             seed=demands.seed,

@@ -18,12 +18,12 @@ from ..dataset import FloatArray
 from ..errors import DataError, Interrupted, SettingError
 from ..loop import ClosedLoopRun
 from ..machine import VirtualMachine
-from ..models import Ensemble
+from ..models import Ensemble, Model
 from ..recording import Recording
 from ..threads import available
 from ..tuning import TuningResult
 from . import excitations
-from .agreement import agreeing
+from .agreement import Disagreement, agreeing
 from .bench import Bench, Followed, NotedBench, bench_of, told_of
 from .caution import cause, cautious
 from .demands import MS, Demands, demands
@@ -36,6 +36,7 @@ from .references import standard
 from .refusal import Refusal
 from .requirements import Requirements
 from .result import VERIFIED, VERIFIED_POORLY, Commissioning
+from .rival import Rival, linear_rival
 from .small_signal import SmallSignal, small_signal
 from .taken import Taken
 from .training import Trained, train
@@ -257,7 +258,13 @@ def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal
 
     journal.enter("training")
     learned = [journal.recording("step"), trapezoids.recording, *pulses]
-    trained = train(learned, levels.recording, asked, journal.within)
+    gentle = [trapezoids.recording, journal.recording("small_signals")]
+    rival = linear_rival(gentle, levels.recording, step, asked)
+    journal.keep(rival=rival)
+    try:
+        trained = train(learned, levels.recording, asked, journal.within)
+    except Refusal as refusal:
+        trained = _instead(rival, levels.recording, refusal, journal)
     journal.keep(models=trained.ensemble, rmse=trained.rmse, card=trained.card)
     load = None
     if small is not None:
@@ -268,24 +275,46 @@ def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal
     verify, practice = _references(fastest, asked, bench)
     weights = cost_of(practice, bench.Ts, asked) if cost is None else cost
     journal.keep(cost=weights)
-    plan = _Plan(practice, asked, weights, fopdt, fastest, small, load)
-    ensemble, controller = _tuned(trained, plan, journal)
+    plan = _Plan(practice, asked, weights, fopdt, fastest, small, load, rival)
+    try:
+        ensemble, controller = _tuned(trained, plan, journal)
+    except Disagreement as refusal:
+        if len(trained.ensemble.members) == 1:
+            raise
+        trained = _instead(rival, levels.recording, refusal, journal)
+        journal.keep(card=trained.card)
+        ensemble, controller = _tuned(trained, plan, journal)
 
     journal.enter("verification")
     controller, swing = cautious(bench, controller, asked, fastest, "hold_tuned", small, ensemble)
     if swing is not None:
         note = (
-            f"{controller.notes}; gains lowered, as the machine swung at {swing.frequency:.3g} Hz "
+            f"gains lowered, as the machine swung at {swing.frequency:.3g} Hz "
             f"under {100 * swing.share:g} % of them: {cause(swing, small)}"
         )
-        controller = replace(controller, notes=note)
+        controller = replace(controller, notes=f"{controller.notes}; {note}")
         journal.keep(controller=controller)
+        journal.say(note)
     comparisons = predict(controller, ensemble, verify, load)
     journal.keep(comparisons=comparisons, judgement=judged(comparisons, ensemble))
     measure(controller, bench, comparisons, lambda found: journal.keep(comparisons=found))
     journal.finish()
     found = journal.result(VERIFIED)
     return replace(found, verdict=VERIFIED_POORLY) if found.is_predicted_poorly else found
+
+
+def _instead(rival: Rival | None, judge: Recording, refusal: Refusal, journal: Journal) -> Trained:
+    """The linear rival in place of networks that failed.
+
+    Raises
+    ------
+    Refusal
+        That of the networks, where the rival is no better.
+    """
+    if rival is None or not rival.is_fit:
+        raise refusal
+    journal.say(f"tuned on the linear model alone, as the networks failed: {refusal}")
+    return rival.alone(judge)
 
 
 def _pulses(bench: Bench, fopdt: Fopdt, asked: Demands) -> tuple[float, list[Recording]]:
@@ -315,6 +344,12 @@ class _Plan:
     fastest: float
     small: SmallSignal | None
     load: TurnLoad | None
+    rival: Rival | None
+
+    @property
+    def second(self) -> Model | None:
+        """The rival, where it predicts well enough to be asked."""
+        return self.rival.model if self.rival is not None and self.rival.is_fit else None
 
 
 def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, Controller]:
@@ -324,6 +359,10 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
     # Eq. 12's gains would wake a resonance: the first gains are what is known to be quiet there
     rival = ruled(plan.fopdt, first) if small is None or small.resonance is None else first
     pushes = along(plan.load, practice, first.Ts)
+    second = plan.second
+    is_alone = plan.rival is not None and plan.rival.model is trained.ensemble.members[0]
+    if is_alone:
+        second = None
 
     def of(ensemble: Ensemble) -> tuple[Requirements, TuningResult]:
         # alpha and beta do not matter to a load, but for what they leave when it comes on
@@ -333,7 +372,7 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
             start = start_of(first, ensemble, practice, cost, asked.threads)
         return required, search(
             ensemble, practice, start, asked, cost, journal.within, requirements=required,
-            disturbances=pushes,
+            disturbances=pushes, rival=second,
         )  # fmt: skip
 
     alike = agreeing(first, trained.ensemble, practice)
@@ -343,7 +382,10 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
         # one that parts from the others has had its say in these gains
         required, tuning = of(ensemble)
     journal.keep(models=ensemble, rmse=trained.errors_of(ensemble))
-    controller = replace(tuning.controller, notes="commissioned on an ensemble of networks")
+    plants = "a linear model" if is_alone else "an ensemble of networks"
+    controller = replace(tuning.controller, notes=f"commissioned on {plants}")
+    if tuning.warning is not None:
+        journal.say(tuning.warning)
     journal.keep(tuning=tuning, controller=controller, met=required.met(controller, ensemble))
     return ensemble, controller
 
