@@ -36,6 +36,7 @@ def numbers(c: Commissioning) -> dict[str, Any]:
         if c.rival is None
         else {"order": c.rival.model.orders["na"], "levels_rmse_rpm": c.rival.rmse},
         "second_opinion": _opinion(c),
+        "simulated_at_s": c.sample_time,
         "notes": list(c.notes),
         "controllers": {
             name: _gains(controller)

@@ -74,6 +74,8 @@ class Commissioning:
         What speaks against the loops as predicted.
     comparisons : tuple of Comparison
         Predicted and measured, per reference.
+    sample_time : float or None
+        Of what is simulated [s]: for a slow drive a multiple of the machine's.
     notes : tuple of str
         What went otherwise than usual: networks that failed, models that contradict each other,
         gains that were lowered.
@@ -103,6 +105,7 @@ class Commissioning:
     card: ReportCard | None = None
     judgement: Judgement | None = None
     comparisons: tuple[Comparison, ...] = ()
+    sample_time: float | None = None
     notes: tuple[str, ...] = ()
     taken_in: Path | None = None
 
@@ -114,8 +117,11 @@ class Commissioning:
     @property
     def is_predicted_poorly(self) -> bool:
         """Whether the machine costs more than twice what was predicted."""
-        predicted, measured = self.predicted_cost, self.measured_cost
-        return predicted is not None and measured is not None and measured > POOR * predicted
+        predicted, runs = self.predicted_cost, [c.alike for c in self.comparisons]
+        alike = [r for r in runs if r is not None]
+        if self.cost is None or predicted is None or len(alike) < len(runs):
+            return False
+        return self.cost.of(alike) > POOR * predicted
 
     @property
     def predicted_cost(self) -> float | None:
