@@ -49,7 +49,7 @@ class Thinning:
         """What a drive's time constant allows; a resonance is not to be folded into it."""
         if small is not None and small.resonance is not None:
             return cls()
-        return cls(max(1, min(MOST, int(fopdt.T / (PER_CONSTANT * Ts)))))
+        return cls(max(1, min(MOST, int(fopdt.T / (PER_CONSTANT * Ts) + 1e-9))))
 
     @classmethod
     def between(cls, coarse: float, fine: float) -> Thinning:
@@ -122,8 +122,5 @@ class Thinning:
         """What the machine did, as it compares with what was simulated."""
         if self.k == 1:
             return found
-        columns = {name: getattr(found, name)[:: self.k] for name in ("t", "r", "u", "y")}
-        feedback = found.feedback[:: self.k]
-        return replace(
-            found, **columns, feedback=feedback, controller=self.coarse(found.controller)
-        )
+        kept = {n: np.ascontiguousarray(x[:: self.k]) for n, x in found.columns().items()}
+        return replace(found, **kept, controller=self.coarse(found.controller))
