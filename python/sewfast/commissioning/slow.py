@@ -123,4 +123,7 @@ class Thinning:
         if self.k == 1:
             return found
         kept = {n: np.ascontiguousarray(x[:: self.k]) for n, x in found.columns().items()}
-        return replace(found, **kept, controller=self.coarse(found.controller))
+        controller = self.coarse(found.controller)
+        return ClosedLoopRun(
+            **kept, controller=controller, plant=found.plant, reference=found.reference
+        )
