@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from sewfast import Controller, Gains, VirtualMachine
+from sewfast.commissioning.gains import ruled
 from sewfast.commissioning.slow import MOST, PER_CONSTANT, Thinning
 from sewfast.commissioning.small_signal import Resonance, SmallSignal
 from sewfast.commissioning.turn import HARMONICS, TurnLoad
 from sewfast.control import Fopdt
 from sewfast.loop import run
 from sewfast.recording import Recording, record
+from sewfast.robustness import margins
 
 
 def recorded(samples: int = 1003) -> Recording:
@@ -63,6 +65,16 @@ def test_commands_are_averaged_and_counts_are_picked() -> None:
     # the speed is that of the samples that are left
     error = thin.y[20:] - whole.speed_true[::10][20:]
     assert np.sqrt(np.mean(error**2)) < 0.02 * np.ptp(whole.speed_true)
+
+
+def test_a_rule_is_told_of_the_delay_of_coarse_samples() -> None:
+    fopdt = Fopdt(K=500.0, T=2.0, L=0.002)
+    assert Thinning().plant(fopdt, 1e-3) is fopdt
+    thinning = Thinning(10)
+    coarse = thinning.coarse(controller())
+    told = thinning.plant(fopdt, 1e-3)
+    assert pytest.approx(0.011) == told.L
+    assert margins(ruled(told, coarse), fopdt).Ms < 2.0
 
 
 def test_a_controller_converts_there_and_back() -> None:

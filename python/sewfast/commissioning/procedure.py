@@ -36,7 +36,7 @@ from .references import standard
 from .refusal import Refusal
 from .requirements import Requirements
 from .result import VERIFIED, VERIFIED_POORLY, Commissioning
-from .rival import Rival, linear_rival
+from .rival import ORDERS, THINNED, Rival, linear_rival
 from .slow import Thinning
 from .small_signal import SmallSignal, small_signal
 from .taken import Taken
@@ -263,7 +263,7 @@ def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal
     thin, judge = thinning.recording, thinning.recording(levels.recording)
     learned = [thin(r) for r in (journal.recording("step"), trapezoids.recording, *pulses)]
     gentle = [thin(trapezoids.recording), thin(journal.recording("small_signals"))]
-    rival = linear_rival(gentle, judge, step, asked)
+    rival = linear_rival(gentle, judge, step, asked, ORDERS if thinning.k == 1 else THINNED)
     journal.keep(rival=rival)
     try:
         trained = train(learned, judge, asked, journal.within)
@@ -286,8 +286,8 @@ def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal
     journal.keep(cost=weights)
     pushes = thinning.pushes(load, practice, bench.Ts)
     plan = _Plan(
-        thinning.references(practice), pushes, asked, weights, fopdt, fastest, small, rival,
-        thinning,
+        thinning.references(practice), pushes, asked, weights, thinning.plant(fopdt, bench.Ts),
+        fastest, small, rival, thinning,
     )  # fmt: skip
     try:
         ensemble, controller = _tuned(trained, plan, journal)

@@ -111,6 +111,14 @@ class Thinning:
             c, Ts=c.Ts / self.k, filter_samples=min(LONGEST_FILTER, self.k * c.filter_samples)
         )
 
+    def plant(self, fopdt: Fopdt, Ts: float) -> Fopdt:
+        """First order with dead time as a loop at coarse samples sees it, `Ts` [s] the machine's.
+
+        Its command is held, and its speed taken, over k samples instead of one: half of the rest
+        each.
+        """
+        return fopdt if self.k == 1 else replace(fopdt, L=fopdt.L + (self.k - 1) * Ts)
+
     def variations(self) -> Sequence[tuple[float, int]] | None:
         """Gain and delay of the plants that are tuned on; None for the usual ones.
 
