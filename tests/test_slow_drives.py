@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sewfast import Controller, Gains, VirtualMachine
+from commissioned import SMALL, short
+from sewfast import Controller, Gains, VirtualMachine, commission
 from sewfast.commissioning.gains import ruled
-from sewfast.commissioning.slow import MOST, PER_CONSTANT, Thinning
+from sewfast.commissioning.slow import MOST, PER_CONSTANT, SHARPEST, Thinning
 from sewfast.commissioning.small_signal import Resonance, SmallSignal
 from sewfast.commissioning.turn import HARMONICS, TurnLoad
 from sewfast.control import Fopdt
@@ -82,8 +84,15 @@ def test_a_controller_converts_there_and_back() -> None:
     coarse = thinning.coarse(controller(20))
     assert (coarse.Ts, coarse.filter_samples) == (0.01, 2)
     assert coarse.gains == controller().gains
-    back = thinning.fine(coarse)
-    assert back == controller(20)
+    # .4 ms of derivative filter are less than 10 ms of sample time are
+    assert coarse.N == SHARPEST
+    softer = replace(coarse, N=5.0)
+    fine = thinning.fine(softer)
+    assert (fine.Ts, fine.filter_samples) == (0.001, 20)
+    assert pytest.approx(0.004 / 5.0 + 0.01) == 0.004 / fine.N + 0.001
+    back = thinning.coarse(fine)
+    assert pytest.approx(5.0) == back.N
+    assert replace(back, N=5.0) == softer
     assert thinning.coarse(controller(3)).filter_samples == 1
     assert thinning.fine(replace(coarse, filter_samples=20)).filter_samples == 64
 
@@ -133,3 +142,26 @@ def test_a_load_over_the_turn_is_averaged_and_not_folded() -> None:
     assert np.abs(found[0]).max() < 1e-6
     assert np.abs(load.along(r["hold"], 1e-3)[::10]).min() > 0.99
     assert Thinning(10).pushes(None, r, 1e-3) is None
+
+
+def test_a_commissioning_on_every_third_sample(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(Thinning, "of", lambda *_: Thinning(3))
+    r = np.concatenate([np.linspace(0.0, 900.0, 500), np.full(400, 900.0)])
+    with short():
+        found = commission(VirtualMachine(), references={"mine": r}, **{**SMALL, "members": 1})
+    assert found.is_verified
+    assert found.sample_time == pytest.approx(0.003)
+    assert found.controller is not None
+    assert found.models is not None
+    assert found.tuning is not None
+    assert (found.controller.Ts, found.models.Ts) == pytest.approx((0.001, 0.003))
+    assert found.tuning.controller.Ts == pytest.approx(0.003)
+    (c,) = found.comparisons
+    assert c.measured is not None
+    assert c.alike is not None
+    assert (len(c.predicted.r), len(c.measured.r), len(c.alike.r)) == (300, 900, 300)
+    np.testing.assert_array_equal(c.alike.r, c.predicted.r)
+    assert c.apart == pytest.approx(np.sqrt(np.mean((c.measured.y[::3] - c.predicted.y) ** 2)))
+    assert "mine, measured" in found.save(tmp_path / "out").read_text()

@@ -30,6 +30,9 @@ MOST = 10
 """Samples of which one is kept, at most."""
 LONGEST_FILTER = 64
 """Of the feedback's moving average [samples]."""
+SHARPEST = 50.0
+"""Derivative filter N of a coarse controller whose own sample time filters more than it asks for;
+the largest that is searched."""
 
 
 @dataclass(frozen=True)
@@ -101,14 +104,28 @@ class Thinning:
         """
         if self.k == 1:
             return c
-        return replace(c, Ts=self.k * c.Ts, filter_samples=max(1, round(c.filter_samples / self.k)))
+        return replace(
+            c,
+            Ts=self.k * c.Ts,
+            filter_samples=max(1, round(c.filter_samples / self.k)),
+            N=_derivative_filter(c, (1 - self.k) * c.Ts),
+        )
 
     def fine(self, c: Controller) -> Controller:
-        """The controller as the machine runs it."""
+        """The controller as the machine runs it.
+
+        A coarse sample filters the derivative by itself: a change is divided by Td / N and the
+        sample time. At the machine's sample time the same `N` would answer every count of the
+        encoder with k times the command.
+        """
         if self.k == 1:
             return c
+        Ts = c.Ts / self.k
         return replace(
-            c, Ts=c.Ts / self.k, filter_samples=min(LONGEST_FILTER, self.k * c.filter_samples)
+            c,
+            Ts=Ts,
+            filter_samples=min(LONGEST_FILTER, self.k * c.filter_samples),
+            N=_derivative_filter(c, c.Ts - Ts),
         )
 
     def plant(self, fopdt: Fopdt, Ts: float) -> Fopdt:
@@ -135,3 +152,11 @@ class Thinning:
         return ClosedLoopRun(
             **kept, controller=controller, plant=found.plant, reference=found.reference
         )
+
+
+def _derivative_filter(c: Controller, longer: float) -> float:
+    """`N` of a derivative filter whose time constant is so much longer [s]."""
+    Td = c.gains.to("standard").Td
+    if Td <= 0.0:
+        return c.N
+    return Td / max(Td / c.N + longer, Td / SHARPEST)
