@@ -15,6 +15,7 @@ from sewfast.commissioning.slow import MOST, PER_CONSTANT, SHARPEST, Thinning
 from sewfast.commissioning.small_signal import Resonance, SmallSignal
 from sewfast.commissioning.turn import HARMONICS, TurnLoad
 from sewfast.control import Fopdt
+from sewfast.cost import Cost
 from sewfast.loop import run
 from sewfast.recording import Recording, record
 from sewfast.robustness import margins
@@ -77,6 +78,13 @@ def test_a_rule_is_told_of_the_delay_of_coarse_samples() -> None:
     told = thinning.plant(fopdt, 1e-3)
     assert pytest.approx(0.011) == told.L
     assert margins(ruled(told, coarse), fopdt).Ms < 2.0
+
+
+def test_chatter_counts_as_it_will_on_the_machine() -> None:
+    cost = Cost(chatter=5.0)
+    assert Thinning().cost(cost) is cost
+    assert Thinning(4).cost(cost) == Cost(chatter=2.5)
+    assert Thinning(4).cost(Cost()) == Cost()
 
 
 def test_a_controller_converts_there_and_back() -> None:

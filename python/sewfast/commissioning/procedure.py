@@ -286,8 +286,8 @@ def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal
     journal.keep(cost=weights)
     pushes = thinning.pushes(load, practice, bench.Ts)
     plan = _Plan(
-        thinning.references(practice), pushes, asked, weights, thinning.plant(fopdt, bench.Ts),
-        fastest, small, rival, thinning,
+        thinning.references(practice), pushes, asked, thinning.cost(weights),
+        thinning.plant(fopdt, bench.Ts), fastest, small, rival, thinning,
     )  # fmt: skip
     try:
         ensemble, controller = _tuned(trained, plan, journal)

@@ -17,6 +17,7 @@ from ..trust import Judgement
 from ..tuning import TuningResult
 from .motion import Motion
 from .rival import Rival
+from .slow import Thinning
 from .small_signal import SmallSignal
 from .turn import TurnLoad
 from .verification import Comparison
@@ -117,18 +118,18 @@ class Commissioning:
     @property
     def is_predicted_poorly(self) -> bool:
         """Whether the machine costs more than twice what was predicted."""
-        predicted, runs = self.predicted_cost, [c.alike for c in self.comparisons]
-        alike = [r for r in runs if r is not None]
-        if self.cost is None or predicted is None or len(alike) < len(runs):
-            return False
-        return self.cost.of(alike) > POOR * predicted
+        predicted, measured = self.predicted_cost, self.measured_cost
+        return predicted is not None and measured is not None and measured > POOR * predicted
 
     @property
     def predicted_cost(self) -> float | None:
         """Over the references [RPM]."""
         if self.cost is None or not self.comparisons:
             return None
-        return self.cost.of([c.predicted for c in self.comparisons])
+        thinning = Thinning()
+        if self.sample_time is not None and self.controller is not None:
+            thinning = Thinning.between(self.sample_time, self.controller.Ts)
+        return thinning.cost(self.cost).of([c.predicted for c in self.comparisons])
 
     @property
     def measured_cost(self) -> float | None:

@@ -8,6 +8,7 @@ time: gains in standard form are in seconds, and so is the feedback's filter.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..control import Controller, Fopdt
+from ..cost import Cost
 from ..dataset import FloatArray
 from ..loop import ClosedLoopRun
 from ..recording import Recording
@@ -142,6 +144,17 @@ class Thinning:
         The coarse sample time itself is more delay than the usual ones add.
         """
         return None if self.k == 1 else ((1.0, 0), (0.8, 0), (1.25, 0))
+
+    def cost(self, cost: Cost) -> Cost:
+        """The same cost of what is simulated.
+
+        A command that follows the encoder's counts changes more from one coarse sample to the next
+        than from one sample to the next: with the square root of k, as whatever is random does.
+        Measured were .67 to .72 of the coarse change at k = 2, .20 to .34 at k = 10.
+        """
+        if self.k == 1 or cost.chatter is None:
+            return cost
+        return replace(cost, chatter=cost.chatter / math.sqrt(self.k))
 
     def run(self, found: ClosedLoopRun) -> ClosedLoopRun:
         """What the machine did, as it compares with what was simulated."""
