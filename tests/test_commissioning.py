@@ -331,6 +331,28 @@ def test_the_folder_holds_everything_and_its_page_is_written_anew(
     assert page.read_text() == text
 
 
+def test_a_linear_rival_is_asked_and_shown(whole: Commissioning, tmp_path: Path) -> None:
+    assert whole.rival is not None
+    assert whole.rival.is_fit
+    assert whole.tuning is not None
+    assert whole.tuning.opinion is not None
+    assert whole.notes == ()
+    text = whole.save(tmp_path / "out").read_text()
+    assert "A second opinion." in text
+    # a folder of before, without what is told of the rival
+    numbers = tmp_path / "out" / "commissioning.json"
+    told = json.loads(numbers.read_text())
+    assert told["second_opinion"]["taken"] == 0
+    for name in ("rival", "second_opinion", "notes", "simulated_at_s"):
+        del told[name]
+    del told["models"]["kind"]
+    numbers.write_text(json.dumps(told))
+    assert "A second opinion." not in report(tmp_path / "out").read_text()
+    told["notes"] = ["tuned on <the> linear model"]
+    numbers.write_text(json.dumps(told))
+    assert "tuned on &lt;the&gt; linear model" in report(tmp_path / "out").read_text()
+
+
 def test_a_folder_of_somebody_else_is_left_alone(whole: Commissioning, tmp_path: Path) -> None:
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / "mine.json").write_text("mine")

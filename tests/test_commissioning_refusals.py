@@ -123,9 +123,29 @@ def test_a_step_that_does_not_settle_is_refused() -> None:
     assert refused(bent(slips=True), "expected a s").stage in ("first motion", "step response")
 
 
-def test_networks_that_do_not_predict_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_networks_and_rival_do_not_predict_it_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(training, "validate_member", lambda *_: (100.0, 40.0))
+    monkeypatch.setattr(procedure, "linear_rival", lambda *_: None)
     assert refused(bent(), "free-run fit of 85 %").stage == "training"
+
+
+def test_where_networks_alone_do_not_predict_the_linear_model_stands_in(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(training, "validate_member", lambda *_: (100.0, 40.0))
+    found = commission(VirtualMachine(), **SMALL)
+    assert found.is_verified
+    assert found.models is not None
+    assert found.rival is not None
+    assert [m.kind for m in found.models.members] == [found.rival.model.kind]
+    assert "free-run fit of 85 %" in found.notes[0]
+    assert found.controller is not None
+    assert found.controller.notes == "commissioned on a linear model"
+    told = found.numbers()
+    assert told["notes"] == list(found.notes)
+    assert told["second_opinion"] is None
 
 
 def test_networks_far_behind_the_best_have_no_say(monkeypatch: pytest.MonkeyPatch) -> None:

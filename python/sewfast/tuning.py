@@ -16,8 +16,9 @@ from .cost import Cost
 from .errors import FitError, Interrupted, SettingError
 from .gains import whole
 from .load_step import LoadStep
-from .loop import check_fits
-from .plants import Plants, References
+from .loop import Plant, check_fits
+from .plants import Plants, References, each_plant
+from .second_opinion import SHARE, SecondOpinion, second_opinion
 from .starting import Encoder, first_controller
 from .tuning_task import (
     Aggregate,
@@ -64,6 +65,8 @@ class TuningResult:
         What had to be kept.
     method : str
         ``genetic`` or ``cma-es``.
+    opinion : SecondOpinion or None
+        What a rival says of the gains; None without one, or where no gains suit it.
     """
 
     controller: Controller
@@ -77,6 +80,15 @@ class TuningResult:
     aggregate: str
     constraints: Constraints
     method: str
+    opinion: SecondOpinion | None = None
+
+    @property
+    def warning(self) -> str | None:
+        """What speaks against the gains, and what to do; None where nothing does.
+
+        Models of two kinds that contradict each other on which gains are good.
+        """
+        return None if self.opinion is None else self.opinion.warning
 
     @property
     def evaluations(self) -> int:
@@ -92,6 +104,8 @@ class TuningResult:
         ]
         if self.constraints != Constraints():
             lines.append(f"  within    {self.constraints}")
+        if self.warning is not None:
+            lines.append(f"  warning   {self.warning}")
         return "\n".join([*lines, str(self.controller)])
 
 
@@ -112,6 +126,7 @@ def tune(
     variations: Sequence[tuple[float, int]] | None = None,
     loads: Sequence[LoadStep] = (),
     disturbances: Sequence[ArrayLike] | None = None,
+    rival: Plants | None = None,
     method: Method = "genetic",
     evaluations: int = EVALUATIONS,
     time_budget: float | None = None,
@@ -169,6 +184,12 @@ def tune(
     disturbances : sequence of array, shape (N,), optional
         One for each reference: a command that is added behind the limits, unseen by the controller
         [u]. A load over the turn that no model holds, for instance.
+    rival : model, optional
+        A model of another kind of the same drive, a linear one beside networks: its own gains are
+        searched for briefly (a fifth of the evaluations). Where either gains cost more than three
+        times as much on the other's model as that one's own, `TuningResult.warning` says so, and
+        of these two, and of gains tuned on both, those are taken whose largest cost, relative to
+        the least on the same model, is smallest.
     method : "genetic" or "cma-es"
         A genetic algorithm with local refinement, or CMA-ES with restarts.
     evaluations : int
@@ -213,21 +234,96 @@ def tune(
         loads=loads,
         disturbances=disturbances,
     )
-    deadline = Deadline(None if time_budget is None else budget(time_budget), progress)
-    found = _core.tune(
-        task.core(variables),
-        method=method,
-        evaluations=whole("evaluations", evaluations),
-        seed=whole("seed", seed),
-        threads=threads_or_all(threads),
-        progress=deadline,
-    )
-    result = _result(found, task, method)
-    if deadline.passed and result.termination == "interrupted":
-        return _in_time(result, found["violation"])
-    if result.termination == "interrupted":
-        raise Interrupted(result.controller)
-    return result
+    seconds = None if time_budget is None else budget(time_budget)
+    if rival is not None and seconds is not None:
+        seconds *= 1.0 - SHARE
+    search = _Search(
+        method, whole("evaluations", evaluations), seconds, whole("seed", seed),
+        threads_or_all(threads), progress,
+    )  # fmt: skip
+    # before anything is searched, so that a rival that cannot be used costs nothing
+    other = None if rival is None else replace(task, plants=_rivals(rival, task))
+    result = search.on(task, variables)
+    return result if other is None else _asked(result, task, other, search, variables)
+
+
+@dataclass(frozen=True)
+class _Search:
+    """How to search, whatever it is on."""
+
+    method: str
+    evaluations: int
+    seconds: float | None
+    seed: int
+    threads: int
+    progress: Progress | None
+
+    def on(self, task: TuningTask, variables: Sequence[Wanted] | None) -> TuningResult:
+        deadline = Deadline(self.seconds, self.progress)
+        found = _core.tune(
+            task.core(variables),
+            method=self.method,
+            evaluations=self.evaluations,
+            seed=self.seed,
+            threads=self.threads,
+            progress=deadline,
+        )
+        result = _result(found, task, self.method)
+        if deadline.passed and result.termination == "interrupted":
+            return _in_time(result, found["violation"])
+        if result.termination == "interrupted":
+            raise Interrupted(result.controller)
+        return result
+
+    def brief(self) -> _Search:
+        """For a second opinion; nobody is told of it, but Ctrl-C ends it."""
+        rest = None if self.seconds is None else 0.5 * SHARE / (1.0 - SHARE) * self.seconds
+        few = max(1, round(SHARE * self.evaluations))
+        return replace(self, evaluations=few, seconds=rest, progress=None)
+
+
+def _rivals(rival: Plants, task: TuningTask) -> list[Plant]:
+    """The plants of a rival.
+
+    Raises
+    ------
+    SettingError
+        For what the loop does not fit.
+    """
+    plants = each_plant(rival)
+    if not plants:
+        raise SettingError("expected a model as rival, got none; leave rival out")
+    for plant in plants:
+        check_fits(task.start, plant)
+    return plants
+
+
+def _asked(
+    result: TuningResult,
+    task: TuningTask,
+    rival: TuningTask,
+    search: _Search,
+    variables: Sequence[Wanted] | None,
+) -> TuningResult:
+    """The result with a second opinion on it, and the gains that are least wrong."""
+    found: list[TuningResult] = [result]
+
+    def brief(on: TuningTask) -> Controller:
+        try:
+            found.append(search.brief().on(on, variables))
+        except Interrupted:
+            raise Interrupted(result.controller) from None
+        return found[-1].controller
+
+    opinion = second_opinion(result.controller, task, rival, brief)
+    if opinion is None:
+        return result
+    pick = opinion.pick
+    taken = found[pick]
+    return replace(
+        result, controller=taken.controller, variables=taken.variables,
+        cost=result.cost if pick == 0 else float(opinion.costs[0, pick]), opinion=opinion,
+    )  # fmt: skip
 
 
 def _in_time(result: TuningResult, violation: float) -> TuningResult:

@@ -56,6 +56,7 @@ examples:
   sewfast tune drive.json --cost chatter=50 --constraint overshoot=2 -o calm.json
   sewfast tune drive.json --load 1500:-2 --constraint recovery=70 -o firm.json
   sewfast tune one.json two.json --aggregate worst --variables Kp,Ti,alpha -o controller.json
+  sewfast tune network.json --rival linear.json -o controller.json
   sewfast tune drive.json --pareto tracking,chatter --front front.png -o controller.json
 """
 
@@ -94,6 +95,11 @@ def add(commands: Commands) -> None:
         "--start", metavar="CONTROLLER.json",
         help="what the search begins with, its limits, encoder and filters included; default: "
         "Table 1 on the first model's step response",
+    )  # fmt: skip
+    parser.add_argument(
+        "--rival", metavar="MODEL.json",
+        help="a model of another kind of the same drive, for a second opinion on the gains: a "
+        "linear one beside a network",
     )  # fmt: skip
     _add_search(parser)
     add_output(parser, "CONTROLLER.json", "controller file to write", required=True)
@@ -157,6 +163,10 @@ def tune_command(args: argparse.Namespace) -> int | None:
     if args.pareto is not None and args.method != "genetic":
         raise SettingError(
             "--method: a front is searched by NSGA-II; leave --method or --pareto out"
+        )
+    if args.pareto is not None and args.rival is not None:
+        raise SettingError(
+            "--rival: a second opinion is on one controller; leave --rival or --pareto out"
         )
     require_place(args.front, (*TABLES, *FIGURES), option="--front")
     models = [load_model(path) for path in args.model]
@@ -236,11 +246,13 @@ def _loop(args: argparse.Namespace) -> dict[str, Any]:
 def _tuned(
     args: argparse.Namespace, models: list[Any], references: Any, settings: dict[str, Any]
 ) -> TuningResult:
+    from ..models import load_model
     from ..tuning import tune
 
+    rival = None if args.rival is None else load_model(args.rival)
     with Progress("tune") as progress:
         return tune(
-            models, references, **_first(args), **settings, method=args.method,
+            models, references, **_first(args), **settings, rival=rival, method=args.method,
             time_budget=args.time_budget, progress=progress,
         )  # fmt: skip
 
@@ -378,6 +390,7 @@ def _show_tuned(args: argparse.Namespace, found: TuningResult) -> None:
                 "evaluations": found.evaluations,
                 "termination": found.termination,
                 "method": found.method,
+                "warning": found.warning,
                 "weights": found.weights.named(),
                 "variables": {
                     v.name: {"value": v.value, "low": v.low, "high": v.high}

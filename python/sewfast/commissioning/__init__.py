@@ -4,6 +4,7 @@ from .bench import Bench, Followed, Stepped, SteppedBench
 from .procedure import STAGES, commission
 from .refusal import Refusal
 from .result import Commissioning
+from .rival import Rival
 from .verification import Comparison
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "Comparison",
     "Followed",
     "Refusal",
+    "Rival",
     "Stepped",
     "SteppedBench",
     "commission",

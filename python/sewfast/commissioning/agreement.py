@@ -11,10 +11,14 @@ from ..dataset import FloatArray
 from ..errors import FitError
 from ..loop import run
 from ..models import Ensemble, Model
-from .refusal import require
+from .refusal import Refusal
 
 DISAGREE = 0.05
 """Largest distance of a member from the median of all, rms over the reference's span."""
+
+
+class Disagreement(Refusal):
+    """Networks that do not agree on what a controller does."""
 
 
 def agreeing(
@@ -24,7 +28,7 @@ def agreeing(
 
     Raises
     ------
-    Refusal
+    Disagreement
         Where less than half of the members agree.
     """
     members = list(ensemble.members)
@@ -36,11 +40,12 @@ def agreeing(
         distances = np.sqrt(np.mean((runs - median) ** 2, axis=1)) / np.ptp(r)
         apart = np.maximum(apart, np.where(known, distances, np.inf))
     kept = [m for m, share in zip(members, apart, strict=True) if share <= DISAGREE]
-    require(
-        2 * len(kept) >= len(members),
-        f"expected at least half of {len(members)} networks within {100 * DISAGREE:g} % of the "
-        f"span from their median in closed loop, {len(kept)} are; record longer, or raise members",
-    )
+    if 2 * len(kept) < len(members):
+        raise Disagreement(
+            f"expected at least half of {len(members)} networks within {100 * DISAGREE:g} % of the "
+            f"span from their median in closed loop, {len(kept)} are; record longer, or raise "
+            "members"
+        )
     return ensemble if len(kept) == len(members) else Ensemble.of(kept)
 
 

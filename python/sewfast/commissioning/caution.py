@@ -16,6 +16,7 @@ from .bench import Bench
 from .demands import Demands
 from .gains import scaled
 from .refusal import Refusal
+from .slow import Thinning
 from .small_signal import LEVEL, SmallSignal
 
 SHARES = (0.25, 0.5, 1.0)
@@ -95,10 +96,12 @@ def cautious(
     name: str,
     small: SmallSignal | None,
     models: Ensemble | None = None,
+    thinning: Thinning | None = None,
 ) -> tuple[Controller, Swing | None]:
     """The gains that hold a speed quietly, of those asked for, and the swing that was met.
 
-    `models` know how far the encoder's counts alone move the command.
+    `models` know how far the encoder's counts alone move the command; they run at the samples that
+    `thinning` leaves.
 
     Raises
     ------
@@ -108,7 +111,9 @@ def cautious(
     r, settled = held(demands, fastest, bench.Ts)
     for share in SHARES:
         tried = scaled(controller, share)
-        expected = 0.0 if models is None else _chatter(tried, models, r, settled)
+        expected = 0.0
+        if models is not None:
+            expected = _chatter(tried, models, r, settled, thinning or Thinning())
         found = bench.follow(tried, r, f"{name}_{100 * share:g}").run
         swing = swing_of(found, settled, share, expected)
         if swing is None:
@@ -124,11 +129,12 @@ def cautious(
 
 
 def _chatter(
-    controller: Controller, models: Ensemble, r: FloatArray, settled: int
-) -> float:  # fmt: skip
+    controller: Controller, models: Ensemble, r: FloatArray, settled: int, thinning: Thinning
+) -> float:
     """Standard deviation of the command at the held speed, the largest of any model [V]."""
     with suppress(FitError):
-        return max(float(run(controller, m, r).u[settled:].std()) for m in models.members)
+        coarse, k = thinning.coarse(controller), thinning.k
+        return max(float(run(coarse, m, r[::k]).u[settled // k :].std()) for m in models.members)
     return 0.0
 
 

@@ -15,6 +15,7 @@ from ..errors import DataError, SettingError
 from ..report.commissioned import FORMAT, NUMBERS, VERSION, run_file
 from ..writers import write_table
 from .numbers import numbers
+from .slow import Thinning
 from .taken import clear, prepare, require_repeatable
 
 if TYPE_CHECKING:
@@ -149,8 +150,11 @@ def _analysis(found: Commissioning, folder: Path) -> None:
         return
     runs = [c.predicted for c in found.comparisons]
     references = [r.r for r in runs if r.t[-1] <= _SHORT] or [r.r for r in runs[:1]] or None
+    coarse = Thinning.between(found.models.members[0].Ts, found.controller.Ts)
     with suppress(SettingError):
-        analyse(found.controller, found.models, references=references).save(folder, png=False)
+        analyse(
+            coarse.coarse(found.controller), found.models, references=references
+        ).save(folder, png=False)  # fmt: skip
 
 
 def _page(folder: Path) -> Path:

@@ -173,8 +173,11 @@ def search(
     requirements: Requirements | None = None,
     variations: Sequence[tuple[float, int]] | None = None,
     disturbances: Sequence[FloatArray] | None = None,
+    rival: Model | None = None,
 ) -> TuningResult:
     """The gains of least cost over all members, each with the usual gain spread and delay.
+
+    A `rival` gives its second opinion on them.
 
     Raises
     ------
@@ -194,6 +197,7 @@ def search(
             constraints=asked.constraints,
             loads=asked.loads,
             disturbances=disturbances,
+            rival=rival,
             variations=variations,
             evaluations=demands.evaluations,
             seed=demands.seed,

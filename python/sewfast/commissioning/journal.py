@@ -83,6 +83,10 @@ class Journal:
         """Results."""
         self._values |= values
 
+    def say(self, note: str) -> None:
+        """What went otherwise than usual."""
+        self._values["notes"] = (*self._values.get("notes", ()), note)
+
     def note(self, name: str, recording: Recording) -> None:
         """A recording, but for those along the references, which are runs."""
         if self.stage != STAGES[-1] or name.startswith("hold_"):

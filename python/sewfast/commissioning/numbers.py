@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ..control import Controller
 from ..loop import ClosedLoopRun
 from .verification import Comparison
@@ -29,7 +31,13 @@ def numbers(c: Commissioning) -> dict[str, Any]:
         "acceleration_rpm_per_s": c.acceleration,
         "turn_load_v_rms": None if c.turn_load is None else c.turn_load.rms,
         "models": {"members": 0 if c.models is None else len(c.models.members)}
-        | {"levels_rmse_rpm": list(c.rmse)},
+        | {"levels_rmse_rpm": list(c.rmse), "kind": _kind(c)},
+        "rival": None
+        if c.rival is None
+        else {"order": c.rival.model.orders["na"], "levels_rmse_rpm": c.rival.rmse},
+        "second_opinion": _opinion(c),
+        "simulated_at_s": c.sample_time,
+        "notes": list(c.notes),
         "controllers": {
             name: _gains(controller)
             for name, controller in (("first", c.first), ("tuned", c.controller))
@@ -68,6 +76,19 @@ def _small_signals(c: Commissioning) -> dict[str, Any] | None:
         "fopdt": None if fopdt is None else {n: getattr(fopdt, n) for n in ("K", "T", "L")},
         "resonance": None if resonance is None else dict(vars(resonance)),
     }
+
+
+def _kind(c: Commissioning) -> str | None:
+    return None if c.models is None else c.models.members[0].kind
+
+
+def _opinion(c: Commissioning) -> dict[str, Any] | None:
+    """What the gains tuned on models, rival and both cost on either; null where a loop diverges."""
+    opinion = None if c.tuning is None else c.tuning.opinion
+    if opinion is None:
+        return None
+    on_models, on_rival = ([x if np.isfinite(x) else None for x in row] for row in opinion.costs)
+    return {"on_models": on_models, "on_rival": on_rival, "taken": opinion.pick}
 
 
 def _gains(controller: Controller) -> dict[str, Any]:

@@ -18,12 +18,12 @@ from ..dataset import FloatArray
 from ..errors import DataError, Interrupted, SettingError
 from ..loop import ClosedLoopRun
 from ..machine import VirtualMachine
-from ..models import Ensemble
+from ..models import Ensemble, Model
 from ..recording import Recording
 from ..threads import available
 from ..tuning import TuningResult
 from . import excitations
-from .agreement import agreeing
+from .agreement import Disagreement, agreeing
 from .bench import Bench, Followed, NotedBench, bench_of, told_of
 from .caution import cause, cautious
 from .demands import MS, Demands, demands
@@ -36,10 +36,12 @@ from .references import standard
 from .refusal import Refusal
 from .requirements import Requirements
 from .result import VERIFIED, VERIFIED_POORLY, Commissioning
+from .rival import ORDERS, THINNED, Rival, linear_rival
+from .slow import Thinning
 from .small_signal import SmallSignal, small_signal
 from .taken import Taken
 from .training import Trained, train
-from .turn import TurnLoad, along, turn_load
+from .turn import turn_load
 from .verification import judged, measure, predict, require_unsaturated
 
 if TYPE_CHECKING:
@@ -256,36 +258,81 @@ def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal
     levels = bench.follow(first, r, "levels")
 
     journal.enter("training")
-    learned = [journal.recording("step"), trapezoids.recording, *pulses]
-    trained = train(learned, levels.recording, asked, journal.within)
+    thinning = Thinning.of(fopdt, bench.Ts, small)
+    journal.keep(sample_time=thinning.k * bench.Ts)
+    thin, judge = thinning.recording, thinning.recording(levels.recording)
+    learned = [thin(r) for r in (journal.recording("step"), trapezoids.recording, *pulses)]
+    gentle = [thin(trapezoids.recording), thin(journal.recording("small_signals"))]
+    rival = linear_rival(gentle, judge, step, asked, ORDERS if thinning.k == 1 else THINNED)
+    journal.keep(rival=rival)
+    try:
+        trained = train(learned, judge, asked, journal.within)
+    except Refusal as refusal:
+        trained = _instead(rival, judge, refusal, journal)
     journal.keep(models=trained.ensemble, rmse=trained.rmse, card=trained.card)
+    if thinning.k > 1:
+        # there is no resonance to keep clear of
+        small = None if rival is None else SmallSignal(rival.model, None, None)
     load = None
     if small is not None:
-        load = turn_load(trained.ensemble, small.model, [trapezoids.recording], levels.recording)
+        load = turn_load(
+            trained.ensemble, small.model, [trapezoids.recording], levels.recording, thinning.k
+        )
     journal.keep(turn_load=load)
 
     journal.enter("tuning")
     verify, practice = _references(fastest, asked, bench)
     weights = cost_of(practice, bench.Ts, asked) if cost is None else cost
     journal.keep(cost=weights)
-    plan = _Plan(practice, asked, weights, fopdt, fastest, small, load)
-    ensemble, controller = _tuned(trained, plan, journal)
+    pushes = thinning.pushes(load, practice, bench.Ts)
+    plan = _Plan(
+        thinning.references(practice), pushes, asked, thinning.cost(weights),
+        thinning.plant(fopdt, bench.Ts), fastest, small, rival, thinning,
+    )  # fmt: skip
+    try:
+        ensemble, controller = _tuned(trained, plan, journal)
+    except Disagreement as refusal:
+        if len(trained.ensemble.members) == 1:
+            raise
+        trained = _instead(rival, judge, refusal, journal)
+        journal.keep(card=trained.card)
+        ensemble, controller = _tuned(trained, plan, journal)
 
     journal.enter("verification")
-    controller, swing = cautious(bench, controller, asked, fastest, "hold_tuned", small, ensemble)
+    controller, swing = cautious(
+        bench, controller, asked, fastest, "hold_tuned", small, ensemble, thinning
+    )
     if swing is not None:
         note = (
-            f"{controller.notes}; gains lowered, as the machine swung at {swing.frequency:.3g} Hz "
+            f"gains lowered, as the machine swung at {swing.frequency:.3g} Hz "
             f"under {100 * swing.share:g} % of them: {cause(swing, small)}"
         )
-        controller = replace(controller, notes=note)
+        controller = replace(controller, notes=f"{controller.notes}; {note}")
         journal.keep(controller=controller)
-    comparisons = predict(controller, ensemble, verify, load)
+        journal.say(note)
+    comparisons = predict(
+        thinning.coarse(controller), ensemble, thinning.references(verify),
+        thinning.pushes(load, verify, bench.Ts),
+    )  # fmt: skip
     journal.keep(comparisons=comparisons, judgement=judged(comparisons, ensemble))
-    measure(controller, bench, comparisons, lambda found: journal.keep(comparisons=found))
+    measure(controller, bench, comparisons, verify, lambda new: journal.keep(comparisons=new))
     journal.finish()
     found = journal.result(VERIFIED)
     return replace(found, verdict=VERIFIED_POORLY) if found.is_predicted_poorly else found
+
+
+def _instead(rival: Rival | None, judge: Recording, refusal: Refusal, journal: Journal) -> Trained:
+    """The linear rival in place of networks that failed.
+
+    Raises
+    ------
+    Refusal
+        That of the networks, where the rival is no better.
+    """
+    if rival is None or not rival.is_fit:
+        raise refusal
+    journal.say(f"tuned on the linear model alone, as the networks failed: {refusal}")
+    return rival.alone(judge)
 
 
 def _pulses(bench: Bench, fopdt: Fopdt, asked: Demands) -> tuple[float, list[Recording]]:
@@ -309,21 +356,31 @@ class _Plan:
     """What gains are searched for, on what, and what is known of the machine."""
 
     practice: Mapping[str, FloatArray]
+    pushes: Sequence[FloatArray] | None
     asked: Demands
     cost: Cost
     fopdt: Fopdt
     fastest: float
     small: SmallSignal | None
-    load: TurnLoad | None
+    rival: Rival | None
+    thinning: Thinning
+
+    @property
+    def second(self) -> Model | None:
+        """The rival, where it predicts well enough to be asked."""
+        return self.rival.model if self.rival is not None and self.rival.is_fit else None
 
 
 def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, Controller]:
     """The gains, and the members that agree on what they do."""
     asked, practice, cost = plan.asked, plan.practice, plan.cost
-    first, small = journal.first, plan.small
+    first, small = plan.thinning.coarse(journal.first), plan.small
     # Eq. 12's gains would wake a resonance: the first gains are what is known to be quiet there
     rival = ruled(plan.fopdt, first) if small is None or small.resonance is None else first
-    pushes = along(plan.load, practice, first.Ts)
+    second = plan.second
+    is_alone = plan.rival is not None and plan.rival.model is trained.ensemble.members[0]
+    if is_alone:
+        second = None
 
     def of(ensemble: Ensemble) -> tuple[Requirements, TuningResult]:
         # alpha and beta do not matter to a load, but for what they leave when it comes on
@@ -333,7 +390,7 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
             start = start_of(first, ensemble, practice, cost, asked.threads)
         return required, search(
             ensemble, practice, start, asked, cost, journal.within, requirements=required,
-            disturbances=pushes,
+            disturbances=plan.pushes, rival=second, variations=plan.thinning.variations(),
         )  # fmt: skip
 
     alike = agreeing(first, trained.ensemble, practice)
@@ -343,8 +400,14 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
         # one that parts from the others has had its say in these gains
         required, tuning = of(ensemble)
     journal.keep(models=ensemble, rmse=trained.errors_of(ensemble))
-    controller = replace(tuning.controller, notes="commissioned on an ensemble of networks")
-    journal.keep(tuning=tuning, controller=controller, met=required.met(controller, ensemble))
+    plants = "a linear model" if is_alone else "an ensemble of networks"
+    tuned = plan.thinning.fine(tuning.controller)
+    controller = replace(tuned, notes=f"commissioned on {plants}")
+    if tuning.warning is not None:
+        journal.say(tuning.warning)
+    journal.keep(
+        tuning=tuning, controller=controller, met=required.met(tuning.controller, ensemble)
+    )
     return ensemble, controller
 
 

@@ -16,6 +16,8 @@ from ..recording import Recording
 from ..trust import Judgement
 from ..tuning import TuningResult
 from .motion import Motion
+from .rival import Rival
+from .slow import Thinning
 from .small_signal import SmallSignal
 from .turn import TurnLoad
 from .verification import Comparison
@@ -54,6 +56,9 @@ class Commissioning:
     first : Controller or None
         The gains by rule, under which the closed loop was recorded.
     models : Ensemble or None
+        What was tuned on: networks, or the linear rival alone where these failed.
+    rival : Rival or None
+        The linear model beside the networks.
     rmse : tuple of float
         Of each member on the recording `levels`, which none was trained on [RPM].
     controller : Controller or None
@@ -70,6 +75,11 @@ class Commissioning:
         What speaks against the loops as predicted.
     comparisons : tuple of Comparison
         Predicted and measured, per reference.
+    sample_time : float or None
+        Of what is simulated [s]: for a slow drive a multiple of the machine's.
+    notes : tuple of str
+        What went otherwise than usual: networks that failed, models that contradict each other,
+        gains that were lowered.
     taken_in : Path or None
         The folder in which each recording was written as it came.
     """
@@ -87,6 +97,7 @@ class Commissioning:
     turn_load: TurnLoad | None = None
     first: Controller | None = None
     models: Ensemble | None = None
+    rival: Rival | None = None
     rmse: tuple[float, ...] = ()
     controller: Controller | None = None
     tuning: TuningResult | None = None
@@ -95,6 +106,8 @@ class Commissioning:
     card: ReportCard | None = None
     judgement: Judgement | None = None
     comparisons: tuple[Comparison, ...] = ()
+    sample_time: float | None = None
+    notes: tuple[str, ...] = ()
     taken_in: Path | None = None
 
     @property
@@ -113,7 +126,10 @@ class Commissioning:
         """Over the references [RPM]."""
         if self.cost is None or not self.comparisons:
             return None
-        return self.cost.of([c.predicted for c in self.comparisons])
+        thinning = Thinning()
+        if self.sample_time is not None and self.controller is not None:
+            thinning = Thinning.between(self.sample_time, self.controller.Ts)
+        return thinning.cost(self.cost).of([c.predicted for c in self.comparisons])
 
     @property
     def measured_cost(self) -> float | None:
@@ -169,6 +185,12 @@ class Commissioning:
                 f"  models         {len(self.models.members)}, free run on data not trained on "
                 f"{worst} RPM rms"
             )
+        if self.rival is not None:
+            lines.append(
+                f"  linear rival   order {self.rival.model.orders['na']}, free run on the same "
+                f"{self.rival.rmse:.3g} RPM rms"
+            )
+        lines += [f"  note           {note}" for note in self.notes]
         lines += _evidence(self)
         lines += [_told(c) for c in self.comparisons]
         if self.measured_cost is not None and self.predicted_cost is not None:

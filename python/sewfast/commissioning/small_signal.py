@@ -207,18 +207,18 @@ def explained(shaken: Shaken, fopdt: Fopdt) -> SmallSignal | None:
     """The simplest linear model of what was shaken."""
     data = shaken.dataset()
     part = folds(data)[0]
-    tried = {order: _fitted(part, order) for order in ORDERS}
+    tried = {order: fitted(part, order) for order in ORDERS}
     found = {order: fit for order, fit in tried.items() if fit is not None}
     if not found or not min(errors.rmse for _, errors in found.values()) < part.spread:
         return None
-    order = _simplest(found)
+    order = simplest(found)
     core = found[order][0]
     model = wrap(LinearOE, core, data)
     resonance = _resonance(core, shaken.Ts)
     return SmallSignal(model, resonance, _first_order(core, shaken.Ts, fopdt))
 
 
-def _fitted(part: Split, order: int) -> tuple[_core.LinearModel, Errors] | None:
+def fitted(part: Split, order: int) -> tuple[_core.LinearModel, Errors] | None:
     """The better of output error and instrumental variables: a resonance makes local minima."""
     tried = []
     for fit in (_core.fit_oe, _core.fit_iv):
@@ -232,7 +232,7 @@ def _fitted(part: Split, order: int) -> tuple[_core.LinearModel, Errors] | None:
     return min(tried, key=lambda t: t[1].rmse, default=None)
 
 
-def _simplest(found: dict[int, tuple[_core.LinearModel, Errors]]) -> int:
+def simplest(found: dict[int, tuple[_core.LinearModel, Errors]]) -> int:
     """The least order whose error is not credibly above the lowest."""
     best = min(found, key=lambda o: found[o][1].rmse)
     for order in sorted(found):

@@ -7,7 +7,7 @@ that would have had the same effect, and is put back where loops are simulated.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from ..dataset import FloatArray
 from ..errors import FitError
 from ..models import Ensemble, Model
 from ..recording import Recording
+from .slow import Thinning
 
 HARMONICS = 6
 """Of a turn that are told apart."""
@@ -64,6 +65,7 @@ def turn_load(
     plant: Model,
     learned: Sequence[Recording],
     judge: Recording,
+    k: int = 1,
 ) -> TurnLoad | None:
     """The load over the turn, where a recording that it was not taken from shows it too.
 
@@ -75,31 +77,35 @@ def turn_load(
         From command to speed about a working speed: what a push does.
     learned, judge : Recordings
         To take it from, and to ask whether it is there.
+    k : int
+        Samples of the recordings in one of the models.
     """
     rows, rests = [], []
     for recording in learned:
-        row, rest = _explained(ensemble, plant, recording)
+        row, rest = _explained(ensemble, plant, recording, k)
         rows.append(row)
         rests.append(rest)
     solution, *_ = np.linalg.lstsq(np.vstack(rows), np.concatenate(rests), rcond=1e-6)
     found = TurnLoad(solution[:HARMONICS], solution[HARMONICS:])
-    row, rest = _explained(ensemble, plant, judge)
+    row, rest = _explained(ensemble, plant, judge, k)
     left = rest - row @ solution
     return found if np.mean(left**2) < WORTH_IT**2 * np.mean(rest**2) else None
 
 
 def _explained(
-    ensemble: Ensemble, plant: Model, recording: Recording
+    ensemble: Ensemble, plant: Model, whole: Recording, k: int
 ) -> tuple[FloatArray, FloatArray]:
     """What each harmonic would do to the speed, and what the models leave unexplained [RPM].
 
     Both without what is slower than a few turns: friction that changes with warmth is no load over
     the turn.
     """
-    turns = (recording.counts - recording.counts[0]) / recording.counts_per_rev
+    thinning = Thinning(k)
+    recording = thinning.recording(whole)
+    turns = (whole.counts - whole.counts[0]) / whole.counts_per_rev
     core, zero = plant.core, np.zeros(plant.core.na)
-    still = core.simulate(np.zeros((len(turns), 1)), zero)
-    pushes = [np.ascontiguousarray(c[:, None]) for c in basis(turns).T]
+    still = core.simulate(np.zeros((len(recording), 1)), zero)
+    pushes = [np.ascontiguousarray(thinning.mean(c)[:, None]) for c in basis(turns).T]
     columns = [core.simulate(push, zero) - still for push in pushes]
     try:
         runs = np.array([m.simulate(recording.dataset(), init=0)[0] for m in ensemble.members])
@@ -115,10 +121,3 @@ def _fast(x: FloatArray, span: int) -> FloatArray:
     kernel = np.ones(span) / span
     weight = np.convolve(np.ones(len(x)), kernel, "same")
     return x - np.convolve(x, kernel, "same") / weight
-
-
-def along(
-    load: TurnLoad | None, references: Mapping[str, FloatArray], Ts: float
-) -> list[FloatArray] | None:
-    """The load's command along each reference; None where there is none."""
-    return None if load is None else [load.along(r, Ts) for r in references.values()]

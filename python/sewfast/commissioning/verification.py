@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from ..trust import Judgement, judge
 from .agreement import DISAGREE
 from .bench import Bench
 from .refusal import Refusal, require
-from .turn import TurnLoad
+from .slow import Thinning
 
 APART = 0.05
 """Largest distance of measurement from prediction, rms over the reference's span."""
@@ -32,7 +32,7 @@ class Comparison:
     ----------
     reference : str
     predicted : ClosedLoopRun
-        The median of the members' runs.
+        The median of the members' runs, for a slow drive at every k-th sample.
     measured : ClosedLoopRun or None
         On the machine; None where it was not run.
     members : tuple of ClosedLoopRun
@@ -53,7 +53,15 @@ class Comparison:
         """Rms distance of the measured output from the predicted one [RPM]."""
         if self.measured is None:
             return None
-        return _rms(self.measured.y - self.predicted.y)
+        assert self.alike is not None
+        return _rms(self.alike.y - self.predicted.y)
+
+    @property
+    def alike(self) -> ClosedLoopRun | None:
+        """`measured` at the samples of `predicted`."""
+        if self.measured is None:
+            return None
+        return Thinning.between(self.predicted.Ts, self.measured.Ts).run(self.measured)
 
     @property
     def disagreement(self) -> float:
@@ -69,9 +77,10 @@ def predict(
     controller: Controller,
     ensemble: Ensemble,
     references: Mapping[str, FloatArray],
-    load: TurnLoad | None = None,
+    pushes: Sequence[FloatArray] | None = None,
 ) -> tuple[Comparison, ...]:
-    """What the ensemble says of every reference, with the load over the turn where one was seen.
+    """What the ensemble says of every reference, with a command behind the limits for each: that
+    of the load over the turn.
 
     Raises
     ------
@@ -79,8 +88,8 @@ def predict(
         Where members disagree, or run away.
     """
     found = []
-    for name, r in references.items():
-        push = None if load is None else load.along(r, controller.Ts)
+    for i, (name, r) in enumerate(references.items()):
+        push = None if pushes is None else pushes[i]
         try:
             runs = tuple(
                 run(controller, m, r, name=name, disturbance=push) for m in ensemble.members
@@ -111,6 +120,7 @@ def measure(
     controller: Controller,
     bench: Bench,
     predicted: tuple[Comparison, ...],
+    references: Mapping[str, FloatArray],
     keep: Callable[[tuple[Comparison, ...]], object],
 ) -> tuple[Comparison, ...]:
     """The same on the machine: the shortest reference first, each judged as it ends.
@@ -122,7 +132,8 @@ def measure(
     """
     found = dict(enumerate(predicted))
     for i in sorted(found, key=lambda i: len(found[i].predicted.r)):
-        run = bench.follow(controller, found[i].predicted.r, found[i].reference).run
+        name = found[i].reference
+        run = bench.follow(controller, references[name], name).run
         found[i] = replace(found[i], measured=run)
         keep(tuple(found[k] for k in range(len(predicted))))
         require_alike(found[i])

@@ -60,6 +60,7 @@ def context(folder: Path) -> dict[str, Any]:
                 "stages": _stages(found),
                 "gains": _gains(found),
                 "met": _met(found),
+                "opinion": _opinion(found),
                 "evidence": [_judged(*item) for item in found.get("evidence", {}).items()],
                 "verified": _verified(found),
                 "analysed": analysed.section(folder),
@@ -114,6 +115,22 @@ def _met(found: Mapping[str, Any]) -> Table | None:
         what = f"slowest recovery from a load of {significant(volt)} V at {significant(level)} RPM"
         rows.append((what, tuned, f"{rule}, under Eq. 12's gains"))
     return Table("Required beside the cost.", ("what", "found", "allowed"), tuple(rows), words=True)
+
+
+def _opinion(found: Mapping[str, Any]) -> Table | None:
+    """What gains of models and linear rival cost on either; none in folders of before."""
+    opinion = found.get("second_opinion")
+    if not opinion:
+        return None
+    names = ("tuned on the networks", "tuned on the linear model", "tuned on both")
+    rows = tuple(
+        (name + (", taken" if i == opinion["taken"] else ""), significant(a), significant(b))
+        for i, (name, a, b) in enumerate(
+            zip(names, opinion["on_models"], opinion["on_rival"], strict=False)
+        )
+    )
+    header = ("gains", "cost on the networks [RPM]", "cost on the linear model [RPM]")
+    return Table("A second opinion.", header, rows)
 
 
 def _judged(name: str, judged: Mapping[str, Any]) -> Table:

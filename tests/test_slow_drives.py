@@ -1,0 +1,175 @@
+"""Slow drives: what is simulated runs on every k-th sample, the machine on every one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from commissioned import SMALL, short
+from sewfast import Controller, Gains, VirtualMachine, commission
+from sewfast.commissioning.gains import ruled
+from sewfast.commissioning.slow import MOST, PER_CONSTANT, SHARPEST, Thinning
+from sewfast.commissioning.small_signal import Resonance, SmallSignal
+from sewfast.commissioning.turn import HARMONICS, TurnLoad
+from sewfast.control import Fopdt
+from sewfast.cost import Cost
+from sewfast.loop import run
+from sewfast.recording import Recording, record
+from sewfast.robustness import margins
+
+
+def recorded(samples: int = 1003) -> Recording:
+    u = 2.0 + np.random.default_rng(0).normal(0.0, 0.5, samples)
+    return record(VirtualMachine(), u, name="noise")
+
+
+def controller(samples: int = 8) -> Controller:
+    return Controller(
+        gains=Gains.standard(0.02, 0.06, 0.004), alpha=0.3, beta=-0.5, N=10.0, u_min=-20.0,
+        u_max=20.0, filter_samples=samples, filter_time=0.004, counts_per_rev=1572.0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("T", "k"), [(0.2, 1), (0.39, 1), (0.6, 3), (2.0, 10), (50.0, MOST)]
+)  # fmt: skip
+def test_it_follows_the_time_constant(T: float, k: int) -> None:
+    fopdt = Fopdt(K=400.0, T=T, L=0.01)
+    assert Thinning.of(fopdt, 1e-3, None).k == k
+    # at another sample time the same samples of a time constant
+    assert Thinning.of(replace(fopdt, T=10.0 * T), 1e-2, None).k == k
+    assert T / (k * 1e-3) >= PER_CONSTANT - 5 or k == 1
+
+
+def test_a_resonance_is_not_folded() -> None:
+    model = None
+    small = SmallSignal(model, Resonance(60.0, 0.02), None)  # type: ignore[arg-type]
+    assert Thinning.of(Fopdt(K=400.0, T=2.0, L=0.01), 1e-3, small).k == 1
+
+
+def test_a_fast_drive_is_left_as_it_is() -> None:
+    same, recording = Thinning(), recorded(200)
+    assert same.recording(recording) is recording
+    assert same.coarse(controller()) == same.fine(controller()) == controller()
+    assert same.variations() is None
+
+
+def test_commands_are_averaged_and_counts_are_picked() -> None:
+    whole, thin = recorded(), Thinning(10).recording(recorded())
+    assert thin.Ts == pytest.approx(0.01)
+    assert len(thin) == 101
+    np.testing.assert_array_equal(thin.counts, whole.counts[::10])
+    np.testing.assert_allclose(thin.u[:100], whole.u[:1000].reshape(100, 10).mean(axis=1))
+    assert thin.u[100] == pytest.approx(whole.u[1000:].mean())
+    assert whole.speed_true is not None
+    # the speed is that of the samples that are left
+    error = thin.y[20:] - whole.speed_true[::10][20:]
+    assert np.sqrt(np.mean(error**2)) < 0.02 * np.ptp(whole.speed_true)
+
+
+def test_a_rule_is_told_of_the_delay_of_coarse_samples() -> None:
+    fopdt = Fopdt(K=500.0, T=2.0, L=0.002)
+    assert Thinning().plant(fopdt, 1e-3) is fopdt
+    thinning = Thinning(10)
+    coarse = thinning.coarse(controller())
+    told = thinning.plant(fopdt, 1e-3)
+    assert pytest.approx(0.011) == told.L
+    assert margins(ruled(told, coarse), fopdt).Ms < 2.0
+
+
+def test_chatter_counts_as_it_will_on_the_machine() -> None:
+    cost = Cost(chatter=5.0)
+    assert Thinning().cost(cost) is cost
+    assert Thinning(4).cost(cost) == Cost(chatter=2.5)
+    assert Thinning(4).cost(Cost()) == Cost()
+
+
+def test_a_controller_converts_there_and_back() -> None:
+    thinning = Thinning(10)
+    coarse = thinning.coarse(controller(20))
+    assert (coarse.Ts, coarse.filter_samples) == (0.01, 2)
+    assert coarse.gains == controller().gains
+    # .4 ms of derivative filter are less than 10 ms of sample time are
+    assert coarse.N == SHARPEST
+    softer = replace(coarse, N=5.0)
+    fine = thinning.fine(softer)
+    assert (fine.Ts, fine.filter_samples) == (0.001, 20)
+    assert pytest.approx(0.004 / 5.0 + 0.01) == 0.004 / fine.N + 0.001
+    back = thinning.coarse(fine)
+    assert pytest.approx(5.0) == back.N
+    assert replace(back, N=5.0) == softer
+    assert thinning.coarse(controller(3)).filter_samples == 1
+    assert thinning.fine(replace(coarse, filter_samples=20)).filter_samples == 64
+
+
+def test_the_converted_controller_does_the_same() -> None:
+    machine, thinning = VirtualMachine(), Thinning(4)
+    r = np.concatenate([np.linspace(0.0, 1000.0, 2000), np.full(1000, 1000.0)])
+    gentle = replace(controller(8), gains=Gains.standard(0.01, 0.2))
+    fine = run(gentle, machine, r)
+    alike = thinning.run(fine)
+    assert (len(alike.y), alike.Ts) == (750, 0.004)
+    np.testing.assert_array_equal(alike.y, fine.y[::4])
+    # one that decides at every fourth sample only, by the converted gains
+    core = thinning.coarse(gentle).core()
+    machine_y = 0.0
+    model = Slow()
+    y = []
+    for k in range(len(r)):
+        if k % 4 == 0:
+            u = core.step(float(r[k]), machine_y)
+        machine_y = model.step(u)
+        y.append(machine_y)
+    held, same = Slow(), gentle.core()
+    z, now = [], 0.0
+    for k in range(len(r)):
+        now = held.step(same.step(float(r[k]), now))
+        z.append(now)
+    assert np.sqrt(np.mean((np.array(y) - np.array(z)) ** 2)) < 5.0
+
+
+class Slow:
+    """500 RPM/V, a time constant of one second."""
+
+    y = 0.0
+
+    def step(self, u: float) -> float:
+        self.y += 1e-3 * (500.0 * u - self.y)
+        return self.y
+
+
+def test_a_load_over_the_turn_is_averaged_and_not_folded() -> None:
+    # the sixth harmonic at 1,000 RPM is 100 Hz: picked every 10 ms it would be a constant
+    load = TurnLoad(np.eye(HARMONICS)[5], np.zeros(HARMONICS))
+    r = {"hold": np.full(1000, 1000.0)}
+    found = Thinning(10).pushes(load, r, 1e-3)
+    assert found is not None
+    assert np.abs(found[0]).max() < 1e-6
+    assert np.abs(load.along(r["hold"], 1e-3)[::10]).min() > 0.99
+    assert Thinning(10).pushes(None, r, 1e-3) is None
+
+
+def test_a_commissioning_on_every_third_sample(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(Thinning, "of", lambda *_: Thinning(3))
+    r = np.concatenate([np.linspace(0.0, 900.0, 500), np.full(400, 900.0)])
+    with short():
+        found = commission(VirtualMachine(), references={"mine": r}, **{**SMALL, "members": 1})
+    assert found.is_verified
+    assert found.sample_time == pytest.approx(0.003)
+    assert found.controller is not None
+    assert found.models is not None
+    assert found.tuning is not None
+    assert (found.controller.Ts, found.models.Ts) == pytest.approx((0.001, 0.003))
+    assert found.tuning.controller.Ts == pytest.approx(0.003)
+    (c,) = found.comparisons
+    assert c.measured is not None
+    assert c.alike is not None
+    assert (len(c.predicted.r), len(c.measured.r), len(c.alike.r)) == (300, 900, 300)
+    np.testing.assert_array_equal(c.alike.r, c.predicted.r)
+    assert c.apart == pytest.approx(np.sqrt(np.mean((c.measured.y[::3] - c.predicted.y) ** 2)))
+    assert "mine, measured" in found.save(tmp_path / "out").read_text()
