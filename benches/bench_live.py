@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from sewfast.live import Feed, open_view
-from sewfast.live.frame import Frame
-from sewfast.live.palette import Palette
+from sewfast.live.plot import Palette
+from sewfast.live.terminal import Frame
 
 UNITS = {"u": "V", "counts": "", "r": "RPM", "current": "A"}
 BATCH, SAMPLES, TS = 10, 30_000, 0.001

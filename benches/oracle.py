@@ -18,7 +18,7 @@ import numpy as np
 from sewfast import Commissioning, Controller
 from sewfast.commissioning import SteppedBench
 from sewfast.commissioning.demands import demands
-from sewfast.commissioning.references import standard
+from sewfast.commissioning.excitations import standard
 from sewfast.cost import Cost
 from sewfast.loop import ClosedLoopRun
 from sewfast.robustness import margins

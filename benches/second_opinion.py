@@ -15,8 +15,8 @@ import numpy as np
 from drives import FAMILY, Simulator, bench_of, drawn
 from sewfast import Controller, _core, identify, tune
 from sewfast.commissioning.demands import demands
+from sewfast.commissioning.excitations import standard
 from sewfast.commissioning.gains import cost_of
-from sewfast.commissioning.references import standard
 from sewfast.dataset import Dataset
 
 TS = 1e-3

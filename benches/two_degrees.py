@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from sewfast import Controller, Gains, VirtualMachine, commission
 from sewfast.analysis import run_under_load
-from sewfast.analysis.loading import torque_of
-from sewfast.analysis.responses import RECOVERED
+from sewfast.analysis.responses import RECOVERED, torque_of
 from sewfast.control import Fopdt
 from sewfast.dataset import FloatArray
 from sewfast.rules import eq_12

@@ -18,7 +18,7 @@ from sewfast import _core
 from sewfast.errors import DataError
 from sewfast.readers import read_table
 from sewfast.recordfile import read_recording
-from sewfast.recordfile.container import CHUNK, CHUNK_HEAD, MAGIC, RECORD
+from sewfast.recordfile.format import CHUNK, CHUNK_HEAD, MAGIC, RECORD
 
 
 def limited(code: str) -> subprocess.CompletedProcess[str]:

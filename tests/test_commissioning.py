@@ -38,16 +38,10 @@ from sewfast import (
     read_table,
     tuning,
 )
-from sewfast.commissioning import (
-    STAGES,
-    Refusal,
-    agreement,
-    gains,
-    training,
-)
+from sewfast.commissioning import STAGES, Refusal, agreement, gains, training
 from sewfast.commissioning.bench import DriveBench, MachineBench, bench_of
 from sewfast.commissioning.demands import demands
-from sewfast.commissioning.requirements import Requirements
+from sewfast.commissioning.gains import Requirements
 from sewfast.errors import LinkError
 from sewfast.link import VirtualDevice, connect
 from sewfast.report import report

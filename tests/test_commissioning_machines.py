@@ -14,9 +14,8 @@ from sewfast.commissioning import SteppedBench
 from sewfast.commissioning.caution import cautious, held, swing_of
 from sewfast.commissioning.demands import Demands, demands
 from sewfast.commissioning.excitations import acceleration_shown
-from sewfast.commissioning.first_order import step_response
 from sewfast.commissioning.gains import first_gains, lowered, scaled
-from sewfast.commissioning.motion import first_motion
+from sewfast.commissioning.motion import first_motion, step_response
 from sewfast.commissioning.refusal import Refusal
 from sewfast.commissioning.small_signal import SmallSignal, small_signal
 from sewfast.commissioning.turn import HARMONICS, TurnLoad, basis

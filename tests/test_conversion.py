@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sewfast import ARX, IV, LinearOE, SettingError, _core
-from sewfast.models.continuous import logarithm
-from sewfast.models.conversion import StateSpace
+from sewfast.models.conversion import StateSpace, logarithm
 
 control = pytest.importorskip("control", reason="needs the extra 'control'")
 signal = pytest.importorskip("scipy.signal", reason="needs the extra 'control'")

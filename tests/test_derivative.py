@@ -11,7 +11,7 @@ import pytest
 import sewfast as api
 from cli import refused, sewfast
 from sewfast.dataset import Dataset, FloatArray
-from sewfast.dataset.derivative import rate_unit
+from sewfast.dataset.rates import rate_unit
 from sewfast.errors import DataError, SettingError
 
 TS = 1e-3

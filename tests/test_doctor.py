@@ -18,9 +18,8 @@ import pytest
 from link_device import TRIPPED, ScriptedDevice
 from sewfast.cli import main
 from sewfast.errors import SettingError
-from sewfast.link import Diagnosis, Finding, VirtualDevice, checkup, examine, system, wire
-from sewfast.link.checkup import _counters, _round_trip, _state, _throughput
-from sewfast.link.doctor import _unopened
+from sewfast.link import Diagnosis, Finding, VirtualDevice, doctor, examine, system, wire
+from sewfast.link.doctor import _counters, _round_trip, _state, _throughput, _unopened
 
 pytest.importorskip("serial", reason="opens pseudo-terminals as serial ports")
 ECHOES = 40
@@ -134,13 +133,13 @@ def _dead(tmp_path: Path, answer: Callable[[bytes], bytes]) -> Iterator[str]:
 
 @pytest.fixture
 def silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    monkeypatch.setattr(checkup, "PATIENCE", 0.3)
+    monkeypatch.setattr(doctor, "PATIENCE", 0.3)
     yield from _dead(tmp_path, lambda data: b"")
 
 
 @pytest.fixture
 def garbling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    monkeypatch.setattr(checkup, "PATIENCE", 0.3)
+    monkeypatch.setattr(doctor, "PATIENCE", 0.3)
     yield from _dead(tmp_path, lambda data: b"\x55\x00ready>\r\n\x00" + bytes(len(data)))
 
 

@@ -26,10 +26,10 @@ from sewfast.evidence import (
     remembered,
     residual_tests,
 )
-from sewfast.evidence.criteria import Criteria
 from sewfast.evidence.distributions import chi2_quantile, chi2_tail, normal_quantile
-from sewfast.evidence.linearised import linearise
 from sewfast.evidence.noise import Noise, fast_length
+from sewfast.evidence.operating import linearise
+from sewfast.evidence.parameters import Criteria
 from sewfast.models.ensemble import Ensemble
 
 

@@ -17,9 +17,9 @@ from sewfast import commission, identification, signals
 from sewfast.commissioning import training
 from sewfast.control import Controller, Gains, load_controller
 from sewfast.errors import DataError, SettingError
-from sewfast.experiment import STAGES, folder, identified, loops, recordings, run_demo
+from sewfast.experiment import STAGES, loops, run_demo
 from sewfast.experiment import demo as experiment
-from sewfast.experiment.rig import rig
+from sewfast.experiment.loops import rig
 from sewfast.machine import VirtualMachine
 from sewfast.models import load_model
 from sewfast.readers import read, read_table
@@ -33,7 +33,7 @@ SCORES = ("rmse_rpm", "fit_percent")
 def _short() -> Any:
     with pytest.MonkeyPatch.context() as patch:
         quick = functools.partial(identification.identify, iterations=3, starts=1)
-        patch.setattr(identified, "identify", quick)
+        patch.setattr(loops, "identify", quick)
         able = functools.partial(identification.identify, iterations=15)
         patch.setattr(training, "identify", able)
         short = functools.partial(commission, members=2, evaluations=25)
@@ -170,11 +170,11 @@ def test_a_folder_that_was_interrupted_while_writing_is_no_result(
     def fail(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(folder, "write_table", fail)
+    monkeypatch.setattr(experiment, "write_table", fail)
     out = Path(shutil.copytree(demo, tmp_path / "cut"))
     models = {"paper": load_model(demo / "models" / "paper.json")}
     with pytest.raises(KeyboardInterrupt):
-        folder.write(
+        demo.write(
             out, {}, recordings={}, models=models, controllers={},
             predictions={"random": {"t": np.zeros(3)}}, runs={}, drawings={},
         )  # fmt: skip
@@ -244,10 +244,10 @@ def test_only_per_sample_gains_on_rpm_track_on_the_papers_plant() -> None:
 def test_the_closed_loop_recording_is_the_loop_itself() -> None:
     with rig(VirtualMachine()) as bench:
         step = bench.record(signals.excitation("step"), "step")
-        controller = recordings.coarse_controller(
-            recordings.first_order(step), Ts=bench.Ts, counts_per_rev=bench.counts_per_rev
+        controller = loops.coarse_controller(
+            loops.first_order(step), Ts=bench.Ts, counts_per_rev=bench.counts_per_rev
         )
-        recording = recordings.closed_loop(bench, controller)
+        recording = loops.closed_loop(bench, controller)
         loop = bench.run(controller, "trapezoids")
     np.testing.assert_array_equal(recording.speed_true, loop.y)
 
@@ -282,4 +282,4 @@ def load_coarse() -> Controller:
 
 def test_the_record_scored_as_saturating_is_the_second_one() -> None:
     assert artefacts.record_of("saturating") == "saturating_2"
-    assert "saturating_2" not in identified.ALL_RECORDS
+    assert "saturating_2" not in loops.ALL_RECORDS

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sewfast import jsonfile
+from sewfast import storage
 from sewfast.errors import ModelFileError
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
@@ -21,8 +21,8 @@ VALUES = st.recursive(
 @given(VALUES)
 def test_what_was_written_is_read(tmp_path_factory: Any, value: Any) -> None:
     path = tmp_path_factory.mktemp("json") / "a.json"
-    jsonfile.write(path, "sewfast.test", 3, {"value": value})
-    assert jsonfile.read(path, "sewfast.test", (1, 3)) == {"version": 3, "value": value}
+    storage.write(path, "sewfast.test", 3, {"value": value})
+    assert storage.read(path, "sewfast.test", (1, 3)) == {"version": 3, "value": value}
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_refuses_what_it_cannot_trust(tmp_path: Path, text: str, says: str) -> N
     path = tmp_path / "bad.json"
     path.write_text(text)
     with pytest.raises(ModelFileError, match=r"bad\.json") as caught:
-        jsonfile.read(path, "sewfast.test", (1,))
+        storage.read(path, "sewfast.test", (1,))
     assert says in str(caught.value)
 
 
@@ -59,28 +59,28 @@ def test_any_bytes_are_refused_with_the_name_of_the_file(
     path = tmp_path_factory.mktemp("json") / "noise.json"
     path.write_bytes(data)
     with pytest.raises(ModelFileError, match=r"noise\.json"):
-        jsonfile.read(path, "sewfast.test", (1,))
+        storage.read(path, "sewfast.test", (1,))
 
 
 def test_refuses_missing_large_and_folders(tmp_path: Path) -> None:
     large = tmp_path / "large.json"
     with large.open("wb") as file:
-        file.truncate(jsonfile.LARGEST_FILE + 1)
+        file.truncate(storage.LARGEST_FILE + 1)
     with pytest.raises(ModelFileError, match="16 MB"):
-        jsonfile.read(large, "sewfast.test", (1,))
+        storage.read(large, "sewfast.test", (1,))
     for path in (tmp_path / "absent.json", tmp_path):
         with pytest.raises(ModelFileError, match="cannot be read"):
-            jsonfile.read(path, "sewfast.test", (1,))
+            storage.read(path, "sewfast.test", (1,))
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "kept.json"
-    jsonfile.write(path, "sewfast.test", 1, {"a": 1})
+    storage.write(path, "sewfast.test", 1, {"a": 1})
     with pytest.raises(ModelFileError, match=r"kept\.json"):
-        jsonfile.write(path, "sewfast.test", 1, {"a": float("nan")})
+        storage.write(path, "sewfast.test", 1, {"a": float("nan")})
     with pytest.raises(ModelFileError, match=r"kept\.json"):
-        jsonfile.write(path, "sewfast.test", 1, {"a": object()})
+        storage.write(path, "sewfast.test", 1, {"a": object()})
     with pytest.raises(ModelFileError, match="cannot be written"):
-        jsonfile.write(tmp_path / "absent" / "a.json", "sewfast.test", 1, {})
-    assert jsonfile.read(path, "sewfast.test", (1,))["a"] == 1
+        storage.write(tmp_path / "absent" / "a.json", "sewfast.test", 1, {})
+    assert storage.read(path, "sewfast.test", (1,))["a"] == 1
     assert [entry.name for entry in tmp_path.iterdir()] == ["kept.json"]

@@ -22,7 +22,7 @@ from sewfast.experiment import run_demo
 from sewfast.link import Drive, VirtualDevice, connect
 from sewfast.loop import run
 from sewfast.recordfile import Header, RecordWriter, export, read_recording
-from sewfast.recordfile.sink import Sink
+from sewfast.recordfile.filing import Sink
 from sewfast.recording import record
 
 U = np.round(3.0 * np.sin(np.arange(300) / 20.0), 3)

@@ -14,13 +14,9 @@ from hypothesis import strategies as st
 from sewfast.cli.arguments import add_view
 from sewfast.errors import DataError, SettingError
 from sewfast.live import Feed, Kind
-from sewfast.live.axis import Axis
-from sewfast.live.canvas import braille, spans, text
-from sewfast.live.feed import _MOST
-from sewfast.live.frame import Frame, panels, status
-from sewfast.live.palette import Palette
-from sewfast.live.speed import speed_over_window
-from sewfast.live.terminal import rows_to_climb
+from sewfast.live.feed import _MOST, speed_over_window
+from sewfast.live.plot import Axis, Palette, braille, spans, text
+from sewfast.live.terminal import Frame, panels, rows_to_climb, status
 
 FINE = Palette(unicode=True, colour=True)
 PLAIN = Palette(unicode=False, colour=False)

@@ -338,7 +338,7 @@ def test_failing_view_costs_a_line(
     def fail(*_: object) -> None:
         raise ValueError("broken")
 
-    monkeypatch.setattr("sewfast.live.plotjuggler.PlotJugglerView._send", fail)
+    monkeypatch.setattr("sewfast.live.stream.PlotJugglerView._send", fail)
     f = feed()
     with open_view("plotjuggler", f, own_process=False):
         play(f, 0.1)

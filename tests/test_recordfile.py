@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from recordings_made import COLUMNS, STARTED, Made, header, make, signals
 from sewfast.errors import DataError, SettingError
 from sewfast.recordfile import Header, RecordWriter, export, read_recording, save_columns
-from sewfast.recordfile.samples import numbers
+from sewfast.recordfile.format import numbers
 
 
 @pytest.fixture(scope="module")

@@ -21,10 +21,9 @@ from hypothesis import strategies as st
 from recordings_made import SOAK, Made, header, make
 from sewfast.errors import DataError
 from sewfast.recordfile import RecordedFile, RecordWriter, read_recording
-from sewfast.recordfile.container import Assembler, Message, opening
-from sewfast.recordfile.curves import _groups
+from sewfast.recordfile.export import _groups
+from sewfast.recordfile.format import Assembler, Message, Topic, opening
 from sewfast.recordfile.reader import decode_recording
-from sewfast.recordfile.topics import Topic
 
 resource = pytest.importorskip("resource", reason="limits a file's size as POSIX systems can")
 

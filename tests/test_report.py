@@ -16,9 +16,8 @@ import result_folder
 from sewfast.errors import DataError, ModelFileError, SewfastError
 from sewfast.report import report
 from sewfast.report.artefacts import load
-from sewfast.report.canvas import thin
-from sewfast.report.goals import goals
-from sewfast.report.numbers import significant
+from sewfast.report.canvas import significant, thin
+from sewfast.report.tables import goals
 
 PAPER_FIGURES = [*range(2, 6), *range(7, 16), *range(19, 23)]
 VOID = {"meta", "link", "br", "img", "input", "hr"}

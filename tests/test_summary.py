@@ -16,8 +16,8 @@ import sewfast as api
 from cli import refused, sewfast
 from sewfast.dataset import Dataset
 from sewfast.dataset.advice import nice
+from sewfast.dataset.noise import band, power_spectrum
 from sewfast.dataset.outliers import usual_threshold
-from sewfast.dataset.spectrum import band, power_spectrum
 from sewfast.errors import SettingError
 
 N, TS = 20_000, 1e-3

@@ -10,8 +10,7 @@ import pytest
 from loops import QUIET, drive
 from sewfast import VirtualMachine
 from sewfast.analysis import run_under_load
-from sewfast.analysis.loading import torque_of
-from sewfast.analysis.responses import RECOVERED
+from sewfast.analysis.responses import RECOVERED, torque_of
 from sewfast.analysis.systems import LinearLoop, simulate
 from sewfast.control import Controller, Gains
 from sewfast.dataset import FloatArray

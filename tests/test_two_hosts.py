@@ -14,7 +14,7 @@ import pytest
 import raw_host as raw
 from raw_host import RawHost
 from sewfast.link import VirtualDevice, wire
-from sewfast.link.checkup import _counters
+from sewfast.link.doctor import _counters
 
 OLD, NEW = 11, 12
 AHEAD = 1_000_000

@@ -12,7 +12,7 @@ from cli import sewfast as command
 from sewfast import read, read_table
 from sewfast.dataset import Dataset, FloatArray
 from sewfast.errors import DataError, SettingError, SewfastError
-from sewfast.readers.table import Table
+from sewfast.readers.containers import Table
 from sewfast.readers.timebase import time_base
 
 TAU = 0.05

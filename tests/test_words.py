@@ -11,9 +11,9 @@ from kinds import TS, model_of, recording
 from plants import linear_data
 from sewfast import Dataset, LinearOE, identify
 from sewfast.evidence import Residuals, operating_range
+from sewfast.evidence.card import summary
 from sewfast.evidence.questions import accuracy, correlation, operation
 from sewfast.evidence.scores import horizon_scores
-from sewfast.evidence.summary import summary
 from sewfast.validation import grade_of, validate
 
 

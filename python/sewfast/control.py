@@ -8,12 +8,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from . import _core, jsonfile
+from . import _core, storage
 from .errors import ModelFileError, SettingError, SewfastError
-from .fopdt import Fopdt, fit_fopdt
 from .gains import Form, Gains, real, vector, whole
 from .models.fields import Fields
-from .rules import Rule, table_1
+from .rules import Fopdt, Rule, fit_fopdt, table_1
 from .units import counts_per_unit
 
 __all__ = [
@@ -176,7 +175,7 @@ class Controller:
         ModelFileError
             Where the file cannot be written.
         """
-        jsonfile.write(path, FORMAT, VERSION, self.to_dict())
+        storage.write(path, FORMAT, VERSION, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as JSON values; null stands for a limit or filter that is not there."""
@@ -225,7 +224,7 @@ def load_controller(path: str | os.PathLike[str]) -> Controller:
         Where the file is missing, damaged, of another format or of an unknown version, or holds a
         setting outside its range; the message names the file and the field.
     """
-    fields = Fields(os.fspath(path), jsonfile.read(path, FORMAT, (1, VERSION)))
+    fields = Fields(os.fspath(path), storage.read(path, FORMAT, (1, VERSION)))
     first = fields.integer("version") == 1
     reals = _FIRST_REALS if first else _REALS
     fields.require_only((*_OTHERS, *reals, *(() if first else ("schedule",))))

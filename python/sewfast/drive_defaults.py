@@ -18,11 +18,11 @@ from . import _core, signals
 from .control import Controller
 from .dataset import FloatArray
 from .errors import DataError, FitError, SettingError
-from .evidence.linearised import linearise
+from .evidence.operating import linearise
 from .evidence.residuals import representative
-from .fopdt import Fopdt, fit_fopdt
 from .gains import real
 from .models import Model
+from .rules import Fopdt, fit_fopdt
 
 NAMES = ("trapezoid", "trapezoids", "random")
 """References to tune on unless others are given."""

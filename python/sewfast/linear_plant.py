@@ -11,8 +11,7 @@ import numpy as np
 from . import _core
 from .dataset import FloatArray
 from .errors import SettingError
-from .models.conversion import from_state_space, transfer_function
-from .models.toolboxes import polynomials_of
+from .models.conversion import from_state_space, polynomials_of, transfer_function
 
 _GRID = 25
 """Constant commands among which a speed is sought."""

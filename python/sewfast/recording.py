@@ -15,7 +15,7 @@ from .dataset import Dataset
 from .errors import DataError, SettingError
 from .machine import VirtualMachine
 from .recordfile import Header, save_columns
-from .recordfile.keeping import require_replaceable
+from .recordfile.writer import require_replaceable
 from .speed import Method, speed_from_counts, speed_or_nan
 from .writers import write_table
 

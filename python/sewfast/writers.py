@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .atomic import replace_file
 from .dataset import labelled
 from .errors import DataError, SettingError
+from .storage import replace_file
 
 _Columns = dict[str, NDArray[Any]]
 

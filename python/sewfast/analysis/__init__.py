@@ -1,15 +1,10 @@
 """Analysis of a controller on models: responses, Bode of L, S, T, gain sensitivity, what-if."""
 
 from .analysis import Analysis, analyse
-from .bode import LoopBode
-from .changes import Change
-from .loading import run_under_load
-from .points import PlantPoint
-from .responses import Responses
-from .scoring import Score
-from .sensitivity import GainSensitivity
+from .points import LoopBode, PlantPoint
+from .responses import Responses, run_under_load
+from .sensitivity import Change, GainSensitivity, Score, WhatIf
 from .systems import LinearLoop
-from .whatif import WhatIf
 
 __all__ = [
     "Analysis",

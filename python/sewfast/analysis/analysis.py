@@ -19,14 +19,10 @@ from ..loop import check_fits, require_controller
 from ..plants import Plants, References, each_plant, each_reference, titles
 from ..trust import Judgement, Limits, judge
 from .arguments import each_change, finite_each, required
-from .bode import LoopBode, loop_bodes
-from .changes import Change
-from .points import PlantPoint, plant_points
+from .points import LoopBode, PlantPoint, loop_bodes, plant_points
 from .responses import Responses, Steps, default_steps, responses
-from .scoring import Score, Task
-from .sensitivity import GainSensitivity, gain_sensitivity
+from .sensitivity import Change, GainSensitivity, Score, Task, WhatIf, gain_sensitivity, what_if
 from .systems import LinearLoop
-from .whatif import WhatIf, what_if
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -199,7 +195,7 @@ def analyse(
     cost : Cost, optional
         As for `sewfast.tune`.
     changes : sequence of Change, optional
-        For the what-if; see `sewfast.analysis.changes`.
+        For the what-if; see `sewfast.analysis.sensitivity`.
     limits : Limits, optional
         For the guards.
     seed : int

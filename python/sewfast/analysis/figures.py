@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..dataset import FloatArray
-from ..dataset.units import lettered
+from ..dataset.arrays import lettered
 from ..evidence.figures import shade
 from ..report.canvas import Float, panels, require_matplotlib, style, thin
-from .bode import LoopBode
+from .points import LoopBode
 from .responses import Responses
-from .scoring import Score
+from .sensitivity import Score
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .. import jsonfile
+from .. import storage
 from ..errors import SettingError
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def save(a: Analysis, folder: str | os.PathLike[str], *, png: bool = True) -> li
             written.append(place / f"{name}.svg")
         target = Path(folder) / NUMBERS
         values = {k: v for k, v in a.to_json().items() if k not in ("format", "version")}
-        jsonfile.write(target, "sewfast.analysis", 1, {**values, "figures": list(drawn)})
+        storage.write(target, "sewfast.analysis", 1, {**values, "figures": list(drawn)})
     except OSError as e:
         raise SettingError(
             f"{folder}: expected a folder to write to, received {e.strerror!r}; choose another"

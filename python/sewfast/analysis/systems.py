@@ -16,8 +16,7 @@ from ..control import Controller
 from ..dataset import FloatArray
 from ..errors import DataError, SettingError
 from ..loop import require_controller
-from ..models.conversion import StateSpace
-from ..models.toolboxes import require_control, require_scipy_signal
+from ..models.conversion import StateSpace, require_control, require_scipy_signal
 from ..robustness import scheduled_gains
 
 SYSTEMS = ("L", "S", "T", "closed", "tracking", "disturbance", "plant", "measurement", "pid")

@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from .bode import LoopBode
+from .points import LoopBode
 from .responses import Responses
-from .scoring import Score
+from .sensitivity import Score
 
 if TYPE_CHECKING:
     from .analysis import Analysis

@@ -121,7 +121,7 @@ def _settle_plant(args: argparse.Namespace) -> None:
         For no plant or two, or for a drive without a reference or without --on: a motor is not
         moved by a slip.
     """
-    from .. import jsonfile
+    from .. import storage
     from ..control import FORMAT
     from ..models.base import FORMAT as MODEL
 
@@ -131,7 +131,7 @@ def _settle_plant(args: argparse.Namespace) -> None:
             f"expected one plant, {args.controller} MODEL.json or --on PORT, received {received}"
         )
     if args.plant is not None:
-        formats = tuple(jsonfile.format_of(path) for path in (args.controller, args.plant))
+        formats = tuple(storage.format_of(path) for path in (args.controller, args.plant))
         if formats == (MODEL, FORMAT):
             args.controller, args.plant = args.plant, args.controller
         if is_port(args.plant):

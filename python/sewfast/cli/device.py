@@ -90,7 +90,7 @@ def add(commands: Commands) -> None:
 
 def device_command(args: argparse.Namespace) -> None:
     from ..link.virtual import VirtualDevice
-    from ..recordfile.keeping import require_replaceable
+    from ..recordfile.writer import require_replaceable
 
     for log in (args.fault_log, args.trace):
         if log is not None:

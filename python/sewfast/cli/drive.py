@@ -190,7 +190,7 @@ def recording_place(out: Path | None, *, overwrite: bool) -> Path:
         Without an output, what a drive did cannot be had again; nor can what another one has done,
         which is kept.
     """
-    from ..recordfile.keeping import require_free, require_replaceable
+    from ..recordfile.writer import require_free, require_replaceable
 
     if out is None:
         raise SettingError(

@@ -54,7 +54,7 @@ def at_loops_period(args: argparse.Namespace, controller: Controller) -> Control
         For what cannot be, before anything moves.
     """
     from ..link import at_period
-    from ..recordfile.keeping import require_free
+    from ..recordfile.writer import require_free
 
     if not is_port(args.on):
         raise SettingError(

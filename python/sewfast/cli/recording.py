@@ -158,7 +158,7 @@ def _require_period(args: argparse.Namespace, given: float, machine: float) -> N
 
 def _record_virtual(args: argparse.Namespace, u: FloatArray, Ts: float) -> None:
     from ..machine import VirtualMachine
-    from ..recordfile.keeping import require_replaceable
+    from ..recordfile.writer import require_replaceable
     from ..recording import record
 
     if not args.on.startswith("virtual"):

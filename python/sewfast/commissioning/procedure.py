@@ -27,14 +27,12 @@ from .agreement import Disagreement, agreeing
 from .bench import Bench, Followed, NotedBench, bench_of, told_of
 from .caution import cause, cautious
 from .demands import MS, Demands, demands
-from .first_order import step_response
+from .excitations import standard
 from .folder import require_own
-from .gains import cost_of, first_gains, ruled, search, start_of
+from .gains import Requirements, cost_of, first_gains, ruled, search, start_of
 from .journal import STAGES, Journal, Progress
-from .motion import first_motion
-from .references import standard
+from .motion import first_motion, step_response
 from .refusal import Refusal
-from .requirements import Requirements
 from .result import VERIFIED, VERIFIED_POORLY, Commissioning
 from .rival import ORDERS, THINNED, Rival, linear_rival
 from .slow import Thinning
@@ -98,7 +96,7 @@ def commission(
         Top of the working range [RPM]: the largest reference, or 2,000. A quarter more is planned.
     references : mapping of name to array, or sequence of names, optional
         What to verify on [RPM] at the machine's sample time; names are those of `sewfast.signals`.
-        By default `sewfast.commissioning.references.standard`.
+        By default `sewfast.commissioning.excitations.standard`.
     practice : mapping of name to array, or sequence of names, optional
         What to tune on. By default the references; of the standard ones shorter kin.
     cost : Cost, optional

@@ -141,7 +141,7 @@ class Commissioning:
 
     def numbers(self) -> dict[str, Any]:
         """Every number as JSON values."""
-        from .numbers import numbers
+        from .folder import numbers
 
         return numbers(self)
 

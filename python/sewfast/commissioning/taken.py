@@ -15,8 +15,8 @@ from ..control import Controller
 from ..errors import DataError, SettingError
 from ..loop import ClosedLoopRun
 from ..recordfile import save_columns
-from ..recordfile.keeping import ENDING, require_replaceable
 from ..recordfile.reader import RecordedFile, read_header, read_recording
+from ..recordfile.writer import ENDING, require_replaceable
 from ..recording import Recording
 from ..report.commissioned import file_name
 from .bench import Followed

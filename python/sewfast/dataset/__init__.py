@@ -1,15 +1,13 @@
 """Data sets: experiments, their parts, what they must fulfil."""
 
-from .arrays import FloatArray
-from .checks import require_dataset
+from .arrays import FloatArray, HasUnits, labelled, require_same_units
 from .dataset import Dataset
 from .diagnosis import Diagnosis, Finding, diagnose, is_reference
 from .experiment import Experiment
 from .outliers import Outliers
-from .pieces import SHORTEST_PIECE
+from .pieces import SHORTEST_PIECE, require_dataset
 from .summary import ColumnSummary, Summary, column_summary
 from .trends import Trend
-from .units import HasUnits, labelled, require_same_units
 
 __all__ = [
     "SHORTEST_PIECE",

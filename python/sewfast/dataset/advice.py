@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from .checks import SMALLEST_FITTED
+from .pieces import SMALLEST_FITTED
 
 if TYPE_CHECKING:
     from .summary import ColumnSummary, Summary

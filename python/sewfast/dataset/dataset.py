@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import DataError, SettingError
-from . import checks, derivative, gaps, outliers, pieces, rates, summary, trends
-from .arrays import range_of, texts
+from . import gaps, outliers, pieces, rates, summary, trends
+from .arrays import labelled, range_of, texts
 from .experiment import Experiment
-from .units import labelled
 from .weights import require_some_weight
 
 
@@ -143,7 +142,7 @@ class Dataset:
             raise DataError("concat: expected at least one data set, received none")
         first = parts[0]
         for other in parts[1:]:
-            checks.require_alike(first, other)
+            pieces.require_alike(first, other)
         return replace(
             first,
             experiments=tuple(e for part in parts for e in part.experiments),
@@ -197,14 +196,14 @@ class Dataset:
     detrend = trends.detrend
     restore = trends.restore
     resample = rates.resample
-    differentiate = derivative.differentiate
+    differentiate = rates.differentiate
     mark_outliers = outliers.mark_outliers
     summary = summary.summary
 
-    require_inputs = checks.require_inputs
-    require_measured = checks.require_measured
-    require_complete = checks.require_complete
-    require_excited = checks.require_excited
+    require_inputs = pieces.require_inputs
+    require_measured = pieces.require_measured
+    require_complete = pieces.require_complete
+    require_excited = pieces.require_excited
 
     def __repr__(self) -> str:
         inputs = ", ".join(map(labelled, self.input_names, self.input_units))

@@ -12,12 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runs import runs
-from .arrays import FloatArray
-from .checks import LARGEST, require_dataset
-from .feedback import feedback
-from .integrator import Integration, integration
+from .arrays import FloatArray, labelled
+from .feedback import Integration, feedback, integration
 from .noise import MAD, quantum
-from .units import labelled
+from .pieces import LARGEST, require_dataset
 
 if TYPE_CHECKING:
     from .dataset import Dataset
@@ -143,7 +141,7 @@ def diagnose(data: Dataset) -> Diagnosis:
 
     Notes
     -----
-    The tests for an integrator and for feedback are statistical: `sewfast.dataset.integrator` and
+    The tests for an integrator and for feedback are statistical: `sewfast.dataset.feedback` and
     `sewfast.dataset.feedback` say what they rest on.
 
     Examples

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ..errors import DataError, SettingError
 from .arrays import FloatArray
-from .checks import require_sane
 from .noise import MAD, quantum, white_noise
+from .pieces import require_sane
 
 if TYPE_CHECKING:
     from ..models import Model

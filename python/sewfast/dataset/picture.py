@@ -10,11 +10,10 @@ import numpy as np
 
 from ..errors import SettingError
 from ..runs import runs
-from .arrays import FloatArray
-from .checks import LARGEST
+from .arrays import FloatArray, labelled, lettered
+from .noise import band, power_spectrum
 from .outliers import distances, usual_threshold
-from .spectrum import band, power_spectrum
-from .units import labelled, lettered
+from .pieces import LARGEST
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

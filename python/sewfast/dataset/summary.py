@@ -12,13 +12,11 @@ import numpy as np
 
 from ..runs import runs
 from .advice import advice
-from .arrays import FloatArray
-from .checks import LARGEST
+from .arrays import FloatArray, labelled
 from .diagnosis import Diagnosis, diagnose
-from .noise import quantum, share_at_limits, white_noise
+from .noise import band, power_spectrum, quantum, share_at_limits, top, white_noise
 from .outliers import distances, usual_threshold
-from .spectrum import band, power_spectrum, top
-from .units import labelled
+from .pieces import LARGEST
 
 if TYPE_CHECKING:
     from .dataset import Dataset

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..errors import DataError, SettingError
 from .arrays import FloatArray, frozen
-from .checks import require_sane
+from .pieces import require_sane
 
 if TYPE_CHECKING:
     from .dataset import Dataset

@@ -3,26 +3,232 @@
 from __future__ import annotations
 
 import math
+import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
-from .lines import Judged, Line, Verdict
-from .summary import summary
+from html import escape
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 if TYPE_CHECKING:
     from ..dataset import FloatArray
     from .correlations import ResidualTest
-    from .criteria import Criteria
     from .operating import OperatingRange
-    from .parameters import Parameters
+    from .parameters import Criteria, Parameters
     from .residuals import Run
     from .scores import HorizonScores
     from .simulation_bands import Bands
 
+__all__ = ["Line", "ReportCard", "Verdict"]
+
+
+# --- Line and Judged: questions with value, limit and verdict, and what shows them together -------
+
+
+Verdict: TypeAlias = Literal["ok", "warn", "fail", "info"]
+_ORDER: dict[Verdict, int] = {"info": 0, "ok": 1, "warn": 2, "fail": 3}
+_WIDTH = 100
+
+
+@dataclass(frozen=True)
+class Line:
+    """One question.
+
+    Attributes
+    ----------
+    name : str
+        What was looked at.
+    value : float
+        The number; NaN where there is none.
+    shown : str
+        The number as text, with its unit.
+    limit : str
+        What it is held against; empty for information alone.
+    verdict : "ok", "warn", "fail" or "info"
+    meaning : str
+        What it says and what to do.
+    """
+
+    name: str
+    value: float
+    shown: str
+    limit: str
+    verdict: Verdict
+    meaning: str
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values."""
+        value = self.value if math.isfinite(self.value) else None
+        return {
+            "name": self.name,
+            "value": value,
+            "shown": self.shown,
+            "limit": self.limit,
+            "verdict": self.verdict,
+            "meaning": self.meaning,
+        }
+
+
+class Judged:
+    """What consists of lines: its verdict is the worst of theirs."""
+
+    lines: tuple[Line, ...]
+    heading = "Report card"
+    style = "report-card"
+    """Class of the table in `to_html`."""
+
+    @property
+    def title(self) -> str:
+        """What was judged."""
+        raise NotImplementedError
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of the lines."""
+        return max((line.verdict for line in self.lines), key=_ORDER.__getitem__, default="info")
+
+    @property
+    def summary(self) -> str:
+        """What the lines amount to and what to do, in a sentence; empty where they stand alone."""
+        return ""
+
+    def line(self, name: str) -> Line:
+        """The line of that name.
+
+        Raises
+        ------
+        KeyError
+            Where there is none.
+        """
+        for line in self.lines:
+            if line.name == name:
+                return line
+        raise KeyError(f"no line {name!r}; there are {', '.join(x.name for x in self.lines)}")
+
+    def to_html(self) -> str:
+        """A table for a page: no script, no style of its own, verdicts as classes of the cells."""
+        rows = "\n".join(
+            f'<tr><th scope="row">{escape(x.name)}</th><td>{escape(x.shown)}</td>'
+            f"<td>{escape(x.limit)}</td>"
+            f'<td class="verdict {x.verdict}">{x.verdict}</td><td>{escape(x.meaning)}</td></tr>'
+            for x in self.lines
+        )
+        heads = "".join(
+            f'<th scope="col">{h}</th>'
+            for h in ("question", "value", "limit", "verdict", "meaning")
+        )
+        closing = f"<br>{escape(self.summary)}" if self.summary else ""
+        return (
+            f'<table class="{self.style}"><caption>{escape(self.title)}: '
+            f'<b class="verdict {self.verdict}">{self.verdict}</b>{closing}</caption>\n'
+            f"<thead><tr>{heads}</tr></thead>\n<tbody>\n{rows}\n</tbody></table>"
+        )
+
+    def __repr__(self) -> str:
+        counts = {v: sum(x.verdict == v for x in self.lines) for v in _ORDER}
+        text = ", ".join(f"{n} {v}" for v, n in reversed(counts.items()) if n)
+        return f"{type(self).__name__}({self.verdict}: {text})"
+
+    def __str__(self) -> str:
+        wide = [
+            max((len(getattr(x, k)) for x in self.lines), default=0)
+            for k in ("name", "shown", "limit")
+        ]
+        found = [f"{self.heading}: {self.title}", f"verdict: {self.verdict}", ""]
+        before = ""
+        for x in self.lines:
+            cells = zip((x.name, x.shown, x.limit), wide, strict=True)
+            found.append(f"{x.verdict:4}  " + "  ".join(c.ljust(w) for c, w in cells).rstrip())
+            if x.meaning != before:
+                found += textwrap.wrap(
+                    x.meaning, _WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6
+                )
+            before = x.meaning
+        if self.summary:
+            found += ["", *textwrap.wrap(f"in short: {self.summary}", _WIDTH)]
+        return "\n".join(found)
+
+
+# --- The closing sentence of a report card: good enough or not, because of what, what to do first -
+
+
+_NAMED = 3
+"""Lines that are named; of more there is only the number."""
+_STEPS = (
+    # by weight: a model that fails an early one is not helped by mending a later one
+    ("free run", "check the columns, the delay and the orders, or record with a larger excitation"),
+    ("largest pole", "record at the operating points that are unstable, and train on them as well"),
+    (
+        "outside training region",
+        "record operation like this, and train on it as well before relying on the model here",
+    ),
+    ("error over training", "train on data like these as well, or take a smaller model"),
+    (
+        "parameters on these data",
+        "train on this recording as well, and allow a network: a linear model is a compromise "
+        "where the plant bends; if that does not help, the plant has changed in between",
+    ),
+    (
+        "residual with past residual times input",
+        "compare recordings from different times: the gain drifts, or noise acts inside the loop",
+    ),
+    (
+        "residual with",
+        "let identify search for the structure (no model named): it tries other orders, delays and "
+        "networks",
+    ),
+    ("squared residual", "allow a network, or see whether the noise grows with the amplitude"),
+    ("mean residual", "see whether the zero of a sensor or an amplifier has moved"),
+    ("samples per parameter", "record longer, or take a smaller model"),
+    ("inside", "read the bands with care: noise or operation differ from the training data"),
+)
+"""How a line's name begins, and what to do where it warns or fails."""
+
+
+def summary(lines: Sequence[Line]) -> str:
+    """Of the lines of a report card."""
+    failed = [x for x in lines if x.verdict == "fail"]
+    warned = [x for x in lines if x.verdict == "warn"]
+    free = next((x for x in lines if x.name == "free run"), None)
+    if free is not None and free.verdict == "fail":
+        return f"useless here ({free.shown}); first {_step([free])}"
+    shown = "" if free is None else f" ({free.shown})"
+    if free is not None and free.verdict == "info":
+        return "the output is constant here, which says nothing of the model; record one that moves"
+    follows = f"the free run follows the data{shown}"
+    if free is not None and free.verdict == "warn":
+        follows = f"not good enough to tune on: the free run follows the data loosely{shown}"
+        warned.remove(free)
+    if failed:
+        return f"{follows}, and {_counted(failed, 'fail')}; first {_step(failed)}"
+    if free is not None and free.verdict == "warn":
+        return f"{follows}; first {_step([free, *warned])}"
+    if warned:
+        return (
+            f"good enough to tune on with care{shown}: {_counted(warned, 'warn')}; to do better, "
+            f"{_step(warned)}"
+        )
+    return f"good enough to tune a controller on{shown}: nothing here speaks against the model"
+
+
+def _counted(lines: Sequence[Line], verb: str) -> str:
+    names = ", ".join(x.name for x in lines[:_NAMED])
+    more = len(lines) - _NAMED
+    count = f"one line {verb}s" if len(lines) == 1 else f"{len(lines)} lines {verb}"
+    return f"{count} ({names}{f' and {more} more' if more > 0 else ''})"
+
+
+def _step(lines: Sequence[Line]) -> str:
+    for start, step in _STEPS:
+        if any(x.name.startswith(start) for x in lines):
+            return step
+    return "read the lines above"
+
+
+# --- ReportCard: how far a model can be trusted, one line per question with its verdict -----------
+
+
 FORMAT = "sewfast.report_card"
 VERSION = 1
-
-__all__ = ["Line", "ReportCard", "Verdict"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

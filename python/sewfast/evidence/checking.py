@@ -15,9 +15,8 @@ from ..models.base import INIT, Model
 from ..validation import Scores, noise_of
 from . import questions
 from .card import Line, ReportCard
-from .criteria import Criteria
 from .operating import OperatingRange, operating_range
-from .parameters import Knowledge, Parameters, estimate
+from .parameters import Criteria, Knowledge, Parameters, estimate
 from .portmanteau import LAGS, parameter_test, residual_tests
 from .region import Place, placed, training_region
 from .residuals import Residuals, representative

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..dataset import FloatArray, labelled
-from ..dataset.units import lettered
+from ..dataset.arrays import lettered
 from ..errors import SettingError
 from .card import ReportCard
 

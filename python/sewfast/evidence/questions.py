@@ -13,9 +13,8 @@ from ..dataset import FloatArray
 from ..validation import FAIR, Scores, grade_of
 from .card import Line, Verdict
 from .correlations import LEVEL, ResidualTest
-from .criteria import Criteria
 from .operating import OperatingRange
-from .parameters import Knowledge, Parameters
+from .parameters import Criteria, Knowledge, Parameters
 from .residuals import Residuals
 from .scores import HorizonScores, fit_text
 from .simulation_bands import Bands

@@ -4,20 +4,112 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from .. import __version__
+from .. import __version__, storage
+from ..commissioning import Commissioning
+from ..commissioning.folder import first_taken, numbers_in
 from ..commissioning.taken import prepare
 from ..control import Controller, Fopdt, paper_controller
+from ..errors import SettingError
+from ..loop import ClosedLoopRun
 from ..machine import VirtualMachine
+from ..models import Model
+from ..recording import Recording
 from ..report import report
+from ..report.artefacts import (
+    FORMAT,
+    VERSION,
+    drawing_file,
+    prediction_file,
+    recording_file,
+    run_file,
+)
 from ..report.canvas import require
 from ..signals import excitation
 from ..tuning import TuningResult
-from . import folder, identified, loops, recordings
-from .rig import Rig, rig
+from ..writers import write_table
+from . import loops
+from .loops import Rig, rig
+
+# --- The result folder: every artefact written whole, results.json last ---------------------------
+
+
+_FOLDERS = ("recordings", "models", "controllers", "predictions", "runs", "check", "commissioning")
+
+
+def require_own(folder: Path, *, overwrite: bool) -> None:
+    """Refuse a folder whose files would be lost and are of no experiment, which can be repeated.
+
+    Raises
+    ------
+    SettingError
+    """
+    if overwrite or _is_result(folder):
+        return
+    place = first_taken(folder, (*_FOLDERS, "results.json", "report.html"))
+    if place is not None:
+        raise SettingError(
+            f"{place}: expected a folder of an earlier experiment or one without such files, "
+            "there are some and no results.json; choose another folder, or overwrite them "
+            "(--overwrite)"
+        )
+
+
+def _is_result(folder: Path) -> bool:
+    # of any version: what an older one has left is replaced as well
+    return numbers_in(folder / "results.json").get("format") == FORMAT
+
+
+def abandon(folder: Path) -> None:
+    """Take the folder away again where nothing has been put into it."""
+    with suppress(OSError):
+        folder.rmdir()
+
+
+def write(
+    folder: Path,
+    results: Mapping[str, Any],
+    *,
+    recordings: Mapping[str, Recording],
+    models: Mapping[str, Model],
+    controllers: Mapping[str, Controller],
+    predictions: Mapping[str, Mapping[str, Any]],
+    runs: Mapping[tuple[str, str], ClosedLoopRun],
+    drawings: Mapping[str, str],
+    commissioning: Commissioning | None = None,
+) -> None:
+    """Put the artefacts in place of those of an earlier experiment.
+
+    Without `results.json` a folder is refused by the report: an interruption in between leaves no
+    mixture that looks whole.
+    """
+    for name in ("results.json", "report.html"):
+        (folder / name).unlink(missing_ok=True)
+    for name in _FOLDERS:
+        (folder / name).mkdir(exist_ok=True)
+    for name, recording in recordings.items():
+        recording.save(folder / recording_file(name))
+    for name, model in models.items():
+        model.save(folder / "models" / f"{name}.json")
+    for name, controller in controllers.items():
+        controller.save(folder / "controllers" / f"{name}.json")
+    for name, columns in predictions.items():
+        write_table(folder / prediction_file(name), columns)
+    for key, loop in runs.items():
+        write_table(folder / run_file(*key), loop.columns())
+    for name, svg in drawings.items():
+        storage.replace(folder / drawing_file(name), svg)
+    if commissioning is not None:
+        commissioning.save(folder / "commissioning", overwrite=True)
+    storage.write(folder / "results.json", FORMAT, VERSION, results)
+
+
+# --- The paper's experiment on a virtual machine, stage by stage: run_demo ------------------------
+
 
 Progress: TypeAlias = Callable[[int, int, str], object]
 """Called with stages done, stages in all, and what comes now."""
@@ -107,46 +199,46 @@ def run_demo(
     plant = VirtualMachine.from_name(machine)
     excitation("random", seed)  # refuses a seed that is none before the folder is made
     target = Path(out)
-    folder.require_own(target, overwrite=overwrite)
+    require_own(target, overwrite=overwrite)
     prepare(target)
     try:
         with rig(plant) as bench:
             return _carry_out(target, bench, seed, _Clock(progress))
     except BaseException:
-        folder.abandon(target)
+        abandon(target)
         raise
 
 
 def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, Any]:
     """The stages, one after the other; the folder is written at the end."""
     clock.enter("recording the machine")
-    recorded = recordings.open_loop(rig, seed)
+    recorded = loops.open_loop(rig, seed)
     lo_hi = recorded["chirp_lo_hi"]
-    speed = recordings.speed_numbers(lo_hi)
+    speed = loops.speed_numbers(lo_hi)
 
     clock.enter("paper's network")
-    models = {"paper": identified.paper(recorded, seed)}
-    ideal = identified.ideal_cost(rig.machine, seed)
+    models = {"paper": loops.paper(recorded, seed)}
+    ideal = loops.ideal_cost(rig.machine, seed)
 
     clock.enter("linear models")
-    models["arx_raw"] = identified.arx_raw(recorded)
-    models["arx"] = identified.linear(recorded, "arx", identified.PAPER_RECORDS)
-    models["oe"] = identified.linear(recorded, "oe", identified.PAPER_RECORDS)
+    models["arx_raw"] = loops.arx_raw(recorded)
+    models["arx"] = loops.linear(recorded, "arx", loops.PAPER_RECORDS)
+    models["oe"] = loops.linear(recorded, "oe", loops.PAPER_RECORDS)
 
     clock.enter("closed-loop recording")
-    fopdt = recordings.first_order(recorded["step"])
-    coarse = recordings.coarse_controller(fopdt, Ts=rig.Ts, counts_per_rev=rig.counts_per_rev)
-    recorded["closed_loop"] = recordings.closed_loop(rig, coarse)
+    fopdt = loops.first_order(recorded["step"])
+    coarse = loops.coarse_controller(fopdt, Ts=rig.Ts, counts_per_rev=rig.counts_per_rev)
+    recorded["closed_loop"] = loops.closed_loop(rig, coarse)
 
     clock.enter("default network")
-    models["oe_all"] = identified.linear(recorded, "oe", identified.ALL_RECORDS)
-    models["neural_oe"] = identified.neural(recorded, seed)
+    models["oe_all"] = loops.linear(recorded, "oe", loops.ALL_RECORDS)
+    models["neural_oe"] = loops.neural(recorded, seed)
 
     clock.enter("scores")
-    scored = identified.scores(models, recorded)
+    scored = loops.scores(models, recorded)
 
     clock.enter("report card")
-    check, drawings = identified.report_card(models["neural_oe"], recorded["random"])
+    check, drawings = loops.report_card(models["neural_oe"], recorded["random"])
 
     clock.enter("commissioning")
     found = loops.commissioned(rig, seed)
@@ -160,9 +252,7 @@ def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, An
     assert tuned is not None
     assert tuning is not None
     controllers = {"paper": paper_controller(), "coarse": coarse, "tuned": tuned}
-    identification = identified.identification_numbers(
-        models, scored, speed["difference"]["cost_floor"]
-    )
+    identification = loops.identification_numbers(models, scored, speed["difference"]["cost_floor"])
     identification["paper"]["cost_ideal"] = ideal
     results = {
         "sewfast": __version__,
@@ -180,13 +270,13 @@ def _carry_out(target: Path, rig: Rig, seed: int, clock: _Clock) -> dict[str, An
         "seconds": clock.seconds,
         "stages": clock.stages(),
     }
-    folder.write(
+    write(
         target,
         results,
         recordings=recorded,
         models=models,
         controllers=controllers,
-        predictions=identified.predictions(scored),
+        predictions=loops.predictions(scored),
         runs=runs | paper_runs,
         drawings=drawings,
         commissioning=found,

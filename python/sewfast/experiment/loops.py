@@ -1,22 +1,322 @@
-"""Closed loops of the experiment: the commissioned controller, and the paper's gains."""
+"""The experiment's machine, recordings, models and closed loops."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from typing import Any, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .. import _core
+from .. import _core, signals
 from ..commissioning import Commissioning, commission
-from ..commissioning.numbers import run_numbers
-from ..control import Controller, Gains, paper_controller
-from ..errors import FitError
+from ..commissioning.bench import DriveBench, Followed
+from ..commissioning.folder import run_numbers
+from ..control import Controller, Fopdt, Gains, fit_fopdt, paper_controller, table_1
+from ..dataset import Dataset
+from ..errors import FitError, LinkError
+from ..evidence.figures import figures
+from ..identification import identify
+from ..link import VirtualDevice, connect
 from ..loop import ClosedLoopRun, run
-from ..models import LinearOE
-from ..report.artefacts import PLANTS, REFERENCES
-from .rig import Rig
+from ..machine import VirtualMachine
+from ..models import LinearOE, Model
+from ..recording import Recording, record
+from ..report.artefacts import PLANTS, REFERENCES, SCORED, record_of
+from ..report.canvas import style, svg
+from ..report.figures.loops import CAPTIONS
+from ..signals import excitation
+from ..speed import Method, floor_of_J
+from ..validation import Validation, validate
+
+# --- Rig: the virtual machine as the experiment has it, a drive behind a port ---------------------
+
+
+T = TypeVar("T")
+
+
+@dataclass(eq=False)
+class Rig(DriveBench):
+    """A drive, and what went over its link so far.
+
+    Attributes
+    ----------
+    drive : Drive
+    machine : VirtualMachine
+        What is behind the port; asked only for what no drive could tell.
+    port : str
+        `pty` or `tcp`.
+    samples : int
+        That the device took and the host received.
+    seconds : float
+        That the runs took.
+    """
+
+    machine: VirtualMachine
+    port: str
+    samples: int = 0
+    seconds: float = 0.0
+
+    def excite(self, u: NDArray[np.float64], name: str) -> Recording:
+        """Excite the drive, as a bench of commissioning."""
+        return self.record(u, name)
+
+    def follow(self, controller: Controller, r: NDArray[np.float64], name: str) -> Followed:
+        """Run a controller on the drive, as a bench of commissioning."""
+        began = time.perf_counter()
+        return self._counted(super().follow(controller, r, name), began)
+
+    def record(self, u: NDArray[np.float64], name: str) -> Recording:
+        """Excite the drive from rest; see `sewfast.recording.record`."""
+        began = time.perf_counter()
+        return self._counted(record(self.drive, u, name=name), began)
+
+    def run(
+        self, controller: Controller, reference: str, *, seed: int = 0, volt: float | None = None
+    ) -> ClosedLoopRun:
+        """Run a controller on the drive, with another volt limit where one is given."""
+        began = time.perf_counter()
+        before = self.drive.limits().volt
+        self.drive.set_limits(volt=volt)
+        found = run(controller, self.drive, reference, seed=seed)
+        self.drive.set_limits(volt=before)
+        return self._counted(found, began)
+
+    def _counted(self, found: T, began: float) -> T:
+        """What came, once it is known that nothing is missing."""
+        outcome = self.drive.outcome
+        if outcome is None or not outcome.is_complete:
+            raise LinkError(f"expected every sample of the run, received: {outcome}; run it again")
+        self.samples += outcome.received
+        self.seconds += time.perf_counter() - began
+        return found
+
+    def numbers(self) -> dict[str, Any]:
+        """`link` of `results.json`."""
+        return {
+            "port": self.port,
+            "protocol": self.drive.identity.version,
+            "samples": self.samples,
+            "missing": 0,
+            "times_real_time": self.samples * self.Ts / self.seconds,
+        }
+
+
+@contextmanager
+def rig(machine: VirtualMachine) -> Iterator[Rig]:
+    """Serve a machine on a port of its own and connect to it, limits at their ceilings."""
+    port = _port()
+    with (
+        VirtualDevice(machine.name, fast=True, endpoint=port) as device,
+        connect(device.port) as drive,
+    ):
+        drive.set_limits()
+        yield Rig(drive, machine, port)
+
+
+def _port() -> Literal["pty", "tcp"]:
+    """A serial port where there are pseudo terminals and something that opens them."""
+    return "pty" if find_spec("serial") and find_spec("pty") and find_spec("termios") else "tcp"
+
+
+# --- Models of the experiment, and what they predict ----------------------------------------------
+
+
+PAPER_RECORDS = ("chirp_lo_hi",)
+"""What the paper trains on."""
+ALL_RECORDS = ("chirp_lo_hi", "saturating", "closed_loop")
+"""What the default network trains on: the drive's limits and the controller's world as well."""
+_SCALE = 1000.0
+"""The paper's unit of speed [RPM]."""
+
+
+def paper(recordings: Mapping[str, Recording], seed: int) -> Model:
+    """The paper's network, on differences of counts as in the paper."""
+    lo_hi = recordings["chirp_lo_hi"]
+    data = lo_hi.dataset(lo_hi.speed("difference"))
+    return identify(data, model="neural_oe", preset="paper", seed=seed)
+
+
+def ideal_cost(machine: VirtualMachine, seed: int) -> float:
+    """J of the paper's network in free run on Lo-Hi, on a machine without encoder and turn.
+
+    Exact position instead of counts, and load, inertia and torque at their means over the turn.
+    """
+    parameters = machine.parameters | {"angle_dependence": 0.0, "quantisation": 0.0}
+    ideal = VirtualMachine(parameters=parameters)
+    lo_hi = record(ideal, excitation("chirp_lo_hi", seed), name="ideal", method="difference")
+    model = identify(lo_hi.dataset(), model="neural_oe", preset="paper", seed=seed)
+    return float(model.training["cost"])
+
+
+def arx_raw(recordings: Mapping[str, Recording]) -> Model:
+    """ARX on differences of counts, as the paper's rival was."""
+    lo_hi = recordings["chirp_lo_hi"]
+    return identify(lo_hi.dataset(lo_hi.speed("difference")), model="arx")
+
+
+def linear(
+    recordings: Mapping[str, Recording], kind: Literal["arx", "oe"], records: tuple[str, ...]
+) -> Model:
+    """A linear model by least squares or by output error."""
+    return identify(_together(recordings, records), model=kind)
+
+
+def neural(recordings: Mapping[str, Recording], seed: int) -> Model:
+    """The default network."""
+    return identify(_together(recordings, ALL_RECORDS), model="neural_oe", seed=seed)
+
+
+def scores(
+    models: Mapping[str, Model], recordings: Mapping[str, Recording]
+) -> dict[str, dict[str, Validation]]:
+    """Free run and one step of every model on every scored record, from rest, against the truth."""
+    data = {r: recordings[record_of(r)].dataset() for r in SCORED}
+    return {
+        name: {r: validate(m, d, init=0, against="speed_true") for r, d in data.items()}
+        for name, m in models.items()
+    }
+
+
+def report_card(model: Model, recording: Recording) -> tuple[dict[str, Any], dict[str, str]]:
+    """The card of a model on a recording as JSON values, and its figures as inline SVG."""
+    card = model.check(recording.dataset())
+    with style():
+        drawn = {
+            name: svg(figure, f"check-{name}", CAPTIONS[name][1])
+            for name, figure in figures(card).items()
+        }
+    return {**card.to_json(), "figures": list(drawn)}, drawn
+
+
+def predictions(
+    scored: Mapping[str, Mapping[str, Validation]],
+) -> dict[str, dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float64]]]]:
+    """Per scored record the series of every model, as the report draws them."""
+    columns: dict[str, dict[str, Any]] = {r: {} for r in SCORED}
+    for model, by_record in scored.items():
+        for name, validation in by_record.items():
+            series = validation.experiments[0]
+            columns[name][f"{model}_simulation"] = series.simulated
+            columns[name][f"{model}_one_step"] = series.one_step
+    return columns
+
+
+def identification_numbers(
+    models: Mapping[str, Model],
+    scored: Mapping[str, Mapping[str, Validation]],
+    cost_floor: float,
+) -> dict[str, dict[str, Any]]:
+    """`identification` of `results.json`."""
+    numbers = {
+        name: {r: _score(v) for r, v in scored[name].items()} | _story(model)
+        for name, model in models.items()
+    }
+    training = models["paper"].training
+    on_training = scored["paper"]["chirp_lo_hi"]
+    numbers["paper"] |= {
+        "cost": training["cost"],
+        "cost_floor": cost_floor,
+        "cost_true": _cost(on_training.simulation.rmse),
+        "cost_one_step": _cost(on_training.one_step.rmse),
+        "iterations": training["iterations"],
+    }
+    return numbers
+
+
+def _together(recordings: Mapping[str, Recording], records: tuple[str, ...]) -> Dataset:
+    return Dataset.concat([recordings[r].dataset() for r in records])
+
+
+def _score(validation: Validation) -> dict[str, dict[str, float]]:
+    horizons = {"simulation": validation.simulation, "one_step": validation.one_step}
+    return {
+        horizon: {"rmse_rpm": s.rmse, "fit_percent": s.fit_percent}
+        for horizon, s in horizons.items()
+    }
+
+
+def _story(model: Model) -> dict[str, Any]:
+    return {
+        "trained_on": [d["name"] for d in model.training["data"]],
+        "seconds": model.training["seconds"],
+        "termination": model.training["termination"],
+    }
+
+
+def _cost(rmse: float) -> float:
+    """J of an error [RPM] in the paper's scaled units (paper Eq. 4)."""
+    return (rmse / _SCALE) ** 2 / 2.0
+
+
+# --- Recordings of the experiment: open-loop excitations, and one closed loop under first gains ---
+
+
+EXCITATIONS = ("step", "chirp_lo_hi", "chirp_hi_lo", "random", "saturating", "saturating_2")
+FILTER_SAMPLES = 8
+"""Of the feedback's moving average: one count in a sample is 38 RPM, in eight it is 5."""
+LIMIT = 20.0
+"""Of the command to either side [V]."""
+DERIVATIVE_FILTER = 10.0
+_METHODS: tuple[Method, ...] = ("difference", "savgol", "kalman")
+
+
+def open_loop(rig: Rig, seed: int) -> dict[str, Recording]:
+    """Every excitation on the drive, each from rest."""
+    return {name: rig.record(signals.excitation(name, seed), name) for name in EXCITATIONS}
+
+
+def first_order(step: Recording) -> Fopdt:
+    """Gain, time constant and dead time from the step response (paper Eq. 10-11)."""
+    return fit_fopdt(step.u, step.y, Ts=step.Ts)
+
+
+def coarse_controller(fopdt: Fopdt, *, Ts: float, counts_per_rev: float) -> Controller:
+    """Gains by Table 1, nearest row; the delay of the feedback's filter counts as dead time."""
+    delayed = replace(fopdt, L=fopdt.L + (FILTER_SAMPLES - 1) / 2 * Ts)
+    rule = table_1(delayed, outside="nearest")
+    return Controller(
+        gains=rule.gains,
+        Ts=Ts,
+        alpha=rule.alpha,
+        beta=rule.beta,
+        N=DERIVATIVE_FILTER,
+        u_min=-LIMIT,
+        u_max=LIMIT,
+        filter_samples=FILTER_SAMPLES,
+        counts_per_rev=counts_per_rev,
+        notes="Table 1 on the recorded step response",
+    )
+
+
+def closed_loop(rig: Rig, controller: Controller) -> Recording:
+    """A recording under the first gains, which follow trapezoids.
+
+    The command is replayed: undisturbed, the machine does the same again and shows its counts.
+    """
+    return rig.record(rig.run(controller, "trapezoids").u, "closed_loop")
+
+
+def speed_numbers(recording: Recording) -> dict[str, dict[str, float]]:
+    """Error and floor of J of each way to a speed, against the true one."""
+    true = recording.speed_true
+    assert true is not None, "of a virtual machine"
+    estimates = {m: recording.speed(m) for m in _METHODS}
+    return {
+        method: {
+            "rmse_rpm": float(np.sqrt(np.mean((y - true) ** 2))),
+            "cost_floor": floor_of_J(y, true),
+        }
+        for method, y in estimates.items()
+    }
+
+
+# --- Closed loops of the experiment: the commissioned controller, and the paper's gains -----------
+
 
 Runs = dict[tuple[str, str], ClosedLoopRun]
 

@@ -7,14 +7,13 @@ from collections.abc import Callable, Mapping
 from typing import Literal, TypeAlias
 
 from ..dataset import Dataset, require_dataset
-from ..dataset.checks import LARGEST_FITTED, require_fittable, require_sane
+from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
 from ..dataset.weights import in_effect
 from ..errors import DataError, FitError, Interrupted, SettingError
 from ..evidence import remembered
 from ..models import Model
 from ..models.base import INIT
-from ..threads import available
-from ..workers import Workers, require_workers
+from ..threads import Workers, available, require_workers
 from . import choice, further, lagged, linear
 from .effort import Clock, Progress
 from .folds import thinned

@@ -11,8 +11,8 @@ from .. import _core
 from ..dataset import Dataset, FloatArray
 from ..errors import FitError
 from ..models import Model
+from ..threads import Workers
 from ..validation import validate
-from ..workers import Workers
 from .effort import Clock, Progress
 
 Provenance: TypeAlias = dict[str, Any]

@@ -18,7 +18,7 @@ import numpy as np
 from .. import _core
 from ..dataset import Dataset
 from ..errors import FitError
-from ..workers import Workers, spread
+from ..threads import Workers, spread
 from .effort import Look, Pool, Stopped
 from .outputs import LINEAR, Output, scale_of
 from .task import Pairs, Provenance, arrays

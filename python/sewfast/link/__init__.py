@@ -1,11 +1,9 @@
 """The link to a real or virtual drive: ports, sessions, runs (docs/PROTOCOL.md)."""
 
 from .clock import ClockBounds
-from .diagnosis import Diagnosis, Finding
-from .doctor import examine
+from .doctor import Diagnosis, Finding, examine
 from .drive import Drive, connect
-from .host_loop import at_period, run_on_host
-from .host_run import HostLoopRun
+from .host_loop import HostLoopRun, at_period, run_on_host
 from .jitter import Jitter
 from .plan import Layout, Outcome, Plan, Sink
 from .ports import Port, PortInfo, list_ports, open_port

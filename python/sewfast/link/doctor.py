@@ -1,17 +1,369 @@
-"""`examine`: what is wrong with a port and the device behind it, with remedies; nothing moves."""
+"""`examine`: what is wrong with a port and the device behind it, with remedies."""
 
 from __future__ import annotations
 
+import math
 import os
+import random
+import statistics
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
 
 from ..errors import LinkError, SettingError
-from . import system
-from .checkup import Metered, checkup
-from .diagnosis import Diagnosis, Finding
+from . import system, wire
+from .connection import Connection
+from .drive import PATIENCE, Drive
 from .failures import NO_PORT
-from .ports import list_ports, open_port
+from .ports import CONNECT_TIMEOUT, Port, list_ports, open_port
+
+# --- Diagnosis: what was found wrong with a port and the device behind it, and what to do ---------
+
+
+Verdict: TypeAlias = Literal["ok", "warn", "fail"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was examined.
+
+    Parameters
+    ----------
+    name : str
+    verdict : "ok", "warn" or "fail"
+    measured : str
+        What was found.
+    remedy : str
+        What to do; empty where nothing is to be done.
+    values : dict
+        The numbers in it, with units in their names.
+    """
+
+    name: str
+    verdict: Verdict
+    measured: str
+    remedy: str = ""
+    values: dict[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        text = f"{self.verdict:<4}  {self.name:<14}{self.measured}"
+        return f"{text}\n{'':20}-> {self.remedy}" if self.remedy else text
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What `examine` found, in the order in which it looked; a failure may have ended it."""
+
+    port: str
+    findings: tuple[Finding, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of all."""
+        verdicts = {f.verdict for f in self.findings}
+        return "fail" if "fail" in verdicts else "warn" if "warn" in verdicts else "ok"
+
+    def __getitem__(self, name: str) -> Finding:
+        """The finding of a name; KeyError where it was not examined."""
+        for finding in self.findings:
+            if finding.name == name:
+                return finding
+        raise KeyError(name)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {
+            "port": self.port,
+            "verdict": self.verdict,
+            "findings": [
+                {
+                    "name": f.name, "verdict": f.verdict, "measured": f.measured,
+                    "remedy": f.remedy, **f.values,
+                }
+                for f in self.findings
+            ],
+        }  # fmt: skip
+
+    def __str__(self) -> str:
+        ends = {
+            "ok": "nothing is wrong with it",
+            "warn": "it works; see the warnings",
+            "fail": "it does not work as it is; see the failures",
+        }
+        return "\n".join([*map(str, self.findings), f"{self.port}: {ends[self.verdict]}"])
+
+
+# --- What is measured of a device and its link: state, round trips, throughput, loss, clock -------
+
+
+SHORT, LONG = 0, 200
+"""Bytes of the two kinds of echoes; the difference of their times is what the bytes cost."""
+SPARE = 0.4
+"""Share of the link that a recording at full rate should leave free."""
+BATCH = 10
+SLOW_TRIP = 0.01
+LOSSY = 0.01
+"""Share of lost frames above which it is no warning any more."""
+DRIFT_PPM = 500.0
+MEASURABLE = 20e-6
+"""Least difference of times that says anything about a rate [s]."""
+
+
+class Metered(Port):
+    """A port that counts what is written to it.
+
+    Parameters
+    ----------
+    port : Port
+        Open.
+    """
+
+    def __init__(self, port: Port) -> None:
+        self._port = port
+        self.url, self.baud = port.url, port.baud
+        self.frames = 0
+
+    def _open(self) -> None: ...
+
+    def read(self, timeout: float) -> bytes:
+        return self._port.read(timeout)
+
+    def write(self, data: bytes) -> None:
+        self.frames += 1
+        self._port.write(data)
+
+    def fileno(self) -> int:
+        return self._port.fileno()
+
+    def close(self) -> None:
+        self._port.close()
+
+    def reopen(self, timeout: float = CONNECT_TIMEOUT) -> None:
+        self._port.reopen(timeout)
+
+
+# --- the device -----------------------------------------------------------------------------------
+
+
+def checkup(port: Metered, echoes: int) -> Iterator[Finding]:
+    """The findings on what is behind an open port, one after the other.
+
+    Raises
+    ------
+    LinkError
+        Where no device answers, or none any more.
+    """
+    link = Connection(port, watchdog=0.05, patience=PATIENCE, resume=0.0)
+    drive = Drive(link)
+    yield _identity(drive)
+    # counted up to the first copy of each STATUS, as the device does: its repeats are none's loss
+    sent, before = port.frames, drive.status()
+    yield _state(before)
+    yield _limits(drive)
+    times = _echo(drive, echoes)
+    yield _round_trip(times)
+    yield _throughput(times, drive, port)
+    sent, after = port.frames - sent, drive.status()
+    yield _loss(link, before, after, sent, 2 * echoes)
+    yield _clock(drive)
+    yield _counters(after, before, drive)
+
+
+def _identity(drive: Drive) -> Finding:
+    i = drive.identity
+    names = ", ".join(f"{c.name} [{c.unit}]" if c.unit else c.name for c in drive.channels)
+    return Finding(
+        "device", "ok",
+        f"{i.name}, firmware {i.firmware}, protocol {i.version}, {i.period_us} us; {names}",
+        values={
+            "device": i.name, "firmware": i.firmware, "protocol": i.version,
+            "period_us": i.period_us, "counts_per_rev": i.counts_per_rev,
+            "channels": [c.name for c in drive.channels],
+        },
+    )  # fmt: skip
+
+
+def _state(status: wire.Status) -> Finding:
+    values = {"state": status.state, "reason": status.reason}
+    if status.state == "tripped":
+        return Finding(
+            "state", "warn", f"tripped: {status.reason}",
+            f"{_TRIPS.get(status.reason, 'find out why')}; then take it back: `sewfast clear`",
+            values,
+        )  # fmt: skip
+    if status.state == "boot":
+        return Finding(
+            "state", "fail", "does not leave boot: no ten samples in a row were measured well",
+            "check encoder and sensors", values,
+        )  # fmt: skip
+    return Finding("state", "ok", status.state, values=values)
+
+
+_TRIPS = {
+    "watchdog": "its host fell silent or the cable was out: see the loss below, and give a busy "
+    "computer more time (--watchdog 250)",
+    "speed": "the speed limit was passed; check the limits and the controller",
+    "acceleration": "the acceleration limit was passed; check the limits and the encoder",
+    "current": "the current limit was passed; check the mechanics for a jam",
+    "underrun": "the profile ran dry; see the throughput below",
+    "bad command": "a command was refused while running; check host and firmware versions",
+    "host changed": "another host greeted it while it ran; let one host use it",
+    "measurement": "a measurement was not finite; check the sensors",
+    "no motion": "the motor did not move; check motor cable, drive supply and encoder",
+    "stop input": "the stop input is active; release it",
+    "late": "a control period came late; see the counters below",
+    "swinging": "the loop swung between its limits; lower the gains, look for a shaft resonance",
+}
+
+
+def _limits(drive: Drive) -> Finding:
+    limits = drive.limits()
+    names = ("volt", "speed_rpm", "acceleration", "current")
+    values = dict(zip(names, (v if math.isfinite(v) else None for v in limits.values), strict=True))
+    if not limits.are_set:
+        return Finding("limits", "ok", "none set in this session: it will not arm before they are")
+    volt, speed, acceleration, current = limits.values
+    told = f"{volt:g} V, {speed:g} RPM, {acceleration:g} RPM/s, {current:g} A"
+    return Finding("limits", "ok", told, values=values)
+
+
+# --- the link -------------------------------------------------------------------------------------
+
+
+def _echo(drive: Drive, echoes: int) -> dict[int, list[float]]:
+    """Round trips of short and long messages in turn [s]."""
+    times: dict[int, list[float]] = {SHORT: [], LONG: []}
+    # no two alike, and every byte value: a line that damages some is found
+    content = random.Random(0)
+    for _ in range(echoes):
+        for size, list_ in times.items():
+            list_.append(drive.echo(content.randbytes(size)))
+    return times
+
+
+def _round_trip(times: dict[int, list[float]]) -> Finding:
+    median, worst = statistics.median(times[SHORT]), max(times[SHORT])
+    values = {"median_s": median, "worst_s": worst}
+    told = f"median {_time(median)}, worst {_time(worst)} of {len(times[SHORT])}"
+    if median <= SLOW_TRIP:
+        return Finding("round trip", "ok", told, values=values)
+    return Finding(
+        "round trip", "warn", told,
+        "an adapter's latency timer or a busy computer; runs go on, a loop on the host suffers",
+        values,
+    )  # fmt: skip
+
+
+def _throughput(times: dict[int, list[float]], drive: Drive, port: Port) -> Finding:
+    """What 200 bytes cost each way, against what samples at full rate need."""
+    # the quickest of each are those that nothing else held up
+    cost = min(times[LONG]) - min(times[SHORT])
+    encodings = [c.encoding for c in drive.channels[:2]]
+    size = wire.wire_size(wire.body_size(encodings, BATCH))
+    needed = size / (BATCH * drive.identity.Ts)
+    values = {"needed_bytes_per_s": needed, "stated_baud": port.baud}
+    if cost < MEASURABLE:
+        told = f"too fast to be measured; {needed:.0f} B/s are needed for counts and command"
+        return Finding("throughput", "ok", told, values=values)
+    rate = 2 * (LONG - SHORT) / cost
+    spare = 1.0 - needed / rate
+    values |= {"bytes_per_s": rate, "spare": spare}
+    told = (
+        f"{rate:.0f} B/s each way; counts and command each {drive.identity.Ts * 1e3:g} ms need "
+        f"{needed:.0f}"
+    )
+    remedy = "raise the baud rate of both sides, or stream fewer channels"
+    if spare < 0.0:
+        return Finding("throughput", "fail", f"{told}: too slow", remedy, values)
+    told += f": {100 * spare:.0f} % to spare"
+    if spare < SPARE:
+        return Finding("throughput", "warn", f"{told}, {100 * SPARE:.0f} % wanted", remedy, values)
+    return Finding("throughput", "ok", told, values=values)
+
+
+def _loss(
+    link: Connection, before: wire.Status, after: wire.Status, sent: int, echoes: int
+) -> Finding:
+    """Frames that did not arrive, or arrived damaged, either way."""
+    counters = link.receiver.counters
+    to_device = max(0, sent - (after.received - before.received))
+    damaged = after.refused - before.refused
+    values = {
+        "echoes": echoes, "lost_to_device": to_device, "damaged_to_device": damaged,
+        "lost_to_host": counters["missing"], "damaged_to_host": counters["rejected"],
+        "repeated_to_host": counters["repeated"], "late_to_host": counters["late"],
+    }  # fmt: skip
+    bad = to_device + counters["missing"]
+    odd = damaged + counters["rejected"] + counters["repeated"] + counters["late"]
+    told = (
+        f"{to_device} of {sent} frames lost on the way there ({damaged} seen damaged), "
+        f"{counters['missing']} on the way back ({counters['rejected']} damaged), "
+        f"of {echoes} echoes"
+    )
+    if not bad and not odd:
+        return Finding("loss", "ok", f"none of {echoes} echoes", values=values)
+    verdict: Verdict = "fail" if bad > LOSSY * 2 * echoes else "warn"
+    return Finding(
+        "loss", verdict, told,
+        "shorten or shield the cable, join the grounds, lower the baud rate, and see that nobody "
+        "else has the port open",
+        values,
+    )  # fmt: skip
+
+
+def _clock(drive: Drive) -> Finding:
+    if drive.identity.on_credit:
+        return Finding("clock", "ok", "stands still but for what the host grants")
+    bounds = drive.clock
+    if bounds is None:
+        return Finding("clock", "warn", "no answer to compare the clocks by")
+    if not bounds.consistent:
+        return Finding(
+            "clock", "fail", str(bounds), "the device's clock jumps; mend its timer in the firmware"
+        )
+    low, high = bounds.drift_ppm
+    values = {
+        "uncertainty_s": bounds.offset_s[1] - bounds.offset_s[0],
+        "drift_ppm_least": low, "drift_ppm_most": high,
+    }  # fmt: skip
+    if low > DRIFT_PPM or high < -DRIFT_PPM:
+        return Finding(
+            "clock",
+            "warn",
+            str(bounds),
+            "see the firmware's clock: a crystal keeps 100 ppm",
+            values,
+        )
+    return Finding("clock", "ok", str(bounds), values=values)
+
+
+def _counters(after: wire.Status, before: wire.Status, drive: Drive) -> Finding:
+    """What the device has counted since its boot."""
+    values = {
+        "received": after.received, "refused": after.refused, "dropped": after.dropped,
+        "late_us": after.late_us, "foreign": after.foreign,
+    }  # fmt: skip
+    told = (
+        f"since boot: {after.received} frames received, {after.refused} refused, {after.dropped} "
+        f"dropped; latest control period {after.late_us} us late"
+    )
+    remedies = []
+    if after.dropped:
+        remedies.append("frames were dropped: the link was too slow or the host did not read")
+    if 2 * after.late_us >= drive.identity.period_us:
+        remedies.append("control periods come late: shorten what else the firmware does")
+    if after.foreign != before.foreign:
+        remedies.append("frames of another host came meanwhile: let one program use the line")
+    verdict: Verdict = "warn" if remedies else "ok"
+    return Finding("counters", verdict, told, "; ".join(remedies), values)
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds * 1e3:.3g} ms" if seconds >= 1e-3 else f"{seconds * 1e6:.0f} us"
+
+
+# --- examine: what is wrong with a port and the device behind it, with remedies; nothing moves ----
+
 
 ECHOES = 200
 LATENCY_TIMER_MS = 2

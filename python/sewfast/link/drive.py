@@ -12,14 +12,14 @@ from typing import Literal
 from ..control import Controller
 from ..errors import LinkError, SettingError
 from ..gains import real
-from . import profile as profiles
+from . import run as profiles
 from . import terms, wire
 from .clock import ClockBounds
 from .connection import Connection, DeviceReset, Loan
 from .plan import Layout, Outcome, Plan, Sink, layout, require_capable
 from .ports import open_port
-from .rest import await_measurement, wait_for_rest
 from .run import Run
+from .terms import await_measurement, wait_for_rest
 from .unique import Unique
 from .wire import Channel, Identity, Kind, Limits, Status
 

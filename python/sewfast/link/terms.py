@@ -1,8 +1,9 @@
-"""Terms of host and device: its channels, limits within its ceilings, controllers in its units."""
+"""Terms of host and device: channels, limits, controllers, and when the motor is at rest."""
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 
 from ..control import Controller
@@ -12,6 +13,8 @@ from ..units import counts_per_unit
 from . import wire
 from .connection import Connection
 from .wire import Channel, Identity, Kind
+
+# --- Terms of host and device: its channels, limits within its ceilings, controllers in its units -
 
 
 def channels(link: Connection) -> tuple[Channel, ...]:
@@ -100,3 +103,47 @@ def _require_units(given: str, device: str, what: str) -> None:
             f"expected a controller whose {what} is in {device}, as the device's, got {given}; "
             "convert its gains"
         )
+
+
+# --- Rest: time that passes on the device until its motor stands still or it has measured well ----
+
+
+REST_US = 120_000
+"""Device's time without a count after which a motor is at rest; ARM wants 100 ms."""
+STEP_US = 20_000
+MEASURED_WITHIN = 1.0
+
+
+def wait_for_rest(link: Connection, timeout: float) -> None:
+    """Wait until the encoder has not moved for a while, as `Drive.wait_for_rest` says."""
+    status = link.status()
+    since = began = status.time_us
+    # a device on credit that takes none must not be waited for either
+    deadline = time.monotonic() + timeout + (5.0 if link.identity.on_credit else 0.0)
+    while status.time_us - since < REST_US:
+        if status.time_us - began > timeout * 1e6 or time.monotonic() > deadline:
+            raise LinkError(
+                f"expected the motor at rest within {timeout:g} s, it turns at "
+                f"{status.speed_rpm:.0f} RPM; brake it or wait longer"
+            )
+        let_pass(link, STEP_US)
+        before, status = status, link.status()
+        if status.counts != before.counts:
+            since = status.time_us
+
+
+def await_measurement(link: Connection) -> None:
+    """Boot ends by itself after some good samples; a device on credit needs time for them."""
+    deadline = time.monotonic() + MEASURED_WITHIN
+    while link.status().state == "boot" and time.monotonic() < deadline:
+        let_pass(link, STEP_US)
+
+
+def let_pass(link: Connection, us: int) -> None:
+    """Grant time to a device on credit; take turns for as long with another."""
+    if link.identity.on_credit:
+        link.grant(link.newest + us)
+        return
+    until = time.monotonic() + us * 1e-6
+    while (rest := until - time.monotonic()) > 0.0:
+        link.turn(rest)

@@ -4,21 +4,113 @@ from __future__ import annotations
 
 import json
 import math
+import mmap
 import os
+import tempfile
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, SettingError
-from .memory import Memory
-from .speed import speed_over_window
+from ..units import counts_per_unit
+
+# --- Memory: the numbers of a feed's ring, in this process or shared with another one -------------
+
+
+_COUNTERS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """A ring of samples.
+
+    Attributes
+    ----------
+    counters : array of int64, shape (4,)
+        Claimed, end, received, gaps.
+    holds : array of int64, shape (size,)
+        Which sample a place holds, so that a gap costs nothing when it is put; -1 for none.
+    rows : array, shape (columns, size)
+    """
+
+    counters: NDArray[np.int64]
+    holds: NDArray[np.int64]
+    rows: NDArray[np.float64]
+
+    @classmethod
+    def own(cls, columns: int, size: int) -> Memory:
+        """Empty, in this process."""
+        return cls(
+            np.zeros(_COUNTERS, dtype=np.int64),
+            np.full(size, -1, dtype=np.int64),
+            np.full((columns, size), np.nan),
+        )
+
+    @classmethod
+    def mapped(cls, file: int, columns: int, size: int) -> Memory:
+        """What is in a file that was made by `shared`."""
+        buffer = mmap.mmap(file, 8 * (_COUNTERS + (1 + columns) * size))
+        whole = np.frombuffer(buffer, dtype=np.int64, count=_COUNTERS + size)
+        rows = np.frombuffer(buffer, dtype=np.float64, offset=8 * len(whole))
+        return cls(whole[:_COUNTERS], whole[_COUNTERS:], rows.reshape(columns, size))
+
+    def shared(self) -> tuple[int, Memory]:
+        """A file without a name [descriptor] and the same numbers in it."""
+        file = _nameless()
+        os.ftruncate(file, 8 * (_COUNTERS + len(self.holds) + self.rows.size))
+        made = Memory.mapped(file, *self.rows.shape)
+        made.counters[:], made.holds[:], made.rows[:] = self.counters, self.holds, self.rows
+        return file, made
+
+
+def _nameless() -> int:
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create("sewfast-live")
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
+
+
+# --- Speed from the change of counts over a window: what a view can know while a record runs ------
+
 
 FloatArray = NDArray[np.float64]
+
+
+def speed_over_window(counts: FloatArray, lag: int, Ts: float, counts_per_rev: float) -> FloatArray:
+    """Mean speed [RPM] over the `lag` samples before each one.
+
+    Parameters
+    ----------
+    counts : array, shape (N,)
+        Accumulated counts; NaN where a sample is missing.
+    lag : int
+        Samples in the window, at least 1; one count over it is `60 / (lag Ts counts_per_rev)` RPM.
+    Ts : float
+        Sample time [s].
+    counts_per_rev : float
+        Counts per revolution.
+
+    Returns
+    -------
+    array, shape (N - lag,)
+        From the sample `lag` on; NaN where a sample of the window is missing, because a device
+        that was reset in the gap counts from elsewhere.
+    """
+    missing = np.concatenate(([0], np.cumsum(np.isnan(counts))))
+    whole = missing[lag + 1 :] == missing[: len(counts) - lag]
+    change = counts[lag:] - counts[: len(counts) - lag]
+    scale = 1.0 / (lag * Ts * counts_per_unit(counts_per_rev))
+    return np.where(whole, change * scale, np.nan)
+
+
+# --- Feed: the newest samples of a running record, between the link's thread and a view's ---------
+
 
 SPEED = "speed"
 """Name of the column that a feed derives from counts."""

@@ -1,13 +1,181 @@
-"""`Tail`: the samples of a feed as JSON objects, at no more than a set rate."""
+"""Views over the network: JSON for Foxglove and PlotJuggler, and who may connect."""
 
 from __future__ import annotations
 
 import json
+import logging
 import math
+import random
+import re
+import socket
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Any
+from urllib.parse import urlsplit
 
+from ..errors import SettingError
 from .feed import Feed
+
+# --- Gate: who may connect to a WebSocket server of this computer, by the head of the request -----
+# A browser lets any page connect to a WebSocket on its own computer and read what it sends; the
+# page's address stands in `Origin`, which a page cannot change. A page whose name was made to lead
+# to this computer (DNS rebinding) gives itself away by `Host`. The server behind, Foxglove's own,
+# looks at neither, so that what passes is handed on to it.
+
+
+LONGEST = 16_384
+"""Bytes of a request's head."""
+PATIENCE = 5.0
+"""Time for it [s]."""
+CONNECTIONS = 16
+"""So many at once; further ones are closed."""
+_REFUSAL = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+_END = b"\r\n\r\n"
+
+
+def hidden_address() -> str:
+    """Where the server behind listens: where it can, at one of 16 million that nobody is told."""
+    if sys.platform != "linux":
+        return "127.0.0.1"
+    drawn = random.SystemRandom()
+    return f"127.{drawn.randint(1, 254)}.{drawn.randint(0, 255)}.{drawn.randint(1, 254)}"
+
+
+def admits(head: bytes) -> bool:
+    """Whether a request comes from a program, Foxglove or a page of this computer."""
+    fields: dict[str, list[str]] = {}
+    for line in head.decode("latin-1").split("\r\n")[1:]:
+        name, colon, value = line.partition(":")
+        if colon:
+            fields.setdefault(name.strip().lower(), []).append(value.strip())
+    hosts, origins = fields.get("host", []), fields.get("origin", [])
+    if len(hosts) != 1 or len(origins) > 1:
+        return False
+    return _is_local(f"//{hosts[0]}") and all(map(_may_read, origins))
+
+
+def _may_read(origin: str) -> bool:
+    """Of the desktop program, Foxglove's own pages, or a page that this computer serves."""
+    if origin == "file://" or _is_local(origin):
+        return True
+    return re.fullmatch(r"https://([a-z0-9-]+\.)*foxglove\.dev", origin) is not None
+
+
+def _is_local(address: str) -> bool:
+    try:
+        return urlsplit(address).hostname in ("localhost", "127.0.0.1", "::1")
+    except ValueError:
+        return False
+
+
+class Gate:
+    """Listens, reads the heads of requests and hands on what may pass.
+
+    Parameters
+    ----------
+    host, port
+        Where it listens; port 0 takes any free one.
+    behind : pair of text and int
+        The server that gets what passes.
+
+    Raises
+    ------
+    OSError
+        Where the port is taken.
+    """
+
+    def __init__(self, host: str, port: int, behind: tuple[str, int]) -> None:
+        self._behind = behind
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self._listener = socket.create_server((host, port), family=family)
+        self.port = int(self._listener.getsockname()[1])
+        self._open: set[socket.socket] = set()
+        self._lock = threading.Lock()
+        self._room = threading.BoundedSemaphore(CONNECTIONS)
+        self._closed = False
+        self._start(self._accept)
+
+    def close(self) -> None:
+        """End all connections, and take no further ones."""
+        self._closed = True
+        # a thread that waits in accept is not woken by closing alone
+        with suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        with self._lock:
+            for connection in self._open:
+                with suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
+
+    @staticmethod
+    def _start(task: Callable[..., None], *arguments: object) -> None:
+        threading.Thread(target=task, args=arguments, name="sewfast-gate", daemon=True).start()
+
+    def _accept(self) -> None:
+        while not self._closed:
+            try:
+                client = self._listener.accept()[0]
+            except OSError:
+                if self._closed:
+                    return
+                continue
+            if self._room.acquire(blocking=False):
+                self._start(self._serve, client)
+            else:
+                client.close()
+
+    def _serve(self, client: socket.socket) -> None:
+        try:
+            with suppress(OSError), client:
+                self._admit(client)
+        finally:
+            self._room.release()
+
+    def _admit(self, client: socket.socket) -> None:
+        client.settimeout(PATIENCE)
+        head = b""
+        while _END not in head and len(head) < LONGEST:
+            piece = client.recv(4096)
+            if not piece:
+                return
+            head += piece
+        if _END not in head or not admits(head.partition(_END)[0]):
+            client.sendall(_REFUSAL)
+            return
+        with socket.create_connection(self._behind, timeout=PATIENCE) as server:
+            for connection in (client, server):
+                connection.settimeout(None)
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            with self._lock:
+                if self._closed:
+                    return
+                self._open |= {client, server}
+            try:
+                server.sendall(head)
+                back = threading.Thread(target=_pump, args=(server, client), daemon=True)
+                back.start()
+                _pump(client, server)
+                back.join()
+            finally:
+                with self._lock:
+                    self._open -= {client, server}
+
+
+def _pump(source: socket.socket, target: socket.socket) -> None:
+    """Hand on until one of the two ends; then end both."""
+    with suppress(OSError):
+        while piece := source.recv(65_536):
+            target.sendall(piece)
+    for connection in (source, target):
+        with suppress(OSError):
+            connection.shutdown(socket.SHUT_RDWR)
+
+
+# --- Tail: the samples of a feed as JSON objects, at no more than a set rate ----------------------
+
 
 PERIOD_S = 0.02
 """Between two looks at the feed [s]."""
@@ -77,3 +245,167 @@ class Tail:
 def encode(value: object) -> bytes:
     """Strict JSON: what is not a number must not be in it."""
     return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
+
+
+# --- FoxgloveView: samples as JSON messages from a WebSocket server that Foxglove connects to -----
+
+
+_LOG = {
+    "type": "object",
+    "properties": {
+        "timestamp": {
+            "type": "object",
+            "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+        },
+        "level": {"type": "integer"},
+        "message": {"type": "string"},
+        "name": {"type": "string"},
+    },
+}
+"""Of Foxglove's own schema foxglove.Log, which its log panel shows."""
+
+_INFO = 2
+
+
+class FoxgloveView:
+    """Topics `/drive` (one message a sample) and `/log` (the lines of status).
+
+    Parameters
+    ----------
+    host, port
+        Where the server is bound; port 0 takes any free one.
+    name : str
+        What clients see.
+
+    Raises
+    ------
+    SettingError
+        Without the package foxglove-sdk, or for a port that is taken.
+    """
+
+    def __init__(self, host: str, port: int, name: str) -> None:
+        try:
+            import foxglove
+        except ImportError as e:
+            raise SettingError(
+                "the Foxglove view expected the package foxglove-sdk, received none; "
+                'pip install "sewfast[foxglove]"'
+            ) from e
+        # a client that goes away is no news; who wants it asks Python's logging for it
+        logging.getLogger("foxglove").addHandler(logging.NullHandler())
+        self._sdk: Any = foxglove
+        self._context = foxglove.Context()
+        # for a client that does not read, the server keeps 1,024 messages and drops the oldest
+        behind = hidden_address()
+        self._server = foxglove.start_server(name=name, host=behind, port=0, context=self._context)
+        try:
+            # it would serve any web page
+            self._gate = Gate(host, port, (behind, int(self._server.port)))
+        except OSError as e:
+            self._server.stop()
+            raise SettingError(
+                f"foxglove: expected port {port} of {host} to be free, received {str(e)!r}; "
+                "choose another one: foxglove:PORT"
+            ) from e
+
+    @property
+    def port(self) -> int:
+        """Where clients connect."""
+        return self._gate.port
+
+    def run(self, feed: Feed) -> None:
+        """Send until the feed is closed, then what is left."""
+        drive = self._channel("/drive", "sewfast.Drive", _schema(feed))
+        log = self._channel("/log", "foxglove.Log", _LOG)
+        tail = Tail(feed)
+        try:
+            while not feed.closed.wait(PERIOD_S):
+                _send(tail, drive, log)
+            _send(tail, drive, log)
+        finally:
+            self._gate.close()
+            # waits for a client that does not read, for as long as that stays connected: it must
+            # not be called from the thread that owns the link
+            self._server.stop()
+
+    def _channel(self, topic: str, name: str, schema: dict[str, Any]) -> Any:
+        described = self._sdk.Schema(
+            name=name, encoding="jsonschema", data=json.dumps(schema).encode()
+        )
+        return self._sdk.Channel(
+            topic, schema=described, message_encoding="json", context=self._context
+        )
+
+
+def _schema(feed: Feed) -> dict[str, Any]:
+    units = {"t": "s", **feed.columns}
+    numbers = {name: {"type": "number", "description": unit} for name, unit in units.items()}
+    return {"type": "object", "properties": numbers}
+
+
+def _send(tail: Tail, drive: Any, log: Any) -> None:
+    stamp = 0.0
+    for stamp, row in tail.rows():
+        drive.log(encode(row), log_time=round(stamp * 1e9))
+    for text in tail.said():
+        at = round((stamp or tail.now) * 1e9)
+        time = {"sec": at // 10**9, "nsec": at % 10**9}
+        message = {"timestamp": time, "level": _INFO, "message": text, "name": "sewfast"}
+        log.log(encode(message), log_time=at)
+
+
+# --- PlotJugglerView: samples as JSON datagrams for PlotJuggler's "UDP Server" --------------------
+
+
+TIMESTAMP = "timestamp"
+"""The field that PlotJuggler is told to use as time [s since 1970]."""
+
+
+class PlotJugglerView:
+    """One datagram a sample: PlotJuggler takes one time from a message, and reads 2,048 bytes.
+
+    A message that is no JSON makes it stop listening, and one without the time makes it use its
+    own clock from then on. Hence a missing value is left out, and the time is always there.
+
+    Parameters
+    ----------
+    host, port
+        Where PlotJuggler listens.
+
+    Raises
+    ------
+    SettingError
+        For a host that has no address.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        try:
+            # IPv4 first: PlotJuggler listens to nothing else
+            found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        except (OSError, UnicodeError) as e:
+            raise SettingError(
+                f"plotjuggler: expected a host with an address, received {host!r} ({e}); "
+                "127.0.0.1 is this machine"
+            ) from e
+        found.sort(key=lambda entry: entry[0] != socket.AF_INET)
+        family, kind, protocol, _, address = found[0]
+        self._address: Any = address
+        self._socket = socket.socket(family, kind, protocol)
+        self._socket.setblocking(False)
+
+    def run(self, feed: Feed) -> None:
+        """Send until the feed is closed, then what is left."""
+        tail = Tail(feed)
+        with self._socket:
+            while not feed.closed.wait(PERIOD_S):
+                self._send(tail)
+            self._send(tail)
+
+    def _send(self, tail: Tail) -> None:
+        for stamp, row in tail.rows():
+            message = encode({TIMESTAMP: round(stamp, 6), "sewfast": row})
+            try:
+                self._socket.sendto(message, self._address)
+            except OSError:
+                # nobody listens, or the buffer is full: a view may lose what it shows
+                continue

@@ -1,4 +1,4 @@
-"""`open_view`: a view in a process of its own, for as long as a `with` lasts."""
+"""`open_view`: which views there are, and each in a process of its own."""
 
 from __future__ import annotations
 
@@ -12,12 +12,128 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from ..errors import SettingError
 from .feed import Feed
-from .kind import Kind
-from .make import make, settled
+
+# --- Kind: what a view is and where it is, as the command line names it ---------------------------
+
+
+KINDS = ("auto", "terminal", "none", "plotjuggler[:HOST:PORT]", "foxglove[:PORT]")
+
+PLOTJUGGLER_PORT = 9870
+FOXGLOVE_PORT = 8765
+
+LOCAL = "127.0.0.1"
+"""Where nobody but this machine listens."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A view by name; streams have an address.
+
+    Attributes
+    ----------
+    name : str
+        `auto`, `terminal`, `none`, `plotjuggler` or `foxglove`.
+    host : str
+        Where PlotJuggler listens; where the Foxglove server is bound.
+    port : int
+        Of the stream; 0 for views without one, and for a Foxglove server on any free port.
+    """
+
+    name: str
+    host: str = ""
+    port: int = 0
+
+    @classmethod
+    def parse(cls, text: str) -> Kind:
+        """`plotjuggler:HOST:PORT` and its like, as in `KINDS`.
+
+        Raises
+        ------
+        SettingError
+            For a text that names no view, or a port outside 1 to 65535 (Foxglove: 0 to 65535).
+        """
+        if not isinstance(text, str):
+            raise _refusal(text)
+        name, _, rest = text.partition(":")
+        if text in ("auto", "terminal", "none"):
+            return cls(text)
+        if name == "plotjuggler":
+            return cls(name, *_host_and_port(text, rest))
+        if name == "foxglove":
+            return cls(name, LOCAL, _port(text, rest, 0) if rest else FOXGLOVE_PORT)
+        raise _refusal(text)
+
+
+def _host_and_port(text: str, rest: str) -> tuple[str, int]:
+    if not rest:
+        return LOCAL, PLOTJUGGLER_PORT
+    host, _, port = rest.rpartition(":")
+    if not host:
+        raise _refusal(text)
+    # brackets are how an IPv6 address keeps its colons apart from the port's
+    return host.strip("[]"), _port(text, port, 1)
+
+
+def _port(text: str, port: str, least: int) -> int:
+    if not (port.isascii() and port.isdigit() and least <= int(port) <= 65535):
+        raise _refusal(text)
+    return int(port)
+
+
+def _refusal(text: str) -> SettingError:
+    return SettingError(
+        f"expected a live view out of {', '.join(KINDS)}, received {text!r}; for example "
+        f"plotjuggler:{LOCAL}:{PLOTJUGGLER_PORT}"
+    )
+
+
+# --- The process that a view runs in: it reads the feed's memory, and lines of status from a pipe -
+
+
+_NICE = 5
+"""The link goes first where both want the processor."""
+
+
+def main() -> None:
+    """Show a feed until the pipe on standard input ends.
+
+    The arguments are the descriptor of the memory, the feed and the kind as JSON. The answer on
+    standard output is a line of JSON: the view's port, or why there is none.
+    """
+    with contextlib.suppress(AttributeError, OSError):
+        os.nice(_NICE)
+    feed = Feed.attached(int(sys.argv[1]), json.loads(sys.argv[2]))
+    try:
+        view = make(Kind(**json.loads(sys.argv[3])), feed)
+    except SettingError as e:
+        _answer_of_viewer({"error": str(e)})
+        return
+    _answer_of_viewer({"port": getattr(view, "port", 0)})
+    threading.Thread(target=_listen, args=(feed,), daemon=True).start()
+    if view is None:
+        return
+    try:
+        view.run(feed)
+    except Exception as e:
+        tell(e)
+
+
+def _answer_of_viewer(value: dict[str, object]) -> None:
+    print(json.dumps(value), flush=True)
+
+
+def _listen(feed: Feed) -> None:
+    for line in sys.stdin:
+        feed.say(json.loads(line))
+    feed.close()
+
+
+# --- open_view: a view in a process of its own, for as long as a with lasts -----------------------
+
 
 CLOSE_S = 0.5
 """For which the end of a `with` waits for a view that hangs [s]."""
@@ -25,7 +141,7 @@ CLOSE_S = 0.5
 START_S = 20.0
 """For which its beginning waits for a view to be there [s]."""
 
-_PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast.live.viewer import main; main()"
+_PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast.live.view import main; main()"
 
 
 @dataclass(frozen=True)
@@ -189,3 +305,57 @@ def tell(e: Exception) -> None:
     # standard error may be the very terminal that has gone away
     with contextlib.suppress(OSError, ValueError):
         print(f"the live view ended early: {type(e).__name__}: {e}", file=sys.stderr, flush=True)
+
+
+# --- make: the view of a kind ---------------------------------------------------------------------
+
+
+class View(Protocol):
+    """What shows a feed."""
+
+    def run(self, feed: Feed) -> None:
+        """Show the feed until it is closed; has a thread or a process to itself."""
+        ...
+
+
+def settled(kind: Kind) -> Kind:
+    """What `auto` stands for here.
+
+    Raises
+    ------
+    SettingError
+        For `terminal` where standard error is none.
+    """
+    terminal = sys.stderr is not None and sys.stderr.isatty()
+    if kind.name == "auto":
+        return Kind("terminal" if terminal else "none")
+    if kind.name == "terminal" and not terminal:
+        raise SettingError(
+            "the live view expected standard error to be a terminal, received a file or a pipe; "
+            "use --live none or auto"
+        )
+    return kind
+
+
+def make(kind: Kind, feed: Feed) -> View | None:
+    """The view of a kind; None for `none`.
+
+    Raises
+    ------
+    SettingError
+        As `settled`; for a host without an address, a port that is taken, a missing package.
+    """
+    kind = settled(kind)
+    if kind.name == "terminal":
+        from .terminal import TerminalView
+
+        return TerminalView(sys.stderr)
+    if kind.name == "plotjuggler":
+        from .stream import PlotJugglerView
+
+        return PlotJugglerView(kind.host, kind.port)
+    if kind.name == "foxglove":
+        from .stream import FoxgloveView
+
+        return FoxgloveView(kind.host, kind.port, feed.title)
+    return None

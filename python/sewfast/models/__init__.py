@@ -4,8 +4,7 @@ from .base import FreeRunJacobian, Model, NotLinearError
 from .ensemble import Ensemble
 from .files import load_model, model_schema
 from .linear import ARX, IV, LinearOE
-from .neural import NeuralOE
-from .neural_ss import NeuralSS
+from .neural import NeuralOE, NeuralSS
 
 __all__ = [
     "ARX",

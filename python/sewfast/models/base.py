@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .. import jsonfile
+from .. import storage
 from ..dataset import (
     Dataset,
     Experiment,
@@ -475,7 +475,7 @@ class Model(ABC):
         ModelFileError
             Where the file cannot be written.
         """
-        jsonfile.write(path, FORMAT, VERSION, self.to_dict())
+        storage.write(path, FORMAT, VERSION, self.to_dict())
 
     def __eq__(self, other: object) -> bool:
         """Whether both have the same kind, numbers, names, units and provenance, as in a file."""

@@ -1,18 +1,149 @@
-"""A linear model's coefficients as transfer function and state space, and back.
-
-Only deviations from an operating point are converted; the offset is what makes one out of them.
-"""
+"""Linear models in other forms: transfer function, state space, continuous, toolboxes."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .. import _core
 from ..dataset import FloatArray
 from ..errors import SettingError
+
+# --- ContinuousModel: the differential equation that a zero-order hold turns into a linear model --
+
+
+NODES = 8
+"""Of the quadrature, which is the [8/8] Pade approximant: rounding below a distance of 0.25."""
+NEAR = 0.25
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ContinuousModel:
+    """dx/dt = A x + B u(t - dead_time), y = C x + D u(t - dead_time), in deviations.
+
+    Attributes
+    ----------
+    A, B, C, D : array, shape (n, n), (n, nu), (1, n), (1, nu)
+        With time in seconds. The state is that of `to_ss` at the sampling instants.
+    dead_time : float
+        [s]; what is left of the delay `nk` after the sample that the hold takes.
+    input_names, output_name
+        As in the model.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    dead_time: float
+    input_names: tuple[str, ...]
+    output_name: str
+
+    @property
+    def poles(self) -> tuple[complex, ...]:
+        """Poles [1/s], the slowest first."""
+        return tuple(sorted(map(complex, np.linalg.eigvals(self.A)), key=lambda p: -p.real))
+
+    def frequency_response(self, omega: ArrayLike) -> NDArray[np.complex128]:
+        """G(i omega), shape (n_inputs, len(omega)), for omega in rad/s; dead time included."""
+        w = np.atleast_1d(np.asarray(omega, dtype=np.float64))
+        eye = np.eye(len(self.A))
+        rows = [(self.C @ np.linalg.solve(1j * v * eye - self.A, self.B) + self.D)[0] for v in w]
+        response: NDArray[np.complex128] = np.array(rows).T * np.exp(-1j * w * self.dead_time)
+        return response
+
+    def to_control(self) -> Any:
+        """`control.StateSpace` in continuous time, without the dead time.
+
+        Raises
+        ------
+        SettingError
+            Where python-control is not installed.
+        """
+        control = require_control()
+        names = {"inputs": list(self.input_names), "outputs": [self.output_name]}
+        return control.ss(self.A, self.B, self.C, self.D, **names)
+
+    def __repr__(self) -> str:
+        poles = ", ".join(
+            f"{p.real:.4g}" + (f"{p.imag:+.4g}j" if p.imag else "") for p in self.poles
+        )
+        return f"ContinuousModel(poles [1/s]: {poles}; dead time {self.dead_time:g} s)"
+
+
+def continuous(
+    core: _core.LinearModel, Ts: float, input_names: tuple[str, ...], output_name: str
+) -> ContinuousModel:
+    """The inverse of the zero-order hold: `[[A, B], [0, 0]] Ts = log [[Ad, Bd], [0, I]]`.
+
+    Raises
+    ------
+    SettingError
+        Where a pole is at or left of 0: no differential equation gives it.
+    """
+    spare = max(core.nk - 1, 0)
+    s = observer_form(_core.LinearModel(core.a, core.b, core.nk - spare, core.offset))
+    _require_logarithm(np.linalg.eigvals(s.A), s, core)
+    n, nu = s.B.shape
+    held = np.block([[s.A, s.B], [np.zeros((nu, n)), np.eye(nu)]])
+    log = logarithm(held) / Ts
+    return ContinuousModel(
+        log[:n, :n].copy(), log[:n, n:].copy(), s.C, s.D, spare * Ts, input_names, output_name
+    )
+
+
+def logarithm(matrix: FloatArray) -> FloatArray:
+    """Principal logarithm by square roots until near I, then Gauss-Legendre (Higham 2008, ch. 11).
+
+    `log(I + X) = int_0^1 X (I + t X)^-1 dt`, and the logarithm of a square root is half of it.
+    """
+    eye, roots = np.eye(len(matrix)), 0
+    while np.linalg.norm(matrix - eye, 1) > NEAR and roots < 60:
+        matrix, roots = _square_root(matrix), roots + 1
+    x = matrix - eye
+    nodes, weights = np.polynomial.legendre.leggauss(NODES)
+    terms = (
+        w / 2 * np.linalg.solve(eye + (t + 1) / 2 * x, x)
+        for t, w in zip(nodes, weights, strict=True)
+    )
+    log: FloatArray = 2.0**roots * sum(terms, np.zeros_like(x))
+    return log
+
+
+def _square_root(matrix: FloatArray) -> FloatArray:
+    """Principal square root by the product form of Denman and Beavers (Higham 2008, eq. 6.29)."""
+    eye, m, x = np.eye(len(matrix)), matrix, matrix
+    for _ in range(60):
+        inverse = np.linalg.inv(m)
+        x = 0.5 * x @ (eye + inverse)
+        m = 0.5 * (eye + 0.5 * (m + inverse))
+        if np.linalg.norm(m - eye, 1) < 1e-14 * len(m):
+            break
+    return x
+
+
+def _require_logarithm(poles: Any, s: StateSpace, core: _core.LinearModel) -> None:
+    if len(s.A) > core.na:
+        raise SettingError(
+            f"expected at most {core.na} coefficients per input beside the delay (nb <= na), "
+            f"received {core.b.shape[1]}: the others are poles at 0, which no differential "
+            "equation has; identify with nb <= na"
+        )
+    size = max(np.abs(poles).max(), 1e-300)
+    bad = [p.real for p in poles if p.real <= 0.0 and abs(p.imag) <= 1e-9 * size]
+    if bad:
+        raise SettingError(
+            f"expected poles off the negative real axis and 0, received "
+            f"{', '.join(f'{p:.4g}' for p in bad)}; no differential equation under a hold has "
+            "such a pole: lower na, or sample faster"
+        )
+
+
+# --- A linear model's coefficients as transfer function and state space, and back -----------------
+# Only deviations from an operating point are converted; the offset is what makes one out of them.
 
 
 class StateSpace(NamedTuple):
@@ -199,3 +330,103 @@ def _product(factors: list[FloatArray]) -> FloatArray:
     for factor in factors:
         product = factor if len(product) == 1 else np.convolve(product, factor)
     return product
+
+
+# --- python-control and scipy.signal: objects of theirs from arrays, and arrays from their objects
+
+
+def require_control() -> Any:
+    """python-control, or a `SettingError` that says how to install it."""
+    try:
+        import control
+    except ImportError as e:
+        raise SettingError(
+            "this needs python-control, which is not installed: "
+            'pip install "sewfast[control]"; to_tf and to_ss give plain arrays'
+        ) from e
+    return control
+
+
+def require_scipy_signal() -> Any:
+    """scipy.signal, or a `SettingError` that says how to install it."""
+    try:
+        from scipy import signal
+    except ImportError as e:
+        raise SettingError(
+            'this needs scipy, which is not installed: pip install "sewfast[control]"; '
+            "to_tf and to_ss give plain arrays"
+        ) from e
+    return signal
+
+
+def control_transfer_function(
+    numerators: list[FloatArray], den: FloatArray, Ts: float, inputs: list[str], output: str
+) -> Any:
+    """`control.TransferFunction` with one output from polynomials in descending powers of z."""
+    control = require_control()
+    dens = [den] * len(numerators)
+    return control.tf([numerators], [dens], Ts, inputs=inputs, outputs=[output])
+
+
+def control_state_space(s: StateSpace, Ts: float, inputs: list[str], output: str) -> Any:
+    """`control.StateSpace` with one output."""
+    return require_control().ss(*s, Ts, inputs=inputs, outputs=[output])
+
+
+def scipy_system(numerators: list[FloatArray], den: FloatArray, s: StateSpace, Ts: float) -> Any:
+    """`scipy.signal.dlti`: a transfer function for one input, a state space for several."""
+    signal = require_scipy_signal()
+    if len(numerators) == 1:
+        return signal.dlti(numerators[0], den, dt=Ts)
+    return signal.dlti(*s, dt=Ts)
+
+
+def polynomials_of(system: Any, Ts: float | None) -> tuple[FloatArray, FloatArray, float]:
+    """Numerators and denominator in powers of z^-1, and the sample time [s], of a system's object.
+
+    Raises
+    ------
+    SettingError
+        For continuous time, several outputs, no sample time, or what is no system.
+    """
+    dt = _sample_time(getattr(system, "dt", None), Ts)
+    if all(hasattr(system, name) for name in "ABCD"):
+        num, den = from_state_space(system.A, system.B, system.C, system.D)
+    elif hasattr(system, "num") and hasattr(system, "den"):
+        num, den = with_common_denominator(*_polynomial_lists(system))
+    elif hasattr(system, "zeros") and hasattr(system, "to_tf"):
+        num, den = with_common_denominator(*_polynomial_lists(system.to_tf()))
+    else:
+        raise SettingError(
+            "expected a transfer function or state space of python-control or scipy.signal, "
+            f"received {type(system).__name__}"
+        )
+    return num, den, dt
+
+
+def _polynomial_lists(system: Any) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Polynomials per input; python-control nests them by output and input."""
+    num, den = system.num, system.den
+    if isinstance(den, np.ndarray) and den.ndim == 1:
+        num, den = [np.atleast_2d(num)], [[den]]
+    if len(num) != 1:
+        raise SettingError(f"expected one output, received {len(num)}; take one of them")
+    rows = [np.asarray(n, dtype=np.float64) for n in num[0]]
+    dens = [np.asarray(d, dtype=np.float64) for d in den[0]]
+    if len(rows) != len(dens):
+        raise SettingError(f"expected one output, received {len(rows)}; take one of them")
+    return rows, dens
+
+
+def _sample_time(dt: Any, Ts: float | None) -> float:
+    """Of the system; `Ts` where that has none (`dt` True or None: unspecified)."""
+    if dt is not None and not isinstance(dt, bool) and dt > 0:
+        if Ts is not None and abs(dt - Ts) > 1e-9 * Ts:
+            raise SettingError(f"Ts: the system has dt = {dt:g} s, received {Ts:g}; leave Ts out")
+        return float(dt)
+    if dt is True and Ts is not None:
+        return Ts
+    raise SettingError(
+        f"expected a system in discrete time with its sample time in seconds, received dt = {dt}; "
+        "convert it (control.sample_system) or give Ts where dt is True"
+    )

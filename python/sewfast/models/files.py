@@ -9,14 +9,13 @@ from dataclasses import replace
 from importlib.resources import files
 from typing import Any, TypeAlias
 
-from .. import jsonfile
+from .. import storage
 from ..errors import ModelFileError, SewfastError
 from .base import FORMAT, VERSION, Model
 from .ensemble import COMBINATIONS, MOST_MEMBERS, Ensemble
 from .fields import Fields
 from .linear import ARX, IV, LinearOE
-from .neural import NeuralOE
-from .neural_ss import NeuralSS
+from .neural import NeuralOE, NeuralSS
 
 SCHEMA = f"model-{VERSION}.json"
 _Kind: TypeAlias = type[ARX] | type[IV] | type[LinearOE] | type[NeuralOE] | type[NeuralSS]
@@ -42,7 +41,7 @@ def load_model(path: str | os.PathLike[str]) -> Model:
         Where the file is missing, damaged, of another format, or of an unknown version or kind;
         the message names the file and the field.
     """
-    return _read(Fields(os.fspath(path), jsonfile.read(path, FORMAT, (VERSION,))))
+    return _read(Fields(os.fspath(path), storage.read(path, FORMAT, (VERSION,))))
 
 
 def from_dict(values: dict[str, Any]) -> Model:

@@ -14,23 +14,22 @@ from .. import _core
 from ..dataset import FloatArray, labelled
 from ..errors import SettingError
 from .base import Model
-from .continuous import ContinuousModel, continuous
 from .conversion import (
+    ContinuousModel,
     StateSpace,
+    continuous,
+    control_state_space,
+    control_transfer_function,
     difference_equation,
     from_state_space,
     in_descending_powers,
     observer_form,
     offset_at,
+    polynomials_of,
+    scipy_system,
     transfer_function,
 )
 from .fields import Fields
-from .toolboxes import (
-    control_state_space,
-    control_transfer_function,
-    polynomials_of,
-    scipy_system,
-)
 
 
 class LinearDifference(Model):

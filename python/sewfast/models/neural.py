@@ -1,15 +1,17 @@
-"""The network output-error model."""
+"""The networks: output error with lagged regressors, and state space."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 
 from .. import _core
-from ..dataset import FloatArray
-from .base import Model
+from ..dataset import Dataset, FloatArray
+from .base import INIT, Model
 from .fields import Fields, entries
+
+# --- The network output-error model ---------------------------------------------------------------
 
 
 class NeuralOE(Model):
@@ -78,3 +80,127 @@ class NeuralOE(Model):
                 f"output saturates at {low:.6g} and {high:.6g} {self.output_unit}".rstrip()
             )
         return lines
+
+
+# --- The neural state-space model -----------------------------------------------------------------
+
+
+OUTPUTS = ("linear", "saturation", "abs")
+
+
+class NeuralSS(Model):
+    """Linear state equations beside one hidden layer of tanh, trained in free run.
+
+    Its states have no unit of their own: they are scaled to be of size 1 on the training data.
+
+    References
+    ----------
+    M. Schoukens, *Improved Initialization of State-Space Artificial Neural Networks*, 2021,
+    arXiv 2103.14516; docs/CONVENTIONS.md, State space.
+    """
+
+    kind: ClassVar[str] = "neural_ss"
+    title: ClassVar[str] = "Neural state space"
+    core: _core.NeuralSS
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Sizes, output function, scaling and statistics, as JSON values."""
+        raw = self.core.settings
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in raw.items()}
+
+    @property
+    def orders(self) -> dict[str, int]:
+        settings = self.settings
+        return {k: settings[k] for k in ("nx", "nk", "hidden")}
+
+    @property
+    def theta(self) -> FloatArray:
+        """`[A, B, E, Wx, Wu, bh, C, D, c, G]`, row by row, in scaled units, shape (p,)."""
+        return self.core.theta
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """`A[i,j]` and so on, in the order of `theta`."""
+        s = self.settings
+        nx, nu, hidden = s["nx"], s["n_inputs"], s["hidden"]
+        return entries(
+            {
+                "A": (nx, nx), "B": (nx, nu), "E": (nx, hidden), "Wx": (hidden, nx),
+                "Wu": (hidden, nu), "bh": (hidden,), "C": (1, nx), "D": (1, nu), "c": (1,),
+                "G": (1, hidden),
+            }
+        )  # fmt: skip
+
+    def states(self, data: Dataset, *, init: int = INIT) -> list[FloatArray]:
+        """States of the free run.
+
+        Parameters
+        ----------
+        data : Dataset
+        init : int
+            As for `simulate`.
+
+        Returns
+        -------
+        list of array, shape (N, nx)
+            One per experiment, in scaled units.
+
+        Raises
+        ------
+        DataError, FitError
+            As for `simulate`.
+        """
+        self._require_match(data)
+        data.require_inputs()
+        return [self.core.states(e.u, self.initial_state(e, init)) for e in data.experiments]
+
+    def parameters(self) -> dict[str, Any]:
+        return {**self.settings, "theta": self.core.theta.tolist()}
+
+    @staticmethod
+    def core_from(fields: Fields) -> _core.NeuralSS:
+        """The compiled model from the parameters of a file."""
+        output = fields.text("output")
+        if output not in OUTPUTS:
+            raise fields.refuse("output", f"one of {', '.join(OUTPUTS)}", output)
+        if fields.integer("n_outputs") != 1:
+            raise fields.refuse("n_outputs", "1, as a data set has", fields.any("n_outputs"))
+        return _core.NeuralSS(
+            nx=fields.integer("nx"),
+            nk=fields.integer("nk"),
+            n_inputs=fields.integer("n_inputs"),
+            n_outputs=fields.integer("n_outputs"),
+            hidden=fields.integer("hidden"),
+            integrator=fields.flag("integrator"),
+            output=cast(Literal["linear", "saturation", "abs"], output),
+            output_parameters=fields.vector("output_parameters"),
+            theta=fields.vector("theta"),
+            u_mean=fields.vector("u_mean"),
+            u_scale=fields.vector("u_scale"),
+            y_mean=fields.vector("y_mean"),
+            y_scale=fields.vector("y_scale"),
+            state_mean=fields.vector("state_mean"),
+            state_covariance=fields.matrix("state_covariance"),
+            residual_variance=fields.vector("residual_variance"),
+            process_noise=fields.number("process_noise"),
+        )
+
+    def describe(self) -> list[str]:
+        s = self.settings
+        last = ", the last one an integrator" if s["integrator"] else ""
+        states = "1 state" if s["nx"] == 1 else f"{s['nx']} states"
+        lines = [f"{states}{last}, {s['hidden']} tanh, {len(self.core.theta)} parameters"]
+        return lines + self._describe_output(s)
+
+    def _describe_output(self, s: dict[str, Any]) -> list[str]:
+        values = [p * s["y_scale"][0] for p in s["output_parameters"]]
+        mean = s["y_mean"][0]
+        if s["output"] == "saturation":
+            low, high = values[0] + mean, values[1] + mean
+            text = f"output saturates softly at {low:.6g} and {high:.6g} {self.output_unit}"
+        elif s["output"] == "abs":
+            text = f"output without sign, with a corner of {values[0]:.6g} {self.output_unit}"
+        else:
+            return []
+        return [text.rstrip()]

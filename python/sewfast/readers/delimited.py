@@ -13,7 +13,7 @@ import numpy as np
 
 from ..dataset import FloatArray
 from ..errors import DataError
-from .table import MAX_COLUMNS, Table, from_headers
+from .containers import MAX_COLUMNS, Table, from_headers
 
 MAX_LINE = 1_000_000
 _PREAMBLE = 200

@@ -1,16 +1,77 @@
-"""One file of any known format -> `Table`, told apart by its first bytes, then by its extension."""
+"""One file of any known format -> `Table`."""
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 
-from ..errors import DataError
-from .containers import read_mat, read_npz
+import numpy as np
+
+from ..errors import DataError, SettingError
+from ..recordfile.format import MAGIC
+from ..recordfile.reader import decode_recording
+from .containers import Table, freeze, from_headers, read_mat, read_npz
 from .delimited import read_delimited
-from .mcap import MAGIC, read_mcap
-from .parquet import read_parquet
-from .table import Table
+
+__all__ = ["MAGIC", "read_mcap"]
+
+
+# --- Parquet -> Table -----------------------------------------------------------------------------
+
+
+def read_parquet(path: Path, raw: bytes) -> Table:
+    """Read the numeric columns of a Parquet file; nulls are NaN.
+
+    Raises
+    ------
+    DataError
+        Where the file is damaged or has no rows.
+    SettingError
+        Where pyarrow is not installed.
+    """
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError as e:
+        raise SettingError(
+            'reading Parquet needs pyarrow, which is not installed: pip install "sewfast[parquet]"'
+        ) from e
+    try:
+        found = pq.read_table(io.BytesIO(raw))
+    except Exception as e:
+        # damaged files make the parser fail in any way
+        raise DataError(f"{path}: expected a Parquet file, but it cannot be read: {e}") from e
+    if found.num_rows == 0:
+        raise DataError(f"{path}: expected rows of numbers, received none")
+    columns, bad = [], {}
+    for i, entry in enumerate(found.schema):
+        try:
+            columns.append(found.column(i).cast(pa.float64(), safe=False).to_numpy())
+        except pa.ArrowException:
+            columns.append(np.empty(0))
+            bad[i] = f"column {entry.name!r} holds {entry.type}; expected numbers"
+    return from_headers(path, found.schema.names, columns, bad)
+
+
+# --- MCAP recordings of the package -> Table ------------------------------------------------------
+
+
+def read_mcap(path: Path, raw: bytes) -> Table:
+    """Time and columns of a recording, NaN in its gaps and where it is damaged.
+
+    Raises
+    ------
+    DataError
+        Where the file is no recording of the package, or holds no sample.
+    """
+    found = decode_recording(path, raw)
+    columns = {name: freeze(c) for name, c in found.table_columns().items()}
+    header = found.header
+    return Table(path, columns, found.units, Ts=header.Ts, counts_per_rev=header.counts_per_rev)
+
+
+# --- One file of any known format -> Table, told apart by its first bytes, then by its extension --
 
 
 def read_table(path: str | os.PathLike[str]) -> Table:

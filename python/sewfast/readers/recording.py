@@ -12,8 +12,8 @@ import numpy as np
 from ..dataset import Dataset, Experiment, FloatArray
 from ..dataset.weights import as_weights, require_some_weight
 from ..errors import DataError, SettingError
+from .containers import Table
 from .files import read_table
-from .table import Table
 from .timebase import TOLERANCE, Grid, time_base
 
 

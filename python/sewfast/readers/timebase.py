@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..dataset import FloatArray
 from ..errors import DataError, SettingError
-from .table import Table
+from .containers import Table
 
 TOLERANCE = 0.01
 """Of the period: how far steps may be from it to count as even."""

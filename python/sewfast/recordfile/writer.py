@@ -1,10 +1,10 @@
-"""`RecordWriter`: samples and events into an MCAP file while the drive runs."""
+"""`RecordWriter`: samples and events into an MCAP file; what is not written over."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -13,11 +13,108 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import DataError
-from . import samples
-from .filing import Block, End, Event, Filing
+from ..errors import DataError, SettingError
+from . import format
+from .filing import Block, End, Event, Filing, replacing
 from .header import MOST_MISSING, Header, bearable, plain
-from .sink import replacing
+from .reader import read_header
+
+# --- What is not written over: a recording of a drive, which cannot be had again ------------------
+
+
+ENDING = ".mcap"
+_COMPUTED = 1 << 5
+"""The capability of a device that is no machine but computes one (docs/PROTOCOL.md)."""
+
+
+def require_ending(path: str | os.PathLike[str]) -> Path:
+    """A recording's name, which other programs tell by its ending.
+
+    Raises
+    ------
+    SettingError
+        For another ending.
+    """
+    if not isinstance(path, (str, os.PathLike)) or "\0" in str(path):
+        raise SettingError(f"expected a file's name, got {path!r}; as in file='run{ENDING}'")
+    found = Path(path)
+    if found.suffix.lower() != ENDING:
+        raise SettingError(
+            f"{found}: expected a recording's name, which ends in {ENDING}, got "
+            f"{found.suffix or 'none'!r}; rename it, and `sewfast.recordfile.export` makes other "
+            "formats of it"
+        )
+    return found
+
+
+def require_replaceable(path: str | os.PathLike[str], *, overwrite: bool) -> None:
+    """Refuse to lose a recording: an `.mcap` is replaced only where a computer can make it again.
+
+    A recording of a virtual machine can be made again, and so can what is no recording but made
+    from one. One that cannot be read may be of a drive.
+
+    Parameters
+    ----------
+    path : path
+        File that is about to be written.
+    overwrite : bool
+        Whether it may be replaced whatever it is.
+
+    Raises
+    ------
+    SettingError
+        Where it is to be kept.
+    """
+    found = Path(path)
+    if overwrite or found.suffix.lower() != ENDING or not _is_there(found):
+        return
+    try:
+        header = read_header(found)
+    except DataError:
+        raise _kept(found, "a file that may be one") from None
+    if not _is_computed(header):
+        device = header.device.get("name", "a drive")
+        raise _kept(found, f"one of {str(device)[:60]!r} of {header.started[:19]}")
+
+
+def require_free(paths: Iterable[str | os.PathLike[str] | None], *, overwrite: bool) -> None:
+    """Refuse to write over anything at all: for what is the only account of a run on a drive.
+
+    Raises
+    ------
+    SettingError
+        Where one of the files exists.
+    """
+    for path in paths:
+        if path is not None and not overwrite and _is_there(Path(path)):
+            raise SettingError(
+                f"{path}: expected a free name for what a drive did, there is a file; it is kept: "
+                "choose another name, or overwrite it (--overwrite, overwrite=True)"
+            )
+
+
+def _is_there(path: Path) -> bool:
+    """Whether there is anything to be lost; a folder is refused by whoever writes."""
+    try:
+        return path.is_file() and path.stat().st_size > 0
+    except (OSError, ValueError):
+        return False
+
+
+def _is_computed(header: Header) -> bool:
+    capabilities = header.device.get("capabilities", 0)
+    computed = isinstance(capabilities, int) and bool(capabilities & _COMPUTED)
+    return computed or header.device.get("kind") == "virtual"
+
+
+def _kept(path: Path, what: str) -> SettingError:
+    return SettingError(
+        f"{path}: expected no recording that cannot be had again, there is {what}; it is kept: "
+        "choose another name, or overwrite it (--overwrite, overwrite=True)"
+    )
+
+
+# --- RecordWriter: samples and events into an MCAP file while the drive runs ----------------------
 
 
 class RecordWriter:
@@ -140,7 +237,7 @@ class RecordWriter:
                 f"{self.path}: expected the columns {', '.join(self.header.columns)}, received "
                 f"{', '.join(map(str, columns)) or 'none'}; give every column of the header"
             )
-        values = {name: samples.numbers(name, columns[name]) for name in self.header.columns}
+        values = {name: format.numbers(name, columns[name]) for name in self.header.columns}
         if len({len(v) for v in values.values()}) > 1:
             raise DataError(
                 f"{self.path}: expected columns of one length, received "
@@ -155,7 +252,7 @@ class RecordWriter:
                 f"{first + count - 1}; a sample is written once"
             )
         missing = first - self._received
-        if not bearable(missing, len(self.header.columns)) or first + count > samples.EXACT:
+        if not bearable(missing, len(self.header.columns)) or first + count > format.EXACT:
             raise DataError(
                 f"{self.path}: expected gaps of at most {MOST_MISSING} values altogether, received "
                 f"sample {first} after {self._received} samples; start a new recording"
@@ -226,7 +323,7 @@ class RecordWriter:
 
 def _index(what: str, value: object) -> int:
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not whole or not 0 <= value <= samples.EXACT:  # type: ignore[operator]
+    if not whole or not 0 <= value <= format.EXACT:  # type: ignore[operator]
         raise DataError(f"{what}: expected the number of a sample, 0 or more, received {value!r}")
     return int(value)  # type: ignore[call-overload, no-any-return]
 

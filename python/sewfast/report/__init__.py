@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from .. import jsonfile
+from .. import storage
 from . import artefacts, canvas, commissioned, page
 
 __all__ = ["report"]
@@ -38,5 +38,5 @@ def report(folder: str | os.PathLike[str]) -> Path:
         text = page.fill("commissioning.html", commissioned.context(Path(folder)))
     else:
         text = page.render(artefacts.load(folder))
-    jsonfile.replace(target, text)
+    storage.replace(target, text)
     return target

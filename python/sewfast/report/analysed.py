@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from .. import jsonfile
+from .. import storage
 from ..analysis.analysis import FORMAT, VERSION
 from ..analysis.filing import ALT, FOLDER, NUMBERS
 from ..errors import ModelFileError
 from .artefacts import drawing
-from .canvas import Picture
-from .numbers import percent, significant
-from .table import Table
+from .canvas import Picture, Table, percent, significant
 
 _CAPTIONS = {
     "responses": (
@@ -50,7 +48,7 @@ def section(folder: Path) -> dict[str, Any] | None:
     path = folder / NUMBERS
     if not path.is_file():
         return None
-    found = jsonfile.read(path, FORMAT, {VERSION})
+    found = storage.read(path, FORMAT, {VERSION})
     try:
         return {
             "margins": _margins(found),

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import jsonfile
+from .. import storage
 from ..errors import DataError, ModelFileError
 from ..readers import read_table
 
@@ -140,7 +140,7 @@ def load(folder: str | os.PathLike[str]) -> Artefacts:
             f"{folder}: expected a result folder, found no results.json in it; "
             "`sewfast demo --out DIR` makes one"
         )
-    results = jsonfile.read(folder / "results.json", FORMAT, {VERSION})
+    results = storage.read(folder / "results.json", FORMAT, {VERSION})
     predicted = [f"{m}_{kind}" for m in MODELS for kind in ("simulation", "one_step")]
     recordings = {r: _columns(folder, recording_file(r), _RECORDING) for r in RECORDINGS}
     predictions = {r: _columns(folder, prediction_file(r), predicted) for r in SCORED}

@@ -1,10 +1,11 @@
-"""The canvas: the look of every figure, thinning of long series, figures as inline SVG."""
+"""Numbers, tables and drawings of a page, as HTML and SVG."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import itertools
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,11 +16,88 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SettingError
-from .table import Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+# --- Numbers as a reader likes them: few digits, a unit, a dash where there is none ---------------
+
+
+NONE = "–"
+_SPACE = "\N{NO-BREAK SPACE}"
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """`digits` significant digits, plain where that is short, else a power of ten."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    if value == 0.0:
+        return "0"
+    # of the rounded value: 9.996 has two digits before the point
+    size = int(f"{value:.{digits - 1}e}".split("e")[1])
+    if not -3 <= size <= 5:
+        mantissa = value / 10.0**size
+        text = f"{mantissa:.{digits - 1}f} × 10{_raised(size)}"
+        return text.replace("-", "−").replace(" ", _SPACE)
+    return f"{value:,.{max(digits - 1 - size, 0)}f}".replace("-", "−")
+
+
+def rpm(value: float | None) -> str:
+    """A speed or its error [RPM]."""
+    return NONE if value is None else f"{significant(value)}{_SPACE}RPM"
+
+
+def volt(value: float | None) -> str:
+    """A command or its change [V]."""
+    return NONE if value is None else f"{significant(value)}{_SPACE}V"
+
+
+def percent(value: float | None, digits: int = 2) -> str:
+    """A share [%]."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    return f"{value:.{digits}f}{_SPACE}%".replace("-", "−")
+
+
+def milliseconds(value: float | None) -> str:
+    """A duration [ms]."""
+    return NONE if value is None else f"{value:.0f}{_SPACE}ms"
+
+
+def _raised(exponent: int) -> str:
+    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
+# --- Table: rows of text under headers ------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows whose first cell is a header.
+
+    Attributes
+    ----------
+    caption : str
+        What it shows.
+    header : tuple of str
+    rows : tuple of tuple of str
+    best : frozenset of (row, column)
+        Cells to set in bold.
+    words : bool
+        Whether its cells hold words rather than numbers, which begin at the left.
+    """
+
+    caption: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    best: frozenset[tuple[int, int]] = frozenset()
+    words: bool = False
+
+
+# --- The canvas: the look of every figure, thinning of long series, figures as inline SVG ---------
+
 
 Float = NDArray[np.float64]
 

@@ -6,13 +6,24 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from .. import jsonfile
+from .. import storage
 from ..errors import DataError, ModelFileError
 from ..readers import read_table
 from . import analysed
-from .canvas import Picture, draw, legend, panels, style, svg
-from .numbers import milliseconds, percent, rpm, significant, volt
-from .table import Table
+from .canvas import (
+    Picture,
+    Table,
+    draw,
+    legend,
+    milliseconds,
+    panels,
+    percent,
+    rpm,
+    significant,
+    style,
+    svg,
+    volt,
+)
 
 FORMAT = "sewfast.commissioning"
 VERSION = 1
@@ -52,7 +63,7 @@ def context(folder: Path) -> dict[str, Any]:
     DataError, ModelFileError
         Where a file is missing or damaged.
     """
-    found = jsonfile.read(folder / NUMBERS, FORMAT, {VERSION})
+    found = storage.read(folder / NUMBERS, FORMAT, {VERSION})
     try:
         with style():
             return {

@@ -8,12 +8,11 @@ from typing import Any
 
 from . import analysed, figures
 from .artefacts import Artefacts
-from .canvas import style
-from .goals import goals
-from .numbers import milliseconds, percent, rpm, significant
+from .canvas import milliseconds, percent, rpm, significant, style
 from .tables import (
     control_table,
     gains_table,
+    goals,
     identification_tables,
     readings_table,
     speed_table,

@@ -1,12 +1,190 @@
-"""The tables of the report."""
+"""Tables of the page: goals, models, loops."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 from ..errors import ModelFileError
 from . import labels
 from .artefacts import MODELS, PLANTS, REFERENCES, SCORED, Artefacts
-from .numbers import milliseconds, percent, significant
-from .table import Table
+from .canvas import Table, milliseconds, percent, rpm, significant
+
+# --- The goals of the experiment, each with what was reached: verdicts follow from the numbers ----
+
+
+_TESTS = ("chirp_hi_lo", "random")
+
+
+@dataclass(frozen=True)
+class Goal:
+    """One goal.
+
+    Attributes
+    ----------
+    demand, reached : str
+        What was asked for and what came out, in words.
+    met : bool or None
+        None where the number is undefined.
+    """
+
+    demand: str
+    reached: str
+    met: bool | None
+
+    @property
+    def verdict(self) -> str:
+        """One word or two."""
+        return {True: "reached", False: "not reached", None: "undefined"}[self.met]
+
+
+def goals(artefacts: Artefacts) -> tuple[Goal, ...]:
+    """Every goal, judged."""
+    return (
+        _speed(artefacts),
+        _ideal(artefacts),
+        _cost(artefacts),
+        _linear(artefacts),
+        _no_worse(artefacts),
+        _saturated(artefacts),
+        _paper_gains(artefacts),
+        _rise(artefacts),
+        _overshoot(artefacts),
+        _alike(artefacts),
+        _duration(artefacts),
+    )
+
+
+def _at_most(value: float | None, limit: float) -> bool | None:
+    return None if value is None else value <= limit
+
+
+def _rmse(a: Artefacts, model: str, record: str) -> float:
+    value = a.number(f"identification.{model}.{record}.simulation.rmse_rpm")
+    return float("inf") if value is None else value
+
+
+def _speed(a: Artefacts) -> Goal:
+    error = a.number("speed.kalman.rmse_rpm")
+    return Goal(
+        "Speed estimated from encoder counts within 1 RPM rms of the truth on the Lo-Hi chirp",
+        rpm(error),
+        _at_most(error, 1.0),
+    )
+
+
+def _ideal(a: Artefacts) -> Goal:
+    cost = a.number("identification.paper.cost_ideal")
+    return Goal(
+        "The paper's network on a machine without encoder steps and without dependence on the "
+        "crank angle: free-run cost J of 1e-4 at most",
+        f"J = {significant(cost)}",
+        _at_most(cost, 1e-4),
+    )
+
+
+def _cost(a: Artefacts) -> Goal:
+    cost, floor = (a.number(f"identification.paper.{n}") for n in ("cost", "cost_floor"))
+    ratio = cost / floor if cost is not None and floor else None
+    return Goal(
+        "The paper's network, trained on raw differences: free-run cost J at most 1.8 times the "
+        "encoder's floor",
+        f"J = {significant(cost)}, floor {significant(floor)}: {significant(ratio)} times",
+        _at_most(ratio, 1.8),
+    )
+
+
+def _linear(a: Artefacts) -> Goal:
+    records = ("chirp_lo_hi", *_TESTS)
+    fits = [a.number(f"identification.oe.{r}.simulation.fit_percent") for r in records]
+    known = [f for f in fits if f is not None]
+    met = min(known) >= 95.0 if len(known) == len(records) else None
+    return Goal(
+        "Linear output error: free-run fit of 95 % or more on Lo-Hi, Hi-Lo and random",
+        ", ".join(percent(f) for f in fits),
+        met,
+    )
+
+
+def _no_worse(a: Artefacts) -> Goal:
+    shown = []
+    met = True
+    for record in _TESTS:
+        network = _rmse(a, "neural_oe", record)
+        linear = min(_rmse(a, "oe", record), _rmse(a, "oe_all", record))
+        met = met and network <= linear
+        shown.append(f"{labels.RECORD[record]} {rpm(network)} against {rpm(linear)}")
+    return Goal(
+        "The default network is no worse than the better linear output-error model on Hi-Lo and "
+        "random",
+        ", ".join(shown),
+        met,
+    )
+
+
+def _saturated(a: Artefacts) -> Goal:
+    network = _rmse(a, "neural_oe", "saturating")
+    linear = min(_rmse(a, "oe", "saturating"), _rmse(a, "oe_all", "saturating"))
+    return Goal(
+        "Where the drive saturates, the default network has at most half the error of the better "
+        "linear model",
+        f"{rpm(network)} against {rpm(linear)}",
+        network <= 0.5 * linear,
+    )
+
+
+def _paper_gains(a: Artefacts) -> Goal:
+    rise = a.number("paper_gains.eq8.rise_time_ms")
+    overshoot = a.number("paper_gains.eq8.overshoot_percent")
+    known = rise is not None and overshoot is not None
+    return Goal(
+        "The paper's gains, read as per-sample gains, track the trapezoid on the plant of its "
+        "Eq. 8: rise of 200 ms at most, where ±10 V allow 186 ms, and 5 % overshoot at most",
+        f"{milliseconds(rise)}, overshoot {percent(overshoot)}",
+        (rise or 0.0) <= 200.0 and (overshoot or 0.0) <= 5.0 if known else None,
+    )
+
+
+def _rise(a: Artefacts) -> Goal:
+    rise = a.number("control.trapezoid.machine.rise_time_ms")
+    own = a.number("control.trapezoid.reference_rise_time_ms")
+    apart = abs(rise - own) if rise is not None and own is not None else None
+    return Goal(
+        "Trapezoid on the machine: 10–90 % rise within 15 ms of the reference's own",
+        f"{milliseconds(rise)} against {milliseconds(own)}",
+        _at_most(apart, 15.0),
+    )
+
+
+def _overshoot(a: Artefacts) -> Goal:
+    overshoot = a.number("control.trapezoid.machine.overshoot_percent")
+    return Goal(
+        "Trapezoid on the machine: overshoot of 3 % at most",
+        percent(overshoot),
+        _at_most(overshoot, 3.0),
+    )
+
+
+def _alike(a: Artefacts) -> Goal:
+    references = ("chirp_hi_lo", "chirp_lo_hi", "random")
+    apart = [a.number(f"control.{r}.model_vs_machine_rmse_rpm") for r in references]
+    known = [x for x in apart if x is not None]
+    return Goal(
+        "The predicted closed loop is within 15 RPM rms of the machine's on both chirps and random",
+        ", ".join(rpm(x) for x in apart),
+        max(known) <= 15.0 if len(known) == len(references) else None,
+    )
+
+
+def _duration(a: Artefacts) -> Goal:
+    seconds = a.number("seconds")
+    return Goal(
+        "The whole experiment within a minute",
+        f"{significant(seconds)} s",
+        _at_most(seconds, 60.0),
+    )
+
+
+# --- The tables of the report ---------------------------------------------------------------------
 
 
 def identification_tables(artefacts: Artefacts) -> list[Table]:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from ..evidence.lines import Judged, Line
+from ..evidence.card import Judged, Line
 from ..loop import ClosedLoopRun
 from .disagreement import Disagreement
 from .limits import Limits

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ..evidence.lines import Line
+from ..evidence.card import Line
 from .disagreement import Disagreement
 from .judgement import JudgedRun
 from .limits import Limits

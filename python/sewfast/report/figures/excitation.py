@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..artefacts import Artefacts, Columns
-from ..canvas import Float, Picture, draw, legend, panels, svg
-from ..numbers import percent, rpm, significant
-from ..table import Table
+from ..canvas import Float, Picture, Table, draw, legend, panels, percent, rpm, significant, svg
 
 _RECORDED = (
     ("2", "step", "Step command and response"),

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...atomic import replace_file
 from ...errors import SettingError
+from ...storage import replace_file
 from .. import canvas
 
 if TYPE_CHECKING:

@@ -9,9 +9,7 @@ import numpy as np
 
 from .. import labels
 from ..artefacts import Artefacts, record_of
-from ..canvas import LOOKS, Float, Picture, draw, legend, panels, svg, thin
-from ..numbers import percent, rpm
-from ..table import Table
+from ..canvas import LOOKS, Float, Picture, Table, draw, legend, panels, percent, rpm, svg, thin
 
 _ZOOM = 2.0
 """Width of the magnified window [s]."""
