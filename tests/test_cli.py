@@ -76,6 +76,10 @@ def test_help_lists_every_command_and_exit_code(tmp_path: Path) -> None:
         assert word in text
 
 
+def test_no_command_shows_the_help(tmp_path: Path) -> None:
+    assert sewfast(tmp_path).out == sewfast(tmp_path, "--help").out
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_each_command_teaches(tmp_path: Path, command: str) -> None:
     text = sewfast(tmp_path, command, "--help").out

@@ -165,9 +165,12 @@ def test_an_output_that_cannot_be_is_refused_before_the_work(folder: Path, out: 
     assert out in message
 
 
-def test_no_command_and_unknown_command(folder: Path) -> None:
-    assert "COMMAND" in refused(folder)
+def test_unknown_commands_and_options_are_answered_with_the_nearest(folder: Path) -> None:
     assert "learn" in refused(folder, "learn")
+    assert "did you mean identify?" in refused(folder, "identfy")
+    assert "did you mean --input?" in refused(folder, *IDENTIFY, "--inptu", "u")
+    assert "did you mean neural-ss?" in refused(folder, *IDENTIFY, "--model", "neural_ss")
+    assert "did you mean" not in refused(folder, *IDENTIFY, "--zzz")
 
 
 # --- models, controllers --------------------------------------------------------------------------

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import difflib
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from . import (
     analyse,
@@ -56,14 +59,56 @@ exit codes:
 """
 
 
+class Parser(argparse.ArgumentParser):
+    """A parser that says what was probably meant, and that shows its help where nothing is asked.
+
+    Commands are parsed by parsers of the same class, which hold what they know in `options`.
+    """
+
+    def parse_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: Any = None
+    ) -> argparse.Namespace:
+        found: argparse.Namespace
+        found, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            known = self.options_of(getattr(found, "name", None))
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{meant(unknown, known)}")
+        if getattr(found, "name", "") is None:
+            self.print_help()
+            self.exit(0)
+        return found
+
+    def options_of(self, command: str | None) -> list[str]:
+        """The long options of a command, or of the program."""
+        parser: argparse.ArgumentParser = self
+        for action in self._actions:
+            if isinstance(action, argparse._SubParsersAction) and command in action.choices:
+                parser = action.choices[command]
+        return [o for a in parser._actions for o in a.option_strings if o.startswith("--")]
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        choices = None if action.choices is None else [str(c) for c in action.choices]
+        if choices is not None and value not in action.choices:  # type: ignore[operator]
+            names = ", ".join(choices)
+            raise argparse.ArgumentError(
+                action,
+                f"invalid choice: {value!r}{meant([str(value)], choices)} (choose from {names})",
+            )
+
+
+def meant(given: Iterable[str], known: Sequence[str]) -> str:
+    """A question after the nearest names, empty where none is near."""
+    near = [difflib.get_close_matches(g.split("=")[0], known, n=1, cutoff=0.6) for g in given]
+    names = [name for some in near for name in some]
+    return f"; did you mean {' '.join(names)}?" if names else ""
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line; a parsed command holds its function as `command`."""
-    parser = argparse.ArgumentParser(
-        prog="sewfast", description=DESCRIPTION, epilog=EPILOG, formatter_class=Help
-    )
+    parser = Parser(prog="sewfast", description=DESCRIPTION, epilog=EPILOG, formatter_class=Help)
     parser.add_argument("--version", action=_Version, help="print the version and exit")
-    commands: Commands = parser.add_subparsers(
-        title="commands", metavar="COMMAND", dest="name", required=True
+    commands: Commands = parser.add_subparsers(  # type: ignore[assignment]
+        title="commands", metavar="COMMAND", dest="name"
     )
     groups = (
         experiment,
