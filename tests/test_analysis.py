@@ -13,7 +13,7 @@ import result_folder
 from cli import sewfast as command
 from loops import QUIET, drive
 from sewfast import Cost, Ensemble, VirtualMachine, _core, identify, run
-from sewfast.analysis import Analysis, analyse, run_under_load, sensitivity
+from sewfast.analysis import Analysis, analyse, changes, run_under_load
 from sewfast.analysis.systems import LinearLoop, response, simulate
 from sewfast.control import Controller, Gains
 from sewfast.dataset import Dataset
@@ -170,10 +170,10 @@ def step_of(model: LinearOE) -> np.ndarray:
 
 def test_changes_of_linear_models_are_what_they_say() -> None:
     before = step_of(drive())
-    assert np.allclose(step_of(sensitivity.with_gain(drive(), 1.25)), 1.25 * before, rtol=1e-12)
-    late = step_of(sensitivity.with_delay(drive(), 3))
+    assert np.allclose(step_of(changes.with_gain(drive(), 1.25)), 1.25 * before, rtol=1e-12)
+    late = step_of(changes.with_delay(drive(), 3))
     assert np.allclose(late[3:], before[:-3], rtol=1e-12, atol=1e-12)
-    slower = sensitivity.with_time_constants(drive(), 1.25)
+    slower = changes.with_time_constants(drive(), 1.25)
     assert np.allclose(
         np.sort(np.abs(np.roots([1.0, *slower.core.a]))),
         np.exp([-0.001 / (1.25 * 0.0074), -0.001 / (1.25 * 0.252)]),
@@ -183,19 +183,19 @@ def test_changes_of_linear_models_are_what_they_say() -> None:
 
 def test_an_integrator_slows_down_and_stays_one() -> None:
     model = LinearOE.from_tf([0.0, 0.02], [1.0, -1.0], 0.001, input_units=["V"], output_unit="RPM")
-    slower = sensitivity.with_time_constants(model, 2.0)
+    slower = changes.with_time_constants(model, 2.0)
     assert np.allclose(slower.core.a, [-1.0])
     assert np.allclose(slower.core.b, 0.01)
 
 
 def test_changes_that_do_not_fit_a_plant_are_refused_or_left_out() -> None:
     with pytest.raises(SettingError, match="got a machine"):
-        sensitivity.gain(1.1).apply(VirtualMachine())
+        changes.gain(1.1).apply(VirtualMachine())
     with pytest.raises(SettingError, match="got a model"):
-        sensitivity.inertia(1.1).apply(drive())
+        changes.inertia(1.1).apply(drive())
     found = analyse(
         IDEAL, drive(), speeds=[500.0], references=[TRAPEZOID],
-        changes=[sensitivity.inertia(2.0), sensitivity.gain(1.1)],
+        changes=[changes.inertia(2.0), changes.gain(1.1)],
     )  # fmt: skip
     assert [w.name for w in found.what_if] == ["gain x 1.1"]
 

@@ -174,7 +174,7 @@ def test_a_folder_that_was_interrupted_while_writing_is_no_result(
     out = Path(shutil.copytree(demo, tmp_path / "cut"))
     models = {"paper": load_model(demo / "models" / "paper.json")}
     with pytest.raises(KeyboardInterrupt):
-        demo.write(
+        experiment.write(
             out, {}, recordings={}, models=models, controllers={},
             predictions={"random": {"t": np.zeros(3)}}, runs={}, drawings={},
         )  # fmt: skip

@@ -33,7 +33,7 @@ from sewfast import (
     run,
     tune,
 )
-from sewfast.analysis import sensitivity
+from sewfast.analysis import changes
 from sewfast.analysis.systems import LinearLoop, simulate
 from sewfast.control import Fopdt
 from sewfast.errors import DataError, ModelFileError, SettingError, SewfastError
@@ -120,13 +120,13 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "a cost that is a number": (lambda: analyse(QUIET, drive(), cost=wrong(5)), "expected Cost"),
     "limits for an analysis": (lambda: analyse(QUIET, drive(), limits=wrong(5)), "Limits"),
     "changes that are none": (lambda: analyse(QUIET, drive(), changes=wrong([5])), "changes"),
-    "a gain of 0": (lambda: sensitivity.gain(0.0), "above 0"),
-    "a delay backwards": (lambda: sensitivity.delay(-5), "samples"),
-    "half a sample": (lambda: sensitivity.delay(wrong(1.5)), "samples"),
-    "no time constants": (lambda: sensitivity.time_constants(0.0), "above 0"),
-    "an unknown parameter": (lambda: sensitivity.parameters("x", mass=2.0), "'mass'"),
-    "friction that drives": (lambda: sensitivity.friction(-1.0), "0 or more"),
-    "a load of NaN": (lambda: sensitivity.load(math.nan), "torque"),
+    "a gain of 0": (lambda: changes.gain(0.0), "above 0"),
+    "a delay backwards": (lambda: changes.delay(-5), "samples"),
+    "half a sample": (lambda: changes.delay(wrong(1.5)), "samples"),
+    "no time constants": (lambda: changes.time_constants(0.0), "above 0"),
+    "an unknown parameter": (lambda: changes.parameters("x", mass=2.0), "'mass'"),
+    "friction that drives": (lambda: changes.friction(-1.0), "0 or more"),
+    "a load of NaN": (lambda: changes.load(math.nan), "torque"),
     "a loop around a model": (lambda: LinearLoop.of(QUIET, wrong(drive())), "to_ss"),
     "inputs of another shape": (
         lambda: simulate(LinearLoop.of(QUIET, drive().to_ss()).closed, np.zeros((5, 3))),

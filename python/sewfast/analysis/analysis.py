@@ -19,9 +19,10 @@ from ..loop import check_fits, require_controller
 from ..plants import Plants, References, each_plant, each_reference, titles
 from ..trust import Judgement, Limits, judge
 from .arguments import each_change, finite_each, required
+from .changes import Change
 from .points import LoopBode, PlantPoint, loop_bodes, plant_points
 from .responses import Responses, Steps, default_steps, responses
-from .sensitivity import Change, GainSensitivity, Score, Task, WhatIf, gain_sensitivity, what_if
+from .sensitivity import GainSensitivity, Score, Task, WhatIf, gain_sensitivity, what_if
 from .systems import LinearLoop
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from ..errors import SettingError
 from ..gains import real
-from .sensitivity import Change
+from .changes import Change
 
 T = TypeVar("T")
 
@@ -78,6 +78,6 @@ def each_change(changes: Any) -> Sequence[Change] | None:
         if not isinstance(one, Change):
             raise SettingError(
                 f"expected a list of changes, got {one!r} in it; for example "
-                "changes=[sewfast.analysis.sensitivity.gain(0.5)]"
+                "changes=[sewfast.analysis.changes.gain(0.5)]"
             )
     return given
