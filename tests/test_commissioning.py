@@ -44,7 +44,7 @@ from sewfast.commissioning.demands import demands
 from sewfast.commissioning.gains import Requirements
 from sewfast.errors import LinkError
 from sewfast.link import VirtualDevice, connect
-from sewfast.report import report
+from sewfast.report import commissioned, report
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -224,6 +224,10 @@ def test_a_run_of_which_the_link_lost_samples_is_made_once_more() -> None:
                 if repeated:
                     break
     assert repeated
+
+
+def test_the_page_says_of_every_stage_what_was_done() -> None:
+    assert set(STAGES) <= set(commissioned.WHAT)
 
 
 # --- Ctrl-C -------------------------------------------------------------------------------------

@@ -29,15 +29,17 @@ FORMAT = "sewfast.commissioning"
 VERSION = 1
 NUMBERS = "commissioning.json"
 _RUN = ("t", "r", "u", "y")
-_HOW = {
+WHAT = {
     "first motion": "which command moves the machine, and which way",
     "step response": "gain, time constant and dead time; first gains by rule",
+    "small signals": "a small random command: delay, resonances, first gains that suit them",
     "closed loop": "trapezoids and random levels under the first gains",
     "limits": "short pulses of nearly the largest command",
     "training": "networks that differ in their seeds; judged on the random levels",
     "tuning": "gains of least cost on all networks, with encoder, filter, gain spread and delay",
     "verification": "prediction, then the machine",
 }
+"""Of each stage, for its table."""
 
 
 def run_file(reference: str, kind: str) -> str:
@@ -85,7 +87,7 @@ def context(folder: Path) -> dict[str, Any]:
 
 
 def _stages(found: Mapping[str, Any]) -> Table:
-    rows = tuple((s, _HOW.get(s, ""), f"{t:.2f}") for s, t in found["seconds"].items())
+    rows = tuple((s, WHAT.get(s, ""), f"{t:.2f}") for s, t in found["seconds"].items())
     return Table(
         "What was done, and how long it took.", ("stage", "what", "seconds"), rows, words=True
     )
