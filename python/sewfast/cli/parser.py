@@ -62,7 +62,7 @@ exit codes:
 class Parser(argparse.ArgumentParser):
     """A parser that says what was probably meant, and that shows its help where nothing is asked.
 
-    Commands are parsed by parsers of the same class, which hold what they know in `options`.
+    argparse makes the parsers of the commands of the same class.
     """
 
     def parse_args(  # type: ignore[override]
@@ -71,9 +71,9 @@ class Parser(argparse.ArgumentParser):
         found: argparse.Namespace
         found, unknown = self.parse_known_args(args, namespace)
         if unknown:
-            known = self.options_of(getattr(found, "name", None))
+            known = self.options_of(found.name)
             self.error(f"unrecognized arguments: {' '.join(unknown)}{meant(unknown, known)}")
-        if getattr(found, "name", "") is None:
+        if found.name is None:
             self.print_help()
             self.exit(0)
         return found

@@ -186,10 +186,12 @@ class Choice:
             earlier.add([(o, nk) for o in sorted(orders)], search.until)
             bound = earlier.best.rmse if earlier.candidates else math.inf
             able = [c for c in winning if search.is_affordable(c.structure, 1)]
-            again = [(c, other) for c, other in self._learned_again(able) if other.starts]
+            again = self._learned_again(able)
             # what the time budget has left unasked has not failed; where it is all, one part counts
             if again or not able:
-                asked = [c for c in asked if c not in able or c in [a for a, _ in again]]
+                learned = [c for c, _ in again]
+                unasked = [c for c in able if c not in learned]
+                asked = [c for c in asked if c not in unasked]
                 passed, parts = [(c.error, c) for c in winning if c not in able], 2
             for c, other in again:
                 if self._usual(other, search.trials[1]) < WORTH_IT * bound:
@@ -212,7 +214,7 @@ class Choice:
         return sorted(kept, key=lambda c: order.index(id(c)) if id(c) in order else len(order))
 
     def _learned_again(self, able: Sequence[Candidate]) -> list[tuple[Candidate, Candidate]]:
-        """The structures learned afresh from what is before the earlier fifth.
+        """Those that could be learned afresh from what is before the earlier fifth, and how.
 
         With a time budget in as many starts as there is time for; if not even two of each, then the
         best structures alone.
@@ -226,7 +228,7 @@ class Choice:
         ends = [n for n in range(1, len(able) + 1) if search.able(starts * sum(wanted[:n])) == 1.0]
         some = able[: max(ends, default=1)]
         found = search.tried([(c.structure, 80, starts) for c in some], 1)
-        return list(zip(some, found, strict=True))
+        return [(c, other) for c, other in zip(some, found, strict=True) if other.starts]
 
     def _usual(self, c: Candidate, held: Split) -> float:
         """The error of the median of the starts, or of the median start where that is larger.
