@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 import result_folder
 from sewfast.errors import DataError, ModelFileError, SewfastError
+from sewfast.plotting import significant, thin
 from sewfast.report import report
 from sewfast.report.artefacts import load
-from sewfast.report.canvas import significant, thin
 from sewfast.report.tables import goals
 
 PAPER_FIGURES = [*range(2, 6), *range(7, 16), *range(19, 23)]

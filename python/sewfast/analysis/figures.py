@@ -11,7 +11,7 @@ import numpy as np
 from ..dataset import FloatArray
 from ..dataset.arrays import lettered
 from ..evidence.figures import shade
-from ..report.canvas import Float, panels, require_matplotlib, style, thin
+from ..plotting import Float, panels, require_matplotlib, style, thin
 from .points import LoopBode
 from .responses import Responses
 from .sensitivity import Score

@@ -33,7 +33,7 @@ def save(a: Analysis, folder: str | os.PathLike[str], *, png: bool = True) -> li
         Where matplotlib is not installed or the folder cannot be written to.
     """
     drawn = a.figures()
-    from ..report.canvas import style, svg
+    from ..plotting import style, svg
 
     place = Path(folder) / FOLDER
     written = []

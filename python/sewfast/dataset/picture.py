@@ -34,7 +34,7 @@ def save(data: Dataset, path: str | os.PathLike[str]) -> None:
     SettingError
         Where matplotlib is not installed or the file cannot be written.
     """
-    from ..report.canvas import require_matplotlib, style
+    from ..plotting import require_matplotlib, style
 
     require_matplotlib()
     with style():
@@ -108,7 +108,7 @@ def _over_time(
 
 
 def _thinned(column: FloatArray, start: int, length: int) -> tuple[FloatArray, FloatArray]:
-    from ..report.canvas import thin
+    from ..plotting import thin
 
     index = np.arange(start, start + length, dtype=np.float64)
     return thin(index, column[start : start + length], _BUCKETS)

@@ -41,7 +41,7 @@ def figures(card: ReportCard) -> dict[str, Figure]:
     SettingError
         Where matplotlib is not installed.
     """
-    from ..report.canvas import require_matplotlib, style
+    from ..plotting import require_matplotlib, style
 
     require_matplotlib()
 
@@ -67,7 +67,7 @@ def save(card: ReportCard, folder: str | os.PathLike[str]) -> list[Path]:
     SettingError
         Where matplotlib is not installed or the folder cannot be written to.
     """
-    from ..report.canvas import style
+    from ..plotting import style
 
     written = []
     drawn = figures(card)

@@ -18,6 +18,7 @@ from ..errors import SettingError
 from ..loop import ClosedLoopRun
 from ..machine import VirtualMachine
 from ..models import Model
+from ..plotting import require
 from ..recording import Recording
 from ..report import report
 from ..report.artefacts import (
@@ -28,7 +29,6 @@ from ..report.artefacts import (
     recording_file,
     run_file,
 )
-from ..report.canvas import require
 from ..signals import excitation
 from ..tuning import TuningResult
 from ..writers import write_table

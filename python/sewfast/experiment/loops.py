@@ -25,9 +25,9 @@ from ..link import VirtualDevice, connect
 from ..loop import ClosedLoopRun, run
 from ..machine import VirtualMachine
 from ..models import LinearOE, Model
+from ..plotting import style, svg
 from ..recording import Recording, record
 from ..report.artefacts import PLANTS, REFERENCES, SCORED, record_of
-from ..report.canvas import style, svg
 from ..report.figures.loops import CAPTIONS
 from ..signals import excitation
 from ..speed import Method, floor_of_J

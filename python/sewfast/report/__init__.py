@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from .. import storage
-from . import artefacts, canvas, commissioned, page
+from .. import plotting, storage
+from . import artefacts, commissioned, page
 
 __all__ = ["report"]
 
@@ -32,7 +32,7 @@ def report(folder: str | os.PathLike[str]) -> Path:
     SettingError
         Where matplotlib or Jinja2 is not installed.
     """
-    canvas.require()
+    plotting.require()
     target = Path(folder) / "report.html"
     if commissioned.is_commissioning(Path(folder)):
         text = page.fill("commissioning.html", commissioned.context(Path(folder)))

@@ -10,8 +10,8 @@ from .. import storage
 from ..analysis.analysis import FORMAT, VERSION
 from ..analysis.filing import ALT, FOLDER, NUMBERS
 from ..errors import ModelFileError
+from ..plotting import Picture, Table, percent, significant
 from .artefacts import drawing
-from .canvas import Picture, Table, percent, significant
 
 _CAPTIONS = {
     "responses": (

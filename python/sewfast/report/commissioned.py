@@ -8,9 +8,7 @@ from typing import Any
 
 from .. import storage
 from ..errors import DataError, ModelFileError
-from ..readers import read_table
-from . import analysed
-from .canvas import (
+from ..plotting import (
     Picture,
     Table,
     draw,
@@ -24,6 +22,8 @@ from .canvas import (
     svg,
     volt,
 )
+from ..readers import read_table
+from . import analysed
 
 FORMAT = "sewfast.commissioning"
 VERSION = 1

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
+from ..plotting import milliseconds, percent, rpm, significant, style
 from . import analysed, figures
 from .artefacts import Artefacts
-from .canvas import milliseconds, percent, rpm, significant, style
 from .tables import (
     control_table,
     gains_table,

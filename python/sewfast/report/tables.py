@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..errors import ModelFileError
+from ..plotting import Table, milliseconds, percent, rpm, significant
 from . import labels
 from .artefacts import MODELS, PLANTS, REFERENCES, SCORED, Artefacts
-from .canvas import Table, milliseconds, percent, rpm, significant
 
 # --- The goals of the experiment, each with what was reached: verdicts follow from the numbers ----
 

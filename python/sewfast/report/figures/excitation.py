@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...plotting import Float, Picture, Table, draw, legend, panels, percent, rpm, significant, svg
 from ..artefacts import Artefacts, Columns
-from ..canvas import Float, Picture, Table, draw, legend, panels, percent, rpm, significant, svg
 
 _RECORDED = (
     ("2", "step", "Step command and response"),

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ... import plotting
 from ...errors import SettingError
 from ...storage import replace_file
-from .. import canvas
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,14 +43,14 @@ def draw(front: ParetoFront, path: Path) -> Path:
     SettingError
         For an ending that is no format of figures, or a file that cannot be written.
     """
-    canvas.require_matplotlib()
+    plotting.require_matplotlib()
     if path.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise SettingError(f"expected a figure ending in .png, .svg or .pdf, got {path.name!r}")
     pairs = list(itertools.combinations(range(len(front.objectives)), 2))
     columns = min(2, len(pairs))
     rows = -(-len(pairs) // columns)
-    with canvas.style():
-        figure, axes = canvas.panels([HEIGHT] * rows, widths=[1] * columns, share_x=False)
+    with plotting.style():
+        figure, axes = plotting.panels([HEIGHT] * rows, widths=[1] * columns, share_x=False)
         for axis, (i, j) in zip(axes.flat, pairs, strict=False):
             _panel(axis, front, i, j)
         for axis in axes.flat[len(pairs) :]:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...plotting import Picture, Table, draw, legend, milliseconds, panels, percent, rpm, svg, volt
 from .. import labels
 from ..artefacts import Artefacts, Columns
-from ..canvas import Picture, Table, draw, legend, milliseconds, panels, percent, rpm, svg, volt
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

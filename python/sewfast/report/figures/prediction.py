@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from ...plotting import LOOKS, Float, Picture, Table, draw, legend, panels, percent, rpm, svg, thin
 from .. import labels
 from ..artefacts import Artefacts, record_of
-from ..canvas import LOOKS, Float, Picture, Table, draw, legend, panels, percent, rpm, svg, thin
 
 _ZOOM = 2.0
 """Width of the magnified window [s]."""
