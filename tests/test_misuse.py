@@ -37,8 +37,8 @@ from sewfast.analysis import changes
 from sewfast.analysis.systems import LinearLoop, simulate
 from sewfast.control import Fopdt
 from sewfast.errors import DataError, ModelFileError, SettingError, SewfastError
+from sewfast.front import NAMES
 from sewfast.pid_forms import to_control, to_matlab
-from sewfast.report.figures.front import NAMES
 from sewfast.robustness import loop_response
 from sewfast.storage import replace_file
 from sewfast.trust import Limits, judge

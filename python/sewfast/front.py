@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import io
+import itertools
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import _core
+from . import _core, plotting
 from .constraints import Constraints
 from .control import Controller
 from .cost import Cost
@@ -19,6 +21,7 @@ from .errors import Interrupted, SettingError
 from .gains import whole
 from .load_step import LoadStep
 from .plants import Plants, References
+from .storage import replace_file
 from .tuning import tune
 from .tuning_task import (
     Aggregate,
@@ -27,6 +30,10 @@ from .tuning_task import (
     threads_or_all,
 )
 from .variables import Wanted, applied
+from .writers import write_table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 EVALUATIONS = 3000
 SIZE = 40
@@ -111,8 +118,6 @@ class ParetoFront:
         SettingError, DataError
             For an ending that stands for no format, or a file that cannot be written.
         """
-        from .writers import write_table
-
         gains = self.picked.gains
         units = {**self.units, "Kp": f"{gains.u_unit}/{gains.y_unit}", "Ti": "s", "Td": "s"}
         write_table(path, self.table(), units=units)
@@ -125,8 +130,6 @@ class ParetoFront:
         SettingError
             Where matplotlib is not installed.
         """
-        from .report.figures.front import draw
-
         return draw(self, Path(path))
 
     def __str__(self) -> str:
@@ -302,3 +305,79 @@ def knee(values: NDArray[np.float64]) -> int:
     columns = [np.log(c) if wide(c) else c for c in values.T]
     shares = [(c - c.min()) / (np.ptp(c) or 1.0) for c in columns]
     return int(np.argmin(np.sum(np.square(shares), axis=0)))
+
+
+# --- The figure: every pair of objectives in a panel, the knee marked -----------------------------
+
+
+NAMES = {
+    "cost": "cost",
+    "tracking": "tracking error, rms",
+    "chatter": "change of the command, rms",
+    "effort": "command, rms",
+    "overshoot": "overshoot",
+    "rise": "rise time beyond the reference's",
+    "lag": "lag",
+    "saturation": "share of samples at a limit",
+    "recovery": "recovery from a load",
+    "load": "deviation under a load",
+    "Ms": "largest sensitivity Ms",
+}
+HEIGHT = 3.6
+"""Of a panel [inch]."""
+
+
+def draw(front: ParetoFront, path: Path) -> Path:
+    """Write the figure in the format of the path's ending.
+
+    Raises
+    ------
+    SettingError
+        For an ending that is no format of figures, or a file that cannot be written.
+    """
+    plotting.require_matplotlib()
+    if path.suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise SettingError(f"expected a figure ending in .png, .svg or .pdf, got {path.name!r}")
+    pairs = list(itertools.combinations(range(len(front.objectives)), 2))
+    columns = min(2, len(pairs))
+    rows = -(-len(pairs) // columns)
+    with plotting.style():
+        figure, axes = plotting.panels([HEIGHT] * rows, widths=[1] * columns, share_x=False)
+        for axis, (i, j) in zip(axes.flat, pairs, strict=False):
+            _panel(axis, front, i, j)
+        for axis in axes.flat[len(pairs) :]:
+            axis.set_visible(False)
+        axes.flat[0].legend()
+        drawn = io.BytesIO()
+        figure.savefig(drawn, format=path.suffix[1:].lower(), dpi=150)
+    try:
+        replace_file(path, drawn.getvalue())
+    except OSError as error:
+        raise SettingError(
+            f"{path}: cannot be written ({error.strerror}); choose a folder that exists and is "
+            "writable"
+        ) from error
+    return path
+
+
+def _panel(axis: Axes, front: ParetoFront, i: int, j: int) -> None:
+    x, y = front.values[:, i], front.values[:, j]
+    order = np.argsort(x)
+    if len(front.objectives) == 2:
+        axis.step(x[order], y[order], where="post", color="#bbbbbb", lw=1.0, zorder=1)
+    axis.scatter(x, y, s=18, color="#0072B2", label="controllers of the front", zorder=2)
+    k = front.pick
+    axis.scatter(
+        x[k], y[k], s=90, marker="D", facecolor="none", edgecolor="#D55E00", lw=1.8,
+        label="the knee", zorder=3,
+    )  # fmt: skip
+    axis.set_xscale("log" if wide(x) else "linear")
+    axis.set_yscale("log" if wide(y) else "linear")
+    axis.set_xlabel(_label(front, i))
+    axis.set_ylabel(_label(front, j))
+
+
+def _label(front: ParetoFront, i: int) -> str:
+    name = front.objectives[i]
+    unit = front.units[name]
+    return NAMES[name] + (f" [{unit}]" if unit else "")

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,10 +17,8 @@ from .errors import DataError, SettingError
 from .gains import Gains
 from .machine import VirtualMachine
 from .models import Ensemble, Model
-from .speed import speed_or_nan
 
 if TYPE_CHECKING:
-    from .link.drive import Drive
     from .live import Kind
 
 FloatArray: TypeAlias = NDArray[np.float64]
@@ -127,9 +124,25 @@ class ClosedLoopRun:
         return "\n".join(lines)
 
 
+class Follower(Protocol):
+    """A machine that runs the controller itself, as a drive does; all that `run` knows of it."""
+
+    def follow(
+        self,
+        controller: Controller,
+        r: FloatArray,
+        *,
+        name: str,
+        file: str | os.PathLike[str] | None,
+        live: str | Kind,
+        overwrite: bool,
+    ) -> ClosedLoopRun:
+        """Run along the reference `r` [y], shape (N,), from rest; arguments as of `run`."""
+
+
 def run(
     controller: Controller,
-    on: Plant | Drive,
+    on: Plant | Follower,
     reference: str | ArrayLike | None = None,
     *,
     feedforward: ArrayLike | None = None,
@@ -200,7 +213,8 @@ def run(
     title = name or (reference if isinstance(reference, str) else "reference")
     beside = _beside(on, feedforward, disturbance)
     if not isinstance(on, (Model, VirtualMachine)):
-        return _run_on(_require_drive(on), controller, r, title, file, live, overwrite)
+        drive = _require_follower(on)
+        return drive.follow(controller, r, name=title, file=file, live=live, overwrite=overwrite)
     check_fits(controller, on)
     record = _core.closed_loop(
         single_core(on),
@@ -265,63 +279,14 @@ def require_controller(controller: Any, plant: Any, call: str) -> None:
     )
 
 
-def _require_drive(on: Any) -> Drive:
-    """What is neither model nor virtual machine; the link's modules need not be loaded to tell."""
-    if not hasattr(on, "stream"):
+def _require_follower(on: Any) -> Follower:
+    if not hasattr(on, "follow"):
         raise SettingError(
             "expected a Model, a VirtualMachine or a Drive to run on, got "
             f"{type(on).__name__}; load a model with load_model, or connect to a drive"
         )
-    drive: Drive = on
+    drive: Follower = on
     return drive
-
-
-def _run_on(
-    drive: Drive,
-    controller: Controller,
-    r: FloatArray,
-    name: str,
-    file: str | os.PathLike[str] | None,
-    live: str | Kind,
-    overwrite: bool,
-) -> ClosedLoopRun:
-    from .link.plan import Plan
-    from .link.play import Played, Stopped, play
-
-    def made(played: Played) -> ClosedLoopRun:
-        return run_of_drive(played.columns, drive, controller, r, name)
-
-    plan = Plan("controller", r, controller)
-    try:
-        return made(play(drive, plan, name=name, file=file, live=live, overwrite=overwrite))
-    except Stopped as stopped:
-        raise stopped.as_error(made) from stopped.cause
-
-
-def run_of_drive(
-    columns: Mapping[str, FloatArray],
-    drive: Drive,
-    controller: Controller,
-    r: FloatArray,
-    name: str,
-) -> ClosedLoopRun:
-    """The run as the drive told it; what it did not stream is known all the same, or is NaN."""
-    identity = drive.identity
-    counts = columns["counts"]
-    speed = columns.get("speed_true")
-    n = len(counts)
-    if speed is None:
-        speed = speed_or_nan(counts, identity.Ts, identity.counts_per_rev, "kalman")
-    return ClosedLoopRun(
-        t=np.arange(n, dtype=np.float64) * identity.Ts,
-        r=r[:n],
-        u=columns["u"],
-        y=speed,
-        feedback=columns.get("feedback", np.full(n, np.nan)),
-        controller=controller,
-        plant=identity.name,
-        reference=name,
-    )
 
 
 def reference_samples(

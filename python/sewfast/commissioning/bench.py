@@ -14,14 +14,15 @@ import numpy as np
 from ..control import Controller
 from ..dataset import FloatArray
 from ..errors import LinkError, SettingError
-from ..loop import ClosedLoopRun, run, run_of_drive
+from ..link.plan import Plan
+from ..link.play import Stopped, conditions_of, device_of, play, run_of_drive
+from ..loop import ClosedLoopRun, run
 from ..machine import VirtualMachine
 from ..recording import Recording, record, recording_of_drive
 from ..speed import speed_from_counts
 
 if TYPE_CHECKING:
     from ..link import Drive
-    from ..link.plan import Plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,14 +223,10 @@ class DriveBench:
         return self.drive.limits().values[1]
 
     def excite(self, u: FloatArray, name: str) -> Recording:
-        from ..link.plan import Plan
-
         columns = self._whole(Plan("commands", u), name)
         return recording_of_drive(columns, self.drive, name, "kalman")
 
     def follow(self, controller: Controller, r: FloatArray, name: str) -> Followed:
-        from ..link.plan import Plan
-
         columns = self._whole(Plan("controller", r, controller), name)
         return Followed(
             run_of_drive(columns, self.drive, controller, r, name),
@@ -242,8 +239,6 @@ class DriveBench:
         What the link has lost of a run that ended well is no danger to the machine: the run is
         made once more, from rest as every run.
         """
-        from ..link.play import Stopped, play
-
         for _ in range(2):
             try:
                 played = play(self.drive, plan, name=name)
@@ -312,8 +307,6 @@ def key_of(signal: FloatArray, controller: Controller | None = None) -> str:
 def told_of(bench: Bench) -> tuple[dict[str, Any], dict[str, Any]]:
     """Device and conditions, as recordings state them."""
     if isinstance(bench, DriveBench):
-        from ..link.play import conditions_of, device_of
-
         return device_of(bench.drive), conditions_of(bench.drive)
     kind = "virtual" if isinstance(bench, MachineBench) else "bench"
     return {"kind": kind, "name": bench.name}, {}

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import math
+import os
 import threading
 import time
 from contextlib import AbstractContextManager, suppress
 from types import TracebackType
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..control import Controller
 from ..errors import LinkError, SettingError
 from ..gains import real
+from ..live import Kind as View
+from ..loop import ClosedLoopRun
+from . import play, terms, wire
 from . import run as profiles
-from . import terms, wire
 from .clock import ClockBounds
 from .connection import Connection, DeviceReset, Loan
 from .plan import Layout, Outcome, Plan, Sink, layout, require_capable
@@ -271,6 +277,42 @@ class Drive(Unique):
         """
         with self._link.owned():
             return self._stream(plan, sink, cancel)
+
+    def follow(
+        self,
+        controller: Controller,
+        r: NDArray[np.float64],
+        *,
+        name: str = "reference",
+        file: str | os.PathLike[str] | None = None,
+        live: str | View = "none",
+        overwrite: bool = False,
+    ) -> ClosedLoopRun:
+        """Run a controller on the device along a reference; `sewfast.run` with a drive does this.
+
+        Parameters
+        ----------
+        controller : Controller
+        r : array, shape (N,)
+            Reference at the device's sample time [y].
+        name : str
+            Of the reference, in messages and reports.
+        file, live, overwrite
+            As for `sewfast.run`.
+
+        Returns
+        -------
+        ClosedLoopRun
+            `y` is the speed estimated from the counts, or the true speed of a virtual drive.
+
+        Raises
+        ------
+        SettingError, LinkError, Interrupted
+            As for `sewfast.run`.
+        """
+        return play.follow(
+            self, controller, r, name=name, file=file, live=live, overwrite=overwrite
+        )
 
     def _stream(self, plan: Plan, sink: Sink, cancel: threading.Event | None) -> Outcome:
         run = self._prepare(plan, sink)

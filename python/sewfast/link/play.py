@@ -7,17 +7,22 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..control import Controller
 from ..errors import Interrupted, LinkError, SettingError, SewfastError
 from ..live import Feed, Kind, open_view
+from ..loop import ClosedLoopRun
 from ..recordfile import Header, RecordWriter, read_recording
 from ..recordfile.writer import require_ending, require_replaceable
-from .drive import Drive
+from ..speed import speed_or_nan
 from .plan import Outcome, Plan
+
+if TYPE_CHECKING:
+    from .drive import Drive
 
 # --- Recorder: a run's samples to memory, a file and a live view, none of which hold it up --------
 
@@ -231,6 +236,54 @@ def play(
     if played.outcome.reason != "finished":
         raise Stopped(played, LinkError(_not_finished(played.outcome, n, drive)))
     return played
+
+
+def follow(
+    drive: Drive,
+    controller: Controller,
+    r: FloatArray,
+    *,
+    name: str,
+    file: str | os.PathLike[str] | None = None,
+    live: str | Kind = "none",
+    overwrite: bool = False,
+) -> ClosedLoopRun:
+    """A controller on a drive along a reference; see `Drive.follow`."""
+
+    def made(played: Played) -> ClosedLoopRun:
+        return run_of_drive(played.columns, drive, controller, r, name)
+
+    plan = Plan("controller", r, controller)
+    try:
+        return made(play(drive, plan, name=name, file=file, live=live, overwrite=overwrite))
+    except Stopped as stopped:
+        raise stopped.as_error(made) from stopped.cause
+
+
+def run_of_drive(
+    columns: Mapping[str, FloatArray],
+    drive: Drive,
+    controller: Controller,
+    r: FloatArray,
+    name: str,
+) -> ClosedLoopRun:
+    """The run as the drive streamed it; what it left out is computed, or is NaN."""
+    identity = drive.identity
+    counts = columns["counts"]
+    speed = columns.get("speed_true")
+    n = len(counts)
+    if speed is None:
+        speed = speed_or_nan(counts, identity.Ts, identity.counts_per_rev, "kalman")
+    return ClosedLoopRun(
+        t=np.arange(n, dtype=np.float64) * identity.Ts,
+        r=r[:n],
+        u=columns["u"],
+        y=speed,
+        feedback=columns.get("feedback", np.full(n, np.nan)),
+        controller=controller,
+        plant=identity.name,
+        reference=name,
+    )
 
 
 def _counts_per_rev(drive: Drive) -> float | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -22,13 +22,15 @@ from .judgement import JudgedRun, Judgement
 from .limits import Limits
 from .oscillation import oscillation
 
-if TYPE_CHECKING:
-    from ..commissioning import Commissioning
-    from ..tuning import TuningResult
 
-    Judgeable: TypeAlias = (
-        ClosedLoopRun | Sequence[ClosedLoopRun] | Controller | TuningResult | Commissioning
-    )
+class HasController(Protocol):
+    """What came with a controller, as from `tune` or `commission`."""
+
+    @property
+    def controller(self) -> Controller | None: ...
+
+
+Judgeable: TypeAlias = ClosedLoopRun | Sequence[ClosedLoopRun] | Controller | HasController
 
 REFERENCES = ("trapezoid", "random")
 
