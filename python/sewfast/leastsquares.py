@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import _core
+from .arrays import FloatArray
 from .errors import DataError, Interrupted, SettingError
 
-FloatArray: TypeAlias = NDArray[np.float64]
 Differences: TypeAlias = Literal["2-point", "3-point", "cs"]
 
 #: Relative steps: rounding and truncation in balance; complex steps cancel nothing.

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from . import _core, signals
+from .arrays import FloatArray
 from .control import Controller, vector
 from .drive_defaults import default_references, drive_references, pace_of
 from .errors import DataError, SettingError
@@ -21,7 +22,6 @@ from .models import Ensemble, Model
 if TYPE_CHECKING:
     from .live import Kind
 
-FloatArray: TypeAlias = NDArray[np.float64]
 Plant: TypeAlias = Model | VirtualMachine
 
 SMOOTHING = 0.005

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from .arrays import FloatArray
 from .dataset import Dataset
 from .errors import DataError, SettingError
 from .machine import VirtualMachine
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from .link.drive import Drive
     from .live import Kind
 
-FloatArray = NDArray[np.float64]
 
 UNITS: Mapping[str, str] = {"t": "s", "u": "V", "y": "RPM", "speed_true": "RPM"}
 """Of the columns; counts are pure numbers."""

@@ -6,15 +6,13 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import _core
+from .arrays import FloatArray
 from .errors import SettingError
-
-FloatArray: TypeAlias = NDArray[np.float64]
 
 #: Sample time of every named signal [s].
 TS = 0.001

@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from . import _core
+from .arrays import FloatArray, runs
 from .errors import DataError, SettingError
-from .runs import runs
 from .units import counts_per_unit
 
-FloatArray: TypeAlias = NDArray[np.float64]
 Method: TypeAlias = Literal["difference", "savgol", "kalman"]
 
 #: Whole numbers above this are not exact in double precision.

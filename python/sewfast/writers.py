@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .dataset import labelled
+from .arrays import labelled
 from .errors import DataError, SettingError
 from .storage import replace_file
 

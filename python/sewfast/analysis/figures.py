@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..arrays import lettered
 from ..dataset import FloatArray
-from ..dataset.arrays import lettered
 from ..evidence.figures import shade
 from ..plotting import Float, panels, require_matplotlib, style, thin
 from .points import LoopBode

@@ -1,6 +1,6 @@
 """Data sets: experiments, their parts, what they must fulfil."""
 
-from .arrays import FloatArray, HasUnits, labelled, require_same_units
+from ..arrays import FloatArray, HasUnits, labelled, require_same_units
 from .dataset import Dataset
 from .diagnosis import Diagnosis, Finding, diagnose, is_reference
 from .experiment import Experiment

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import labelled, range_of, texts
 from ..errors import DataError, SettingError
 from . import gaps, outliers, pieces, rates, summary, trends
-from .arrays import labelled, range_of, texts
 from .experiment import Experiment
 from .weights import require_some_weight
 

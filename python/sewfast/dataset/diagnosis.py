@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runs import runs
-from .arrays import FloatArray, labelled
+from ..arrays import FloatArray, labelled, runs
 from .feedback import Integration, feedback, integration
 from .noise import MAD, quantum
 from .pieces import LARGEST, require_dataset

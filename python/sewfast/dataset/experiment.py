@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import FloatArray, as_column, as_inputs
 from ..errors import DataError
-from .arrays import FloatArray, as_column, as_inputs
 from .weights import as_weights
 
 if TYPE_CHECKING:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..runs import runs
-from .arrays import FloatArray
+from ..arrays import FloatArray, runs
 from .pieces import LARGEST
 
 if TYPE_CHECKING:

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import FloatArray, frozen, runs
 from ..errors import DataError, SettingError
-from ..runs import runs
-from .arrays import FloatArray, frozen
 from .pieces import range_of_text
 
 if TYPE_CHECKING:

@@ -7,8 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ..runs import runs
-from .arrays import FloatArray
+from ..arrays import FloatArray, runs
 
 # --- What one column says of its sensor: white noise, quantum, limits -----------------------------
 

@@ -5,19 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Protocol, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import FloatArray
 from ..errors import DataError, SettingError
-from .arrays import FloatArray
 from .noise import MAD, quantum, white_noise
 from .pieces import require_sane
 
 if TYPE_CHECKING:
-    from ..models import Model
     from .dataset import Dataset
+
+
+class Simulates(Protocol):
+    """A model, as far as outliers need one: its free run on a data set."""
+
+    @property
+    def input_names(self) -> tuple[str, ...]: ...
+
+    def simulate(self, data: Dataset) -> list[FloatArray]: ...
+
 
 BoolArray = NDArray[np.bool_]
 
@@ -82,7 +91,11 @@ class Outliers(Sequence[BoolArray]):
 
 
 def mark_outliers(
-    data: Dataset, *, threshold: float | None = None, window: int = 7, model: Model | None = None
+    data: Dataset,
+    *,
+    threshold: float | None = None,
+    window: int = 7,
+    model: Simulates | None = None,
 ) -> Outliers:
     """Marks of outputs that stand out of their neighbours; nothing is changed.
 
@@ -138,7 +151,7 @@ def usual_threshold(data: Dataset) -> float:
     return THRESHOLD + 0.75 * max(0.0, math.log10(len(data) / 20_000))
 
 
-def _series(data: Dataset, model: Model | None) -> list[FloatArray]:
+def _series(data: Dataset, model: Simulates | None) -> list[FloatArray]:
     if model is None:
         return [e.y for e in data.experiments]
     if data.n_inputs != len(model.input_names):

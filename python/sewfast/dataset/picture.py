@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..arrays import FloatArray, labelled, lettered, runs
 from ..errors import SettingError
-from ..runs import runs
-from .arrays import FloatArray, labelled, lettered
 from .noise import band, power_spectrum
 from .outliers import distances, usual_threshold
 from .pieces import LARGEST

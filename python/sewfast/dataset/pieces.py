@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import FloatArray, range_of, require_same_units, runs
 from ..errors import DataError, SettingError
-from ..runs import runs
-from .arrays import FloatArray, range_of, require_same_units
 
 if TYPE_CHECKING:
     from .dataset import Dataset

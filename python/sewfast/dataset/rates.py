@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import _core
+from ..arrays import FloatArray, frozen, runs
 from ..errors import DataError, SettingError
-from ..runs import runs
-from .arrays import FloatArray, frozen
 from .gaps import interpolated
 from .noise import quantum, white_noise
 from .pieces import require_sane

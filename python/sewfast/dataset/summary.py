@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ..runs import runs
+from ..arrays import FloatArray, labelled, runs
 from .advice import advice
-from .arrays import FloatArray, labelled
 from .diagnosis import Diagnosis, diagnose
 from .noise import band, power_spectrum, quantum, share_at_limits, top, white_noise
 from .outliers import distances, usual_threshold

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import FloatArray, frozen
 from ..errors import DataError, SettingError
-from .arrays import FloatArray, frozen
 from .pieces import require_sane
 
 if TYPE_CHECKING:

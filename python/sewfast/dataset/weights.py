@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import FloatArray, as_float, frozen
 from ..errors import DataError
-from .arrays import FloatArray, as_float, frozen
 
 if TYPE_CHECKING:
     from .dataset import Dataset

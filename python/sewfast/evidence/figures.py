@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..arrays import lettered
 from ..dataset import FloatArray, labelled
-from ..dataset.arrays import lettered
 from ..errors import SettingError
 from .card import ReportCard
 

@@ -8,12 +8,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import _core, signals
+from ..arrays import FloatArray
 from ..control import Controller
 from ..errors import DataError, Interrupted, LinkError, SettingError
 from ..loop import SMOOTHING, reference_samples, require_controller
@@ -29,9 +30,6 @@ from .plan import Layout, Plan
 from .wire import Identity, refusal
 
 # --- HostLoopRun: what a controller on the host did -----------------------------------------------
-
-
-FloatArray: TypeAlias = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

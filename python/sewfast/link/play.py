@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import FloatArray
 from ..control import Controller
 from ..errors import Interrupted, LinkError, SettingError, SewfastError
 from ..live import Feed, Kind, open_view
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 # --- Recorder: a run's samples to memory, a file and a live view, none of which hold it up --------
 
-
-FloatArray = NDArray[np.float64]
 
 _OF_A_RUN = ("started", "gap")
 """Events that say that the device has accepted a start."""

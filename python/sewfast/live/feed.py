@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import FloatArray
 from ..errors import DataError, SettingError
 from ..units import counts_per_unit
 
@@ -77,9 +78,6 @@ def _nameless() -> int:
 
 
 # --- Speed from the change of counts over a window: what a view can know while a record runs ------
-
-
-FloatArray = NDArray[np.float64]
 
 
 def speed_over_window(counts: FloatArray, lag: int, Ts: float, counts_per_rev: float) -> FloatArray:

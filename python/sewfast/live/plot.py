@@ -10,6 +10,8 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import FloatArray
+
 # --- Axis: a range that ends on round numbers, with its ticks and their labels --------------------
 
 
@@ -83,7 +85,6 @@ def round_step(least: float) -> float:
 # --- Curves as characters: spans of dots per column, drawn in braille or as one mark per cell -----
 
 
-FloatArray = NDArray[np.float64]
 Codes = NDArray[np.uint32]
 
 _DOTS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], dtype=np.uint32)

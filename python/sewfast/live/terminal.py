@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .feed import SPEED, Feed
 from .plot import GUTTER, Axis, Palette, Panel, time_axis
@@ -109,8 +108,6 @@ def palette(term: str | None, encoding: str | None, no_color: str | None) -> Pal
 
 # --- Frame: one picture of a feed as lines of text that fit a terminal ----------------------------
 
-
-FloatArray = NDArray[np.float64]
 
 _NARROW, _LOW = 40, 12
 """Below this many columns or lines there is room for the status alone."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from ..dataset import FloatArray
+from ..arrays import FloatArray
 from ..errors import DataError
 
 # --- The four kinds of message in a recording: channel numbers, topics, JSON schemas --------------

@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..dataset import FloatArray, labelled
+from ..arrays import FloatArray, labelled, runs
 from ..errors import DataError, printable
-from ..runs import runs
 from .format import (
     CHANNEL,
     CHUNK,

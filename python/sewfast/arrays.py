@@ -1,19 +1,15 @@
-"""Columns as they are kept: read-only float64, with names and units."""
+"""Columns of numbers as the package keeps them, their names and units, runs of True in a mask."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import DataError
-
-if TYPE_CHECKING:
-    from .dataset import Dataset
-
+from .errors import DataError
 
 # --- Names and units of columns -------------------------------------------------------------------
 
@@ -27,7 +23,14 @@ class HasUnits(Protocol):
     def output_unit(self) -> str: ...
 
 
-def require_same_units(one: HasUnits, other: Dataset) -> None:
+class HasSource(HasUnits, Protocol):
+    """A data set, which knows where it came from."""
+
+    @property
+    def source(self) -> str: ...
+
+
+def require_same_units(one: HasUnits, other: HasSource) -> None:
     """Raise `DataError` where a unit is known on both sides and differs."""
     mine = (*one.input_units, one.output_unit)
     for unit, received in zip(mine, (*other.input_units, other.output_unit), strict=True):
@@ -113,3 +116,18 @@ def texts(value: str | Sequence[str] | None, default: tuple[str, ...]) -> tuple[
     if value is None:
         return default
     return (value,) if isinstance(value, str) else tuple(value)
+
+
+# --- Runs of one value in a column: gaps, and the pieces between them -----------------------------
+
+
+def runs(mask: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
+    """First index and length of each run of True in a mask of shape (N,).
+
+    Examples
+    --------
+    >>> runs(np.array([True, True, False, True]))
+    ((0, 2), (3, 1))
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
+    return tuple((int(a), int(b - a)) for a, b in edges.reshape(-1, 2))
