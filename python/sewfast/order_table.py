@@ -14,9 +14,9 @@ from . import _core
 from .dataset import Dataset, FloatArray, labelled, require_dataset
 from .dataset.weights import in_effect
 from .delays import LONGEST, DelayEstimate, delay
+from .dynamic_model import INIT
 from .errors import DataError, FitError, SettingError
 from .lipschitz import lipschitz_index
-from .models.base import INIT
 from .regression import LaggedRegression, Solution
 
 Progress: TypeAlias = Callable[[int, int, float], object]

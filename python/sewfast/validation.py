@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from .dataset import Dataset, Experiment, FloatArray, require_dataset
 from .dataset.noise import white_noise
 from .dataset.weights import in_effect, without_weightless
+from .dynamic_model import INIT, DynamicModel, require_init
 from .errors import DataError
-from .models.base import INIT, Model, require_init
 
 GOOD, FAIR, POOR = 90.0, 70.0, 30.0
 """Percent of the free run's fit from which a model is good, fair, poor; below it is useless."""
@@ -277,7 +277,7 @@ def _beside_a_constant(scores: Scores) -> str:
 
 
 def validate(
-    model: Model, data: Dataset, *, init: int = INIT, against: str | None = None
+    model: DynamicModel, data: Dataset, *, init: int = INIT, against: str | None = None
 ) -> Validation:
     """Score a model on data that it was not trained on.
 
@@ -372,7 +372,7 @@ def _target(experiment: Experiment, against: str | None, first: int) -> FloatArr
     return target
 
 
-def _beyond_training(model: Model, data: Dataset) -> list[str]:
+def _beyond_training(model: DynamicModel, data: Dataset) -> list[str]:
     """Inputs that leave the range that the model has seen by more than a hundredth of it."""
     notes = []
     known = model.training.get("input_range", [])

@@ -123,7 +123,7 @@ def _settle_plant(args: argparse.Namespace) -> None:
     """
     from .. import storage
     from ..control import FORMAT
-    from ..models.base import FORMAT as MODEL
+    from ..dynamic_model import FORMAT as MODEL
 
     if (args.on is None) == (args.plant is None):
         received = "neither" if args.on is None else "both"

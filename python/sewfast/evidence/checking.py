@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ..dataset import Dataset, require_dataset
 from ..dataset.weights import in_effect
+from ..dynamic_model import INIT, DynamicModel
 from ..errors import FitError, SewfastError
-from ..models.base import INIT, Model
 from ..validation import Scores, noise_of
 from . import questions
 from .card import Line, ReportCard
@@ -31,10 +31,11 @@ from .simulation_bands import (
 )
 
 _FORGOTTEN = 0.05
+_M = TypeVar("_M", bound=DynamicModel)
 
 
 def check(
-    model: Model,
+    model: DynamicModel,
     data: Dataset,
     *,
     training: Dataset | None = None,
@@ -113,14 +114,14 @@ def check(
     )  # fmt: skip
 
 
-def is_training_data(model: Model, data: Dataset) -> bool:
+def is_training_data(model: DynamicModel, data: Dataset) -> bool:
     """Whether names, ranges and lengths are those that the model was identified from."""
     known = model.training.get("data")
     mine = [{"name": e.name, "range": e.range_text, "samples": len(e)} for e in data.experiments]
     return known == mine
 
 
-def memory(model: Model, data: Dataset, init: int = INIT) -> int:
+def memory(model: DynamicModel, data: Dataset, init: int = INIT) -> int:
     """Samples after which a model has forgotten all but a twentieth of its initial state."""
     single = representative(model)
     e = max(data.experiments, key=len)
@@ -136,12 +137,12 @@ def memory(model: Model, data: Dataset, init: int = INIT) -> int:
     return int(kept[-1]) + 1 if len(kept) else LAGS
 
 
-def remembered(model: Model, data: Dataset) -> Model:
+def remembered(model: _M, data: Dataset) -> _M:
     """The model with what `training_evidence` finds in its `training`."""
     return replace(model, training={**model.training, **training_evidence(model, data)})
 
 
-def training_evidence(model: Model, data: Dataset) -> dict[str, Any]:
+def training_evidence(model: DynamicModel, data: Dataset) -> dict[str, Any]:
     """What a model should store: `region`, `uncertainty`, `information`, JSON values.
 
     Parameters
@@ -179,14 +180,14 @@ def _named(data: Dataset) -> str:
     return ", ".join(f"{e.name} [{e.range_text}]" for e in data.experiments)
 
 
-def _training_scores(model: Model, training: Dataset, init: int) -> Scores:
+def _training_scores(model: DynamicModel, training: Dataset, init: int) -> Scores:
     return horizon_scores(
         model, training, Residuals.of(model, training, init, "free run"), ()
     ).pooled["free run"]
 
 
 def _parameters(
-    model: Model, data: Dataset, training: Dataset | None, on_training: bool, init: int
+    model: DynamicModel, data: Dataset, training: Dataset | None, on_training: bool, init: int
 ) -> tuple[Parameters | None, Criteria | None, list[Line]]:
     """Parameters and criteria from the training data if at hand, else what is stored."""
     source = training if training is not None else data if on_training else None
@@ -207,7 +208,7 @@ def _parameters(
 
 
 def _bands(
-    model: Model,
+    model: DynamicModel,
     data: Dataset,
     free: Residuals,
     training: Dataset | None,
@@ -220,7 +221,7 @@ def _bands(
     return bands_of(model, data, free, known, level, place)
 
 
-def _operating(model: Model) -> OperatingRange | None:
+def _operating(model: DynamicModel) -> OperatingRange | None:
     if not model.training.get("input_range"):
         return None
     return operating_range(model)

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..dataset import FloatArray
+from ..dynamic_model import DynamicModel
 from ..errors import DataError, SettingError, SewfastError
-from ..models.base import Model
 from .region import TrainingRegion, stored_region
 from .residuals import representative
 
@@ -401,7 +401,7 @@ class OperatingRange:
 
 
 def operating_range(
-    model: Model, inputs: Sequence[FloatArray] | None = None, points: int = POINTS
+    model: DynamicModel, inputs: Sequence[FloatArray] | None = None, points: int = POINTS
 ) -> OperatingRange:
     """Linearise a model over the range of its training inputs.
 
@@ -431,7 +431,7 @@ def operating_range(
     )  # fmt: skip
 
 
-def _input_range(model: Model, first: Model) -> FloatArray:
+def _input_range(model: DynamicModel, first: DynamicModel) -> FloatArray:
     """Of the training inputs, (nu, 2): an ensemble stores it itself, or its members do."""
     ranges = model.training.get("input_range") or first.training.get("input_range")
     if not ranges:
@@ -444,7 +444,7 @@ def _input_range(model: Model, first: Model) -> FloatArray:
 
 
 def _grid(
-    model: Model, limits: FloatArray, points: int, region: TrainingRegion | None
+    model: DynamicModel, limits: FloatArray, points: int, region: TrainingRegion | None
 ) -> tuple[list[FloatArray], tuple[int, ...]]:
     grid: list[FloatArray] = []
     for i in range(len(limits)):
@@ -453,7 +453,7 @@ def _grid(
 
 
 def _closed_in(
-    model: Model, limits: FloatArray, i: int, points: int, region: TrainingRegion | None
+    model: DynamicModel, limits: FloatArray, i: int, points: int, region: TrainingRegion | None
 ) -> list[FloatArray]:
     """Values of input i over what the data came near: a pulse's height was never held for long."""
     low, high = limits[i]
@@ -474,7 +474,9 @@ def _line(limits: FloatArray, i: int, low: float, high: float, points: int) -> l
     return list(grid)
 
 
-def _given(model: Model, inputs: Sequence[FloatArray]) -> tuple[list[FloatArray], tuple[int, ...]]:
+def _given(
+    model: DynamicModel, inputs: Sequence[FloatArray]
+) -> tuple[list[FloatArray], tuple[int, ...]]:
     grid = [np.atleast_1d(np.asarray(u, dtype=np.float64)) for u in inputs]
     for u in grid:
         if u.shape != (len(model.input_names),) or not np.isfinite(u).all():
@@ -486,7 +488,7 @@ def _given(model: Model, inputs: Sequence[FloatArray]) -> tuple[list[FloatArray]
 
 
 def _points(
-    model: Model, grid: Sequence[FloatArray], region: TrainingRegion | None
+    model: DynamicModel, grid: Sequence[FloatArray], region: TrainingRegion | None
 ) -> list[OperatingPoint]:
     found, state = [], None
     for u in grid:
@@ -497,7 +499,7 @@ def _points(
 
 
 def _point(
-    model: Model, u: FloatArray, small: Linearised, region: TrainingRegion | None
+    model: DynamicModel, u: FloatArray, small: Linearised, region: TrainingRegion | None
 ) -> OperatingPoint:
     known = region is None or region.holds(u, small.y)
     return OperatingPoint(
@@ -506,7 +508,7 @@ def _point(
     )  # fmt: skip
 
 
-def point_at_level(model: Model, u: FloatArray, level: float) -> OperatingPoint:
+def point_at_level(model: DynamicModel, u: FloatArray, level: float) -> OperatingPoint:
     """The point of an integrator at an input at which it keeps its output, at that output."""
     small = linearise(model.core, u, level=level)
     reached = abs(small.y - level) <= 1e-6 * max(abs(level), 1.0)

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from ..dataset import FloatArray
-from ..models.base import Model
+from ..dynamic_model import DynamicModel
 from .noise import Noise
 from .residuals import Residuals, representative
 
@@ -122,7 +122,7 @@ class Information:
     penalty: FloatArray
 
     @classmethod
-    def of(cls, model: Model, residuals: Residuals) -> Information:
+    def of(cls, model: DynamicModel, residuals: Residuals) -> Information:
         gram = np.sum([r.sensitivity.T @ r.sensitivity for r in residuals.runs], axis=0)
         return cls(gram, penalty(model, residuals))
 
@@ -184,7 +184,7 @@ class Knowledge:
         return {k: v if np.isfinite(v) else None for k, v in asdict(self).items()}
 
     @classmethod
-    def stored(cls, model: Model) -> Knowledge | None:
+    def stored(cls, model: DynamicModel) -> Knowledge | None:
         """What the model stores; None where there is nothing that can be read."""
         values = model.training.get("information")
         if not isinstance(values, Mapping):
@@ -205,7 +205,7 @@ class Knowledge:
             return None
 
 
-def estimate(model: Model, residuals: Residuals) -> Parameters | None:
+def estimate(model: DynamicModel, residuals: Residuals) -> Parameters | None:
     """What the data say of a model's parameters; None for an ensemble, which has no one set."""
     if residuals.width == 0 or model.members:
         return None
@@ -219,7 +219,7 @@ def estimate(model: Model, residuals: Residuals) -> Parameters | None:
     return Parameters(values, covariance, effective, condition, lost, names)
 
 
-def penalty(model: Model, residuals: Residuals) -> FloatArray:
+def penalty(model: DynamicModel, residuals: Residuals) -> FloatArray:
     """The weight decay as a diagonal beside Psi'Psi, in the data's units; zero where there is none.
 
     The training cost is 1/(2N) sum (e/y_scale)^2 + decay/2 |w|^2 (docs/CONVENTIONS.md).
@@ -236,7 +236,7 @@ def penalty(model: Model, residuals: Residuals) -> FloatArray:
     return weights
 
 
-def _network_decay(model: Model) -> tuple[FloatArray, float]:
+def _network_decay(model: DynamicModel) -> tuple[FloatArray, float]:
     s = model.core.settings
     regressors = s["na"] + s["nb"] * s["n_inputs"]
     hidden = s["hidden"]
@@ -245,7 +245,7 @@ def _network_decay(model: Model) -> tuple[FloatArray, float]:
     return np.concatenate([*parts, np.zeros(rest)]), float(s["y_scale"])
 
 
-def _state_space_decay(model: Model) -> tuple[FloatArray, float]:
+def _state_space_decay(model: DynamicModel) -> tuple[FloatArray, float]:
     s = model.core.settings
     nx, nu, ny, hidden = s["nx"], s["n_inputs"], s["n_outputs"], s["hidden"]
     parts = [(nx * (nx + nu), 0.0), (nx * hidden, 1.0), (hidden * (nx + nu), 1.0), (hidden, 0.1)]
@@ -266,7 +266,7 @@ def _meat(residuals: Residuals, noise: Noise) -> FloatArray:
     return total
 
 
-def _values(model: Model, residuals: Residuals) -> tuple[FloatArray, tuple[str, ...]]:
+def _values(model: DynamicModel, residuals: Residuals) -> tuple[FloatArray, tuple[str, ...]]:
     values, names = model.theta, model.parameter_names
     if residuals.horizon == "one step":
         # regressors are past outputs themselves, a_i their negative factors

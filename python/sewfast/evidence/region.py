@@ -34,7 +34,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..dataset import Dataset, FloatArray
-from ..models.base import INIT, Model
+from ..dynamic_model import INIT, DynamicModel
 
 Signals: TypeAlias = tuple[FloatArray, FloatArray]
 """Inputs (N, nu) and output (N,) of one run."""
@@ -253,12 +253,12 @@ class TrainingRegion:
         return cls(inner, centre, level, peak, max(lag, 1), max(window, 1))
 
 
-def training_region(model: Model, data: Dataset) -> dict[str, Any]:
+def training_region(model: DynamicModel, data: Dataset) -> dict[str, Any]:
     """The region that a model passes through on its training data, for its `training["region"]`."""
     return TrainingRegion.of(_runs(model, data, INIT)).to_json()
 
 
-def stored_region(model: Model) -> TrainingRegion | None:
+def stored_region(model: DynamicModel) -> TrainingRegion | None:
     """The region stored with the model; None where there is none that can be read."""
     values = model.training.get("region")
     if not isinstance(values, Mapping):
@@ -291,7 +291,7 @@ class Place:
 
 
 def placed(
-    model: Model, data: Dataset, training: Dataset | None = None, init: int = INIT
+    model: DynamicModel, data: Dataset, training: Dataset | None = None, init: int = INIT
 ) -> Place | None:
     """In the region stored with the model, or that of the training data where they are given.
 
@@ -304,7 +304,7 @@ def placed(
     return None if known is None else Place(known, _runs(model, data, init))
 
 
-def _runs(model: Model, data: Dataset, init: int) -> list[Signals]:
+def _runs(model: DynamicModel, data: Dataset, init: int) -> list[Signals]:
     simulated = model.simulate(data, init=init)
     return [(e.u, yhat) for e, yhat in zip(data.experiments, simulated, strict=True)]
 

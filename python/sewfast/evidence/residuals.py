@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..dataset import Dataset, Experiment, FloatArray, require_dataset
+from ..dynamic_model import INIT, DynamicModel, FreeRunJacobian, require_init
 from ..errors import DataError, FitError
-from ..models.base import INIT, FreeRunJacobian, Model, require_init
 from .noise import Noise
 
 Horizon: TypeAlias = Literal["free run", "one step"]
@@ -88,7 +88,7 @@ class Residuals:
 
     @classmethod
     def of(
-        cls, model: Model, data: Dataset, init: int = INIT, horizon: Horizon | None = None
+        cls, model: DynamicModel, data: Dataset, init: int = INIT, horizon: Horizon | None = None
     ) -> Residuals:
         """Residuals of a model, at the horizon that it was made for unless told otherwise.
 
@@ -159,12 +159,12 @@ class Residuals:
         return Noise.fit([(v, r.counts) for v, r in zip(series, self.runs, strict=True)], spent)
 
 
-def representative(model: Model) -> Model:
+def representative(model: DynamicModel) -> DynamicModel:
     """The model itself, or an ensemble's first member: the one that did best in training."""
     return model.members[0] if model.members else model
 
 
-def _free_runs(model: Model, data: Dataset, init: int) -> list[Run]:
+def _free_runs(model: DynamicModel, data: Dataset, init: int) -> list[Run]:
     simulated = model.simulate(data, init=init)
     slopes = _sensitivities(model, data, init, simulated)
     return [
@@ -174,7 +174,7 @@ def _free_runs(model: Model, data: Dataset, init: int) -> list[Run]:
 
 
 def _sensitivities(
-    model: Model, data: Dataset, init: int, simulated: Sequence[FloatArray]
+    model: DynamicModel, data: Dataset, init: int, simulated: Sequence[FloatArray]
 ) -> list[FreeRunJacobian]:
     """Of the model; of an ensemble, of the member whose free runs are nearest to its own."""
     nearest, least = model, np.inf
@@ -187,7 +187,7 @@ def _sensitivities(
     return nearest.jacobian(data, init=init)
 
 
-def _one_step_runs(model: Model, data: Dataset, init: int) -> list[Run]:
+def _one_step_runs(model: DynamicModel, data: Dataset, init: int) -> list[Run]:
     orders = model.orders
     lag = max(orders["na"], orders["nk"] + orders["nb"] - 1)
     predicted = model.predict(data, init=init)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..dataset import Dataset, FloatArray
-from ..models.base import Model
+from ..dynamic_model import DynamicModel
 from ..validation import Scores
 from .residuals import Residuals
 
@@ -49,7 +49,7 @@ class HorizonScores:
 
 
 def horizon_scores(
-    model: Model, data: Dataset, residuals: Residuals, steps: tuple[int, ...] = STEPS
+    model: DynamicModel, data: Dataset, residuals: Residuals, steps: tuple[int, ...] = STEPS
 ) -> HorizonScores:
     """Errors at every horizon; those of some steps ahead only where the outputs are complete.
 

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from ..dataset import Dataset, FloatArray
+from ..dynamic_model import INIT, DynamicModel
 from ..errors import FitError, SettingError
-from ..models.base import INIT, Model
 from .distributions import normal_quantile
 from .parameters import Information, Parameters, estimate
 from .region import Place, placed
@@ -138,7 +138,7 @@ class Bands:
 
 
 def bands(
-    model: Model,
+    model: DynamicModel,
     data: Dataset,
     level: float = LEVEL,
     *,
@@ -180,7 +180,7 @@ def bands(
 
 
 def bands_of(
-    model: Model,
+    model: DynamicModel,
     data: Dataset,
     residuals: Residuals,
     known: Uncertainty,
@@ -213,7 +213,7 @@ def bands_of(
     )
 
 
-def uncertainty(model: Model, data: Dataset, init: int = INIT) -> Uncertainty:
+def uncertainty(model: DynamicModel, data: Dataset, init: int = INIT) -> Uncertainty:
     """From the data that a model was identified from."""
     residuals = Residuals.of(model, data, init, "free run")
     found = None if model.members else estimate(model, residuals)
@@ -221,7 +221,7 @@ def uncertainty(model: Model, data: Dataset, init: int = INIT) -> Uncertainty:
 
 
 def uncertainty_of(
-    model: Model, data: Dataset, residuals: Residuals, found: Parameters | None
+    model: DynamicModel, data: Dataset, residuals: Residuals, found: Parameters | None
 ) -> Uncertainty:
     """From free runs on the training data, and what they say of the parameters."""
     factor = np.zeros((0, 0)) if found is None else _factor(found, residuals)
@@ -244,7 +244,7 @@ def uncertainty_of(
     )
 
 
-def stored_uncertainty(model: Model) -> Uncertainty | None:
+def stored_uncertainty(model: DynamicModel) -> Uncertainty | None:
     """What the model stores; None where there is nothing that can be read."""
     values = model.training.get("uncertainty")
     if not isinstance(values, Mapping):
@@ -269,7 +269,7 @@ def _factor(found: Parameters, residuals: Residuals) -> FloatArray:
     return factor
 
 
-def _left_out(model: Model, residuals: Residuals) -> list[FloatArray]:
+def _left_out(model: DynamicModel, residuals: Residuals) -> list[FloatArray]:
     """Residuals of every block with the parameters that the other blocks alone would give.
 
     To first order e_b + Psi_b (H - H_b + L)^-1 Psi_b' e_b.
@@ -304,7 +304,7 @@ def _bounded(change: FloatArray, e: FloatArray) -> FloatArray:
 
 
 def _spreads(
-    model: Model, data: Dataset, residuals: Residuals, known: Uncertainty
+    model: DynamicModel, data: Dataset, residuals: Residuals, known: Uncertainty
 ) -> list[FloatArray]:
     """s(k) of every experiment."""
     own = [np.full(len(r.y), known.spread) for r in residuals.runs]
@@ -321,7 +321,9 @@ def _spreads(
     ]
 
 
-def _member_runs(members: Sequence[Model], data: Dataset, init: int) -> list[list[FloatArray]]:
+def _member_runs(
+    members: Sequence[DynamicModel], data: Dataset, init: int
+) -> list[list[FloatArray]]:
     """Free runs of the members that stand the input, as those count in the ensemble's own."""
     found = []
     for member in members:

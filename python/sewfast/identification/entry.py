@@ -9,10 +9,10 @@ from typing import Literal, TypeAlias
 from ..dataset import Dataset, require_dataset
 from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
 from ..dataset.weights import in_effect
+from ..dynamic_model import INIT
 from ..errors import DataError, FitError, Interrupted, SettingError
 from ..evidence import remembered
 from ..models import Model
-from ..models.base import INIT
 from ..threads import Workers, available, require_workers
 from . import choice, further, lagged, linear
 from .effort import Clock, Progress

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..dataset import Dataset, Experiment, FloatArray
 from ..dataset.weights import mean_square, weights_of
+from ..dynamic_model import INIT, Core
 from ..errors import DataError, FitError
-from ..models.base import INIT, Core
 from .task import Provenance, sources
 
 SHARE = 0.2

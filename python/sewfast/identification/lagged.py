@@ -10,9 +10,9 @@ import numpy as np
 
 from .. import _core
 from ..dataset import Experiment
+from ..dynamic_model import INIT
 from ..errors import FitError, Interrupted
 from ..models import LinearOE, Model, NeuralOE
-from ..models.base import INIT
 from .folds import folds
 from .linear import linear_fit
 from .orders import is_misled, raised

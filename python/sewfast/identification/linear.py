@@ -9,9 +9,9 @@ import numpy as np
 
 from .. import _core
 from ..dataset.weights import mean_square, weights_of
+from ..dynamic_model import INIT
 from ..errors import Interrupted
 from ..models import ARX, IV, LinearOE, Model
-from ..models.base import INIT
 from .task import Provenance, Task, arrays, documented, fit_provenance, with_provenance, wrap
 
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from .. import _core
 from ..dataset import Dataset, FloatArray
+from ..dynamic_model import INIT
 from ..errors import FitError
-from ..models.base import INIT
 from .effort import Look
 from .task import Pairs
 

@@ -1,6 +1,7 @@
 """Identified models: linear ones and networks, with their files."""
 
-from .base import FreeRunJacobian, Model, NotLinearError
+from ..dynamic_model import FreeRunJacobian
+from .base import Model, NotLinearError
 from .ensemble import Ensemble
 from .files import load_model, model_schema
 from .linear import ARX, IV, LinearOE

@@ -9,8 +9,9 @@ from typing import Any, ClassVar, Literal, TypeAlias, cast
 import numpy as np
 
 from ..dataset import FloatArray
+from ..dynamic_model import Core, FreeRunJacobian
 from ..errors import FitError, SettingError
-from .base import Core, FreeRunJacobian, Model
+from .base import Model
 
 Combine: TypeAlias = Literal["median", "mean"]
 COMBINATIONS: tuple[Combine, ...] = ("median", "mean")

@@ -10,8 +10,9 @@ from importlib.resources import files
 from typing import Any, TypeAlias
 
 from .. import storage
+from ..dynamic_model import FORMAT, VERSION
 from ..errors import ModelFileError, SewfastError
-from .base import FORMAT, VERSION, Model
+from .base import Model
 from .ensemble import COMBINATIONS, MOST_MEMBERS, Ensemble
 from .fields import Fields
 from .linear import ARX, IV, LinearOE

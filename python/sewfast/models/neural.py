@@ -8,7 +8,8 @@ import numpy as np
 
 from .. import _core
 from ..dataset import Dataset, FloatArray
-from .base import INIT, Model
+from ..dynamic_model import INIT
+from .base import Model
 from .fields import Fields, entries
 
 # --- The network output-error model ---------------------------------------------------------------

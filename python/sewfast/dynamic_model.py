@@ -1,0 +1,515 @@
+"""`DynamicModel`: free run, prediction, derivatives and file of a model of any kind."""
+
+from __future__ import annotations
+
+import json
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple, Protocol, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from . import storage
+from .dataset import (
+    Dataset,
+    Experiment,
+    FloatArray,
+    labelled,
+    require_dataset,
+    require_same_units,
+)
+from .dataset.weights import without_weightless
+from .errors import DataError, SettingError, SewfastError
+
+FORMAT = "sewfast.model"
+VERSION = 1
+INIT = 20
+"""Samples that set the initial state, unless told otherwise."""
+_STEPS_SHOWN = 4
+
+
+class FreeRunJacobian(NamedTuple):
+    """A free run and its derivatives, all in the output's unit.
+
+    Attributes
+    ----------
+    y : array, shape (N,)
+        The free run.
+    theta : array, shape (N, p)
+        By the parameters, in the order of `Model.theta` and `DynamicModel.parameter_names`.
+    state : array, shape (N, s)
+        By the initial state, in the order of `Model.state_names`.
+    """
+
+    y: FloatArray
+    theta: FloatArray
+    state: FloatArray
+
+
+def require_init(init: int) -> None:
+    """A whole number of samples, or a `SettingError`."""
+    whole = isinstance(init, (int, np.integer)) and not isinstance(init, bool)
+    if not whole or init < 0:
+        raise SettingError(f"init: expected a whole number of 0 or more, received {init!r}")
+
+
+class Core(Protocol):
+    """What the compiled models share."""
+
+    def rest_state(self) -> FloatArray: ...
+    def simulate(self, u: FloatArray, state: FloatArray) -> FloatArray: ...
+    def predict(
+        self, u: FloatArray, y: FloatArray, state: FloatArray, horizon: int
+    ) -> FloatArray: ...
+    def estimate_initial_state(self, u: FloatArray, y: FloatArray) -> FloatArray: ...
+    def jacobian(self, u: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]: ...
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DynamicModel(ABC):
+    """A model of one plant that runs, in the units of the data it was identified from.
+
+    What validation and evidence need of a model; `sewfast.Model`, which builds on them, is what
+    users have.
+
+    Parameters
+    ----------
+    core : compiled model
+        Its arithmetic; takes part in `sewfast.loop` and `sewfast.tuning` as a plant.
+    Ts : float
+        Sample time [s].
+    input_names, input_units, output_name, output_unit
+        As in the data set.
+    counts : tuple (column, counts_per_rev) or None
+        Set where the output is a speed computed from encoder counts.
+    training : mapping
+        How it came about: data, settings, cost with its horizon, termination. JSON values only.
+    alternatives : tuple of Model
+        What `identify` would have chosen next, the best first; not written to the model's file.
+    """
+
+    core: Any
+    Ts: float
+    input_names: tuple[str, ...]
+    output_name: str
+    input_units: tuple[str, ...]
+    output_unit: str
+    counts: tuple[str, float] | None = None
+    training: Mapping[str, Any] = field(default_factory=dict)
+    alternatives: tuple[DynamicModel, ...] = ()
+
+    kind: ClassVar[str]
+    title: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def orders(self) -> dict[str, int]:
+        """`na`, `nb`, `nk` and whatever else sizes the model."""
+
+    @abstractmethod
+    def parameters(self) -> dict[str, Any]:
+        """Everything that the compiled model is made from, as JSON values."""
+
+    @abstractmethod
+    def describe(self) -> list[str]:
+        """Lines about the model itself, for `str`."""
+
+    @property
+    @abstractmethod
+    def theta(self) -> FloatArray:
+        """All parameters as one vector, shape (p,), in the order of docs/CONVENTIONS.md, Models.
+
+        Those of a network are in its scaled units.
+        """
+
+    @property
+    @abstractmethod
+    def parameter_names(self) -> tuple[str, ...]:
+        """One name for each entry of `theta`; indices count from 0, those of a_i and b_i from 1."""
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """One name for each entry of an initial state: past outputs, the newest first, or states.
+
+        Past outputs are in the output's unit, states of a state-space model in scaled units.
+        """
+        na = self.orders.get("na")
+        if na is not None:
+            return tuple(f"{self.output_name}(-{i + 1})" for i in range(na))
+        return tuple(f"x[{i}]" for i in range(self.orders["nx"]))
+
+    @property
+    def members(self) -> tuple[DynamicModel, ...]:
+        """The models that an ensemble consists of; a single model has none."""
+        return ()
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """Arguments for `read` that name this model's columns in another recording."""
+        column, per_rev = self.counts or (None, None)
+        return {
+            "inputs": self.input_names,
+            "output": self.output_name,
+            "counts": column,
+            "counts_per_rev": per_rev,
+        }
+
+    @overload
+    def simulate(self, data: Dataset, *, init: int = INIT) -> list[FloatArray]: ...
+    @overload
+    def simulate(
+        self, data: ArrayLike, *, initial_state: ArrayLike | None = None
+    ) -> FloatArray: ...
+
+    def simulate(
+        self,
+        data: Dataset | ArrayLike,
+        *,
+        init: int = INIT,
+        initial_state: ArrayLike | None = None,
+    ) -> list[FloatArray] | FloatArray:
+        """Free run: from the inputs and the initial state alone.
+
+        Parameters
+        ----------
+        data : Dataset or array, shape (N,) or (N, n_inputs)
+            Inputs are complete; outputs of a data set may be NaN, and are not looked at after the
+            initial ones. An array holds inputs alone, in the model's units and at its sample time.
+        init : int
+            The initial state is estimated from this many measured outputs, the first ones; 0 starts
+            from rest.
+        initial_state : array, shape (s,), optional
+            Of a run on an array; its entries are `state_names`. By default rest.
+
+        Returns
+        -------
+        list of array, shape (N,), or array, shape (N,)
+            In the output's unit, from the first sample on: one per experiment of a data set, of an
+            array the run itself.
+
+        Raises
+        ------
+        DataError
+            Where the data do not fit the model: inputs, sample time, shapes, values that are not
+            finite.
+        SettingError
+            For an initial state together with a data set, whose outputs set it.
+        FitError
+            Where the model is unstable on this input.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import sewfast
+        >>> model = sewfast.LinearOE.from_tf([0.0, 0.5], [1.0, -0.5], Ts=0.01)
+        >>> model.simulate(np.ones(4))
+        array([0.5  , 0.75 , 0.875, 0.9375])
+
+        Inputs before the first sample count as equal to it.
+        """
+        if not isinstance(data, Dataset):
+            return self._simulate_array(data, initial_state)
+        _require_no_state(initial_state)
+        self._require_match(data)
+        try:
+            return [self.core.simulate(e.u, self.initial_state(e, init)) for e in data.experiments]
+        except SewfastError:
+            # the core looks at every input, too, but does not know where it came from
+            data.require_inputs()
+            raise
+
+    def _simulate_array(self, u: ArrayLike, initial_state: ArrayLike | None) -> FloatArray:
+        run: FloatArray = self.core.simulate(self._inputs(u), self._state(initial_state))
+        return run
+
+    @overload
+    def jacobian(self, data: Dataset, *, init: int = INIT) -> list[FreeRunJacobian]: ...
+    @overload
+    def jacobian(
+        self, data: ArrayLike, *, initial_state: ArrayLike | None = None
+    ) -> FreeRunJacobian: ...
+
+    def jacobian(
+        self,
+        data: Dataset | ArrayLike,
+        *,
+        init: int = INIT,
+        initial_state: ArrayLike | None = None,
+    ) -> list[FreeRunJacobian] | FreeRunJacobian:
+        """Free run and its derivatives by every parameter and by the initial state.
+
+        The sensitivities run along with the model, so that they are exact: what training, standard
+        errors and bands are computed from. An estimated initial state counts as given.
+
+        Parameters
+        ----------
+        data, init, initial_state
+            As for `simulate`.
+
+        Returns
+        -------
+        FreeRunJacobian or list of it, one per experiment
+            `y` (N,), `theta` (N, p) and `state` (N, s); `parameter_names` and `state_names` name
+            the columns. The median of an ensemble has the derivatives of the member in the middle
+            at each sample; parameters of the others have 0 there.
+
+        Raises
+        ------
+        DataError, SettingError, FitError
+            As for `simulate`; for an ensemble also where any member is unstable on this input.
+        """
+        if not isinstance(data, Dataset):
+            return self._jacobian(self._inputs(data), self._state(initial_state))
+        _require_no_state(initial_state)
+        self._require_match(data)
+        data.require_inputs()
+        return [self._jacobian(e.u, self.initial_state(e, init)) for e in data.experiments]
+
+    def _jacobian(self, u: FloatArray, state: FloatArray) -> FreeRunJacobian:
+        y, rows = self.core.jacobian(u, state)
+        split = rows.shape[1] - len(state)
+        return FreeRunJacobian(y, rows[:, :split], rows[:, split:])
+
+    def predict(self, data: Dataset, horizon: int = 1, *, init: int = INIT) -> list[FloatArray]:
+        """Outputs `horizon` steps ahead of the measured ones.
+
+        Parameters
+        ----------
+        data : Dataset
+            Inputs are complete. In the place of an output that was not measured (NaN, or of weight
+            0) stands the model's own prediction of it.
+        horizon : int
+            1 is one-step prediction.
+        init : int
+            As for `simulate`; it matters for the first samples only.
+
+        Returns
+        -------
+        list of array, shape (N,)
+            One per experiment, in the output's unit.
+
+        Raises
+        ------
+        DataError, SettingError, FitError
+            As for `simulate`; a horizon below 1.
+        """
+        if horizon < 1:
+            raise SettingError(f"horizon: expected 1 step or more, received {horizon}")
+        self._require_match(data)
+        data.require_measured(0)
+        return [
+            self.core.predict(e.u, e.y, self.initial_state(e, init), horizon)
+            for e in map(without_weightless, data.experiments)
+        ]
+
+    def initial_state(self, experiment: Experiment, init: int) -> FloatArray:
+        """What a run over an experiment starts from, by its first `init` measured outputs.
+
+        Past outputs y(-1), y(-2), .. of a lagged model, the states of a state-space model. Where
+        some of the first outputs are missing, more samples are looked at.
+        """
+        require_init(init)
+        if init == 0:
+            rest: FloatArray = self.core.rest_state()
+            return rest
+        experiment = without_weightless(experiment)
+        first = experiment.initial_samples(init)
+        state: FloatArray = self.core.estimate_initial_state(
+            experiment.u[:first], experiment.y[:first]
+        )
+        return state
+
+    def _inputs(self, values: ArrayLike) -> FloatArray:
+        """Inputs as (N, n_inputs)."""
+        n = len(self.input_names)
+        expected = "(N,) or (N, 1)" if n == 1 else f"(N, {n})"
+        if values is None or isinstance(values, (str, os.PathLike)):
+            require_dataset(values, "data")
+        try:
+            u = np.array(values, dtype=np.float64, order="C")
+        except (TypeError, ValueError) as e:
+            raise DataError(f"u: expected numbers of shape {expected}, received {e}") from e
+        shape = u.shape
+        if u.ndim == 1 and n == 1:
+            u = u[:, None]
+        if u.ndim != 2 or u.shape[1] != n or len(u) == 0:
+            raise DataError(
+                f"u: expected shape {expected} for {', '.join(self.input_names)}, received "
+                f"{shape}; time comes first"
+            )
+        unknown = np.flatnonzero(~np.isfinite(u).all(axis=1))
+        if len(unknown):
+            raise DataError(
+                f"u: expected finite inputs, received {u[unknown[0]].tolist()} at sample "
+                f"{unknown[0]}; fill it first"
+            )
+        return u
+
+    def _state(self, values: ArrayLike | None) -> FloatArray:
+        """An initial state as the core takes it; None is rest."""
+        rest: FloatArray = self.core.rest_state()
+        if values is None:
+            return rest
+        try:
+            state = np.array(values, dtype=np.float64)
+        except (TypeError, ValueError) as e:
+            raise DataError(
+                f"initial_state: expected numbers of shape {rest.shape}, received {e}"
+            ) from e
+        if state.shape != rest.shape:
+            raise DataError(
+                f"initial_state: expected shape {rest.shape}, one value for each of "
+                f"{', '.join(self.state_names)}; received {state.shape}"
+            )
+        if not np.isfinite(state).all():
+            raise DataError(f"initial_state: expected finite values, received {state.tolist()}")
+        return state
+
+    def _require_match(self, data: Dataset) -> None:
+        if not isinstance(data, Dataset):
+            require_dataset(data, "data")
+        if data.n_inputs != len(self.input_names):
+            raise DataError(
+                f"{data.source}: expected {len(self.input_names)} inputs "
+                f"({', '.join(self.input_names)}), received {data.n_inputs}"
+            )
+        if abs(data.Ts - self.Ts) > 0.01 * self.Ts:
+            raise DataError(
+                f"{data.source}: the model was identified at Ts = {self.Ts:g} s, the data have "
+                f"{data.Ts:g} s; resample the data or identify again"
+            )
+        require_same_units(self, data)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The model as JSON values, as in its file."""
+        inputs = zip(self.input_names, self.input_units, strict=True)
+        column, per_rev = self.counts or (None, None)
+        return {
+            "kind": self.kind,
+            "Ts": self.Ts,
+            "inputs": [{"name": name, "unit": unit} for name, unit in inputs],
+            "output": {"name": self.output_name, "unit": self.output_unit},
+            "counts": self.counts and {"column": column, "counts_per_rev": per_rev},
+            "parameters": self.parameters(),
+            "training": dict(self.training),
+        }
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the model as versioned JSON, whole or not at all; `load_model` reads it.
+
+        Raises
+        ------
+        ModelFileError
+            Where the file cannot be written.
+        """
+        storage.write(path, FORMAT, VERSION, self.to_dict())
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both have the same kind, numbers, names, units and provenance, as in a file."""
+        if not isinstance(other, DynamicModel):
+            return NotImplemented
+        return self is other or (type(self) is type(other) and self._text() == other._text())
+
+    def __hash__(self) -> int:
+        return hash((self.kind, self.Ts, self.input_names, self.output_name, self.theta.tobytes()))
+
+    def _text(self) -> str:
+        return json.dumps(self.to_dict(), sort_keys=True, default=repr)
+
+    def __repr__(self) -> str:
+        orders = ", ".join(f"{k}={v}" for k, v in self.orders.items())
+        return f"{type(self).__name__}({orders}, Ts={self.Ts:g} s, {self.signature})"
+
+    @property
+    def signature(self) -> str:
+        """`u [V] -> y [RPM]`."""
+        inputs = ", ".join(map(labelled, self.input_names, self.input_units))
+        return f"{inputs} -> {labelled(self.output_name, self.output_unit)}"
+
+    def __str__(self) -> str:
+        orders = ", ".join(f"{k} = {v}" for k, v in self.orders.items())
+        lines = [f"{self.title}: {self.signature}", f"{orders}, Ts = {self.Ts:g} s"]
+        return "\n".join([*lines, *self.describe(), *self._story()])
+
+    def _story(self) -> list[str]:
+        t = self.training
+        if not t:
+            return []
+        names = ", ".join(dict.fromkeys(d["name"] for d in t.get("data", [])))
+        lines = [f"trained on {t.get('samples')} samples of {names}"]
+        if t.get("termination"):
+            count = t.get("iterations")
+            steps = "" if count is None else f"{count} iterations, "
+            lines[0] += f"; {steps}{t['termination']}"
+        prepared = [f"prepared: {note}" for note in t.get("preparation", [])]
+        if len(prepared) > _STEPS_SHOWN:
+            prepared[_STEPS_SHOWN:] = [f"prepared: and {len(prepared) - _STEPS_SHOWN} more"]
+        lines += prepared
+        lines += choice_lines(t, self.output_unit)
+        lines += [str(note) for note in t.get("notes", [])]
+        return lines + verdict_lines(t)
+
+
+def _require_no_state(initial_state: ArrayLike | None) -> None:
+    if initial_state is not None:
+        raise SettingError(
+            "initial_state: expected with an array of inputs, received with a data set, whose "
+            "first measured outputs set the state (init)"
+        )
+
+
+# --- Why `identify` chose the model, as a table for `print` ---------------------------------------
+
+
+_COLUMNS = 5
+_MOST_ROWS = 40
+
+
+def choice_lines(training: Mapping[str, Any], unit: str) -> list[str]:
+    """The candidates with their free-run errors on data not trained on, and the reason."""
+    choice = training.get("choice")
+    if not isinstance(choice, Mapping):
+        return []
+    listed = choice.get("candidates")
+    listed = listed if isinstance(listed, Sequence) else ()
+    candidates = [c for c in listed if isinstance(c, Mapping)][:_MOST_ROWS]
+    lines = _table(candidates, choice, unit) if candidates else []
+    return [*lines, f"chosen: {choice.get('chosen')}; {choice.get('reason')}"]
+
+
+def verdict_lines(training: Mapping[str, Any]) -> list[str]:
+    """The closing words: good enough to tune on or not, because of what, what to do next."""
+    verdict = training.get("verdict")
+    if not isinstance(verdict, Mapping):
+        return []
+    return [f"verdict: {verdict.get('text')}", *(f"  {n}" for n in verdict.get("next", ()))]
+
+
+def _table(
+    candidates: Sequence[Mapping[str, Any]], choice: Mapping[str, Any], unit: str
+) -> list[str]:
+    heading = f"free-run rmse{f' [{unit}]' if unit else ''} on data not trained on:"
+    rows = [_row(c, choice.get("chosen_structure")) for c in candidates]
+    widths = [max(len(r[i]) for r in rows) for i in range(_COLUMNS)]
+    padded = (["  ", *(t.ljust(w + 2) for t, w in zip(r, widths, strict=True))] for r in rows)
+    return [heading, *("".join(p).rstrip() for p in padded)]
+
+
+def _row(c: Mapping[str, Any], chosen: Any) -> tuple[str, ...]:
+    """Model, output function, weight decay, error, mark."""
+    error = _number(c.get("free_run_rmse"), "runs away")
+    if c.get("kind") == "oe":
+        return f"oe, na = {c.get('na')}, nb = {c.get('nb')}, nk = {c.get('nk')}", "", "", error, ""
+    orders = ", ".join(f"{k} = {c[k]}" for k in ("nx", "na", "nb") if k in c)
+    size = f"{c.get('kind')}, {orders}, {c.get('hidden')} tanh, nk = {c.get('nk')}"
+    size += ", integrator" if c.get("integrator") else ""
+    decay = f"decay {_number(c.get('weight_decay'), '?')}"
+    is_chosen = isinstance(chosen, Mapping) and all(c.get(k) == v for k, v in chosen.items())
+    return size, str(c.get("output")), decay, error, "chosen" if is_chosen else ""
+
+
+def _number(value: Any, otherwise: str) -> str:
+    return f"{value:.4g}" if isinstance(value, (int, float)) else otherwise
