@@ -317,7 +317,7 @@ def test_jitter_prints_and_serialises_even_without_ticks() -> None:
 def test_jitter_draws_both_histograms(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "jitter.png"
-    _jitter().plot(path)
+    _jitter().plot(file=path)
     assert path.read_bytes().startswith(b"\x89PNG")
 
 

@@ -224,7 +224,7 @@ def test_a_front_needs_a_folder(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="needs the extra 'report'")
     front = pareto(drive(), EDGE, evaluations=40, size=4, threads=1)
     with pytest.raises(SettingError, match="cannot be written"):
-        front.plot(tmp_path / "none" / "front.png")
+        front.plot(file=tmp_path / "none" / "front.png")
 
 
 def test_a_machine_is_no_linear_plant() -> None:

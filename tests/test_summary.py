@@ -188,7 +188,7 @@ def test_look_draws(folder: Path) -> None:
     assert ".png" in refused(folder, "look", "run.csv:u:speed", "--plot", "look.doc")
     assert "which column" in refused(folder, "look", "run.csv", "--plot", "look.png")
     with pytest.raises(SettingError, match="folder that exists"):
-        Dataset.from_arrays(T, T, TS).summary().plot(folder / "nowhere" / "look.png")
+        Dataset.from_arrays(T, T, TS).summary().plot(file=folder / "nowhere" / "look.png")
 
 
 def test_a_model_from_prepared_data(folder: Path) -> None:

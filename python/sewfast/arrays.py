@@ -41,11 +41,6 @@ def require_same_units(one: HasUnits, other: HasSource) -> None:
             )
 
 
-def lettered(text: str) -> str:
-    r"""A text for a figure as it is: a dollar begins no formula there, as `$\frac{1}{` is none."""
-    return text.replace("$", r"\$")
-
-
 def labelled(name: str, unit: str) -> str:
     """`name [unit]`, or the name alone where the unit is unknown."""
     return f"{name} [{unit}]" if unit else name

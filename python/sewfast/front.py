@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import _core, plotting
+from . import _core
 from .constraints import Constraints
 from .control import Controller
 from .cost import Cost
@@ -21,7 +20,7 @@ from .errors import Interrupted, SettingError
 from .gains import whole
 from .load_step import LoadStep
 from .plants import Plants, References
-from .storage import replace_file
+from .plotting import Drawing, Panel, lettered
 from .tuning import tune
 from .tuning_task import (
     Aggregate,
@@ -122,15 +121,27 @@ class ParetoFront:
         units = {**self.units, "Kp": f"{gains.u_unit}/{gains.y_unit}", "Ti": "s", "Td": "s"}
         write_table(path, self.table(), units=units)
 
-    def plot(self, path: str | os.PathLike[str]) -> Path:
-        """Draw the front, every pair of objectives in a panel, as PNG, SVG or PDF by the ending.
+    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
+        """Draw the front, every pair of objectives in a panel, the knee marked.
+
+        Parameters
+        ----------
+        ax : Axes or sequence of Axes, optional
+            One shows the first two objectives.
+        file : path, optional
+            Where to write the figure: PNG, SVG or PDF by its ending.
+
+        Returns
+        -------
+        Axes or array of Axes
+            `ax`, or the panels of a new figure, shape (pairs,).
 
         Raises
         ------
         SettingError
-            Where matplotlib is not installed.
+            Where matplotlib is not installed or the file cannot be written.
         """
-        return draw(self, Path(path))
+        return drawing(self).plot(ax, file)
 
     def __str__(self) -> str:
         names = [f"{n} [{self.units[n]}]" if self.units[n] else n for n in self.objectives]
@@ -327,37 +338,14 @@ HEIGHT = 3.6
 """Of a panel [inch]."""
 
 
-def draw(front: ParetoFront, path: Path) -> Path:
-    """Write the figure in the format of the path's ending.
-
-    Raises
-    ------
-    SettingError
-        For an ending that is no format of figures, or a file that cannot be written.
-    """
-    plotting.require_matplotlib()
-    if path.suffix.lower() not in (".png", ".svg", ".pdf"):
-        raise SettingError(f"expected a figure ending in .png, .svg or .pdf, got {path.name!r}")
-    pairs = list(itertools.combinations(range(len(front.objectives)), 2))
-    columns = min(2, len(pairs))
-    rows = -(-len(pairs) // columns)
-    with plotting.style():
-        figure, axes = plotting.panels([HEIGHT] * rows, widths=[1] * columns, share_x=False)
-        for axis, (i, j) in zip(axes.flat, pairs, strict=False):
-            _panel(axis, front, i, j)
-        for axis in axes.flat[len(pairs) :]:
-            axis.set_visible(False)
-        axes.flat[0].legend()
-        drawn = io.BytesIO()
-        figure.savefig(drawn, format=path.suffix[1:].lower(), dpi=150)
-    try:
-        replace_file(path, drawn.getvalue())
-    except OSError as error:
-        raise SettingError(
-            f"{path}: cannot be written ({error.strerror}); choose a folder that exists and is "
-            "writable"
-        ) from error
-    return path
+def drawing(front: ParetoFront) -> Drawing:
+    """Every pair of objectives in a panel."""
+    pairs = itertools.combinations(range(len(front.objectives)), 2)
+    panels: list[Panel | None] = [partial(_panel, front=front, i=i, j=j) for i, j in pairs]
+    columns = min(2, len(panels))
+    panels += [None] * (-len(panels) % columns)
+    rows = tuple(tuple(panels[k : k + columns]) for k in range(0, len(panels), columns))
+    return Drawing(rows, (HEIGHT,) * len(rows), (1.0,) * columns, share_x=False, legend=2)
 
 
 def _panel(axis: Axes, front: ParetoFront, i: int, j: int) -> None:
@@ -380,4 +368,4 @@ def _panel(axis: Axes, front: ParetoFront, i: int, j: int) -> None:
 def _label(front: ParetoFront, i: int) -> str:
     name = front.objectives[i]
     unit = front.units[name]
-    return NAMES[name] + (f" [{unit}]" if unit else "")
+    return lettered(NAMES[name] + (f" [{unit}]" if unit else ""))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
@@ -100,6 +102,46 @@ class ClosedLoopRun:
         except DataError:
             return dict.fromkeys(names)
         return {name: None if math.isnan(value) else value for name, value in found.items()}
+
+    def plot(
+        self,
+        ax: Any = None,
+        *,
+        beside: Sequence[ClosedLoopRun] = (),
+        file: str | os.PathLike[str] | None = None,
+    ) -> Any:
+        """Draw output over reference, error and command, below each other.
+
+        Parameters
+        ----------
+        ax : Axes or sequence of Axes, optional
+            One shows the output, further ones the error and the command.
+        beside : sequence of ClosedLoopRun
+            Other runs over the same reference, such as the one that a model predicted.
+        file : path, optional
+            Where to write the figure: PNG, SVG or PDF by its ending.
+
+        Returns
+        -------
+        Axes or array of Axes
+            `ax`, or the three panels of a new figure.
+
+        Raises
+        ------
+        SettingError
+            Where matplotlib is not installed or the file cannot be written.
+        """
+        from .plotting import Trace, loop_drawing
+
+        others = [beside] if isinstance(beside, ClosedLoopRun) else list(beside)
+        looks = ("machine", "model", "oe", "arx_raw", "arx") if others else ("measured",)
+        traces = [
+            Trace.of(run.columns(), look, run.plant)
+            for run, look in zip((self, *others), itertools.cycle(looks), strict=False)
+        ]
+        limits = (self.controller.u_min, self.controller.u_max)
+        # the others are drawn over this one, whose line is wider
+        return loop_drawing(traces[::-1], self.units["y"], self.units["u"], limits).plot(ax, file)
 
     def __str__(self) -> str:
         unit = self.units | {n: unit or n for n, unit in self.units.items() if n in "uy"}

@@ -1,4 +1,9 @@
-"""Numbers, tables and drawings of a page, as HTML and SVG."""
+"""Pictures of results: the look of every figure, `plot`; numbers and tables of a page.
+
+What a result looks like is a `Drawing`: panels, each a function that draws into axes. `plot` puts
+them into a new figure, into axes that the caller has, or into a file; the report puts the same
+panels into its page.
+"""
 
 from __future__ import annotations
 
@@ -6,20 +11,27 @@ import contextlib
 import io
 import itertools
 import math
+import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import SettingError
+from .storage import replace_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    Panel: TypeAlias = Callable[[Axes], None]
+else:
+    Panel: TypeAlias = object
 
 
 # --- Numbers as a reader likes them: few digits, a unit, a dash where there is none ---------------
@@ -196,13 +208,15 @@ def panels(
 def thin(x: Float, y: Float, buckets: int = BUCKETS) -> tuple[Float, Float]:
     """The smallest and largest value of each bucket, in their order: no peak is lost.
 
+    NaN stays where it is, so that gaps of a record are gaps of its line.
+
     Parameters
     ----------
     x, y : array, shape (N,)
 
     Returns
     -------
-    x, y : array, shape (M,), M at most 2 `buckets` + 2
+    x, y : array, shape (M,), M at most 2 `buckets` + 2, and the buckets that hold a NaN
         The series itself where it is short; its first and last sample always.
     """
     n = len(y)
@@ -211,17 +225,25 @@ def thin(x: Float, y: Float, buckets: int = BUCKETS) -> tuple[Float, Float]:
     edges = np.linspace(0, n, buckets + 1).astype(int)
     kept = {0, n - 1}
     for start, stop in itertools.pairwise(edges):
-        kept.add(start + int(np.argmin(y[start:stop])))
-        kept.add(start + int(np.argmax(y[start:stop])))
+        part = y[start:stop]
+        if np.isnan(part).any():
+            kept.update(range(start, stop))
+            continue
+        kept.add(start + int(np.argmin(part)))
+        kept.add(start + int(np.argmax(part)))
     index = np.array(sorted(kept))
     return x[index], y[index]
 
 
 def draw(
-    ax: Axes, x: Float, y: Float, look: str, label: str | None = None, *, width: float | None = None
-) -> None:
-    """A thinned line in the look of its role, or thinner than that."""
-    ax.plot(*thin(x, y), label=label, **LOOKS[look] | ({"lw": width} if width else {}))
+    ax: Axes, x: Float, y: Float, look: str, label: str | None = None, *,
+    width: float | None = None, held: bool = False,
+) -> None:  # fmt: skip
+    """A thinned line in the look of its role, or another width; `held` as steps."""
+    changed: dict[str, Any] = {"lw": width} if width else {}
+    if held:
+        changed["drawstyle"] = "steps-post"
+    ax.plot(*thin(x, y), label=label, **LOOKS[look] | changed)
 
 
 def legend(ax: Axes, columns: int = 6) -> None:
@@ -230,6 +252,322 @@ def legend(ax: Axes, columns: int = 6) -> None:
         loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.1,
         handlelength=2.8, columnspacing=1.4,
     )  # fmt: skip
+
+
+# --- Drawing: what a result looks like, in a notebook, in axes of the caller's, in a file ---------
+
+
+FILES = (".png", ".svg", ".pdf")
+"""Formats of a figure in a file."""
+DPI = 150
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What a result looks like.
+
+    Attributes
+    ----------
+    rows : tuple of tuple of Panel or None
+        Functions that draw into axes, row by row; None leaves a place empty.
+    heights, widths : tuple of float
+        Of the rows [inch] and of the columns, relative to each other.
+    share_x : bool
+        Whether the panels of a column have one axis in common.
+    main : int
+        The panel, counted row by row, that is drawn where there are axes for one.
+    legend : int
+        Columns of a legend above the figure for the labels of the first panel; 0: the panels have
+        legends of their own.
+    """
+
+    rows: tuple[tuple[Panel | None, ...], ...]
+    heights: tuple[float, ...]
+    widths: tuple[float, ...] = (1.0,)
+    share_x: bool = True
+    main: int = 0
+    legend: int = 0
+
+    @property
+    def panels(self) -> list[Panel]:
+        """All of them in reading order."""
+        return [panel for row in self.rows for panel in row if panel is not None]
+
+    def figure(self) -> Figure:
+        """A figure of its own, which no window or notebook shows: for pages and files."""
+        from matplotlib.figure import Figure
+
+        require_matplotlib()
+        with style():
+            figure = Figure(figsize=(WIDTH, sum(self.heights)), layout="constrained")
+            self._fill(figure)
+        return figure
+
+    def plot(self, ax: Any = None, file: str | os.PathLike[str] | None = None) -> Any:
+        """Draw into axes, a file, or a new figure of pyplot, which a notebook shows.
+
+        Parameters
+        ----------
+        ax : Axes or sequence of Axes, optional
+            One takes the main panel; several take as many panels, in reading order.
+        file : path, optional
+            PNG, SVG or PDF by its ending; replaced in one step where it exists.
+
+        Returns
+        -------
+        Axes or array of Axes
+            `ax` where it was given, else the panels, shape (panels,).
+
+        Raises
+        ------
+        SettingError
+            Where matplotlib is not installed, `ax` is none, or the file cannot be written.
+        """
+        if isinstance(ax, (str, os.PathLike)):
+            raise SettingError(
+                f"expected matplotlib axes, got {os.fspath(ax)!r}; for a file: plot(file=...)"
+            )
+        if ax is not None and file is not None:
+            raise SettingError(
+                "expected axes or a file, got both; the figure of the axes has savefig"
+            )
+        require_matplotlib()
+        if ax is not None:
+            return self._into(ax)
+        if file is not None:
+            return self._save(Path(file))
+        from matplotlib import pyplot
+
+        with style():
+            figure = pyplot.figure(figsize=(WIDTH, sum(self.heights)), layout="constrained")
+            return self._fill(figure)
+
+    def _fill(self, figure: Figure) -> NDArray[Any]:
+        axes = figure.subplots(
+            len(self.rows),
+            len(self.widths),
+            squeeze=False,
+            sharex="col" if self.share_x else "none",
+            gridspec_kw={"height_ratios": self.heights, "width_ratios": self.widths},
+        )
+        drawn = []
+        for row, places in zip(self.rows, axes, strict=True):
+            for panel, place in itertools.zip_longest(row, places):
+                if panel is None:
+                    place.set_axis_off()
+                    continue
+                panel(place)
+                drawn.append(place)
+        for above, below in zip(axes[:-1].flat, axes[1:].flat, strict=True):
+            if above.get_xlabel() == below.get_xlabel():
+                above.set_xlabel("")
+        if self.legend:
+            figure.legend(
+                *drawn[0].get_legend_handles_labels(), loc="outside upper right",
+                ncols=self.legend,
+            )  # fmt: skip
+        return np.array(drawn, dtype=object)
+
+    def _into(self, given: Any) -> Any:
+        axes = np.ravel(np.array(given, dtype=object))
+        panels = self.panels
+        if not 0 < len(axes) <= len(panels) or not all(hasattr(a, "set_xlabel") for a in axes):
+            raise SettingError(
+                f"expected one of matplotlib's axes or up to {len(panels)}, one per panel, got "
+                f"{given!r}"
+            )
+        if len(axes) == 1:
+            panels = [panels[self.main]]
+        for panel, ax in zip(panels, axes, strict=False):
+            panel(ax)
+            # above the axes, as in a figure of its own, it could cover what is the caller's
+            if ax.get_legend() is not None or (self.legend and ax is axes[0]):
+                ax.legend()
+        return given
+
+    def _save(self, path: Path) -> NDArray[Any]:
+        require_file(path)
+        figure, buffer = self.figure(), io.BytesIO()
+        dated = {"CreationDate": None} if path.suffix.lower() == ".pdf" else {}
+        dated = {"Date": None} if path.suffix.lower() == ".svg" else dated
+        with style():
+            figure.savefig(buffer, format=path.suffix[1:].lower(), dpi=DPI, metadata=dated)
+        try:
+            replace_file(path, buffer.getvalue())
+        except OSError as e:
+            raise SettingError(
+                f"{path}: cannot be written ({e.strerror or e}); choose a folder that exists and "
+                "is writable"
+            ) from e
+        return np.array([ax for ax in figure.axes if ax.axison], dtype=object)
+
+
+def require_file(path: Path) -> None:
+    """Refuse a name that stands for no format of a figure.
+
+    Raises
+    ------
+    SettingError
+    """
+    if path.suffix.lower() not in FILES:
+        raise SettingError(f"expected a figure ending in .png, .svg or .pdf, got {path.name!r}")
+
+
+def stacked(panels: Sequence[Panel], heights: Sequence[float], **settings: Any) -> Drawing:
+    """Panels below each other over one axis."""
+    return Drawing(tuple((panel,) for panel in panels), tuple(heights), **settings)
+
+
+def lettered(text: str) -> str:
+    r"""A text for a figure as it is: a dollar begins no formula there, as `$\frac{1}{` is none."""
+    return text.replace("$", r"\$")
+
+
+# --- Series: closed loops, measured beside computed outputs ---------------------------------------
+
+
+CYCLE = ("measured", "model", "oe", "arx_raw", "arx", "truth")
+"""Looks of series that are alike, in their order; each has a line style of its own."""
+FINE = 1.2
+"""Line width where lines do not cover each other."""
+_SPEEDS = ("rpm", "rad/s", "1/min", "min^-1", "1/s", "hz", "deg/s", "°/s")
+
+
+def quantity(unit: str) -> str:
+    """`speed [RPM]`, `output [mm]`, or `output` of an unknown unit."""
+    name = "speed" if unit.lower() in _SPEEDS else "output"
+    return lettered(f"{name} [{unit}]" if unit else name)
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A closed loop as it is drawn: time [s], reference, command and output, shape (N,) each."""
+
+    t: Float
+    r: Float
+    u: Float
+    y: Float
+    look: str
+    label: str
+
+    @classmethod
+    def of(cls, columns: Mapping[str, Float], look: str, label: str) -> Trace:
+        """Of columns t, r, u, y."""
+        return cls(columns["t"], columns["r"], columns["u"], columns["y"], look, label)
+
+
+def loop_panels(
+    traces: Sequence[Trace], y_unit: str, u_unit: str, limits: tuple[float, float] | None = None
+) -> tuple[Panel, Panel, Panel]:
+    """Output over the reference, error and command of closed loops; the first lies on top.
+
+    Parameters
+    ----------
+    limits : (float, float), optional
+        Of the command, marked where a loop reaches one.
+    """
+    first = traces[0]
+
+    def output(ax: Axes) -> None:
+        for s in reversed(traces):
+            draw(ax, s.t, s.y, s.look, s.label)
+        draw(ax, first.t, first.r, "reference", "reference")
+        legend(ax)
+        _over_time(ax, quantity(y_unit))
+
+    def error(ax: Axes) -> None:
+        for s in reversed(traces):
+            draw(ax, s.t, s.r - s.y, s.look, width=FINE)
+        _over_time(ax, lettered(f"error [{y_unit}]" if y_unit else "error"))
+
+    def command(ax: Axes) -> None:
+        for s in reversed(traces):
+            draw(ax, s.t, s.u, s.look, width=FINE, held=len(s.t) <= BUCKETS)
+        for limit in limits or ():
+            if any(np.nanmax(np.abs(s.u), initial=0.0) >= abs(limit) > 0.0 for s in traces):
+                ax.axhline(limit, color="#777777", lw=0.8, ls=(0, (2, 2)))
+        _over_time(ax, lettered(f"command [{u_unit}]" if u_unit else "command"))
+
+    return output, error, command
+
+
+def loop_drawing(
+    traces: Sequence[Trace], y_unit: str, u_unit: str, limits: tuple[float, float] | None = None
+) -> Drawing:
+    """Output, error and command below each other."""
+    return stacked(loop_panels(traces, y_unit, u_unit, limits), (2.2, 1.3, 1.3))
+
+
+def fit_panels(
+    Ts: float | None, measured: Sequence[Float], computed: Mapping[str, Sequence[Float]],
+    errors: Mapping[str, Sequence[Float]], *, label: str, unit: str, title: str = "",
+) -> tuple[Panel, Panel]:  # fmt: skip
+    """Computed outputs over the measured one, and errors; experiments one after the other.
+
+    Parameters
+    ----------
+    Ts : float or None
+        Sample time [s]; None: samples are counted.
+    measured : sequence of array, shape (N,)
+        One per experiment.
+    computed, errors : mapping of label to sequence of array, shape (N,)
+        One look per label, the same in both.
+    label : str
+        Of the output, with its unit.
+    """
+    looks = {name: CYCLE[i % len(CYCLE)] for i, name in enumerate({**computed, **errors})}
+    when = "sample" if Ts is None else "time [s]"
+    if len(measured) > 1:
+        when += ", experiments one after the other"
+    t, ends = _one_after_the_other(measured, Ts or 1.0)
+
+    def output(ax: Axes) -> None:
+        draw(ax, t, _joined(measured), "truth", "measured")
+        for name, series in computed.items():
+            draw(ax, t, _joined(series), looks[name], name)
+        if title:
+            ax.set_title(lettered(title))
+        legend(ax)
+        finish(ax, label)
+
+    def error(ax: Axes) -> None:
+        for name, series in errors.items():
+            draw(ax, t, _joined(series), looks[name], name, width=0.9)
+        ax.axhline(0.0, color="#555555", lw=0.7)
+        if errors.keys() != computed.keys():
+            legend(ax)
+        finish(ax, f"error [{unit}]" if unit else "error")
+
+    def finish(ax: Axes, name: str) -> None:
+        _over_time(ax, lettered(name), when)
+        for end in ends:
+            ax.axvline(end, color="#888888", lw=0.8, ls=(0, (2, 2)))
+
+    return output, error
+
+
+def _over_time(ax: Axes, name: str, when: str = "time [s]") -> None:
+    ax.set_ylabel(name)
+    ax.set_xlabel(when)
+    ax.margins(x=0.01)
+
+
+def _one_after_the_other(parts: Sequence[Float], step: float) -> tuple[Float, list[float]]:
+    """Times of `_joined`, and where one experiment ends and the next begins."""
+    counts = np.cumsum([len(part) for part in parts])
+    times = [
+        step * np.append(np.arange(end - len(part), end), end - 0.5)
+        for part, end in zip(parts, counts, strict=True)
+    ]
+    return np.concatenate(times)[:-1], [float(step * (end - 0.5)) for end in counts[:-1]]
+
+
+def _joined(parts: Sequence[Float]) -> Float:
+    """All experiments, with a NaN between two so that no line joins them."""
+    return np.concatenate([np.append(part, np.nan) for part in parts])[:-1]
+
+
+# --- Picture: a figure of a page, as inline SVG ---------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
@@ -16,7 +18,7 @@ from .cost import Cost
 from .errors import FitError, Interrupted, SettingError
 from .gains import whole
 from .load_step import LoadStep
-from .loop import Plant, check_fits
+from .loop import Plant, check_fits, run
 from .plants import Plants, References, each_plant
 from .second_opinion import SHARE, SecondOpinion, second_opinion
 from .starting import Encoder, first_controller
@@ -94,6 +96,48 @@ class TuningResult:
     def evaluations(self) -> int:
         """Controllers tried."""
         return len(self.trace)
+
+    def plot(
+        self,
+        on: Plant,
+        reference: str | ArrayLike | None = None,
+        ax: Any = None,
+        *,
+        file: str | os.PathLike[str] | None = None,
+    ) -> Any:
+        """Run the tuned controller and the start on a plant, and draw both.
+
+        Parameters
+        ----------
+        on : Model or VirtualMachine
+        reference : str or array, shape (N,), optional
+            As for `sewfast.run`; by default a trapezoid that suits the plant.
+        ax : Axes or sequence of Axes, optional
+            One shows the output, further ones the error and the command.
+        file : path, optional
+            Where to write the figure: PNG, SVG or PDF by its ending.
+
+        Returns
+        -------
+        Axes or array of Axes
+            `ax`, or the three panels of a new figure.
+
+        Raises
+        ------
+        SettingError
+            Where matplotlib is not installed, the file cannot be written, or as `sewfast.run`.
+        FitError
+            Where the tuned loop diverges on this plant; a start that does is left out.
+        """
+        from .plotting import Trace, loop_drawing
+
+        after = run(self.controller, on, reference)
+        traces = [Trace.of(after.columns(), "measured", "tuned")]
+        with contextlib.suppress(FitError):
+            before = run(self.start, on, reference)
+            traces.append(Trace.of(before.columns(), "model", "start"))
+        limits = (self.controller.u_min, self.controller.u_max)
+        return loop_drawing(traces, after.units["y"], after.units["u"], limits).plot(ax, file)
 
     def __str__(self) -> str:
         unit = self.controller.gains.y_unit or "y"

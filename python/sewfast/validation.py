@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .dataset import Dataset, Experiment, FloatArray, require_dataset
+from .dataset import Dataset, Experiment, FloatArray, labelled, require_dataset
 from .dataset.noise import white_noise
 from .dataset.weights import in_effect, without_weightless
 from .dynamic_model import INIT, DynamicModel, require_init
@@ -144,6 +145,8 @@ class Validation:
         Of the errors.
     notes : tuple of str
         What the reader should know, such as inputs beyond the range of the training data.
+    Ts : float or None
+        Sample time of the data [s].
     """
 
     simulation: Scores
@@ -155,6 +158,7 @@ class Validation:
     model: str
     against: str
     notes: tuple[str, ...] = ()
+    Ts: float | None = None
 
     @property
     def unmeasured(self) -> int:
@@ -214,6 +218,44 @@ class Validation:
             ],
             "notes": list(self.notes),
         }
+
+    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
+        """Draw the measured output, the free run over it, and both errors below.
+
+        Parameters
+        ----------
+        ax : Axes or sequence of Axes, optional
+            One shows the outputs, a second one the errors.
+        file : path, optional
+            Where to write the figure: PNG, SVG or PDF by its ending.
+
+        Returns
+        -------
+        Axes or array of Axes
+            `ax`, or the two panels of a new figure.
+
+        Raises
+        ------
+        SettingError
+            Where matplotlib is not installed or the file cannot be written.
+        """
+        from .plotting import fit_panels, significant, stacked
+
+        s, unit = self.simulation, f" {self.unit}" if self.unit else ""
+        fit = f"fit {s.fit_percent:.2f} %, " if math.isfinite(s.fit_percent) else ""
+        panels = fit_panels(
+            self.Ts,
+            [e.y for e in self.experiments],
+            {"free run": [e.simulated for e in self.experiments]},
+            {
+                "free run": [e.error for e in self.experiments],
+                "one step ahead": [e.one_step_error for e in self.experiments],
+            },
+            label=labelled(self.against, self.unit),
+            unit=self.unit,
+            title=f"{fit}error {significant(s.rmse)}{unit} rms",
+        )
+        return stacked(panels, (2.6, 1.7)).plot(ax, file)
 
     def __repr__(self) -> str:
         s = self.simulation
@@ -347,6 +389,7 @@ def validate(
         model.title,
         against or data.output_name,
         tuple(_beyond_training(model, data)),
+        data.Ts,
     )
 
 

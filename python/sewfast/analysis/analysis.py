@@ -106,6 +106,39 @@ class Analysis:
 
         return figures(self)
 
+    def plot(
+        self,
+        name: str | None = None,
+        ax: Any = None,
+        *,
+        file: str | os.PathLike[str] | None = None,
+    ) -> Any:
+        """Draw steps and Bode together, or one figure of `figures` by its name.
+
+        Parameters
+        ----------
+        name : str, optional
+            `responses`, `bode`, `sensitivity` or `what_if`.
+        ax : Axes or sequence of Axes, optional
+            One takes the figure's first panel, several as many panels, in reading order: output
+            and command after both steps; |L|, |S|, phase of L and |T|; cost and Ms.
+        file : path, optional
+            Where to write the figure: PNG, SVG or PDF by its ending.
+
+        Returns
+        -------
+        Axes or array of Axes
+            `ax`, or the panels of a new figure, shape (panels,).
+
+        Raises
+        ------
+        SettingError
+            For another name, where matplotlib is not installed, or the file cannot be written.
+        """
+        from .figures import drawing
+
+        return drawing(self, name).plot(ax, file)
+
     def save(self, folder: str | os.PathLike[str], *, png: bool = True) -> list[Path]:
         """Write `analysis.json` and every figure as SVG, and as PNG, into a folder.
 

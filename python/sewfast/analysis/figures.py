@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..arrays import lettered
 from ..dataset import FloatArray
+from ..errors import SettingError
 from ..evidence.figures import shade
-from ..plotting import Float, panels, require_matplotlib, style, thin
+from ..plotting import Drawing, Float, Panel, lettered, thin
 from .points import LoopBode
 from .responses import Responses
 from .sensitivity import Score
@@ -36,39 +37,86 @@ def figures(a: Analysis) -> dict[str, Figure]:
     SettingError
         Where matplotlib is not installed.
     """
-    require_matplotlib()
-    with style():
-        found = {"bode": bode_figure(a)}
-        if a.responses:
-            found = {"responses": response_figure(a), **found}
-        if a.sensitivity:
-            found["sensitivity"] = sensitivity_figure(a)
-        if a.what_if:
-            found["what_if"] = what_if_figure(a)
-    return found
+    return {name: drawing(a, name).figure() for name in names(a)}
 
 
-def response_figure(a: Analysis) -> Figure:
+def names(a: Analysis) -> list[str]:
+    """The figures that an analysis has numbers for."""
+    there = {
+        "responses": bool(a.responses), "bode": True, "sensitivity": bool(a.sensitivity),
+        "what_if": bool(a.what_if),
+    }  # fmt: skip
+    return [name for name, is_there in there.items() if is_there]
+
+
+def drawing(a: Analysis, name: str | None = None) -> Drawing:
+    """One figure of an analysis, by default steps and Bode together.
+
+    Raises
+    ------
+    SettingError
+        For a name that is no figure of this analysis.
+    """
+    if name is None:
+        return overview(a)
+    there = names(a)
+    if name not in there:
+        raise SettingError(f"expected a figure of this analysis, {', '.join(there)}, got {name!r}")
+    return _DRAWINGS[name](a)
+
+
+def overview(a: Analysis) -> Drawing:
+    """Steps above, loop transfer and sensitivities below: what a loop does, and how safely."""
+    rows = [row for part in (response_drawing(a), bode_drawing(a)) for row in part.rows]
+    heights = [h for part in (response_drawing(a), bode_drawing(a)) for h in part.heights]
+    if not a.responses:
+        rows, heights = rows[2:], heights[2:]
+    rows = [
+        tuple(_with_legend(panel) if i % 2 == 0 and k == 0 else panel for k, panel in enumerate(r))
+        for i, r in enumerate(rows)
+    ]
+    return Drawing(tuple(rows), tuple(heights), (1.0, 1.0), share_x=False)
+
+
+def _with_legend(panel: Panel | None) -> Panel:
+    def drawn(ax: Axes) -> None:
+        assert panel is not None
+        panel(ax)
+        ax.legend(loc="best", fontsize=8)
+
+    return drawn
+
+
+def response_drawing(a: Analysis) -> Drawing:
     """Reference step beside disturbance step: output with the band of all plants, command."""
-    figure, axes = panels([2.6, 1.9], widths=[1, 1])
-    for column, r in enumerate(a.responses):
-        output, command = axes[0, column], axes[1, column]
-        t = 1e3 * r.t
-        if len(r.plants) > 1:
-            _band(output, t, *r.band)
-            _band(command, t, r.u.min(axis=0), r.u.max(axis=0))
-        output.plot(*thin(t, r.r), color=BLACK, lw=0.9, ls=(0, (4, 2)), label="reference")
-        name = "median of the plants" if len(r.plants) > 1 else r.plants[0]
-        output.plot(*thin(t, np.median(r.y, axis=0)), color=BLUE, lw=1.4, label=name)
-        command.plot(*thin(t, np.median(r.u, axis=0)), color=BLUE, lw=1.1)
-        output.set_title(_step_title(r))
-        output.set_ylabel(lettered(f"output [{r.y_unit}]"))
-        command.set_ylabel(lettered(f"command [{r.u_unit}]"))
-        command.set_xlabel("time since the step [ms]")
-        output.margins(x=0.01)
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=3)
-    return figure
+    rows = (
+        tuple(partial(_output, r=r) for r in a.responses),
+        tuple(partial(_command, r=r) for r in a.responses),
+    )
+    return Drawing(rows, (2.7, 1.9), (1.0,) * len(a.responses), legend=3)
+
+
+def _output(ax: Axes, r: Responses) -> None:
+    t = 1e3 * r.t
+    if len(r.plants) > 1:
+        _band(ax, t, *r.band)
+    ax.plot(*thin(t, r.r), color=BLACK, lw=0.9, ls=(0, (4, 2)), label="reference")
+    name = "median of the plants" if len(r.plants) > 1 else r.plants[0]
+    ax.plot(*thin(t, np.median(r.y, axis=0)), color=BLUE, lw=1.4, label=name)
+    ax.set_title(_step_title(r))
+    ax.set_ylabel(lettered(f"output [{r.y_unit}]"))
+    ax.set_xlabel("time since the step [ms]")
+    ax.margins(x=0.01)
+
+
+def _command(ax: Axes, r: Responses) -> None:
+    t = 1e3 * r.t
+    if len(r.plants) > 1:
+        _band(ax, t, r.u.min(axis=0), r.u.max(axis=0))
+    ax.plot(*thin(t, np.median(r.u, axis=0)), color=BLUE, lw=1.1)
+    ax.set_ylabel(lettered(f"command [{r.u_unit}]"))
+    ax.set_xlabel("time since the step [ms]")
+    ax.margins(x=0.01)
 
 
 def _step_title(r: Responses) -> str:
@@ -87,43 +135,57 @@ def _band(ax: Axes, t: FloatArray, low: FloatArray, high: FloatArray) -> None:
 # --- frequency ------------------------------------------------------------------------------------
 
 
-def bode_figure(a: Analysis) -> Figure:
+def bode_drawing(a: Analysis) -> Drawing:
     """Gain and phase of L on the left, |S| and |T| on the right, per operating point."""
-    figure, axes = panels([2.5, 2.5], widths=[1, 1])
-    gain, phase, s, t = axes[0, 0], axes[1, 0], axes[0, 1], axes[1, 1]
+    gain, phase, s, t = (partial(_bode, a=a, curve=curve) for curve in ("L", "phase", "S", "T"))
+    return Drawing(((gain, s), (phase, t)), (2.6, 2.6), (1.0, 1.0), legend=4)
+
+
+_BODE: dict[str, tuple[str, Callable[[LoopBode], Float]]] = {
+    "L": ("loop transfer L: gain", lambda x: np.abs(x.L)),
+    "phase": ("loop transfer L: phase", lambda x: np.degrees(np.unwrap(np.angle(x.L), axis=1))),
+    "S": ("sensitivity |S|: what is left of a disturbance", lambda x: np.abs(x.S)),
+    "T": ("complementary sensitivity |T|", lambda x: np.abs(x.T)),
+}
+"""Title and values, shape (plants, frequencies), of each panel."""
+
+
+def _bode(ax: Axes, a: Analysis, curve: str) -> None:
+    title, values = _BODE[curve]
     unit = lettered(a.controller.gains.y_unit)
     for n, loop in enumerate(a.loops):
         look = {
             "color": shade(n, len(a.loops)),
             "ls": _STYLES[n % len(_STYLES)],
             # what lies on top of another curve leaves it to be seen
-            "lw": 3.2 - 2.0 * n / max(1, len(a.loops) - 1),
+            "lw": 1.4 + 1.8 * (1.0 - (n + 1) / len(a.loops)),
         }
-        label = f"about {loop.level:.4g} {unit}"
-        _curve(gain, loop, np.abs(loop.L), look, label)
-        _curve(phase, loop, np.degrees(np.unwrap(np.angle(loop.L), axis=1)), look)
-        _curve(s, loop, np.abs(loop.S), look)
-        _curve(t, loop, np.abs(loop.T), look)
-    for ax in (gain, s, t):
-        ax.set_yscale("log")
-        ax.axhline(1.0, color="#555555", lw=0.7)
-    _mark(s)
-    phase.axhline(-180.0, color="#555555", lw=0.7)
-    _sensible(a.loops, phase, gain, s, t)
-    for ax, title in (
-        (gain, "loop transfer L: gain"), (phase, "loop transfer L: phase"),
-        (s, "sensitivity |S|: what is left of a disturbance"),
-        (t, "complementary sensitivity |T|"),
-    ):  # fmt: skip
-        ax.set_title(title)
-        ax.set_xscale("log")
-        ax.margins(x=0.0)
-        ax.set_ylabel("phase [°]" if ax is phase else "gain [1]")
-    for ax in (phase, t):
-        ax.set_xlabel("frequency [Hz]")
-    handles, labels = gain.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=4)
-    return figure
+        _curve(ax, loop, values(loop), look, f"about {loop.level:.4g} {unit}")
+    ax.set_title(title)
+    ax.set_xscale("log")
+    ax.set_xlabel("frequency [Hz]")
+    ax.margins(x=0.0)
+    if curve == "phase":
+        ax.axhline(-180.0, color="#555555", lw=0.7)
+        ax.set_ylabel("phase [°]")
+        _sensible_phase(ax)
+        return
+    ax.set_yscale("log")
+    ax.axhline(1.0, color="#555555", lw=0.7)
+    ax.set_ylabel("gain [1]")
+    if curve == "S":
+        _mark(ax)
+    least = min(float(values(x).min()) for x in a.loops)
+    most = max(float(values(x).max()) for x in a.loops)
+    ax.set_ylim(max(0.7 * least, 1e-3), max(1.5 * most, 2.2 * LARGE_MS))
+
+
+def _sensible_phase(ax: Axes) -> None:
+    """What lies where the loop no longer acts is not what one looks for."""
+    low, high = ax.get_ylim()
+    low, high = max(low, -540.0), min(max(high, 0.0), 90.0)
+    ax.set_ylim(low, high)
+    ax.set_yticks(np.arange(math.ceil(low / 90) * 90, high + 1.0, 90))
 
 
 def _mark(ax: Axes) -> None:
@@ -143,82 +205,80 @@ def _curve(ax: Axes, loop: LoopBode, values: Float, look: Any, label: str | None
     ax.plot(loop.hertz, np.median(values, axis=0), label=label, **look)
 
 
-def _sensible(loops: Sequence[LoopBode], phase: Axes, gain: Axes, s: Axes, t: Axes) -> None:
-    """What lies where the loop no longer acts is not what one looks for."""
-    low, high = phase.get_ylim()
-    low, high = max(low, -540.0), min(max(high, 0.0), 90.0)
-    phase.set_ylim(low, high)
-    phase.set_yticks(np.arange(math.ceil(low / 90) * 90, high + 1.0, 90))
-    for ax, values in (
-        (gain, [np.abs(x.L) for x in loops]),
-        (s, [np.abs(x.S) for x in loops]),
-        (t, [np.abs(x.T) for x in loops]),
-    ):
-        least = min(float(v.min()) for v in values)
-        most = max(float(v.max()) for v in values)
-        ax.set_ylim(max(0.7 * least, 1e-3), max(1.5 * most, 2.2 * LARGE_MS))
-
-
 # --- sensitivity ----------------------------------------------------------------------------------
 
 
-def sensitivity_figure(a: Analysis) -> Figure:
+def sensitivity_drawing(a: Analysis) -> Drawing:
     """Cost over that of the gains as they are, and Ms, over the factor on each setting."""
-    figure, axes = panels([3.3], widths=[1, 1], share_x=False)
-    cost, peak = axes[0]
+    cost = partial(_sensitivity, a=a, value=lambda s: s.cost / a.score.cost)
+    peak = partial(_sensitivity, a=a, value=lambda s: s.Ms, is_peak=True)
+    return Drawing(((cost, peak),), (3.3,), (1.0, 1.0), share_x=False, legend=8)
+
+
+def _sensitivity(
+    ax: Axes, a: Analysis, value: Callable[[Score], float], is_peak: bool = False
+) -> None:
     for n, s in enumerate(a.sensitivity):
         factors = np.array([*s.factors, 1.0])
         order = np.argsort(factors)
-        percent = 100.0 * (factors[order] - 1.0)
         scores = [*s.scores, a.score]
-        look = {
-            "color": shade(n, len(a.sensitivity)),
-            "ls": _STYLES[n % len(_STYLES)],
-            "marker": "osD^vP<>"[n % 8],
-            "ms": 4.5,
-            "lw": 1.3,
-        }
-        cost.plot(
-            percent, _finite([scores[i].cost / a.score.cost for i in order]), label=s.name, **look
-        )
-        peak.plot(percent, _finite([scores[i].Ms for i in order]), **look)
-    cost.axhline(1.0, color="#555555", lw=0.7)
-    _mark(peak)
-    peak.set_ylim(top=max(peak.get_ylim()[1], 1.06 * LARGE_MS))
-    cost.set_ylabel("cost over that of the controller [1]")
-    peak.set_ylabel("largest Ms [1]")
-    for ax in (cost, peak):
-        ax.set_xlabel("change of the setting [%]")
-        ax.set_xticks([100.0 * (f - 1.0) for f in (*a.sensitivity[0].factors, 1.0)])
-    figure.legend(*cost.get_legend_handles_labels(), loc="outside upper right", ncols=8)
-    return figure
+        ax.plot(
+            100.0 * (factors[order] - 1.0), _finite([value(scores[i]) for i in order]),
+            label=s.name, color=shade(n, len(a.sensitivity)), ls=_STYLES[n % len(_STYLES)],
+            marker="osD^vP<>"[n % 8], ms=4.5, lw=1.3,
+        )  # fmt: skip
+    if is_peak:
+        _mark(ax)
+        ax.set_ylim(top=max(ax.get_ylim()[1], 1.06 * LARGE_MS))
+        ax.set_ylabel("largest Ms [1]")
+    else:
+        ax.axhline(1.0, color="#555555", lw=0.7)
+        ax.set_ylabel("cost over that of the controller [1]")
+    ax.set_xlabel("change of the setting [%]")
+    ax.set_xticks([100.0 * (f - 1.0) for f in (*a.sensitivity[0].factors, 1.0)])
 
 
 def _finite(values: Sequence[float]) -> list[float]:
     return [v if math.isfinite(v) else math.nan for v in values]
 
 
-def what_if_figure(a: Analysis) -> Figure:
+def what_if_drawing(a: Analysis) -> Drawing:
     """Cost, worst error and Ms on changed plants, one row per change."""
-    names = ["as it is", *(w.name for w in a.what_if)]
-    scores = [a.score, *(w.score for w in a.what_if)]
-    figure, axes = panels([0.32 * len(names) + 1.0], widths=[1, 1, 1], share_x=False)
     unit = lettered(a.controller.gains.y_unit)
-    rows: tuple[tuple[str, Any], ...] = (
+    values: tuple[tuple[str, Callable[[Score], float]], ...] = (
         (f"cost [{unit}]", lambda s: s.cost),
         (f"worst error [{unit} rms]", lambda s: s.tracking),
         ("Ms [1]", lambda s: s.Ms),
     )
+    panels = tuple(
+        partial(_what_if, a=a, label=label, value=value, is_first=i == 0, is_peak=i == 2)
+        for i, (label, value) in enumerate(values)
+    )
+    return Drawing((panels,), (0.32 * (1 + len(a.what_if)) + 1.0,), (1.0,) * 3, share_x=False)
+
+
+def _what_if(
+    ax: Axes, a: Analysis, label: str, value: Callable[[Score], float], is_first: bool,
+    is_peak: bool,
+) -> None:  # fmt: skip
+    names = ["as it is", *(w.name for w in a.what_if)]
+    scores = [a.score, *(w.score for w in a.what_if)]
     at = np.arange(len(names), dtype=np.float64)
-    for ax, (label, value) in zip(axes[0], rows, strict=True):
-        _dots(ax, at, scores, value, start=1.0 if ax is axes[0, 2] else 0.0)
-        ax.set_xlabel(label)
-        ax.set_yticks(at, names if ax is axes[0, 0] else [""] * len(names))
-        ax.invert_yaxis()
-        ax.grid(axis="y", visible=False)
-    if axes[0, 2].get_xlim()[1] > LARGE_MS:
-        axes[0, 2].axvline(LARGE_MS, color=ORANGE, lw=1.0, ls=(0, (4, 2)))
-    return figure
+    _dots(ax, at, scores, value, start=1.0 if is_peak else 0.0)
+    ax.set_xlabel(label)
+    ax.set_yticks(at, names if is_first else [""] * len(names))
+    ax.invert_yaxis()
+    ax.grid(axis="y", visible=False)
+    if is_peak and ax.get_xlim()[1] > LARGE_MS:
+        ax.axvline(LARGE_MS, color=ORANGE, lw=1.0, ls=(0, (4, 2)))
+
+
+_DRAWINGS: dict[str, Callable[[Analysis], Drawing]] = {
+    "responses": response_drawing,
+    "bode": bode_drawing,
+    "sensitivity": sensitivity_drawing,
+    "what_if": what_if_drawing,
+}
 
 
 def _dots(ax: Axes, at: FloatArray, scores: Sequence[Score], value: Any, *, start: float) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .arguments import Commands, add_command
+from .arguments import Commands, add_command, add_plot, require_plot
 from .control import plant_of, reference_of
 from .output import print_json
 
@@ -18,6 +18,7 @@ plants that are not as identified would cost, and what speaks against the simula
 EXAMPLES = """\
 examples:
   sewfast analyse controller.json drive.json
+  sewfast analyse controller.json drive.json --plot loop.png      steps and Bode in one picture
   sewfast analyse controller.json drive.json --out analysis       figures and analysis.json
   sewfast analyse controller.json one.json two.json virtual --json
   sewfast analyse controller.json drive.json --speed 300 --speed 1500 --reference cycle.csv
@@ -49,6 +50,7 @@ def add(commands: Commands) -> None:
         "--reference", action="append", metavar="FILE|NAME",
         help="what the cost is taken over; may repeat (trapezoid, random)",
     )  # fmt: skip
+    add_plot(parser, "draw steps, loop transfer and sensitivities")
     parser.add_argument(
         "--out", metavar="DIR", type=Path, help="folder for analysis.json and the figures"
     )
@@ -58,6 +60,7 @@ def analyse_command(args: argparse.Namespace) -> None:
     from ..analysis import analyse
     from ..control import load_controller
 
+    require_plot(args.plot)
     controller = load_controller(args.controller)
     references = [
         reference_of(text, controller.Ts, controller.gains.y_unit) for text in args.reference or ()
@@ -72,6 +75,9 @@ def analyse_command(args: argparse.Namespace) -> None:
         references=references or None,
     )
     written = found.save(args.out) if args.out is not None else []
+    if args.plot is not None:
+        found.plot(file=args.plot)
+        written.append(args.plot)
     if args.json:
         print_json({**found.to_json(), **({"files": list(map(str, written))} if written else {})})
         return

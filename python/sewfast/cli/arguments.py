@@ -111,6 +111,25 @@ def add_overwrite(parser: argparse._ActionsContainer) -> None:
     )  # fmt: skip
 
 
+def add_plot(parser: argparse._ActionsContainer, what: str) -> None:
+    """`--plot FILE`, the same for every command that has something to show."""
+    parser.add_argument("--plot", metavar="FILE", type=Path, help=f"{what}: PNG, SVG or PDF")
+
+
+def require_plot(path: Path | None) -> None:
+    """Refuse a figure that could not be drawn or written, before the work is done.
+
+    Raises
+    ------
+    SettingError
+    """
+    from ..plotting import FILES, require_matplotlib
+
+    if path is not None:
+        require_place(path, FILES, option="--plot")
+        require_matplotlib()
+
+
 def require_place(path: Path | None, suffixes: tuple[str, ...], *, option: str = "-o") -> None:
     """Refuse an output file that could not be written, before the work is done.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .arguments import Commands, add_columns, add_command, add_split, add_weights
+from .arguments import Commands, add_columns, add_command, add_split, add_weights, require_plot
 from .data import read_for_model
 from .models import whole
 from .output import print_json
@@ -22,7 +22,8 @@ examples:
   sewfast check drive.json other.csv
   sewfast check drive.json run.csv --range 5000:8334          the part not trained on
   sewfast check drive.json other.csv --training run.csv       criteria, growth of the error
-  sewfast check drive.json other.csv --plot figures           one PNG per question
+  sewfast check drive.json other.csv --plot band.png          free run in its band
+  sewfast check drive.json other.csv --plot figures           a folder: one PNG per question
   sewfast check drive.json other.csv --json
 """
 
@@ -47,7 +48,11 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--training-range", metavar="A:B", help="samples of it that it was identified from"
     )
-    parser.add_argument("--plot", metavar="DIR", type=Path, help="folder for a PNG per question")
+    parser.add_argument(
+        "--plot", metavar="FILE", type=Path,
+        help="draw measured output, free run and its band: PNG, SVG or PDF; a folder takes a PNG "
+        "per question",
+    )  # fmt: skip
     add_columns(parser, from_model=True)
     add_weights(parser)
     add_split(parser)
@@ -56,7 +61,10 @@ def add(commands: Commands) -> None:
 
 def check_command(args: argparse.Namespace) -> None:
     from ..models import load_model
+    from ..plotting import FILES
 
+    if args.plot is not None and args.plot.suffix.lower() in FILES:
+        require_plot(args.plot)
     model = load_model(args.model)
     data, _ = read_for_model(args.data, model, args)
     data = masked(data, args)
@@ -69,7 +77,10 @@ def check_command(args: argparse.Namespace) -> None:
         training = prepared(training, args, cut=True)
     card = model.check(part, training, init=args.init)
     written = []
-    if args.plot is not None:
+    if args.plot is not None and args.plot.suffix.lower() in FILES:
+        card.plot(file=args.plot)
+        written = [args.plot]
+    elif args.plot is not None:
         from ..evidence.figures import save
 
         written = save(card, args.plot)

@@ -14,7 +14,9 @@ from .arguments import (
     add_command,
     add_output,
     add_overwrite,
+    add_plot,
     require_place,
+    require_plot,
 )
 from .drive import (
     add_drive,
@@ -46,7 +48,7 @@ another ending of -o is made from it afterwards. Ctrl-C stops the motor and keep
 RUN_EXAMPLES = """\
 examples:
   sewfast run controller.json drive.json -o predicted.csv
-  sewfast run controller.json --on drive.json --reference random -o predicted.csv
+  sewfast run controller.json --on drive.json --reference random -o predicted.csv --plot loop.png
   sewfast run controller.json --on virtual --reference trapezoid -o measured.csv
   sewfast run controller.json --on virtual:7 --reference cycle.csv --json
   sewfast run controller.json --on /dev/ttyUSB0 --reference trapezoid -o measured.mcap \\
@@ -76,6 +78,7 @@ def add(commands: Commands) -> None:
         parser, "OUT",
         "CSV, .npz, .mat or Parquet, of a drive .mcap too; default: CSV to standard output",
     )  # fmt: skip
+    add_plot(parser, "draw output, error and command; with --host-loop its times as well")
     add_overwrite(parser)
     add_drive(parser)
     add_host_loop(parser)
@@ -86,6 +89,7 @@ def run_command(args: argparse.Namespace) -> int | None:
     from ..loop import run
 
     _settle_plant(args)
+    require_plot(args.plot)
     if args.host_loop is not None:
         controller = at_loops_period(args, load_controller(args.controller))
         return run_host_loop(args, controller, _wanted(args, controller))
@@ -153,6 +157,10 @@ def _show_run(
     summary |= {"unit": found.units["y"], "n": len(found.t), "Ts": found.Ts, **found.metrics()}
     summary["warnings"] = [line.to_json() for line in warnings]
     lines = [f"  warning   {x.name}, {x.shown}: {x.meaning}" for x in warnings]
+    if args.plot is not None:
+        found.plot(file=args.plot)
+        summary["plot"] = str(args.plot)
+        lines.append(f"drawn to {args.plot}")
     write_columns(
         args.out, found.columns(), found.units, summary, [*str(found).splitlines(), *lines],
         as_json=args.json, written=place,

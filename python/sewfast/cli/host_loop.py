@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from ..dataset import FloatArray
     from ..link import HostLoopRun
 
-PICTURES = (".png", ".svg", ".pdf")
-
 
 def add_host_loop(parser: argparse.ArgumentParser) -> None:
     """Options of a controller that runs here and not on the drive."""
@@ -35,9 +33,6 @@ def add_host_loop(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--samples", type=Path, metavar="FILE", help="keep what the drive sent, at its own period"
-    )
-    group.add_argument(
-        "--plot", type=Path, metavar="FILE", help="draw the histograms of lateness and age"
     )
     group.add_argument(
         "--real-time", action="store_true",
@@ -63,7 +58,6 @@ def at_loops_period(args: argparse.Namespace, controller: Controller) -> Control
         )
     require_place(args.out, TABLES)
     require_place(args.samples, RECORDINGS)
-    require_place(args.plot, PICTURES)
     require_free([args.out, args.samples, args.plot], overwrite=args.overwrite)
     if not args.host_loop:
         return controller
@@ -119,8 +113,9 @@ def _show(args: argparse.Namespace, found: HostLoopRun) -> None:
         found.save_samples(args.samples, overwrite=args.overwrite)
         lines.append(f"samples written to {args.samples}")
     if args.plot is not None:
-        found.jitter.plot(args.plot)
-        lines.append(f"histograms drawn to {args.plot}")
+        found.plot(file=args.plot)
+        summary["plot"] = str(args.plot)
+        lines.append(f"drawn to {args.plot}")
     if args.out is None and args.samples is not None:
         print_json(summary) if args.json else print("\n".join(lines))
         return

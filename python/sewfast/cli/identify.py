@@ -14,9 +14,11 @@ from .arguments import (
     add_columns,
     add_command,
     add_output,
+    add_plot,
     add_split,
     add_weights,
     require_place,
+    require_plot,
 )
 from .data import read_training, split
 from .output import print_json
@@ -63,6 +65,9 @@ examples:
   sewfast identify run.mat --input u --output y --ts 0.02 --model oe -o linear.json
       a file without a time column; linear output error alone
 
+  sewfast identify run.csv --input u --output y --validate 5000:8334 -o drive.json --plot fit.png
+      a picture of the free run on the samples held out
+
   sewfast identify run.csv --input u --output y --time-budget 30 -o drive.json
       the best model that is found in half a minute
 
@@ -94,6 +99,7 @@ def add(commands: Commands) -> None:
         help="samples of each file that are held out: they choose, and are scored; default: the "
         "last fifth is held out to choose, and learned from in the end",
     )  # fmt: skip
+    add_plot(parser, "draw the free run on the data held out, else on the training data")
     add_output(parser, "MODEL.json", "model file to write", required=True)
 
 
@@ -138,6 +144,7 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
 
 def identify_command(args: argparse.Namespace) -> int | None:
     require_place(args.out, (".json",))
+    require_plot(args.plot)
     train, held = split(masked(read_training(args), args), args.train, args.validate)
     train = prepared(train, args, cut=True)
     held = None if held is None else prepared(held, args, like=train, cut=True)
@@ -151,7 +158,10 @@ def identify_command(args: argparse.Namespace) -> int | None:
     model.save(args.out)
     try:
         others = _save_alternatives(args, model) if args.alternatives else []
-        _show(args, model, _scores(model, train, held), others)
+        scores = _scores(model, train, held)
+        if args.plot is not None:
+            scores["train" if held is None else "validation"].plot(file=args.plot)
+        _show(args, model, scores, others)
     except KeyboardInterrupt:
         print(f"interrupted; the model is in {args.out}, it was not scored", file=sys.stderr)
         return 130
@@ -222,6 +232,8 @@ def _show(
             "scores": {name: s.to_json() for name, s in scores.items()},
             "alternatives": [str(path) for path in others],
         }
+        if args.plot is not None:
+            found["plot"] = str(args.plot)
         print_json(found)
         return
     print(model)
@@ -233,4 +245,6 @@ def _show(
     # without --alternatives nothing was written
     for path, other in zip(others, model.alternatives, strict=False):
         print(f"alternative: {other!r} in {path}")
+    if args.plot is not None:
+        print(f"drawn to {args.plot}")
     print(f"written to {args.out}; score it on another recording: sewfast validate {args.out} DATA")

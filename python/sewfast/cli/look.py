@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import SettingError
-from .arguments import Commands, add_columns, add_command, require_place
+from .arguments import Commands, add_columns, add_command, add_plot, require_plot
 from .data import read_training
-from .output import print_json
+from .output import print_json, print_result
 from .preparation import add_preparation, prepared
 
 if TYPE_CHECKING:
@@ -39,28 +38,21 @@ def add(commands: Commands) -> None:
         summary="what is in recordings", text=TEXT, examples=EXAMPLES,
     )  # fmt: skip
     parser.add_argument("data", nargs="+", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
-    parser.add_argument(
-        "--plot", metavar="FILE", type=Path, help="picture of columns and spectra: PNG, SVG or PDF"
-    )
+    add_plot(parser, "draw columns and spectra")
     add_columns(parser, from_model=False)
     add_preparation(parser)
 
 
 def look_command(args: argparse.Namespace) -> None:
-    require_place(args.plot, (".png", ".svg", ".pdf"), option="--plot")
+    require_plot(args.plot)
     tables = [] if args.input or args.output or args.counts else _unnamed(args)
     if tables:
         _show_columns(tables, args)
         return
     found = prepared(read_training(args), args).summary()
     if args.plot is not None:
-        found.plot(args.plot)
-    if args.json:
-        print_json(found.to_json() | ({"plot": str(args.plot)} if args.plot is not None else {}))
-        return
-    print(found)
-    if args.plot is not None:
-        print(f"written to {args.plot}")
+        found.plot(file=args.plot)
+    print_result(found, args, plot=args.plot)
 
 
 def _unnamed(args: argparse.Namespace) -> list[Table]:

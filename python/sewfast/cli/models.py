@@ -11,12 +11,14 @@ from .arguments import (
     add_columns,
     add_command,
     add_output,
+    add_plot,
     add_split,
     add_weights,
     require_place,
+    require_plot,
 )
 from .data import read_for_model
-from .output import print_json, write_columns
+from .output import print_result, write_columns
 from .preparation import add_hold, add_preparation, held, masked, prepared
 
 if TYPE_CHECKING:
@@ -34,6 +36,7 @@ looks good for models that are of no use alone, and bad where the outputs are no
 VALIDATE_EXAMPLES = """\
 examples:
   sewfast validate drive.json other.csv
+  sewfast validate drive.json other.csv --plot free-run.png
   sewfast validate drive.json run.csv --range 5000:8334      the part not trained on
   sewfast validate drive.json other.csv --init 0             from rest; every sample is scored
   sewfast validate drive.json other.mat:volt:rpm --json
@@ -61,6 +64,7 @@ def add(commands: Commands) -> None:
     _add_model_and_data(parser)
     add_split(parser)
     add_preparation(parser)
+    add_plot(parser, "draw measured output, free run and errors")
     parser.add_argument(
         "--range", metavar="A:B", help="samples to score, 0-based, end excluded; default: all"
     )
@@ -100,15 +104,15 @@ def validate_command(args: argparse.Namespace) -> None:
     from ..models import load_model
     from ..validation import validate
 
+    require_plot(args.plot)
     model = load_model(args.model)
     data, _ = read_for_model(args.data, model, args)
     data = masked(data, args)
     part = prepared(data if args.range is None else data.slice(args.range), args, cut=True)
     found = validate(model, part, init=args.init)
-    if args.json:
-        print_json(found.to_json())
-    else:
-        print(found)
+    if args.plot is not None:
+        found.plot(file=args.plot)
+    print_result(found, args, plot=args.plot)
 
 
 def simulate_command(args: argparse.Namespace) -> None:

@@ -30,6 +30,16 @@ def _finite(value: Any) -> Any:
     return value
 
 
+def print_result(result: Any, args: Any, *, plot: Path | None = None) -> None:
+    """A result with `to_json` and `str`, and where its figure has been written."""
+    if args.json:
+        print_json(result.to_json() | ({"plot": str(plot)} if plot is not None else {}))
+        return
+    print(result)
+    if plot is not None:
+        print(f"written to {plot}")
+
+
 def print_rows(rows: Sequence[Sequence[str]]) -> None:
     """Columns of text, as wide as they need to be; the last one runs free."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import Interrupted, SettingError
-from .arguments import TABLES, Commands, add_command, add_output, require_place
+from .arguments import (
+    TABLES,
+    Commands,
+    add_command,
+    add_output,
+    add_plot,
+    require_place,
+    require_plot,
+)
 from .control import reference_of
 from .output import print_json, print_rows
 from .progress import Progress
@@ -56,6 +64,7 @@ examples:
   sewfast tune drive.json --cost chatter=50 --constraint overshoot=2 -o calm.json
   sewfast tune drive.json --load 1500:-2 --constraint recovery=70 -o firm.json
   sewfast tune one.json two.json --aggregate worst --variables Kp,Ti,alpha -o controller.json
+  sewfast tune drive.json -o controller.json --plot tuned.png
   sewfast tune network.json --rival linear.json -o controller.json
   sewfast tune drive.json --pareto tracking,chatter --front front.png -o controller.json
 """
@@ -102,6 +111,7 @@ def add(commands: Commands) -> None:
         "linear one beside a network",
     )  # fmt: skip
     _add_search(parser)
+    add_plot(parser, "draw the tuned loop beside the start's; of --pareto the front")
     add_output(parser, "CONTROLLER.json", "controller file to write", required=True)
 
 
@@ -154,6 +164,7 @@ def tune_command(args: argparse.Namespace) -> int | None:
     from ..models import load_model
 
     require_place(args.out, (".json",))
+    require_plot(args.plot)
     if args.front is not None and args.pareto is None:
         raise SettingError("--front: expected --pareto with the objectives of the front as well")
     if args.pareto is not None and args.time_budget is not None:
@@ -179,6 +190,8 @@ def tune_command(args: argparse.Namespace) -> int | None:
         if args.pareto is None:
             found = _tuned(args, models, references, settings)
             found.controller.save(args.out)
+            if args.plot is not None:
+                found.plot(first, references[0] if references else None, file=args.plot)
             _show_tuned(args, found)
         else:
             front = _front(args, models, references, settings)
@@ -391,6 +404,7 @@ def _show_tuned(args: argparse.Namespace, found: TuningResult) -> None:
                 "termination": found.termination,
                 "method": found.method,
                 "warning": found.warning,
+                "plot": None if args.plot is None else str(args.plot),
                 "weights": found.weights.named(),
                 "variables": {
                     v.name: {"value": v.value, "low": v.low, "high": v.high}
@@ -405,8 +419,10 @@ def _show_tuned(args: argparse.Namespace, found: TuningResult) -> None:
 
 
 def _show_front(args: argparse.Namespace, front: ParetoFront) -> None:
+    if args.plot is not None:
+        front.plot(file=args.plot)
     if args.front is not None and args.front.suffix.lower() in FIGURES:
-        front.plot(args.front)
+        front.plot(file=args.front)
     elif args.front is not None:
         front.save(args.front)
     if args.json:
@@ -449,6 +465,8 @@ def _show_gains(args: argparse.Namespace, controller: Controller) -> None:
             "feedback: free of noise and of an encoder's steps, as the model knows of none; "
             "--counts-per-rev puts an encoder in the loop"
         )
+    if args.plot is not None:
+        print(f"drawn to {args.plot}")
     print(f"written to {args.out}; try it: sewfast run {args.out} {args.model[0]}")
 
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import labelled, range_of, texts
 from ..errors import DataError, SettingError
-from . import gaps, outliers, pieces, rates, summary, trends
+from . import gaps, outliers, picture, pieces, rates, summary, trends
 from .experiment import Experiment
 from .weights import require_some_weight
 
@@ -199,6 +199,7 @@ class Dataset:
     differentiate = rates.differentiate
     mark_outliers = outliers.mark_outliers
     summary = summary.summary
+    plot = picture.plot
 
     require_inputs = pieces.require_inputs
     require_measured = pieces.require_measured

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..arrays import FloatArray, labelled, lettered, runs
-from ..errors import SettingError
+from ..arrays import FloatArray, labelled, runs
+from ..plotting import Drawing, legend, lettered, thin
 from .noise import band, power_spectrum
 from .outliers import distances, usual_threshold
 from .pieces import LARGEST
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from .dataset import Dataset
 
@@ -25,50 +24,52 @@ MOST_PANELS = 8
 _BUCKETS = 1200
 
 
-def save(data: Dataset, path: str | os.PathLike[str]) -> None:
-    """Draw `figure` into a file whose ending says the format.
+def plot(data: Dataset, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
+    """Draw every column over time and its spectrum.
+
+    What is missing is shaded, outputs that stand out of their neighbours are circled; experiments
+    follow one another.
+
+    Parameters
+    ----------
+    ax : Axes or sequence of Axes, optional
+        One shows the output over time; several are filled in reading order.
+    file : path, optional
+        Where to write the figure: PNG, SVG or PDF by its ending.
+
+    Returns
+    -------
+    Axes or array of Axes
+        `ax`, or the panels of a new figure: time and spectrum of each input, then of the output.
 
     Raises
     ------
     SettingError
         Where matplotlib is not installed or the file cannot be written.
     """
-    from ..plotting import require_matplotlib, style
-
-    require_matplotlib()
-    with style():
-        drawn = figure(data)
-        try:
-            drawn.savefig(Path(path), dpi=150)
-        except (OSError, ValueError) as e:
-            raise SettingError(
-                f"{path}: expected a file ending in .png, .svg or .pdf in a folder that exists, "
-                f"received {e}"
-            ) from e
+    return drawing(data).plot(ax, file)
 
 
-def figure(data: Dataset) -> Figure:
+def drawing(data: Dataset) -> Drawing:
     """One row per column, time on the left, spectrum on the right; experiments side by side."""
-    from matplotlib.figure import Figure
-
     names = [*map(labelled, data.input_names, data.input_units)]
     names = [*names[: MOST_PANELS - 1], labelled(data.output_name, data.output_unit)]
-    drawn = Figure(figsize=(9.2, 0.7 + 1.9 * len(names)), layout="constrained")
-    names = [*map(lettered, names)]
-    axes = drawn.subplots(
-        len(names), 2, squeeze=False, sharex="col", gridspec_kw={"width_ratios": [2.6, 1.0]}
-    )
-    for i, (name, (left, right)) in enumerate(zip(names, axes, strict=True)):
+    rows = []
+    units = [*data.input_units[: len(names) - 1], data.output_unit]
+    for i, (name, unit) in enumerate(zip(map(lettered, names), map(lettered, units), strict=True)):
         is_output = i == len(names) - 1
         columns = [e.y if is_output else e.u[:, i] for e in data.experiments]
         columns = [np.where(np.abs(c) < LARGEST, c, np.nan) for c in columns]
-        _over_time(left, columns, data.Ts, name, usual_threshold(data) if is_output else None)
-        _over_frequency(right, columns, data.Ts, OUTPUT if is_output else INPUT)
-    several = ", experiments one after the other" if len(data.experiments) > 1 else ""
-    axes[-1, 0].set_xlabel(f"time [s]{several}")
-    axes[-1, 1].set_xlabel("frequency [Hz]")
-    axes[0, 1].set_title("power density; 90 % is shaded")
-    return drawn
+        threshold = usual_threshold(data) if is_output else None
+        colour = OUTPUT if is_output else INPUT
+        rows.append((
+            partial(_over_time, columns=columns, Ts=data.Ts, name=name, threshold=threshold),
+            partial(
+                _over_frequency, columns=columns, Ts=data.Ts, colour=colour, unit=unit,
+                titled=i == 0,
+            ),
+        ))  # fmt: skip
+    return Drawing(tuple(rows), (2.2, *[1.9] * (len(rows) - 1)), (2.6, 1.0), main=2 * len(rows) - 2)
 
 
 def _over_time(
@@ -76,7 +77,7 @@ def _over_time(
 ) -> None:
     """One column; with a threshold it is the output, whose outliers are circled."""
     is_output, offset = threshold is not None, 0
-    labels: dict[str, Any] = {}
+    has_gaps = has_outliers = False
     look: dict[str, Any] = {"lw": 0.9, "color": OUTPUT if is_output else INPUT}
     look |= {"drawstyle": "default" if is_output else "steps-post"}
     for column in columns:
@@ -85,35 +86,39 @@ def _over_time(
             ax.plot((offset + t) * Ts, y, **look)
         for start, length in runs(np.isnan(column)):
             left = (offset + start - 0.5) * Ts
-            labels["missing"] = ax.axvspan(
-                left, left + length * Ts, color=MISSING, alpha=0.25, lw=0
-            )
+            label = "" if has_gaps else "missing"
+            ax.axvspan(left, left + length * Ts, color=MISSING, alpha=0.25, lw=0, label=label)
+            has_gaps = True
         if threshold is not None:
             at = np.flatnonzero(distances(column) > threshold)
             if len(at):
-                (labels["stands out"],) = ax.plot(
-                    (offset + at) * Ts, column[at], "o", ms=5, mfc="none", mec=OUTLIER
-                )
+                label = "" if has_outliers else "stands out"
+                circle: dict[str, Any] = {"ms": 5, "mfc": "none", "mec": OUTLIER, "label": label}
+                ax.plot((offset + at) * Ts, column[at], "o", **circle)
+                has_outliers = True
         offset += len(column)
         if column is not columns[-1]:
             ax.axvline(offset * Ts, color="#888888", lw=0.8, ls=(0, (2, 2)))
     ax.set_ylabel(name)
+    several = ", experiments one after the other" if len(columns) > 1 else ""
+    ax.set_xlabel(f"time [s]{several}")
     ax.set_xlim(0.0, offset * Ts)
-    if labels:
-        ax.legend(
-            list(labels.values()), list(labels), loc="lower right", bbox_to_anchor=(1.0, 1.0),
-            ncols=2, borderaxespad=0.1,
-        )  # fmt: skip
+    if has_gaps or has_outliers:
+        legend(ax)
 
 
 def _thinned(column: FloatArray, start: int, length: int) -> tuple[FloatArray, FloatArray]:
-    from ..plotting import thin
-
     index = np.arange(start, start + length, dtype=np.float64)
     return thin(index, column[start : start + length], _BUCKETS)
 
 
-def _over_frequency(ax: Axes, columns: list[FloatArray], Ts: float, colour: str) -> None:
+def _over_frequency(
+    ax: Axes, columns: list[FloatArray], Ts: float, colour: str, unit: str, titled: bool
+) -> None:
+    ax.set_xlabel("frequency [Hz]")
+    ax.set_ylabel(f"density [{unit}²/Hz]" if unit else "density [1/Hz]")
+    if titled:
+        ax.set_title("90 % is shaded")
     frequency, power = power_spectrum(columns, Ts)
     found = band(frequency, power)
     if found is None:

@@ -130,18 +130,10 @@ class Summary:
             "notes": list(self.notes),
         }
 
-    def plot(self, path: str | os.PathLike[str]) -> None:
-        """Draw the columns over time and their spectra into a PNG, SVG or PDF file.
-
-        Raises
-        ------
-        SettingError
-            Where matplotlib is not installed or the file cannot be written.
-        """
-        from .picture import save
-
+    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
+        """Draw the data: `Dataset.plot`."""
         assert self.data is not None
-        save(self.data, path)
+        return self.data.plot(ax, file=file)
 
     def __repr__(self) -> str:
         hints = len(self.advice) + len(self.diagnosis.findings)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -305,6 +306,38 @@ class ReportCard(Judged):
         """Model, data, and whether it was trained on them."""
         kind = "its training data" if self.on_training else "data not trained on"
         return f"{self.model} on {self.data} ({kind})"
+
+    def plot(
+        self,
+        name: str | None = None,
+        ax: Any = None,
+        *,
+        file: str | os.PathLike[str] | None = None,
+    ) -> Any:
+        """Draw one figure: `bands` (the default), `residuals`, `bode`, `poles` or `region`.
+
+        Parameters
+        ----------
+        name : str, optional
+            A figure that the card has evidence for.
+        ax : Axes or sequence of Axes, optional
+            One takes the figure's first panel, several as many panels, in reading order.
+        file : path, optional
+            Where to write the figure: PNG, SVG or PDF by its ending.
+
+        Returns
+        -------
+        Axes or array of Axes
+            `ax`, or the panels of a new figure, shape (panels,).
+
+        Raises
+        ------
+        SettingError
+            For another name, where matplotlib is not installed, or the file cannot be written.
+        """
+        from .figures import drawing
+
+        return drawing(self, name).plot(ax, file)
 
 
 def _test_json(t: ResidualTest) -> dict[str, Any]:

@@ -147,6 +147,35 @@ class HostLoopRun:
             return dict.fromkeys(names)
         return {name: None if math.isnan(value) else value for name, value in found.items()}
 
+    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
+        """Draw output over reference, error, command, and how late each tick was.
+
+        Parameters
+        ----------
+        ax : Axes or sequence of Axes, optional
+            One shows the output, further ones error, command and histograms (`Jitter.plot`).
+        file : path, optional
+            Where to write the figure: PNG, SVG or PDF by its ending.
+
+        Returns
+        -------
+        Axes or array of Axes
+            `ax`, or the four panels of a new figure.
+
+        Raises
+        ------
+        SettingError
+            Where matplotlib is not installed or the file cannot be written.
+        """
+        from ..plotting import Trace, loop_panels, stacked
+
+        trace = Trace.of(self.columns(), "measured", self.plant)
+        limits = (self.controller.u_min, self.controller.u_max)
+        panels = loop_panels([trace], self.units["y"], self.units["u"], limits)
+        return stacked((*panels, self.jitter.panel), (2.2, 1.3, 1.3, 2.4), share_x=False).plot(
+            ax, file
+        )
+
     def save_samples(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write every sample of the device as CSV, `.npz`, `.mat`, Parquet or MCAP.
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 EDGES = np.array([m * 10.0**d for d in range(7) for m in (1.0, 2.0, 5.0)] + [1e7])
 """Ends of the bins [us], 1 us to 10 s; what lies beyond counts in the first or last one."""
@@ -105,45 +108,44 @@ class Jitter:
         lines.append(f"  scheduling: {self.real_time}")
         return "\n".join(lines + _bars(self.histogram()))
 
-    def plot(self, path: str | os.PathLike[str]) -> None:
-        """Both histograms as a picture.
+    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
+        """Draw both histograms.
 
         Parameters
         ----------
-        path : path
-            Its extension chooses the format.
+        ax : Axes, optional
+        file : path, optional
+            Where to write the figure: PNG, SVG or PDF by its ending.
+
+        Returns
+        -------
+        Axes or array of Axes
+            `ax`, or the one panel of a new figure.
 
         Raises
         ------
         SettingError
-            Where matplotlib is not installed.
+            Where matplotlib is not installed or the file cannot be written.
         """
-        from ..errors import SettingError
+        from ..plotting import stacked
 
-        try:
-            from matplotlib.figure import Figure
-        except ImportError as error:
-            raise SettingError(
-                'a picture needs matplotlib, which is not installed: pip install "sewfast[report]"'
-            ) from error
-        figure = Figure(figsize=(7.0, 3.4), layout="constrained")
-        axes = figure.add_subplot()
+        return stacked((self.panel,), (3.4,)).plot(ax, file)
+
+    def panel(self, ax: Axes) -> None:
+        """Draw both histograms into axes."""
         for name, values, colour in (
-            ("wake-up lateness", self.late, "C0"),
-            ("age of the newest sample", self.age, "C1"),
+            ("wake-up lateness", self.late, "#0072B2"),
+            ("age of the newest sample", self.age, "#D55E00"),
         ):
-            axes.stairs(_counted(values), EDGES, label=name, fill=True, alpha=0.5, color=colour)
-        axes.axvline(self.period, color="0.3", linestyle="--", label="period")
+            ax.stairs(_counted(values), EDGES, label=name, fill=True, alpha=0.5, color=colour)
+        ax.axvline(self.period, color="0.3", linestyle="--", label="period")
         used = np.flatnonzero(_counted(self.late) + _counted(self.age))
         ends = (EDGES[used[0]], EDGES[used[-1] + 1]) if len(used) else (1.0, 1.0)
         span = (0.5 * min(ends[0], self.period), 2.0 * max(ends[1], self.period))
-        axes.set(xscale="log", yscale="log", xlim=span, ylim=(0.5, None))
-        axes.set(xlabel="time [us]", ylabel="ticks")
-        axes.set_title(
-            f"{len(self.late)} ticks of {_time(self.period)}, {self.missed} missed", fontsize=10
-        )
-        axes.legend(frameon=False, fontsize=8)
-        figure.savefig(os.fspath(path), dpi=150)
+        ax.set(xscale="log", yscale="log", xlim=span, ylim=(0.5, None))
+        ax.set(xlabel="time [us]", ylabel="ticks")
+        ax.set_title(f"{len(self.late)} ticks of {_time(self.period)}, {self.missed} missed")
+        ax.legend()
 
 
 def _percentiles(values: FloatArray) -> dict[str, float]:

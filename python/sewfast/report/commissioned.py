@@ -11,10 +11,9 @@ from ..errors import DataError, ModelFileError
 from ..plotting import (
     Picture,
     Table,
-    draw,
-    legend,
+    Trace,
+    loop_drawing,
     milliseconds,
-    panels,
     percent,
     rpm,
     significant,
@@ -190,20 +189,8 @@ def _picture(folder: Path, name: str, n: Mapping[str, Any]) -> Picture:
     kinds = [k for k in ("predicted", "measured") if n[k] is not None]
     runs = {k: _columns(folder / run_file(name, k)) for k in kinds}
     looks = {"predicted": "model", "measured": "machine"}
-    figure, axes = panels([2.2, 1.3, 1.3])
-    speed, error, command = axes[:, 0]
-    for kind in reversed(kinds):
-        c, look = runs[kind], looks[kind]
-        draw(speed, c["t"], c["y"], look, kind)
-        draw(error, c["t"], c["r"] - c["y"], look, width=1.2)
-        draw(command, c["t"], c["u"], look, width=1.2)
-    first = runs[kinds[0]]
-    draw(speed, first["t"], first["r"], "reference", "reference")
-    legend(speed)
-    for ax, label in ((speed, "speed [RPM]"), (error, "error [RPM]"), (command, "command [V]")):
-        ax.set_ylabel(label)
-        ax.margins(x=0.01)
-    command.set_xlabel("time [s]")
+    traces = [Trace.of(runs[kind], looks[kind], kind) for kind in kinds]
+    figure = loop_drawing(traces, "RPM", "V").figure()
     key = "run-" + "".join(c if c.isalnum() else "-" for c in name)
     alt = f"{name}: reference, predicted and measured speed, tracking error and command over time"
     caption = "The median of the ensemble's runs, and the machine."

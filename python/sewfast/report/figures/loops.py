@@ -6,7 +6,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...plotting import Picture, Table, draw, legend, milliseconds, panels, percent, rpm, svg, volt
+from ...plotting import (
+    Picture,
+    Table,
+    Trace,
+    draw,
+    loop_drawing,
+    loop_panels,
+    milliseconds,
+    percent,
+    rpm,
+    stacked,
+    svg,
+    volt,
+)
 from .. import labels
 from ..artefacts import Artefacts, Columns
 
@@ -77,8 +90,6 @@ _PURPOSE = {
 
 _MAGNIFIED = 0.4
 """Width of the magnified rise [s]."""
-_FINE = 1.2
-"""Line width where the lines do not cover each other."""
 
 
 def loop_pictures(artefacts: Artefacts) -> list[Picture]:
@@ -132,37 +143,39 @@ def _paper_gains(
 
 
 def _loop_figure(runs: dict[str, Columns], names: dict[str, str], *, magnified: bool) -> Figure:
-    heights = [2.0, 1.9, 1.2, 1.2] if magnified else [2.2, 1.3, 1.3]
-    figure, axes = panels(heights, share_x=False)
-    speed, command, error = axes[0, 0], axes[-1, 0], axes[-2, 0]
-    first = next(iter(runs.values()))
-    for look, run in reversed(runs.items()):
-        draw(speed, run["t"], run["y"], look, names[look])
-        draw(error, run["t"], run["r"] - run["y"], look, width=_FINE)
-        draw(command, run["t"], run["u"], look, width=_FINE)
-    draw(speed, first["t"], first["r"], "reference", "reference")
-    if magnified:
-        _magnify(axes[1, 0], speed, runs)
-    legend(speed)
-    for ax, label in ((speed, "speed [RPM]"), (error, "error [RPM]"), (command, "command [V]")):
-        ax.set_ylabel(label)
-        ax.margins(x=0.01)
-    command.set_xlabel("time [s]")
-    return figure
+    traces = [Trace.of(run, look, names[look]) for look, run in runs.items()]
+    if not magnified:
+        return loop_drawing(traces, "RPM", "V").figure()
+    output, error, command = loop_panels(traces, "RPM", "V")
+    window = _rise(traces[0])
+
+    def whole(ax: Axes) -> None:
+        output(ax)
+        ax.axvspan(window[0], window[1], color="#f3ead2", zorder=0)
+
+    drawing = stacked(
+        (whole, lambda ax: _magnify(ax, traces, window), error, command), (2.0, 1.9, 1.2, 1.2),
+        share_x=False,
+    )  # fmt: skip
+    return drawing.figure()
 
 
-def _magnify(ax: Axes, speed: Axes, runs: dict[str, Columns]) -> None:
+def _rise(trace: Trace) -> tuple[float, float]:
+    """A window about the first edge of the reference [s]."""
+    start = float(trace.t[int(np.argmax(trace.r > trace.r[0]))]) - 0.1
+    return start, start + _MAGNIFIED
+
+
+def _magnify(ax: Axes, traces: list[Trace], window: tuple[float, float]) -> None:
     """The rise, which lasts a few per cent of the record."""
-    first = next(iter(runs.values()))
-    t, r = first["t"], first["r"]
-    start = float(t[int(np.argmax(r > r[0]))]) - 0.1
-    for look, run in (*reversed(runs.items()), ("reference", first)):
-        inside = (run["t"] >= start) & (run["t"] <= start + _MAGNIFIED)
-        draw(ax, run["t"][inside], run["r" if look == "reference" else "y"][inside], look)
+    for s in reversed(traces):
+        inside = (s.t >= window[0]) & (s.t <= window[1])
+        draw(ax, s.t[inside], s.y[inside], s.look)
+    draw(ax, s.t[inside], s.r[inside], "reference")
     ax.set_title("magnified: the rise", pad=3)
     ax.set_ylabel("speed [RPM]")
+    ax.set_xlabel("time [s]")
     ax.margins(x=0.01)
-    speed.axvspan(start, start + _MAGNIFIED, color="#f3ead2", zorder=0)
 
 
 def _tuned_numbers(artefacts: Artefacts, reference: str) -> Table:

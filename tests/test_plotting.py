@@ -1,0 +1,162 @@
+"""`plot` of every result: into new figures, into axes, into files; `--plot` of every command."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sewfast
+from cli import refused
+from cli import sewfast as command
+from plants import bent_data, linear_data
+from sewfast import Dataset, Model, VirtualMachine
+from sewfast.errors import SettingError
+from sewfast.plotting import thin
+
+matplotlib = pytest.importorskip("matplotlib", reason="needs the report extra")
+matplotlib.use("Agg")
+from matplotlib import pyplot  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def no_figure_is_left() -> Iterator[None]:
+    yield
+    pyplot.close("all")
+
+
+@cache
+def model() -> Model:
+    return sewfast.identify(bent_data(800, noise=0.05), model="oe")
+
+
+def loop(plant: Any) -> sewfast.ClosedLoopRun:
+    return sewfast.run(sewfast.paper_controller(), plant, 500.0 * np.ones(200))
+
+
+def results() -> dict[str, tuple[Any, int]]:
+    """Every result that draws itself, and how many panels it has."""
+    held = bent_data(400, noise=0.05)
+    run = loop(VirtualMachine())
+    return {
+        "data": (held, 4),
+        "summary": (held.summary(), 4),
+        "validation": (sewfast.validate(model(), held), 2),
+        "card": (sewfast.check(model(), held), 2),
+        "run": (run, 3),
+    }
+
+
+@pytest.mark.parametrize("name", ["data", "summary", "validation", "card", "run"])
+def test_a_result_draws_itself(name: str, tmp_path: Path) -> None:
+    result, count = results()[name]
+    args = (None,) if name == "card" else ()
+    panels = result.plot()
+    assert len(panels) == count
+    for ax in panels:
+        assert ax.get_ylabel()
+    assert panels[0].figure.number in pyplot.get_fignums()
+    pyplot.close(panels[0].figure)
+
+    figure, axes = pyplot.subplots(1, 2)
+    assert result.plot(*args, axes[0]) is axes[0]
+    assert axes[0].lines
+    result.plot(*args, axes)
+    assert axes[1].lines
+    pyplot.close(figure)
+
+    for ending in ("png", "svg", "pdf"):
+        result.plot(file=tmp_path / f"{name}.{ending}")
+        assert (tmp_path / f"{name}.{ending}").stat().st_size > 1000
+    assert not pyplot.get_fignums()
+
+
+def test_wrong_axes_and_files_are_refused(tmp_path: Path) -> None:
+    run = loop(VirtualMachine())
+    with pytest.raises(SettingError, match=r"plot\(file=\.\.\.\)"):
+        run.plot("run.png")
+    with pytest.raises(SettingError, match="up to 3"):
+        run.plot([None])
+    with pytest.raises(SettingError, match=r"\.png, \.svg or \.pdf"):
+        run.plot(file=tmp_path / "run.jpg")
+    with pytest.raises(SettingError, match="folder that exists"):
+        run.plot(file=tmp_path / "none" / "run.png")
+    figure, axes = pyplot.subplots(1, 4)
+    with pytest.raises(SettingError, match="up to 3"):
+        run.plot(axes)
+    with pytest.raises(SettingError, match="both"):
+        run.plot(axes[0], file="run.png")
+    pyplot.close(figure)
+    card = sewfast.check(model(), bent_data(400, noise=0.05))
+    with pytest.raises(SettingError, match="residuals"):
+        card.plot("spectrum")
+
+
+def test_predicted_beside_measured() -> None:
+    measured = loop(VirtualMachine())
+    panels = measured.plot(beside=[loop(VirtualMachine(7))])
+    labels = [line.get_label() for line in panels[0].lines]
+    assert len(labels) == 3
+    assert labels[-1] == "reference"
+    assert "7" in labels[1]
+    pyplot.close(panels[0].figure)
+
+
+def test_experiments_are_not_joined() -> None:
+    data = Dataset.concat([linear_data(50, seed=1), linear_data(60, seed=2)])
+    found = sewfast.validate(sewfast.identify(linear_data(400), model="arx"), data)
+    output, error = found.plot()
+    (measured,) = (x for x in output.lines if x.get_label() == "measured")
+    t, y = np.asarray(measured.get_xdata()), np.asarray(measured.get_ydata())
+    assert np.flatnonzero(np.isnan(y)).tolist() == [50]
+    assert np.all(np.diff(t) > 0.0)
+    assert "one after the other" in error.get_xlabel()
+    pyplot.close(output.figure)
+
+
+def test_gaps_stay_gaps_in_a_thinned_line() -> None:
+    x = np.arange(30_000.0)
+    y = np.sin(0.01 * x)
+    y[12_000:12_400] = np.nan
+    y[20_000] = 7.0
+    _, kept = thin(x, y, 500)
+    assert len(kept) < 3000
+    assert np.isnan(kept).any()
+    assert np.nanmax(kept) == 7.0
+
+
+# --- the command line -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    data = linear_data(600, noise=0.5)
+    e = data.experiments[0]
+    columns = {"t": data.Ts * np.arange(len(e)), "u": e.u[:, 0], "y": e.y}
+    sewfast.write_table(tmp_path / "run.csv", columns, units={"u": "V", "y": "RPM"})
+    return tmp_path
+
+
+def test_every_command_draws(folder: Path) -> None:
+    def drawn(*args: str) -> str:
+        said = command(folder, *args, "--plot", f"{args[0]}.png").out
+        assert (folder / f"{args[0]}.png").read_bytes().startswith(b"\x89PNG")
+        return said
+
+    columns = ("--input", "u", "--output", "y")
+    for said in (
+        drawn("look", "run.csv", *columns),
+        drawn("identify", "run.csv", *columns, "--model", "oe", "-o", "m.json"),
+        drawn("validate", "m.json", "run.csv"),
+        drawn("check", "m.json", "run.csv"),
+        drawn("tune", "m.json", "-o", "c.json", "--evaluations", "20"),
+        drawn("run", "c.json", "m.json", "-o", "r.csv"),
+        drawn("analyse", "c.json", "m.json"),
+    ):
+        assert ".png" in said
+    assert "--plot" in refused(folder, "validate", "m.json", "run.csv", "--plot", "fit.doc")
+    assert "none" in refused(folder, "run", "c.json", "m.json", "--plot", "none/run.png")
