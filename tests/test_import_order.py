@@ -1,0 +1,74 @@
+"""The order of the package: a unit imports what stands before it, never what stands behind it.
+
+A unit is a module or a folder directly below `sewfast`. Every import counts, those inside functions
+and those for types too: they are the ones that hide a knot.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import sewfast
+
+ORDER = """
+    errors arrays units storage plotting threads speed signals
+    writers recordfile dataset readers benchmarks machine live
+    dynamic_model validation evidence models
+    regression lipschitz delays order_table leastsquares linear_plant identification
+    gains rules control variables drive_defaults loop plants load_step constraints robustness cost
+    starting tuning_task second_opinion tuning front trust analysis pid_forms
+    link recording report commissioning experiment cli __main__
+"""
+
+LEFT: frozenset[tuple[str, str]] = frozenset()
+"""Imports (module, unit) that still point up. Take out what is mended; nothing is put in."""
+
+BELOW_ALL = ("_core", "__version__")
+"""The compiled core and the package's version, which is the core's."""
+
+ROOT = Path(sewfast.__file__).parent
+MODULES = {
+    ".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): f
+    for f in ROOT.rglob("*.py")
+    if f != ROOT / "__init__.py"
+}
+
+
+def _imported(module: str) -> Iterator[str]:
+    """Modules of the package that a module imports anywhere; `` where it imports the package."""
+    file = MODULES[module]
+    package = module.split(".") if file.name == "__init__.py" else module.split(".")[:-1]
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names = [alias.name.split(".") for alias in node.names]
+            yield from (".".join(n[1:]) for n in names if n[0] == "sewfast")
+        elif isinstance(node, ast.ImportFrom):
+            path = (node.module or "").split(".") if node.module else []
+            if node.level:
+                path = [*package[: len(package) - node.level + 1], *path]
+            elif path[:1] == ["sewfast"]:
+                path = path[1:]
+            else:
+                continue
+            for alias in node.names:
+                whole = ".".join([*path, alias.name])
+                yield whole if whole in MODULES or not path else ".".join(path)
+
+
+def _arrows() -> set[tuple[str, str]]:
+    """Every import from one unit into another: (module, unit)."""
+    found = {(m, target.split(".")[0]) for m in MODULES for target in _imported(m)}
+    return {(m, unit) for m, unit in found if unit not in (m.split(".")[0], *BELOW_ALL)}
+
+
+def test_every_unit_has_its_place() -> None:
+    assert sorted(ORDER.split()) == sorted({m.split(".")[0] for m in MODULES})
+
+
+def test_imports_point_down() -> None:
+    place = {unit: i for i, unit in enumerate(ORDER.split())}
+    up = {(m, u) for m, u in _arrows() if u not in place or place[u] > place[m.split(".")[0]]}
+    assert up - LEFT == set(), "move what is imported down, or hand the value in"
+    assert LEFT - up == set(), "mended: take it out of LEFT"
