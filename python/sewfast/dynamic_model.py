@@ -434,6 +434,13 @@ class DynamicModel(ABC):
         lines = [f"{self.title}: {self.signature}", f"{orders}, Ts = {self.Ts:g} s"]
         return "\n".join([*lines, *self.describe(), *self._story()])
 
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        from .plotting import html_of
+
+        first, *lines = str(self).splitlines()
+        return html_of("\n".join([first, f"orders: {lines[0]}", *lines[1:]]))
+
     def _story(self) -> list[str]:
         t = self.training
         if not t:

@@ -20,7 +20,7 @@ from .errors import Interrupted, SettingError
 from .gains import whole
 from .load_step import LoadStep
 from .plants import Plants, References
-from .plotting import Drawing, Panel, lettered
+from .plotting import Drawing, Panel, Table, lettered, significant
 from .tuning import tune
 from .tuning_task import (
     Aggregate,
@@ -142,6 +142,15 @@ class ParetoFront:
             Where matplotlib is not installed or the file cannot be written.
         """
         return drawing(self).plot(ax, file)
+
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        header = [f"{n} [{self.units[n]}]" if self.units[n] else n for n in self.objectives]
+        rows = tuple(
+            ("the knee" if i == self.pick else "", *map(significant, row))
+            for i, row in enumerate(self.values.tolist())
+        )
+        return Table(f"{len(self)} controllers", ("", *header), rows).to_html()
 
     def __str__(self) -> str:
         names = [f"{n} [{self.units[n]}]" if self.units[n] else n for n in self.objectives]

@@ -143,6 +143,10 @@ class ClosedLoopRun:
         # the others are drawn over this one, whose line is wider
         return loop_drawing(traces[::-1], self.units["y"], self.units["u"], limits).plot(ax, file)
 
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        return run_html(self, f"{self.reference} on {self.plant}, {len(self.t) * self.Ts:g} s")
+
     def __str__(self) -> str:
         unit = self.units | {n: unit or n for n, unit in self.units.items() if n in "uy"}
         told = self.metrics()
@@ -180,6 +184,35 @@ class Follower(Protocol):
         overwrite: bool,
     ) -> ClosedLoopRun:
         """Run along the reference `r` [y], shape (N,), from rest; arguments as of `run`."""
+
+
+class HasMetrics(Protocol):
+    """A run of a closed loop, whoever has carried it out."""
+
+    @property
+    def units(self) -> dict[str, str]: ...
+    def metrics(self) -> dict[str, float | None]: ...
+
+
+def run_html(found: HasMetrics, caption: str) -> str:
+    """What a controller did, as a table for a notebook."""
+    from .plotting import Table, percent, significant
+
+    m, u, y = found.metrics(), found.units["u"], found.units["y"]
+    saturated = m["saturated"]
+
+    def size(name: str, unit: str) -> str:
+        return f"{significant(m[name])} {unit}".rstrip()
+
+    rows = [("tracking error", f"{size('rmse', y)} rms, {size('max_abs', y)} at most")]
+    if m["rise_time_ms"] is not None:
+        rise = f"{size('rise_time_ms', 'ms')} (reference {size('reference_rise_time_ms', 'ms')})"
+        rows.append(("10 to 90 % of the first edge", rise))
+        rows.append(("overshoot", percent(m["overshoot_percent"])))
+    rows.append(("command", f"{size('u_rms', u)} rms"))
+    rows.append(("change from sample to sample", f"{size('du_rms', u)} rms"))
+    rows.append(("at a limit", percent(None if saturated is None else 100.0 * saturated)))
+    return Table(caption, (), tuple(rows)).to_html()
 
 
 def run(

@@ -15,6 +15,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -78,6 +79,16 @@ def milliseconds(value: float | None) -> str:
     return NONE if value is None else f"{value:.0f}{_SPACE}ms"
 
 
+def html_of(text: str) -> str:
+    """Lines of text, `name: value`, as a table for a notebook; the first line is its caption."""
+    caption, *lines = text.splitlines()
+    rows: list[tuple[str, ...]] = []
+    for line in lines:
+        name, colon, value = line.strip().partition(": ")
+        rows.append((name, value) if colon else ("", line.strip()))
+    return Table(caption, (), tuple(rows), words=True).to_html()
+
+
 def _raised(exponent: int) -> str:
     return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
@@ -106,6 +117,28 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     best: frozenset[tuple[int, int]] = frozenset()
     words: bool = False
+
+    def to_html(self, notes: Sequence[str] = ()) -> str:
+        """As HTML for a notebook, everything escaped: no style or script of its own.
+
+        Parameters
+        ----------
+        notes : sequence of str
+            Lines below the table.
+        """
+        heads = "".join(f'<th scope="col">{escape(h)}</th>' for h in self.header)
+        head = f"<thead><tr>{heads}</tr></thead>\n" if self.header else ""
+        rows = "\n".join(
+            f'<tr><th scope="row">{escape(row[0])}</th>'
+            + "".join(f"<td>{escape(cell)}</td>" for cell in row[1:])
+            + "</tr>"
+            for row in self.rows
+        )
+        below = "".join(f"\n<div>{escape(note)}</div>" for note in notes)
+        return (
+            f"<table><caption>{escape(self.caption)}</caption>\n{head}"
+            f"<tbody>\n{rows}\n</tbody></table>{below}"
+        )
 
 
 # --- The canvas: the look of every figure, thinning of long series, figures as inline SVG ---------

@@ -139,6 +139,22 @@ class TuningResult:
         limits = (self.controller.u_min, self.controller.u_max)
         return loop_drawing(traces, after.units["y"], after.units["u"], limits).plot(ax, file)
 
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        from .plotting import Table, significant
+
+        unit = self.controller.gains.y_unit or "y"
+        rows = tuple(
+            (v.name, significant(v.value, 4), significant(v.low), significant(v.high))
+            for v in self.variables
+        )
+        return Table(
+            f"cost {self.cost:.4g} {unit} (start {self.start_cost:.4g}), {self.evaluations} "
+            f"controllers tried, ended by {self.termination}",
+            ("searched", "found", "from", "to"),
+            rows,
+        ).to_html([] if self.warning is None else [f"warning: {self.warning}"])
+
     def __str__(self) -> str:
         unit = self.controller.gains.y_unit or "y"
         lines = [

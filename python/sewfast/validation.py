@@ -257,6 +257,26 @@ class Validation:
         )
         return stacked(panels, (2.6, 1.7)).plot(ax, file)
 
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        from .plotting import Table, percent, significant
+
+        unit = f" [{self.unit}]" if self.unit else ""
+        rows = [("free run", self.simulation), ("one step ahead", self.one_step)]
+        if len(self.experiments) > 1:
+            rows += [
+                (f"{e.name} [{e.range_text}], free run", e.simulation_scores)
+                for e in self.experiments
+            ]
+        return Table(
+            f"{self.model} against {self.against}{unit}, {self.n} samples scored",
+            ("", f"rms error{unit}", "fit", f"largest error{unit}"),
+            tuple(
+                (name, significant(s.rmse), percent(s.fit_percent), significant(s.max_abs))
+                for name, s in rows
+            ),
+        ).to_html([*(f"note: {n}" for n in self.notes), f"verdict: {self.verdict}"])
+
     def __repr__(self) -> str:
         s = self.simulation
         return f"Validation(free run: rmse={s.rmse:.4g}, fit={s.fit_percent:.2f} %, n={self.n})"

@@ -206,6 +206,21 @@ class Dataset:
     require_complete = pieces.require_complete
     require_excited = pieces.require_excited
 
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        from ..plotting import Table, significant
+
+        names = [*map(labelled, self.input_names, self.input_units)]
+        columns = [
+            ("input", name, span) for name, span in zip(names, self.input_range, strict=True)
+        ]
+        columns.append(("output", labelled(self.output_name, self.output_unit), self.output_range))
+        rows = tuple((n, r, *map(significant, span)) for r, n, span in columns)
+        count = len(self.experiments)
+        several = f" in {count} experiments" if count > 1 else ""
+        caption = f"{len(self)} samples{several} at Ts = {self.Ts:g} s"
+        return Table(caption, ("column", "", "from", "to"), rows).to_html(self.notes)
+
     def __repr__(self) -> str:
         inputs = ", ".join(map(labelled, self.input_names, self.input_units))
         return (

@@ -124,6 +124,8 @@ class Judged:
             f"<thead><tr>{heads}</tr></thead>\n<tbody>\n{rows}\n</tbody></table>"
         )
 
+    _repr_html_ = to_html
+
     def __repr__(self) -> str:
         counts = {v: sum(x.verdict == v for x in self.lines) for v in _ORDER}
         text = ", ".join(f"{n} {v}" for v, n in reversed(counts.items()) if n)

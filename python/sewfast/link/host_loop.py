@@ -17,7 +17,7 @@ from .. import _core, signals
 from ..arrays import FloatArray
 from ..control import Controller
 from ..errors import DataError, Interrupted, LinkError, SettingError
-from ..loop import SMOOTHING, reference_samples, require_controller
+from ..loop import SMOOTHING, reference_samples, require_controller, run_html
 from ..recordfile import Header, RecordWriter
 from ..recordfile.filing import replacing
 from ..recordfile.writer import require_replaceable
@@ -175,6 +175,11 @@ class HostLoopRun:
         return stacked((*panels, self.jitter.panel), (2.2, 1.3, 1.3, 2.4), share_x=False).plot(
             ax, file
         )
+
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        caption = f"{self.reference} on {self.plant} from this computer, {self.outcome}"
+        return run_html(self, caption)
 
     def save_samples(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write every sample of the device as CSV, `.npz`, `.mat`, Parquet or MCAP.
