@@ -19,9 +19,9 @@ from sewfast import Commissioning, Controller
 from sewfast.commissioning import SteppedBench
 from sewfast.commissioning.demands import demands
 from sewfast.commissioning.excitations import standard
+from sewfast.control.loop import ClosedLoopRun
+from sewfast.control.margins import margins
 from sewfast.cost import Cost
-from sewfast.loop import ClosedLoopRun
-from sewfast.robustness import margins
 from sewfast.tuning import Variable
 from sewfast.variables import applied
 

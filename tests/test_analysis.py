@@ -14,8 +14,8 @@ from cli import sewfast as command
 from loops import QUIET, drive
 from sewfast import Cost, Ensemble, VirtualMachine, _core, identify, run
 from sewfast.analysis import Analysis, analyse, changes, run_under_load
-from sewfast.analysis.systems import LinearLoop, response, simulate
 from sewfast.control import Controller, Gains
+from sewfast.control.systems import LinearLoop, response, simulate
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError, ModelFileError, SettingError
 from sewfast.models import LinearOE

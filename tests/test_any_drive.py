@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import sewfast
 from documents import Command
 from sewfast.control import Controller, Gains, load_controller
-from sewfast.drive_defaults import (
+from sewfast.control.defaults import (
     catalogue_fits,
     default_references,
     drive_references,

@@ -19,7 +19,7 @@ from sewfast.commissioning.motion import first_motion, step_response
 from sewfast.commissioning.refusal import Refusal
 from sewfast.commissioning.small_signal import SmallSignal, small_signal
 from sewfast.commissioning.turn import HARMONICS, TurnLoad, basis
-from sewfast.robustness import margins
+from sewfast.control.margins import margins
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benches"))
 drives = pytest.importorskip("drives")

@@ -30,9 +30,9 @@ from sewfast.commissioning import Followed
 from sewfast.commissioning.bench import MachineBench
 from sewfast.commissioning.folder import require_own
 from sewfast.commissioning.taken import Taken, prepare
+from sewfast.control.loop import run as closed_loop
 from sewfast.dataset import FloatArray
 from sewfast.link import VirtualDevice
-from sewfast.loop import run as closed_loop
 from sewfast.recordfile import read_recording
 from sewfast.recording import Recording, record
 

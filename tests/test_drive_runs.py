@@ -16,9 +16,9 @@ from cli import PROGRAM, environment, refused, sewfast
 from moments import is_on, once_on, until
 from sewfast import signals
 from sewfast.control import Controller, Gains
+from sewfast.control.loop import run
 from sewfast.errors import Interrupted, LinkError, SettingError
 from sewfast.link import Drive, VirtualDevice, connect
-from sewfast.loop import run
 from sewfast.machine import VirtualMachine
 from sewfast.readers import read
 from sewfast.recordfile import read_recording

@@ -11,10 +11,10 @@ import pytest
 
 from plants import bent_data, linear_data
 from sewfast import _core
+from sewfast.control.loop import run
 from sewfast.dataset import Dataset
 from sewfast.dynamic_model import FORMAT, VERSION
 from sewfast.errors import FitError, ModelFileError, SettingError
-from sewfast.loop import run
 from sewfast.models import Ensemble, LinearOE, Model, load_model, model_schema
 from sewfast.tuning import tune
 

@@ -16,9 +16,9 @@ ORDER = """
     errors arrays units storage plotting threads speed signals
     writers recordfile dataset readers benchmarks machine live
     dynamic_model validation evidence models
-    regression lipschitz delays order_table leastsquares linear_plant identification
-    gains rules control variables drive_defaults loop plants load_step constraints robustness cost
-    starting tuning_task second_opinion tuning front trust analysis pid_forms
+    regression lipschitz delays order_table leastsquares identification
+    gains rules control variables load_step constraints cost
+    starting tuning_task second_opinion tuning front trust analysis
     link recording report commissioning experiment cli __main__
 """
 

@@ -17,10 +17,10 @@ from moments import once_on
 from sewfast import VirtualMachine
 from sewfast.cli import main
 from sewfast.control import Controller, Gains
+from sewfast.control.loop import run
 from sewfast.errors import DataError, LinkError, SettingError
 from sewfast.experiment import run_demo
 from sewfast.link import Drive, VirtualDevice, connect
-from sewfast.loop import run
 from sewfast.recordfile import Header, RecordWriter, export, read_recording
 from sewfast.recordfile.filing import Sink
 from sewfast.recording import record

@@ -17,9 +17,9 @@ import pytest
 from link_device import RUNNING, ScriptedDevice
 from sewfast import Controller, Gains, VirtualMachine
 from sewfast.cli import main
+from sewfast.control.loop import run
 from sewfast.errors import DataError, LinkError, SettingError
 from sewfast.link import Drive, Outcome, Plan, VirtualDevice, connect, examine, run_on_host
-from sewfast.loop import run
 from sewfast.recordfile import Header, RecordWriter, export, read_recording
 from sewfast.recording import record
 

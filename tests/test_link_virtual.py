@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sewfast import Controller, Gains, VirtualMachine, loop, signals
+from sewfast import Controller, Gains, VirtualMachine, signals
+from sewfast.control import loop
 from sewfast.errors import LinkError, SettingError
 from sewfast.link import Plan, VirtualDevice, connect
 from test_link_drive import Kept, once

@@ -20,7 +20,7 @@ from sewfast import (
     signals,
     tune,
 )
-from sewfast.loop import run
+from sewfast.control.loop import run
 from sewfast.tuning import costs, recoveries
 
 STEP = LoadStep(1500.0, -2.0)

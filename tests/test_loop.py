@@ -9,8 +9,8 @@ import pytest
 from loops import QUIET, drive
 from sewfast import _core, signals
 from sewfast.control import Controller, Gains, paper_controller
+from sewfast.control.loop import run
 from sewfast.errors import DataError, FitError, SettingError
-from sewfast.loop import run
 from sewfast.machine import VirtualMachine
 from sewfast.models import LinearOE
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from plants import bent_data
 from sewfast import Controller, Gains, LinearOE, SettingError, identify, margins
 from sewfast.control import Fopdt
+from sewfast.control.margins import loop_response
 from sewfast.evidence import operating_range
-from sewfast.robustness import loop_response
 
 Ts = 0.001
 DRIVE = Fopdt(490.0, 0.25, 0.0083)

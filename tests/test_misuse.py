@@ -34,12 +34,12 @@ from sewfast import (
     tune,
 )
 from sewfast.analysis import changes
-from sewfast.analysis.systems import LinearLoop, simulate
 from sewfast.control import Fopdt
+from sewfast.control.forms import to_control, to_matlab
+from sewfast.control.margins import loop_response
+from sewfast.control.systems import LinearLoop, simulate
 from sewfast.errors import DataError, ModelFileError, SettingError, SewfastError
 from sewfast.front import NAMES
-from sewfast.pid_forms import to_control, to_matlab
-from sewfast.robustness import loop_response
 from sewfast.storage import replace_file
 from sewfast.trust import Limits, judge
 from sewfast.tuning import costs

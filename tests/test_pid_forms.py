@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sewfast import Controller, Gains, SettingError
-from sewfast.pid_forms import from_control, from_matlab, matlab_code, to_control, to_matlab
+from sewfast.control.forms import from_control, from_matlab, matlab_code, to_control, to_matlab
 
 PID = Controller(
     Gains.standard(0.02, 0.2, 0.01), 0.001, alpha=0.4, beta=0.3, N=8.0, filter_samples=4,

@@ -15,10 +15,10 @@ from sewfast.commissioning.slow import MOST, PER_CONSTANT, SHARPEST, Thinning
 from sewfast.commissioning.small_signal import Resonance, SmallSignal
 from sewfast.commissioning.turn import HARMONICS, TurnLoad
 from sewfast.control import Fopdt
+from sewfast.control.loop import run
+from sewfast.control.margins import margins
 from sewfast.cost import Cost
-from sewfast.loop import run
 from sewfast.recording import Recording, record
-from sewfast.robustness import margins
 
 
 def recorded(samples: int = 1003) -> Recording:

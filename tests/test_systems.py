@@ -7,10 +7,10 @@ import pytest
 
 from loops import QUIET, drive
 from sewfast import run
-from sewfast.analysis.systems import LinearLoop, response, simulate
 from sewfast.control import Controller, Gains
+from sewfast.control.margins import loop_response
+from sewfast.control.systems import LinearLoop, response, simulate
 from sewfast.models import LinearOE
-from sewfast.robustness import loop_response
 
 IDEAL = replace(QUIET, counts_per_rev=None, u_min=-np.inf, u_max=np.inf)
 CONTROLLERS = {

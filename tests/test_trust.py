@@ -14,9 +14,9 @@ from cli import sewfast as command
 from loops import QUIET, drive
 from sewfast import Ensemble, VirtualMachine, identify, paper_controller, run, signals, tune
 from sewfast.control import Gains
+from sewfast.control.loop import ClosedLoopRun
 from sewfast.dataset import Dataset
 from sewfast.errors import FitError, SettingError
-from sewfast.loop import ClosedLoopRun
 from sewfast.trust import Limits, disagreements, judge, oscillation
 
 LEVELS = np.concatenate(

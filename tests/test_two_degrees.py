@@ -11,8 +11,8 @@ from loops import QUIET, drive
 from sewfast import VirtualMachine
 from sewfast.analysis import run_under_load
 from sewfast.analysis.responses import RECOVERED, torque_of
-from sewfast.analysis.systems import LinearLoop, simulate
 from sewfast.control import Controller, Gains
+from sewfast.control.systems import LinearLoop, simulate
 from sewfast.dataset import FloatArray
 
 OTHER_F2 = replace(QUIET, alpha=0.7, beta=0.5)

@@ -11,14 +11,9 @@ if TYPE_CHECKING:
     from .analysis import Analysis, analyse
     from .commissioning import Commissioning, commission
     from .constraints import Constraints
-    from .control import (
-        Controller,
-        Gains,
-        fit_fopdt,
-        load_controller,
-        paper_controller,
-        table_1,
-    )
+    from .control.controller import Controller, load_controller, paper_controller
+    from .control.loop import ClosedLoopRun, run
+    from .control.margins import Margins, margins
     from .cost import Cost
     from .dataset import Dataset, Diagnosis, Experiment, diagnose
     from .delays import DelayEstimate, delay
@@ -33,16 +28,16 @@ if TYPE_CHECKING:
     )
     from .evidence import ReportCard, check
     from .front import ParetoFront, pareto
+    from .gains import Gains
     from .identification import identify
     from .leastsquares import LeastSquaresResult, least_squares
     from .load_step import LoadStep
-    from .loop import ClosedLoopRun, run
     from .machine import VirtualMachine
     from .models import ARX, IV, Ensemble, LinearOE, Model, NeuralOE, NeuralSS, load_model
     from .order_table import OrderTable, orders
     from .readers import read, read_table
     from .recording import Recording, record
-    from .robustness import Margins, margins
+    from .rules import fit_fopdt, table_1
     from .speed import speed_from_counts
     from .tuning import TuningResult, tune
     from .validation import Validation, validate
@@ -128,14 +123,14 @@ _HOMES = {
     "evidence": "ReportCard check",
     "identification": "identify",
     "leastsquares": "LeastSquaresResult least_squares",
-    "loop": "ClosedLoopRun run",
+    "control.loop": "ClosedLoopRun run",
     "machine": "VirtualMachine",
     "models": "ARX IV Ensemble LinearOE Model NeuralOE NeuralSS load_model",
     "order_table": "OrderTable orders",
     "front": "ParetoFront pareto",
     "readers": "read read_table",
     "recording": "Recording record",
-    "robustness": "Margins margins",
+    "control.margins": "Margins margins",
     "speed": "speed_from_counts",
     "tuning": "TuningResult tune",
     "validation": "Validation validate",

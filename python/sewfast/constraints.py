@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from . import _core
-from .control import Controller
+from .control.controller import Controller
 from .errors import SettingError
 from .gains import real
 

@@ -13,7 +13,7 @@ from .errors import DataError, SettingError
 from .gains import real
 
 if TYPE_CHECKING:
-    from .loop import ClosedLoopRun
+    from .control.loop import ClosedLoopRun
 
 SHARES = ("chatter", "overshoot", "saturation")
 """Weights whose default depends on the references' span."""
@@ -104,7 +104,7 @@ class Cost:
         DataError
             Where there is no run, or what is none, or one has samples missing.
         """
-        from .loop import ClosedLoopRun
+        from .control.loop import ClosedLoopRun
 
         several = list(runs) if isinstance(runs, Sequence) else [runs]
         for one in several:

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from . import _core
 from .constraints import Constraints
-from .control import Controller
+from .control.controller import Controller
+from .control.loop import Plants, References
 from .cost import Cost
 from .errors import Interrupted, SettingError
 from .gains import whole
 from .load_step import LoadStep
-from .plants import Plants, References
 from .plotting import Drawing, Panel, Table, lettered, significant
 from .tuning import tune
 from .tuning_task import (

@@ -97,7 +97,7 @@ class VirtualMachine:
 
     @property
     def core(self) -> Machine:
-        """Its arithmetic; takes part in `sewfast.loop` as a plant."""
+        """Its arithmetic; takes part in `sewfast.control.loop` as a plant."""
         return self._core
 
     @property

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import _core
-from .control import Controller
+from .control.controller import Controller
 from .errors import FitError
 from .tuning_task import TuningTask
 

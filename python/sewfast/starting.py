@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal, TypeAlias
 
-from .control import Controller, Gains, table_1
-from .drive_defaults import command_limits, drive_step, filter_length, require_one_input
+from .control.controller import Controller
+from .control.defaults import command_limits, drive_step, filter_length, require_one_input
+from .control.loop import Plant, plant_units
 from .errors import SettingError
-from .gains import whole
-from .loop import Plant, plant_units
+from .gains import Gains, whole
 from .models import Model
+from .rules import table_1
 from .units import REVOLUTIONS_PER_SECOND
 
 DERIVATIVE_FILTER = 10.0

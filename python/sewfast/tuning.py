@@ -13,13 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import _core
 from .constraints import Constraints
-from .control import Controller
+from .control.controller import Controller
+from .control.loop import Plant, Plants, References, check_fits, each_plant, run
 from .cost import Cost
 from .errors import FitError, Interrupted, SettingError
 from .gains import whole
 from .load_step import LoadStep
-from .loop import Plant, check_fits, run
-from .plants import Plants, References, each_plant
 from .second_opinion import SHARE, SecondOpinion, second_opinion
 from .starting import Encoder, first_controller
 from .tuning_task import (

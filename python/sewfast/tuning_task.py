@@ -13,14 +13,20 @@ from numpy.typing import ArrayLike
 
 from . import _core
 from .constraints import Constraints
-from .control import Controller, vector
+from .control.controller import Controller
+from .control.defaults import beyond_record, default_references
+from .control.loop import (
+    Plants,
+    References,
+    check_fits,
+    each_plant,
+    each_reference,
+    reference_samples,
+)
 from .cost import Cost
-from .drive_defaults import beyond_record, default_references
 from .errors import SettingError
-from .gains import real, whole
+from .gains import real, vector, whole
 from .load_step import LoadStep
-from .loop import check_fits, reference_samples
-from .plants import Plants, References, each_plant, each_reference
 from .starting import first_controller
 from .threads import available
 from .variables import Wanted, usual_variables, wanted
@@ -116,7 +122,7 @@ class TuningTask:
 
     def _loops(self) -> list[Any]:
         """The linear plants that Ms is taken on, as fractions."""
-        from .linear_plant import sampled
+        from .control.margins import sampled
 
         given = self.constraints.plant
         if given is None:

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from .control import Controller
+from .control.controller import Controller
 from .errors import SettingError
 from .gains import Gains, real
 

@@ -1,11 +1,11 @@
 """Analysis of a controller on models: responses, Bode of L, S, T, gain sensitivity, what-if."""
 
+from ..control.systems import LinearLoop
 from .analysis import Analysis, analyse
 from .changes import Change
 from .points import LoopBode, PlantPoint
 from .responses import Responses, run_under_load
 from .sensitivity import GainSensitivity, Score, WhatIf
-from .systems import LinearLoop
 
 __all__ = [
     "Analysis",

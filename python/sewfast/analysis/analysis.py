@@ -11,19 +11,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..control import Controller
+from ..control.controller import Controller
+from ..control.defaults import catalogue_fits
+from ..control.loop import (
+    Plants,
+    References,
+    check_fits,
+    each_plant,
+    each_reference,
+    require_controller,
+    titles,
+)
+from ..control.systems import LinearLoop
 from ..cost import Cost
-from ..drive_defaults import catalogue_fits
 from ..errors import FitError, SettingError
-from ..loop import check_fits, require_controller
-from ..plants import Plants, References, each_plant, each_reference, titles
 from ..trust import Judgement, Limits, judge
 from .arguments import each_change, finite_each, required
 from .changes import Change
 from .points import LoopBode, PlantPoint, loop_bodes, plant_points
 from .responses import Responses, Steps, default_steps, responses
 from .sensitivity import GainSensitivity, Score, Task, WhatIf, gain_sensitivity, what_if
-from .systems import LinearLoop
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

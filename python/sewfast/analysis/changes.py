@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from .. import _core
+from ..control.loop import Plant
 from ..errors import SettingError
 from ..gains import real, whole
-from ..loop import Plant
 from ..machine import VirtualMachine
 from ..models import Model, NeuralSS
 from ..models.files import from_dict

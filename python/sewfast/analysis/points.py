@@ -10,17 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..control import Controller
+from ..control.controller import Controller
+from ..control.loop import Plant
+from ..control.margins import Margins, loop_response, margins, operating_point
 from ..dataset import FloatArray
 from ..errors import SettingError
 from ..evidence.operating import OperatingPoint, operating_range
-from ..linear_plant import operating_point
-from ..loop import Plant
 from ..machine import VirtualMachine
 from ..models import Model
 from ..models.conversion import StateSpace
 from ..models.linear import LinearDifference
-from ..robustness import Margins, loop_response, margins
 
 # --- PlantPoint: a plant as a linear system about a steady output ---------------------------------
 

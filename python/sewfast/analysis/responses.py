@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..control import Controller, vector
+from ..control.controller import Controller
+from ..control.loop import ClosedLoopRun, Plant, check_fits, reference_samples, run
 from ..dataset import FloatArray
 from ..errors import DataError, SettingError
-from ..loop import ClosedLoopRun, Plant, check_fits, reference_samples, run
+from ..gains import vector
 from ..machine import VirtualMachine
 from .arguments import finite
 from .points import PlantPoint

@@ -11,13 +11,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..control import Controller
+from ..control.controller import Controller
+from ..control.loop import Plant, run
+from ..control.margins import margins
 from ..cost import Cost, terms
 from ..errors import FitError, SettingError
 from ..gains import Gains
-from ..loop import Plant, run
 from ..machine import VirtualMachine
-from ..robustness import margins
 from ..threads import available
 from .changes import ON_MACHINES, ON_MODELS, Change
 from .points import PlantPoint, plant_points

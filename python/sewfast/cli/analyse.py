@@ -58,7 +58,7 @@ def add(commands: Commands) -> None:
 
 def analyse_command(args: argparse.Namespace) -> None:
     from ..analysis import analyse
-    from ..control import load_controller
+    from ..control.controller import load_controller
 
     require_plot(args.plot)
     controller = load_controller(args.controller)

@@ -30,10 +30,10 @@ from .host_loop import add_host_loop, at_loops_period, run_host_loop
 from .output import write_columns
 
 if TYPE_CHECKING:
-    from ..control import Controller
+    from ..control.controller import Controller
+    from ..control.loop import ClosedLoopRun, Plant
     from ..dataset import FloatArray
     from ..evidence import Line
-    from ..loop import ClosedLoopRun, Plant
 
 RUN = """\
 Close the loop around a model, a virtual machine or a drive, with the same controller arithmetic.
@@ -85,8 +85,8 @@ def add(commands: Commands) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int | None:
-    from ..control import load_controller
-    from ..loop import run
+    from ..control.controller import load_controller
+    from ..control.loop import run
 
     _settle_plant(args)
     require_plot(args.plot)
@@ -126,7 +126,7 @@ def _settle_plant(args: argparse.Namespace) -> None:
         moved by a slip.
     """
     from .. import storage
-    from ..control import FORMAT
+    from ..control.controller import FORMAT
     from ..dynamic_model import FORMAT as MODEL
 
     if (args.on is None) == (args.plant is None):

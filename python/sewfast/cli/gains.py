@@ -12,9 +12,9 @@ from .output import print_json, print_rows
 from .tune import FORMS, forms_of, gain_row
 
 if TYPE_CHECKING:
-    from ..control import Controller, Fopdt
-    from ..robustness import Margins
-    from ..rules import Rule
+    from ..control.controller import Controller
+    from ..control.margins import Margins
+    from ..rules import Fopdt, Rule
 
 RULES = ("eq-12", "table-1", "simc", "simc-pid", "amigo")
 FILTER = 8
@@ -77,7 +77,7 @@ def add(commands: Commands) -> None:
 
 
 def gains_command(args: argparse.Namespace) -> None:
-    from ..robustness import margins
+    from ..control.margins import margins
 
     require_place(args.out, (".json",))
     if args.filter < 1:
@@ -98,7 +98,7 @@ def gains_command(args: argparse.Namespace) -> None:
 
 def _plant(args: argparse.Namespace) -> tuple[Fopdt, float]:
     """The first-order model and the sample time."""
-    from ..control import Fopdt, fit_fopdt
+    from ..rules import Fopdt, fit_fopdt
 
     given = [args.K, args.T, args.L]
     if (args.data is None) == (None in given):
@@ -140,7 +140,7 @@ def _rule(args: argparse.Namespace, plant: Fopdt) -> Rule:
 
 
 def _controller(args: argparse.Namespace, rule: Rule, fopdt: Fopdt, Ts: float) -> Controller:
-    from ..control import Controller
+    from ..control.controller import Controller
 
     form = args.form.replace("-", "_")
     return Controller(

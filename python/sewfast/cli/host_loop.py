@@ -14,7 +14,7 @@ from .output import print_json, write_columns
 from .progress import Progress
 
 if TYPE_CHECKING:
-    from ..control import Controller
+    from ..control.controller import Controller
     from ..dataset import FloatArray
     from ..link import HostLoopRun
 

@@ -23,9 +23,10 @@ from .progress import Progress
 
 if TYPE_CHECKING:
     from ..constraints import Constraints
-    from ..control import Controller, Gains
+    from ..control.controller import Controller
     from ..cost import Cost
     from ..front import ParetoFront
+    from ..gains import Gains
     from ..load_step import LoadStep
     from ..tuning import TuningResult
     from ..variables import Wanted
@@ -229,7 +230,7 @@ def _first(args: argparse.Namespace) -> dict[str, Any]:
     """
     if args.start is None:
         return _loop(args)
-    from ..control import load_controller
+    from ..control.controller import load_controller
 
     given = [
         "--" + option.replace("_", "-")

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..control import Controller
+from ..control.controller import Controller
+from ..control.loop import run
 from ..dataset import FloatArray
 from ..errors import FitError
-from ..loop import run
 from ..models import Ensemble, Model
 from .refusal import Refusal
 

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
-from ..control import Controller
+from ..control.controller import Controller
+from ..control.loop import ClosedLoopRun, run
 from ..dataset import FloatArray
 from ..errors import LinkError, SettingError
 from ..link.plan import Plan
 from ..link.play import Stopped, conditions_of, device_of, play, run_of_drive
-from ..loop import ClosedLoopRun, run
 from ..machine import VirtualMachine
 from ..recording import Recording, record, recording_of_drive
 from ..speed import speed_from_counts

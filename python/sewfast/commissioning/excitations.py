@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from .. import _core
-from ..control import Fopdt
 from ..dataset import FloatArray
 from ..recording import Recording
+from ..rules import Fopdt
 from .demands import Demands
 
 # --- Signals for a machine that is known as a first order with dead time only ---------------------

@@ -13,9 +13,9 @@ import numpy as np
 
 from .. import __version__, storage
 from ..analysis.filing import NUMBERS as ANALYSIS
-from ..control import Controller
+from ..control.controller import Controller
+from ..control.loop import ClosedLoopRun
 from ..errors import DataError, SettingError
-from ..loop import ClosedLoopRun
 from ..report.commissioned import FORMAT, NUMBERS, VERSION, run_file
 from ..writers import write_table
 from .slow import Thinning

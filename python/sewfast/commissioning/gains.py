@@ -13,17 +13,16 @@ import numpy as np
 
 from .. import _core
 from ..constraints import Constraints
-from ..control import Controller, Fopdt
+from ..control.controller import Controller
+from ..control.margins import margins, sampled
 from ..cost import Cost
 from ..dataset import FloatArray
 from ..errors import DataError, FitError, SettingError
 from ..gains import Gains
-from ..linear_plant import sampled
 from ..load_step import LoadStep
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
-from ..robustness import margins
-from ..rules import Rule, eq_12, simc
+from ..rules import Fopdt, Rule, eq_12, simc
 from ..tuning import TuningResult, costs, recoveries, tune
 from .bench import Bench
 from .demands import Demands

@@ -6,8 +6,9 @@ import time
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
-from ..control import Controller, Fopdt
+from ..control.controller import Controller
 from ..recording import Recording
+from ..rules import Fopdt
 from .result import Commissioning
 
 Progress: TypeAlias = Callable[[int, int, str], object]

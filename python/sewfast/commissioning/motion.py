@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..control import Fopdt, fit_fopdt
 from ..dataset import FloatArray
 from ..errors import DataError, FitError
 from ..recording import Recording
+from ..rules import Fopdt, fit_fopdt
 from .bench import Bench
 from .demands import Demands
 from .excitations import step

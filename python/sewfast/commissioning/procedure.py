@@ -12,14 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import signals
-from ..control import Controller, Fopdt, vector
+from ..control.controller import Controller
+from ..control.loop import ClosedLoopRun
 from ..cost import Cost
 from ..dataset import FloatArray
 from ..errors import DataError, Interrupted, SettingError
-from ..loop import ClosedLoopRun
+from ..gains import vector
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
 from ..recording import Recording
+from ..rules import Fopdt
 from ..threads import available
 from ..tuning import TuningResult
 from . import excitations

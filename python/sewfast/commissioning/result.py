@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..control import Controller, Fopdt
+from ..control.controller import Controller
 from ..cost import Cost
 from ..evidence import Line, ReportCard
 from ..models import Ensemble
 from ..recording import Recording
+from ..rules import Fopdt
 from ..trust import Judgement
 from ..tuning import TuningResult
 from .motion import Motion

@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..control import Fopdt
 from ..dataset import Experiment
 from ..evidence import check
 from ..identification.folds import folds, thinned
 from ..identification.task import wrap
 from ..models import Ensemble, LinearOE, Model
 from ..recording import Recording
+from ..rules import Fopdt
 from .demands import Demands
 from .small_signal import SIZE, fitted, simplest
 from .training import LEAST_FIT, MOST_SAMPLES, Trained, validate_member

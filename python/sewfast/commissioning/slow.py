@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..control import Controller, Fopdt
+from ..control.controller import Controller
+from ..control.loop import ClosedLoopRun
 from ..cost import Cost
 from ..dataset import FloatArray
-from ..loop import ClosedLoopRun
 from ..recording import Recording
+from ..rules import Fopdt
 from ..speed import speed_from_counts
 from .small_signal import SmallSignal
 

@@ -17,13 +17,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import _core
-from ..control import Fopdt, fit_fopdt
 from ..dataset import Dataset, FloatArray
 from ..errors import DataError, FitError
 from ..identification.folds import Errors, Split, compared, errors_of, folds, free_runs
 from ..identification.task import arrays, wrap
 from ..models import LinearOE, Model
 from ..recording import Recording
+from ..rules import Fopdt, fit_fopdt
 from .bench import Bench
 from .demands import Demands
 from .motion import Motion

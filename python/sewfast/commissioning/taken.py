@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ..control import Controller
+from ..control.controller import Controller
+from ..control.loop import ClosedLoopRun
 from ..errors import DataError, SettingError
-from ..loop import ClosedLoopRun
 from ..recordfile import save_columns
 from ..recordfile.reader import RecordedFile, read_header, read_recording
 from ..recordfile.writer import ENDING, require_replaceable

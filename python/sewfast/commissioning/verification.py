@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..control import Controller
+from ..control.controller import Controller
+from ..control.loop import ClosedLoopRun, run
 from ..dataset import FloatArray
 from ..errors import FitError
-from ..loop import ClosedLoopRun, run
 from ..models import Ensemble
 from ..trust import Judgement, judge
 from .agreement import DISAGREE

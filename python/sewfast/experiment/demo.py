@@ -13,9 +13,9 @@ from .. import __version__, storage
 from ..commissioning import Commissioning
 from ..commissioning.folder import first_taken, numbers_in
 from ..commissioning.taken import prepare
-from ..control import Controller, Fopdt, paper_controller
+from ..control.controller import Controller, paper_controller
+from ..control.loop import ClosedLoopRun
 from ..errors import SettingError
-from ..loop import ClosedLoopRun
 from ..machine import VirtualMachine
 from ..models import Model
 from ..plotting import require
@@ -29,6 +29,7 @@ from ..report.artefacts import (
     recording_file,
     run_file,
 )
+from ..rules import Fopdt
 from ..signals import excitation
 from ..tuning import TuningResult
 from ..writers import write_table

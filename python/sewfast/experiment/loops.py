@@ -16,19 +16,21 @@ from .. import _core, signals
 from ..commissioning import Commissioning, commission
 from ..commissioning.bench import DriveBench, Followed
 from ..commissioning.folder import run_numbers
-from ..control import Controller, Fopdt, Gains, fit_fopdt, paper_controller, table_1
+from ..control.controller import Controller, paper_controller
+from ..control.loop import ClosedLoopRun, run
 from ..dataset import Dataset
 from ..errors import FitError, LinkError
 from ..evidence.figures import figures
+from ..gains import Gains
 from ..identification import identify
 from ..link import VirtualDevice, connect
-from ..loop import ClosedLoopRun, run
 from ..machine import VirtualMachine
 from ..models import LinearOE, Model
 from ..plotting import style, svg
 from ..recording import Recording, record
 from ..report.artefacts import PLANTS, REFERENCES, SCORED, record_of
 from ..report.figures.loops import CAPTIONS
+from ..rules import Fopdt, fit_fopdt, table_1
 from ..signals import excitation
 from ..speed import Method, floor_of_J
 from ..validation import Validation, validate

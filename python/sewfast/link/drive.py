@@ -13,11 +13,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..control import Controller
+from ..control.controller import Controller
+from ..control.loop import ClosedLoopRun
 from ..errors import LinkError, SettingError
 from ..gains import real
 from ..live import Kind as View
-from ..loop import ClosedLoopRun
 from . import play, terms, wire
 from . import run as profiles
 from .clock import ClockBounds

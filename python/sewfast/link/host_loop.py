@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from .. import _core, signals
 from ..arrays import FloatArray
-from ..control import Controller
+from ..control.controller import Controller
+from ..control.loop import SMOOTHING, reference_samples, require_controller, run_html
 from ..errors import DataError, Interrupted, LinkError, SettingError
-from ..loop import SMOOTHING, reference_samples, require_controller, run_html
 from ..recordfile import Header, RecordWriter
 from ..recordfile.filing import replacing
 from ..recordfile.writer import require_replaceable

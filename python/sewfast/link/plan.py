@@ -10,8 +10,9 @@ from typing import Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..control import Controller, vector
+from ..control.controller import Controller
 from ..errors import SettingError
+from ..gains import vector
 from . import wire
 from .clock import ClockBounds
 from .wire import Channel, Identity

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..arrays import FloatArray
-from ..control import Controller
+from ..control.controller import Controller
+from ..control.loop import ClosedLoopRun
 from ..errors import Interrupted, LinkError, SettingError, SewfastError
 from ..live import Feed, Kind, open_view
-from ..loop import ClosedLoopRun
 from ..recordfile import Header, RecordWriter, read_recording
 from ..recordfile.writer import require_ending, require_replaceable
 from ..speed import speed_or_nan

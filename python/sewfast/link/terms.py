@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 
-from ..control import Controller
+from ..control.controller import Controller
 from ..errors import LinkError, SettingError
 from ..gains import Gains, real
 from ..units import counts_per_unit

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..control import Controller
-from ..loop import ClosedLoopRun
+from ..control.controller import Controller
+from ..control.loop import ClosedLoopRun
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from ..control.loop import ClosedLoopRun
 from ..evidence.card import Judged, Line
-from ..loop import ClosedLoopRun
 from .disagreement import Disagreement
 from .limits import Limits
 from .oscillation import Oscillation

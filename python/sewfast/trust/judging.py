@@ -8,14 +8,23 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
-from ..control import Controller
+from ..control.controller import Controller
+from ..control.defaults import default_references
+from ..control.loop import (
+    ClosedLoopRun,
+    Plant,
+    Plants,
+    References,
+    check_fits,
+    each_plant,
+    each_reference,
+    titles,
+    trial,
+)
 from ..dataset import Dataset
-from ..drive_defaults import default_references
 from ..errors import FitError, SettingError, SewfastError
 from ..evidence.region import placed
-from ..loop import ClosedLoopRun, Plant, check_fits
 from ..models import Model
-from ..plants import Plants, References, each_plant, each_reference, titles, trial
 from . import questions
 from .disagreement import disagreements
 from .judgement import JudgedRun, Judgement

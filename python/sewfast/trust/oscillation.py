@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..control.loop import ClosedLoopRun
 from ..dataset import FloatArray
-from ..loop import ClosedLoopRun
 from ..units import REVOLUTIONS_PER_SECOND
 
 SETTLING = 0.4

@@ -8,25 +8,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from . import _core, storage
-from .errors import ModelFileError, SettingError, SewfastError
-from .gains import Form, Gains, real, vector, whole
-from .models.fields import Fields
-from .rules import Fopdt, Rule, fit_fopdt, table_1
-from .units import counts_per_unit
-
-__all__ = [
-    "Controller",
-    "Fopdt",
-    "Form",
-    "Gains",
-    "Rule",
-    "fit_fopdt",
-    "load_controller",
-    "paper_controller",
-    "table_1",
-    "vector",
-]
+from .. import _core, storage
+from ..errors import ModelFileError, SettingError, SewfastError
+from ..gains import Gains, real, whole
+from ..models.fields import Fields
+from ..units import counts_per_unit
 
 FORMAT = "sewfast.controller"
 VERSION = 2

@@ -8,15 +8,12 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from .control import Controller
-from .dataset import FloatArray
-from .errors import SettingError
-from .gains import Gains, real
+from ..dataset import FloatArray
+from ..errors import SettingError
+from ..gains import Gains, real
+from ..models.conversion import polynomials_of, require_control
+from .controller import Controller
 from .loop import require_controller
-from .models.conversion import polynomials_of, require_control
-
-__all__ = ["from_control", "from_matlab", "matlab_code", "to_control", "to_matlab"]
-
 
 # --- PIDs out of python-control's objects: the one set of gains that a fraction in z can have -----
 # With `p = Tf/(Tf + Ts)`, `Tf = Td/N`, the controller is
@@ -350,8 +347,8 @@ def to_control(controller: Controller) -> Any:
     SettingError
         Where python-control is not installed, or for a gain schedule.
     """
-    from .analysis.systems import beside, gain, measurement, pid, series
-    from .models.conversion import require_control
+    from ..models.conversion import require_control
+    from .systems import beside, gain, measurement, pid, series
 
     require_controller(controller, None, "to_control(controller)")
     if controller.schedule:

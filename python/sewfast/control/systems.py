@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..control import Controller
 from ..dataset import FloatArray
 from ..errors import DataError, SettingError
-from ..loop import require_controller
 from ..models.conversion import StateSpace, require_control, require_scipy_signal
-from ..robustness import scheduled_gains
+from .controller import Controller
+from .loop import require_controller
+from .margins import scheduled_gains
 
 SYSTEMS = ("L", "S", "T", "closed", "tracking", "disturbance", "plant", "measurement", "pid")
 """What a `LinearLoop` hands to toolboxes by name."""

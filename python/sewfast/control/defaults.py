@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from . import _core, signals
-from .control import Controller
-from .dataset import FloatArray
-from .errors import DataError, FitError, SettingError
-from .evidence.operating import linearise
-from .evidence.residuals import representative
-from .gains import real
-from .models import Model
-from .rules import Fopdt, fit_fopdt
+from .. import _core, signals
+from ..dataset import FloatArray
+from ..errors import DataError, FitError, SettingError
+from ..evidence.operating import linearise
+from ..evidence.residuals import representative
+from ..gains import real
+from ..models import Model
+from ..rules import Fopdt, fit_fopdt
+from .controller import Controller
 
 NAMES = ("trapezoid", "trapezoids", "random")
 """References to tune on unless others are given."""

@@ -6,23 +6,23 @@ import itertools
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from . import _core, signals
-from .arrays import FloatArray
-from .control import Controller, vector
-from .drive_defaults import default_references, drive_references, pace_of
-from .errors import DataError, SettingError
-from .gains import Gains
-from .machine import VirtualMachine
-from .models import Ensemble, Model
+from .. import _core, signals
+from ..arrays import FloatArray
+from ..errors import DataError, FitError, SettingError
+from ..gains import Gains, vector
+from ..machine import VirtualMachine
+from ..models import Ensemble, Model
+from .controller import Controller
+from .defaults import default_references, drive_references, pace_of
 
 if TYPE_CHECKING:
-    from .live import Kind
+    from ..live import Kind
 
 Plant: TypeAlias = Model | VirtualMachine
 
@@ -131,7 +131,7 @@ class ClosedLoopRun:
         SettingError
             Where matplotlib is not installed or the file cannot be written.
         """
-        from .plotting import Trace, loop_drawing
+        from ..plotting import Trace, loop_drawing
 
         others = [beside] if isinstance(beside, ClosedLoopRun) else list(beside)
         looks = ("machine", "model", "oe", "arx_raw", "arx") if others else ("measured",)
@@ -370,7 +370,7 @@ def reference_samples(
     """The samples of a reference given by name or as they are, shape (N,), never the caller's own.
 
     A name is the signal of the catalogue for a controller in RPM at 1 ms; with a model the same
-    shape over the model's recorded range (`sewfast.drive_defaults.drive_references`) otherwise.
+    shape over the model's recorded range (`sewfast.control.defaults.drive_references`) otherwise.
 
     Raises
     ------
@@ -453,3 +453,95 @@ def plant_name(plant: Plant) -> str:
     if isinstance(plant, Ensemble):
         return f"{plant.kind}, first member"
     return plant.name if isinstance(plant, VirtualMachine) else plant.kind
+
+
+# --- Plants and references as they are given, one by one: members, titles, samples ----------------
+
+
+Plants: TypeAlias = Plant | Sequence[Plant]
+References: TypeAlias = str | ArrayLike | Sequence[str | ArrayLike] | None
+
+
+def each_plant(on: Plants | None) -> list[Plant]:
+    """Every plant by itself: of an ensemble its members.
+
+    Raises
+    ------
+    SettingError
+        For what is neither model nor virtual machine.
+    """
+    if on is None:
+        return []
+    given = list(on) if isinstance(on, Sequence) else [on]
+    for plant in given:
+        if not isinstance(plant, (Model, VirtualMachine)):
+            raise SettingError(
+                f"on: expected models or virtual machines, got {type(plant).__name__}; load a "
+                "model with load_model"
+            )
+    return [m for plant in given for m in _singles(plant)]
+
+
+def _singles(plant: Plant) -> list[Plant]:
+    """Members know what their ensemble stores of the training data, region and ranges."""
+    if not isinstance(plant, Ensemble):
+        return [plant]
+    return [_informed(m, plant) for m in plant.members]
+
+
+def _informed(member: Model, ensemble: Ensemble) -> Model:
+    shared = ("input_range", "output_range", "region")
+    known = {k: ensemble.training[k] for k in shared if k in ensemble.training}
+    return replace(member, training={**known, **member.training})
+
+
+def titles(plants: Sequence[Plant]) -> list[str]:
+    """What to call each."""
+    names = [p.name if isinstance(p, VirtualMachine) else p.kind for p in plants]
+    if len(plants) == 1:
+        return names
+    return [f"{name}, {i + 1} of {len(names)}" for i, name in enumerate(names)]
+
+
+def each_reference(references: Any, default: Sequence[str]) -> list[Any]:
+    """The references one by one: a name or a vector is one, a sequence of those is several.
+
+    Raises
+    ------
+    SettingError
+        For what is none of these.
+    """
+    if references is None:
+        return list(default)
+    if isinstance(references, str):
+        return [references]
+    try:
+        iter(references)
+    except TypeError:
+        raise SettingError(
+            f"expected references as names or samples, got {references!r}; for example 'trapezoid'"
+        ) from None
+    several = not isinstance(references, np.ndarray) and any(
+        isinstance(r, str) or np.ndim(r) for r in references
+    )
+    return list(references) if several or np.ndim(references) == 2 else [references]
+
+
+def trial(
+    controller: Controller, plant: Plant, reference: Any, title: str, seed: int = 0
+) -> ClosedLoopRun:
+    """A run under the plant's title.
+
+    Raises
+    ------
+    FitError
+        Where the loop runs away; the plant is named.
+    """
+    try:
+        return replace(run(controller, plant, reference, seed=seed), plant=title)
+    except FitError as e:
+        named = reference if isinstance(reference, str) else "reference"
+        raise FitError(
+            f"expected a loop that stays bounded, received one that runs away on {title}, "
+            f"{named}: {e}"
+        ) from e

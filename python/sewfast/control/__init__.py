@@ -1,0 +1,23 @@
+"""The controller and its loop.
+
+Read in this order: `controller` (settings, files, first gains), `loop` (`run`: on a model or a
+machine), `defaults` (what is taken for a drive where nothing is stated), `margins` (of the linear
+loop), `systems` (the linear loop as state space), `forms` (a PID as MATLAB's and python-control's).
+"""
+
+from ..gains import Form, Gains, vector
+from ..rules import Fopdt, Rule, fit_fopdt, table_1
+from .controller import Controller, load_controller, paper_controller
+
+__all__ = [
+    "Controller",
+    "Fopdt",
+    "Form",
+    "Gains",
+    "Rule",
+    "fit_fopdt",
+    "load_controller",
+    "paper_controller",
+    "table_1",
+    "vector",
+]
