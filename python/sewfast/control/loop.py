@@ -196,7 +196,7 @@ class HasMetrics(Protocol):
 
 def run_html(found: HasMetrics, caption: str) -> str:
     """What a controller did, as a table for a notebook."""
-    from .plotting import Table, percent, significant
+    from ..plotting import Table, percent, significant
 
     m, u, y = found.metrics(), found.units["u"], found.units["y"]
     saturated = m["saturated"]
