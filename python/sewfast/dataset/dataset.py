@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import labelled, range_of, texts
 from ..errors import DataError, SettingError
-from . import gaps, outliers, picture, pieces, rates, summary, trends
+from . import frames, gaps, outliers, picture, pieces, rates, summary, trends
 from .experiment import Experiment
 from .weights import require_some_weight
 
@@ -200,6 +200,11 @@ class Dataset:
     mark_outliers = outliers.mark_outliers
     summary = summary.summary
     plot = picture.plot
+    to_pandas = frames.to_pandas
+    to_polars = frames.to_polars
+    to_arrow = frames.to_arrow
+    to_xarray = frames.to_xarray
+    __arrow_c_stream__ = frames.arrow_stream
 
     require_inputs = pieces.require_inputs
     require_measured = pieces.require_measured

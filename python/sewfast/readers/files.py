@@ -5,14 +5,14 @@ from __future__ import annotations
 import io
 import os
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from ..errors import DataError, SettingError
 from ..recordfile.format import MAGIC
 from ..recordfile.reader import decode_recording
-from .containers import Table, freeze, from_headers, read_mat, read_npz
+from .containers import Table, freeze, read_mat, read_npz
 from .delimited import read_delimited
+from .frames import collected, of_arrow, table_of
 
 __all__ = ["MAGIC", "read_mcap"]
 
@@ -31,7 +31,6 @@ def read_parquet(path: Path, raw: bytes) -> Table:
         Where pyarrow is not installed.
     """
     try:
-        import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError as e:
         raise SettingError(
@@ -44,14 +43,7 @@ def read_parquet(path: Path, raw: bytes) -> Table:
         raise DataError(f"{path}: expected a Parquet file, but it cannot be read: {e}") from e
     if found.num_rows == 0:
         raise DataError(f"{path}: expected rows of numbers, received none")
-    columns, bad = [], {}
-    for i, entry in enumerate(found.schema):
-        try:
-            columns.append(found.column(i).cast(pa.float64(), safe=False).to_numpy())
-        except pa.ArrowException:
-            columns.append(np.empty(0))
-            bad[i] = f"column {entry.name!r} holds {entry.type}; expected numbers"
-    return from_headers(path, found.schema.names, columns, bad)
+    return collected(path, of_arrow(found))
 
 
 # --- MCAP recordings of the package -> Table ------------------------------------------------------
@@ -74,13 +66,16 @@ def read_mcap(path: Path, raw: bytes) -> Table:
 # --- One file of any known format -> Table, told apart by its first bytes, then by its extension --
 
 
-def read_table(path: str | os.PathLike[str]) -> Table:
-    """Read all columns of a CSV, `.mat`, `.npz`, Parquet or MCAP file.
+def read_table(path: Any) -> Table:
+    """Read all columns of a CSV, `.mat`, `.npz`, Parquet or MCAP file, or of a table in memory.
 
     Parameters
     ----------
-    path : path
-        The format is told by the file's first bytes, where they tell, else by its extension.
+    path : path or table
+        The format is told by the file's first bytes, where they tell, else by its extension. A
+        table is one of pandas, polars, pyarrow (or anything with `__arrow_c_stream__`), an xarray
+        Dataset or a mapping of name to array; null, NA and NaT are NaN, moments become seconds from
+        the first one.
 
     Returns
     -------
@@ -92,8 +87,11 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     DataError
         Where the file is missing, empty, damaged or of an unknown kind; the message names it.
     SettingError
-        Where the format needs a package that is not installed.
+        Where the format needs a package that is not installed, or for what is neither path nor
+        table.
     """
+    if not isinstance(path, (str, os.PathLike)):
+        return table_of(path)
     path = Path(path)
     raw = _bytes(path)
     if raw.startswith(MAGIC) or path.suffix.lower() == ".mcap":

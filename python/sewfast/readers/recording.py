@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from .timebase import TOLERANCE, Grid, time_base
 
 
 def read(
-    path: str | os.PathLike[str] | Table,
+    path: Any,
     *,
     inputs: str | Sequence[str],
     output: str | None = None,
@@ -30,12 +30,13 @@ def read(
     name: str | None = None,
     weights: str | None = None,
 ) -> Dataset:
-    """Read inputs and an output from one recording.
+    """Read inputs and an output from one recording, a file or a table in memory.
 
     Parameters
     ----------
-    path : path or Table
-        CSV, `.mat`, `.npz`, Parquet or MCAP; see `read_table`.
+    path : path or table
+        CSV, `.mat`, `.npz`, Parquet or MCAP; a table of pandas, polars, pyarrow or xarray, a
+        mapping of name to array, or a `Table`; see `read_table`.
     inputs : str or sequence of str
         Column names of the inputs.
     output : str or None

@@ -1,0 +1,185 @@
+"""Tables in memory: pandas, polars, Arrow, xarray or a mapping of columns -> `Table`.
+
+None of these packages is imported before an object of theirs is given. What is missing (null, NA,
+NaT) is NaN; moments and durations become seconds from the first one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import FloatArray
+from ..errors import DataError, SettingError
+from .containers import Table, from_headers
+
+Found = tuple[str, FloatArray | None, str, str]
+"""Header, numbers or None, unit where it stands beside the header, why there are no numbers."""
+
+
+def table_of(frame: Any) -> Table:
+    """The numeric columns of a table in memory.
+
+    Parameters
+    ----------
+    frame : pandas, polars or xarray object, mapping of name to array, or Arrow stream
+        Anything with `__arrow_c_stream__` is read by pyarrow. An index of pandas is a column where
+        it is named or holds moments; without a name it is `t`. Units come from headers such as
+        `u [V]`, from `attrs["units"]` (pandas, xarray) or from a field's metadata `unit` (Arrow).
+
+    Raises
+    ------
+    DataError
+        Where it has no rows, or no column holds numbers.
+    SettingError
+        For another object, or where pyarrow is needed and not installed.
+    """
+    kinds = {c.__module__.partition(".")[0] for c in type(frame).__mro__}
+    if "polars" in kinds and hasattr(frame, "collect"):
+        frame = frame.collect()
+    if "pandas" in kinds and hasattr(frame, "columns"):
+        found = _of_pandas(frame)
+    elif "polars" in kinds and hasattr(frame, "columns"):
+        found = _of_polars(frame)
+    elif "xarray" in kinds:
+        found = _of_xarray(frame)
+    elif isinstance(frame, Mapping):
+        found = ((str(n), *_numbers(_array(v))) for n, v in frame.items())
+    elif hasattr(frame, "__arrow_c_stream__"):
+        found = of_arrow(_arrow(frame))
+    else:
+        raise SettingError(
+            "expected a file's path or a table (pandas, polars, pyarrow, xarray, a dict of "
+            f"columns), got {type(frame).__name__}; for arrays: Dataset.from_arrays"
+        )
+    return collected(Path(type(frame).__name__), found)
+
+
+def collected(path: Path, found: Iterator[Found]) -> Table:
+    """A table of what was found in each column.
+
+    Raises
+    ------
+    DataError
+        Where there are no rows.
+    """
+    headers, columns, bad, units = [], [], {}, {}
+    for i, (header, values, unit, why) in enumerate(found):
+        headers.append(header)
+        columns.append(np.empty(0) if values is None else values)
+        if values is None:
+            bad[i] = f"column {header!r} {why}; expected numbers"
+        if unit:
+            units[header] = unit
+    if not any(len(c) for c in columns) and not bad:
+        raise DataError(f"{path}: expected rows of numbers, received none")
+    table = from_headers(path, headers, columns, bad)
+    known = {**table.units, **{n: u for n, u in units.items() if n in table.columns}}
+    return Table(path, table.columns, known, table.unusable)
+
+
+def of_arrow(table: Any) -> Iterator[Found]:
+    """Columns of a pyarrow table."""
+    import pyarrow as pa
+
+    for i, entry in enumerate(table.schema):
+        column, metadata = table.column(i), entry.metadata or {}
+        unit = metadata.get(b"unit", b"").decode("utf-8", "replace")
+        try:
+            if pa.types.is_temporal(entry.type):
+                yield entry.name, *_numbers(column.to_numpy())
+            else:
+                numbers = column.cast(pa.float64(), safe=False).to_numpy()
+                yield entry.name, numbers, unit, ""
+        except pa.ArrowException:
+            yield entry.name, None, "", f"holds {entry.type}"
+
+
+def _arrow(frame: Any) -> Any:
+    try:
+        import pyarrow as pa
+    except ImportError as e:
+        raise SettingError(
+            f"reading {type(frame).__name__} needs pyarrow, which is not installed: "
+            'pip install "sewfast[parquet]"'
+        ) from e
+    return pa.table(frame)
+
+
+def _of_pandas(frame: Any) -> Iterator[Found]:
+    units = frame.attrs.get("units", {})
+    index = frame.index
+    counts_rows = (index.name is None and index.dtype.kind in "iu") or index.nlevels > 1
+    if not counts_rows and index.dtype.kind in "iufmM":
+        name = str(index.name or "t")
+        if name not in map(str, frame.columns):
+            yield _with_unit(name, _of_series(index), units)
+    for i, name in enumerate(frame.columns):
+        # by place: a name may occur twice
+        yield _with_unit(str(name), _of_series(frame.iloc[:, i]), units)
+
+
+def _of_series(column: Any) -> tuple[FloatArray | None, str, str]:
+    """Of a column or an index of pandas."""
+    if column.dtype.kind in "mM":
+        # a moment with a time zone becomes one in UTC
+        return _numbers(column.to_numpy(dtype=f"{column.dtype.kind}8[ns]"))
+    if column.dtype.kind in "iufb":
+        return column.to_numpy(dtype=np.float64, na_value=np.nan), "", ""
+    values: Any = np.where(column.isna(), None, column.to_numpy())
+    return _numbers(values)
+
+
+def _of_polars(frame: Any) -> Iterator[Found]:
+    for name in frame.columns:
+        column = frame[name]
+        if column.dtype.is_temporal() or column.dtype.is_numeric():
+            yield name, *_numbers(column.to_numpy())
+        elif str(column.dtype) == "Boolean":
+            yield name, *_numbers(column.cast(int).to_numpy())
+        else:
+            yield name, None, "", f"holds {column.dtype}"
+
+
+def _of_xarray(frame: Any) -> Iterator[Found]:
+    if not hasattr(frame, "data_vars"):
+        frame = frame.to_dataset(name=str(frame.name or "values"))
+    for name, column in {**frame.coords, **frame.data_vars}.items():
+        if column.ndim == 1:
+            values, unit, why = _numbers(column.to_numpy())
+            yield str(name), values, str(column.attrs.get("units", unit)), why
+        else:
+            yield str(name), None, "", f"has dimensions {column.dims}"
+
+
+def _with_unit(name: str, found: tuple[Any, str, str], units: Any) -> Found:
+    values, unit, why = found
+    return name, values, str(units.get(name, unit)) if isinstance(units, Mapping) else unit, why
+
+
+def _array(values: Any) -> NDArray[Any]:
+    try:
+        return np.asarray(values)
+    except ValueError:
+        # lists of different lengths
+        return np.empty((0, 0))
+
+
+def _numbers(values: NDArray[Any]) -> tuple[FloatArray | None, str, str]:
+    """Numbers, their unit where they are seconds, or why they are none."""
+    kind = values.dtype.kind
+    if values.ndim != 1:
+        return None, "", f"has shape {values.shape}"
+    if kind in "iufb":
+        return values.astype(np.float64), "", ""
+    if kind in "mM":
+        known = values[~np.isnat(values)]
+        since = values - known[0] if kind == "M" and len(known) else values
+        return since / np.timedelta64(1, "s"), "s", ""
+    if kind == "O" and all(v is None or isinstance(v, (int, float, np.number)) for v in values):
+        return np.array([np.nan if v is None else v for v in values], dtype=np.float64), "", ""
+    return None, "", f"holds {values.dtype}"
