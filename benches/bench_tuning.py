@@ -21,8 +21,7 @@ import numpy as np
 import sewfast
 from sewfast import Cost, signals
 from sewfast.tuning import costs, first_controller, tune
-from sewfast.tuning_task import threads_or_all
-from sewfast.variables import applied
+from sewfast.tuning.task import applied, threads_or_all
 
 COST = Cost(tracking=1.0, chatter=5.0, overshoot=3.0, saturation=0.0)
 

@@ -21,9 +21,9 @@ from sewfast.commissioning.demands import demands
 from sewfast.commissioning.excitations import standard
 from sewfast.control.loop import ClosedLoopRun
 from sewfast.control.margins import margins
-from sewfast.cost import Cost
-from sewfast.tuning import Variable
-from sewfast.variables import applied
+from sewfast.tuning.objective import Cost
+from sewfast.tuning.search import Variable
+from sewfast.tuning.task import applied
 
 EVALUATIONS = 200
 """From the tuned gains; two thirds of it in a first search, the rest close to its best."""

@@ -13,7 +13,7 @@ import sewfast
 import state_space
 from sewfast import _core
 from sewfast.tuning import costs
-from sewfast.tuning_task import TuningTask
+from sewfast.tuning.task import TuningTask
 
 Work = Callable[[], dict[str, Any]]
 TRACKING = sewfast.Cost(chatter=0.0, overshoot=0.0, saturation=0.0)

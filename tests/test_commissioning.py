@@ -36,7 +36,6 @@ from sewfast import (
     load_controller,
     load_model,
     read_table,
-    tuning,
 )
 from sewfast.commissioning import STAGES, Refusal, agreement, gains, training
 from sewfast.commissioning.bench import DriveBench, MachineBench, bench_of
@@ -45,6 +44,7 @@ from sewfast.commissioning.gains import Requirements
 from sewfast.errors import LinkError
 from sewfast.link import VirtualDevice, connect
 from sewfast.report import commissioned, report
+from sewfast.tuning import search
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -294,7 +294,7 @@ def test_ctrl_c_does_not_wait_for_what_cannot_be_stopped(monkeypatch: pytest.Mon
 def test_an_interrupted_search_keeps_its_best_gains(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def stopped(*args: Any, start: Controller, **options: Any) -> tuning.TuningResult:
+    def stopped(*args: Any, start: Controller, **options: Any) -> search.TuningResult:
         raise Interrupted(replace(start, notes="the best so far"))
 
     monkeypatch.setattr(gains, "tune", stopped)

@@ -17,8 +17,7 @@ ORDER = """
     writers recordfile dataset readers benchmarks machine live
     dynamic_model validation evidence models
     regression lipschitz delays order_table leastsquares identification
-    gains rules control variables load_step constraints cost
-    starting tuning_task second_opinion tuning front trust analysis
+    gains rules control tuning trust analysis
     link recording report commissioning experiment cli __main__
 """
 

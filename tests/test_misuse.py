@@ -39,10 +39,10 @@ from sewfast.control.forms import to_control, to_matlab
 from sewfast.control.margins import loop_response
 from sewfast.control.systems import LinearLoop, simulate
 from sewfast.errors import DataError, ModelFileError, SettingError, SewfastError
-from sewfast.front import NAMES
 from sewfast.storage import replace_file
 from sewfast.trust import Limits, judge
 from sewfast.tuning import costs
+from sewfast.tuning.front import NAMES
 
 PLANT = Fopdt(490.0, 0.25, 0.0075)
 EDGE = np.repeat([0.0, 1000.0], [20, 130])

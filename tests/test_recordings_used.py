@@ -201,7 +201,7 @@ def test_tune_takes_the_volt_limit_of_a_recording(
         given.update(settings)
         raise SettingError("far enough")
 
-    monkeypatch.setattr("sewfast.tuning.tune", tune)
+    monkeypatch.setattr("sewfast.tuning.search.tune", tune)
     model = tmp_path / "model.json"
     data = api.read(folder / "whole.mcap", inputs="u", output="y")
     api.identify(data, model="arx").save(model)

@@ -14,13 +14,12 @@ from sewfast import _core, load_controller, signals
 from sewfast.commissioning.bench import MachineBench
 from sewfast.commissioning.demands import demands
 from sewfast.commissioning.rival import linear_rival
-from sewfast.constraints import Constraints
 from sewfast.control import Fopdt
 from sewfast.errors import Interrupted, SettingError
 from sewfast.machine import VirtualMachine
 from sewfast.models import LinearOE
-from sewfast.second_opinion import MUCH, SecondOpinion
-from sewfast.tuning import TuningResult, tune
+from sewfast.tuning.objective import Constraints
+from sewfast.tuning.search import MUCH, SecondOpinion, TuningResult, tune
 
 SHORT = signals.reference("trapezoid")[:900]
 
@@ -95,7 +94,7 @@ def test_a_rival_without_gains_within_the_constraints_has_no_opinion() -> None:
 
 
 def test_ctrl_c_within_the_second_opinion_keeps_the_gains() -> None:
-    from sewfast import tuning
+    from sewfast.tuning import search
 
     found: list[Any] = []
 
@@ -104,7 +103,7 @@ def test_ctrl_c_within_the_second_opinion_keeps_the_gains() -> None:
         raise Interrupted(None)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tuning._Search, "brief", lambda self: type("S", (), {"on": stopped})())
+        patch.setattr(search._Search, "brief", lambda self: type("S", (), {"on": stopped})())
         with pytest.raises(Interrupted) as caught:
             tuned(rival=drive(gain=470.0))
     assert found

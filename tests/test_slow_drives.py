@@ -17,8 +17,8 @@ from sewfast.commissioning.turn import HARMONICS, TurnLoad
 from sewfast.control import Fopdt
 from sewfast.control.loop import run
 from sewfast.control.margins import margins
-from sewfast.cost import Cost
 from sewfast.recording import Recording, record
+from sewfast.tuning.objective import Cost
 
 
 def recorded(samples: int = 1003) -> Recording:

@@ -10,17 +10,16 @@ import numpy as np
 import pytest
 
 from sewfast import _core, pareto, signals
-from sewfast.constraints import Constraints
 from sewfast.control import Controller, Gains
 from sewfast.control.loop import run
 from sewfast.control.margins import margins
-from sewfast.cost import Cost, terms
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError, FitError, Interrupted, SettingError
 from sewfast.identification import identify
 from sewfast.machine import VirtualMachine
 from sewfast.models import LinearOE
 from sewfast.tuning import costs, default_variations, first_controller, tune
+from sewfast.tuning.objective import Constraints, Cost, terms
 
 
 def linear(a: list[float], b: list[float]) -> LinearOE:

@@ -10,11 +10,9 @@ if TYPE_CHECKING:
     from ._core import __version__
     from .analysis import Analysis, analyse
     from .commissioning import Commissioning, commission
-    from .constraints import Constraints
     from .control.controller import Controller, load_controller, paper_controller
     from .control.loop import ClosedLoopRun, run
     from .control.margins import Margins, margins
-    from .cost import Cost
     from .dataset import Dataset, Diagnosis, Experiment, diagnose
     from .delays import DelayEstimate, delay
     from .errors import (
@@ -27,11 +25,9 @@ if TYPE_CHECKING:
         SewfastError,
     )
     from .evidence import ReportCard, check
-    from .front import ParetoFront, pareto
     from .gains import Gains
     from .identification import identify
     from .leastsquares import LeastSquaresResult, least_squares
-    from .load_step import LoadStep
     from .machine import VirtualMachine
     from .models import ARX, IV, Ensemble, LinearOE, Model, NeuralOE, NeuralSS, load_model
     from .order_table import OrderTable, orders
@@ -39,7 +35,9 @@ if TYPE_CHECKING:
     from .recording import Recording, record
     from .rules import fit_fopdt, table_1
     from .speed import speed_from_counts
-    from .tuning import TuningResult, tune
+    from .tuning.front import ParetoFront, pareto
+    from .tuning.objective import Constraints, Cost, LoadStep
+    from .tuning.search import TuningResult, tune
     from .validation import Validation, validate
     from .writers import write_table
 
@@ -113,10 +111,8 @@ _HOMES = {
     "_core": "__version__",
     "commissioning": "Commissioning commission",
     "analysis": "Analysis analyse",
-    "constraints": "Constraints",
-    "load_step": "LoadStep",
     "control": "Controller Gains fit_fopdt load_controller paper_controller table_1",
-    "cost": "Cost",
+    "tuning": "Constraints Cost LoadStep ParetoFront TuningResult pareto tune",
     "dataset": "Dataset Diagnosis Experiment diagnose",
     "delays": "DelayEstimate delay",
     "errors": "DataError FitError Interrupted LinkError ModelFileError SettingError SewfastError",
@@ -127,12 +123,10 @@ _HOMES = {
     "machine": "VirtualMachine",
     "models": "ARX IV Ensemble LinearOE Model NeuralOE NeuralSS load_model",
     "order_table": "OrderTable orders",
-    "front": "ParetoFront pareto",
     "readers": "read read_table",
     "recording": "Recording record",
     "control.margins": "Margins margins",
     "speed": "speed_from_counts",
-    "tuning": "TuningResult tune",
     "validation": "Validation validate",
     "writers": "write_table",
 }

@@ -78,7 +78,7 @@ class DynamicModel(ABC):
     Parameters
     ----------
     core : compiled model
-        Its arithmetic; takes part in `sewfast.control.loop` and `sewfast.tuning` as a plant.
+        Its arithmetic; takes part in `sewfast.run` and `sewfast.tune` as a plant.
     Ts : float
         Sample time [s].
     input_names, input_units, output_name, output_unit

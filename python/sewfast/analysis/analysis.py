@@ -23,9 +23,9 @@ from ..control.loop import (
     titles,
 )
 from ..control.systems import LinearLoop
-from ..cost import Cost
 from ..errors import FitError, SettingError
 from ..trust import Judgement, Limits, judge
+from ..tuning.objective import Cost
 from .arguments import each_change, finite_each, required
 from .changes import Change
 from .points import LoopBode, PlantPoint, loop_bodes, plant_points

@@ -14,11 +14,11 @@ import numpy as np
 from ..control.controller import Controller
 from ..control.loop import Plant, run
 from ..control.margins import margins
-from ..cost import Cost, terms
 from ..errors import FitError, SettingError
 from ..gains import Gains
 from ..machine import VirtualMachine
 from ..threads import available
+from ..tuning.objective import Cost, terms
 from .changes import ON_MACHINES, ON_MODELS, Change
 from .points import PlantPoint, plant_points
 

@@ -22,14 +22,12 @@ from .output import print_json, print_rows
 from .progress import Progress
 
 if TYPE_CHECKING:
-    from ..constraints import Constraints
     from ..control.controller import Controller
-    from ..cost import Cost
-    from ..front import ParetoFront
     from ..gains import Gains
-    from ..load_step import LoadStep
-    from ..tuning import TuningResult
-    from ..variables import Wanted
+    from ..tuning.front import ParetoFront
+    from ..tuning.objective import Constraints, Cost, LoadStep
+    from ..tuning.search import TuningResult
+    from ..tuning.task import Wanted
 
 FORMS = ("standard", "parallel", "per_sample")
 FIGURES = (".png", ".svg", ".pdf")
@@ -261,7 +259,7 @@ def _tuned(
     args: argparse.Namespace, models: list[Any], references: Any, settings: dict[str, Any]
 ) -> TuningResult:
     from ..models import load_model
-    from ..tuning import tune
+    from ..tuning.search import tune
 
     rival = None if args.rival is None else load_model(args.rival)
     with Progress("tune") as progress:
@@ -274,8 +272,8 @@ def _tuned(
 def _front(
     args: argparse.Namespace, models: list[Any], references: Any, settings: dict[str, Any]
 ) -> ParetoFront:
-    from ..front import pareto
-    from ..starting import first_controller
+    from ..tuning.front import pareto
+    from ..tuning.task import first_controller
 
     first = _first(args)
     start = first.get("start") or first_controller(models[0], **first)
@@ -301,13 +299,13 @@ def _pairs(given: list[str] | None, option: str) -> dict[str, float]:
 
 
 def _cost(given: list[str] | None) -> Cost:
-    from ..cost import Cost
+    from ..tuning.objective import Cost
 
     return Cost(**_known(_pairs(given, "--cost"), "--cost", tuple(Cost.__dataclass_fields__)))
 
 
 def _constraints(given: list[str] | None) -> Constraints:
-    from ..constraints import Constraints
+    from ..tuning.objective import Constraints
 
     pairs = _pairs(given, "--constraint")
     return Constraints(
@@ -316,7 +314,7 @@ def _constraints(given: list[str] | None) -> Constraints:
 
 
 def _loads(given: list[str] | None) -> list[LoadStep]:
-    from ..load_step import LoadStep
+    from ..tuning.objective import LoadStep
 
     steps = []
     for text in given or ():

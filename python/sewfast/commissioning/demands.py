@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from ..constraints import Constraints
 from ..dataset import FloatArray
 from ..errors import SettingError
 from ..gains import real, whole
 from ..report.commissioned import file_name
-from ..tuning_task import budget
+from ..tuning.objective import Constraints
+from ..tuning.task import budget
 from .bench import Bench
 
 LONGEST_NAME = 100

@@ -12,18 +12,16 @@ from typing import Any
 import numpy as np
 
 from .. import _core
-from ..constraints import Constraints
 from ..control.controller import Controller
 from ..control.margins import margins, sampled
-from ..cost import Cost
 from ..dataset import FloatArray
 from ..errors import DataError, FitError, SettingError
 from ..gains import Gains
-from ..load_step import LoadStep
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
 from ..rules import Fopdt, Rule, eq_12, simc
-from ..tuning import TuningResult, costs, recoveries, tune
+from ..tuning.objective import Constraints, Cost, LoadStep
+from ..tuning.search import TuningResult, costs, recoveries, tune
 from .bench import Bench
 from .demands import Demands
 from .excitations import pace_of

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from .. import signals
 from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun
-from ..cost import Cost
 from ..dataset import FloatArray
 from ..errors import DataError, Interrupted, SettingError
 from ..gains import vector
@@ -23,7 +22,8 @@ from ..models import Ensemble, Model
 from ..recording import Recording
 from ..rules import Fopdt
 from ..threads import available
-from ..tuning import TuningResult
+from ..tuning.objective import Cost
+from ..tuning.search import TuningResult
 from . import excitations
 from .agreement import Disagreement, agreeing
 from .bench import Bench, Followed, NotedBench, bench_of, told_of

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from ..control.controller import Controller
-from ..cost import Cost
 from ..evidence import Line, ReportCard
 from ..models import Ensemble
 from ..recording import Recording
 from ..rules import Fopdt
 from ..trust import Judgement
-from ..tuning import TuningResult
+from ..tuning.objective import Cost
+from ..tuning.search import TuningResult
 from .motion import Motion
 from .rival import Rival
 from .slow import Thinning

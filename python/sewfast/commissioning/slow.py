@@ -17,11 +17,11 @@ import numpy as np
 
 from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun
-from ..cost import Cost
 from ..dataset import FloatArray
 from ..recording import Recording
 from ..rules import Fopdt
 from ..speed import speed_from_counts
+from ..tuning.objective import Cost
 from .small_signal import SmallSignal
 
 if TYPE_CHECKING:

@@ -31,7 +31,7 @@ from ..report.artefacts import (
 )
 from ..rules import Fopdt
 from ..signals import excitation
-from ..tuning import TuningResult
+from ..tuning.search import TuningResult
 from ..writers import write_table
 from . import loops
 from .loops import Rig, rig

@@ -12,24 +12,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import _core
-from .constraints import Constraints
-from .control.controller import Controller
-from .control.loop import Plants, References
-from .cost import Cost
-from .errors import Interrupted, SettingError
-from .gains import whole
-from .load_step import LoadStep
-from .plotting import Drawing, Panel, Table, lettered, significant
-from .tuning import tune
-from .tuning_task import (
-    Aggregate,
-    Progress,
-    TuningTask,
-    threads_or_all,
-)
-from .variables import Wanted, applied
-from .writers import write_table
+from .. import _core
+from ..control.controller import Controller
+from ..control.loop import Plants, References
+from ..errors import Interrupted, SettingError
+from ..gains import whole
+from ..plotting import Drawing, Panel, Table, lettered, significant
+from ..writers import write_table
+from .objective import Constraints, Cost, LoadStep
+from .search import tune
+from .task import Aggregate, Progress, TuningTask, Wanted, applied, threads_or_all
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,0 +1,24 @@
+"""From models to a controller.
+
+Read in this order: `objective` (`Cost`, `Constraints`, `LoadStep`), `task` (what is searched, on
+which plants, from where), `search` (`tune`, a second opinion), `front` (`pareto`).
+"""
+
+from .front import ParetoFront, pareto
+from .objective import Constraints, Cost, LoadStep
+from .search import TuningResult, costs, recoveries, tune
+from .task import default_variations, first_controller
+
+__all__ = [
+    "Constraints",
+    "Cost",
+    "LoadStep",
+    "ParetoFront",
+    "TuningResult",
+    "costs",
+    "default_variations",
+    "first_controller",
+    "pareto",
+    "recoveries",
+    "tune",
+]

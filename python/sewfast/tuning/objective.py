@@ -1,0 +1,305 @@
+"""What a good controller is: cost of a run, constraints before it, loads to stand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from .. import _core
+from ..control.controller import Controller
+from ..dataset import FloatArray
+from ..errors import DataError, SettingError
+from ..gains import real
+
+if TYPE_CHECKING:
+    from ..control.loop import ClosedLoopRun
+
+SHARES = ("chatter", "overshoot", "saturation")
+"""Weights whose default depends on the references' span."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Weights of the terms of a run (docs/CONVENTIONS.md, Tuning); the sum is in the output's unit.
+
+    A weight is per unit of its term. None is the default in shares of the references' span R (the
+    largest minus the smallest value).
+
+    Parameters
+    ----------
+    tracking : float
+        Of rms(r - y) [y], y the true output.
+    chatter : float or None
+        Of rms(du) [u], du the command's change from sample to sample; .5 R/(u_max - u_min).
+    effort : float
+        Of rms(u) [u].
+    overshoot : float or None
+        Of the overshoot above its limit [%], where the reference is a step or trapezoid; R/100.
+    overshoot_limit : float
+        Overshoot that costs nothing [%].
+    rise : float
+        Of the 10-to-90 % rise time beyond the reference's own [ms], on a step or trapezoid.
+    lag : float
+        Of the shift of the output against the reference with the least rms difference [ms].
+    saturation : float or None
+        Of the share of samples at a limit; .02 R.
+    recovery : float
+        Of the time until a load step is fought down [ms] (`LoadStep`), the mean over these.
+    load : float
+        Of the rms deviation under a load step [y].
+
+    Raises
+    ------
+    SettingError
+        For a weight that is not a finite number of 0 or more.
+    """
+
+    tracking: float = 1.0
+    chatter: float | None = None
+    effort: float = 0.0
+    overshoot: float | None = None
+    overshoot_limit: float = 1.0
+    rise: float = 0.0
+    lag: float = 0.0
+    saturation: float | None = None
+    recovery: float = 0.0
+    load: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is None and field.name in SHARES:
+                continue
+            weight = real(field.name, value)
+            if not (weight >= 0.0 and np.isfinite(weight)):
+                raise SettingError(
+                    f"expected a finite weight of 0 or more for {field.name}, got {value!r}"
+                )
+            object.__setattr__(self, field.name, weight)
+
+    def named(self) -> dict[str, float]:
+        """The weights that are numbers, by name."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def resolved(self, span: float, u_range: float) -> Cost:
+        """The same with numbers in place of None, for references of this span and limits of u this
+        far apart.
+        """
+        shares = {
+            "chatter": 0.5 * span / u_range,
+            "overshoot": span / 100.0,
+            "saturation": 0.02 * span,
+        }
+        return Cost(**(shares | self.named()))
+
+    def of(self, runs: ClosedLoopRun | Sequence[ClosedLoopRun]) -> float:
+        """What runs cost: the mean over them, as in `sewfast.tune` over references.
+
+        Runs along references are meant: recovery and load do not count.
+
+        Raises
+        ------
+        DataError
+            Where there is no run, or what is none, or one has samples missing.
+        """
+        from ..control.loop import ClosedLoopRun
+
+        several = list(runs) if isinstance(runs, Sequence) else [runs]
+        for one in several:
+            if not isinstance(one, ClosedLoopRun):
+                raise DataError(
+                    f"expected closed-loop runs to take the cost of, got {type(one).__name__}; "
+                    "run(controller, plant, reference) gives one"
+                )
+        if not several:
+            raise DataError("expected at least one run to take the cost of, got none")
+        r = np.concatenate([run.r for run in several])
+        limits = several[0].controller
+        cost = self.resolved(float(np.ptp(r)), limits.u_max - limits.u_min)
+        return float(np.mean([cost._of(terms(run)) for run in several]))
+
+    def _of(self, terms: dict[str, float]) -> float:
+        above = {**terms, "overshoot": max(terms["overshoot"] - self.overshoot_limit, 0.0)}
+        weights = self.named()
+        return sum(weights[name] * value for name, value in above.items() if name in weights)
+
+
+def terms(run: ClosedLoopRun) -> dict[str, float]:
+    """What a run was like: tracking [y], chatter and effort [u], overshoot [%], rise and lag [ms],
+    saturation (a share), u_max (largest \\|u\\|) [u].
+
+    Overshoot and rise are 0 where the reference is no step or trapezoid; where the response does
+    not reach 90 %, rise is the whole time that it had.
+
+    Raises
+    ------
+    DataError
+        Where samples are missing.
+    """
+    limits = run.controller
+    return _core.cost_terms(
+        run.r, run.u, run.y, u_min=limits.u_min, u_max=limits.u_max, Ts=limits.Ts
+    )
+
+
+# --- Constraints: what a controller must keep to, whatever it costs -------------------------------
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """Limits that come before the cost (docs/CONVENTIONS.md, Tuning).
+
+    Of two controllers the one within all limits is better; of two beyond them, that with the
+    smaller sum of relative violations.
+
+    Parameters
+    ----------
+    Ms : float, optional
+        Largest sensitivity of the linear loop (`sewfast.margins`), 1.4 to 2 for a robust one; with
+        a gain schedule at each of its points.
+    overshoot : float, optional
+        Largest overshoot on steps and trapezoids [%], on every plant.
+    u : float, optional
+        Largest \\|u\\| in every run [u].
+    recovery : float or Controller, optional
+        Longest recovery from any load step, on every plant in every variation [ms]. Of a
+        controller what it takes on each plant itself, at least one sample: no plant may recover
+        later than under it, as it is, or in every variation where none leaves it as it is.
+    load : float or Controller, optional
+        Largest rms deviation under any load step [y], likewise.
+    plant : linear plant or list of them, optional
+        Where Ms is taken: whatever `sewfast.margins` takes. By default the linear models among the
+        plants that are tuned on.
+    speed : float, optional
+        Where a nonlinear `plant` is linearised [y].
+
+    Raises
+    ------
+    SettingError
+        For a limit that is not finite and above 0, or Ms not above 1.
+    """
+
+    Ms: float | None = None
+    overshoot: float | None = None
+    u: float | None = None
+    recovery: float | Controller | None = None
+    load: float | Controller | None = None
+    plant: Any = None
+    speed: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in LIMITS:
+            value, least = getattr(self, name), 1.0 if name == "Ms" else 0.0
+            if value is None or (name in BY_RIVAL and isinstance(value, Controller)):
+                continue
+            limit = real(name, value)
+            if not (limit > least and math.isfinite(limit)):
+                raise SettingError(
+                    f"expected a finite limit above {least:g} for {name}, got {value!r}"
+                )
+            object.__setattr__(self, name, limit)
+        if self.speed is not None:
+            object.__setattr__(self, "speed", real("speed", self.speed))
+
+    @property
+    def limits(self) -> _core._Limits:
+        """By name, as the core takes them."""
+        values = {name: getattr(self, name) for name in LIMITS}
+        cores = {n: v.core() if isinstance(v, Controller) else v for n, v in values.items()}
+        return cast("_core._Limits", cores)
+
+    def __str__(self) -> str:
+        given = {n: getattr(self, n) for n in LIMITS if getattr(self, n) is not None}
+        return ", ".join(_told(n, v) for n, v in given.items()) or "none"
+
+
+LIMITS = {"Ms": "", "overshoot": " %", "u": "", "recovery": " ms", "load": ""}
+"""Every limit with its unit."""
+BY_RIVAL = ("recovery", "load")
+
+
+def _told(name: str, limit: float | Controller) -> str:
+    if isinstance(limit, Controller):
+        return f"{name} no larger than under {limit.notes or 'another controller'}"
+    return f"{name} <= {limit:g}{LIMITS[name]}"
+
+
+# --- LoadStep: a disturbance that comes on while a level is held ----------------------------------
+
+
+BAND = 0.01
+"""Of the level: deviation that counts as recovered."""
+
+
+@dataclass(frozen=True)
+class LoadStep:
+    """A level is approached and held; then a command that the controller does not see comes on.
+
+    It acts as a load on the shaft does: a torque of a motor takes as many volts as it makes current
+    times resistance (docs/tuning.md). The run's recovery [ms] is the last time after it that the
+    true output, in the mean of the last `mean` seconds, is farther than `band` from the level; its
+    load the rms of that deviation from then on [y].
+
+    Parameters
+    ----------
+    level : float
+        What is held [y].
+    disturbance : float
+        Added to the command behind its limits [u]; one that brakes has the other sign.
+    band : float, optional
+        [y]; a hundredth of the level by default.
+    ramp, settle, look : float
+        Time of the way to the level, from there to the load, and of the load [s].
+    mean : float
+        Time of the moving mean of the deviation [s]; that of a turn where a load varies over it, 0
+        for none.
+
+    Raises
+    ------
+    SettingError
+        For values that are not finite, no disturbance, times below 0 or no time under load.
+    """
+
+    level: float
+    disturbance: float
+    band: float | None = None
+    ramp: float = 0.3
+    settle: float = 0.5
+    look: float = 0.5
+    mean: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name == "band" and value is None:
+                value = BAND * abs(real("level", self.level))
+            number = real(field.name, value)
+            least = -math.inf if field.name in ("level", "disturbance") else 0.0
+            if not (math.isfinite(number) and number >= least):
+                raise SettingError(
+                    f"expected a finite {field.name} of a load step"
+                    + ("" if math.isinf(least) else " of 0 or more")
+                    + f", got {value!r}"
+                )
+            object.__setattr__(self, field.name, number)
+        for name in ("disturbance", "band", "look"):
+            if getattr(self, name) == 0.0:
+                raise SettingError(f"expected a {name} of a load step other than 0, got 0")
+
+    def samples(self, Ts: float) -> tuple[FloatArray, FloatArray, float, int]:
+        """Reference [y], disturbance [u], band [y] and samples of the mean."""
+        on = round((self.ramp + self.settle) / Ts)
+        k = np.arange(on + max(1, round(self.look / Ts)))
+        share = np.minimum(1.0, k * Ts / self.ramp) if self.ramp > 0.0 else np.ones(len(k))
+        assert self.band is not None
+        return (
+            self.level * share,
+            np.where(k < on, 0.0, self.disturbance),
+            self.band,
+            max(1, round(self.mean / Ts)),
+        )

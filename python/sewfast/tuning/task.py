@@ -1,0 +1,446 @@
+"""One task to tune: plants, references, limits; what is searched; the first controller."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .. import _core
+from ..control.controller import Controller
+from ..control.defaults import (
+    beyond_record,
+    command_limits,
+    default_references,
+    drive_step,
+    filter_length,
+    require_one_input,
+)
+from ..control.loop import (
+    Plant,
+    Plants,
+    References,
+    check_fits,
+    each_plant,
+    each_reference,
+    plant_units,
+    reference_samples,
+)
+from ..errors import SettingError
+from ..gains import Gains, real, vector, whole
+from ..models import Model
+from ..rules import table_1
+from ..threads import available
+from ..units import REVOLUTIONS_PER_SECOND
+from .objective import Constraints, Cost, LoadStep
+
+Progress: TypeAlias = Callable[[int, int, float], object]
+Aggregate: TypeAlias = Literal["mean", "worst"]
+
+GAINS = (0.8, 1.25)
+"""Plant gains beside the identified one that a controller has to bear, so that it transfers."""
+
+
+@dataclass(frozen=True)
+class TuningTask:
+    """Everything but the search itself."""
+
+    plants: list[Any]
+    references: list[Any]
+    loads: list[LoadStep]
+    disturbances: list[Any]
+    start: Controller
+    variations: list[tuple[float, int]]
+    cost: Cost
+    aggregate: str
+    constraints: Constraints
+    assumed: str
+
+    @classmethod
+    def of(
+        cls,
+        models: Plants,
+        references: References,
+        *,
+        start: Controller | None,
+        first: Mapping[str, Any],
+        cost: Cost | None,
+        aggregate: str,
+        constraints: Constraints | None,
+        variations: Sequence[tuple[float, int]] | None,
+        loads: Sequence[LoadStep] = (),
+        disturbances: Sequence[ArrayLike] | None = None,
+    ) -> TuningTask:
+        """Checked; without a start, `first` are the settings of the first controller."""
+        given = list(models) if isinstance(models, Sequence) else [models]
+        if not given:
+            raise SettingError("expected at least one plant to tune on, got none")
+        plants = each_plant(given)
+        if not (start is None or isinstance(start, Controller)):
+            raise SettingError(
+                f"expected a Controller to start from, got {type(start).__name__}; read a file "
+                "with load_controller"
+            )
+        derived = start is None
+        if start is None:
+            start = first_controller(given[0], **first)
+        for plant in given:
+            check_fits(start, plant)
+        if references is None:
+            references = default_references(given[0], start)
+        return cls(
+            plants=plants,
+            references=[
+                reference_samples(r, start, plant=given[0]) for r in each_reference(references, ())
+            ],
+            loads=_load_steps(loads),
+            disturbances=[vector("disturbance", d) for d in disturbances or ()],
+            start=start,
+            variations=_checked(default_variations(start) if variations is None else variations),
+            cost=_instance(cost, Cost, "Cost(chatter=5.0)"),
+            aggregate=aggregate,
+            constraints=_instance(constraints, Constraints, "Constraints(overshoot=2.0)"),
+            assumed=_assumed(start, given, derived=derived),
+        )
+
+    def core(self, names: Sequence[Wanted] | None = None, *, ms: bool = False) -> _core._Task:
+        """As the core takes it, with variables by name; `ms`: Ms is asked for anyway."""
+        loops = self._loops() if ms or self.constraints.Ms is not None else []
+        return {
+            "plants": [plant.core for plant in self.plants],
+            "references": self.references,
+            "disturbances": self.disturbances,
+            "load_steps": [step.samples(self.start.Ts) for step in self.loads],
+            "start": self.start.core(),
+            "counts_per_unit": self.start.counts_per_unit,
+            "variations": self.variations,
+            "variables": wanted(
+                usual_variables(self.start) if names is None else names, self.start
+            ),
+            "cost": self.cost.named(),
+            "aggregate": self.aggregate,
+            "limits": self.constraints.limits,
+            "linear_plants": loops,
+        }
+
+    def _loops(self) -> list[Any]:
+        """The linear plants that Ms is taken on, as fractions."""
+        from ..control.margins import sampled
+
+        given = self.constraints.plant
+        if given is None:
+            plants = [p for p in self.plants if hasattr(p, "to_tf")]
+        else:
+            plants = list(given) if isinstance(given, (list, tuple)) else [given]
+        if not plants:
+            raise SettingError(
+                "expected a linear plant to take Ms on, got none among the plants; give "
+                "Constraints(plant=...), for example a linear model of the same drive, or add one "
+                "to the plants"
+            )
+        return [sampled(plant, self.start.Ts, self.constraints.speed) for plant in plants]
+
+
+def _assumed(start: Controller, given: list[Any], *, derived: bool) -> str:
+    """What of the limits has to be said in a controller's notes."""
+    if derived:
+        _, _, said = start.notes.partition("; ")
+    else:
+        said = beyond_record(given, start.u_min, start.u_max)
+    return f"; {said}" if said else ""
+
+
+def threads_or_all(threads: int | None) -> int:
+    """The number of threads; by default all that are available."""
+    return whole("threads", available() if threads is None else threads)
+
+
+def default_variations(controller: Controller) -> tuple[tuple[float, int], ...]:
+    """(gain, extra delay in samples) of the plants that a controller is tuned on; see `tune`."""
+    delay = max(1, controller.filter_samples // 4)
+    return ((1.0, 0), *((gain, delay) for gain in GAINS))
+
+
+def _instance(given: Any, kind: type[Any], example: str) -> Any:
+    if not (given is None or isinstance(given, kind)):
+        raise SettingError(
+            f"expected a {kind.__name__}, got {type(given).__name__}; for example {example}"
+        )
+    return kind() if given is None else given
+
+
+def budget(seconds: Any) -> float:
+    """A time in which a search has to end [s].
+
+    Raises
+    ------
+    SettingError
+        For what is no number above 0.
+    """
+    time = real("time_budget", seconds)
+    if not 0.0 < time < math.inf:
+        raise SettingError(f"expected a time_budget above 0 s, got {time:g}; None for none")
+    return time
+
+
+class TimeUp(KeyboardInterrupt):
+    """Asks the core to stop and hand over its best."""
+
+
+@dataclass
+class Deadline:
+    """Progress that ends a search after a time."""
+
+    seconds: float | None
+    inner: Progress | None
+
+    def __post_init__(self) -> None:
+        self._began = time.monotonic()
+        self.passed = False
+
+    def __call__(self, done: int, total: int, best: float) -> None:
+        if self.inner is not None:
+            self.inner(done, total, best)
+        # before the first gains are known there is nothing to hand over
+        if self.seconds is not None and math.isfinite(best) and done > 0:
+            self.passed = time.monotonic() - self._began > self.seconds
+            if self.passed:
+                raise TimeUp
+
+
+def _load_steps(given: Sequence[LoadStep]) -> list[LoadStep]:
+    steps = [given] if isinstance(given, LoadStep) else list(given)
+    return [_instance(step, LoadStep, "LoadStep(1500.0, -2.0)") for step in steps]
+
+
+def _checked(variations: Sequence[tuple[float, int]]) -> list[tuple[float, int]]:
+    pairs = isinstance(variations, Sequence) and all(np.shape(v) == (2,) for v in variations)
+    if not (pairs and variations):
+        raise SettingError(
+            f"expected variations as pairs of a gain and a delay in samples, got {variations!r}"
+        )
+    return [(real("a variation's gain", g), whole("a variation's delay", d)) for g, d in variations]
+
+
+# --- Variables: what is searched of a controller, and the controller that values stand for --------
+
+
+Wanted: TypeAlias = str | tuple[str, float, float]
+
+GAIN_NAMES = ("Kp", "Ti", "Td")
+SETTINGS = (
+    "alpha", "beta", "N", "Tt", "filter_samples", "filter_time", "observer_time", "r_rate",
+)  # fmt: skip
+_EDGE = 1e-3
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A number of the controller that was searched.
+
+    Attributes
+    ----------
+    name : str
+        ``Kp``, ``Ti``, ``Td``, a setting of `Controller`, or ``Kp[0]``.. of a schedule's point.
+    low, high : float
+        Its bounds.
+    value : float
+        What was found.
+    """
+
+    name: str
+    low: float
+    high: float
+    value: float
+
+    @property
+    def at_bound(self) -> bool:
+        """Whether it lies on a bound: what is best may lie beyond."""
+        room = _EDGE * (self.high - self.low)
+        near_low = self.value <= self.low + min(room, _EDGE * abs(self.low) or room)
+        return near_low or self.value >= self.high - room
+
+    def __str__(self) -> str:
+        where = ", at a bound" if self.at_bound else ""
+        return f"{self.name} {self.value:.6g} ({self.low:.4g} to {self.high:.4g}{where})"
+
+
+def wanted(
+    variables: Sequence[Wanted] | None, start: Controller
+) -> list[tuple[str, tuple[float, float] | None]]:
+    """Names and bounds as the core takes them; ``schedule`` stands for the gains of all points.
+
+    Raises
+    ------
+    SettingError
+        For what is neither a name nor a name with two bounds, or for no variable at all.
+    """
+    if variables is None:
+        return []
+    if isinstance(variables, str) or not variables:
+        raise SettingError(
+            f"expected a list of variables, got {variables!r}; for example variables=['Kp', "
+            "('Ti', 0.02, 0.5)]"
+        )
+    return [one for given in variables for one in _one(given, start)]
+
+
+def usual_variables(start: Controller) -> list[Wanted] | None:
+    """What is searched unless it is named, where the core's usual bounds do not hold it; else None.
+
+    These leave Ti at 4 sample times or more. A drive whose time constant is a few sample times
+    begins below that.
+    """
+    Ti = start.gains.to("standard").Ti
+    if start.schedule or not 0.0 < Ti < 8.0 * start.Ts:
+        return None
+    names: list[Wanted] = ["Kp", ("Ti", 0.1 * Ti, 1e3 * Ti), "Td", "alpha", "beta"]
+    return [*names, "N"] if np.isfinite(start.N) else names
+
+
+def _one(given: Any, start: Controller) -> list[tuple[str, tuple[float, float] | None]]:
+    if given == "schedule":
+        points = len(start.schedule)
+        if not points:
+            raise SettingError(
+                "expected a start with a gain schedule for the variable 'schedule', got one with "
+                "constant gains; search 'Kp', 'Ti', 'Td'"
+            )
+        return [(f"{gain}[{k}]", None) for k in range(points) for gain in GAIN_NAMES]
+    if isinstance(given, str):
+        return [(given, None)]
+    if not (isinstance(given, tuple) and len(given) == 3 and isinstance(given[0], str)):
+        raise SettingError(
+            f"expected a variable as a name or (name, low, high), got {given!r}; for example "
+            "('Ti', 0.02, 0.5)"
+        )
+    name, *bounds = given
+    low, high = (real(f"the bounds of {name}", bound) for bound in bounds)
+    if name == "filter_samples" and low < high and np.ceil(low) > np.floor(high):
+        raise SettingError(
+            f"expected bounds of filter_samples with a whole number between them, got {low:g} and "
+            f"{high:g}"
+        )
+    return [(name, (low, high))]
+
+
+def applied(values: Mapping[str, float], start: Controller, notes: str) -> Controller:
+    """The start with these values by name; its gains in standard form."""
+    gains = _standard(start.gains, values, GAIN_NAMES)
+    known = {field.name for field in fields(start)}
+    changes: dict[str, Any] = {n: values[n] for n in SETTINGS if n in values and n in known}
+    if "filter_samples" in changes:
+        changes["filter_samples"] = int(changes["filter_samples"])
+    schedule = getattr(start, "schedule", ())
+    if schedule:
+        changes["schedule"] = tuple(
+            (speed, _standard(point, values, [f"{gain}[{k}]" for gain in GAIN_NAMES]))
+            for k, (speed, point) in enumerate(schedule)
+        )
+    return replace(start, gains=gains, notes=notes, **changes)
+
+
+def _standard(own: Gains, values: Mapping[str, float], names: Sequence[str]) -> Gains:
+    """The gains in standard form, with the values that have one of the names."""
+    standard = own.to("standard")
+    kept = (standard.Kp, standard.Ti, standard.Td)
+    Kp, Ti, Td = (values.get(name, own) for name, own in zip(names, kept, strict=True))
+    return Gains.standard(Kp, Ti, Td, u_unit=own.u_unit, y_unit=own.y_unit)
+
+
+# --- The controller to start from -----------------------------------------------------------------
+
+
+DERIVATIVE_FILTER = 10.0
+"""N to begin with."""
+
+Encoder: TypeAlias = float | Literal["model"] | None
+
+
+def first_controller(
+    plant: Plant,
+    *,
+    u_min: float | None = None,
+    u_max: float | None = None,
+    counts_per_rev: Encoder = "model",
+    filter_samples: int | None = None,
+    output_unit: str | None = None,
+) -> Controller:
+    """A conservative controller from a model's own step response by Table 1 (nearest row).
+
+    The moving average's delay counts as dead time. Parameters are those of `tune`.
+
+    Raises
+    ------
+    SettingError
+        For a machine: record its step response and use `fit_fopdt` and `table_1`. For limits that
+        are neither stated nor recorded, and for an encoder on an output of unknown unit.
+    FitError
+        Where no step of the model settles.
+    """
+    if not isinstance(plant, Model):
+        raise SettingError(
+            "expected a model to find a start from, got a machine; give start=, or tune on a model"
+        )
+    require_one_input(plant)
+    low, high, note = command_limits([plant], u_min, u_max)
+    u_unit, y_unit = _units(plant, output_unit)
+    step = drive_step(plant, low, high)
+    if filter_samples is None:
+        filter_samples = filter_length(plant.Ts, step.slowest)
+    average = (max(1, whole("filter_samples", filter_samples)) - 1) / 2 * plant.Ts
+    rule = table_1(replace(step.fopdt, L=step.fopdt.L + average), outside="nearest")
+    gains = Gains.standard(
+        rule.gains.Kp, rule.gains.Ti, rule.gains.Td, u_unit=u_unit, y_unit=y_unit
+    )
+    return Controller(
+        gains=gains,
+        Ts=plant.Ts,
+        alpha=rule.alpha,
+        beta=rule.beta,
+        N=DERIVATIVE_FILTER,
+        u_min=low,
+        u_max=high,
+        filter_samples=filter_samples,
+        counts_per_rev=_encoder(plant, counts_per_rev, y_unit),
+        notes="; ".join(n for n in ("Table 1 on the model's step response", note) if n),
+    )
+
+
+def _units(plant: Model, stated: str | None) -> tuple[str, str]:
+    """Units of command and output; empty where nobody says them."""
+    u_unit, y_unit = plant_units(plant)
+    if stated is not None and not isinstance(stated, str):
+        raise SettingError(f"expected a unit as text for output_unit, got {stated!r}")
+    if stated and y_unit and stated.lower() != y_unit.lower():
+        raise SettingError(
+            f"expected the output in the model's unit {y_unit!r}, got output_unit = {stated!r}; "
+            "leave it out, or identify the model from converted data"
+        )
+    return u_unit, y_unit or stated or ""
+
+
+def _encoder(plant: Model, stated: Encoder, unit: str) -> float | None:
+    """Counts of one turn: as stated, else of the counts that the model's output came from."""
+    counts = stated
+    if isinstance(stated, str):
+        if stated != "model":
+            raise SettingError(
+                f"expected counts_per_rev as a number, None for ideal feedback, or 'model', got "
+                f"{stated!r}"
+            )
+        counts = plant.counts[1] if plant.counts else None
+        if unit.lower() not in REVOLUTIONS_PER_SECOND:
+            return None
+    if counts is not None and not unit:
+        raise SettingError(
+            f"expected the unit of the output {plant.output_name!r} for an encoder, as the model "
+            "states none; give it, output_unit='RPM' (--unit RPM), or name the column "
+            f"'{plant.output_name} [RPM]' in the recording"
+        )
+    return counts  # type: ignore[return-value]
