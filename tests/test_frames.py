@@ -99,8 +99,9 @@ def test_a_dict_of_columns_is_a_table() -> None:
         sewfast.read(columns, inputs="u", output="sped")
     with pytest.raises(DataError, match="expected rows"):
         sewfast.read({}, inputs="u")
-    with pytest.raises(DataError, match="shape"):
-        sewfast.read({"u": [[1.0], [1.0, 2.0]]}, inputs="u")
+    for wrong in ([[1.0], [1.0, 2.0]], data(), 3.0):
+        with pytest.raises(DataError, match="shape"):
+            sewfast.read({"u": wrong}, inputs="u")
 
 
 def test_another_object_is_refused() -> None:

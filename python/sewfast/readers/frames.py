@@ -164,8 +164,8 @@ def _with_unit(name: str, found: tuple[Any, str, str], units: Any) -> Found:
 def _array(values: Any) -> NDArray[Any]:
     try:
         return np.asarray(values)
-    except ValueError:
-        # lists of different lengths
+    except (ValueError, TypeError):
+        # lists of different lengths, or no list at all
         return np.empty((0, 0))
 
 
