@@ -16,7 +16,7 @@ ORDER = """
     errors arrays units storage plotting threads speed signals
     writers recordfile dataset readers benchmarks machine live
     dynamic_model validation evidence models
-    regression lipschitz delays order_table leastsquares identification
+    identification
     gains rules control tuning trust analysis
     link recording report commissioning experiment cli __main__
 """

@@ -11,9 +11,8 @@ import pytest
 import sewfast as api
 from cli import refused, sewfast
 from sewfast import DataError, Dataset, SettingError, _core
-from sewfast.lipschitz import lipschitz_index
-from sewfast.order_table import Structure
-from sewfast.regression import LaggedRegression
+from sewfast.identification.delays import LaggedRegression
+from sewfast.identification.order_table import Structure, lipschitz_index
 
 A, B = [-1.5, 0.7], [[0.5, 0.3]]
 

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from .control.loop import ClosedLoopRun, run
     from .control.margins import Margins, margins
     from .dataset import Dataset, Diagnosis, Experiment, diagnose
-    from .delays import DelayEstimate, delay
     from .errors import (
         DataError,
         FitError,
@@ -27,10 +26,11 @@ if TYPE_CHECKING:
     from .evidence import ReportCard, check
     from .gains import Gains
     from .identification import identify
-    from .leastsquares import LeastSquaresResult, least_squares
+    from .identification.delays import DelayEstimate, delay
+    from .identification.least_squares import LeastSquaresResult, least_squares
+    from .identification.order_table import OrderTable, orders
     from .machine import VirtualMachine
     from .models import ARX, IV, Ensemble, LinearOE, Model, NeuralOE, NeuralSS, load_model
-    from .order_table import OrderTable, orders
     from .readers import read, read_table
     from .recording import Recording, record
     from .rules import fit_fopdt, table_1
@@ -114,15 +114,15 @@ _HOMES = {
     "control": "Controller Gains fit_fopdt load_controller paper_controller table_1",
     "tuning": "Constraints Cost LoadStep ParetoFront TuningResult pareto tune",
     "dataset": "Dataset Diagnosis Experiment diagnose",
-    "delays": "DelayEstimate delay",
+    "identification.delays": "DelayEstimate delay",
     "errors": "DataError FitError Interrupted LinkError ModelFileError SettingError SewfastError",
     "evidence": "ReportCard check",
     "identification": "identify",
-    "leastsquares": "LeastSquaresResult least_squares",
+    "identification.least_squares": "LeastSquaresResult least_squares",
     "control.loop": "ClosedLoopRun run",
     "machine": "VirtualMachine",
     "models": "ARX IV Ensemble LinearOE Model NeuralOE NeuralSS load_model",
-    "order_table": "OrderTable orders",
+    "identification.order_table": "OrderTable orders",
     "readers": "read read_table",
     "recording": "Recording record",
     "control.margins": "Margins margins",

@@ -49,7 +49,7 @@ def add(commands: Commands) -> None:
 
 
 def orders_command(args: argparse.Namespace) -> None:
-    from ..order_table import orders
+    from ..identification.order_table import orders
 
     data = prepared(read_training(args), args)
     with Progress("orders") as progress:

@@ -9,9 +9,9 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import _core
-from .arrays import FloatArray
-from .errors import DataError, Interrupted, SettingError
+from .. import _core
+from ..arrays import FloatArray
+from ..errors import DataError, Interrupted, SettingError
 
 Differences: TypeAlias = Literal["2-point", "3-point", "cs"]
 
