@@ -15,7 +15,7 @@ import sewfast
 ORDER = """
     errors arrays units storage plotting threads speed signals
     writers recordfile dataset readers benchmarks machine live
-    dynamic_model validation evidence models
+    dynamic_model validation comparison evidence models
     identification
     gains rules control tuning trust analysis
     link recording report commissioning experiment cli __main__

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from ._core import __version__
     from .analysis import Analysis, analyse
     from .commissioning import Commissioning, commission
+    from .comparison import Comparison, compare
     from .control.controller import Controller, load_controller, paper_controller
     from .control.loop import ClosedLoopRun, run
     from .control.margins import Margins, margins
@@ -47,6 +48,7 @@ __all__ = [
     "Analysis",
     "ClosedLoopRun",
     "Commissioning",
+    "Comparison",
     "Constraints",
     "Controller",
     "Cost",
@@ -81,6 +83,7 @@ __all__ = [
     "analyse",
     "check",
     "commission",
+    "compare",
     "delay",
     "diagnose",
     "fit_fopdt",
@@ -110,6 +113,7 @@ __all__ = [
 _HOMES = {
     "_core": "__version__",
     "commissioning": "Commissioning commission",
+    "comparison": "Comparison compare",
     "analysis": "Analysis analyse",
     "control": "Controller Gains fit_fopdt load_controller paper_controller table_1",
     "tuning": "Constraints Cost LoadStep ParetoFront TuningResult pareto tune",
