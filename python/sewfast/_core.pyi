@@ -105,6 +105,35 @@ def unwrap_counts(counts: _F, *, bits: int) -> _F: ...
 # --- models.rs --------------------------------------------------------------------------------------------
 
 @final
+class EmbeddedModel:
+    """A model's coefficients by name, and its step in the arithmetic of a microcontroller."""
+
+    @property
+    def kind(self) -> str:
+        """``linear``, ``network`` or ``states``."""
+
+    @property
+    def orders(self) -> dict[str, int]:
+        """na (past outputs, or states), nb, nk, inputs."""
+
+    @property
+    def parts(self) -> dict[str, _F]:
+        """Coefficients by the names of the Rust crate's ``model``; matrices row by row."""
+
+    @property
+    def scaling(self) -> dict[str, _F] | None:
+        """u_mean, u_scale, y_mean, y_scale around the equation."""
+
+    @property
+    def output(self) -> tuple[str, list[float]]:
+        """Name and parameters of the output function."""
+
+    def run(self, u: _F, state: _F, held: _F, *, precision: str = "f64") -> _F:
+        """Free run over u, (N, inputs), from a state, with inputs of ``held`` before; (N,)."""
+
+def tanh_quotients() -> dict[str, tuple[list[float], list[float], float]]:
+    """tanh(x) = x P(x^2)/Q(x^2): P, Q and the largest |x| of ``near``, ``far`` and ``single``."""
+
 class LinearModel:
     """y(k) = -sum_i a[i] y(k-1-i) + sum_j sum_i b[j, i] u_j(k-nk-i) + offset, in the data's units."""
 
@@ -125,6 +154,9 @@ class LinearModel:
         """Real and imaginary parts, (na, 2)."""
     def dc_gain(self) -> _F:
         """Steady gain from each input, (n_inputs,)."""
+    def embedded(self) -> EmbeddedModel:
+        """For a microcontroller."""
+
     def rest_state(self) -> _F:
         """Zeros, (na,): past outputs of a drive at rest."""
     def simulate(self, u: _F, y_past: _F) -> _F: ...
@@ -155,6 +187,9 @@ class NeuralOE:
         """Every constructor argument but theta."""
     @property
     def na(self) -> int: ...
+    def embedded(self, *, scaled: bool = False) -> EmbeddedModel:
+        """For a microcontroller: in the data's units where ``simulate`` is, or ``scaled``."""
+
     def rest_state(self) -> _F:
         """Zeros, (na,): past outputs of a drive at rest."""
     def simulate(self, u: _F, y_past: _F) -> _F: ...
@@ -200,6 +235,9 @@ class NeuralSS:
         It keeps all weights; what is new acts on the rest with weights of about 1e-3, so that the free run hardly
         changes. New states come after the old ones, before an integrated one. Smaller sizes are a SettingError.
         """
+    def embedded(self) -> EmbeddedModel:
+        """For a microcontroller."""
+
     def rest_state(self) -> _F:
         """State that minimises |x+ - x|^2 + |y|^2 at input zero, (nx,)."""
     def simulate(self, u: _F, state: _F) -> _F: ...
@@ -415,6 +453,21 @@ def convert_gains(
 ) -> tuple[float, float, float]: ...
 
 @final
+class SingleController:
+    """The controller's arithmetic in single precision, as a microcontroller has it."""
+
+    def step(self, r: float, y: float, feedforward: float = 0.0) -> float: ...
+    def set_manual(self, u: float) -> None: ...
+    def set_automatic(self) -> None: ...
+    @property
+    def manual(self) -> bool: ...
+    def reset(self) -> None: ...
+    @property
+    def filtered(self) -> float: ...
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What the step computes with: as ``Controller.numbers``, in single precision."""
+
 class Controller:
     """The controller's arithmetic, one sample at a time (paper Fig. 16). Gains in standard form."""
 
@@ -440,6 +493,14 @@ class Controller:
     @property
     def filtered(self) -> float:
         """The feedback after its filter, at the last step."""
+
+    def single(self) -> SingleController:
+        """The same settings, rounded to single precision; at rest."""
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What the step computes with: gains per sample, filters, limits; ``rows`` of the schedule have speed, Kp,
+        Kp Ts/Ti, Td and one over the distance to the next."""
 
 _Plant: TypeAlias = Machine | LinearModel | NeuralOE | NeuralSS
 

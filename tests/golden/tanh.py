@@ -1,7 +1,7 @@
-"""The coefficients of `rust/core/src/simd/tanh.rs`: `python tests/golden/tanh.py`; needs mpmath.
+"""The coefficients of `rust/control/src/model/tanh.rs`: `python tests/golden/tanh.py`; needs mpmath.
 
 Remez's algorithm for tanh(x)/x = P(s)/Q(s), s = x^2, with the least relative error: up to where
-tanh is 1 to the last bit, and, of lower degree, up to 8.
+tanh is 1 to the last bit; of lower degree up to 8; and for single precision.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sys
 import mpmath as mp
 
 mp.mp.dps = 60
-QUOTIENTS = ((10, mp.mpf("19.1")), (7, mp.mpf(8)))
+QUOTIENTS = ((10, mp.mpf("19.1")), (7, mp.mpf(8)), (4, mp.mpf("9.1")))
 GRID = 1500
 
 

@@ -1,7 +1,7 @@
 //! The whole controller of the paper's Fig. 16: feedback filter, reference ramp, then two-degree-of-freedom PID.
 
 use crate::pid::Terms;
-use crate::schedule::Table;
+use crate::schedule::{Row, Table};
 use crate::{Design, Feedback, Pid, Ramp, Real, Refused, Settings};
 
 /// What the step of a controller with constant gains computes with: for code that steps many controllers at once with
@@ -147,6 +147,11 @@ impl<T: Real> Controller<T> {
     /// What it is made from.
     pub fn design(&self) -> &Design<T> {
         &self.design
+    }
+
+    /// The schedule as the step uses it, one row more than points at least, the last one repeated; empty for constant gains.
+    pub fn rows(&self) -> &[Row<T>] {
+        self.table.as_ref().map_or(&[], Table::rows)
     }
 
     /// What a step computes with; `None` where the gains follow a schedule.

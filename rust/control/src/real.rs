@@ -36,6 +36,8 @@ pub trait Real:
     fn from_count(count: usize) -> Self;
     /// The value for a message.
     fn to_f64(self) -> f64;
+    /// The hyperbolic tangent ([`model::tanh`](crate::model::tanh)).
+    fn tanh(self) -> Self;
 
     /// The nearest value in `[low, high]`; NaN stays NaN. Always two comparisons.
     fn limit(self, low: Self, high: Self) -> Self {
@@ -60,7 +62,7 @@ pub(crate) fn one_minus_exp<T: Real>(x: T) -> T {
 }
 
 macro_rules! real {
-    ($($float:ident)*) => {$(
+    ($($float:ident $tanh:ident),*) => {$(
         impl Real for $float {
             const ZERO: Self = 0.0;
             const ONE: Self = 1.0;
@@ -75,11 +77,14 @@ macro_rules! real {
             fn to_f64(self) -> f64 {
                 self.into()
             }
+            fn tanh(self) -> Self {
+                crate::model::tanh::$tanh(self)
+            }
         }
     )*};
 }
 
-real!(f32 f64);
+real!(f32 single, f64 double);
 
 #[cfg(test)]
 pub(crate) mod counted;

@@ -117,14 +117,17 @@ fn expected_in_point(name: &str) -> &'static str {
 
 /// A point in the form that is interpolated, and the way to the next one.
 #[derive(Clone, Copy, Debug)]
-struct Row<T> {
-    speed: T,
-    kp: T,
+pub struct Row<T> {
+    /// Size of the filtered output \[y\].
+    pub speed: T,
+    /// `Kp`.
+    pub kp: T,
     /// `Kp Ts/Ti`.
-    ki: T,
-    td: T,
+    pub ki: T,
+    /// `Td`.
+    pub td: T,
     /// One over the distance to the next point; 0 after the last.
-    inverse: T,
+    pub inverse: T,
 }
 
 /// A schedule as the step uses it: one row more than points, the last one repeated, so that every look-up takes the same
@@ -154,6 +157,11 @@ impl<T: Real> Table<T> {
             }
         }
         Some(Self { rows, n, ts })
+    }
+
+    /// All rows.
+    pub(crate) fn rows(&self) -> &[Row<T>] {
+        &self.rows
     }
 
     /// The gains where the filtered output is `y`.

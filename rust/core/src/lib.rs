@@ -8,6 +8,7 @@ pub mod arx;
 pub mod closed_loop;
 pub mod data;
 mod descent;
+pub mod embedded;
 pub mod encoder;
 pub mod error;
 pub mod fopdt;

@@ -69,6 +69,7 @@ macro_rules! started_fit_methods {
     };
 }
 
+pub mod embedded;
 mod guard;
 pub mod linear;
 pub mod neural;
@@ -83,6 +84,7 @@ use sewfast_core::linearised::Linearised;
 use crate::arrays::{array2, raise, rows, slice};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    embedded::register(module)?;
     guard::register(module)?;
     linear::register(module)?;
     neural::register(module)?;

@@ -85,4 +85,7 @@ impl Real for Counted {
     fn to_f64(self) -> f64 {
         self.0
     }
+    fn tanh(self) -> Self {
+        panic!("a controller has no tanh")
+    }
 }

@@ -6,6 +6,7 @@
 
 use core::panic::PanicInfo;
 use sewfast_control::link::{Body, Deframer, Fields, Header, MAX_WIRE, encode};
+use sewfast_control::model::{Equation, Model, Orders, Scaling};
 use sewfast_control::{Controller, Design, Point, Schedule};
 
 #[panic_handler]
@@ -75,4 +76,18 @@ pub fn change(controller: &mut Controller<f32>, design: &Design<f32>, u: f32) ->
     controller.set_automatic();
     controller.reset();
     changed && manual && controller.is_manual()
+}
+
+/// Any model in any memory.
+#[unsafe(no_mangle)]
+pub fn simulate(
+    orders: Orders,
+    equation: Equation<'_, f32>,
+    scaling: Option<Scaling<'_, f32>>,
+    memory: &mut [f32],
+    u: &[f32],
+) -> Option<f32> {
+    let mut model = Model::new(orders, equation, scaling, memory).ok()?;
+    model.begin(u, u);
+    Some(model.step(u))
 }

@@ -8,6 +8,14 @@ impl NeuralOE {
     /// With `(x - m)/s` for each regressor, `W1' = W1/s`, `b1' = b1 - W1' m`; with `y_scale f + y_mean` for the output,
     /// `w2' = y_scale w2`, `linear' = y_scale linear/s`, `b2' = y_scale b2 + y_mean - linear' m`.
     pub(crate) fn in_data_units(&self) -> Network {
+        let (theta, limits) = self.theta_in_data_units();
+        let mut network = Network::zero(self.shape(), limits);
+        network.load(&theta);
+        network
+    }
+
+    /// Its parameters and the limits of its output.
+    pub(crate) fn theta_in_data_units(&self) -> (Vec<f64>, (f64, f64)) {
         let (shape, scaling) = (self.shape(), &self.scaling);
         let (n_phi, na, nb) = (shape.lags.regressors(), shape.lags.na, shape.lags.nb);
         let [bias, second, constant, linear] = shape.offsets();
@@ -31,8 +39,6 @@ impl NeuralOE {
             theta[constant] -= theta[i] * mean;
         }
         let (low, high) = self.limits();
-        let mut network = Network::zero(shape, (scaling.restored(low), scaling.restored(high)));
-        network.load(&theta);
-        network
+        (theta, (scaling.restored(low), scaling.restored(high)))
     }
 }

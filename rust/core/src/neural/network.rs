@@ -53,7 +53,7 @@ impl Shape {
     }
 
     /// Where `b1`, `w2`, `b2` and `linear` begin in theta.
-    pub(super) fn offsets(&self) -> [usize; 4] {
+    pub(crate) fn offsets(&self) -> [usize; 4] {
         let bias = self.hidden * self.lags.regressors();
         let (second, constant) = (bias + self.hidden, bias + 2 * self.hidden);
         [bias, second, constant, constant + 1]

@@ -69,7 +69,7 @@ impl Scaling {
     }
 
     /// Whether weights may take the scaling in: a mean far beyond its scale would cost digits, a scale beyond all use its sense.
-    pub(super) fn is_moderate(&self) -> bool {
+    pub(crate) fn is_moderate(&self) -> bool {
         let inputs = self.u_mean.iter().zip(&self.u_scale);
         inputs
             .chain([(&self.y_mean, &self.y_scale)])

@@ -5,62 +5,16 @@ pub(super) mod pieces;
 #[cfg(target_arch = "x86_64")]
 pub(super) mod sums;
 
+use sewfast_control::model::tanh::{
+    self, DENOMINATOR, NEAR_DENOMINATOR, NEAR_NUMERATOR, NUMERATOR,
+};
+
 use crate::simd::Eight;
 
 /// From here on `tanh` is 1 to the last bit.
-const SATURATED: f64 = 19.1;
-/// `tanh(x)/x = P(x^2)/Q(x^2)` with a relative error of 2.5e-18 up to [`SATURATED`] (Remez's algorithm with 60 digits,
-/// `tests/golden/tanh.py`). All coefficients are positive: nothing cancels.
-const NUMERATOR: [f64; 11] = [
-    1.0,
-    0.15342010899213995,
-    0.006218719727800223,
-    0.00010308332400821754,
-    8.279151667440908e-07,
-    3.4541114898965334e-09,
-    7.560627214653178e-12,
-    8.307073685177713e-15,
-    4.069825331388988e-18,
-    6.773230739311428e-22,
-    1.615141015295681e-26,
-];
-const DENOMINATOR: [f64; 11] = [
-    1.0,
-    0.4867534423254733,
-    0.03513653383629132,
-    0.000883056260962854,
-    1.0053683169986197e-05,
-    5.7931712066037706e-08,
-    1.7541773556984035e-10,
-    2.7458456140969587e-13,
-    2.057898725685464e-16,
-    6.18199285124705e-20,
-    4.764238210598914e-24,
-];
-
+const SATURATED: f64 = tanh::FAR.end;
 /// Up to here [`near`] is used, which is shorter.
-const NEAR: f64 = 8.0;
-/// The same quotient of degree 7 with a relative error of 1.1e-17 up to [`NEAR`].
-const NEAR_NUMERATOR: [f64; 8] = [
-    1.0,
-    0.14881781282238896,
-    0.00553061499956883,
-    7.715039209671254e-05,
-    4.5470732847987743e-07,
-    1.099905863206026e-09,
-    8.807499367377642e-13,
-    1.0228779747038627e-16,
-];
-const NEAR_DENOMINATOR: [f64; 8] = [
-    1.0,
-    0.4821511461557223,
-    0.032914330384809606,
-    0.0007300283345242129,
-    6.5870715235225754e-06,
-    2.518690175001794e-08,
-    3.666532835695883e-11,
-    1.3626929902246258e-14,
-];
+const NEAR: f64 = tanh::NEAR.end;
 
 /// `tanh(x)`, within 1e-15 of its size, never beyond +-1; NaN stays NaN. A lane's result does not depend on the others.
 ///

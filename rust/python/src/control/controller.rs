@@ -1,7 +1,10 @@
-//! The controller, one sample at a time.
+//! The controller, one sample at a time, in double precision and in that of most microcontrollers.
 
 use pyo3::prelude::*;
-use sewfast_control::{Controller as Core, Design, Point, Refused, Schedule, Settings, Standard};
+use pyo3::types::PyDict;
+use sewfast_control::{
+    Controller as Core, Design, Point, Refused, Row, Schedule, Settings, Standard,
+};
 use sewfast_core::Error;
 
 use crate::arrays::raise;
@@ -12,19 +15,136 @@ pub struct Controller {
     pub core: Core<f64>,
 }
 
-/// Speed, then Kp, Ti, Td in standard form.
-type Row = (f64, f64, f64, f64);
+/// The same arithmetic in single precision, as a microcontroller has it: settings are rounded first.
+#[pyclass(module = "sewfast._core")]
+pub struct SingleController {
+    core: Core<f32>,
+}
 
-fn schedule(rows: &[Row]) -> Result<Schedule<f64>, Refused> {
-    let point = |&(speed, kp, ti, td): &Row| Point {
+/// Speed, then Kp, Ti, Td in standard form.
+type Given = (f64, f64, f64, f64);
+
+fn schedule(rows: &[Given]) -> Result<Schedule<f64>, Refused> {
+    let point = |&(speed, kp, ti, td): &Given| Point {
         speed,
         gains: Standard { kp, ti, td },
     };
     Schedule::new(&rows.iter().map(point).collect::<Vec<_>>())
 }
 
-#[pymethods]
-impl Controller {
+/// A design rounded to single precision.
+fn single(design: &Design<f64>) -> Result<Design<f32>, Refused> {
+    let gains = |g: Standard<f64>| Standard {
+        kp: g.kp as f32,
+        ti: g.ti as f32,
+        td: g.td as f32,
+    };
+    let point = |p: &Point<f64>| Point {
+        speed: p.speed as f32,
+        gains: gains(p.gains),
+    };
+    let points: Vec<_> = design.schedule.points().iter().map(point).collect();
+    let s = &design.pid;
+    Ok(Design {
+        pid: Settings {
+            gains: gains(s.gains),
+            alpha: s.alpha as f32,
+            beta: s.beta as f32,
+            n: s.n as f32,
+            tt: s.tt as f32,
+            u_min: s.u_min as f32,
+            u_max: s.u_max as f32,
+            slew: s.slew as f32,
+            ts: s.ts as f32,
+        },
+        filter_samples: design.filter_samples,
+        filter_time: design.filter_time as f32,
+        observer_time: design.observer_time as f32,
+        r_rate: design.r_rate as f32,
+        schedule: Schedule::new(&points)?,
+    })
+}
+
+/// What a controller does in either precision, beside methods of its own.
+macro_rules! controller_methods {
+    ($class:ident, $float:ty { $($own:tt)* }) => {
+        #[pymethods]
+        impl $class {
+            $($own)*
+
+            #[pyo3(signature = (r, y, feedforward=0.0))]
+            fn step(&mut self, r: $float, y: $float, feedforward: $float) -> $float {
+                self.core.step_with(r, y, feedforward)
+            }
+
+            fn set_manual(&mut self, py: Python<'_>, u: $float) -> PyResult<()> {
+                let done = self.core.set_manual(u);
+                done.map_err(|refused| raise(py, Error::from(refused)))
+            }
+
+            fn set_automatic(&mut self) {
+                self.core.set_automatic();
+            }
+
+            #[getter]
+            fn manual(&self) -> bool {
+                self.core.is_manual()
+            }
+
+            fn reset(&mut self) {
+                self.core.reset();
+            }
+
+            #[getter]
+            fn filtered(&self) -> $float {
+                self.core.filtered()
+            }
+
+            /// What the step computes with, worked out from the settings in this precision.
+            #[getter]
+            fn numbers<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+                let (design, found) = (*self.core.design(), PyDict::new(py));
+                let constant = Design { schedule: Schedule::NONE, ..design };
+                let constant = Core::new(constant).map_err(|e| raise(py, Error::from(e)))?;
+                let Some(numbers) = constant.numbers() else {
+                    return Ok(found);
+                };
+                let (keep, gain) = numbers.observer.unwrap_or_default();
+                for (name, value) in [
+                    ("kp", numbers.terms.kp),
+                    ("ki", numbers.terms.ki),
+                    ("kd", numbers.terms.kd),
+                    ("pole", numbers.terms.pole),
+                    ("tracking", numbers.tracking),
+                    ("lag", numbers.lag),
+                    ("keep", keep),
+                    ("gain", gain),
+                    ("ramp", numbers.ramp),
+                    ("change", design.pid.slew * design.pid.ts),
+                    ("alpha", design.pid.alpha),
+                    ("beta", design.pid.beta),
+                    ("u_min", design.pid.u_min),
+                    ("u_max", design.pid.u_max),
+                    ("n", design.pid.n),
+                    ("ts", design.pid.ts),
+                ] {
+                    found.set_item(name, f64::from(value))?;
+                }
+                found.set_item("tracks", design.pid.tt != 0.0)?;
+                found.set_item("observes", numbers.observer.is_some())?;
+                found.set_item("samples", numbers.samples)?;
+                let row = |r: &Row<$float>| {
+                    [r.speed, r.kp, r.ki, r.td, r.inverse].map(f64::from)
+                };
+                let rows: Vec<_> = self.core.rows().iter().map(row).collect();
+                found.set_item("rows", rows)?;
+                Ok(found)
+            }
+        }
+    };
+}
+
+controller_methods!(Controller, f64 {
     #[new]
     #[pyo3(signature = (*, Kp, Ti, Td, alpha, beta, N, Tt, u_min, u_max, slew, Ts, filter_samples, filter_time, observer_time=0.0, r_rate=f64::INFINITY, schedule=Vec::new()))]
     #[expect(non_snake_case, reason = "the field's names")]
@@ -46,7 +166,7 @@ impl Controller {
         filter_time: f64,
         observer_time: f64,
         r_rate: f64,
-        schedule: Vec<Row>,
+        schedule: Vec<Given>,
     ) -> PyResult<Self> {
         let gains = Standard {
             kp: Kp,
@@ -78,9 +198,11 @@ impl Controller {
         Ok(Self { core })
     }
 
-    #[pyo3(signature = (r, y, feedforward=0.0))]
-    fn step(&mut self, r: f64, y: f64, feedforward: f64) -> f64 {
-        self.core.step_with(r, y, feedforward)
+    /// The same settings in single precision.
+    fn single(&self, py: Python<'_>) -> PyResult<SingleController> {
+        let made = single(self.core.design()).and_then(Core::new);
+        let core = made.map_err(|refused| raise(py, Error::from(refused)))?;
+        Ok(SingleController { core })
     }
 
     fn set_design(&mut self, py: Python<'_>, other: &Bound<'_, Self>) -> PyResult<()> {
@@ -92,27 +214,6 @@ impl Controller {
         let done = self.core.set_design(design);
         done.map_err(|refused| raise(py, Error::from(refused)))
     }
+});
 
-    fn set_manual(&mut self, py: Python<'_>, u: f64) -> PyResult<()> {
-        let done = self.core.set_manual(u);
-        done.map_err(|refused| raise(py, Error::from(refused)))
-    }
-
-    fn set_automatic(&mut self) {
-        self.core.set_automatic();
-    }
-
-    #[getter]
-    fn manual(&self) -> bool {
-        self.core.is_manual()
-    }
-
-    fn reset(&mut self) {
-        self.core.reset();
-    }
-
-    #[getter]
-    fn filtered(&self) -> f64 {
-        self.core.filtered()
-    }
-}
+controller_methods!(SingleController, f32 {});

@@ -5,6 +5,7 @@ use pyo3::prelude::*;
 use sewfast_core::lagged::Lagged;
 use sewfast_core::{Error, arx, iv, linear, linear_fit, oe};
 
+use super::embedded::EmbeddedModel;
 use super::{Matrices, Rows, RunAndJacobian, Values};
 use crate::arrays::{Experiments, array1, array2, raise, records, rows, samples, slice};
 use crate::watch::watched;
@@ -58,6 +59,10 @@ impl LinearModel {
     #[getter]
     fn na(&self) -> usize {
         self.inner.lags().na
+    }
+
+    fn embedded(&self) -> EmbeddedModel {
+        EmbeddedModel::of(self.inner.embedded())
     }
 
     #[getter]

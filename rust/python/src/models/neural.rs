@@ -7,6 +7,7 @@ use sewfast_core::lagged::{Lagged, Lags};
 use sewfast_core::neural::{self, InitialState, Scaling, Settings, Shape};
 use sewfast_core::{Error, Result};
 
+use super::embedded::EmbeddedModel;
 use super::linear::LinearModel;
 use super::{Matrices, Rows, RunAndJacobian, Values};
 use crate::arrays::{Experiments, array1, array2, raise, records, rows, slice};
@@ -87,6 +88,11 @@ impl NeuralOE {
         settings.set_item("output_low", limit(self.inner.limits().0))?;
         settings.set_item("output_high", limit(self.inner.limits().1))?;
         Ok(settings)
+    }
+
+    #[pyo3(signature = (*, scaled=false))]
+    fn embedded(&self, scaled: bool) -> EmbeddedModel {
+        EmbeddedModel::of(self.inner.embedded(scaled))
     }
 
     #[getter]

@@ -8,6 +8,7 @@ use sewfast_core::neural_ss::{
 };
 use sewfast_core::{Error, Result};
 
+use super::embedded::EmbeddedModel;
 use super::linear::LinearModel;
 use super::{Matrices, Rows, Values};
 use crate::arrays::{Experiment, array1, array2, raise, rows, slice};
@@ -90,6 +91,11 @@ impl NeuralSS {
     #[getter]
     fn theta<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         array1(py, self.inner.theta().to_vec())
+    }
+
+    fn embedded(&self, py: Python<'_>) -> PyResult<EmbeddedModel> {
+        let made = self.inner.embedded();
+        made.map(EmbeddedModel::of).map_err(|e| raise(py, e))
     }
 
     #[getter]

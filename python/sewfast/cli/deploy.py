@@ -1,0 +1,59 @@
+"""`sewfast deploy`: a model or a controller as code for a processor or another tool."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .arguments import Commands, add_command
+from .output import print_json
+
+DEPLOY = """\
+Write a model or a controller as code: C99 without heap, C library or global state, or IEC 61131-3
+structured text. Beside the C lie a test that compares its results with those of sewfast, bit by
+bit, and what CMake, PlatformIO and Zephyr ask for.
+"""
+
+EXAMPLES = """\
+examples:
+  sewfast deploy controller.json firmware             controller.c, controller.h and their test
+  sewfast deploy drive.json firmware --name plant     the model: plant.c, plant.h
+  sewfast deploy controller.json simulation --precision f64
+  sewfast deploy controller.json plc --to st          a function block for a PLC
+
+try it:  cc -std=c99 firmware/controller.c firmware/controller_test.c && ./a.out
+"""
+
+
+def add(commands: Commands) -> None:
+    parser = add_command(
+        commands, "deploy", deploy_command,
+        summary="a model or controller as C99 or structured text", text=DEPLOY, examples=EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument("file", metavar="FILE.json", help="model or controller")
+    parser.add_argument("folder", metavar="DIR", type=Path, help="folder for the code")
+    parser.add_argument(
+        "--to", choices=("c99", "st"), default="c99", help="C99, or structured text (c99)"
+    )
+    parser.add_argument(
+        "--precision", choices=("f32", "f64"), default="f32", help="of the arithmetic (f32)"
+    )
+    parser.add_argument(
+        "--name", dest="prefix", metavar="NAME",
+        help="with which all names in the code begin; default: controller or model",
+    )  # fmt: skip
+
+
+def deploy_command(args: argparse.Namespace) -> None:
+    from .. import deploy, storage
+    from ..control import FORMAT, load_controller
+    from ..models import load_model
+
+    controller = storage.format_of(args.file) == FORMAT
+    what = load_controller(args.file) if controller else load_model(args.file)
+    done = deploy.deploy(what, args.folder, to=args.to, precision=args.precision, name=args.prefix)
+    if args.json:
+        files = [str(done.folder / name) for name in done.files]
+        print_json({"folder": str(done.folder), "files": files, "notes": list(done.notes)})
+    else:
+        print(done)

@@ -1,0 +1,119 @@
+"""Models and controllers as code for other processors and tools.
+
+`deploy` writes a folder: C99 or structured text, with a test against the step of this package.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..control import Controller
+from ..errors import SettingError
+from ..models import Model
+from ..storage import replace
+from . import c99, structured_text
+
+TARGETS = ("c99", "st")
+PRECISIONS = ("f32", "f64")
+
+_WRITERS: dict[str, Callable[[Model | Controller, str, str], tuple[dict[str, str], list[str]]]] = {
+    "c99": c99.files,
+    "st": structured_text.files,
+}
+
+
+@dataclass(frozen=True)
+class Deployment:
+    """What `deploy` wrote.
+
+    Attributes
+    ----------
+    folder : Path
+    files : tuple of str
+        Their paths within the folder.
+    notes : tuple of str
+        What the code does and costs, one line each.
+    """
+
+    folder: Path
+    files: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def __str__(self) -> str:
+        listed = "\n".join(f"  {name}" for name in self.files)
+        notes = "\n".join(self.notes)
+        return f"{notes}\nwritten to {self.folder}\n{listed}"
+
+
+def deploy(
+    what: Model | Controller,
+    folder: str | os.PathLike[str],
+    *,
+    to: str = "c99",
+    precision: str = "f32",
+    name: str | None = None,
+) -> Deployment:
+    """Write a model or a controller as code.
+
+    Parameters
+    ----------
+    what : Model or Controller
+        Linear models, networks, neural state-space models of one output and ensembles of them; a
+        PID in all its forms.
+    folder : path
+        Made if it is not there. Files of the same names are replaced, each as a whole.
+    to : {"c99", "st"}
+        C99 without heap, libm, recursion or global state; or IEC 61131-3 structured text, of a
+        controller only.
+    precision : {"f32", "f64"}
+        Of the arithmetic. A microcontroller that computes only single precision in hardware takes
+        some fifty times as long for `f64`.
+    name : str, optional
+        With which every name in the code begins; `controller` or `model` where there is none.
+
+    Returns
+    -------
+    Deployment
+
+    Raises
+    ------
+    SettingError
+        For another target, precision or name, and for a model that single precision would change.
+    ModelFileError
+        Where a file cannot be written.
+    """
+    if not isinstance(what, Model | Controller):
+        raise SettingError(
+            f"expected a model or a controller, got {type(what).__name__}; load it with "
+            "sewfast.load_model or sewfast.load_controller"
+        )
+    if to not in TARGETS:
+        raise SettingError(f"to: expected {' or '.join(TARGETS)}, received {to!r}")
+    if precision not in PRECISIONS:
+        raise SettingError(f"precision: expected {' or '.join(PRECISIONS)}, received {precision!r}")
+    if name is None:
+        name = "controller" if isinstance(what, Controller) else "model"
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name) or name in c99.KEYWORDS:
+        raise SettingError(
+            f"name: expected lower-case letters, digits and underscores that are no word of the "
+            f"language, received {name!r}; for example drive"
+        )
+    texts, notes = _WRITERS[to](what, name, precision)
+    target = Path(folder)
+    if target.exists() and not target.is_dir():
+        raise SettingError(f"expected a folder, got the file {target}; name another one")
+    for path, text in texts.items():
+        place = target / path
+        try:
+            place.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SettingError(
+                f"expected a folder that can be made, got {place.parent} ({error.strerror}); name "
+                "one that can be written to"
+            ) from error
+        replace(place, text)
+    return Deployment(target, tuple(texts), tuple(notes))

@@ -1,0 +1,541 @@
+"""C99 of models and controllers: coefficients from the core, the steps from the files in `c99/`.
+
+The C has the bits of `sewfast_control`, the Rust crate for microcontrollers, in either precision.
+
+In the files `@_` stands for the name with which every function begins, `@@_` for the same in
+capitals, `@m_` and `@M_` for those of a model's member; `R(1.0)` is a number of the precision.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from importlib.resources import files as resources
+from typing import Any
+
+import numpy as np
+
+from .. import __version__, _core
+from ..control import Controller
+from ..dataset import FloatArray
+from ..errors import FitError, SettingError
+from ..models import Ensemble, Model
+from . import manifests
+
+KEYWORDS = frozenset(
+    keyword
+    for line in (
+        "auto bool break case char class const continue default delete do double else enum",
+        "extern float for goto if inline int long main namespace new private public register",
+        "restrict return short signed sizeof static struct switch template this typedef union",
+        "unsigned using void volatile while",
+    )
+    for keyword in line.split()
+)
+"""Words of C and C++ that no name may be."""
+MOST_LOSS = 0.01
+"""Of the output's span: a model that single precision changes by more is refused."""
+_SAMPLES = 5000
+"""Over which the loss of single precision is measured."""
+_VECTORS = 200
+"""Samples of the test that stands beside the code."""
+_MOST_MEMBERS = 64
+_LICENCE = "The code in this file may be used under MIT, Apache-2.0 or 0BSD, as you like."
+
+
+def files(what: Model | Controller, name: str, precision: str) -> tuple[dict[str, str], list[str]]:
+    """The texts of all files by their names, and what is to be said of them."""
+    code = _Code(name, precision)
+    if isinstance(what, Controller):
+        header, source, vectors, notes = _controller(what, code)
+    else:
+        header, source, vectors, notes = _model(what, code)
+    texts = {
+        f"{name}.h": header,
+        f"{name}.c": source,
+        f"{name}_test.c": vectors,
+        **manifests.files(name, what),
+    }
+    return texts, notes
+
+
+@dataclass(frozen=True)
+class _Code:
+    """A name and a number type, and how both are written in C."""
+
+    name: str
+    precision: str
+
+    @property
+    def single(self) -> bool:
+        return self.precision == "f32"
+
+    @property
+    def real(self) -> str:
+        return "float" if self.single else "double"
+
+    def literal(self, value: float) -> str:
+        """The shortest decimal that a compiler reads as this number."""
+        if math.isnan(value):
+            raise SettingError("expected numbers to write, got NaN; identify the model again")
+        if math.isinf(value):
+            largest = "3.40282347e+38f" if self.single else "1.7976931348623157e+308"
+            return largest if value > 0 else f"-{largest}"
+        text = str(np.float32(value)) if self.single else repr(float(value))
+        text = text if re.search(r"[.e]", text) else f"{text}.0"
+        return f"{text}f" if self.single else text
+
+    def literals(self, values: Iterable[float], indent: str = "    ") -> str:
+        """Several, six in a row."""
+        written = [self.literal(float(v)) for v in values]
+        rows = [", ".join(written[i : i + 6]) for i in range(0, len(written), 6)]
+        return f",\n{indent}".join(rows)
+
+    def table(self, name: str, values: Iterable[float]) -> str:
+        """A constant array."""
+        held = list(values)
+        body = self.literals(held)
+        return f"static const {self.name}_real {name}[{len(held)}] = {{\n    {body}\n}};\n"
+
+    def template(self, file: str, member: str = "", **values: str) -> str:
+        """A file of `c99/` with its places filled."""
+        text = resources(__package__).joinpath("c99", file).read_text(encoding="utf-8")
+        for key in sorted(values, key=len, reverse=True):
+            text = text.replace(f"@{key}", values[key])
+        prefix = member or self.name
+        text = text.replace("@m_", f"{prefix}_").replace("@M_", f"{prefix.upper()}_")
+        text = text.replace("@@_", f"{self.name.upper()}_").replace("@_", f"{self.name}_")
+        suffix = "f" if self.single else ""
+        return re.sub(r"R\((-?[0-9.]+)\)", rf"\g<1>{suffix}", text)
+
+    def tanh(self) -> str:
+        """The hyperbolic tangent of the core, with its coefficients."""
+        values: dict[str, str] = {}
+        for name, (numerator, denominator, end) in _core.tanh_quotients().items():
+            wide = _Code(self.name, "f32" if name == "single" else "f64")
+            values[f"{name.upper()}_P"] = wide.literals(numerator, " " * 12)
+            values[f"{name.upper()}_Q"] = wide.literals(denominator, " " * 12)
+            values[f"{name.upper()}_END"] = wide.literal(end)
+        return self.template(f"tanh_{self.precision}.c", **values)
+
+    def opening(self, what: str, about: Iterable[str]) -> str:
+        """The comment that every file begins with."""
+        lines = [
+            what,
+            "",
+            *about,
+            "",
+            _LICENCE,
+            f"Written by sewfast {__version__}; change it there.",
+        ]
+        body = "\n".join(f" * {_safe(line)}".rstrip() for line in lines)
+        return f"/*\n{body}\n */\n"
+
+    def framed(self, file: str, opening: str, body: str) -> str:
+        """A whole file: a header, or code that refuses arithmetic of another kind."""
+        return self.template(file, OPENING=opening, REAL=self.real, NAME=self.name, BODY=body)
+
+
+def _safe(text: str) -> str:
+    """Text of a user that may stand in a comment, and holds no place to be filled."""
+    return re.sub(r"[\x00-\x1f\x7f]", " ", text.replace("*/", "* /").replace("/*", "/ *")).replace(
+        "@", "(at)"
+    )
+
+
+# --- Models ---------------------------------------------------------------------------------------
+
+
+def _model(model: Model, code: _Code) -> tuple[str, str, str, list[str]]:
+    members = list(model.members) if isinstance(model, Ensemble) else [model]
+    if len(members) > _MOST_MEMBERS:
+        raise SettingError(
+            f"expected at most {_MOST_MEMBERS} members for a processor, got {len(members)}; deploy "
+            "some of them with Ensemble.of(model.members[:3])"
+        )
+    embedded = [m.core.embedded(**_scaled(m, code)) for m in members]
+    combined = model.combine if isinstance(model, Ensemble) else "median"
+    functions = ", ".join(f"{code.name}_{f}" for f in ("init", "begin", "step"))
+    notes = [f"{model.title} as C99 in {code.real}: {functions}"]
+    if code.single:
+        notes.append(_require_single(model, members, embedded, combined))
+    numbers = sum(len(v) for e in embedded for v in e.parts.values())
+    size = 4 if code.single else 8
+    rooms = [_room(e) for e in embedded]
+    notes.append(
+        f"{numbers * size} bytes of coefficients, {sum(rooms) * size} bytes of memory a model"
+    )
+    inputs = ", ".join(
+        _named(n, u) for n, u in zip(model.input_names, model.input_units, strict=True)
+    )
+    output = _named(model.output_name, model.output_unit)
+    about = [
+        f"{model.title}: from {inputs} to {output} every {model.Ts:g} s.",
+        *model.describe(),
+        f"Parameters: {_digest(model)}.",
+        "",
+        "Compile with -ffp-contract=off where a step is to have the bits of sewfast's own.",
+        "No heap, no C library, no global state; a step takes the same path every time.",
+    ]
+    return (
+        _model_header(model, code, embedded, about),
+        _model_source(code, members, embedded, combined, about),
+        _model_test(model, code, members, embedded, combined),
+        notes,
+    )
+
+
+def _named(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit else name
+
+
+def _digest(model: Model) -> str:
+    """What tells two models apart: the start of the hash of all parameters."""
+    import hashlib
+
+    return f"SHA-256 {hashlib.sha256(model.theta.tobytes()).hexdigest()[:16]}"
+
+
+def _scaled(model: Model, code: _Code) -> dict[str, bool]:
+    return {"scaled": code.single} if model.kind == "neural_oe" else {}
+
+
+def _kept(embedded: _core.EmbeddedModel) -> int:
+    return embedded.orders["nk"] + embedded.orders["nb"]
+
+
+def _room(embedded: _core.EmbeddedModel) -> int:
+    return embedded.orders["na"] + embedded.orders["inputs"] * _kept(embedded)
+
+
+def _excitation(model: Model, samples: int) -> FloatArray:
+    """Steps over the range that the model was trained on, held for 1 to 80 samples."""
+    rng = np.random.default_rng(0)
+    columns = []
+    settings = getattr(model, "settings", None) or {}
+    inputs = len(model.input_names)
+    means, scales = settings.get("u_mean", [0.0] * inputs), settings.get("u_scale", [1.0] * inputs)
+    for mean, scale in zip(means, scales, strict=True):
+        held = np.repeat(rng.uniform(-2.0, 2.0, samples), rng.integers(1, 81, samples))
+        columns.append(mean + scale * held[:samples])
+    return np.ascontiguousarray(np.stack(columns, axis=1))
+
+
+def _run(
+    members: list[Model],
+    embedded: list[_core.EmbeddedModel],
+    combined: str,
+    u: FloatArray,
+    precision: str,
+) -> FloatArray:
+    """The free run from rest, as the C computes it."""
+    held = np.zeros(u.shape[1])
+    runs = [
+        e.run(u, m.core.rest_state(), held, precision=precision)
+        for m, e in zip(members, embedded, strict=True)
+    ]
+    if precision == "f64":
+        stacked = np.array(runs)
+        return np.asarray(
+            np.median(stacked, axis=0) if combined == "median" else np.mean(stacked, axis=0)
+        )
+    single = np.array(runs, dtype=np.float32)
+    ordered = np.sort(single, axis=0)
+    n, half = len(runs), np.float32(0.5)
+    if combined == "median":
+        middle = half * (ordered[(n - 1) // 2] + ordered[n // 2])
+        return np.asarray(ordered[n // 2] if n % 2 else middle, dtype=np.float64)
+    total = np.zeros(single.shape[1], dtype=np.float32)
+    for run in single:
+        total = total + run
+    return np.asarray(total / np.float32(n), dtype=np.float64)
+
+
+def _require_single(
+    model: Model, members: list[Model], embedded: list[_core.EmbeddedModel], combined: str
+) -> str:
+    """Refuses a model that single precision would change; else what it costs."""
+    exact = [m.core.embedded() for m in members]
+    u = _excitation(members[0], _SAMPLES)
+    with np.errstate(all="ignore"):
+        double = _run(members, exact, combined, u, "f64")
+        single = _run(members, embedded, combined, u, "f32")
+        span = float(np.ptp(double))
+        loss = float(np.max(np.abs(single - double))) / span if span > 0 else math.nan
+    if not np.isfinite(double).all():
+        raise FitError(
+            "expected a model whose free run stays finite over its own input range, got one that "
+            "leaves it; identify a stable model"
+        )
+    if not loss <= MOST_LOSS:
+        poles = [abs(p) for m in members if m.kind in ("arx", "oe", "iv") for p in m.poles]  # type: ignore[attr-defined]
+        slow = f" (its slowest pole is {max(poles):.9g})" if poles else ""
+        raise SettingError(
+            f"expected a model that single precision changes by at most {MOST_LOSS:.0%} of its "
+            f"span, got {loss:.3%}{slow}; deploy it with precision f64, or identify it at a longer "
+            "sample time"
+        )
+    return f"single precision changes a free run of {_SAMPLES} samples by {loss:.1e} of its span"
+
+
+def _model_header(
+    model: Model, code: _Code, embedded: list[_core.EmbeddedModel], about: list[str]
+) -> str:
+    memories, fields = "", ""
+    for prefix, e in zip(_prefixes(code, embedded), embedded, strict=True):
+        sizes = {"SIZE": e.orders["na"], "ROOM": e.orders["inputs"] * _kept(e)}
+        memories += code.template("memory.h", prefix, **{k: str(v) for k, v in sizes.items()})
+        fields += f"    {prefix}_memory {_member_name(prefix, code)};\n"
+    body = code.template(
+        "model.h",
+        INPUTS=str(len(model.input_names)),
+        STATES=str(sum(e.orders["na"] for e in embedded)),
+        TS=_Code(code.name, "f64").literal(model.Ts),
+        MEMORIES=memories,
+        FIELDS=fields,
+    )
+    return code.framed("frame.h", code.opening(f"{code.name}: an identified model", about), body)
+
+
+def _prefixes(code: _Code, embedded: list[_core.EmbeddedModel]) -> list[str]:
+    if len(embedded) == 1:
+        return [code.name]
+    return [f"{code.name}_{i}" for i in range(len(embedded))]
+
+
+def _member_name(prefix: str, code: _Code) -> str:
+    return "only" if prefix == code.name else f"member_{prefix.rsplit('_', 1)[1]}"
+
+
+def _model_source(
+    code: _Code,
+    members: list[Model],
+    embedded: list[_core.EmbeddedModel],
+    combined: str,
+    about: list[str],
+) -> str:
+    prefixes = _prefixes(code, embedded)
+    networks = any(e.kind != "linear" for e in embedded)
+    functions = {e.output[0] for e in embedded if e.kind == "states"}
+    parts = [code.template("common.c")]
+    if networks:
+        parts += [code.tanh(), code.template("lanes.c")]
+    parts += [code.template(f"{f}.c") for f in sorted(functions - {"linear"})]
+    for prefix, e in zip(prefixes, embedded, strict=True):
+        parts.append(_member(code, prefix, e))
+    parts.append(_whole(code, prefixes, members, embedded, combined))
+    opening = code.opening(f"{code.name}: an identified model", about)
+    return code.framed("frame.c", opening, "\n".join(parts))
+
+
+def _member(code: _Code, prefix: str, e: _core.EmbeddedModel) -> str:
+    orders, upper = e.orders, prefix.upper()
+    sizes = {"NB": orders["nb"], "NK": orders["nk"], "KEPT": _kept(e), "NA": orders["na"]}
+    if e.kind == "network":
+        sizes["HIDDEN"] = len(e.parts["b1"])
+    if e.kind == "states":
+        sizes |= {"NX": orders["na"], "HIDDEN": len(e.parts["bh"])}
+        del sizes["NB"]
+    defines = "".join(f"#define {upper}_{key} {value}\n" for key, value in sizes.items())
+    limits = {k: float(e.parts[k][0]) for k in ("low", "high") if k in e.parts}
+    tables = "".join(
+        code.table(f"{prefix}_{key}", values)
+        for key, values in e.parts.items()
+        if key not in limits
+    )
+    scaled, begin, restored = "", "state[i]", "y"
+    scaling = e.scaling
+    if scaling is not None:
+        tables += code.table(f"{prefix}_u_mean", scaling["u_mean"])
+        tables += code.table(f"{prefix}_u_scale", scaling["u_scale"])
+        mean, scale = code.literal(scaling["y_mean"][0]), code.literal(scaling["y_scale"][0])
+        scaled = f"({{}} - {prefix}_u_mean[j]) / {prefix}_u_scale[j]"
+        restored = f"y * {scale} + {_signed(mean)}"
+        if e.kind == "network":
+            begin = f"(state[i] - {_signed(mean)}) / {scale}"
+    limited = ""
+    if limits and not (math.isinf(limits["low"]) and math.isinf(limits["high"])):
+        low, high = code.literal(limits["low"]), code.literal(limits["high"])
+        limited = f"    sum = sum < {low} ? {low} : sum;\n    sum = sum > {high} ? {high} : sum;\n"
+    function, values = e.output
+    output = {
+        "linear": "sum",
+        "saturation": "@_saturated(sum, {})",
+        "abs": "@_hypotenuse(sum, {})",
+    }[function].format(", ".join(code.literal(v) for v in values))
+    body = code.template(f"{e.kind}.c", prefix, LIMITS=limited, OUTPUT=output)
+    frame = code.template("member.c", prefix, BEGIN_STATE=begin, RESTORED=restored)
+    frame = re.sub(
+        r"@SCALED\((\w+\[j\])\)", lambda m: scaled.format(m[1]) if scaled else m[1], frame
+    )
+    return f"/* ---- {prefix} ---- */\n\n{defines}\n{tables}\n{body}\n{frame}"
+
+
+def _signed(literal: str) -> str:
+    return f"({literal})" if literal.startswith("-") else literal
+
+
+def _whole(
+    code: _Code,
+    prefixes: list[str],
+    members: list[Model],
+    embedded: list[_core.EmbeddedModel],
+    combined: str,
+) -> str:
+    """The public functions: all members, and what they give together."""
+    count = len(prefixes)
+    names = [_member_name(p, code) for p in prefixes]
+    at, begins = 0, ""
+    for prefix, name, e in zip(prefixes, names, embedded, strict=True):
+        begins += f"    {prefix}_begin_member(&model->{name}, state + {at}, held);\n"
+        at += e.orders["na"]
+    steps = [f"{p}_step_member(&model->{name}, u)" for p, name in zip(prefixes, names, strict=True)]
+    combine = ""
+    if count == 1:
+        step = f"    return {steps[0]};\n"
+    else:
+        runs = "".join(f"    y[{i}] = {s};\n" for i, s in enumerate(steps))
+        step = f"    @_real y[{count}];\n{runs}    return @_combined(y);\n"
+        half = count // 2
+        middle = f"y[{half}]" if count % 2 else f"R(0.5) * (y[{half - 1}] + y[{half}])"
+        combine = code.template(f"{combined}.c", COUNT=str(count), MIDDLE=middle)
+    rest = code.literals(np.concatenate([m.core.rest_state() for m in members]), " " * 8)
+    return combine + code.template("model.c", BEGINS=begins, REST=rest, STEP=step)
+
+
+def _model_test(
+    model: Model,
+    code: _Code,
+    members: list[Model],
+    embedded: list[_core.EmbeddedModel],
+    combined: str,
+) -> str:
+    u = _excitation(members[0], _VECTORS)
+    if code.single:
+        u = u.astype(np.float32).astype(np.float64)
+    y = _run(members, embedded, combined, u, code.precision)
+    return _test(code, "test_model.c", {"u": u.ravel(), "y": y})
+
+
+def _test(code: _Code, file: str, vectors: Mapping[str, FloatArray]) -> str:
+    opening = code.opening(
+        f"A test of {code.name}: its results are compared with those of sewfast, to the last bit.",
+        ["Returns 0 where all are equal."],
+    )
+    tables = "\n".join(code.table(name, values) for name, values in vectors.items())
+    body, count = code.template(file, COUNT=str(_VECTORS)), str(_VECTORS)
+    values = {"OPENING": opening, "NAME": code.name, "TABLES": tables, "BODY": body}
+    return code.template("test.c", COUNT=count, **values)
+
+
+# --- The controller -------------------------------------------------------------------------------
+
+
+def _controller(controller: Controller, code: _Code) -> tuple[str, str, str, list[str]]:
+    core: Any = controller.core()
+    core = core.single() if code.single else core
+    numbers: dict[str, Any] = core.numbers
+    u, y = controller.gains.u_unit or "u", controller.gains.y_unit or "y"
+    about = [
+        *str(controller).splitlines(),
+        "",
+        f"Reference and measurement in {y}, command in {u}.",
+        f"Call {code.name}_step once every {controller.Ts:g} s.",
+        "Compile with -ffp-contract=off where a step is to have the bits of sewfast's own.",
+        "No heap, no C library, no global state.",
+    ]
+    size = 4 if code.single else 8
+    memory = (numbers["samples"] + 10) * size + 10
+    functions = f"{code.name}_init, {code.name}_step"
+    notes = [f"PID as C99 in {code.real}: {functions}; about {memory} bytes of memory"]
+    return (
+        _controller_header(controller, code, numbers, about),
+        _controller_source(code, numbers, about),
+        _controller_test(controller, code, core),
+        notes,
+    )
+
+
+def _controller_header(
+    controller: Controller, code: _Code, numbers: Mapping[str, Any], about: list[str]
+) -> str:
+    body = code.template(
+        "pid.h",
+        TS=_Code(code.name, "f64").literal(controller.Ts),
+        SAMPLES=str(numbers["samples"]),
+        UNIT_U=_safe(controller.gains.u_unit or "u"),
+        UNIT_Y=_safe(controller.gains.y_unit or "y"),
+    )
+    opening = code.opening(f"{code.name}: a two-degree-of-freedom PID controller", about)
+    return code.framed("frame.h", opening, body)
+
+
+def _controller_source(code: _Code, numbers: Mapping[str, Any], about: list[str]) -> str:
+    def number(name: str) -> str:
+        return _signed(code.literal(numbers[name]))
+
+    observer = ""
+    if numbers["observes"]:
+        observer = code.template("observer.c", KEEP=number("keep"), GAIN=number("gain"))
+    if numbers["tracks"]:
+        windup = f"        kept = integral + {number('tracking')} * excess;"
+    else:
+        windup = (
+            "        /* the integral stops where it pushes on, and still moves away */\n"
+            "        kept = (integral - c->integral) * excess < R(0.0) ? c->integral : integral;"
+        )
+    names = ("ALPHA", "BETA", "LAG", "RAMP", "CHANGE", "U_MIN", "U_MAX")
+    body = code.template(
+        "pid.c",
+        OBSERVER=observer,
+        WINDUP=windup,
+        GAINS=_gains(code, numbers).rstrip(),
+        FILTER_WORDS=", then an observer" if numbers["observes"] else "",
+        **{name: number(name.lower()) for name in names},
+    )
+    opening = code.opening(f"{code.name}: a two-degree-of-freedom PID controller", about)
+    return code.framed("frame.c", opening, body)
+
+
+def _gains(code: _Code, numbers: Mapping[str, Any]) -> str:
+    """The body of the function that gives a sample's gains."""
+    rows = numbers["rows"]
+    if not rows:
+        terms = ", ".join(code.literal(numbers[k]) for k in ("kp", "ki", "kd", "pole"))
+        return code.template("constant.c", TERMS=terms)
+    # behind the last point, whose distance to the next is 0, it comes once more
+    used = rows[: next(i for i, row in enumerate(rows) if row[4] == 0.0) + 2]
+    lines = [f"{{{', '.join(code.literal(v) for v in row)}}}" for row in used]
+    return code.template(
+        "schedule.c",
+        ROWS=str(len(used)),
+        TABLE=(",\n" + " " * 8).join(lines),
+        # Td/N, of which infinity leaves 0
+        FILTER="R(0.0)" if math.isinf(numbers["n"]) else f"td / {code.literal(numbers['n'])}",
+        STEP=code.literal(numbers["ts"]),
+    )
+
+
+def _controller_test(controller: Controller, code: _Code, core: Any) -> str:
+    r, y = _signals(controller, _VECTORS, code)
+    u = np.array([core.step(float(a), float(b)) for a, b in zip(r, y, strict=True)])
+    return _test(code, "test_pid.c", {"r": r, "y": y, "u": u})
+
+
+def _signals(controller: Controller, count: int, code: _Code) -> tuple[FloatArray, FloatArray]:
+    """Reference and measurement about the size at which the proportional term spans the limits."""
+    rng = np.random.default_rng(0)
+    gains = controller.gains.to("standard")
+    limit = max(
+        (abs(v) for v in (controller.u_min, controller.u_max) if math.isfinite(v)), default=1.0
+    )
+    size = limit / abs(gains.Kp) if gains.Kp else 1.0
+    if controller.schedule:
+        size = max(size, 1.5 * controller.schedule[-1][0])
+    r = np.repeat(rng.uniform(-size, size, count), 20)[:count]
+    y = 0.7 * r + rng.normal(0.0, 0.2 * size, count)
+    if code.single:
+        r, y = (v.astype(np.float32).astype(np.float64) for v in (r, y))
+    return r, y

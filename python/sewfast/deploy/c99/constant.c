@@ -1,0 +1,3 @@
+    static const @_terms constant = {@TERMS};
+    (void)y;
+    return constant;

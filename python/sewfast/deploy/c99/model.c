@@ -1,0 +1,16 @@
+void @_begin(@_model *model, const @_real *state, const @_real *held)
+{
+@BEGINS}
+
+void @_init(@_model *model)
+{
+    static const @_real rest[@@_STATES] = {
+        @REST
+    };
+    static const @_real zero[@@_INPUTS] = {0};
+    @_begin(model, rest, zero);
+}
+
+@_real @_step(@_model *model, const @_real *u)
+{
+@STEP}

@@ -1,0 +1,6 @@
+    @_pid c;
+    int k, wrong = 0;
+    @_init(&c);
+    for (k = 0; k < @COUNT; k++) {
+        wrong += @_step(&c, r[k], y[k]) != u[k];
+    }
