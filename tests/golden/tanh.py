@@ -1,4 +1,4 @@
-"""The coefficients of `rust/control/src/model/tanh.rs`: `python tests/golden/tanh.py`; needs mpmath.
+"""The coefficients of `rust/control/src/model/tanh.rs`; run it with Python, it needs mpmath.
 
 Remez's algorithm for tanh(x)/x = P(s)/Q(s), s = x^2, with the least relative error: up to where
 tanh is 1 to the last bit; of lower degree up to 8; and for single precision.

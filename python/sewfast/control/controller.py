@@ -136,8 +136,8 @@ class Controller:
         """The arithmetic itself, at rest: `step(r, y, feedforward)` gives the command of a sample.
 
         `set_design(other.core())` changes its settings and `set_manual(u)`, `set_automatic()` its
-        mode while it runs, without a bump. `core().single()` is the same in single precision: bit by
-        bit what a microcontroller computes.
+        mode while it runs, without a bump. `core().single()` is the same in single precision, bit
+        by bit what a microcontroller computes.
         """
         gains = self.gains.to("standard")
         return _core.Controller(

@@ -149,14 +149,7 @@ def _safe(text: str) -> str:
 
 
 def _model(model: Model, code: _Code) -> tuple[str, str, str, list[str]]:
-    members = list(model.members) if isinstance(model, Ensemble) else [model]
-    if len(members) > _MOST_MEMBERS:
-        raise SettingError(
-            f"expected at most {_MOST_MEMBERS} members for a processor, got {len(members)}; deploy "
-            "some of them with Ensemble.of(model.members[:3])"
-        )
-    embedded = [m.core.embedded(**_scaled(m, code)) for m in members]
-    combined = model.combine if isinstance(model, Ensemble) else "median"
+    members, embedded, combined = embedded_members(model, code.precision)
     functions = ", ".join(f"{code.name}_{f}" for f in ("init", "begin", "step"))
     notes = [f"{model.title} as C99 in {code.real}: {functions}"]
     if code.single:
@@ -198,8 +191,22 @@ def _digest(model: Model) -> str:
     return f"SHA-256 {hashlib.sha256(model.theta.tobytes()).hexdigest()[:16]}"
 
 
-def _scaled(model: Model, code: _Code) -> dict[str, bool]:
-    return {"scaled": code.single} if model.kind == "neural_oe" else {}
+def embedded_members(
+    model: Model, precision: str
+) -> tuple[list[Model], list[_core.EmbeddedModel], str]:
+    """A model's members, their steps, and how their outputs are combined.
+
+    In single precision a network keeps its scaled units, which lose fewer digits.
+    """
+    members = list(model.members) if isinstance(model, Ensemble) else [model]
+    if len(members) > _MOST_MEMBERS:
+        raise SettingError(
+            f"expected at most {_MOST_MEMBERS} members for a processor, got {len(members)}; deploy "
+            "some of them with Ensemble.of(model.members[:3])"
+        )
+    scaled = {"scaled": precision == "f32"}
+    embedded = [m.core.embedded(**(scaled if m.kind == "neural_oe" else {})) for m in members]
+    return members, embedded, model.combine if isinstance(model, Ensemble) else "median"
 
 
 def _kept(embedded: _core.EmbeddedModel) -> int:
@@ -211,19 +218,17 @@ def _room(embedded: _core.EmbeddedModel) -> int:
 
 
 def _excitation(model: Model, samples: int) -> FloatArray:
-    """Steps over the range that the model was trained on, held for 1 to 80 samples."""
+    """Steps over the range that the model was trained on, held for 1 to 80 samples, (N, inputs)."""
     rng = np.random.default_rng(0)
-    columns = []
-    settings = getattr(model, "settings", None) or {}
-    inputs = len(model.input_names)
-    means, scales = settings.get("u_mean", [0.0] * inputs), settings.get("u_scale", [1.0] * inputs)
-    for mean, scale in zip(means, scales, strict=True):
-        held = np.repeat(rng.uniform(-2.0, 2.0, samples), rng.integers(1, 81, samples))
-        columns.append(mean + scale * held[:samples])
+    ranges = model.training.get("input_range") or [[-1.0, 1.0]] * len(model.input_names)
+    columns = [
+        np.repeat(rng.uniform(low, high, samples), rng.integers(1, 81, samples))[:samples]
+        for low, high in ranges
+    ]
     return np.ascontiguousarray(np.stack(columns, axis=1))
 
 
-def _run(
+def combined_run(
     members: list[Model],
     embedded: list[_core.EmbeddedModel],
     combined: str,
@@ -257,11 +262,11 @@ def _require_single(
     model: Model, members: list[Model], embedded: list[_core.EmbeddedModel], combined: str
 ) -> str:
     """Refuses a model that single precision would change; else what it costs."""
-    exact = [m.core.embedded() for m in members]
-    u = _excitation(members[0], _SAMPLES)
+    _, exact, _ = embedded_members(model, "f64")
+    u = _excitation(model, _SAMPLES)
     with np.errstate(all="ignore"):
-        double = _run(members, exact, combined, u, "f64")
-        single = _run(members, embedded, combined, u, "f32")
+        double = combined_run(members, exact, combined, u, "f64")
+        single = combined_run(members, embedded, combined, u, "f32")
         span = float(np.ptp(double))
         loss = float(np.max(np.abs(single - double))) / span if span > 0 else math.nan
     if not np.isfinite(double).all():
@@ -412,10 +417,10 @@ def _model_test(
     embedded: list[_core.EmbeddedModel],
     combined: str,
 ) -> str:
-    u = _excitation(members[0], _VECTORS)
+    u = _excitation(model, _VECTORS)
     if code.single:
         u = u.astype(np.float32).astype(np.float64)
-    y = _run(members, embedded, combined, u, code.precision)
+    y = combined_run(members, embedded, combined, u, code.precision)
     return _test(code, "test_model.c", {"u": u.ravel(), "y": y})
 
 
