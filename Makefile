@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo accuracy battery commissioning drives motors laws bench bench-parts counts bench-device clean $(MARKED)
+.PHONY: help demo accuracy battery commissioning drives motors bits laws bench bench-parts counts bench-device clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -55,6 +55,9 @@ SEED ?= $(shell printf '%d' "0x$$(git rev-parse HEAD 2>/dev/null | cut -c1-8 | g
 rust-test: $(DEV) ## unit, property and documentation tests of the crates (SEED=N; by default of the commit)
 	@echo "properties with PROPTEST_RNG_SEED=$(SEED)"
 	PROPTEST_RNG_SEED=$(SEED) cargo test --workspace --profile checked --quiet
+
+bits: $(DEV) ## deployed code against the core over ten million samples of every kind (an hour)
+	$(BIN)/python tests/deployed.py
 
 laws: $(DEV) ## every property of the crates under 20 seeds with 10,000 cases each (hours; SEEDS=, CASES=, ONLY=word)
 	$(BIN)/python tests/laws.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(CASES),--cases $(CASES)) $(if $(ONLY),--only $(ONLY))

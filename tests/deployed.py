@@ -19,9 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from sewfast import Controller, Gains, Model
-from sewfast.deploy import deploy
-from sewfast.deploy.c99 import combined_run, embedded_members
+from sewfast import Controller, Gains, Model, deploy
+from sewfast.deployment.c99 import combined_run, embedded_members
 
 EMULATED = Path(__file__).parent / "emulated"
 WARNINGS = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
@@ -226,6 +225,59 @@ def host(folder: Path, name: str, compiler: str, optimise: str = "-O2") -> str:
     )
     done = subprocess.run([program], capture_output=True, text=True, check=True)
     return done.stdout.strip()
+
+
+COUNTED = """
+#include <stdint.h>
+#include "{name}.h"
+
+void say(const char *text);
+
+int main(void)
+{{
+    volatile uint32_t *const timer = (uint32_t *)0x40000000u;
+    volatile {name}_real sink;
+    uint32_t k, ticks;
+    char text[12];
+    int i;
+{declare}
+    timer[2] = timer[1] = 0xffffffffu;
+    timer[0] = 1u;
+    for (k = 0; k < {samples}u; k++) {{
+{step}
+    }}
+    ticks = 0xffffffffu - timer[1];
+    for (i = 9; i >= 0; i--) {{
+        text[i] = (char)('0' + ticks % 10u);
+        ticks /= 10u;
+    }}
+    text[10] = '\\n';
+    text[11] = 0;
+    say(text);
+    return 0;
+}}
+"""
+
+
+def instructions(what: Model | Controller, folder: Path, precision: str) -> float:
+    """Instructions of a step on the emulated Cortex-M4, its caller's loop included.
+
+    QEMU counts instructions, not cycles: its clock moves a nanosecond with each, and a timer of
+    25 MHz reads it.
+    """
+    deploy(what, folder, precision=precision, name="code")
+    samples = 5000
+    if isinstance(what, Controller):
+        declare = PID.format(name="code")
+        step = "        sink = code_step(&c, (code_real)(k & 1023u), (code_real)(k & 511u));"
+    else:
+        inputs = len(what.input_names)
+        declare = MODEL.format(name="code", inputs=inputs)
+        fill = "".join(f"        u[{j}] = (code_real)(k & 3u);\n" for j in range(inputs))
+        step = f"{fill}        sink = code_step(&model, u);"
+    text = COUNTED.format(name="code", declare=declare, step=step, samples=samples)
+    (folder / "main.c").write_text(text)
+    return int(cortex_m4(folder, "code", "-icount", "shift=0")) * 40 / samples
 
 
 def cortex_m4(folder: Path, name: str, *options: str) -> str:

@@ -16,9 +16,9 @@ import pytest
 
 import deployed
 import kinds
-from sewfast import Controller, Ensemble, Gains, LinearOE, Model, _core
+from sewfast import Controller, Ensemble, Gains, LinearOE, Model, _core, deploy
 from sewfast.cli import main
-from sewfast.deploy import c99, deploy
+from sewfast.deployment import c99
 from sewfast.errors import FitError, SettingError
 
 needs_compiler = pytest.mark.skipif(not deployed.compilers(), reason="needs gcc or clang")
@@ -91,7 +91,7 @@ def test_double_precision_is_the_baselines_free_run() -> None:
     """In a process of its own: the level of the kernels is chosen as the package is loaded."""
     program = """
 import kinds, numpy as np
-from sewfast.deploy import c99
+from sewfast.deployment import c99
 for name in kinds.CASES:
     model = kinds.model_of(name)
     u = kinds.levels(3000, 4, len(model.input_names))

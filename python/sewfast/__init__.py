@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .control.loop import ClosedLoopRun, run
     from .control.margins import Margins, margins
     from .dataset import Dataset, Diagnosis, Experiment, diagnose
+    from .deployment import Deployment, deploy
     from .errors import (
         DataError,
         FitError,
@@ -55,6 +56,7 @@ __all__ = [
     "DataError",
     "Dataset",
     "DelayEstimate",
+    "Deployment",
     "Diagnosis",
     "Ensemble",
     "Experiment",
@@ -85,6 +87,7 @@ __all__ = [
     "commission",
     "compare",
     "delay",
+    "deploy",
     "diagnose",
     "fit_fopdt",
     "identify",
@@ -119,6 +122,7 @@ _HOMES = {
     "tuning": "Constraints Cost LoadStep ParetoFront TuningResult pareto tune",
     "dataset": "Dataset Diagnosis Experiment diagnose",
     "identification.delays": "DelayEstimate delay",
+    "deployment": "Deployment deploy",
     "errors": "DataError FitError Interrupted LinkError ModelFileError SettingError SewfastError",
     "evidence": "ReportCard check",
     "identification": "identify",

@@ -45,13 +45,15 @@ def add(commands: Commands) -> None:
 
 
 def deploy_command(args: argparse.Namespace) -> None:
-    from .. import deploy, storage
-    from ..control import FORMAT, load_controller
+    from .. import storage
+    from ..control import load_controller
+    from ..control.controller import FORMAT
+    from ..deployment import deploy
     from ..models import load_model
 
     controller = storage.format_of(args.file) == FORMAT
     what = load_controller(args.file) if controller else load_model(args.file)
-    done = deploy.deploy(what, args.folder, to=args.to, precision=args.precision, name=args.prefix)
+    done = deploy(what, args.folder, to=args.to, precision=args.precision, name=args.prefix)
     if args.json:
         files = [str(done.folder / name) for name in done.files]
         print_json({"folder": str(done.folder), "files": files, "notes": list(done.notes)})
