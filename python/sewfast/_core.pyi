@@ -134,6 +134,7 @@ class EmbeddedModel:
 def tanh_quotients() -> dict[str, tuple[list[float], list[float], float]]:
     """tanh(x) = x P(x^2)/Q(x^2): P, Q and the largest |x| of ``near``, ``far`` and ``single``."""
 
+@final
 class LinearModel:
     """y(k) = -sum_i a[i] y(k-1-i) + sum_j sum_i b[j, i] u_j(k-nk-i) + offset, in the data's units."""
 
@@ -468,6 +469,7 @@ class SingleController:
     def numbers(self) -> dict[str, Any]:
         """What the step computes with: as ``Controller.numbers``, in single precision."""
 
+@final
 class Controller:
     """The controller's arithmetic, one sample at a time (paper Fig. 16). Gains in standard form."""
 
