@@ -1,10 +1,7 @@
 """What speaks against a closed loop: training region, saturation, limit cycle, disagreement."""
 
-from .disagreement import Disagreement, disagreements
-from .judgement import Judgement
+from .judgement import Disagreement, Judgement, Limits, Oscillation, disagreements, oscillation
 from .judging import judge
-from .limits import Limits
-from .oscillation import Oscillation, oscillation
 
 __all__ = [
     "Disagreement",

@@ -1,16 +1,247 @@
-"""`Judgement`: what speaks against a set of closed loops, one line per guard."""
+"""`Judgement`: what was seen in closed loops, against `Limits`, one line per guard."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
+import numpy as np
+
+from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun
+from ..dataset import FloatArray
+from ..errors import SettingError
 from ..evidence.card import Judged, Line
-from .disagreement import Disagreement
-from .limits import Limits
-from .oscillation import Oscillation
+from ..evidence.questions import OUTSIDE
+from ..gains import real
+from ..units import REVOLUTIONS_PER_SECOND
+
+# --- Disagreement: how far members of an ensemble part under one controller and reference ---------
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """Members on one reference.
+
+    Attributes
+    ----------
+    reference, plant : str
+        The reference, and the member farthest from the median.
+    plants : int
+        How many were compared.
+    rms : float
+        Rms distance of that member's output from the median of all, sample by sample [y]; of two
+        it is half of their distance.
+    span : float
+        Of the reference [y].
+    """
+
+    reference: str
+    plant: str
+    plants: int
+    rms: float
+    span: float
+
+    @property
+    def share(self) -> float:
+        """`rms` over `span`."""
+        return self.rms / max(self.span, 1e-300)
+
+
+def disagreements(runs: Sequence[ClosedLoopRun]) -> tuple[Disagreement, ...]:
+    """Runs of one controller over the same reference on several plants, compared.
+
+    Parameters
+    ----------
+    runs : sequence of ClosedLoopRun
+        Those that stand alone are not compared.
+    """
+    groups: dict[tuple[Controller, str, bytes], list[ClosedLoopRun]] = {}
+    for run in runs:
+        groups.setdefault((run.controller, run.reference, run.r.tobytes()), []).append(run)
+    return tuple(_of(group) for group in groups.values() if len(group) > 1)
+
+
+def _of(group: list[ClosedLoopRun]) -> Disagreement:
+    y = np.array([run.y for run in group])
+    middle = np.median(y, axis=0)
+    known = np.isfinite(middle)
+    rms = np.sqrt(np.mean(np.square(y - middle)[:, known], axis=1)) if known.any() else np.zeros(1)
+    worst = int(np.argmax(rms))
+    r = group[0].r
+    return Disagreement(
+        group[0].reference,
+        group[worst].plant,
+        len(group),
+        float(rms[worst]),
+        float(r.max() - r.min()) or float(np.abs(r).max()),
+    )
+
+
+# --- `Oscillation`: does a loop swing by itself where its reference is constant? ------------------
+
+
+SETTLING = 0.4
+"""Part of a constant stretch that belongs to what came before."""
+LEAST_SAMPLES = 100
+"""Of what is judged of a stretch: less says nothing about what lasts."""
+LEAST_PERIODS = 5.0
+LASTING = 0.5
+"""Second half over first half [rms] from which on an oscillation does not die away."""
+SHAFT_ORDERS = (1, 2, 3, 4)
+LEAST_TURNS = 3.0
+"""Periods of an order within a stretch from which on it can be told from a trend."""
+
+
+@dataclass(frozen=True)
+class Oscillation:
+    """What a loop does at constant reference, at the stretch where it swings most.
+
+    Attributes
+    ----------
+    command, output : float
+        Rms about a straight line, without what repeats with the shaft's turn [u], [y].
+    swing : float
+        `command` over half the command's range (where it has none: over its largest size).
+    ripple : float
+        `output` over the largest reference.
+    level : float
+        The constant reference [y].
+    hertz : float
+        Mean frequency, from crossings of the mean.
+    lasts : bool
+        At least `LEAST_PERIODS`, and not dying away.
+    """
+
+    command: float
+    output: float
+    swing: float
+    ripple: float
+    level: float
+    hertz: float
+    lasts: bool
+
+
+def oscillation(run: ClosedLoopRun) -> Oscillation | None:
+    """The worst oscillation of a run at constant reference; None where no stretch is long enough.
+
+    A limit cycle is an oscillation of the loop's own making that lasts: neither the way to a new
+    level, nor a swing that dies away, nor the answer to a load that repeats with the shaft's turn.
+    So the first `SETTLING` of each constant stretch is left out, the rest is freed of a straight
+    line and, where the output is a speed, of the shaft's orders `SHAFT_ORDERS`. What the encoder's
+    steps and noise put into the command stays in: it is told from a limit cycle by its size.
+
+    Parameters
+    ----------
+    run : ClosedLoopRun
+    """
+    found = [_oscillation_of(run, part) for part in _constant(run)]
+    return max(found, key=lambda o: (o.lasts, o.swing + o.ripple), default=None)
+
+
+def _constant(run: ClosedLoopRun) -> Iterator[slice]:
+    """The judged parts of the stretches of constant reference without missing samples."""
+    known = np.isfinite(run.u) & np.isfinite(run.y)
+    still = np.concatenate([[False], np.diff(run.r) == 0.0]) & known
+    still[1:] &= known[:-1]
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
+    for start, stop in edges.reshape(-1, 2).tolist():
+        first = start + math.ceil(SETTLING * (stop - start))
+        if stop - first >= LEAST_SAMPLES:
+            yield slice(first, stop)
+
+
+def _oscillation_of(run: ClosedLoopRun, part: slice) -> Oscillation:
+    forced = _forced(run, part)
+    u, y = (_without(values[part], forced) for values in (run.u, run.y))
+    command, output = _rms(u), _rms(y)
+    swing = command / max(_half_range(run), 1e-300)
+    ripple = output / max(float(np.abs(run.r).max()), 1e-300)
+    main = u if swing >= ripple else y
+    periods = 0.5 * np.count_nonzero(np.diff(np.signbit(main)))
+    half = len(main) // 2
+    lasts = periods >= LEAST_PERIODS and _rms(main[half:]) >= LASTING * _rms(main[:half])
+    hertz = periods / (len(main) * run.Ts)
+    return Oscillation(
+        command, output, swing, ripple, float(run.r[part][0]), float(hertz), bool(lasts)
+    )
+
+
+def _forced(run: ClosedLoopRun, part: slice) -> FloatArray:
+    """What may be taken off, as columns: a straight line and the shaft's orders, shape (n, c)."""
+    n = part.stop - part.start
+    columns = [np.ones(n), np.linspace(-1.0, 1.0, n)]
+    per_unit = REVOLUTIONS_PER_SECOND.get(run.units["y"].lower())
+    if per_unit is not None:
+        turns = np.cumsum(run.y[part]) * per_unit * run.Ts
+        travelled = abs(float(turns[-1] - turns[0]))
+        for order in SHAFT_ORDERS:
+            if order * travelled >= LEAST_TURNS:
+                angle = 2.0 * np.pi * order * turns
+                columns += [np.cos(angle), np.sin(angle)]
+    return np.column_stack(columns)
+
+
+def _without(values: FloatArray, columns: FloatArray) -> FloatArray:
+    found: FloatArray = values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
+    return found
+
+
+def _half_range(run: ClosedLoopRun) -> float:
+    c = run.controller
+    half = 0.5 * (c.u_max - c.u_min)
+    return half if math.isfinite(half) else float(np.nanmax(np.abs(run.u)))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+# --- `Limits`: the bounds that loops are judged by ------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Bounds; what exceeds one is warned of, or refused (`disagreement`).
+
+    Parameters
+    ----------
+    outside : float
+        Share of the samples outside the model's training region.
+    saturated : float
+        Share of the samples with the command at a limit.
+    swing : float
+        Limit cycle: rms of the command's oscillation at constant reference over half its range.
+    ripple : float
+        Limit cycle: rms of the output's oscillation at constant reference over the largest
+        reference.
+    disagreement : float
+        Rms distance of a member's output from the median of all members, over the reference's span.
+
+    Raises
+    ------
+    SettingError
+        For a bound that is not a number of 0 or more.
+    """
+
+    outside: float = OUTSIDE
+    saturated: float = 0.1
+    swing: float = 0.15
+    ripple: float = 0.02
+    disagreement: float = 0.05
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value = real(each.name, getattr(self, each.name))
+            if not 0.0 <= value <= math.inf:
+                raise SettingError(f"expected a bound of 0 or more for {each.name}, got {value:g}")
+            object.__setattr__(self, each.name, value)
+
+
+# --- `Judgement`: what speaks against a set of closed loops, one line per guard -------------------
+
 
 FORMAT = "sewfast.judgement"
 VERSION = 1
@@ -100,3 +331,97 @@ class Judgement(Judged):
             "disagreements": [{**vars(d), "share": d.share} for d in self.disagreements],
             "limits": dict(vars(self.limits)),
         }
+
+
+# --- The lines of a judgement: from what was seen in runs to limits, verdicts and sentences -------
+
+
+FAR = 0.2
+
+
+def region(runs: Sequence[JudgedRun], limits: Limits) -> Line:
+    """Does a model have to say what it has never seen?"""
+    name, limit = "training region", f"<= {100 * limits.outside:g} %"
+    known = [r for r in runs if math.isfinite(r.outside)]
+    if not known:
+        return Line(
+            name, math.nan, "not known", limit, "info",
+            "no model with a stored training region was given: give the one that was tuned on",
+        )  # fmt: skip
+    worst = max(known, key=lambda r: (r.outside, r.farthest))
+    shown = f"{100 * worst.outside:.2f} % of samples, {worst.farthest:.3g} radii at most"
+    if worst.outside <= limits.outside:
+        text = "the loop stays where the model was trained"
+        return Line(name, worst.outside, shown, limit, "ok", text)
+    far = "the loop runs where the model was not trained: what it promises there is a guess"
+    some = "some of the loop runs where the model was not trained"
+    text = (
+        f"{far if worst.outside > FAR else some} (worst: {worst.name}); record such operation, "
+        "best in a closed loop, and identify again, or demand less"
+    )
+    return Line(name, worst.outside, shown, limit, "warn", text)
+
+
+def saturation(runs: Sequence[JudgedRun], limits: Limits) -> Line:
+    """Does the loop lean on the limits of the command?"""
+    worst = max(runs, key=lambda r: r.saturated)
+    name, limit = "saturation", f"<= {100 * limits.saturated:g} %"
+    shown = f"{100 * worst.saturated:.1f} % of the time"
+    if worst.saturated <= limits.saturated:
+        text = "the command keeps within its limits for most of the time"
+        return Line(name, worst.saturated, shown, limit, "ok", text)
+    text = (
+        f"the command stays at a limit (worst: {worst.name}): there the loop is open, gains say "
+        "nothing and a disturbance is not rejected; demand less, or check whether it swings"
+    )
+    return Line(name, worst.saturated, shown, limit, "warn", text)
+
+
+def limit_cycle(runs: Sequence[JudgedRun], limits: Limits) -> Line:
+    """Does the loop swing by itself?"""
+    name = "limit cycle"
+    limit = f"swing <= {100 * limits.swing:g} %, ripple <= {100 * limits.ripple:g} %"
+    seen = [(r, r.oscillation) for r in runs if r.oscillation is not None]
+    if not seen:
+        text = "no reference is constant for long enough to see whether the loop swings by itself"
+        return Line(name, math.nan, "not seen", limit, "info", text)
+    cycling = [
+        (r, o) for r, o in seen if o.lasts and (o.swing > limits.swing or o.ripple > limits.ripple)
+    ]
+    run, worst = max(cycling or seen, key=lambda pair: pair[1].swing + pair[1].ripple)
+    units = run.run.units
+    shown = (
+        f"{worst.command:.3g} {units['u']}, {worst.output:.3g} {units['y']} rms "
+        f"({100 * worst.swing:.3g} %, {100 * worst.ripple:.3g} %)"
+    )
+    if not cycling:
+        return Line(
+            name, worst.swing, shown, limit, "ok",
+            "at constant reference the loop comes to rest, but for the encoder's steps and what "
+            "the load does",
+        )  # fmt: skip
+    text = (
+        f"at a constant reference of {worst.level:g} {units['y']} the loop swings by itself, with "
+        f"about {worst.hertz:.3g} Hz (worst: {run.name}): it tracks as a limit cycle held by the "
+        "limits; lower the gains, filter the feedback, or take delay out of the loop"
+    )
+    return Line(name, worst.swing, shown, limit, "warn", text)
+
+
+def disagreement(found: Sequence[Disagreement], limits: Limits, unit: str) -> Line:
+    """Do models of the same plant promise the same?"""
+    name, limit = "disagreement", f"<= {100 * limits.disagreement:g} % of the reference's span"
+    if not found:
+        text = "one plant alone: nothing says how far its promise may be off; tune on several"
+        return Line(name, math.nan, "not known", limit, "info", text)
+    worst = max(found, key=lambda d: d.share)
+    shown = f"{worst.rms:.3g} {unit} rms, {100 * worst.share:.3g} %"
+    if worst.share <= limits.disagreement:
+        text = f"{worst.plants} plants answer alike: what they promise does not hang on one of them"
+        return Line(name, worst.share, shown, limit, "ok", text)
+    text = (
+        f"{worst.plant} parts from the median of {worst.plants} plants on {worst.reference}: the "
+        "data do not decide what this loop will do; leave out members that fit badly, or record "
+        "a closed loop and identify again"
+    )
+    return Line(name, worst.share, shown, limit, "fail", text)

@@ -25,11 +25,8 @@ from ..dataset import Dataset
 from ..errors import FitError, SettingError, SewfastError
 from ..evidence.region import placed
 from ..models import Model
-from . import questions
-from .disagreement import disagreements
-from .judgement import JudgedRun, Judgement
-from .limits import Limits
-from .oscillation import oscillation
+from . import judgement
+from .judgement import JudgedRun, Judgement, Limits, disagreements, oscillation
 
 
 class HasController(Protocol):
@@ -105,10 +102,10 @@ def judge(
     apart = disagreements([r for r, _ in runs])
     unit = found[0].run.units["y"]
     lines = (
-        questions.region(found, limits),
-        questions.saturation(found, limits),
-        questions.limit_cycle(found, limits),
-        questions.disagreement(apart, limits, unit),
+        judgement.region(found, limits),
+        judgement.saturation(found, limits),
+        judgement.limit_cycle(found, limits),
+        judgement.disagreement(apart, limits, unit),
     )
     if refuse and lines[-1].verdict == "fail":
         raise FitError(_refusal(lines[-1].shown, lines[-1].limit, lines[-1].meaning))
