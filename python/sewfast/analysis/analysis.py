@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .. import storage
 from ..control.controller import Controller
 from ..control.defaults import catalogue_fits
 from ..control.loop import (
@@ -26,10 +27,17 @@ from ..control.systems import LinearLoop
 from ..errors import FitError, SettingError
 from ..trust import Judgement, Limits, judge
 from ..tuning.objective import Cost
-from .arguments import each_change, finite_each, required
 from .changes import Change
 from .points import LoopBode, PlantPoint, loop_bodes, plant_points
-from .responses import Responses, Steps, default_steps, responses
+from .responses import (
+    Responses,
+    Steps,
+    default_steps,
+    each_change,
+    finite_each,
+    required,
+    responses,
+)
 from .sensitivity import GainSensitivity, Score, Task, WhatIf, gain_sensitivity, what_if
 
 if TYPE_CHECKING:
@@ -163,7 +171,6 @@ class Analysis:
         SettingError
             Where matplotlib is not installed or the folder cannot be written to.
         """
-        from .filing import save
 
         return save(self, folder, png=png)
 
@@ -190,7 +197,6 @@ class Analysis:
         return f"Analysis(Ms {self.Ms:.3g}, {len(self.plants)} plants)"
 
     def __str__(self) -> str:
-        from .text import text
 
         return text(self)
 
@@ -336,3 +342,136 @@ def _judgement(
         return judge(controller, plants, references, limits=limits, seed=seed, refuse=False)
     except FitError:
         return None
+
+
+# --- An analysis as text --------------------------------------------------------------------------
+
+
+def text(a: Analysis) -> str:
+    """Margins, steps, cost, sensitivities, what-if, guards."""
+    y, u = a.controller.gains.y_unit, a.controller.gains.u_unit
+    lines = [f"Analysis on {_plants(a.plants)}", "", "margins (worst plant)"]
+    lines += rows([["about", "Ms", "Mt", "gain", "phase", "delay", "noise gain"]]
+                  + [_margin_row(loop, u, y) for loop in a.loops])  # fmt: skip
+    lines += ["", *(_response_line(r) for r in a.responses)]
+    lines += ["", f"cost on {', '.join(a.references)}"]
+    head = ["", "cost", f"error [{y} rms]", "overshoot", f"chatter [{u} rms]", "Ms"]
+    table = [head, ["as it is", *_cells(a.score)]]
+    table += [
+        [f"{s.name} {100 * (f - 1):+.0f} %", *_cells(score)]
+        for s in a.sensitivity
+        for f, score in zip(s.factors, s.scores, strict=True)
+    ]
+    table += [[w.name, *_cells(w.score)] for w in a.what_if]
+    lines += [*rows(table), ""]
+    lines.append(str(a.judgement) if a.judgement is not None else "a loop runs away")
+    return "\n".join(lines)
+
+
+def _plants(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{len(names)} plants, {names[0]} to {names[-1]}"
+
+
+def _margin_row(loop: LoopBode, u: str, y: str) -> list[str]:
+    m = loop.worst
+    about = f"{loop.level:.4g} {y}"
+    if not m.stable:
+        return [about, "unstable", "", "", "", "", ""]
+    return [
+        about, f"{m.Ms:.3f}", f"{m.Mt:.3f}", f"{m.gain_margin:.3g}",
+        f"{m.phase_margin_deg:.1f} deg", f"{1e3 * m.delay_margin_s:.3g} ms",
+        f"{m.noise_gain:.3g} {u}/{y}",
+    ]  # fmt: skip
+
+
+def _response_line(r: Responses) -> str:
+    found = r.metrics()
+    if r.kind == "reference":
+        return (
+            f"reference step of {r.size:.4g} {r.y_unit} at {r.level:.4g} {r.y_unit}: "
+            f"rise {span([m['rise_ms'] for m in found])} ms, overshoot "
+            f"{span([m['overshoot_percent'] for m in found])} %, settled within "
+            f"{span([m['settling_ms'] for m in found])} ms"
+        )
+    return (
+        f"disturbance worth {r.disturbance:.3g} {r.u_unit} at the plant's input: "
+        f"{span([m['peak'] for m in found])} {r.y_unit} off, back within "
+        f"{span([m['recovery_ms'] for m in found])} ms"
+    )
+
+
+def span(values: Sequence[float | None]) -> str:
+    """The smallest and the largest of the plants'."""
+    known = [v for v in values if v is not None]
+    if not known:
+        return "-"
+    low, high = f"{min(known):.3g}", f"{max(known):.3g}"
+    shown = low if low == high else f"{low} to {high}"
+    return shown if len(known) == len(values) else f"{shown} (not all)"
+
+
+def _cells(s: Score) -> list[str]:
+    numbers = [s.cost, s.tracking, s.overshoot_percent, s.chatter, s.Ms]
+    shown = [
+        "-" if math.isnan(v) else "runs away" if math.isinf(v) else f"{v:.4g}" for v in numbers
+    ]
+    return [*shown[:2], f"{shown[2]} %" if math.isfinite(numbers[2]) else shown[2], *shown[3:]]
+
+
+def rows(cells: Sequence[Sequence[str]]) -> list[str]:
+    """Columns as wide as they need to be; the first to the left, numbers to the right."""
+    widths = [max(len(r[i]) for r in cells) for i in range(len(cells[0]))]
+    return [
+        "  " + r[0].ljust(widths[0]) + "".join(
+            f"  {c.rjust(w)}" for c, w in zip(r[1:], widths[1:], strict=True)
+        )
+        for r in cells
+    ]  # fmt: skip
+
+
+# --- An analysis in a folder: `analysis.json`, and every figure as PNG and SVG --------------------
+
+
+NUMBERS = "analysis.json"
+FOLDER = "analysis"
+"""Of the figures, within the folder of the numbers."""
+ALT = {
+    "responses": "Output and command over time after a step of the reference and after a step of a "
+    "disturbance; the band holds all plants",
+    "bode": "Gain and phase of L and gains of S and T over frequency, with bands over the plants",
+    "sensitivity": "Cost and largest Ms over the change of each setting in percent",
+    "what_if": "Cost, worst error and Ms on plants that are not as identified",
+}
+
+
+def save(a: Analysis, folder: str | os.PathLike[str], *, png: bool = True) -> list[Path]:
+    """Write everything, or without the PNGs, which the report has no use for; what was written.
+
+    Raises
+    ------
+    SettingError
+        Where matplotlib is not installed or the folder cannot be written to.
+    """
+    drawn = a.figures()
+    from ..plotting import style, svg
+
+    place = Path(folder) / FOLDER
+    written = []
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        for name, figure in drawn.items():
+            with style():
+                text = svg(figure, f"analysis-{name}", ALT[name])
+                if png:
+                    figure.savefig(place / f"{name}.png", dpi=150)
+                    written.append(place / f"{name}.png")
+            (place / f"{name}.svg").write_text(text, encoding="utf-8")
+            written.append(place / f"{name}.svg")
+        target = Path(folder) / NUMBERS
+        values = {k: v for k, v in a.to_json().items() if k not in ("format", "version")}
+        storage.write(target, "sewfast.analysis", 1, {**values, "figures": list(drawn)})
+    except OSError as e:
+        raise SettingError(
+            f"{folder}: expected a folder to write to, received {e.strerror!r}; choose another"
+        ) from e
+    return [target, *written]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import __version__, storage
-from ..analysis.filing import NUMBERS as ANALYSIS
+from ..analysis.analysis import NUMBERS as ANALYSIS
 from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun
 from ..errors import DataError, SettingError

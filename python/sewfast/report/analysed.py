@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import storage
-from ..analysis.analysis import FORMAT, VERSION
-from ..analysis.filing import ALT, FOLDER, NUMBERS
+from ..analysis.analysis import ALT, FOLDER, FORMAT, NUMBERS, VERSION
 from ..errors import ModelFileError
 from ..plotting import Picture, Table, percent, significant
 from .artefacts import drawing
