@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo accuracy battery commissioning drives motors bits laws bench bench-parts counts bench-device clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors bits laws bench bench-parts counts bench-device clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -108,6 +108,10 @@ bench: $(VENV)/bench.stamp ## sewfast and its rivals in one run; writes docs/PER
 
 bench-parts: $(VENV)/bench.stamp ## every benchmark by itself, with its spread (pytest-benchmark)
 	$(BIN)/python -m pytest benches --benchmark-enable --benchmark-only -o python_files='bench_*.py' -s
+
+pictures: $(REPORT) ## the picture of the README, from demo/ (which is made where it is missing)
+	test -f $(OUT)/results.json || $(BIN)/sewfast demo --out $(OUT)
+	$(BIN)/python docs/pictures.py $(OUT)
 
 accuracy: $(DEV) ## accuracy of the default configuration on public records, beside published figures (SEWFAST_DATA)
 	$(BIN)/python benches/accuracy.py

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import result_folder
 import sewfast
 from cli import refused
 from cli import sewfast as command
@@ -21,6 +23,8 @@ from sewfast.plotting import thin
 matplotlib = pytest.importorskip("matplotlib", reason="needs the report extra")
 matplotlib.use("Agg")
 from matplotlib import pyplot  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(autouse=True)
@@ -104,6 +108,16 @@ def test_predicted_beside_measured() -> None:
     assert labels[-1] == "reference"
     assert "7" in labels[1]
     pyplot.close(panels[0].figure)
+
+
+def test_the_picture_of_the_readme_is_drawn_from_a_demo(tmp_path: Path) -> None:
+    script = runpy.run_path(str(ROOT / "docs" / "pictures.py"))
+    folder = result_folder.make(tmp_path / "demo")
+    drawn = script["drawing"](script["traces"](folder)).plot(file=tmp_path / "picture.svg")
+    assert len(drawn) == 4
+    labels = [line.get_label() for line in drawn[0].lines]
+    assert labels[-3:] == [*reversed(script["LABELS"].values()), "reference"]
+    assert script["PICTURE"].stat().st_size <= script["LARGEST"]
 
 
 def test_experiments_are_not_joined() -> None:

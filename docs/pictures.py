@@ -1,0 +1,72 @@
+"""Draws assets/closed_loop.svg, the picture of the README, from the demo's own results.
+
+sewfast demo --out demo && python docs/pictures.py demo      (or: make pictures)
+"""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sewfast.plotting import Drawing, Trace, draw, loop_panels
+from sewfast.readers import read_table
+from sewfast.report.artefacts import run_file
+
+PICTURE = Path(__file__).parent / "assets" / "closed_loop.svg"
+LARGEST = 150_000
+"""Bytes: a page has to load it."""
+LABELS = {"model": "predicted (model)", "machine": "measured (virtual machine)"}
+RISE = (0.08, 0.36)
+"""The window that is shown magnified [s]."""
+
+
+def traces(folder: Path) -> list[Trace]:
+    """The trapezoid on the identified model and on the machine, as the demo left them."""
+    return [
+        Trace.of(read_table(folder / run_file("trapezoid", plant)).columns, plant, label)
+        for plant, label in LABELS.items()
+    ]
+
+
+def magnified(ax: Any, loops: list[Trace]) -> None:
+    """The rise: 3,000 RPM in 150 ms."""
+    for loop in reversed(loops):
+        inside = (loop.t >= RISE[0]) & (loop.t <= RISE[1])
+        draw(ax, loop.t[inside], loop.y[inside], loop.look, loop.label)
+    draw(ax, loop.t[inside], loop.r[inside], "reference", "reference")
+    ax.set_title("the rise, magnified")
+    ax.legend(loc="lower right", handlelength=1.8)
+    ax.set_xlabel("time [s]")
+    ax.margins(x=0.01)
+
+
+def drawing(loops: list[Trace]) -> Drawing:
+    """The whole run beside its rise, error and command below."""
+    output, error, command = loop_panels(loops, "RPM", "V")
+
+    def whole(ax: Any) -> None:
+        output(ax)
+        # it stands in the other panel, where there is room for it
+        ax.get_legend().remove()
+
+    rows = ((whole, partial(magnified, loops=loops)), (error, command))
+    return Drawing(rows, (2.6, 1.6), (1.35, 1.0), share_x=False)
+
+
+def main() -> None:
+    loops = traces(Path(sys.argv[1] if len(sys.argv) > 1 else "demo"))
+    drawing(loops).plot(file=PICTURE)
+    size = PICTURE.stat().st_size
+    predicted, measured = loops
+    apart = float(np.sqrt(np.mean((predicted.y - measured.y) ** 2)))
+    print(f"{PICTURE}: {size // 1000} kB; predicted and measured are {apart:.1f} RPM rms apart")
+    if size > LARGEST:
+        raise SystemExit(f"expected at most {LARGEST} bytes, received {size}")
+
+
+if __name__ == "__main__":
+    main()
