@@ -37,7 +37,7 @@ from sewfast import (
     load_model,
     read_table,
 )
-from sewfast.commissioning import STAGES, Refusal, agreement, gains, training
+from sewfast.commissioning import STAGES, Refusal, gains, training, verification
 from sewfast.commissioning.bench import DriveBench, MachineBench, bench_of
 from sewfast.commissioning.demands import demands
 from sewfast.commissioning.gains import Requirements
@@ -394,7 +394,7 @@ def test_a_member_that_parts_from_the_others_is_left_out(whole: Commissioning) -
     good = whole.models.members[0]
     linear = _core.LinearModel(np.array([-0.9]), np.array([[0.5]]), 1, 0.0)
     stuck = LinearOE(linear, good.Ts, good.input_names, good.output_name, ("V",), "RPM")
-    kept = agreement.agreeing(whole.controller, Ensemble.of([good, stuck, good]), r)
+    kept = verification.agreeing(whole.controller, Ensemble.of([good, stuck, good]), r)
     assert kept.members == (good, good)
     with pytest.raises(Refusal, match="at least half of 2 networks"):
-        agreement.agreeing(whole.controller, Ensemble.of([good, stuck]), r)
+        verification.agreeing(whole.controller, Ensemble.of([good, stuck]), r)

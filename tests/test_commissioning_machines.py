@@ -11,14 +11,11 @@ import pytest
 
 from sewfast import Controller, Gains
 from sewfast.commissioning import SteppedBench
-from sewfast.commissioning.caution import cautious, held, swing_of
-from sewfast.commissioning.demands import Demands, demands
-from sewfast.commissioning.excitations import acceleration_shown
-from sewfast.commissioning.gains import first_gains, lowered, scaled
-from sewfast.commissioning.motion import first_motion, step_response
-from sewfast.commissioning.refusal import Refusal
+from sewfast.commissioning.demands import Demands, Refusal, demands
+from sewfast.commissioning.excitations import acceleration_shown, first_motion, step_response
+from sewfast.commissioning.gains import cautious, first_gains, held, lowered, scaled, swing_of
+from sewfast.commissioning.slow import HARMONICS, TurnLoad, basis
 from sewfast.commissioning.small_signal import SmallSignal, small_signal
-from sewfast.commissioning.turn import HARMONICS, TurnLoad, basis
 from sewfast.control.margins import margins
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benches"))

@@ -12,7 +12,7 @@ import pytest
 import sewfast
 from sewfast import Cost, commission, signals
 from sewfast.commissioning.demands import demands
-from sewfast.commissioning.motion import first_motion, step_response
+from sewfast.commissioning.excitations import first_motion, step_response
 from sewfast.commissioning.small_signal import SmallSignal, small_signal
 
 pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'sewfast[test]'")

@@ -13,7 +13,7 @@ from cli import refused, sewfast
 from sewfast import _core, load_controller, signals
 from sewfast.commissioning.bench import MachineBench
 from sewfast.commissioning.demands import demands
-from sewfast.commissioning.rival import linear_rival
+from sewfast.commissioning.training import linear_rival
 from sewfast.control import Fopdt
 from sewfast.errors import Interrupted, SettingError
 from sewfast.machine import VirtualMachine

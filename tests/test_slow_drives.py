@@ -11,9 +11,8 @@ import pytest
 from commissioned import SMALL, short
 from sewfast import Controller, Gains, VirtualMachine, commission
 from sewfast.commissioning.gains import ruled
-from sewfast.commissioning.slow import MOST, PER_CONSTANT, SHARPEST, Thinning
+from sewfast.commissioning.slow import HARMONICS, MOST, PER_CONSTANT, SHARPEST, Thinning, TurnLoad
 from sewfast.commissioning.small_signal import Resonance, SmallSignal
-from sewfast.commissioning.turn import HARMONICS, TurnLoad
 from sewfast.control import Fopdt
 from sewfast.control.loop import run
 from sewfast.control.margins import margins

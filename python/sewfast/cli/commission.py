@@ -84,8 +84,7 @@ def add(commands: Commands) -> None:
 
 
 def command(args: argparse.Namespace) -> int | None:
-    from ..commissioning.folder import require_own
-    from ..commissioning.taken import FOLDER, prepare
+    from ..commissioning.folder import FOLDER, prepare, require_own
 
     if not is_port(args.on):
         require_no_drive_options(args)

@@ -1,10 +1,10 @@
 """Commissioning: from a machine at rest to a verified controller."""
 
 from .bench import Bench, Followed, Stepped, SteppedBench
+from .demands import Refusal
 from .procedure import STAGES, commission
-from .refusal import Refusal
 from .result import Commissioning
-from .rival import Rival
+from .training import Rival
 from .verification import Comparison
 
 __all__ = [

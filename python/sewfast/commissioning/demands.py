@@ -1,4 +1,4 @@
-"""`Demands`: what a machine is commissioned for, and what commissioning may do."""
+"""What is asked and allowed; `Refusal`: evidence that is not good enough."""
 
 from __future__ import annotations
 
@@ -6,14 +6,48 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 from ..dataset import FloatArray
-from ..errors import SettingError
+from ..errors import FitError, SettingError
 from ..gains import real, whole
 from ..report.commissioned import file_name
 from ..tuning.objective import Constraints
 from ..tuning.task import budget
 from .bench import Bench
+
+if TYPE_CHECKING:
+    from .result import Commissioning
+
+
+class Refusal(FitError):
+    """What was expected, what was seen, what to do; the machine is at rest.
+
+    Attributes
+    ----------
+    stage : str
+        Where it stopped.
+    so_far : Commissioning or None
+        What had been recorded, identified and tuned until then.
+    """
+
+    stage: str = ""
+    so_far: Commissioning | None = None
+
+
+def require(met: bool, message: str) -> None:
+    """Stop with a reason.
+
+    Raises
+    ------
+    Refusal
+    """
+    if not met:
+        raise Refusal(message)
+
+
+# --- `Demands`: what a machine is commissioned for, and what commissioning may do -----------------
+
 
 LONGEST_NAME = 100
 """Of a reference's file [bytes]; file systems take 255, of which endings need some."""

@@ -25,24 +25,16 @@ from ..threads import available
 from ..tuning.objective import Cost
 from ..tuning.search import TuningResult
 from . import excitations
-from .agreement import Disagreement, agreeing
 from .bench import Bench, Followed, NotedBench, bench_of, told_of
-from .caution import cause, cautious
-from .demands import MS, Demands, demands
-from .excitations import standard
-from .folder import require_own
-from .gains import Requirements, cost_of, first_gains, ruled, search, start_of
-from .journal import STAGES, Journal, Progress
-from .motion import first_motion, step_response
-from .refusal import Refusal
+from .demands import MS, Demands, Refusal, demands
+from .excitations import first_motion, standard, step_response
+from .folder import STAGES, Journal, Progress, Taken, require_own
+from .gains import Requirements, cause, cautious, cost_of, first_gains, ruled, search, start_of
 from .result import VERIFIED, VERIFIED_POORLY, Commissioning
-from .rival import ORDERS, THINNED, Rival, linear_rival
-from .slow import Thinning
+from .slow import Thinning, turn_load
 from .small_signal import SmallSignal, small_signal
-from .taken import Taken
-from .training import Trained, train
-from .turn import turn_load
-from .verification import judged, measure, predict, require_unsaturated
+from .training import ORDERS, THINNED, Rival, Trained, linear_rival, train
+from .verification import Disagreement, agreeing, judged, measure, predict, require_unsaturated
 
 if TYPE_CHECKING:
     from ..link import Drive

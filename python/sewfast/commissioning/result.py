@@ -16,11 +16,10 @@ from ..rules import Fopdt
 from ..trust import Judgement
 from ..tuning.objective import Cost
 from ..tuning.search import TuningResult
-from .motion import Motion
-from .rival import Rival
-from .slow import Thinning
+from .excitations import Motion
+from .slow import Thinning, TurnLoad
 from .small_signal import SmallSignal
-from .turn import TurnLoad
+from .training import Rival
 from .verification import Comparison
 
 VERIFIED, VERIFIED_POORLY = "verified", "verified, prediction poor"

@@ -26,9 +26,9 @@ from ..recording import Recording
 from ..rules import Fopdt, fit_fopdt
 from .bench import Bench
 from .demands import Demands
-from .motion import Motion
+from .excitations import Motion
 
-LEVEL = 0.5
+SHAKEN_AT = 0.5
 """Of the top speed, at which the machine is shaken."""
 FASTER = 0.8
 """Of the top speed, at which it is shaken again where something swings."""
@@ -110,7 +110,7 @@ def small_signal(
     is shaken at a higher speed as well. What has moved in proportion with the speed is a load over
     the turn: it is taken out, and no resonance.
     """
-    u, settled = shaking(demands, motion, fopdt, bench.Ts, LEVEL)
+    u, settled = shaking(demands, motion, fopdt, bench.Ts, SHAKEN_AT)
     slow = Shaken.of(bench.excite(u, "small_signals"), settled)
     found = explained(slow, fopdt)
     if found is None or not _suspects(found.model, slow):

@@ -499,6 +499,12 @@ def _result(found: Mapping[str, Any], task: TuningTask, method: str) -> TuningRe
 
 
 # --- A second opinion of a model of another kind --------------------------------------------------
+#
+# A search finds what is good on its models, their mistakes included: a network can follow a record
+# to 94 % and still reward gains that its drive does not. A model of another kind has other
+# mistakes. Its own gains are searched for briefly; where either gains cost much more on the
+# other's model than that one's own, at least one model is wrong in closed loop, and no simulation
+# says which. Then the gains are taken that are the least wrong whichever it is.
 
 
 SHARE = 0.2
