@@ -77,8 +77,8 @@ def write(
     replace(path, text)
 
 
-def replace(path: str | os.PathLike[str], text: str) -> None:
-    """Put ``text`` in place of a file: a temporary name beside it, renamed once it is whole.
+def replace(path: str | os.PathLike[str], content: str | bytes) -> None:
+    """Put ``content`` in place of a file: a temporary name beside it, renamed once it is whole.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def replace(path: str | os.PathLike[str], text: str) -> None:
         The folder does not exist or cannot be written to.
     """
     try:
-        replace_file(path, text.encode())
+        replace_file(path, content.encode() if isinstance(content, str) else content)
     except OSError as error:
         raise ModelFileError(
             f"{path}: cannot be written ({error.strerror}); "

@@ -1,13 +1,13 @@
 """Models and controllers as code for other processors and tools.
 
-`deploy` writes a folder: C99 or structured text, with a test against the step of this package.
+`deploy` writes a folder: C99 with a test against the step of this package, structured text, ONNX.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,14 +15,16 @@ from ..control import Controller
 from ..errors import SettingError
 from ..models import Model
 from ..storage import replace
-from . import c99, structured_text
+from . import c99, onnx, structured_text
 
-TARGETS = ("c99", "st")
+TARGETS = ("c99", "st", "onnx")
 PRECISIONS = ("f32", "f64")
 
-_WRITERS: dict[str, Callable[[Model | Controller, str, str], tuple[dict[str, str], list[str]]]] = {
+_Writer = Callable[[Model | Controller, str, str], tuple[Mapping[str, str | bytes], list[str]]]
+_WRITERS: dict[str, _Writer] = {
     "c99": c99.files,
     "st": structured_text.files,
+    "onnx": onnx.files,
 }
 
 
@@ -54,7 +56,7 @@ def deploy(
     folder: str | os.PathLike[str],
     *,
     to: str = "c99",
-    precision: str = "f32",
+    precision: str | None = None,
     name: str | None = None,
 ) -> Deployment:
     """Write a model or a controller as code.
@@ -66,12 +68,12 @@ def deploy(
         PID in all its forms.
     folder : path
         Made if it is not there. Files of the same names are replaced, each as a whole.
-    to : {"c99", "st"}
-        C99 without heap, libm, recursion or global state; or IEC 61131-3 structured text, of a
-        controller only.
-    precision : {"f32", "f64"}
-        Of the arithmetic. A microcontroller that computes only single precision in hardware takes
-        some fifty times as long for `f64`.
+    to : {"c99", "st", "onnx"}
+        C99 without heap, libm, recursion or global state; IEC 61131-3 structured text, of a
+        controller only; ONNX, of a model only.
+    precision : {"f32", "f64"}, optional
+        Of the arithmetic: f32 by default, f64 for ONNX. A microcontroller that computes only single
+        precision in hardware takes some fifty times as long for `f64`.
     name : str, optional
         With which every name in the code begins; `controller` or `model` where there is none.
 
@@ -92,7 +94,9 @@ def deploy(
             "sewfast.load_model or sewfast.load_controller"
         )
     if to not in TARGETS:
-        raise SettingError(f"to: expected {' or '.join(TARGETS)}, received {to!r}")
+        raise SettingError(f"to: expected one of {', '.join(TARGETS)}, received {to!r}")
+    if precision is None:
+        precision = "f64" if to == "onnx" else "f32"
     if precision not in PRECISIONS:
         raise SettingError(f"precision: expected {' or '.join(PRECISIONS)}, received {precision!r}")
     if name is None:
@@ -106,7 +110,7 @@ def deploy(
     target = Path(folder)
     if target.exists() and not target.is_dir():
         raise SettingError(f"expected a folder, got the file {target}; name another one")
-    for path, text in texts.items():
+    for path, content in texts.items():
         place = target / path
         try:
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -115,5 +119,5 @@ def deploy(
                 f"expected a folder that can be made, got {place.parent} ({error.strerror}); name "
                 "one that can be written to"
             ) from error
-        replace(place, text)
+        replace(place, content)
     return Deployment(target, tuple(texts), tuple(notes))
