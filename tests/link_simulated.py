@@ -10,7 +10,7 @@ import pytest
 
 from link_device import ScriptedDevice
 from sewfast.errors import LinkError
-from sewfast.link import connection, drive, run, terms
+from sewfast.link import connection, drive, run
 from sewfast.link.connection import Connection
 from sewfast.link.drive import Drive
 from sewfast.link.ports import Port
@@ -79,7 +79,7 @@ def simulated(**settings: object) -> Iterator[tuple[ScriptedDevice, SimulatedPor
     """A device and its port, with the host's clock simulated as long as the block lasts."""
     clock = Clock()
     with pytest.MonkeyPatch.context() as patch:
-        for module in (connection, drive, terms, run):
+        for module in (connection, drive, run):
             patch.setattr(module, "time", clock)
         device = ScriptedDevice(None, clock=clock, **settings)
         device.wire = Ideal()  # type: ignore[assignment]

@@ -18,7 +18,7 @@ import pytest
 from link_device import TRIPPED, ScriptedDevice
 from sewfast.cli import main
 from sewfast.errors import SettingError
-from sewfast.link import Diagnosis, Finding, VirtualDevice, doctor, examine, system, wire
+from sewfast.link import Diagnosis, Finding, VirtualDevice, doctor, examine, wire
 from sewfast.link.doctor import _counters, _round_trip, _state, _throughput, _unopened
 
 pytest.importorskip("serial", reason="opens pseudo-terminals as serial ports")
@@ -224,22 +224,22 @@ def test_permission_is_judged_as_the_kernel_does(
         values[0], values[4], values[5] = 0o020000 | mode, 0, 77
         return os.stat_result(values)
 
-    monkeypatch.setattr(system.os, "stat", of_root_and_77)
-    found = system.access("port", user, frozenset(groups))
+    monkeypatch.setattr(doctor.os, "stat", of_root_and_77)
+    found = doctor.access("port", user, frozenset(groups))
     assert found.allowed == allowed
     assert found.member == (77 in groups)
     assert found.group == ("77" if mode & 0o060 == 0o060 else None)
 
 
 def test_permission_remedies_name_the_group_or_the_rule() -> None:
-    denied = system.Access(False, "uucp", "root", "crw-rw----", member=False)
-    remedy = system.permission_remedy(denied, 0x0403, 0x6001)
+    denied = doctor.Access(False, "uucp", "root", "crw-rw----", member=False)
+    remedy = doctor.permission_remedy(denied, 0x0403, 0x6001)
     assert "usermod -aG uucp" in remedy
     assert 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6001"' in remedy
     assert "udevadm" in remedy
     closed = replace(denied, group=None, mode="crw-------")
-    assert 'GROUP="dialout"' in system.permission_remedy(closed)
-    assert "is in the way" in system.permission_remedy(replace(denied, member=True))
+    assert 'GROUP="dialout"' in doctor.permission_remedy(closed)
+    assert "is in the way" in doctor.permission_remedy(replace(denied, member=True))
 
 
 def test_a_port_that_is_not_mine_fails_with_its_group(
@@ -247,8 +247,8 @@ def test_a_port_that_is_not_mine_fails_with_its_group(
 ) -> None:
     port = tmp_path / "port"
     port.touch()
-    denied = system.Access(False, "dialout", "root", "crw-rw----", member=False)
-    monkeypatch.setattr(system, "access", lambda path: denied)
+    denied = doctor.Access(False, "dialout", "root", "crw-rw----", member=False)
+    monkeypatch.setattr(doctor, "access", lambda path: denied)
     from sewfast.errors import LinkError
 
     found = _unopened(str(port), LinkError("expected this, got that; do so"))
@@ -284,16 +284,16 @@ def test_reads_the_latency_timer_where_there_is_one(tmp_path: Path) -> None:
     timer = tmp_path / "ttyUSB7" / "device" / "latency_timer"
     timer.parent.mkdir(parents=True)
     timer.write_text("16\n")
-    assert system.latency_timer("/dev/ttyUSB7", tmp_path) == (16, timer)
+    assert doctor.latency_timer("/dev/ttyUSB7", tmp_path) == (16, timer)
     timer.write_text("soon")
-    assert system.latency_timer("/dev/ttyUSB7", tmp_path) is None
-    assert system.latency_timer("/dev/ttyACM0", tmp_path) is None
+    assert doctor.latency_timer("/dev/ttyUSB7", tmp_path) is None
+    assert doctor.latency_timer("/dev/ttyACM0", tmp_path) is None
 
 
 def test_a_long_latency_timer_is_a_warning(
     silent: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(system, "latency_timer", lambda path: (16, tmp_path / "latency_timer"))
+    monkeypatch.setattr(doctor, "latency_timer", lambda path: (16, tmp_path / "latency_timer"))
     found = examine(silent, echoes=10)["latency timer"]
     assert found.verdict == "warn"
     assert "16 ms" in found.measured

@@ -20,7 +20,8 @@ from link_kept import LONG, Kept, U, once
 from link_simulated import SimulatedPort, driven, linked, simulated
 from sewfast import Controller, Gains
 from sewfast.errors import LinkError, SettingError
-from sewfast.link import Drive, Plan, connect, terms
+from sewfast.link import Drive, Plan, connect
+from sewfast.link.drive import gains
 
 SOAK = bool(os.environ.get("SEWFAST_SOAK"))
 
@@ -118,7 +119,7 @@ def test_a_device_that_knows_them_is_sent_the_whole_design(drive):
     controller = Controller(
         Gains.standard(0.01, 0.1), observer_time=0.004, r_rate=1000.0, schedule=points
     )
-    body = terms.gains(controller, drive.channels, knowing)
+    body = gains(controller, drive.channels, knowing)
     assert len(body) == 49 + 9 + 2 * 16
     told = struct.unpack("<12fB2fB8f", body)
     assert told[13:16] == (np.float32(0.004), 1000.0, 2)

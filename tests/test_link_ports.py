@@ -20,7 +20,7 @@ import pytest
 from cli import sewfast
 from sewfast.errors import LinkError, SettingError
 from sewfast.link import PortInfo, list_ports, open_port, ports
-from sewfast.link.failures import explain
+from sewfast.link.ports import explain
 
 REMEDY = r"expected .+; .+"
 

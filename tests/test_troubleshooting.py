@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from documents import blocks
-from sewfast.link.failures import explain
+from sewfast.link.ports import explain
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "troubleshooting.md"

@@ -236,8 +236,7 @@ def _record_on(
     settings: Mapping[str, Any] | None,
     overwrite: bool,
 ) -> Recording:
-    from .link.plan import Plan
-    from .link.play import Played, Stopped, play
+    from .link.plan import Plan, Played, Stopped, play
 
     def recording(played: Played) -> Recording:
         return recording_of_drive(played.columns, drive, name, method)

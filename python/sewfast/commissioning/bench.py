@@ -15,8 +15,7 @@ from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun, run
 from ..dataset import FloatArray
 from ..errors import LinkError, SettingError
-from ..link.plan import Plan
-from ..link.play import Stopped, conditions_of, device_of, play, run_of_drive
+from ..link.plan import Plan, Stopped, conditions_of, device_of, play, run_of_drive
 from ..machine import VirtualMachine
 from ..recording import Recording, record, recording_of_drive
 from ..speed import speed_from_counts

@@ -1,6 +1,6 @@
 """The link to a real or virtual drive: ports, sessions, runs (docs/PROTOCOL.md)."""
 
-from .clock import ClockBounds
+from .connection import ClockBounds
 from .doctor import Diagnosis, Finding, examine
 from .drive import Drive, connect
 from .host_loop import HostLoopRun, at_period, run_on_host

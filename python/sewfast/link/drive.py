@@ -6,6 +6,7 @@ import math
 import os
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
 from types import TracebackType
 from typing import Literal
@@ -16,18 +17,154 @@ from numpy.typing import NDArray
 from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun
 from ..errors import LinkError, SettingError
-from ..gains import real
+from ..gains import Gains, real
 from ..live import Kind as View
-from . import play, terms, wire
+from ..units import counts_per_unit
 from . import run as profiles
-from .clock import ClockBounds
-from .connection import Connection, DeviceReset, Loan
-from .plan import Layout, Outcome, Plan, Sink, layout, require_capable
-from .ports import open_port
+from . import wire
+from .connection import ClockBounds, Connection, DeviceReset, Loan
+from .plan import Layout, Outcome, Plan, Sink, follow, layout, require_capable
+from .ports import Unique, open_port
 from .run import Run
-from .terms import await_measurement, wait_for_rest
-from .unique import Unique
 from .wire import Channel, Identity, Kind, Limits, Status
+
+# --- Terms of host and device: its channels, limits within its ceilings, controllers in its units -
+
+
+def channels(link: Connection) -> tuple[Channel, ...]:
+    """What the device can stream, as it describes it.
+
+    Raises
+    ------
+    LinkError
+        Where that is not what its schema hash stands for.
+    """
+    identity = link.identity
+    bodies = [link.ask(Kind.DESCRIBE, bytes([k])) for k in range(identity.channels)]
+    if wire.schema_hash(identity.version, identity.period_us, bodies) != identity.schema:
+        raise LinkError(
+            "expected channels that match the device's schema hash, got others; connect again, "
+            "or mend the firmware"
+        )
+    found = tuple(map(wire.channel, bodies))
+    if (found[0].encoding, found[1].encoding) != (0, 1):
+        raise LinkError("expected channel 0 to be counts and 1 the command; mend the firmware")
+    return found
+
+
+def limit(name: str, value: float | None, present: float, ceiling: float) -> float:
+    """The limit to set: the one asked for, the one in force, or the device's ceiling.
+
+    Raises
+    ------
+    SettingError
+        For a limit that is not above 0 or is above the ceiling.
+    """
+    if value is None:
+        return present if present else ceiling
+    if not 0.0 < real(name, value) <= ceiling * (1.0 + 1e-6):
+        raise SettingError(
+            f"expected {name} above 0 and at most {ceiling:g}, the device's ceiling, got {value}; "
+            f"{'lower' if value > ceiling else 'raise'} it"
+        )
+    return min(value, ceiling)
+
+
+def fitting(controller: Controller, streamed: Sequence[Channel]) -> Gains:
+    """The controller's gains in standard form.
+
+    Raises
+    ------
+    SettingError
+        Where they are not in the device's units.
+    """
+    units = {c.name: c.unit for c in streamed}
+    gains = controller.gains.to("standard")
+    _require_units(gains.u_unit, units.get("u", ""), "command")
+    _require_units(gains.y_unit, units.get("feedback", "RPM"), "output")
+    return gains
+
+
+def gains(controller: Controller, streamed: Sequence[Channel], identity: Identity) -> bytes:
+    """Body of GAINS for a controller; the encoder is the device's own.
+
+    Raises
+    ------
+    SettingError
+        Where its gains are not in the device's units, or the device does not know its parts.
+    """
+    g, c = fitting(controller, streamed), controller
+    named = ("observer_time", bool(c.observer_time)), ("r_rate", c.r_rate != math.inf)
+    further = [name for name, used in (*named, ("schedule", bool(c.schedule))) if used]
+    if further and not identity.capabilities & wire.DESIGN:
+        raise SettingError(
+            f"expected a controller without {' and '.join(further)} for this device, whose "
+            "firmware does not know them; leave them out, or build the firmware with this sewfast"
+        )
+    values = (
+        g.Kp, g.Ti, g.Td, c.alpha, c.beta, c.N, c.Tt, c.u_min, c.u_max, c.slew, c.filter_time,
+        counts_per_unit(identity.counts_per_rev, g.y_unit),
+    )  # fmt: skip
+    body = wire.gains(values, c.filter_samples)
+    if not further:
+        return body
+    return body + wire.design(c.observer_time, c.r_rate, c.schedule_rows())
+
+
+def _require_units(given: str, device: str, what: str) -> None:
+    if given.lower() != device.lower():
+        raise SettingError(
+            f"expected a controller whose {what} is in {device}, as the device's, got {given}; "
+            "convert its gains"
+        )
+
+
+# --- Rest: time that passes on the device until its motor stands still or it has measured well ----
+
+
+REST_US = 120_000
+"""Device's time without a count after which a motor is at rest; ARM wants 100 ms."""
+STEP_US = 20_000
+MEASURED_WITHIN = 1.0
+
+
+def wait_for_rest(link: Connection, timeout: float) -> None:
+    """Wait until the encoder has not moved for a while, as `Drive.wait_for_rest` says."""
+    status = link.status()
+    since = began = status.time_us
+    # a device on credit that takes none must not be waited for either
+    deadline = time.monotonic() + timeout + (5.0 if link.identity.on_credit else 0.0)
+    while status.time_us - since < REST_US:
+        if status.time_us - began > timeout * 1e6 or time.monotonic() > deadline:
+            raise LinkError(
+                f"expected the motor at rest within {timeout:g} s, it turns at "
+                f"{status.speed_rpm:.0f} RPM; brake it or wait longer"
+            )
+        let_pass(link, STEP_US)
+        before, status = status, link.status()
+        if status.counts != before.counts:
+            since = status.time_us
+
+
+def await_measurement(link: Connection) -> None:
+    """Boot ends by itself after some good samples; a device on credit needs time for them."""
+    deadline = time.monotonic() + MEASURED_WITHIN
+    while link.status().state == "boot" and time.monotonic() < deadline:
+        let_pass(link, STEP_US)
+
+
+def let_pass(link: Connection, us: int) -> None:
+    """Grant time to a device on credit; take turns for as long with another."""
+    if link.identity.on_credit:
+        link.grant(link.newest + us)
+        return
+    until = time.monotonic() + us * 1e-6
+    while (rest := until - time.monotonic()) > 0.0:
+        link.turn(rest)
+
+
+# --- `Drive`: a motor drive behind a port; `connect` opens it -------------------------------------
+
 
 PATIENCE = 3.0
 
@@ -46,7 +183,7 @@ class Drive(Unique):
 
     def __init__(self, link: Connection) -> None:
         self._link = link
-        self._channels = terms.channels(link)
+        self._channels = channels(link)
         #: What became of the last run, also of one that ended in an exception.
         self.outcome: Outcome | None = None
         await_measurement(link)
@@ -149,7 +286,7 @@ class Drive(Unique):
             "volt": volt, "speed_rpm": speed_rpm, "acceleration": acceleration, "current": current
         }  # fmt: skip
         values = [
-            terms.limit(name, value, now, ceiling)
+            limit(name, value, now, ceiling)
             for (name, value), now, ceiling in zip(
                 given.items(), present.values, present.ceilings, strict=True
             )
@@ -164,7 +301,7 @@ class Drive(Unique):
         SettingError
             Where sample time or units are not the device's.
         """
-        body = terms.gains(controller, self.channels, self.identity)
+        body = gains(controller, self.channels, self.identity)
         self._link.ask(Kind.GAINS, body)
 
     def arm(self) -> None:
@@ -310,9 +447,7 @@ class Drive(Unique):
         SettingError, LinkError, Interrupted
             As for `sewfast.run`.
         """
-        return play.follow(
-            self, controller, r, name=name, file=file, live=live, overwrite=overwrite
-        )
+        return follow(self, controller, r, name=name, file=file, live=live, overwrite=overwrite)
 
     def _stream(self, plan: Plan, sink: Sink, cancel: threading.Event | None) -> Outcome:
         run = self._prepare(plan, sink)
@@ -350,7 +485,7 @@ class Drive(Unique):
             Where the device is not idle or its motor does not rest.
         """
         require_capable(plan, self.identity)
-        terms.fitting(controller, self.channels)
+        fitting(controller, self.channels)
         streamed = self.layout(plan)
         self._require_idle()
         self.wait_for_rest()

@@ -17,7 +17,7 @@ from .._core import DeviceServer
 from ..errors import LinkError, SettingError
 from ..gains import real
 from ..machine import VirtualMachine
-from .unique import Unique
+from .ports import Unique
 
 __all__ = ["VirtualDevice"]
 
