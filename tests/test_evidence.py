@@ -30,7 +30,7 @@ from sewfast.evidence.distributions import chi2_quantile, chi2_tail, normal_quan
 from sewfast.evidence.noise import Noise, fast_length
 from sewfast.evidence.operating import linearise
 from sewfast.evidence.parameters import Criteria
-from sewfast.models.ensemble import Ensemble
+from sewfast.models.base import Ensemble
 
 
 @cache

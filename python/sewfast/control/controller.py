@@ -11,7 +11,7 @@ from typing import Any
 from .. import _core, storage
 from ..errors import ModelFileError, SettingError, SewfastError
 from ..gains import Gains, real, whole
-from ..models.fields import Fields
+from ..storage import Fields
 from ..units import counts_per_unit
 
 FORMAT = "sewfast.controller"

@@ -18,7 +18,7 @@ import numpy as np
 from .. import _core
 from ..dataset import Diagnosis, diagnose
 from ..errors import FitError
-from ..models.ensemble import EnsembleCore
+from ..models.base import EnsembleCore
 from .effort import Look, Pool
 from .folds import RUNAWAY, Errors, Split, compared, errors_of, free_runs
 from .orders import LinearTable, slowest_pole

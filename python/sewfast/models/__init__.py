@@ -1,8 +1,7 @@
 """Identified models: linear ones and networks, with their files."""
 
 from ..dynamic_model import FreeRunJacobian
-from .base import Model, NotLinearError
-from .ensemble import Ensemble
+from .base import Ensemble, Model, NotLinearError
 from .files import load_model, model_schema
 from .linear import ARX, IV, LinearOE
 from .neural import NeuralOE, NeuralSS

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..dataset import Dataset
-from ..dynamic_model import INIT, DynamicModel
-from ..errors import SettingError
+from ..dataset import Dataset, FloatArray
+from ..dynamic_model import INIT, Core, DynamicModel, FreeRunJacobian
+from ..errors import FitError, SettingError
 from ..evidence import Bands, OperatingPoint, ReportCard, bands, check, operating_range
 from ..validation import Validation, validate
 
@@ -119,3 +120,219 @@ class Model(DynamicModel):
         from .files import restored
 
         return restored, (self.to_dict(), self.alternatives)
+
+
+# --- Ensemble: several models of one plant as one -------------------------------------------------
+
+
+Combine: TypeAlias = Literal["median", "mean"]
+COMBINATIONS: tuple[Combine, ...] = ("median", "mean")
+MOST_MEMBERS = 1000
+LEAST_SHARE = 0.5
+"""Members that must stand an input for the ensemble to answer at all."""
+
+
+@dataclass(frozen=True, eq=False)
+class EnsembleCore:
+    """The members' arithmetic; the state is that of all members, one after the other.
+
+    A member that runs away on an input is left out of that run: its output says nothing, and the
+    median of the others is what the ensemble is for. Where fewer than half are left, it is a
+    `FitError`.
+    """
+
+    members: tuple[Core, ...]
+    combine: Combine
+
+    def rest_state(self) -> FloatArray:
+        """Every member at rest."""
+        return np.concatenate([m.rest_state() for m in self.members])
+
+    def estimate_initial_state(self, u: FloatArray, y: FloatArray) -> FloatArray:
+        """Every member's own estimate."""
+        return np.concatenate([m.estimate_initial_state(u, y) for m in self.members])
+
+    def simulate(self, u: FloatArray, state: FloatArray) -> FloatArray:
+        """Median or mean of the members' free runs, sample by sample, (N,)."""
+        return self._combined(self.simulations(u, state))
+
+    def simulations(self, u: FloatArray, state: FloatArray) -> FloatArray:
+        """Free runs of the members that stand this input, (members, N)."""
+        return self._runs(state, lambda m, x: m.simulate(u, x))
+
+    def predict(self, u: FloatArray, y: FloatArray, state: FloatArray, horizon: int) -> FloatArray:
+        """Median or mean of the members' predictions, (N,)."""
+        return self._combined(self._runs(state, lambda m, x: m.predict(u, y, x, horizon)))
+
+    def jacobian(self, u: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The run and its derivatives by all members' parameters and states, member by member.
+
+        A median has the derivative of the member, or the two, in the middle.
+        """
+        found = [m.jacobian(u, x) for m, x in self._with_states(state)]
+        runs = np.array([run for run, _ in found])
+        weights = self._weights(runs)
+        rows = [w[:, None] * rows for w, (_, rows) in zip(weights, found, strict=True)]
+        return self._combined(runs), np.hstack(rows)
+
+    def _weights(self, runs: FloatArray) -> FloatArray:
+        """How much each member counts at each sample, (members, N)."""
+        n = len(runs)
+        if self.combine == "mean":
+            return np.full(runs.shape, 1.0 / n)
+        rank = runs.argsort(axis=0, kind="stable").argsort(axis=0, kind="stable")
+        middle = (rank == (n - 1) // 2).astype(np.float64) + (rank == n // 2)
+        return cast(FloatArray, middle / 2.0)
+
+    def _combined(self, runs: FloatArray) -> FloatArray:
+        reduce = np.median if self.combine == "median" else np.mean
+        return np.asarray(reduce(runs, axis=0), dtype=np.float64)
+
+    def _runs(self, state: FloatArray, run: Callable[[Core, FloatArray], FloatArray]) -> FloatArray:
+        found: list[FloatArray] = []
+        reason: FitError | None = None
+        for member, x in self._with_states(state):
+            try:
+                found.append(run(member, x))
+            except FitError as e:
+                reason = e
+        if len(found) < LEAST_SHARE * len(self.members):
+            raise FitError(
+                f"expected at least half of {len(self.members)} members to stand this input, "
+                f"received {len(found)} ({reason}); identify from data that cover it"
+            ) from reason
+        return np.array(found)
+
+    def _with_states(self, state: FloatArray) -> list[tuple[Core, FloatArray]]:
+        sizes = [len(m.rest_state()) for m in self.members]
+        pieces = np.split(state, np.cumsum(sizes)[:-1])
+        return [(m, np.ascontiguousarray(x)) for m, x in zip(self.members, pieces, strict=True)]
+
+
+class Ensemble(Model):
+    """Models of one plant, combined; a model like any other.
+
+    A closed loop is simulated, and a controller tuned, on its `members`: each is a plant.
+    """
+
+    kind: ClassVar[str] = "ensemble"
+    title: ClassVar[str] = "Ensemble"
+    core: _ModelsCore
+
+    @classmethod
+    def of(
+        cls,
+        members: Sequence[Model],
+        combine: Combine = "median",
+        training: Mapping[str, Any] | None = None,
+    ) -> Ensemble:
+        """Combine models of one plant.
+
+        Parameters
+        ----------
+        members : sequence of Model
+            With the same inputs, output and sample time; none of them an ensemble.
+        combine : {"median", "mean"}
+            Taken over the members' runs, sample by sample. A median does not heed the few members
+            that go astray on a new input.
+        training : mapping, optional
+            How it came about.
+
+        Raises
+        ------
+        SettingError
+            Where there is no member, or the members are of different plants.
+        """
+        _require_members(members)
+        if combine not in COMBINATIONS:
+            raise SettingError(f"combine: expected median or mean, received {combine!r}")
+        first = members[0]
+        core = _ModelsCore(tuple(m.core for m in members), combine, tuple(members))
+        names = (first.input_names, first.output_name, first.input_units, first.output_unit)
+        return cls(core, first.Ts, *names, first.counts, training or {})
+
+    @property
+    def members(self) -> tuple[Model, ...]:
+        """The models it consists of."""
+        return self.core.models
+
+    @property
+    def combine(self) -> Combine:
+        """`median` or `mean`."""
+        return self.core.combine
+
+    @property
+    def orders(self) -> dict[str, int]:
+        """What all members have in common, and their number."""
+        first, *others = (m.orders for m in self.members)
+        common = {k: v for k, v in first.items() if all(o.get(k) == v for o in others)}
+        return {"members": len(self.members), **common}
+
+    @property
+    def theta(self) -> FloatArray:
+        """The members' parameters, one member after the other."""
+        return np.concatenate([m.theta for m in self.members])
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Those of the members, each with its member's number, counted from 0."""
+        return tuple(f"{i}: {n}" for i, m in enumerate(self.members) for n in m.parameter_names)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """As `parameter_names`."""
+        return tuple(f"{i}: {n}" for i, m in enumerate(self.members) for n in m.state_names)
+
+    def _jacobian(self, u: FloatArray, state: FloatArray) -> FreeRunJacobian:
+        # the core's columns are member by member, parameters and then states of each
+        y, rows = self.core.jacobian(u, state)
+        theta, states, at = [], [], 0
+        for m in self.members:
+            p, s = len(m.theta), len(m.core.rest_state())
+            theta.append(rows[:, at : at + p])
+            states.append(rows[:, at + p : at + p + s])
+            at += p + s
+        return FreeRunJacobian(y, np.hstack(theta), np.hstack(states))
+
+    def parameters(self) -> dict[str, Any]:
+        members = [
+            {"kind": m.kind, "parameters": m.parameters(), "training": dict(m.training)}
+            for m in self.members
+        ]
+        return {"combine": self.combine, "members": members}
+
+    def describe(self) -> list[str]:
+        counted: dict[str, int] = {}
+        for m in self.members:
+            counted[m.title] = counted.get(m.title, 0) + 1
+        parts = ", ".join(f"{n} x {title}" for title, n in counted.items())
+        return [f"{self.combine} of {parts}"]
+
+
+@dataclass(frozen=True, eq=False)
+class _ModelsCore(EnsembleCore):
+    """The arithmetic together with the models that it comes from."""
+
+    models: tuple[Model, ...]
+
+
+def _require_members(members: Sequence[Model]) -> None:
+    if not 1 <= len(members) <= MOST_MEMBERS:
+        raise SettingError(f"members: expected 1 to {MOST_MEMBERS} models, received {len(members)}")
+    for m in members:
+        if not isinstance(m, Model) or isinstance(m, Ensemble):
+            raise SettingError(
+                f"members: expected single models, received {type(m).__name__}; pass the members "
+                "of an ensemble"
+            )
+    for m in members[1:]:
+        if _plant(m) != _plant(members[0]):
+            raise SettingError(
+                f"members: expected models of one plant, received {members[0].signature} at "
+                f"{members[0].Ts:g} s and {m.signature} at {m.Ts:g} s"
+            )
+
+
+def _plant(model: Model) -> tuple[object, ...]:
+    names = (model.input_names, model.output_name, model.input_units, model.output_unit)
+    return (model.Ts, *names, model.counts)

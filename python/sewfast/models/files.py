@@ -12,9 +12,8 @@ from typing import Any, TypeAlias
 from .. import storage
 from ..dynamic_model import FORMAT, VERSION
 from ..errors import ModelFileError, SewfastError
-from .base import Model
-from .ensemble import COMBINATIONS, MOST_MEMBERS, Ensemble
-from .fields import Fields
+from ..storage import Fields
+from .base import COMBINATIONS, MOST_MEMBERS, Ensemble, Model
 from .linear import ARX, IV, LinearOE
 from .neural import NeuralOE, NeuralSS
 

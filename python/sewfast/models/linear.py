@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from .. import _core
 from ..dataset import FloatArray, labelled
 from ..errors import SettingError
+from ..storage import Fields
 from .base import Model
 from .conversion import (
     ContinuousModel,
@@ -29,7 +30,6 @@ from .conversion import (
     scipy_system,
     transfer_function,
 )
-from .fields import Fields
 
 
 class LinearDifference(Model):

@@ -9,8 +9,8 @@ import numpy as np
 from .. import _core
 from ..dataset import Dataset, FloatArray
 from ..dynamic_model import INIT
+from ..storage import Fields, entries
 from .base import Model
-from .fields import Fields, entries
 
 # --- The network output-error model ---------------------------------------------------------------
 
