@@ -12,6 +12,7 @@ from . import (
     check,
     commission,
     compare,
+    completion,
     control,
     deploy,
     device,
@@ -132,6 +133,7 @@ def build_parser() -> argparse.ArgumentParser:
         doctor,
         drive,
         device,
+        completion,
     )
     for group in groups:
         group.add(commands)
