@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -101,7 +101,8 @@ def _library() -> ModuleType:
         raise SettingError(
             "expected the onnx package to write ONNX, got none; pip install 'sewfast[onnx]'"
         ) from error
-    return cast(ModuleType, onnx)
+    found: ModuleType = onnx
+    return found
 
 
 def _properties(model: Model) -> dict[str, str]:
