@@ -26,10 +26,10 @@ from sewfast.evidence import (
     remembered,
     residual_tests,
 )
-from sewfast.evidence.distributions import chi2_quantile, chi2_tail, normal_quantile
-from sewfast.evidence.noise import Noise, fast_length
+from sewfast.evidence.correlations import chi2_quantile, chi2_tail, normal_quantile
 from sewfast.evidence.operating import linearise
 from sewfast.evidence.parameters import Criteria
+from sewfast.evidence.residuals import Noise, fast_length
 from sewfast.models.base import Ensemble
 
 

@@ -15,9 +15,8 @@ from hypothesis.extra import numpy as hnp
 import sewfast as api
 from cli import refused, sewfast
 from sewfast.dataset import Dataset
-from sewfast.dataset.advice import nice
-from sewfast.dataset.noise import band, power_spectrum
-from sewfast.dataset.outliers import usual_threshold
+from sewfast.dataset.outliers import band, power_spectrum, usual_threshold
+from sewfast.dataset.summary import nice
 from sewfast.errors import SettingError
 
 N, TS = 20_000, 1e-3

@@ -13,7 +13,7 @@ from sewfast import Dataset, LinearOE, identify
 from sewfast.evidence import Residuals, operating_range
 from sewfast.evidence.card import summary
 from sewfast.evidence.questions import accuracy, correlation, operation
-from sewfast.evidence.scores import horizon_scores
+from sewfast.evidence.residuals import horizon_scores
 from sewfast.validation import grade_of, validate
 
 

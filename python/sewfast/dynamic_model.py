@@ -21,7 +21,7 @@ from .dataset import (
     require_dataset,
     require_same_units,
 )
-from .dataset.weights import without_weightless
+from .dataset.experiment import without_weightless
 from .errors import DataError, SettingError, SewfastError
 
 FORMAT = "sewfast.model"

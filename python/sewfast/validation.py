@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .dataset import Dataset, Experiment, FloatArray, labelled, require_dataset
-from .dataset.noise import white_noise
-from .dataset.weights import in_effect, without_weightless
+from .dataset.experiment import in_effect, without_weightless
+from .dataset.outliers import white_noise
 from .dynamic_model import INIT, DynamicModel, require_init
 from .errors import DataError
 

@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike
 
 from ..arrays import labelled, range_of, texts
 from ..errors import DataError, SettingError
-from . import frames, gaps, outliers, picture, pieces, rates, summary, trends
-from .experiment import Experiment
-from .weights import require_some_weight
+from . import frames, outliers, picture, pieces, rates, summary, trends
+from .experiment import Experiment, require_some_weight
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -191,8 +190,8 @@ class Dataset:
     split = pieces.split
     split_at_gaps = pieces.split_at_gaps
 
-    mask = gaps.mask
-    fill_inputs = gaps.fill_inputs
+    mask = pieces.mask
+    fill_inputs = pieces.fill_inputs
     detrend = trends.detrend
     restore = trends.restore
     resample = rates.resample

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray, labelled, runs
 from .feedback import Integration, feedback, integration
-from .noise import MAD, quantum
+from .outliers import MAD, quantum
 from .pieces import LARGEST, require_dataset
 
 if TYPE_CHECKING:

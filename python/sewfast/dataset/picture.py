@@ -10,8 +10,7 @@ import numpy as np
 
 from ..arrays import FloatArray, labelled, runs
 from ..plotting import Drawing, legend, lettered, thin
-from .noise import band, power_spectrum
-from .outliers import distances, usual_threshold
+from .outliers import band, distances, power_spectrum, usual_threshold
 from .pieces import LARGEST
 
 if TYPE_CHECKING:

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from .. import _core
 from ..arrays import FloatArray, frozen, runs
 from ..errors import DataError, SettingError
-from .gaps import interpolated
-from .noise import quantum, white_noise
-from .pieces import require_sane
+from .experiment import without_weightless
+from .outliers import quantum, white_noise
+from .pieces import interpolated, require_sane
 from .trends import Trend
-from .weights import without_weightless
 
 if TYPE_CHECKING:
     from ..speed import Method

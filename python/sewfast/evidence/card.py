@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from .correlations import ResidualTest
     from .operating import OperatingRange
     from .parameters import Criteria, Parameters
-    from .residuals import Run
-    from .scores import HorizonScores
+    from .residuals import HorizonScores, Run
     from .simulation_bands import Bands
 
 __all__ = ["Line", "ReportCard", "Verdict"]

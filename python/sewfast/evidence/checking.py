@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..dataset import Dataset, require_dataset
-from ..dataset.weights import in_effect
+from ..dataset.experiment import in_effect
 from ..dynamic_model import INIT, DynamicModel
 from ..errors import FitError, SewfastError
 from ..validation import Scores, noise_of
@@ -19,8 +19,7 @@ from .operating import OperatingRange, operating_range
 from .parameters import Criteria, Knowledge, Parameters, estimate
 from .portmanteau import LAGS, parameter_test, residual_tests
 from .region import Place, placed, training_region
-from .residuals import Residuals, representative
-from .scores import horizon_scores
+from .residuals import Residuals, horizon_scores, representative
 from .simulation_bands import (
     LEVEL,
     Bands,

@@ -10,8 +10,7 @@ import numpy as np
 
 from ..dataset import FloatArray
 from ..dynamic_model import DynamicModel
-from .noise import Noise
-from .residuals import Residuals, representative
+from .residuals import Noise, Residuals, representative
 
 # --- Information criteria with the number of parameters that count --------------------------------
 

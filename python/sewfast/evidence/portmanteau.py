@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from ..dataset import FloatArray
 from .correlations import ResidualTest, Sums, independent_directions, verdict
-from .noise import Noise
-from .residuals import Residuals, Run
+from .residuals import Noise, Residuals, Run
 
 LAGS = 25
 LEAST_SAMPLES = 50

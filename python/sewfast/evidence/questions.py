@@ -15,8 +15,7 @@ from .card import Line, Verdict
 from .correlations import LEVEL, ResidualTest
 from .operating import OperatingRange
 from .parameters import Criteria, Knowledge, Parameters
-from .residuals import Residuals
-from .scores import HorizonScores, fit_text
+from .residuals import HorizonScores, Residuals, fit_text
 from .simulation_bands import Bands
 
 SMALL = 0.1

@@ -24,7 +24,7 @@ import numpy as np
 from ..dataset import Dataset, FloatArray
 from ..dynamic_model import INIT, DynamicModel
 from ..errors import FitError, SettingError
-from .distributions import normal_quantile
+from .correlations import normal_quantile
 from .parameters import Information, Parameters, estimate
 from .region import Place, placed
 from .residuals import Residuals

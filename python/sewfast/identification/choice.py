@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import _core
 from ..dataset import Dataset
-from ..dataset.weights import mean_square, weights_of
+from ..dataset.experiment import mean_square, weights_of
 from ..errors import FitError, Interrupted
 from ..models import Ensemble, LinearOE, Model, NeuralOE, NeuralSS
 from .effort import Look, Pool, Stopped

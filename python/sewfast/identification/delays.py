@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import _core
 from ..dataset import Dataset, Experiment, FloatArray, require_dataset
-from ..dataset.weights import in_effect
+from ..dataset.experiment import in_effect
 from ..errors import DataError, FitError, SettingError
 
 CHUNK = 4096

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from typing import Literal, TypeAlias
 
 from ..dataset import Dataset, require_dataset
+from ..dataset.experiment import in_effect
 from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
-from ..dataset.weights import in_effect
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, Interrupted, SettingError
 from ..evidence import remembered

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..dataset import Dataset, Experiment, FloatArray
-from ..dataset.weights import mean_square, weights_of
+from ..dataset.experiment import mean_square, weights_of
 from ..dynamic_model import INIT, Core
 from ..errors import DataError, FitError
 from .task import Provenance, sources

@@ -8,7 +8,7 @@ import time
 import numpy as np
 
 from .. import _core
-from ..dataset.weights import mean_square, weights_of
+from ..dataset.experiment import mean_square, weights_of
 from ..dynamic_model import INIT
 from ..errors import Interrupted
 from ..models import ARX, IV, LinearOE, Model

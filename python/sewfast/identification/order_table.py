@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import _core
 from ..dataset import Dataset, Experiment, FloatArray, labelled, require_dataset
-from ..dataset.weights import in_effect
+from ..dataset.experiment import in_effect
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, SettingError
 from .delays import LONGEST, DelayEstimate, LaggedRegression, Solution, delay

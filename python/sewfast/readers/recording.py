@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..dataset import Dataset, Experiment, FloatArray
-from ..dataset.weights import as_weights, require_some_weight
+from ..dataset.experiment import as_weights, require_some_weight
 from ..errors import DataError, SettingError
 from .containers import Table
 from .files import read_table
