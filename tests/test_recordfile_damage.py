@@ -21,9 +21,9 @@ from hypothesis import strategies as st
 from recordings_made import SOAK, Made, header, make
 from sewfast.errors import DataError
 from sewfast.recordfile import RecordedFile, RecordWriter, read_recording
-from sewfast.recordfile.export import _groups
 from sewfast.recordfile.format import Assembler, Message, Topic, opening
 from sewfast.recordfile.reader import decode_recording
+from sewfast.recordfile.writer import _groups
 
 resource = pytest.importorskip("resource", reason="limits a file's size as POSIX systems can")
 

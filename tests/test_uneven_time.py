@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import sewfast
@@ -224,6 +224,7 @@ def test_a_table_with_text_in_it_is_read_as_before(tmp_path: Path) -> None:
     ordered=st.booleans(),
     Ts=st.none() | st.floats(1e-12, 1e12),
 )
+@example(t=[0.0, 0.0, 8.9e307], ordered=False, Ts=0.5)
 def test_any_time_column_is_a_grid_or_an_error(
     t: list[float], ordered: bool, Ts: float | None
 ) -> None:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ..dataset import FloatArray
 from .residuals import Noise
 
-# --- Tails and quantiles of the chi-square and the normal distribution -----------------------------
+# --- Tails and quantiles of the chi-square and the normal distribution ----------------------------
 
 
 _TINY = 1e-300

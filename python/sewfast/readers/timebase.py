@@ -282,7 +282,8 @@ def _grid(table: Table, name: str, t: FloatArray, period: float, given: float | 
     )
     Ts = fitted if exact else period if given is None else float(given)
     most = max(_MOST_PER_ROW * len(t), 10_000)
-    if not t[-1] / Ts < most:
+    # in this order: the quotient of the largest time stamps is no finite number
+    if not t[-1] < most * Ts:
         k = int(np.argmax(np.diff(t)))
         raise DataError(
             f"{table.path}: column {name!r}: expected time stamps that a grid of Ts = {Ts:.4g} s "

@@ -1,9 +1,8 @@
 """Recordings as MCAP files: written while the drive runs, readable after whatever happened."""
 
-from .export import export
-from .header import Header
+from .format import Header
 from .reader import RecordedFile, read_recording
-from .writer import RecordWriter, save_columns
+from .writer import RecordWriter, export, save_columns
 
 __all__ = [
     "Header",

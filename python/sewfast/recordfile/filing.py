@@ -15,8 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from ..errors import DataError, SettingError, SewfastError
 from . import format
-from .format import Assembler, Message, Topic, opening
-from .header import Header, bearable
+from .format import Assembler, Header, Message, Topic, bearable, opening
 
 # --- A file that grows by whole pieces: what is in it is complete, whatever stops the writer ------
 
