@@ -158,6 +158,18 @@ def test_pandas_series_are_arrays() -> None:
     assert np.array_equal(found.experiments[0].y, Y, equal_nan=True)
 
 
+def test_columns_of_any_package_are_arrays() -> None:
+    pl = pytest.importorskip("polars")
+    pa = pytest.importorskip("pyarrow")
+    for column in (
+        pl.Series([1, None, 3]),
+        pa.array([1, None, 3]),
+        pa.chunked_array([[1, None, 3]]),
+    ):
+        e = Dataset.from_arrays(np.ones(3), column, TS).experiments[0]
+        assert np.array_equal(e.y, [1.0, np.nan, 3.0], equal_nan=True)
+
+
 def test_polars_and_arrow_kinds_of_columns() -> None:
     pl = pytest.importorskip("polars")
     when = np.datetime64("2026-01-01", "us") + (1e6 * T).astype("timedelta64[us]")

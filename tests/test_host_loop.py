@@ -217,6 +217,7 @@ def test_ctrl_c_stops_before_the_next_tick_and_keeps_the_run(
     assert isinstance(run, HostLoopRun)
     assert run.outcome == "interrupted"
     assert len(run.samples["t"]) == run.taken
+    assert "interrupted" in run._repr_html_()
 
 
 def test_a_refusal_says_what_to_do(device: ScriptedDevice) -> None:

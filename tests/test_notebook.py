@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
 from typing import Any
@@ -62,10 +63,13 @@ def results() -> dict[str, Any]:
     return {
         "model": model(), "data": held, "validation": sewfast.validate(model(), both),
         "card": sewfast.check(model(), held), "run": run, "tuning": tuned, "front": front,
+        "controller": replace(tuned.controller, notes=HOSTILE),
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["model", "data", "validation", "card", "run", "tuning", "front"])
+@pytest.mark.parametrize(
+    "name", ["model", "data", "validation", "card", "run", "tuning", "front", "controller"]
+)
 def test_a_notebook_shows_a_table_and_runs_nothing(name: str) -> None:
     found = Cells(results()[name]._repr_html_())
     assert {"table", "caption", "th", "td"} <= found.tags

@@ -80,12 +80,12 @@ def milliseconds(value: float | None) -> str:
 
 
 def html_of(text: str) -> str:
-    """Lines of text, `name: value`, as a table for a notebook; the first line is its caption."""
+    """Lines of text, `name: value` or `name   value`, as a table; the first line is its caption."""
     caption, *lines = text.splitlines()
     rows: list[tuple[str, ...]] = []
     for line in lines:
-        name, colon, value = line.strip().partition(": ")
-        rows.append((name, value) if colon else ("", line.strip()))
+        parts = re.split(r": | {2,}", line.strip(), maxsplit=1)
+        rows.append((parts[0], parts[1]) if len(parts) == 2 else ("", parts[0]))
     return Table(caption, (), tuple(rows), words=True).to_html()
 
 

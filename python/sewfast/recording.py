@@ -136,6 +136,14 @@ class Recording:
             return
         write_table(path, self.columns(), units=UNITS)
 
+    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
+        """Draw command and speed over time, and their spectra: `Dataset.plot`."""
+        return self.dataset().plot(ax, file=file)
+
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        return self.dataset()._repr_html_()
+
     def __repr__(self) -> str:
         return f"Recording({self.name!r}, {len(self)} samples, Ts={self.Ts:g} s)"
 

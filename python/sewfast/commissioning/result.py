@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from ..control.controller import Controller
+from ..errors import SettingError
 from ..evidence import Line, ReportCard
 from ..models import Ensemble
+from ..plotting import Trace, html_of, loop_drawing
 from ..recording import Recording
 from ..rules import Fopdt
 from ..trust import Judgement
@@ -170,6 +172,56 @@ class Commissioning:
         from .folder import write
 
         return write(self, Path(folder), overwrite=overwrite)
+
+    def plot(
+        self,
+        reference: str | None = None,
+        ax: Any = None,
+        *,
+        file: str | os.PathLike[str] | None = None,
+    ) -> Any:
+        """Draw the loop as predicted beside that of the machine: output, error, command.
+
+        Parameters
+        ----------
+        reference : str, optional
+            One of `comparisons`; by default the first.
+        ax : Axes or sequence of Axes, optional
+            One shows the output, further ones the error and the command.
+        file : path, optional
+            Where to write the figure: PNG, SVG or PDF by its ending.
+
+        Returns
+        -------
+        Axes or array of Axes
+            `ax`, or the three panels of a new figure.
+
+        Raises
+        ------
+        SettingError
+            For another reference, or where it ended before any loop was predicted; where matplotlib
+            is not installed or the file cannot be written.
+        """
+        found = {c.reference: c for c in self.comparisons}
+        name = next(iter(found), None) if reference is None else reference
+        if name not in found:
+            raise SettingError(
+                f"expected one of the references {', '.join(found) or 'none, as it ended before'}"
+                f", got {reference!r}"
+            )
+        shown = found[name]
+        kinds = {"model": ("predicted", shown.predicted), "machine": ("measured", shown.measured)}
+        traces = [
+            Trace.of(run.columns(), look, label)
+            for look, (label, run) in kinds.items()
+            if run is not None
+        ]
+        units = shown.predicted.units
+        return loop_drawing(traces, units["y"], units["u"]).plot(ax, file)
+
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        return html_of(str(self))
 
     def __str__(self) -> str:
         lines = [f"commissioning of {self.machine}: {self.verdict}"]

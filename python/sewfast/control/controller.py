@@ -11,6 +11,7 @@ from typing import Any
 from .. import _core, storage
 from ..errors import ModelFileError, SettingError, SewfastError
 from ..gains import Gains, real, whole
+from ..plotting import html_of
 from ..storage import Fields
 from ..units import counts_per_unit
 
@@ -177,6 +178,10 @@ class Controller:
             "counts_per_rev": self.counts_per_rev,
             "notes": self.notes,
         }
+
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        return html_of(str(self))
 
     def __str__(self) -> str:
         u, y = self.gains.u_unit or "u", self.gains.y_unit or "y"
