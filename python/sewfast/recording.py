@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -148,8 +148,14 @@ class Recording:
         return f"Recording({self.name!r}, {len(self)} samples, Ts={self.Ts:g} s)"
 
 
+class Excited(Protocol):
+    """A machine that plays commands by itself, such as a `sewfast.commissioning.SteppedBench`."""
+
+    def excite(self, u: FloatArray, name: str) -> Recording: ...
+
+
 def record(
-    machine: VirtualMachine | Drive,
+    machine: VirtualMachine | Drive | Excited,
     u: ArrayLike,
     *,
     name: str = "array",
@@ -163,9 +169,10 @@ def record(
 
     Parameters
     ----------
-    machine : VirtualMachine or Drive
+    machine : VirtualMachine, Drive or a machine of your own
         A virtual machine is reset first, and left where the run ends. A drive (`sewfast.link`)
-        waits for rest, is armed and started; its limits must have been set.
+        waits for rest, is armed and started; its limits must have been set. One of your own, a
+        simulator or an FMU, stands in a `sewfast.commissioning.SteppedBench`.
     u : array, shape (N,)
         Command [V] at the machine's sample time; see `sewfast.signals.excitation`.
     name : str
@@ -201,7 +208,9 @@ def record(
     Interrupted
         On Ctrl-C, of a drive; the motor is stopped, `best` is the recording up to there.
     """
-    if not isinstance(machine, VirtualMachine) and not hasattr(machine, "stream"):
+    if not isinstance(machine, VirtualMachine) and not (
+        hasattr(machine, "stream") or hasattr(machine, "excite")
+    ):
         raise SettingError(
             f"expected a VirtualMachine or a Drive to record, got {type(machine).__name__}; the "
             "machine comes first: record(machine, u)"
@@ -219,10 +228,17 @@ def record(
         raise DataError(
             f"expected an excitation of shape (N,), received {command.shape}; pass one column"
         )
-    if not isinstance(machine, VirtualMachine):
-        return _record_on(machine, command, name, method, file, live, settings, overwrite)
+    if hasattr(machine, "stream"):
+        return _record_on(
+            cast("Drive", machine), command, name, method, file, live, settings, overwrite
+        )
     if file is not None:
         require_replaceable(file, overwrite=overwrite)
+    if not isinstance(machine, VirtualMachine):
+        found = cast(Excited, machine).excite(command, name)
+        if file is not None:
+            found.save(file, overwrite=overwrite)
+        return found
     machine.reset()
     run = machine.run(command)
     y = speed_from_counts(run.counts, machine.Ts, machine.counts_per_rev, method=method)

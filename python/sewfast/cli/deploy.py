@@ -9,9 +9,10 @@ from .arguments import Commands, add_command
 from .output import print_json
 
 DEPLOY = """\
-Write a model or a controller as code: C99 without heap, C library or global state, or IEC 61131-3
-structured text; a model also as ONNX. Beside the C lie a test that compares its results with those
-of sewfast, bit by bit, and what CMake, PlatformIO and Zephyr ask for.
+Write a model or a controller as code: C99 without heap, C library or global state; IEC 61131-3
+structured text; a co-simulation FMU (FMI 3.0); a model also as ONNX. Beside the C lie a test that
+compares its results with those of sewfast, bit by bit, and what CMake, PlatformIO and Zephyr ask
+for.
 """
 
 EXAMPLES = """\
@@ -20,6 +21,7 @@ examples:
   sewfast deploy drive.json firmware --name plant     the model: plant.c, plant.h
   sewfast deploy controller.json simulation --precision f64
   sewfast deploy controller.json plc --to st          a function block for a PLC
+  sewfast deploy drive.json fmu --to fmi              for Simulink, Modelica tools, FMPy
   sewfast deploy drive.json graphs --to onnx          one step, and a batch of free runs
 
 try it:  cc -std=c99 firmware/controller.c firmware/controller_test.c && ./a.out
@@ -29,19 +31,19 @@ try it:  cc -std=c99 firmware/controller.c firmware/controller_test.c && ./a.out
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "deploy", deploy_command,
-        summary="a model or controller as C99, structured text or ONNX",
+        summary="a model or controller as C99, PLC code, FMU or ONNX",
         text=DEPLOY, examples=EXAMPLES,
     )  # fmt: skip
     parser.add_argument("file", metavar="FILE.json", help="model or controller")
     parser.add_argument("folder", metavar="DIR", type=Path, help="folder for the code")
     parser.add_argument(
         "--to",
-        choices=("c99", "st", "onnx"),
+        choices=("c99", "st", "fmi", "onnx"),
         default="c99",
-        help="C99, structured text or ONNX (c99)",
+        help="C99, structured text, FMU or ONNX (c99)",
     )
     parser.add_argument(
-        "--precision", choices=("f32", "f64"), help="of the arithmetic (f32; f64 for onnx)"
+        "--precision", choices=("f32", "f64"), help="of the arithmetic (f32; f64 for fmi, onnx)"
     )
     parser.add_argument(
         "--name", dest="prefix", metavar="NAME",

@@ -2,6 +2,7 @@
 
 from .bench import Bench, Followed, Stepped, SteppedBench
 from .demands import Refusal
+from .fmu import FmuMachine, fmu_bench
 from .procedure import STAGES, commission
 from .result import Commissioning
 from .training import Rival
@@ -12,10 +13,12 @@ __all__ = [
     "Bench",
     "Commissioning",
     "Comparison",
+    "FmuMachine",
     "Followed",
     "Refusal",
     "Rival",
     "Stepped",
     "SteppedBench",
     "commission",
+    "fmu_bench",
 ]

@@ -289,7 +289,13 @@ def run(
     beside = _beside(on, feedforward, disturbance)
     if not isinstance(on, (Model, VirtualMachine)):
         drive = _require_follower(on)
-        return drive.follow(controller, r, name=title, file=file, live=live, overwrite=overwrite)
+        if hasattr(drive, "excite"):  # a machine of the user's own, which says what it saw as well
+            found: ClosedLoopRun = drive.follow(controller, r, title).run
+        else:
+            found = drive.follow(
+                controller, r, name=title, file=file, live=live, overwrite=overwrite
+            )
+        return found
     check_fits(controller, on)
     record = _core.closed_loop(
         single_core(on),
@@ -354,14 +360,13 @@ def require_controller(controller: Any, plant: Any, call: str) -> None:
     )
 
 
-def _require_follower(on: Any) -> Follower:
+def _require_follower(on: Any) -> Any:
     if not hasattr(on, "follow"):
         raise SettingError(
             "expected a Model, a VirtualMachine or a Drive to run on, got "
             f"{type(on).__name__}; load a model with load_model, or connect to a drive"
         )
-    drive: Follower = on
-    return drive
+    return on
 
 
 def reference_samples(

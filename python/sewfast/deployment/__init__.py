@@ -1,6 +1,7 @@
 """Models and controllers as code for other processors and tools.
 
-`deploy` writes a folder: C99 with a test against the step of this package, structured text, ONNX.
+`deploy` writes a folder: C99 with a test against the step of this package, structured text, FMU,
+ONNX.
 """
 
 from __future__ import annotations
@@ -15,15 +16,16 @@ from ..control import Controller
 from ..errors import SettingError
 from ..models import Model
 from ..storage import replace
-from . import c99, onnx, structured_text
+from . import c99, fmi, onnx, structured_text
 
-TARGETS = ("c99", "st", "onnx")
+TARGETS = ("c99", "st", "fmi", "onnx")
 PRECISIONS = ("f32", "f64")
 
 _Writer = Callable[[Model | Controller, str, str], tuple[Mapping[str, str | bytes], list[str]]]
 _WRITERS: dict[str, _Writer] = {
     "c99": c99.files,
     "st": structured_text.files,
+    "fmi": fmi.files,
     "onnx": onnx.files,
 }
 
@@ -68,12 +70,13 @@ def deploy(
         PID in all its forms.
     folder : path
         Made if it is not there. Files of the same names are replaced, each as a whole.
-    to : {"c99", "st", "onnx"}
+    to : {"c99", "st", "fmi", "onnx"}
         C99 without heap, libm, recursion or global state; IEC 61131-3 structured text, of a
-        controller only; ONNX, of a model only.
+        controller only; a co-simulation FMU of FMI 3.0, for which a C compiler is needed; ONNX, of
+        a model only.
     precision : {"f32", "f64"}, optional
-        Of the arithmetic: f32 by default, f64 for ONNX. A microcontroller that computes only single
-        precision in hardware takes some fifty times as long for `f64`.
+        Of the arithmetic: f32 by default, f64 for FMI and ONNX. A microcontroller that computes
+        only single precision in hardware takes some fifty times as long for `f64`.
     name : str, optional
         With which every name in the code begins; `controller` or `model` where there is none.
 
@@ -96,7 +99,7 @@ def deploy(
     if to not in TARGETS:
         raise SettingError(f"to: expected one of {', '.join(TARGETS)}, received {to!r}")
     if precision is None:
-        precision = "f64" if to == "onnx" else "f32"
+        precision = "f64" if to in ("fmi", "onnx") else "f32"
     if precision not in PRECISIONS:
         raise SettingError(f"precision: expected {' or '.join(PRECISIONS)}, received {precision!r}")
     if name is None:

@@ -47,7 +47,7 @@ _LICENCE = "The code in this file may be used under MIT, Apache-2.0 or 0BSD, as 
 
 def files(what: Model | Controller, name: str, precision: str) -> tuple[dict[str, str], list[str]]:
     """The texts of all files by their names, and what is to be said of them."""
-    code = _Code(name, precision)
+    code = Code(name, precision)
     if isinstance(what, Controller):
         header, source, vectors, notes = _controller(what, code)
     else:
@@ -62,7 +62,7 @@ def files(what: Model | Controller, name: str, precision: str) -> tuple[dict[str
 
 
 @dataclass(frozen=True)
-class _Code:
+class Code:
     """A name and a number type, and how both are written in C."""
 
     name: str
@@ -114,7 +114,7 @@ class _Code:
         """The hyperbolic tangent of the core, with its coefficients."""
         values: dict[str, str] = {}
         for name, (numerator, denominator, end) in _core.tanh_quotients().items():
-            wide = _Code(self.name, "f32" if name == "single" else "f64")
+            wide = Code(self.name, "f32" if name == "single" else "f64")
             values[f"{name.upper()}_P"] = wide.literals(numerator, " " * 12)
             values[f"{name.upper()}_Q"] = wide.literals(denominator, " " * 12)
             values[f"{name.upper()}_END"] = wide.literal(end)
@@ -148,7 +148,7 @@ def _safe(text: str) -> str:
 # --- Models ---------------------------------------------------------------------------------------
 
 
-def _model(model: Model, code: _Code) -> tuple[str, str, str, list[str]]:
+def _model(model: Model, code: Code) -> tuple[str, str, str, list[str]]:
     members, embedded, combined = embedded_members(model, code.precision)
     functions = ", ".join(f"{code.name}_{f}" for f in ("init", "begin", "step"))
     notes = [f"{model.title} as C99 in {code.real}: {functions}"]
@@ -286,7 +286,7 @@ def _require_single(
 
 
 def _model_header(
-    model: Model, code: _Code, embedded: list[_core.EmbeddedModel], about: list[str]
+    model: Model, code: Code, embedded: list[_core.EmbeddedModel], about: list[str]
 ) -> str:
     memories, fields = "", ""
     for prefix, e in zip(_prefixes(code, embedded), embedded, strict=True):
@@ -297,25 +297,25 @@ def _model_header(
         "model.h",
         INPUTS=str(len(model.input_names)),
         STATES=str(sum(e.orders["na"] for e in embedded)),
-        TS=_Code(code.name, "f64").literal(model.Ts),
+        TS=Code(code.name, "f64").literal(model.Ts),
         MEMORIES=memories,
         FIELDS=fields,
     )
     return code.framed("frame.h", code.opening(f"{code.name}: an identified model", about), body)
 
 
-def _prefixes(code: _Code, embedded: list[_core.EmbeddedModel]) -> list[str]:
+def _prefixes(code: Code, embedded: list[_core.EmbeddedModel]) -> list[str]:
     if len(embedded) == 1:
         return [code.name]
     return [f"{code.name}_{i}" for i in range(len(embedded))]
 
 
-def _member_name(prefix: str, code: _Code) -> str:
+def _member_name(prefix: str, code: Code) -> str:
     return "only" if prefix == code.name else f"member_{prefix.rsplit('_', 1)[1]}"
 
 
 def _model_source(
-    code: _Code,
+    code: Code,
     members: list[Model],
     embedded: list[_core.EmbeddedModel],
     combined: str,
@@ -335,7 +335,7 @@ def _model_source(
     return code.framed("frame.c", opening, "\n".join(parts))
 
 
-def _member(code: _Code, prefix: str, e: _core.EmbeddedModel) -> str:
+def _member(code: Code, prefix: str, e: _core.EmbeddedModel) -> str:
     orders, upper = e.orders, prefix.upper()
     sizes = {"NB": orders["nb"], "NK": orders["nk"], "KEPT": _kept(e), "NA": orders["na"]}
     if e.kind == "network":
@@ -383,7 +383,7 @@ def _signed(literal: str) -> str:
 
 
 def _whole(
-    code: _Code,
+    code: Code,
     prefixes: list[str],
     members: list[Model],
     embedded: list[_core.EmbeddedModel],
@@ -412,7 +412,7 @@ def _whole(
 
 def _model_test(
     model: Model,
-    code: _Code,
+    code: Code,
     members: list[Model],
     embedded: list[_core.EmbeddedModel],
     combined: str,
@@ -424,7 +424,7 @@ def _model_test(
     return _test(code, "test_model.c", {"u": u.ravel(), "y": y})
 
 
-def _test(code: _Code, file: str, vectors: Mapping[str, FloatArray]) -> str:
+def _test(code: Code, file: str, vectors: Mapping[str, FloatArray]) -> str:
     opening = code.opening(
         f"A test of {code.name}: its results are compared with those of sewfast, to the last bit.",
         ["Returns 0 where all are equal."],
@@ -438,7 +438,7 @@ def _test(code: _Code, file: str, vectors: Mapping[str, FloatArray]) -> str:
 # --- The controller -------------------------------------------------------------------------------
 
 
-def _controller(controller: Controller, code: _Code) -> tuple[str, str, str, list[str]]:
+def _controller(controller: Controller, code: Code) -> tuple[str, str, str, list[str]]:
     core: Any = controller.core()
     core = core.single() if code.single else core
     numbers: dict[str, Any] = core.numbers
@@ -464,11 +464,11 @@ def _controller(controller: Controller, code: _Code) -> tuple[str, str, str, lis
 
 
 def _controller_header(
-    controller: Controller, code: _Code, numbers: Mapping[str, Any], about: list[str]
+    controller: Controller, code: Code, numbers: Mapping[str, Any], about: list[str]
 ) -> str:
     body = code.template(
         "pid.h",
-        TS=_Code(code.name, "f64").literal(controller.Ts),
+        TS=Code(code.name, "f64").literal(controller.Ts),
         SAMPLES=str(numbers["samples"]),
         UNIT_U=_safe(controller.gains.u_unit or "u"),
         UNIT_Y=_safe(controller.gains.y_unit or "y"),
@@ -477,7 +477,7 @@ def _controller_header(
     return code.framed("frame.h", opening, body)
 
 
-def _controller_source(code: _Code, numbers: Mapping[str, Any], about: list[str]) -> str:
+def _controller_source(code: Code, numbers: Mapping[str, Any], about: list[str]) -> str:
     def number(name: str) -> str:
         return _signed(code.literal(numbers[name]))
 
@@ -504,7 +504,7 @@ def _controller_source(code: _Code, numbers: Mapping[str, Any], about: list[str]
     return code.framed("frame.c", opening, body)
 
 
-def _gains(code: _Code, numbers: Mapping[str, Any]) -> str:
+def _gains(code: Code, numbers: Mapping[str, Any]) -> str:
     """The body of the function that gives a sample's gains."""
     rows = numbers["rows"]
     if not rows:
@@ -523,13 +523,13 @@ def _gains(code: _Code, numbers: Mapping[str, Any]) -> str:
     )
 
 
-def _controller_test(controller: Controller, code: _Code, core: Any) -> str:
+def _controller_test(controller: Controller, code: Code, core: Any) -> str:
     r, y = _signals(controller, _VECTORS, code)
     u = np.array([core.step(float(a), float(b)) for a, b in zip(r, y, strict=True)])
     return _test(code, "test_pid.c", {"r": r, "y": y, "u": u})
 
 
-def _signals(controller: Controller, count: int, code: _Code) -> tuple[FloatArray, FloatArray]:
+def _signals(controller: Controller, count: int, code: Code) -> tuple[FloatArray, FloatArray]:
     """Reference and measurement about the size at which the proportional term spans the limits."""
     rng = np.random.default_rng(0)
     gains = controller.gains.to("standard")

@@ -1,0 +1,314 @@
+"""A co-simulation FMU as a machine: a plant from Modelica, Simulink or any other tool.
+
+FMPy loads it. An FMU is a program: what is loaded runs on this computer with the user's rights.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import tempfile
+import weakref
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from ..errors import ModelFileError, SettingError
+from .bench import SteppedBench
+
+MOST_BYTES = 2 * 1024**3
+"""Of all files of an FMU, unpacked."""
+MOST_FILES = 20_000
+MOST_XML = 64 * 1024**2
+"""Bytes of a model description."""
+_TURNS = {"rad": 1.0 / (2.0 * math.pi), "deg": 1.0 / 360.0, "turn": 1.0, "rev": 1.0}
+_RPM = {
+    "RPM": 1.0, "rpm": 1.0, "1/min": 1.0, "rev/min": 1.0, "rad/s": 30.0 / math.pi,
+    "deg/s": 1.0 / 6.0, "rev/s": 60.0, "Hz": 60.0,
+}  # fmt: skip
+
+
+class FmuMachine:
+    """A co-simulation FMU that is advanced one sample at a time (`sewfast.commissioning.Stepped`).
+
+    Parameters
+    ----------
+    path : path
+        FMU of version 1.0, 2.0 or 3.0 with a binary for this platform.
+    Ts : float
+        Sample time [s]; the FMU is asked for steps of it.
+    input : str
+        Variable that takes the command.
+    speed, angle, counts : str, optional
+        Variables to measure, at least one. Counts are read as they are, else made from the angle,
+        else from the integral of the speed.
+    speed_unit, angle_unit : str, optional
+        Units of those where the FMU states none: `RPM`, `rad/s`, `deg/s`, `rev/s`; `rad`, `deg`,
+        `rev`.
+    counts_per_rev : float
+        Encoder counts of one turn.
+    start : mapping, optional
+        Values of further variables at the beginning.
+
+    Raises
+    ------
+    ModelFileError
+        For a file that is no FMU, is damaged, hostile or for another platform.
+    SettingError
+        For variables that are not there, units that are not known, and without FMPy.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        Ts: float,
+        input: str,
+        counts_per_rev: float,
+        speed: str | None = None,
+        angle: str | None = None,
+        counts: str | None = None,
+        speed_unit: str | None = None,
+        angle_unit: str | None = None,
+        start: Mapping[str, float] | None = None,
+    ) -> None:
+        self.path = Path(path)
+        self.Ts, self.counts_per_rev = float(Ts), float(counts_per_rev)
+        if not (self.Ts > 0.0 and math.isfinite(self.Ts)):
+            raise SettingError(f"Ts: expected a time above 0 s, received {Ts!r}; 0.001 is usual")
+        _require_fmu(self.path)
+        self._fmpy = _library()
+        self._folder = tempfile.mkdtemp(prefix="sewfast-fmu-")
+        weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+        self._description = self._described()
+        self._variables = {v.name: v for v in self._description.modelVariables}
+        if speed is None and angle is None and counts is None:
+            raise SettingError(
+                f"{self.path}: expected a variable to measure, received none; give speed=, angle= "
+                f"or counts=, one of {self._names('output')}"
+            )
+        self._input = self._reference(input)
+        self._counts = None if counts is None else self._reference(counts)
+        self._angle = None if angle is None else self._reference(angle)
+        self._speed = None if speed is None else self._reference(speed)
+        self._turns = self._factor(angle, angle_unit, _TURNS, "angle_unit")
+        self._rpm = self._factor(speed, speed_unit, _RPM, "speed_unit")
+        self._start = {self._reference(n): float(v) for n, v in (start or {}).items()}
+        self._fmu: Any = None
+        self._sample = 0
+        self._turned = 0.0
+        self._before = 0.0
+        self.reset()
+
+    def _described(self) -> Any:
+        try:
+            with zipfile.ZipFile(self.path) as archive:
+                archive.extractall(self._folder)
+            found = self._fmpy.read_model_description(self._folder)
+        except Exception as error:
+            said = str(error).strip().splitlines()
+            raise ModelFileError(
+                f"{self.path}: expected an FMU whose model description is valid, got "
+                f"{said[0][:200] if said else type(error).__name__}; export it again"
+            ) from error
+        if found.coSimulation is None:
+            raise ModelFileError(
+                f"{self.path}: expected an FMU for co-simulation, got one for model exchange only; "
+                "export it for co-simulation, with its solver"
+            )
+        own, present = self._fmpy.platform, self._fmpy.supported_platforms(self._folder)
+        tuple_name = getattr(self._fmpy, "platform_tuple", own)
+        if not {own, tuple_name} & set(present):
+            got = ", ".join(present) or "none"
+            raise ModelFileError(
+                f"{self.path}: expected a binary for {tuple_name}, got {got}; export it for this "
+                "platform, or compile its sources"
+            )
+        return found
+
+    def _names(self, causality: str) -> str:
+        names = [v.name for v in self._variables.values() if v.causality == causality]
+        names = names or list(self._variables)
+        return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+
+    def _reference(self, name: str) -> int:
+        found = self._variables.get(name)
+        if found is None or found.type not in ("Real", "Float64"):
+            got = "none" if found is None else f"one of type {found.type}"
+            raise SettingError(
+                f"{self.path}: expected a real variable {name!r}, got {got}; it has inputs "
+                f"{self._names('input')} and outputs {self._names('output')}"
+            )
+        return int(found.valueReference)
+
+    def _factor(
+        self, name: str | None, unit: str | None, known: Mapping[str, float], option: str
+    ) -> float:
+        if name is None:
+            return 1.0
+        unit = unit or self._variables[name].unit
+        if unit not in known:
+            raise SettingError(
+                f"{self.path}: expected the unit of {name} as one of {', '.join(known)}, got "
+                f"{unit or 'none'}; give {option}="
+            )
+        return known[unit]
+
+    def reset(self) -> None:
+        """A new run: the FMU is begun again."""
+        self.close()
+        version = self._description.fmiVersion
+        fmu = self._fmpy.instantiate_fmu(self._folder, self._description, "CoSimulation")
+        for reference, value in self._start.items():
+            self._set(fmu, reference, value)
+        if version.startswith("1."):
+            fmu.initialize()
+        else:
+            if version.startswith("2."):
+                fmu.setupExperiment(startTime=0.0)
+            fmu.enterInitializationMode()
+            self._set(fmu, self._input, 0.0)
+            fmu.exitInitializationMode()
+        self._fmu, self._sample, self._turned = fmu, 0, 0.0
+        self._before = self.speed_rpm if self._speed is not None else 0.0
+
+    def step(self, u: float) -> None:
+        """Hold a command for one sample.
+
+        Raises
+        ------
+        SettingError
+            Where the FMU refuses the step.
+        """
+        self._set(self._fmu, self._input, u)
+        try:
+            self._fmu.doStep(self._sample * self.Ts, self.Ts)
+        except Exception as error:
+            raise SettingError(
+                f"{self.path}: expected a step of {self.Ts:g} s from {self._sample * self.Ts:g} s, "
+                f"got {error}; give a Ts that its solver can do"
+            ) from error
+        self._sample += 1
+        if self._speed is not None:
+            now = self.speed_rpm
+            self._turned += 0.5 * (self._before + now) * self.Ts / 60.0
+            self._before = now
+
+    @property
+    def counts(self) -> float:
+        """What the encoder shows."""
+        if self._counts is not None:
+            return self._get(self._counts)
+        turned = self._turned if self._angle is None else self._get(self._angle) * self._turns
+        return math.floor(turned * self.counts_per_rev)
+
+    @property
+    def speed_rpm(self) -> float:
+        """True speed [RPM]; not a number where the FMU does not show it."""
+        return math.nan if self._speed is None else self._get(self._speed) * self._rpm
+
+    def close(self) -> None:
+        """Free the FMU; the next `reset` begins it again."""
+        if self._fmu is not None:
+            fmu, self._fmu = self._fmu, None
+            fmu.terminate()
+            fmu.freeInstance()
+
+    def _get(self, reference: int) -> float:
+        three = self._description.fmiVersion.startswith("3.")
+        values = (self._fmu.getFloat64 if three else self._fmu.getReal)([reference])
+        return float(values[0])
+
+    def _set(self, fmu: Any, reference: int, value: float) -> None:
+        three = self._description.fmiVersion.startswith("3.")
+        (fmu.setFloat64 if three else fmu.setReal)([reference], [value])
+
+
+def fmu_bench(
+    path: str | os.PathLike[str],
+    *,
+    input: str,
+    volt: float,
+    Ts: float = 0.001,
+    counts_per_rev: float = 4096.0,
+    limit: float = math.inf,
+    **variables: Any,
+) -> SteppedBench:
+    """A co-simulation FMU as a machine for `record`, `run` and `commission`.
+
+    Parameters
+    ----------
+    path, Ts, input, counts_per_rev
+        As of `FmuMachine`.
+    volt : float
+        Largest command that it takes to either side; larger ones are clipped.
+    limit : float
+        Speed beyond which it stops by itself [RPM].
+    **variables
+        Further arguments of `FmuMachine`: `speed`, `angle`, `counts`, units, `start`.
+
+    Returns
+    -------
+    SteppedBench
+
+    Raises
+    ------
+    ModelFileError, SettingError
+        As `FmuMachine`.
+    """
+    machine = FmuMachine(path, Ts=Ts, input=input, counts_per_rev=counts_per_rev, **variables)
+    return SteppedBench(machine, Ts, counts_per_rev, volt, Path(path).stem, limit)
+
+
+def _library() -> Any:
+    try:
+        import fmpy
+    except ImportError as error:
+        raise SettingError(
+            "expected the FMPy package to run an FMU, got none; pip install 'sewfast[fmi]'"
+        ) from error
+    return fmpy
+
+
+def _require_fmu(path: Path) -> None:
+    """Refuse what is no FMU or would do harm as it is unpacked; nothing of it is executed."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+            described = [e for e in entries if e.filename == "modelDescription.xml"]
+            if len(described) != 1 or described[0].file_size > MOST_XML:
+                raise ModelFileError(
+                    f"{path}: expected an FMU with one modelDescription.xml, got {len(described)}; "
+                    "export it again"
+                )
+            with archive.open(described[0]) as file:
+                text = file.read(MOST_XML)
+    except ModelFileError:
+        raise
+    except OSError as error:
+        raise ModelFileError(
+            f"{path}: cannot be read ({error.strerror or error}); check the name"
+        ) from error
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError, EOFError) as error:
+        raise ModelFileError(
+            f"{path}: expected an FMU, which is a zip file, got {error}; export it again"
+        ) from error
+    if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
+        raise ModelFileError(
+            f"{path}: expected a model description without entities, got some; an FMU needs none"
+        )
+    size = sum(e.file_size for e in entries)
+    if size > MOST_BYTES or len(entries) > MOST_FILES:
+        raise ModelFileError(
+            f"{path}: expected at most {MOST_FILES} files of {MOST_BYTES} bytes, got "
+            f"{len(entries)} of {size}; export it without what is not needed"
+        )
+    for entry in entries:
+        place = PurePosixPath(entry.filename.replace("\\", "/"))
+        link = entry.external_attr >> 28 == 0xA
+        if place.is_absolute() or ".." in place.parts or ":" in entry.filename or link:
+            raise ModelFileError(
+                f"{path}: expected files within the FMU, got {entry.filename[:80]!r}; do not use it"
+            )
