@@ -1,15 +1,24 @@
-"""`sewfast check`: whether a model can be trusted on a recording."""
+"""`sewfast check`, `compare` and `analyse`: whether to trust a model, and a controller on it."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from .arguments import Commands, add_columns, add_command, add_split, add_weights, require_plot
-from .data import read_for_model
-from .models import whole
-from .output import print_json
-from .preparation import add_preparation, masked, prepared
+from ..errors import SettingError
+from .arguments import (
+    Commands,
+    add_columns,
+    add_command,
+    add_plot,
+    add_split,
+    add_weights,
+    require_plot,
+)
+from .control import plant_of, reference_of
+from .data import add_preparation, masked, prepared, read_for_model
+from .identify import whole
+from .output import print_json, print_result
 
 CHECK = """\
 The report card of a model on a recording, best one that it was not trained on: errors in free run
@@ -90,3 +99,143 @@ def check_command(args: argparse.Namespace) -> None:
     print(card)
     for path in written:
         print(f"written to {path}")
+
+
+# --- `sewfast analyse`: what a controller does on models, and what it would do on slightly others -
+
+
+ANALYSE = """\
+A controller on models (every member of an ensemble) or on the virtual machine: margins over the
+operating range, steps of the reference and of a disturbance, what gains that are a little off and
+plants that are not as identified would cost, and what speaks against the simulated loops.
+"""
+
+ANALYSE_EXAMPLES = """\
+examples:
+  sewfast analyse controller.json drive.json
+  sewfast analyse controller.json drive.json --plot loop.png      steps and Bode in one picture
+  sewfast analyse controller.json drive.json --out analysis       figures and analysis.json
+  sewfast analyse controller.json one.json two.json virtual --json
+  sewfast analyse controller.json drive.json --speed 300 --speed 1500 --reference cycle.csv
+"""
+
+
+def add_analyse(commands: Commands) -> None:
+    parser = add_command(
+        commands, "analyse", analyse_command,
+        summary="margins, steps, sensitivities of a controller", text=ANALYSE,
+        examples=ANALYSE_EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument("controller", metavar="CONTROLLER.json", help="file that tune wrote")
+    parser.add_argument(
+        "plants", metavar="MODEL.json|virtual[:SEED]", nargs="+", help="what to analyse it on"
+    )
+    parser.add_argument(
+        "--speed", action="append", type=float, metavar="Y",
+        help="output about which the plants are linearised; may repeat (three over the training "
+        "data)",
+    )  # fmt: skip
+    parser.add_argument("--step", type=float, metavar="Y", help="size of the reference step")
+    parser.add_argument(
+        "--disturbance", type=float, metavar="U", help="size of the step at the plant's input"
+    )
+    parser.add_argument(
+        "--seconds", type=float, metavar="S", help="how long the steps are looked at"
+    )
+    parser.add_argument(
+        "--reference", action="append", metavar="FILE|NAME",
+        help="what the cost is taken over; may repeat (trapezoid, random)",
+    )  # fmt: skip
+    add_plot(parser, "draw steps, loop transfer and sensitivities")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, help="folder for analysis.json and the figures"
+    )
+
+
+def analyse_command(args: argparse.Namespace) -> None:
+    from ..analysis import analyse
+    from ..control.controller import load_controller
+
+    require_plot(args.plot)
+    controller = load_controller(args.controller)
+    references = [
+        reference_of(text, controller.Ts, controller.gains.y_unit) for text in args.reference or ()
+    ]
+    found = analyse(
+        controller,
+        [plant_of(text) for text in args.plants],
+        speeds=args.speed,
+        step=args.step,
+        disturbance=args.disturbance,
+        seconds=args.seconds,
+        references=references or None,
+    )
+    written = found.save(args.out) if args.out is not None else []
+    if args.plot is not None:
+        found.plot(file=args.plot)
+        written.append(args.plot)
+    if args.json:
+        print_json({**found.to_json(), **({"files": list(map(str, written))} if written else {})})
+        return
+    print(found)
+    for path in written:
+        print(f"written to {path}")
+
+
+# --- `sewfast compare`: several models on one recording -------------------------------------------
+
+
+COMPARE = """\
+Score several models on the same recording, best one that none of them was trained on: free run
+(the headline), one step ahead, number of parameters. Columns are those of the first model.
+"""
+
+COMPARE_EXAMPLES = """\
+examples:
+  sewfast compare network.json linear.json other.csv
+  sewfast compare network.json linear.json other.csv --plot both.png
+  sewfast compare drive.json drive-alternative-*.json run.csv --range 5000:8334 --json
+"""
+
+
+def add_compare(commands: Commands) -> None:
+    parser = add_command(
+        commands, "compare", compare_command,
+        summary="several models on a recording", text=COMPARE, examples=COMPARE_EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument(
+        "models", nargs="+", metavar="MODEL.json", help="model file that identify wrote"
+    )
+    parser.add_argument("data", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
+    parser.add_argument(
+        "--init", type=whole, default=20, metavar="N",
+        help="first samples, which set the initial state and are not scored (20); 0: from rest",
+    )  # fmt: skip
+    parser.add_argument(
+        "--range", metavar="A:B", help="samples to score, 0-based, end excluded; default: all"
+    )
+    add_plot(parser, "draw measured output, free runs and errors")
+    add_columns(parser, from_model=True)
+    add_weights(parser)
+    add_split(parser)
+    add_preparation(parser)
+
+
+def compare_command(args: argparse.Namespace) -> None:
+    from ..comparison import compare
+    from ..models import load_model
+
+    require_plot(args.plot)
+    names = [Path(path).stem for path in args.models]
+    if len(set(names)) < len(names):
+        names = list(args.models)
+    if len(set(names)) < len(names):
+        raise SettingError("expected different models, received one of them twice")
+    models = {name: load_model(path) for name, path in zip(names, args.models, strict=True)}
+    data, _ = read_for_model(args.data, models[names[0]], args)
+    data = masked(data, args)
+    part = prepared(data if args.range is None else data.slice(args.range), args, cut=True)
+    found = compare(models, data=part, init=args.init)
+    if args.plot is not None:
+        found.plot(file=args.plot)
+    print_result(found, args, plot=args.plot)

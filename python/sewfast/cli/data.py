@@ -1,4 +1,4 @@
-"""DATA arguments -> `Dataset`."""
+"""DATA arguments -> `Dataset`, prepared; `sewfast look`."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from ..errors import DataError, SettingError
+from .arguments import Commands, add_columns, add_command, add_plot, require_plot
+from .output import print_json, print_result
 
 if TYPE_CHECKING:
-    from ..dataset import Dataset
+    from ..dataset import ColumnSummary, Dataset
     from ..models import Model
     from ..readers import Table
 
@@ -186,3 +188,186 @@ def _require_apart(train: Dataset, held: Dataset) -> None:
                 f"--train {a.range_text} and --validate {b.range_text} overlap in {a.name}; what a "
                 "model was trained on says nothing about it: give ranges that do not overlap"
             )
+
+
+# --- Options that prepare data before they are used, in the order in which they act ---------------
+
+
+def add_preparation(parser: argparse.ArgumentParser, *, detrend: bool = True) -> None:
+    """`--mask` to `--resample` and, where a model may come of it, `--detrend`."""
+    group = parser.add_argument_group("preparation, in this order")
+    group.add_argument(
+        "--mask", action="append", metavar="A:B", default=[],
+        help="outputs of each file to take out: no weight, no score; repeat it for several ranges; "
+        "outliers: those that stand out of their neighbours",
+    )  # fmt: skip
+    add_hold(group)
+    group.add_argument(
+        "--differentiate", action="store_true",
+        help="the output is a position: take its speed, [deg] becomes [deg/s]",
+    )  # fmt: skip
+    group.add_argument(
+        "--resample", type=float, metavar="TS",
+        help="new sample time [s]; the output is filtered, inputs are averaged as held ones",
+    )  # fmt: skip
+    if detrend:
+        group.add_argument(
+            "--detrend", choices=("0", "1", "steady"),
+            help="take off 0: the mean, 1: a straight line, steady: the level before inputs move",
+        )  # fmt: skip
+
+
+def add_hold(parser: argparse._ActionsContainer) -> None:
+    parser.add_argument(
+        "--hold-inputs", action="store_true",
+        help="take an input that is missing to be the last known one, held",
+    )  # fmt: skip
+
+
+def held(data: Dataset, args: argparse.Namespace) -> Dataset:
+    """The data with missing inputs held, where that is asked for."""
+    before = len(data.notes)
+    data = data.fill_inputs("hold") if args.hold_inputs else data
+    _tell(data, before)
+    return data
+
+
+def masked(data: Dataset, args: argparse.Namespace) -> Dataset:
+    """The data without the outputs that are masked: ranges are of whole files."""
+    before = len(data.notes)
+    for text in args.mask:
+        if text == "outliers":
+            data = data.mask(data.mark_outliers(), why="stand out")
+        else:
+            data = data.mask(text)
+    _tell(data, before)
+    return data
+
+
+def prepared(
+    data: Dataset, args: argparse.Namespace, *, like: Dataset | None = None, cut: bool = False
+) -> Dataset:
+    """The data behind every option; what was done goes to standard error.
+
+    Parameters
+    ----------
+    like : Dataset or None
+        Training data: the mean that was taken off them comes off these as well.
+    cut : bool
+        The data were cut out of masked files already: leaves the mask out.
+    """
+    data = data if cut else masked(data, args)
+    data = held(data, args)
+    before = len(data.notes)
+    if getattr(args, "split_at_gaps", False):
+        data = data.split_at_gaps()
+    if args.differentiate:
+        data = data.differentiate()
+    if args.resample is not None:
+        data = data.resample(args.resample)
+    data = _detrended(data, getattr(args, "detrend", None), like)
+    _tell(data, before)
+    return data
+
+
+def _tell(data: Dataset, before: int) -> None:
+    for note in data.notes[before:]:
+        print(note, file=sys.stderr)
+
+
+def _detrended(data: Dataset, order: str | None, like: Dataset | None) -> Dataset:
+    if order is None:
+        return data
+    if order == "0":
+        return data.detrend(0, like=like)
+    return data.detrend("steady" if order == "steady" else 1)
+
+
+# --- `sewfast look`: what is in recordings before anything is identified from them ----------------
+
+
+LOOK_TEXT = """\
+Say what one should know of recordings before identifying from them: samples, gaps, range, trend,
+quantisation, time at limits, noise, the band that is excited, and what to do about each finding.
+
+Without --input and --output every column of a file is listed, so that the two can be chosen.
+"""
+
+LOOK_EXAMPLES = """\
+examples:
+  sewfast look run.csv                                    which columns are there
+  sewfast look run.csv --input u --output speed
+  sewfast look run.csv --input u --output speed --plot look.png
+  sewfast look run.csv:u:speed other.csv:volt:rpm --json
+  sewfast look run.csv --input u --output speed --resample 0.005 --mask 100:120
+"""
+
+
+def add_look(commands: Commands) -> None:
+    parser = add_command(
+        commands, "look", look_command,
+        summary="what is in recordings", text=LOOK_TEXT, examples=LOOK_EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument("data", nargs="+", metavar="DATA", help="recording: FILE or FILE:IN:OUT")
+    add_plot(parser, "draw columns and spectra")
+    add_columns(parser, from_model=False)
+    add_preparation(parser)
+
+
+def look_command(args: argparse.Namespace) -> None:
+    require_plot(args.plot)
+    tables = [] if args.input or args.output or args.counts else _unnamed_columns(args)
+    if tables:
+        _show_columns(tables, args)
+        return
+    found = prepared(read_training(args), args).summary()
+    if args.plot is not None:
+        found.plot(file=args.plot)
+    print_result(found, args, plot=args.plot)
+
+
+def _unnamed_columns(args: argparse.Namespace) -> list[Table]:
+    """The files, where none says which column is what."""
+    from ..readers import parse_source, read_table
+
+    sources = [parse_source(source) for source in args.data]
+    if any(inputs or output for _, inputs, output in sources):
+        return []
+    tables = [read_table(path) for path, _, _ in sources]
+    return [] if all(t.counts_per_rev is not None for t in tables) else tables
+
+
+def _show_columns(tables: list[Table], args: argparse.Namespace) -> None:
+    if args.plot is not None:
+        raise SettingError(
+            f"--plot: which column is the input, which the output? available: "
+            f"{', '.join(tables[0].names)}; name them: --input COL --output COL"
+        )
+    columns = {str(t.path): _columns(t) for t in tables}
+    if args.json:
+        print_json({path: [vars(c) for c in found] for path, found in columns.items()})
+        return
+    from .output import print_rows
+
+    for table, (path, found) in zip(tables, columns.items(), strict=True):
+        print(f"{path}: {found[0].n if found else 0} rows")
+        header = ("column", "from", "to", "standard deviation", "missing")
+        print_rows([header, *map(_row, found)])
+        for name, reason in table.unusable.items():
+            print(f"not a column of numbers: {name}, {reason}")
+    print("name the input and the output to see more: --input COL --output COL")
+
+
+def _columns(table: Table) -> list[ColumnSummary]:
+    from ..dataset import column_summary
+
+    return [
+        column_summary(name, table.unit(name), "column", [table[name]], None)
+        for name in table.names
+    ]
+
+
+def _row(c: ColumnSummary) -> tuple[str, ...]:
+    from ..dataset import labelled
+
+    return (labelled(c.name, c.unit), *(f"{v:.6g}" for v in (c.low, c.high, c.std)), f"{c.missing}")

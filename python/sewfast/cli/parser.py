@@ -8,24 +8,15 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from . import (
-    analyse,
     check,
     commission,
-    compare,
     completion,
     control,
+    data,
     deploy,
-    device,
-    doctor,
     drive,
-    experiment,
-    files,
     gains,
     identify,
-    look,
-    models,
-    orders,
-    ports,
     recording,
     tune,
 )
@@ -113,30 +104,31 @@ def build_parser() -> argparse.ArgumentParser:
     commands: Commands = parser.add_subparsers(  # type: ignore[assignment]
         title="commands", metavar="COMMAND", dest="name"
     )
-    groups = (
-        experiment,
-        commission,
-        recording,
-        files,
-        look,
-        orders,
-        identify,
-        models,
-        check,
-        compare,
-        gains,
-        tune,
-        control,
-        analyse,
-        deploy,
-        ports,
-        doctor,
-        drive,
-        device,
-        completion,
+    # in the order in which the help shows them
+    makers = (
+        commission.add_demo,
+        commission.add,
+        recording.add,
+        recording.add_files,
+        data.add_look,
+        identify.add_orders,
+        identify.add,
+        identify.add_models,
+        check.add,
+        check.add_compare,
+        gains.add,
+        tune.add,
+        control.add,
+        check.add_analyse,
+        deploy.add,
+        drive.add_ports,
+        drive.add_doctor,
+        drive.add,
+        drive.add_device,
+        completion.add,
     )
-    for group in groups:
-        group.add(commands)
+    for add in makers:
+        add(commands)
     return parser
 
 

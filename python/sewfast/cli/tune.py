@@ -18,8 +18,7 @@ from .arguments import (
     require_plot,
 )
 from .control import reference_of
-from .output import print_json, print_rows
-from .progress import Progress
+from .output import Progress, print_json, print_rows
 
 if TYPE_CHECKING:
     from ..control.controller import Controller
