@@ -1,19 +1,4 @@
-//! Control arithmetic that runs unchanged on a microcontroller, in simulation and against the virtual machine; and the
-//! frames by which such a drive talks to its host.
-//!
-//! No standard library, no allocation, no dependency.
-//!
-//! ```
-//! use sewfast_control::{Controller, Design, Settings, Standard};
-//!
-//! let gains = Standard { kp: 0.02, ti: 0.25, td: 0.004 };
-//! let settings = Settings { alpha: 0.4, beta: 0.2, u_min: -20.0, u_max: 20.0, ..Settings::new(gains, 1e-3) };
-//! let mut controller = Controller::new(Design { filter_samples: 8, ..Design::new(settings) })?;
-//! let u = controller.step(100.0, 0.0);
-//! let expected: f64 = 0.02 * 60.0 + 0.02 * 100.0 * 1e-3 / 0.25;
-//! assert!((u - expected).abs() < 1e-12);
-//! # Ok::<(), sewfast_control::Refused>(())
-//! ```
+#![doc = include_str!("../README.md")]
 #![no_std]
 
 #[cfg(test)]
