@@ -260,7 +260,7 @@ def test_its_own_fmu_is_a_machine_as_well(tmp_path: Path) -> None:
     ("changed", "message"),
     [
         ({"input": "volt"}, "real variable 'volt'.*inputs voltage"),
-        ({"speed": None, "angle": None}, "a variable to measure.*speed, angle"),
+        ({"speed": None, "angle": None}, "among 2 outputs.*speed, angle"),
         ({"speed_unit": None}, "give speed_unit="),
         ({"angle_unit": "mile"}, "give angle_unit="),
         ({"Ts": 0.0}, "Ts: expected"),
@@ -337,3 +337,26 @@ def test_a_bench_of_an_fmu_is_a_bench(motor: Path) -> None:
     bench = fmu_bench(motor, **OF_MOTOR)
     assert isinstance(bench, SteppedBench)
     assert (bench.name, bench.volt, bench.Ts) == ("Motor", 10.0, 0.001)
+
+
+def test_the_commands_take_an_fmu(
+    motor: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    on = f"{motor}?volt=10&speed=speed&speed_unit=RPM"
+    out = str(tmp_path / "chirp.csv")
+    record = ["record", "--signal", "chirp_lo_hi", "-o", out]
+    assert main([*record, "--on", on]) == 0
+    assert "Motor, chirp_lo_hi: 20000 samples" in capsys.readouterr().out
+    controller = sewfast.Controller(sewfast.Gains.standard(0.01, 0.1), u_min=-10.0, u_max=10.0)
+    controller.save(tmp_path / "controller.json")
+    run = ["run", str(tmp_path / "controller.json"), "--on", on, "--reference", "trapezoid"]
+    assert main([*run, "--json"]) == 0
+    capsys.readouterr()
+    for wrong, said in (
+        (str(motor), "add ?volt=24"),
+        (f"{motor}?volt=much", "volt as a number"),
+        (f"{motor}?voltage=3", "arguments among volt"),
+        (str(motor.with_name("nix.fmu?volt=3")), "cannot be read"),
+    ):
+        assert main([*record, "--on", wrong]) == 2
+        assert said in capsys.readouterr().err

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import Interrupted
 from .arguments import Commands, add_command, add_overwrite
-from .drive import add_drive, is_port, opened, require_no_drive_options
+from .drive import add_drive, is_port, machine_of, opened, require_no_drive_options
 from .output import Progress, print_json, print_rows
 
 if TYPE_CHECKING:
@@ -42,7 +42,10 @@ def add(commands: Commands) -> None:
         summary="from a machine at rest to a verified controller", text=TEXT, examples=EXAMPLES,
     )  # fmt: skip
     parser.add_argument(
-        "--on", required=True, metavar="virtual[:SEED]|PORT", help="what to commission"
+        "--on",
+        required=True,
+        metavar="virtual[:SEED]|FILE.fmu?volt=V|PORT",
+        help="what to commission: virtual machine, FMU of another tool, or drive",
     )
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder to fill")
     parser.add_argument(
@@ -131,7 +134,6 @@ def _kept(args: argparse.Namespace) -> int | None:
 
 def _commissioned(args: argparse.Namespace) -> Commissioning:
     from ..commissioning import commission
-    from ..machine import VirtualMachine
 
     with Progress("commission") as progress:
         options = {
@@ -152,7 +154,7 @@ def _commissioned(args: argparse.Namespace) -> Commissioning:
         if is_port(args.on):
             with opened(args) as drive:
                 return commission(drive, **options)
-        return commission(VirtualMachine.from_name(args.on), **options)
+        return commission(machine_of(args.on), **options)
 
 
 # --- `sewfast demo`, `sewfast report`: the whole experiment and its page --------------------------

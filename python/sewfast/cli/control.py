@@ -22,6 +22,7 @@ from .arguments import (
 from .drive import (
     add_drive,
     is_port,
+    machine_of,
     opened,
     recording_place,
     require_no_drive_options,
@@ -69,7 +70,9 @@ def add(commands: Commands) -> None:
         "plant", nargs="?", metavar="MODEL.json|virtual[:SEED]",
         help="what to run on, where it is no drive; both files in any order",
     )  # fmt: skip
-    parser.add_argument("--on", metavar="MODEL.json|virtual[:SEED]|PORT", help="what to run on")
+    parser.add_argument(
+        "--on", metavar="MODEL.json|virtual[:SEED]|FILE.fmu?volt=V|PORT", help="what to run on"
+    )
     parser.add_argument(
         "--reference", metavar="FILE|NAME",
         help="what to track; default: a trapezoid over the recorded range of the model (a drive "
@@ -86,6 +89,7 @@ def add(commands: Commands) -> None:
 
 
 def run_command(args: argparse.Namespace) -> int | None:
+    from ..commissioning.fmu import is_fmu
     from ..control.controller import load_controller
     from ..control.loop import run
 
@@ -99,6 +103,10 @@ def run_command(args: argparse.Namespace) -> int | None:
     name = None if args.reference is None else Path(args.reference).stem
     if not is_port(args.on):
         require_no_drive_options(args)
+        if is_fmu(args.on):
+            found = run(controller, machine_of(args.on), _wanted(args, controller), name=name)
+            _show_run(args, found, None)
+            return None
         plant = plant_of(args.on)
         reference = _wanted(args, controller)
         _show_run(args, run(controller, plant, reference, name=name), None, plant)

@@ -20,8 +20,10 @@ from .arguments import Commands, add_command, add_view
 from .output import print_json, print_rows
 
 if TYPE_CHECKING:
+    from ..commissioning import SteppedBench
     from ..link import Drive, PortInfo
     from ..link.virtual import VirtualDevice
+    from ..machine import VirtualMachine
 
 PORTS = """\
 List the serial ports of this computer, with what speaks against opening one.
@@ -185,6 +187,26 @@ def is_port(text: str) -> bool:
         return stat.S_ISCHR(Path(text).stat().st_mode)
     except (OSError, ValueError):
         return False
+
+
+def machine_of(text: str) -> VirtualMachine | SteppedBench:
+    """What `--on` names where it is no port: `virtual[:SEED]`, or an FMU with its arguments.
+
+    Raises
+    ------
+    SettingError, ModelFileError
+    """
+    from ..commissioning.fmu import fmu_of, is_fmu
+    from ..machine import VirtualMachine
+
+    if is_fmu(text):
+        return fmu_of(text)
+    if not text.startswith("virtual"):
+        raise SettingError(
+            f"--on {text}: expected virtual[:SEED], FILE.fmu?volt=24, a serial port or "
+            "socket://HOST:PORT, got none of them; `sewfast ports` lists the serial ports"
+        )
+    return VirtualMachine.from_name(text)
 
 
 def require_no_drive_options(args: argparse.Namespace) -> None:

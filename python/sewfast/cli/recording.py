@@ -19,6 +19,7 @@ from .arguments import (
 from .drive import (
     add_drive,
     is_port,
+    machine_of,
     opened,
     recording_place,
     require_no_drive_options,
@@ -67,7 +68,10 @@ def add(commands: Commands) -> None:
         examples=RECORD_EXAMPLES,
     )  # fmt: skip
     parser.add_argument(
-        "--on", required=True, metavar="virtual[:SEED]|PORT", help="virtual machine, or drive"
+        "--on",
+        required=True,
+        metavar="virtual[:SEED]|FILE.fmu?volt=V|PORT",
+        help="virtual machine, FMU of another tool, or drive",
     )
     parser.add_argument(
         "--signal", required=True, metavar="FILE|NAME",
@@ -158,18 +162,12 @@ def _require_period(args: argparse.Namespace, given: float, machine: float) -> N
 
 
 def _record_virtual(args: argparse.Namespace, u: FloatArray, Ts: float) -> None:
-    from ..machine import VirtualMachine
     from ..recordfile.writer import require_replaceable
     from ..recording import record
 
-    if not args.on.startswith("virtual"):
-        raise SettingError(
-            f"--on {args.on}: expected virtual[:SEED], a serial port or socket://HOST:PORT, got "
-            "neither; `sewfast ports` lists the serial ports"
-        )
     if args.out is not None:
         require_replaceable(args.out, overwrite=args.overwrite)
-    machine = VirtualMachine.from_name(args.on)
+    machine = machine_of(args.on)
     _require_period(args, Ts, machine.Ts)
     _write(args, record(machine, u, name=_name(args)), machine.name, None)
 

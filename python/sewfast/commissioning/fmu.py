@@ -39,11 +39,11 @@ class FmuMachine:
         FMU of version 1.0, 2.0 or 3.0 with a binary for this platform.
     Ts : float
         Sample time [s]; the FMU is asked for steps of it.
-    input : str
-        Variable that takes the command.
+    input : str, optional
+        Variable that takes the command; the only input where there is one.
     speed, angle, counts : str, optional
-        Variables to measure, at least one. Counts are read as they are, else made from the angle,
-        else from the integral of the speed.
+        Variables to measure, at least one; where none is named, the only output is the speed.
+        Counts are read as they are, else made from the angle, else from the integral of the speed.
     speed_unit, angle_unit : str, optional
         Units of those where the FMU states none: `RPM`, `rad/s`, `deg/s`, `rev/s`; `rad`, `deg`,
         `rev`.
@@ -65,8 +65,8 @@ class FmuMachine:
         path: str | os.PathLike[str],
         *,
         Ts: float,
-        input: str,
         counts_per_rev: float,
+        input: str | None = None,
         speed: str | None = None,
         angle: str | None = None,
         counts: str | None = None,
@@ -85,11 +85,8 @@ class FmuMachine:
         self._description = self._described()
         self._variables = {v.name: v for v in self._description.modelVariables}
         if speed is None and angle is None and counts is None:
-            raise SettingError(
-                f"{self.path}: expected a variable to measure, received none; give speed=, angle= "
-                f"or counts=, one of {self._names('output')}"
-            )
-        self._input = self._reference(input)
+            speed = self._only("output", "speed=, angle= or counts=")
+        self._input = self._reference(input or self._only("input", "input="))
         self._counts = None if counts is None else self._reference(counts)
         self._angle = None if angle is None else self._reference(angle)
         self._speed = None if speed is None else self._reference(speed)
@@ -127,6 +124,15 @@ class FmuMachine:
                 "platform, or compile its sources"
             )
         return found
+
+    def _only(self, causality: str, options: str) -> str:
+        names = [v.name for v in self._variables.values() if v.causality == causality]
+        if len(names) != 1:
+            raise SettingError(
+                f"{self.path}: expected {options} among {len(names)} {causality}s, received none; "
+                f"name one of {self._names(causality)}"
+            )
+        return str(names[0])
 
     def _names(self, causality: str) -> str:
         names = [v.name for v in self._variables.values() if v.causality == causality]
@@ -229,7 +235,6 @@ class FmuMachine:
 def fmu_bench(
     path: str | os.PathLike[str],
     *,
-    input: str,
     volt: float,
     Ts: float = 0.001,
     counts_per_rev: float = 4096.0,
@@ -240,14 +245,14 @@ def fmu_bench(
 
     Parameters
     ----------
-    path, Ts, input, counts_per_rev
+    path, Ts, counts_per_rev
         As of `FmuMachine`.
     volt : float
         Largest command that it takes to either side; larger ones are clipped.
     limit : float
         Speed beyond which it stops by itself [RPM].
     **variables
-        Further arguments of `FmuMachine`: `speed`, `angle`, `counts`, units, `start`.
+        Further arguments of `FmuMachine`: `input`, `speed`, `angle`, `counts`, units, `start`.
 
     Returns
     -------
@@ -258,8 +263,45 @@ def fmu_bench(
     ModelFileError, SettingError
         As `FmuMachine`.
     """
-    machine = FmuMachine(path, Ts=Ts, input=input, counts_per_rev=counts_per_rev, **variables)
+    machine = FmuMachine(path, Ts=Ts, counts_per_rev=counts_per_rev, **variables)
     return SteppedBench(machine, Ts, counts_per_rev, volt, Path(path).stem, limit)
+
+
+_NUMBERS = ("volt", "Ts", "counts_per_rev", "limit")
+_NAMES = ("input", "speed", "angle", "counts", "speed_unit", "angle_unit")
+
+
+def is_fmu(text: str) -> bool:
+    """Whether a text of the command line names an FMU: `FILE.fmu`, `FILE.fmu?speed=w&volt=24`."""
+    return text.partition("?")[0].lower().endswith(".fmu")
+
+
+def fmu_of(text: str) -> SteppedBench:
+    """The machine of `FILE.fmu?volt=24&input=u&speed=w`, the arguments of `fmu_bench` by name.
+
+    Raises
+    ------
+    ModelFileError, SettingError
+        As `fmu_bench`, and for arguments that are none.
+    """
+    path, _, query = text.partition("?")
+    given: dict[str, Any] = {}
+    for part in filter(None, query.split("&")):
+        name, _, value = part.partition("=")
+        if name not in (*_NUMBERS, *_NAMES):
+            raise SettingError(
+                f"{path}: expected arguments among {', '.join((*_NUMBERS, *_NAMES))}, received "
+                f"{name!r}; as in {path}?volt=24&speed=w"
+            )
+        try:
+            given[name] = float(value) if name in _NUMBERS else value
+        except ValueError:
+            raise SettingError(f"{path}: expected {name} as a number, received {value!r}") from None
+    if "volt" not in given:
+        raise SettingError(
+            f"{path}: expected the largest command that it takes, received none; add ?volt=24"
+        )
+    return fmu_bench(path, **given)
 
 
 def _library() -> Any:

@@ -186,6 +186,13 @@ class Follower(Protocol):
         """Run along the reference `r` [y], shape (N,), from rest; arguments as of `run`."""
 
 
+class OwnMachine(Protocol):
+    """A machine of the user's own, such as a `sewfast.commissioning.SteppedBench`."""
+
+    def follow(self, controller: Controller, r: FloatArray, name: str) -> Any:
+        """Run along the reference `r` [y], shape (N,), from rest; `run` is what came of it."""
+
+
 class HasMetrics(Protocol):
     """A run of a closed loop, whoever has carried it out."""
 
@@ -217,7 +224,7 @@ def run_html(found: HasMetrics, caption: str) -> str:
 
 def run(
     controller: Controller,
-    on: Plant | Follower,
+    on: Plant | Follower | OwnMachine,
     reference: str | ArrayLike | None = None,
     *,
     feedforward: ArrayLike | None = None,
