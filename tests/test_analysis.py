@@ -20,7 +20,7 @@ from sewfast.dataset import Dataset
 from sewfast.errors import DataError, ModelFileError, SettingError
 from sewfast.models import LinearOE
 from sewfast.report import report
-from sewfast.report.analysed import section
+from sewfast.report.commissioned import section
 
 IDEAL = replace(QUIET, counts_per_rev=None)
 TRAPEZOID = np.concatenate([np.zeros(50), np.linspace(0, 800, 100), np.full(150, 800.0)])

@@ -17,7 +17,7 @@ from sewfast.errors import DataError, ModelFileError, SewfastError
 from sewfast.plotting import significant, thin
 from sewfast.report import report
 from sewfast.report.artefacts import load
-from sewfast.report.tables import goals
+from sewfast.report.page import goals
 
 PAPER_FIGURES = [*range(2, 6), *range(7, 16), *range(19, 23)]
 VOID = {"meta", "link", "br", "img", "input", "hr"}

@@ -29,7 +29,7 @@ from ..models import LinearOE, Model
 from ..plotting import style, svg
 from ..recording import Recording, record
 from ..report.artefacts import PLANTS, REFERENCES, SCORED, record_of
-from ..report.figures.loops import CAPTIONS
+from ..report.pictures import CAPTIONS
 from ..rules import Fopdt, fit_fopdt, table_1
 from ..signals import excitation
 from ..speed import Method, floor_of_J
