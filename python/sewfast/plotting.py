@@ -241,7 +241,8 @@ def panels(
 def thin(x: Float, y: Float, buckets: int = BUCKETS) -> tuple[Float, Float]:
     """The smallest and largest value of each bucket, in their order: no peak is lost.
 
-    NaN stays where it is, so that gaps of a record are gaps of its line.
+    A gap (NaN) that fills half of a bucket or more is a gap of the line; a shorter one would not be
+    seen.
 
     Parameters
     ----------
@@ -249,7 +250,7 @@ def thin(x: Float, y: Float, buckets: int = BUCKETS) -> tuple[Float, Float]:
 
     Returns
     -------
-    x, y : array, shape (M,), M at most 2 `buckets` + 2, and the buckets that hold a NaN
+    x, y : array, shape (M,), M at most 3 `buckets` + 2
         The series itself where it is short; its first and last sample always.
     """
     n = len(y)
@@ -259,11 +260,12 @@ def thin(x: Float, y: Float, buckets: int = BUCKETS) -> tuple[Float, Float]:
     kept = {0, n - 1}
     for start, stop in itertools.pairwise(edges):
         part = y[start:stop]
-        if np.isnan(part).any():
-            kept.update(range(start, stop))
-            continue
-        kept.add(start + int(np.argmin(part)))
-        kept.add(start + int(np.argmax(part)))
+        missing = np.isnan(part)
+        if 2 * np.count_nonzero(missing) >= len(part):
+            kept.add(start + int(np.argmax(missing)))
+        if not missing.all():
+            kept.add(start + int(np.nanargmin(part)))
+            kept.add(start + int(np.nanargmax(part)))
     index = np.array(sorted(kept))
     return x[index], y[index]
 

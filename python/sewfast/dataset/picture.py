@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 INPUT, OUTPUT, MISSING, OUTLIER = "#333333", "#0072B2", "#D55E00", "#CC0000"
 MOST_PANELS = 8
 _BUCKETS = 1200
+_MOST_GAPS = 1000
+"""That are shaded, the longest first; of more a figure would only be slow."""
 
 
 def plot(data: Dataset, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
@@ -80,13 +82,19 @@ def _over_time(
     look: dict[str, Any] = {"lw": 0.9, "color": OUTPUT if is_output else INPUT}
     look |= {"drawstyle": "default" if is_output else "steps-post"}
     for column in columns:
-        for start, length in runs(np.isfinite(column)):
-            t, y = _thinned(column, start, length)
-            ax.plot((offset + t) * Ts, y, **look)
-        for start, length in runs(np.isnan(column)):
-            left = (offset + start - 0.5) * Ts
-            label = "" if has_gaps else "missing"
-            ax.axvspan(left, left + length * Ts, color=MISSING, alpha=0.25, lw=0, label=label)
+        index = np.arange(offset, offset + len(column), dtype=np.float64)
+        ax.plot(*thin(index * Ts, column, _BUCKETS), **look)
+        gaps = sorted(runs(np.isnan(column)), key=lambda gap: -gap[1])[:_MOST_GAPS]
+        if gaps:
+            places = [((offset + start - 0.5) * Ts, length * Ts) for start, length in gaps]
+            missing: dict[str, Any] = {"color": MISSING, "alpha": 0.25, "lw": 0, "snap": False}
+            missing |= {"label": "" if has_gaps else "missing"}
+            # over the whole height, as one collection: a link can lose thousands of samples; a gap
+            # that is thinner than a pixel has a mark at the bottom
+            height = ax.get_xaxis_transform()
+            ax.broken_barh(places, (0.0, 1.0), transform=height, **missing)
+            middles = [left + 0.5 * width for left, width in places]
+            ax.plot(middles, np.zeros(len(places)), "|", color=MISSING, ms=7, transform=height)
             has_gaps = True
         if threshold is not None:
             at = np.flatnonzero(distances(column) > threshold)
@@ -104,11 +112,6 @@ def _over_time(
     ax.set_xlim(0.0, offset * Ts)
     if has_gaps or has_outliers:
         legend(ax)
-
-
-def _thinned(column: FloatArray, start: int, length: int) -> tuple[FloatArray, FloatArray]:
-    index = np.arange(start, start + length, dtype=np.float64)
-    return thin(index, column[start : start + length], _BUCKETS)
 
 
 def _over_frequency(
