@@ -88,7 +88,8 @@ ifeq ($(shell uname),Linux)
 endif
 
 python-test: $(DEV) ## pytest, with every snippet of the documentation and every example
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not alone'
+	$(BIN)/python -m pytest -m alone
 
 docs: $(DEV) ## the site, in site/index.html; works offline
 	$(BIN)/mkdocs build --strict --quiet

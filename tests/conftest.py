@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -23,6 +24,19 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # how long an example takes says something about the computer, nothing about the program
 hypothesis.settings.register_profile("untimed", deadline=None)
 hypothesis.settings.load_profile("untimed")
+
+
+ALONE = re.compile(
+    r"test_(link|live|device|virtual_device|doctor|drive_runs|host_loop|keeping|locks|soak|two_hosts"
+    r"|watchdog|deaf_host|recordfile_kill|commissioning_process|firmware|emulated|choice|cli)"
+)
+"""Files whose tests wait for processes and ports, or bind to a time budget: marked `alone`."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if ALONE.match(item.path.name):
+            item.add_marker("alone")
 
 
 @pytest.fixture
