@@ -110,7 +110,7 @@ bench: $(VENV)/bench.stamp ## sewfast and its rivals in one run; writes docs/PER
 bench-parts: $(VENV)/bench.stamp ## every benchmark by itself, with its spread (pytest-benchmark)
 	$(BIN)/python -m pytest benches --benchmark-enable --benchmark-only -o python_files='bench_*.py' -s
 
-pictures: $(REPORT) ## the picture of the README, from demo/ (which is made where it is missing)
+pictures: $(REPORT) ## the pictures of README and gallery, from demo/ (which is made where it is missing)
 	test -f $(OUT)/results.json || $(BIN)/sewfast demo --out $(OUT)
 	$(BIN)/python docs/pictures.py $(OUT)
 

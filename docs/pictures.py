@@ -11,14 +11,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
+import sewfast
 from sewfast.plotting import Drawing, Trace, draw, loop_panels
 from sewfast.readers import read_table
 from sewfast.report.artefacts import run_file
 
-PICTURE = Path(__file__).parent / "assets" / "closed_loop.svg"
+ASSETS = Path(__file__).parent / "assets"
+PICTURE = ASSETS / "closed_loop.svg"
+GALLERY = ASSETS / "gallery"
 LARGEST = 150_000
-"""Bytes: a page has to load it."""
+"""Bytes of a picture: a page has to load it."""
+COLOURS = 64
+"""That a picture of the gallery is stored with: lines on white need no more."""
 LABELS = {"model": "predicted (model)", "machine": "measured (virtual machine)"}
 RISE = (0.08, 0.36)
 """The window that is shown magnified [s]."""
@@ -57,15 +63,51 @@ def drawing(loops: list[Trace]) -> Drawing:
     return Drawing(rows, (2.6, 1.6), (1.35, 1.0), share_x=False)
 
 
+def gallery(folder: Path) -> dict[str, Any]:
+    """What draws each picture of gallery.md: a function of the file."""
+
+    def read(name: str) -> sewfast.Dataset:
+        path = folder / "recordings" / f"{name}.csv"
+        return sewfast.read(path, inputs="u", output="y", channels=["speed_true"])
+
+    networks = sewfast.load_model(folder / "commissioning" / "models" / "ensemble.json")
+    linear = sewfast.load_model(folder / "models" / "oe_all.json")
+    controller = sewfast.load_controller(folder / "controllers" / "tuned.json")
+    random = read("random")
+    both = sewfast.compare({"networks": networks, "linear": linear}, data=random)
+    card = sewfast.check(sewfast.load_model(folder / "models" / "neural_oe.json"), random)
+    analysis = sewfast.analyse(controller, networks)
+    front = sewfast.pareto(networks, "trapezoid", start=controller, evaluations=1500, seed=1)
+    return {
+        "data": read("saturating").plot,
+        "compare": both.plot,
+        "bands": partial(card.plot, "bands"),
+        "bode": partial(card.plot, "bode"),
+        "analysis": analysis.plot,
+        "sensitivity": partial(analysis.plot, "sensitivity"),
+        "front": front.plot,
+    }
+
+
 def main() -> None:
-    loops = traces(Path(sys.argv[1] if len(sys.argv) > 1 else "demo"))
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo")
+    loops = traces(folder)
     drawing(loops).plot(file=PICTURE)
-    size = PICTURE.stat().st_size
     predicted, measured = loops
     apart = float(np.sqrt(np.mean((predicted.y - measured.y) ** 2)))
-    print(f"{PICTURE}: {size // 1000} kB; predicted and measured are {apart:.1f} RPM rms apart")
-    if size > LARGEST:
-        raise SystemExit(f"expected at most {LARGEST} bytes, received {size}")
+    print(f"predicted and measured are {apart:.1f} RPM rms apart")
+    written = [PICTURE]
+    GALLERY.mkdir(exist_ok=True)
+    for name, plot in gallery(folder).items():
+        path = GALLERY / f"{name}.png"
+        plot(file=path)
+        Image.open(path).convert("RGB").quantize(COLOURS).save(path, optimize=True)
+        written.append(path)
+    for path in written:
+        size = path.stat().st_size
+        print(f"{path}: {size // 1000} kB")
+        if size > LARGEST:
+            raise SystemExit(f"expected at most {LARGEST} bytes, received {size}")
 
 
 if __name__ == "__main__":

@@ -117,7 +117,8 @@ def test_the_picture_of_the_readme_is_drawn_from_a_demo(tmp_path: Path) -> None:
     assert len(drawn) == 4
     labels = [line.get_label() for line in drawn[0].lines]
     assert labels[-3:] == [*reversed(script["LABELS"].values()), "reference"]
-    assert script["PICTURE"].stat().st_size <= script["LARGEST"]
+    for picture in (script["PICTURE"], *script["GALLERY"].glob("*.png")):
+        assert picture.stat().st_size <= script["LARGEST"]
 
 
 def test_experiments_are_not_joined() -> None:
