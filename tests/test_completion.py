@@ -60,7 +60,7 @@ def test_other_shells_know_every_command(tmp_path: Path) -> None:
 
 
 def test_without_shtab_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    from sewfast.cli.completion import completion_command
+    from sewfast.cli.parser import completion_command
     from sewfast.errors import SettingError
 
     monkeypatch.setitem(sys.modules, "shtab", None)

@@ -209,9 +209,9 @@ def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
     SettingError, DataError
         For a text that is neither, a file without r, one at another sample time or in another unit.
     """
+    from ..arrays import REVOLUTIONS_PER_SECOND
     from ..readers import read
     from ..signals import REFERENCES
-    from ..units import REVOLUTIONS_PER_SECOND
 
     if text.replace("-", "_").lower() in REFERENCES:
         return text

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from .. import _core, storage
+from ..arrays import counts_per_unit
 from ..errors import ModelFileError, SettingError, SewfastError
 from ..gains import Gains, real, whole
 from ..plotting import html_of
 from ..storage import Fields
-from ..units import counts_per_unit
 
 FORMAT = "sewfast.controller"
 VERSION = 2

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import labelled, range_of, texts
 from ..errors import DataError, SettingError
-from . import frames, outliers, picture, pieces, rates, summary, trends
+from . import frames, outliers, pieces, rates, summary, trends
 from .experiment import Experiment, require_some_weight
 
 
@@ -197,8 +197,8 @@ class Dataset:
     resample = rates.resample
     differentiate = rates.differentiate
     mark_outliers = outliers.mark_outliers
+    plot = summary.plot
     summary = summary.summary
-    plot = picture.plot
     to_pandas = frames.to_pandas
     to_polars = frames.to_polars
     to_arrow = frames.to_arrow

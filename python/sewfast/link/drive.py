@@ -14,12 +14,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import counts_per_unit
 from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun
 from ..errors import LinkError, SettingError
 from ..gains import Gains, real
 from ..live import Kind as View
-from ..units import counts_per_unit
 from . import run as profiles
 from . import wire
 from .connection import ClockBounds, Connection, DeviceReset, Loan

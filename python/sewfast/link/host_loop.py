@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import _core, signals
-from ..arrays import FloatArray
+from ..arrays import FloatArray, counts_per_unit
 from ..control.controller import Controller
 from ..control.loop import SMOOTHING, reference_samples, require_controller, run_html
 from ..errors import DataError, Interrupted, LinkError, SettingError
 from ..recordfile import Header, RecordWriter
 from ..recordfile.filing import replacing
 from ..recordfile.writer import require_replaceable
-from ..units import counts_per_unit
 from ..writers import write_table
 from . import wire
 from .drive import Drive

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import REVOLUTIONS_PER_SECOND
 from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun
 from ..dataset import FloatArray
@@ -16,7 +17,6 @@ from ..errors import SettingError
 from ..evidence.card import Judged, Line
 from ..evidence.questions import OUTSIDE
 from ..gains import real
-from ..units import REVOLUTIONS_PER_SECOND
 
 # --- Disagreement: how far members of an ensemble part under one controller and reference ---------
 

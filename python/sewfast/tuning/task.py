@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import _core
+from ..arrays import REVOLUTIONS_PER_SECOND
 from ..control.controller import Controller
 from ..control.defaults import (
     beyond_record,
@@ -36,7 +37,6 @@ from ..gains import Gains, real, vector, whole
 from ..models import Model
 from ..rules import table_1
 from ..threads import available
-from ..units import REVOLUTIONS_PER_SECOND
 from .objective import Constraints, Cost, LoadStep
 
 Progress: TypeAlias = Callable[[int, int, float], object]
