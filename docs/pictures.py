@@ -81,10 +81,10 @@ def gallery(folder: Path) -> dict[str, Any]:
     return {
         "data": read("saturating").plot,
         "compare": both.plot,
-        "bands": partial(card.plot, "bands"),
-        "bode": partial(card.plot, "bode"),
+        "bands": card.plot,
+        "bode": partial(card.plot, figure="bode"),
         "analysis": analysis.plot,
-        "sensitivity": partial(analysis.plot, "sensitivity"),
+        "sensitivity": partial(analysis.plot, figure="sensitivity"),
         "front": front.plot,
     }
 

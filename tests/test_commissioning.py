@@ -64,11 +64,11 @@ def whole(_short: None) -> Commissioning:
 def test_it_is_drawn_and_shown(whole: Commissioning, tmp_path: Path) -> None:
     assert "<td>" in whole._repr_html_()
     pytest.importorskip("matplotlib", reason="needs the report extra")
-    panels = whole.plot("random", file=tmp_path / "random.png")
+    panels = whole.plot(reference="random", file=tmp_path / "random.png")
     labels = [line.get_label() for line in panels[0].lines]
     assert labels == ["measured", "predicted", "reference"]
     with pytest.raises(SettingError, match="chirp_lo_hi"):
-        whole.plot("ramp")
+        whole.plot(reference="ramp")
 
 
 def test_it_ends_verified_with_prediction_beside_measurement(whole: Commissioning) -> None:

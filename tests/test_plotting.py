@@ -58,7 +58,6 @@ def results() -> dict[str, tuple[Any, int]]:
 @pytest.mark.parametrize("name", ["data", "summary", "validation", "card", "run"])
 def test_a_result_draws_itself(name: str, tmp_path: Path) -> None:
     result, count = results()[name]
-    args = (None,) if name == "card" else ()
     panels = result.plot()
     assert len(panels) == count
     for ax in panels:
@@ -67,9 +66,9 @@ def test_a_result_draws_itself(name: str, tmp_path: Path) -> None:
     pyplot.close(panels[0].figure)
 
     figure, axes = pyplot.subplots(1, 2)
-    assert result.plot(*args, axes[0]) is axes[0]
+    assert result.plot(axes[0]) is axes[0]
     assert axes[0].lines
-    result.plot(*args, axes)
+    result.plot(axes)
     assert axes[1].lines
     pyplot.close(figure)
 
@@ -97,7 +96,7 @@ def test_wrong_axes_and_files_are_refused(tmp_path: Path) -> None:
     pyplot.close(figure)
     card = sewfast.check(model(), bent_data(400, noise=0.05))
     with pytest.raises(SettingError, match="residuals"):
-        card.plot("spectrum")
+        card.plot(figure="spectrum")
 
 
 def test_predicted_beside_measured() -> None:

@@ -123,20 +123,20 @@ class Analysis:
 
     def plot(
         self,
-        name: str | None = None,
         ax: Any = None,
         *,
+        figure: str | None = None,
         file: str | os.PathLike[str] | None = None,
     ) -> Any:
         """Draw steps and Bode together, or one figure of `figures` by its name.
 
         Parameters
         ----------
-        name : str, optional
-            `responses`, `bode`, `sensitivity` or `what_if`.
         ax : Axes or sequence of Axes, optional
             One takes the figure's first panel, several as many panels, in reading order: output
             and command after both steps; |L|, |S|, phase of L and |T|; cost and Ms.
+        figure : str, optional
+            `responses`, `bode`, `sensitivity` or `what_if`.
         file : path, optional
             Where to write the figure: PNG, SVG or PDF by its ending.
 
@@ -148,11 +148,11 @@ class Analysis:
         Raises
         ------
         SettingError
-            For another name, where matplotlib is not installed, or the file cannot be written.
+            For another figure, where matplotlib is not installed, or the file cannot be written.
         """
         from .figures import drawing
 
-        return drawing(self, name).plot(ax, file)
+        return drawing(self, figure).plot(ax, file)
 
     def save(self, folder: str | os.PathLike[str], *, png: bool = True) -> list[Path]:
         """Write `analysis.json` and every figure as SVG, and as PNG, into a folder.

@@ -175,19 +175,19 @@ class Commissioning:
 
     def plot(
         self,
-        reference: str | None = None,
         ax: Any = None,
         *,
+        reference: str | None = None,
         file: str | os.PathLike[str] | None = None,
     ) -> Any:
         """Draw the loop as predicted beside that of the machine: output, error, command.
 
         Parameters
         ----------
-        reference : str, optional
-            One of `comparisons`; by default the first.
         ax : Axes or sequence of Axes, optional
             One shows the output, further ones the error and the command.
+        reference : str, optional
+            One of `comparisons`; by default the first.
         file : path, optional
             Where to write the figure: PNG, SVG or PDF by its ending.
 

@@ -310,19 +310,19 @@ class ReportCard(Judged):
 
     def plot(
         self,
-        name: str | None = None,
         ax: Any = None,
         *,
+        figure: str | None = None,
         file: str | os.PathLike[str] | None = None,
     ) -> Any:
-        """Draw one figure: `bands` (the default), `residuals`, `bode`, `poles` or `region`.
+        """Draw one figure, by default measured output and free run in its band.
 
         Parameters
         ----------
-        name : str, optional
-            A figure that the card has evidence for.
         ax : Axes or sequence of Axes, optional
             One takes the figure's first panel, several as many panels, in reading order.
+        figure : str, optional
+            `bands`, `residuals`, `bode`, `poles` or `region`: what the card has evidence for.
         file : path, optional
             Where to write the figure: PNG, SVG or PDF by its ending.
 
@@ -334,11 +334,11 @@ class ReportCard(Judged):
         Raises
         ------
         SettingError
-            For another name, where matplotlib is not installed, or the file cannot be written.
+            For another figure, where matplotlib is not installed, or the file cannot be written.
         """
         from .figures import drawing
 
-        return drawing(self, name).plot(ax, file)
+        return drawing(self, figure).plot(ax, file)
 
 
 def _test_json(t: ResidualTest) -> dict[str, Any]:

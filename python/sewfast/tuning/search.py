@@ -96,8 +96,8 @@ class TuningResult:
         self,
         on: Plant,
         reference: str | ArrayLike | None = None,
-        ax: Any = None,
         *,
+        ax: Any = None,
         file: str | os.PathLike[str] | None = None,
     ) -> Any:
         """Run the tuned controller and the start on a plant, and draw both.
