@@ -258,6 +258,13 @@ def test_files_and_figures_are_whole(tmp_path: Path) -> None:
         several().save(tmp_path / "file")
 
 
+def test_a_notebook_shows_margins_and_judgement() -> None:
+    shown = several()._repr_html_()
+    assert shown.count("<table") == 2
+    assert "phase margin" in shown
+    assert "limit cycle" in shown
+
+
 def test_the_text_holds_every_part() -> None:
     text = str(several())
     for part in (

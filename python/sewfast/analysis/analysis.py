@@ -25,6 +25,7 @@ from ..control.loop import (
 )
 from ..control.systems import LinearLoop
 from ..errors import FitError, SettingError
+from ..plotting import Table
 from ..trust import Judgement, Limits, judge
 from ..tuning.objective import Cost
 from .changes import Change
@@ -192,6 +193,17 @@ class Analysis:
             "what_if": [w.to_json() for w in self.what_if],
             "judgement": self.judgement and self.judgement.to_json(),
         }
+
+    def _repr_html_(self) -> str:
+        """A table for a notebook: margins, then the steps and what speaks against the loop."""
+        y, u = self.controller.gains.y_unit, self.controller.gains.u_unit
+        table = Table(
+            f"Analysis on {_plants(self.plants)}: margins of the worst plant",
+            ("about", "Ms", "Mt", "gain margin", "phase margin", "delay margin", "noise gain"),
+            tuple(tuple(_margin_row(loop, u, y)) for loop in self.loops),
+        )
+        steps = [_response_line(r) for r in self.responses]
+        return table.to_html(steps) + ("" if self.judgement is None else self.judgement.to_html())
 
     def __repr__(self) -> str:
         return f"Analysis(Ms {self.Ms:.3g}, {len(self.plants)} plants)"
