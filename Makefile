@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors bits laws bench bench-parts counts bench-device clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors fleet bits laws bench bench-parts counts bench-device clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -55,6 +55,9 @@ SEED ?= $(shell printf '%d' "0x$$(git rev-parse HEAD 2>/dev/null | cut -c1-8 | g
 rust-test: $(DEV) ## unit, property and documentation tests of the crates (SEED=N; by default of the commit)
 	@echo "properties with PROPTEST_RNG_SEED=$(SEED)"
 	PROPTEST_RNG_SEED=$(SEED) cargo test --workspace --profile checked --quiet
+
+fleet: $(DEV) ## 2,000 recordings on one worker and on two, and with a worker killed every 10 s
+	$(BIN)/python benches/fleet.py
 
 bits: $(DEV) ## deployed code against the core over ten million samples of every kind (an hour)
 	$(BIN)/python tests/deployed.py

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         SewfastError,
     )
     from .evidence import ReportCard, check
+    from .fleets import Fleet, fleet
     from .gains import Gains
     from .identification import identify
     from .identification.delays import DelayEstimate, delay
@@ -61,6 +62,7 @@ __all__ = [
     "Ensemble",
     "Experiment",
     "FitError",
+    "Fleet",
     "Gains",
     "Interrupted",
     "LeastSquaresResult",
@@ -90,6 +92,7 @@ __all__ = [
     "deploy",
     "diagnose",
     "fit_fopdt",
+    "fleet",
     "identify",
     "least_squares",
     "load_controller",
@@ -125,6 +128,7 @@ _HOMES = {
     "deployment": "Deployment deploy",
     "errors": "DataError FitError Interrupted LinkError ModelFileError SettingError SewfastError",
     "evidence": "ReportCard check",
+    "fleets": "Fleet fleet",
     "identification": "identify",
     "identification.least_squares": "LeastSquaresResult least_squares",
     "control.loop": "ClosedLoopRun run",

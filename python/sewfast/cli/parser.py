@@ -9,7 +9,19 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from ..errors import SettingError
-from . import check, commission, control, data, deploy, drive, gains, identify, recording, tune
+from . import (
+    check,
+    commission,
+    control,
+    data,
+    deploy,
+    drive,
+    fleet,
+    gains,
+    identify,
+    recording,
+    tune,
+)
 from .arguments import Commands, Help, add_command
 from .output import print_json
 
@@ -112,6 +124,7 @@ def build_parser() -> argparse.ArgumentParser:
         control.add,
         check.add_analyse,
         deploy.add,
+        fleet.add,
         drive.add_ports,
         drive.add_doctor,
         drive.add,

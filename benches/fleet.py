@@ -1,0 +1,88 @@
+"""Recordings a second of `fleet` on one worker and on two, and what a worker's death costs.
+
+python benches/fleet.py                       2,000 recordings of 5,000 samples
+python benches/fleet.py --recordings 200
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+from sewfast import fleet
+
+
+def made(folder: Path, count: int, samples: int) -> None:
+    """First-order machines with noise, each with a gain and time constant of its own."""
+    for i in range(count):
+        rng = np.random.default_rng(i)
+        gain, pole = rng.uniform(50.0, 150.0), np.exp(-1e-3 / rng.uniform(0.02, 0.2))
+        u = np.repeat(rng.uniform(-5.0, 5.0, samples // 50), 50)
+        y = np.zeros(samples)
+        for k in range(1, samples):
+            y[k] = pole * y[k - 1] + (1.0 - pole) * gain * u[k - 1]
+        y += 2.0 * rng.normal(size=samples)
+        np.savez(folder / f"machine-{i:05d}.npz", t=np.arange(samples) * 1e-3, u=u, y=y)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--recordings", type=int, default=2000)
+    parser.add_argument("--samples", type=int, default=5000)
+    args = parser.parse_args()
+    import dask
+    import distributed
+
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        made(folder, args.recordings, args.samples)
+        rows, seconds = {}, {}
+        for workers in (1, 2):
+            options = {"threads_per_worker": 1, "dashboard_address": None, "memory_limit": "500MB"}
+            with (
+                distributed.LocalCluster(n_workers=workers, **options) as cluster,
+                distributed.Client(cluster) as client,
+            ):
+                began = time.perf_counter()
+                rows[workers] = [repr(row) for row in fleet(folder, client=client).rows]
+                seconds[workers] = time.perf_counter() - began
+                memory = max(
+                    w["metrics"]["memory"]
+                    for w in client.scheduler_info(n_workers=-1)["workers"].values()
+                )
+            rate = args.recordings / seconds[workers]
+            print(
+                f"{workers} worker(s): {seconds[workers]:.1f} s, {rate:.1f} recordings/s, "
+                f"{memory / 1e6:.0f} MB a worker",
+                flush=True,
+            )
+        print(f"two over one: {seconds[1] / seconds[2]:.2f} x (must 1.8)")
+        print(f"same bits: {rows[1] == rows[2]}")
+        with (
+            dask.config.set({"distributed.scheduler.allowed-failures": 50}),
+            distributed.LocalCluster(n_workers=2, **options) as cluster,
+            distributed.Client(cluster) as client,
+        ):
+            ended, killed = threading.Event(), [0]
+
+            def kill() -> None:
+                while not ended.wait(10.0):
+                    os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
+                    killed[0] += 1
+
+            killer = threading.Thread(target=kill, daemon=True)
+            killer.start()
+            found = [repr(row) for row in fleet(folder, client=client).rows]
+            ended.set()
+            print(f"{killed[0]} workers killed: rows and bits the same: {found == rows[1]}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,90 @@
+"""`sewfast fleet`: many machines, a row each."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+from .arguments import Commands, add_command
+from .output import Progress, print_json
+
+FLEET = """\
+Identify and check every recording of a folder, or of a manifest (CSV with a column file and, where
+they differ, inputs, output, Ts), on all cores or on a Dask cluster. A recording that cannot be used
+costs its own row and no other. The same command goes on where it was interrupted, and works only on
+what is new or changed. With --before, machines whose gain, residence time or noise has moved beyond
+its band are named.
+"""
+
+EXAMPLES = """\
+examples:
+  sewfast fleet recordings -o results.parquet
+  sewfast fleet machines.csv --input u --output speed -o october.csv
+  sewfast fleet november -o november.csv --before october.csv           what has drifted
+  sewfast fleet recordings -o gains.csv --controller template.json      a controller for each
+  sewfast fleet recordings -o results.csv --scheduler tcp://host:8786   on a cluster
+"""
+
+
+def add(commands: Commands) -> None:
+    parser = add_command(
+        commands, "fleet", fleet_command,
+        summary="many recordings, a row each", text=FLEET, examples=EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument("recordings", metavar="FOLDER|MANIFEST", help="recordings, or their list")
+    parser.add_argument(
+        "-o", "--out", required=True, type=Path, metavar="OUT", help=".csv, .json or .parquet"
+    )
+    parser.add_argument(
+        "--input", action="append", metavar="COL", help="column of the input (u); repeat it"
+    )
+    parser.add_argument("--output", default="y", metavar="COL", help="column of the output (y)")
+    parser.add_argument(
+        "--ts", "--Ts", type=float, metavar="S", help="sample time [s]; default: the time column's"
+    )
+    parser.add_argument(
+        "--model", default="oe", choices=("auto", "arx", "iv", "oe", "neural_oe", "neural_ss"),
+        help="kind of model (oe)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--controller", metavar="FILE.json", help="tune it anew for every recording's model"
+    )
+    parser.add_argument("--before", metavar="FILE", help="an earlier table, to find drift")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster")
+    parser.add_argument(
+        "--workers", type=int, metavar="N",
+        help="processes on this computer (its cores); 0: in this process, without Dask",
+    )  # fmt: skip
+    parser.add_argument("--memory", default="500MB", metavar="SIZE", help="of each of them (500MB)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of every search (0)")
+
+
+def fleet_command(args: argparse.Namespace) -> None:
+    from ..control.controller import load_controller
+    from ..fleets import fleet
+
+    controller = None if args.controller is None else load_controller(args.controller)
+    with Progress("fleet") as progress:
+        found = fleet(
+            args.recordings,
+            inputs=args.input or "u",
+            output=args.output,
+            Ts=args.ts,
+            model=args.model,
+            controller=controller,
+            before=args.before,
+            out=args.out,
+            scheduler=args.scheduler,
+            workers=args.workers,
+            memory=args.memory,
+            seed=args.seed,
+            progress=lambda done, total, failed: progress.say(f"{done} of {total}"),
+        )
+    if args.json:
+        drifts = [dataclasses.asdict(drift) for drift in found.drifts]
+        failed = [{"file": row.file, "message": row.message} for row in found.failed]
+        summary = {"recordings": len(found.rows), "failed": failed, "drifts": drifts}
+        print_json({**summary, "file": str(args.out)})
+    else:
+        print(f"{found}\nwritten to {args.out}")

@@ -1,0 +1,264 @@
+"""Many machines: rows that do not depend on where they were made, and none lost or doubled."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sewfast import Controller, Fleet, Gains, fleet
+from sewfast.cli import main
+from sewfast.errors import SettingError
+from sewfast.fleets import load_fleet
+
+SAMPLES = 1500
+MACHINES = 8
+
+
+def made(folder: Path, count: int = MACHINES, seed: int = 0, **altered: Any) -> Path:
+    """Recordings of first-order machines, each with a gain and time constant of its own.
+
+    `altered` maps a machine's number to what its gain, time constant and noise are multiplied by.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for i in range(count):
+        own = np.random.default_rng(1000 + i)
+        gain, lag, noise = own.uniform(50.0, 150.0), own.uniform(0.02, 0.08), 2.0
+        by = altered.get(f"m{i}", (1.0, 1.0, 1.0))
+        gain, lag, noise = gain * by[0], lag * by[1], noise * by[2]
+        rng = np.random.default_rng(seed + i)
+        u = np.repeat(rng.uniform(-5.0, 5.0, SAMPLES // 30), 30)
+        y, pole = np.zeros(SAMPLES), np.exp(-1e-3 / lag)
+        for k in range(1, SAMPLES):
+            y[k] = pole * y[k - 1] + (1.0 - pole) * gain * u[k - 1]
+        y += noise * rng.normal(size=SAMPLES)
+        np.savez(folder / f"m{i}.npz", t=np.arange(SAMPLES) * 1e-3, u=u, y=y)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made(tmp_path_factory.mktemp("fleet") / "october")
+
+
+@pytest.fixture(scope="module")
+def alone(folder: Path) -> Fleet:
+    """In this process."""
+    return fleet(folder, workers=0)
+
+
+def bits(found: Fleet) -> list[str]:
+    """Rows as text: NaN is no number, and equal to itself here."""
+    return [repr(row) for row in found.rows]
+
+
+@pytest.fixture
+def quiet() -> Iterator[None]:
+    """What a cluster says while it is taken down is not what is tested."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def test_every_machine_is_found(alone: Fleet) -> None:
+    assert [row.file for row in alone.rows] == [f"m{i}.npz" for i in range(MACHINES)]
+    for i, row in enumerate(alone.rows):
+        own = np.random.default_rng(1000 + i)
+        gain, lag = own.uniform(50.0, 150.0), own.uniform(0.02, 0.08)
+        assert row.status == "ok", row.message
+        assert abs(row.gain - gain) < 5.0 * row.gain_error + 1e-3 * gain
+        # one sample of delay beside the lag, of which the first half is the sample itself
+        assert abs(row.residence_time - lag) < 5.0 * row.residence_time_error + 1e-3
+        assert row.fit_percent > 90.0
+
+
+def test_standard_errors_are_those_of_repetition(tmp_path: Path) -> None:
+    runs = [fleet(made(tmp_path / str(s), 1, seed=100 * s), workers=0).rows[0] for s in range(16)]
+    for quantity in ("gain", "residence_time"):
+        values = np.array([getattr(row, quantity) for row in runs])
+        said = np.mean([getattr(row, f"{quantity}_error") for row in runs])
+        assert 0.5 < values.std(ddof=1) / said < 1.8
+
+
+@pytest.mark.usefixtures("quiet")
+def test_a_cluster_gives_the_same_bits_and_loses_no_row(folder: Path, alone: Fleet) -> None:
+    pytest.importorskip("distributed", reason="needs dask")
+    assert bits(fleet(folder, workers=2)) == bits(alone)
+
+
+@pytest.mark.usefixtures("quiet")
+def test_workers_that_are_killed_cost_nothing(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="needs dask")
+    import dask
+
+    many = made(tmp_path / "many", 60)
+    expected = bits(fleet(many, workers=0))
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 50}),
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        pids = list(client.run(os.getpid).values())
+        killer = threading.Timer(1.0, lambda: [os.kill(pid, signal.SIGKILL) for pid in pids[:1]])
+        killer.start()
+        assert bits(fleet(many, client=client)) == expected
+        killer.join()
+        assert set(client.run(os.getpid).values()) != set(pids)
+
+
+def test_a_bad_recording_costs_its_own_row(tmp_path: Path) -> None:
+    place = made(tmp_path / "mixed", 2)
+    (place / "empty.csv").write_text("")
+    (place / "text.csv").write_text("t,u,y\n0,one,two\n")
+    (place / "still.csv").write_text("t,u,y\n" + "".join(f"{k},0,0\n" for k in range(200)))
+    (place / "short.csv").write_text("t,u,y\n0,1,2\n1,2,3\n")
+    (place / "other.csv").write_text("t,voltage,speed\n0,1,2\n")
+    (place / "cut.npz").write_bytes((place / "m0.npz").read_bytes()[:300])
+    (place / "notes.txt").write_text("no recording")
+    found = fleet(place, workers=0)
+    assert len(found.rows) == 8
+    assert {row.file for row in found.rows if row.status == "ok"} == {"m0.npz", "m1.npz"}
+    assert all(row.message for row in found.failed)
+    assert "2 identified, 6 failed" in str(found)
+    assert "failed  text.csv: " in str(found)
+
+
+@pytest.mark.parametrize("ending", ["csv", "json", "parquet"])
+def test_a_table_comes_back_as_it_was(ending: str, tmp_path: Path, alone: Fleet) -> None:
+    if ending == "parquet":
+        pytest.importorskip("pyarrow", reason="needs pyarrow")
+    alone.save(tmp_path / f"table.{ending}")
+    assert bits(load_fleet(tmp_path / f"table.{ending}")) == bits(alone)
+
+
+def test_drift_is_seen_and_nothing_else(tmp_path: Path, alone: Fleet) -> None:
+    later = made(
+        tmp_path / "november", seed=500, m1=(1.1, 1.0, 1.0), m4=(1.0, 1.3, 1.0), m6=(1.0, 1.0, 2.5)
+    )
+    alone.save(tmp_path / "october.csv")
+    found = fleet(later, before=tmp_path / "october.csv", workers=0)
+    assert {(d.file, d.quantity) for d in found.drifts} == {
+        ("m1.npz", "gain"), ("m4.npz", "residence_time"), ("m6.npz", "noise"),
+    }  # fmt: skip
+    assert "drift   m1.npz: gain" in str(found)
+
+
+def test_no_machine_drifts_by_itself(tmp_path: Path, alone: Fleet) -> None:
+    """48 comparisons of three quantities, none of which has changed."""
+    for seed in range(6):
+        later = made(tmp_path / str(seed), seed=10_000 + 100 * seed)
+        assert fleet(later, before=alone, workers=0).drifts == ()
+
+
+def test_what_is_done_is_not_done_again(
+    folder: Path, alone: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sewfast import fleets
+
+    asked: list[str] = []
+    real = fleets._row
+
+    def interrupted(job: Any, *rest: Any) -> Any:
+        if len(asked) == 3:
+            raise KeyboardInterrupt
+        asked.append(job.file)
+        return real(job, *rest)
+
+    out = tmp_path / "table.csv"
+    monkeypatch.setattr(fleets, "_row", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fleet(folder, out=out, workers=0)
+    journal = tmp_path / ".table.csv.journal"
+    assert not out.exists()
+    # and the process was killed in the middle of a line
+    journal.write_text(journal.read_text() + '{"of": [1, 2')
+    monkeypatch.setattr(
+        fleets, "_row", lambda job, *rest: asked.append(job.file) or real(job, *rest)
+    )
+    found = fleet(folder, out=out, workers=0)
+    assert sorted(asked) == [f"m{i}.npz" for i in range(MACHINES)]
+    assert bits(found) == bits(alone) == bits(load_fleet(out))
+    assert not journal.exists()
+
+
+def test_other_settings_begin_anew(folder: Path, tmp_path: Path) -> None:
+    from sewfast import fleets
+
+    out = tmp_path / "table.json"
+    jobs = fleets._jobs(folder, "u", "y", None)
+    kept = fleets._Journal(out, {"model": "oe", "seed": 0, "controller": None})
+    with kept:
+        kept.add(jobs[0], fleets.Row("m0.npz", kind="kept"))
+    again = fleets._Journal(out, {"model": "oe", "seed": 0, "controller": None})
+    known = again.known(jobs[0])
+    assert known is not None
+    assert known.kind == "kept"
+    assert fleets._Journal(out, {"model": "arx", "seed": 0}).known(jobs[0]) is None
+    os.utime(jobs[0].path, ns=(time.time_ns(), time.time_ns()))
+    assert again.known(jobs[0]) is None
+
+
+def test_a_manifest_says_how_each_is_read(tmp_path: Path, folder: Path) -> None:
+    data = np.load(folder / "m2.npz")
+    rows = zip(data["u"], data["y"], strict=True)
+    (tmp_path / "own.csv").write_text(
+        "volt,rpm\n" + "".join(f"{u!r},{y!r}\n" for u, y in ((float(a), float(b)) for a, b in rows))
+    )
+    manifest = tmp_path / "machines.csv"
+    manifest.write_text("file,inputs,output,Ts\nown.csv,volt,rpm,0.001\n")
+    row = fleet(manifest, workers=0).rows[0]
+    assert row.status == "ok", row.message
+    assert abs(row.gain - fleet([folder / "m2.npz"], workers=0).rows[0].gain) < 1e-6 * abs(row.gain)
+    for text, said in (
+        ("path\nown.csv\n", "a column file"),
+        ("file,Ts\nown.csv,fast\n", "line 2: expected Ts"),
+        ("file\nown.csv\nown.csv\n", "twice"),
+        ("", "a column file"),
+    ):
+        manifest.write_text(text)
+        with pytest.raises(SettingError, match=said):
+            fleet(manifest, workers=0)
+
+
+def test_a_controller_for_each(tmp_path: Path) -> None:
+    template = Controller(Gains.standard(0.01, 0.1), u_min=-5.0, u_max=5.0)
+    found = fleet(made(tmp_path / "two", 2), controller=template, workers=0)
+    gains = [row.Kp for row in found.rows]
+    assert all(np.isfinite(gains))
+    assert gains[0] != gains[1]
+
+
+def test_what_makes_no_fleet_is_refused(tmp_path: Path, folder: Path) -> None:
+    with pytest.raises(SettingError, match=r"got none in"):
+        fleet(tmp_path, workers=0)
+    with pytest.raises(SettingError, match="a folder, or a manifest"):
+        fleet(tmp_path / "nix", workers=0)
+    with pytest.raises(SettingError, match=r"ends in \.csv, \.json or \.parquet"):
+        fleet(folder, out=tmp_path / "table.xlsx", workers=0)
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(SettingError, match="a table that `sewfast fleet` wrote"):
+        fleet(folder, before=tmp_path / "other.csv", workers=0)
+
+
+def test_the_command(
+    folder: Path, tmp_path: Path, alone: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "table.csv"
+    assert main(["fleet", str(folder), "-o", str(out), "--workers", "0"]) == 0
+    assert f"{MACHINES} recordings: {MACHINES} identified, 0 failed" in capsys.readouterr().out
+    assert bits(load_fleet(out)) == bits(alone)
+    again = ["fleet", str(folder), "-o", str(tmp_path / "later.json"), "--workers", "0"]
+    assert main([*again, "--before", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["drifts"] == []
+    assert main(["fleet", str(tmp_path / "nix"), "-o", str(out), "--workers", "0"]) == 2
