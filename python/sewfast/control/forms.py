@@ -14,6 +14,7 @@ from ..gains import Gains, real
 from ..models.conversion import polynomials_of, require_control
 from .controller import Controller
 from .loop import require_controller
+from .systems import beside, gain, measurement, pid, series
 
 # --- PIDs out of python-control's objects: the one set of gains that a fraction in z can have -----
 # With `p = Tf/(Tf + Ts)`, `Tf = Td/N`, the controller is
@@ -347,9 +348,6 @@ def to_control(controller: Controller) -> Any:
     SettingError
         Where python-control is not installed, or for a gain schedule.
     """
-    from ..models.conversion import require_control
-    from .systems import beside, gain, measurement, pid, series
-
     require_controller(controller, None, "to_control(controller)")
     if controller.schedule:
         raise SettingError("expected constant gains, received a gain schedule: it is not linear")

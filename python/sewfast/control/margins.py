@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from .. import _core
 from ..dataset import FloatArray
 from ..errors import SettingError
+from ..evidence.operating import operating_range, point_at_level
 from ..gains import Gains, real, vector
 from ..models import Model
 from ..models.conversion import from_state_space, polynomials_of, transfer_function
@@ -78,8 +79,6 @@ def operating_point(model: Any, speed: float) -> Any:
     SettingError
         Where no command within the range of the training data holds that speed.
     """
-    from ..evidence.operating import operating_range
-
     low, high = model.training.get("input_range", [[-1.0, 1.0]])[0]
     grid = operating_range(model, [np.array([u]) for u in np.linspace(low, high, _GRID)]).points
     if not any(p.settled for p in grid) and any(p.drift for p in grid):
@@ -104,8 +103,6 @@ def operating_point(model: Any, speed: float) -> Any:
 
 def _integrating_point(model: Any, grid: Any, level: float) -> Any:
     """Where an integrator keeps its output: at a command of its own, at any level."""
-    from ..evidence.operating import operating_range, point_at_level
-
     pairs = [p for p in itertools.pairwise(grid) if p[0].drift * p[1].drift <= 0.0]
     if not pairs:
         raise SettingError(

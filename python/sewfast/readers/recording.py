@@ -16,6 +16,7 @@ from ..dataset.experiment import as_weights, require_some_weight
 from ..errors import DataError, SettingError
 from ..recordfile.format import MAGIC
 from ..recordfile.reader import decode_recording
+from ..speed import speed_between_gaps
 from .containers import Table, freeze, read_mat, read_npz
 from .delimited import read_delimited
 from .frames import collected, of_arrow, table_of
@@ -302,8 +303,6 @@ def _require_length(table: Table, name: str, column: FloatArray, other: str, n: 
 
 
 def _speed(table: Table, column: str, counts_per_rev: float, Ts: float) -> FloatArray:
-    from ..speed import speed_between_gaps
-
     counts = table[column]
     bad = np.flatnonzero(np.isinf(counts))
     if len(bad):

@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
 from .. import _core
 from ..control.controller import Controller
+from ..control.loop import ClosedLoopRun
 from ..dataset import FloatArray
 from ..errors import DataError, SettingError
 from ..gains import real
-
-if TYPE_CHECKING:
-    from ..control.loop import ClosedLoopRun
 
 SHARES = ("chatter", "overshoot", "saturation")
 """Weights whose default depends on the references' span."""
@@ -107,8 +105,6 @@ class Cost:
         DataError
             Where there is no run, or what is none, or one has samples missing.
         """
-        from ..control.loop import ClosedLoopRun
-
         several = list(runs) if isinstance(runs, Sequence) else [runs]
         for one in several:
             if not isinstance(one, ClosedLoopRun):

@@ -32,6 +32,7 @@ from ..control.loop import (
     plant_units,
     reference_samples,
 )
+from ..control.margins import sampled
 from ..errors import SettingError
 from ..gains import Gains, real, vector, whole
 from ..models import Model
@@ -130,8 +131,6 @@ class TuningTask:
 
     def _loops(self) -> list[Any]:
         """The linear plants that Ms is taken on, as fractions."""
-        from ..control.margins import sampled
-
         given = self.constraints.plant
         if given is None:
             plants = [p for p in self.plants if hasattr(p, "to_tf")]
