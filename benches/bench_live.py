@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from sewfast.live import Feed, open_view
-from sewfast.live.plot import Palette
-from sewfast.live.terminal import Frame
+from sewfast.live.terminal import Frame, Palette
 
 UNITS = {"u": "V", "counts": "", "r": "RPM", "current": "A"}
 BATCH, SAMPLES, TS = 10, 30_000, 0.001

@@ -140,7 +140,7 @@ def test_a_column_s_name_is_no_formula_and_steers_no_terminal(tmp_path: Path) ->
 def test_a_full_disk_keeps_the_controllers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from types import SimpleNamespace
 
-    from sewfast.commissioning import folder
+    from sewfast.commissioning import result
 
     written = []
 
@@ -162,7 +162,7 @@ def test_a_full_disk_keeps_the_controllers(tmp_path: Path, monkeypatch: pytest.M
         models=Artefact(), first=Artefact(), controller=Artefact(), comparisons=[],
     )  # fmt: skip
     with pytest.raises(DataError, match="1 of 2 tables could not be written, the controllers"):
-        folder._artefacts(found, tmp_path)  # type: ignore[arg-type]
+        result._artefacts(found, tmp_path)  # type: ignore[arg-type]
     assert written == [
         "controllers/tuned.json", "controllers/first.json", "models/ensemble.json",
         "recordings/motion.csv",

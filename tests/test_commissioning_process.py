@@ -28,7 +28,7 @@ from sewfast import (
 )
 from sewfast.commissioning import Followed
 from sewfast.commissioning.bench import MachineBench
-from sewfast.commissioning.folder import Taken, prepare, require_own
+from sewfast.commissioning.result import Taken, prepare, require_own
 from sewfast.control.loop import run as closed_loop
 from sewfast.dataset import FloatArray
 from sewfast.link import VirtualDevice

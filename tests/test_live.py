@@ -15,8 +15,17 @@ from sewfast.cli.arguments import add_view
 from sewfast.errors import DataError, SettingError
 from sewfast.live import Feed, Kind
 from sewfast.live.feed import _MOST, speed_over_window
-from sewfast.live.plot import Axis, Palette, braille, spans, text
-from sewfast.live.terminal import Frame, panels, rows_to_climb, status
+from sewfast.live.terminal import (
+    Axis,
+    Frame,
+    Palette,
+    braille,
+    panels,
+    rows_to_climb,
+    spans,
+    status,
+    text,
+)
 
 FINE = Palette(unicode=True, colour=True)
 PLAIN = Palette(unicode=False, colour=False)

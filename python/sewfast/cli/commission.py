@@ -87,7 +87,7 @@ def add(commands: Commands) -> None:
 
 
 def command(args: argparse.Namespace) -> int | None:
-    from ..commissioning.folder import FOLDER, prepare, require_own
+    from ..commissioning.result import FOLDER, prepare, require_own
 
     if not is_port(args.on):
         require_no_drive_options(args)

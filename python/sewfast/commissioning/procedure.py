@@ -28,9 +28,17 @@ from . import excitations
 from .bench import Bench, Followed, NotedBench, bench_of, told_of
 from .demands import MS, Demands, Refusal, demands
 from .excitations import first_motion, standard, step_response
-from .folder import STAGES, Journal, Progress, Taken, require_own
 from .gains import Requirements, cause, cautious, cost_of, first_gains, ruled, search, start_of
-from .result import VERIFIED, VERIFIED_POORLY, Commissioning
+from .result import (
+    STAGES,
+    VERIFIED,
+    VERIFIED_POORLY,
+    Commissioning,
+    Journal,
+    Progress,
+    Taken,
+    require_own,
+)
 from .slow import Thinning, turn_load
 from .small_signal import SmallSignal, small_signal
 from .training import ORDERS, THINNED, Rival, Trained, linear_rival, train

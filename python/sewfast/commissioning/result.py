@@ -2,22 +2,38 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import time
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
+import numpy as np
+
+from .. import __version__, storage
+from ..analysis.analysis import NUMBERS as ANALYSIS
 from ..control.controller import Controller
-from ..errors import SettingError
+from ..control.loop import ClosedLoopRun
+from ..errors import DataError, SettingError
 from ..evidence import Line, ReportCard
 from ..models import Ensemble
 from ..plotting import Trace, html_of, loop_drawing
+from ..recordfile import save_columns
+from ..recordfile.reader import RecordedFile, read_header, read_recording
+from ..recordfile.writer import ENDING, require_replaceable
 from ..recording import Recording
+from ..report.commissioned import FORMAT, NUMBERS, VERSION, file_name, run_file
 from ..rules import Fopdt
 from ..trust import Judgement
 from ..tuning.objective import Cost
 from ..tuning.search import TuningResult
+from ..writers import write_table
+from .bench import Followed
 from .excitations import Motion
 from .slow import Thinning, TurnLoad
 from .small_signal import SmallSignal
@@ -143,7 +159,6 @@ class Commissioning:
 
     def numbers(self) -> dict[str, Any]:
         """Every number as JSON values."""
-        from .folder import numbers
 
         return numbers(self)
 
@@ -169,7 +184,6 @@ class Commissioning:
         DataError
             Where it cannot be made.
         """
-        from .folder import write
 
         return write(self, Path(folder), overwrite=overwrite)
 
@@ -289,3 +303,532 @@ def _told(c: Comparison) -> str:
     return (
         f"{text}, measured {c.measured.metrics()['rmse']:.4g} RPM rms; {c.apart:.3g} RPM rms apart"
     )
+
+
+# --- A commissioning on the disk: recordings as they come, what came so far, its folder -----------
+
+
+Progress: TypeAlias = Callable[[int, int, str], object]
+"""Called with stages done, stages in all, and what comes now."""
+
+STAGES = (
+    "first motion",
+    "step response",
+    "small signals",
+    "limits",
+    "closed loop",
+    "training",
+    "tuning",
+    "verification",
+)
+
+
+class Journal:
+    """Collects results; a `Commissioning` can be had at any time.
+
+    Parameters
+    ----------
+    machine : str
+    progress : callable or None
+    """
+
+    def __init__(self, machine: str, progress: Progress | None) -> None:
+        self._progress = progress
+        self._began: list[tuple[str, float]] = []
+        self._values: dict[str, Any] = {"machine": machine, "recordings": {}}
+
+    @property
+    def fopdt(self) -> Fopdt:
+        """Of the step response."""
+        found: Fopdt = self._values["fopdt"]
+        return found
+
+    @property
+    def first(self) -> Controller:
+        """The first gains."""
+        found: Controller = self._values["first"]
+        return found
+
+    def recording(self, name: str) -> Recording:
+        """One that was noted."""
+        found: Recording = self._values["recordings"][name]
+        return found
+
+    @property
+    def stage(self) -> str:
+        """The one that is on."""
+        return self._began[-1][0] if self._began else STAGES[0]
+
+    def enter(self, stage: str) -> None:
+        """Begin a stage."""
+        # begun before it is told: whoever is told may stop
+        self._began.append((stage, time.perf_counter()))
+        self._tell(STAGES.index(stage), stage)
+
+    def within(self, done: int, total: int) -> None:
+        """Tell how far the stage is."""
+        self._tell(STAGES.index(self.stage), f"{self.stage} {done}/{total}")
+
+    def finish(self) -> None:
+        """All stages are through."""
+        self._tell(len(STAGES), "done")
+
+    def _tell(self, done: int, text: str) -> None:
+        if self._progress is not None:
+            self._progress(done, len(STAGES), text)
+
+    def keep(self, **values: Any) -> None:
+        """Results."""
+        self._values |= values
+
+    def say(self, note: str) -> None:
+        """What went otherwise than usual."""
+        self._values["notes"] = (*self._values.get("notes", ()), note)
+
+    def note(self, name: str, recording: Recording) -> None:
+        """A recording, but for those along the references, which are runs."""
+        if self.stage != STAGES[-1] or name.startswith("hold_"):
+            self._values["recordings"] = {**self._values["recordings"], name: recording}
+
+    def result(self, verdict: str, reason: str = "") -> Commissioning:
+        """What there is."""
+        ends = [t for _, t in self._began[1:]] + [time.perf_counter()]
+        seconds = {s: end - t for (s, t), end in zip(self._began, ends, strict=True)}
+        return Commissioning(
+            **self._values, verdict=verdict, stage=self.stage, reason=reason, seconds=seconds
+        )
+
+
+# --- `Taken`: the recordings of a commissioning as files, each written as soon as it is there -----
+
+
+FOLDER = "unfinished"
+"""Of its own, so that a killed commissioning and an earlier whole one never mix."""
+_MARK = "commissioning"
+"""The setting that tells these files from any others."""
+
+
+@dataclass
+class Taken:
+    """Without it a process that is killed, or a computer without power, loses what a machine did.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the commissioning; the files lie in its `unfinished` until `folder.write` has written
+        the tables that hold the same.
+    device, conditions : mapping
+        What the recordings are made on, and under which settings.
+    resume : bool
+        Whether what lies there is of an attempt that this one goes on from.
+    """
+
+    folder: Path
+    device: Mapping[str, Any]
+    conditions: Mapping[str, Any]
+    resume: bool = False
+    _has_warned: bool = field(default=False, init=False)
+
+    def begin(self) -> None:
+        """Make the place; files of an earlier commissioning would pass for this one's.
+
+        Raises
+        ------
+        DataError
+        """
+        try:
+            if not self.resume:
+                clear(self.folder)
+        except OSError as error:
+            raise DataError(
+                f"{self.folder / FOLDER}: recordings of an earlier commissioning cannot be taken "
+                f"away ({error.strerror}); choose another folder"
+            ) from error
+        prepare(self.folder / FOLDER)
+
+    def keep(
+        self, stage: str, name: str, key: str, recording: Recording, run: ClosedLoopRun | None
+    ) -> None:
+        """Write one; an earlier one of that name was not good enough.
+
+        A file that cannot be written is warned of, once: what the machine did is in memory as well.
+        """
+        columns = recording.columns()
+        del columns["t"]
+        own: dict[str, Any] = {}
+        if run is not None:
+            own = {"controller": run.controller.to_dict()}
+            columns |= {"r": run.r, "speed": run.y, "feedback": run.feedback}
+        settings = {_MARK: {"stage": stage, "key": key, **self.conditions}, **own}
+        header = recording.header(device=self.device, **settings)
+        units = {"r": "RPM", "speed": "RPM", "feedback": "RPM"}
+        known = {**header.columns, **{n: u for n, u in units.items() if n in columns}}
+        try:
+            save_columns(self._place(stage, name), replace(header, columns=known), columns)
+        except DataError as error:
+            if not self._has_warned:
+                self._has_warned = True
+                warnings.warn(
+                    f"{error}; the commissioning goes on, its recordings are in memory alone",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+
+    def _place(self, stage: str, name: str) -> Path:
+        if stage == STAGES[-1]:
+            # a reference may have the name of an excitation
+            name = f"{stage}_{name}"
+        return self.folder / FOLDER / f"{file_name(name)}{ENDING}"
+
+    def found(self, stage: str, name: str, key: str) -> Recording | None:
+        """What an earlier attempt has recorded of the very same, whole; None where it has not."""
+        file = self._found(stage, name, key)
+        if file is None:
+            return None
+        c, header = file.columns, file.header
+        return Recording(
+            c["u"], c["counts"], c["y"], c.get("speed_true"), header.Ts,
+            float(header.counts_per_rev or 0.0), name,
+        )  # fmt: skip
+
+    def found_run(
+        self, stage: str, name: str, key: str, controller: Controller, plant: str
+    ) -> Followed | None:
+        """The same of a closed loop."""
+        file, recording = self._found(stage, name, key), self.found(stage, name, key)
+        if file is None or recording is None:
+            return None
+        c = file.columns
+        t = np.arange(len(c["u"]), dtype=np.float64) * recording.Ts
+        run = ClosedLoopRun(
+            t, c["r"], c["u"], c["speed"], c["feedback"], controller, plant, name
+        )  # fmt: skip
+        return Followed(run, recording)
+
+    def _found(self, stage: str, name: str, key: str) -> RecordedFile | None:
+        if not self.resume:
+            return None
+        try:
+            file = read_recording(self._place(stage, name))
+        except (DataError, OSError):
+            return None
+        known = file.header.settings.get(_MARK, {})
+        same = {"key": key, **self.conditions}
+        is_same = all(known.get(name) == value for name, value in same.items())
+        return file if file.complete and is_same else None
+
+
+def prepare(folder: Path) -> None:
+    """Make the folder, so that one that cannot be made is refused before the machine moves.
+
+    Raises
+    ------
+    DataError
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be made ({error.strerror}); choose a folder that is writable"
+        ) from error
+
+
+def clear(folder: Path) -> None:
+    """Take the files away: of an earlier commissioning, or of one whose tables are there."""
+    place = folder / FOLDER
+    for file in _inside(place):
+        if _is_own(file):
+            file.unlink()
+    with suppress(OSError):
+        # what somebody else has put there stays
+        place.rmdir()
+
+
+def require_repeatable(folder: Path) -> None:
+    """Refuse files there that a virtual machine could not make again.
+
+    Raises
+    ------
+    SettingError
+    """
+    for file in _inside(folder / FOLDER):
+        if not _is_own(file):
+            raise SettingError(
+                f"{file}: expected nothing but recordings of a commissioning in this folder; "
+                "choose another folder, or overwrite them (--overwrite)"
+            )
+        require_replaceable(file, overwrite=False)
+
+
+def _inside(place: Path) -> list[Path]:
+    return sorted(place.iterdir()) if place.is_dir() else []
+
+
+def _is_own(file: Path) -> bool:
+    """Such a file, or what was being written of one when its process was killed."""
+    if not file.is_file():
+        return False
+    if file.name.startswith(".") and f"{ENDING}." in file.name and file.suffix == ".tmp":
+        return True
+    try:
+        return file.suffix == ENDING and _MARK in read_header(file).settings
+    except DataError:
+        return False
+
+
+# --- The numbers of a commissioning as JSON values ------------------------------------------------
+
+
+_FOPDT = ("K", "T", "L", "offset", "u_low", "u_high", "fit_percent")
+
+
+def numbers(c: Commissioning) -> dict[str, Any]:
+    """`commissioning.json`; null where there is nothing yet."""
+    return {
+        "machine": c.machine,
+        "verdict": c.verdict,
+        "stage": c.stage,
+        "reason": c.reason,
+        "seconds": dict(c.seconds),
+        "recordings": {name: len(r) * r.Ts for name, r in c.recordings.items()},
+        "motion": None if c.motion is None else dict(vars(c.motion)),
+        "fopdt": None if c.fopdt is None else {n: getattr(c.fopdt, n) for n in _FOPDT},
+        "small_signals": _small_signals(c),
+        "acceleration_rpm_per_s": c.acceleration,
+        "turn_load_v_rms": None if c.turn_load is None else c.turn_load.rms,
+        "models": {"members": 0 if c.models is None else len(c.models.members)}
+        | {"levels_rmse_rpm": list(c.rmse), "kind": _kind(c)},
+        "rival": None
+        if c.rival is None
+        else {"order": c.rival.model.orders["na"], "levels_rmse_rpm": c.rival.rmse},
+        "second_opinion": _opinion(c),
+        "simulated_at_s": c.sample_time,
+        "notes": list(c.notes),
+        "controllers": {
+            name: _gains(controller)
+            for name, controller in (("first", c.first), ("tuned", c.controller))
+            if controller is not None
+        },
+        "tuning": None
+        if c.tuning is None
+        else {
+            "evaluations": c.tuning.evaluations,
+            "cost": c.tuning.cost,
+            "start_cost": c.tuning.start_cost,
+            "termination": c.tuning.termination,
+            "constraints": str(c.tuning.constraints),
+        },
+        "cost": None if c.cost is None else dict(vars(c.cost)),
+        "met": None if c.met is None else dict(c.met),
+        "evidence": {
+            name: {"verdict": judged.verdict, "lines": [x.to_json() for x in judged.lines]}
+            for name, judged in (("report card", c.card), ("closed loops", c.judgement))
+            if judged is not None
+        },
+        "predicted_cost": c.predicted_cost,
+        "measured_cost": c.measured_cost,
+        "references": {x.reference: _comparison(x) for x in c.comparisons},
+    }
+
+
+def _small_signals(c: Commissioning) -> dict[str, Any] | None:
+    """Order and first-order description of the machine about a working speed; its resonance."""
+    found = c.small_signal
+    if found is None:
+        return None
+    fopdt, resonance = found.fopdt, found.resonance
+    return {
+        "order": found.model.orders["na"],
+        "fopdt": None if fopdt is None else {n: getattr(fopdt, n) for n in ("K", "T", "L")},
+        "resonance": None if resonance is None else dict(vars(resonance)),
+    }
+
+
+def _kind(c: Commissioning) -> str | None:
+    return None if c.models is None else c.models.members[0].kind
+
+
+def _opinion(c: Commissioning) -> dict[str, Any] | None:
+    """What the gains tuned on models, rival and both cost on either; null where a loop diverges."""
+    opinion = None if c.tuning is None else c.tuning.opinion
+    if opinion is None:
+        return None
+    on_models, on_rival = ([x if np.isfinite(x) else None for x in row] for row in opinion.costs)
+    return {"on_models": on_models, "on_rival": on_rival, "taken": opinion.pick}
+
+
+def _gains(controller: Controller) -> dict[str, Any]:
+    """As in its file, in standard form, infinity as null."""
+    return {**controller.to_dict(), "gains": controller.gains.to("standard").to_dict()}
+
+
+def _comparison(c: Comparison) -> dict[str, Any]:
+    return {
+        "predicted": run_numbers(c.predicted),
+        "measured": None if c.measured is None else run_numbers(c.measured),
+        "apart_rmse_rpm": c.apart,
+        "disagreement_rmse_rpm": c.disagreement,
+    }
+
+
+def run_numbers(found: ClosedLoopRun) -> dict[str, float | None]:
+    """What a run's metrics are called in result files."""
+    told = found.metrics()
+    return {
+        "rmse_rpm": told["rmse"],
+        "max_abs_rpm": told["max_abs"],
+        "rise_time_ms": told["rise_time_ms"],
+        "overshoot_percent": told["overshoot_percent"],
+        "effort_v": told["u_rms"],
+        "chatter_v": told["du_rms"],
+        "saturated": told["saturated"],
+    }
+
+
+# --- The folder of a commissioning: every artefact written whole, commissioning.json last ---------
+
+
+_FOLDERS = ("recordings", "models", "controllers", "runs", "analysis")
+_SHORT = 5.0
+"""References of up to this are analysed on [s]."""
+
+
+def require_own(folder: Path, *, overwrite: bool) -> None:
+    """Refuse a folder whose files would be lost and are of no commissioning of a virtual machine.
+
+    Raises
+    ------
+    SettingError
+    """
+    if not overwrite:
+        require_repeatable(folder)
+        _require_own_artefacts(folder)
+
+
+def _require_own_artefacts(folder: Path) -> None:
+    if _may_be_replaced(folder):
+        return
+    place = first_taken(folder, (*_FOLDERS, NUMBERS, "results.json", "report.html"))
+    if place is not None:
+        raise SettingError(
+            f"{place}: expected a folder without such files, or one of a virtual machine's "
+            "commissioning, which can be repeated; choose another folder, or overwrite them "
+            "(--overwrite)"
+        )
+
+
+def first_taken(folder: Path, names: Iterable[str]) -> Path | None:
+    """The first of these that is a file, or a folder with something in it."""
+    for name in names:
+        place = folder / name
+        if place.is_file() or (place.is_dir() and any(place.iterdir())):
+            return place
+    return None
+
+
+def _may_be_replaced(folder: Path) -> bool:
+    found = numbers_in(folder / NUMBERS)
+    return found.get("format") == FORMAT and str(found.get("machine", "")).startswith("virtual")
+
+
+def numbers_in(file: Path) -> dict[str, Any]:
+    """What a file of results says, as far as it is one: nothing where it is damaged or missing."""
+    try:
+        found = json.loads(file.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
+    """Put the artefacts in place of those of an earlier commissioning; then the page.
+
+    Without `commissioning.json` a folder is refused by the report: an interruption in between
+    leaves no mixture that looks whole. What was written there as the recordings came stays until
+    then.
+    """
+    if not overwrite:
+        _require_own_artefacts(folder)
+    prepare(folder)
+    for name in (NUMBERS, ANALYSIS, "report.html"):
+        (folder / name).unlink(missing_ok=True)
+    for name in _FOLDERS:
+        place = folder / name
+        place.mkdir(exist_ok=True)
+        # artefacts of an earlier one that this one has not would pass for its own
+        for old in place.iterdir():
+            if old.suffix in (".csv", ".json", ".npz", ".svg"):
+                old.unlink()
+    _artefacts(found, folder)
+    _analysis(found, folder)
+    storage.write(folder / NUMBERS, FORMAT, VERSION, {"sewfast": __version__, **numbers(found)})
+    own = found.taken_in is not None and found.taken_in.resolve() == folder.resolve()
+    if own and found.is_verified:
+        # of any other there is something to resume
+        with suppress(OSError):
+            # they hold nothing that the tables have not; the page is worth more than their absence
+            clear(folder)
+    return _page(folder)
+
+
+def _artefacts(found: Commissioning, folder: Path) -> None:
+    """What the machine's minutes were for, a few kB, comes first: a disk may be full by the tables.
+
+    A table that has no room does not keep the others from being written.
+
+    Raises
+    ------
+    DataError
+        For the first table that could not be written, once all others are.
+    """
+    for name, controller in (("tuned", found.controller), ("first", found.first)):
+        if controller is not None:
+            controller.save(folder / "controllers" / f"{name}.json")
+    if found.models is not None:
+        found.models.save(folder / "models" / "ensemble.json")
+    tables: list[Callable[[], object]] = [
+        partial(recording.save, folder / "recordings" / f"{name}.csv")
+        for name, recording in found.recordings.items()
+    ]
+    tables += [
+        partial(write_table, folder / run_file(c.reference, kind), loop.columns())
+        for c in found.comparisons
+        for kind, loop in (("predicted", c.predicted), ("measured", c.measured))
+        if loop is not None
+    ]
+    failures: list[Exception] = []
+    for table in tables:
+        try:
+            table()
+        except (OSError, DataError) as error:
+            failures.append(error)
+    if failures:
+        raise DataError(
+            f"{failures[0]}; {len(failures)} of {len(tables)} tables could not be written, the "
+            f"controllers and models are in {folder}: free some space and save again"
+        ) from failures[0]
+
+
+def _analysis(found: Commissioning, folder: Path) -> None:
+    """The loop from every side, for the page; an extra as that one is."""
+    from ..analysis import analyse
+
+    if found.controller is None or found.models is None:
+        return
+    runs = [c.predicted for c in found.comparisons]
+    references = [r.r for r in runs if r.t[-1] <= _SHORT] or [r.r for r in runs[:1]] or None
+    coarse = Thinning.between(found.models.members[0].Ts, found.controller.Ts)
+    with suppress(SettingError):
+        analyse(
+            coarse.coarse(found.controller), found.models, references=references
+        ).save(folder, png=False)  # fmt: skip
+
+
+def _page(folder: Path) -> Path:
+    from ..report import report
+
+    try:
+        return report(folder)
+    except SettingError:
+        # the page is an extra; `sewfast report DIR` writes it once its packages are there
+        return folder / NUMBERS

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 from .. import __version__, storage
 from ..commissioning import Commissioning
-from ..commissioning.folder import first_taken, numbers_in, prepare
+from ..commissioning.result import first_taken, numbers_in, prepare
 from ..control.controller import Controller, paper_controller
 from ..control.loop import ClosedLoopRun
 from ..errors import SettingError

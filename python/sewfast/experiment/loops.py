@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .. import _core, signals
 from ..commissioning import Commissioning, commission
 from ..commissioning.bench import DriveBench, Followed
-from ..commissioning.folder import run_numbers
+from ..commissioning.result import run_numbers
 from ..control.controller import Controller, paper_controller
 from ..control.loop import ClosedLoopRun, run
 from ..dataset import Dataset

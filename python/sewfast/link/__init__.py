@@ -3,8 +3,7 @@
 from .connection import ClockBounds
 from .doctor import Diagnosis, Finding, examine
 from .drive import Drive, connect
-from .host_loop import HostLoopRun, at_period, run_on_host
-from .jitter import Jitter
+from .host_loop import HostLoopRun, Jitter, at_period, run_on_host
 from .plan import Layout, Outcome, Plan, Sink
 from .ports import Port, PortInfo, list_ports, open_port
 from .virtual import VirtualDevice
