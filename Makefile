@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors fleet bits laws bench bench-parts counts bench-device clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors fleet bits laws bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -89,6 +89,17 @@ c-test: ## the C library and the example firmware, with board, motor and host in
 ifeq ($(shell uname),Linux)
 	! nm target/bare/device_test | grep panicking
 endif
+
+M4 = thumbv7em-none-eabihf
+firmware: ## the example firmware for an emulated Cortex-M4 (Debian: rustc-web rust-web-src gcc-arm-none-eabi libnewlib-arm-none-eabi)
+	RUSTC=/usr/bin/rustc RUSTC_BOOTSTRAP=1 cargo rustc --package sewfast-capi --profile firmware --crate-type staticlib \
+	  --quiet -Zbuild-std=core --target $(M4)
+	mkdir -p target/bare
+	arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16 -O2 -std=c99 -Wall -Wextra -Werror \
+	  -nostartfiles -Wl,--gc-sections -T examples/firmware/mps2/board.ld -I rust/capi/include -I examples/firmware \
+	  -o target/bare/mps2.elf examples/firmware/mps2/board.c examples/firmware/firmware.c \
+	  $(or $(CARGO_TARGET_DIR),target)/$(M4)/firmware/libsewfast_capi.a -lm
+	arm-none-eabi-size target/bare/mps2.elf
 
 python-test: $(DEV) ## pytest, with every snippet of the documentation and every example
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not alone'

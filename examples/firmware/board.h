@@ -28,4 +28,7 @@ size_t board_write(const uint8_t *bytes, size_t count);
 bool firmware_init(void);
 void firmware_step(void);
 
+/* For what only some boards need: credit, a stop input. */
+sewfast_device *firmware_device(void);
+
 #endif

@@ -23,6 +23,11 @@ bool firmware_init(void) {
     return device != NULL;
 }
 
+/* NULL before firmware_init. */
+sewfast_device *firmware_device(void) {
+    return device;
+}
+
 static void communicate(void) {
     static uint8_t out[64];
     static size_t waiting, sent;

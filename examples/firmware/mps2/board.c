@@ -1,0 +1,171 @@
+/* A board that is an emulated Cortex-M4: QEMU's mps2-an386, with UART0 as port and a computed motor with dry friction as drive
+ * (built by `make firmware`).
+ *
+ * It runs on credit: once a host has opened a session, its time stands still but for what the host grants, so that a busy
+ * computer changes no recording. A serial line does not tell that the host has gone: time then stands until the next host. */
+#include "board.h"
+
+#include <math.h>
+#include <string.h>
+
+enum { PERIOD = 1000, TICKS_PER_US = 25, RING = 1024 };
+
+static const float COUNTS_PER_REV = 1572.0f;
+static const float GAIN = 490.0f;    /* RPM/V */
+static const float LAG = 0.15f;      /* s */
+static const float FRICTION = 0.25f; /* V */
+
+typedef struct {
+    volatile uint32_t data, state, control, interrupt, divider;
+} uart_registers;
+typedef struct {
+    volatile uint32_t control, value, reload, interrupt;
+} timer_registers;
+static uart_registers *const UART = (uart_registers *)0x40004000u;
+static timer_registers *const TIMER = (timer_registers *)0x40000000u;
+static volatile uint32_t *const ENABLE_INTERRUPTS = (volatile uint32_t *)0xE000E100u;
+static volatile uint32_t *const COPROCESSORS = (volatile uint32_t *)0xE000ED88u;
+/* Boot id and entropy, put there by the emulator: -device loader,addr=0x203ffff0,data=N,data-len=8; else 0. */
+static const volatile uint32_t *const DRAWN = (const volatile uint32_t *)0x203ffff0u;
+
+static volatile uint8_t ring[RING];
+static volatile uint32_t written, taken;
+static uint64_t sampled;  /* us */
+static uint32_t last;     /* the timer, which counts down */
+static uint32_t elapsed;  /* ticks since the last sample, while time runs by itself */
+static float applied;     /* V */
+static float speed;       /* RPM */
+static float fraction;    /* counts */
+static int32_t counts;
+
+/* A byte that the ring has no room for stays in the UART, which takes no other one then. */
+static void pump(void) {
+    while ((UART->state & 2u) != 0 && written - taken < RING) {
+        ring[written % RING] = (uint8_t)UART->data;
+        written++;
+    }
+}
+
+/* Acknowledged before it is emptied: a byte that came between the two would otherwise never be read. */
+void UART_Handler(void) {
+    UART->interrupt = 2;
+    pump();
+}
+
+static bool on_credit(uint64_t *until) {
+    sewfast_device *device = firmware_device();
+    return device != NULL && sewfast_device_credit(device, until);
+}
+
+static void let_time_pass(void) {
+    const uint32_t value = TIMER->value;
+    elapsed += last - value;
+    last = value;
+}
+
+uint64_t board_time(void) {
+    uint64_t until;
+    if (on_credit(&until)) return sampled;
+    let_time_pass();
+    const uint32_t since = elapsed / TICKS_PER_US;
+    return sampled + (since < PERIOD ? since : PERIOD - 1);
+}
+
+static void turn_the_motor(void) {
+    const float share = 1e-6f * PERIOD / LAG;
+    const bool held = fabsf(applied) <= FRICTION;
+    if (speed != 0.0f || !held) {
+        const float against = copysignf(FRICTION, speed != 0.0f ? speed : applied);
+        const float next = speed + share * (GAIN * (applied - against) - speed);
+        speed = held && next * speed <= 0.0f ? 0.0f : next;
+    }
+    fraction += speed * COUNTS_PER_REV * (1e-6f * PERIOD / 60.0f);
+    const int32_t whole = (int32_t)floorf(fraction);
+    counts += whole;
+    fraction -= (float)whole;
+}
+
+bool board_measure(sewfast_measurement *measurement, uint64_t *when) {
+    uint64_t until;
+    let_time_pass();
+    if (on_credit(&until)) {
+        elapsed = 0;
+        if (sampled + PERIOD > until) return false;
+    } else {
+        if (elapsed < PERIOD * TICKS_PER_US) return false;
+        elapsed -= PERIOD * TICKS_PER_US;
+    }
+    turn_the_motor();
+    sampled += PERIOD;
+    const sewfast_measurement found = {counts, NAN, NULL, 0};
+    *measurement = found;
+    *when = sampled;
+    return true;
+}
+
+void board_apply(sewfast_output output) {
+    applied = output.enabled ? output.u : 0.0f;
+}
+
+size_t board_read(uint8_t *bytes, size_t size) {
+    size_t count = 0;
+    while (count < size && taken != written) {
+        bytes[count++] = ring[taken % RING];
+        taken++;
+    }
+    __asm__ volatile("cpsid i" ::: "memory");
+    pump(); /* what had no room */
+    __asm__ volatile("cpsie i" ::: "memory");
+    return count;
+}
+
+size_t board_write(const uint8_t *bytes, size_t count) {
+    size_t sent = 0;
+    while (sent < count && (UART->state & 1u) == 0) UART->data = bytes[sent++];
+    return sent;
+}
+
+void board_identity(sewfast_identity *identity) {
+    static const sewfast_channel channels[] = {
+        {SEWFAST_COUNTS, SEWFAST_FROM_COUNTS, 0, 1, "counts", "1"},
+        {SEWFAST_STEPS, SEWFAST_FROM_COMMAND, 0, 1000, "u", "V"},
+        {SEWFAST_FLOAT, SEWFAST_FROM_FEEDBACK, 0, 1, "feedback", "RPM"},
+    };
+    identity->boot_id = DRAWN[0];
+    identity->entropy = DRAWN[1];
+    identity->name = "emulated drive";
+    identity->firmware = "1.0";
+    identity->period = PERIOD;
+    identity->counts_per_rev = COUNTS_PER_REV;
+    identity->capabilities = SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN | SEWFAST_CAN_CREDIT;
+    identity->ceilings = (sewfast_limits){20.0f, 4000.0f, 60000.0f, INFINITY};
+    identity->channels = channels;
+    identity->channel_count = sizeof channels / sizeof channels[0];
+}
+
+extern uint32_t __stack, __data, __data_end, __data_load, __bss_start__, __bss_end__;
+
+void Reset_Handler(void) {
+    *COPROCESSORS |= 0xFu << 20; /* the floating-point unit, before any float */
+    __asm__ volatile("dsb; isb");
+    memcpy(&__data, &__data_load, (size_t)((char *)&__data_end - (char *)&__data));
+    memset(&__bss_start__, 0, (size_t)((char *)&__bss_end__ - (char *)&__bss_start__));
+    TIMER->reload = TIMER->value = last = 0xFFFFFFFFu;
+    TIMER->control = 1;
+    UART->divider = 16;
+    UART->control = 1u | 2u | 8u; /* send, receive, interrupt where a byte has come */
+    *ENABLE_INTERRUPTS = 1;
+    if (firmware_init()) {
+        for (;;) firmware_step();
+    }
+    for (;;) __asm__ volatile("wfi");
+}
+
+static void Fault_Handler(void) {
+    for (;;) __asm__ volatile("wfi");
+}
+
+__attribute__((section(".vectors"), used)) static const void *const vectors[17] = {
+    &__stack,      (void *)Reset_Handler, (void *)Fault_Handler, (void *)Fault_Handler, (void *)Fault_Handler,
+    (void *)Fault_Handler, (void *)Fault_Handler, [16] = (void *)UART_Handler,
+};
