@@ -113,8 +113,10 @@ ASK = 0.5
 """Time between two STATUS in real time [s]; each of them bounds the clocks."""
 CREDIT_SHARE = 0.8
 """Share of the watchdog time that a device on credit may run ahead."""
-AGAIN = 0.002
-"""Time after which credit that brought nothing is granted again [s]."""
+AGAIN, AT_MOST = 0.002, 0.064
+"""Time after which credit that brought nothing is granted again [s]: twice as long each time, up to
+the second. A device that is slow to read would otherwise drown in grants, with its answers behind
+them."""
 ARMED_SILENCE = 0.25
 """Time within which an armed device says something: every .2 s [s]."""
 _ENDS = ("finished", "stopped", "tripped")
@@ -151,7 +153,8 @@ class Run:
         self._sink_works = True
         self._last: Status | None = None
         self._lead = round(CREDIT_SHARE * link.watchdog_us)
-        self._granted = 0
+        self._granted = self._brought = 0
+        self._again = AGAIN
         self._driven = 0.0
         self._beaten = self._heard = self._asked = 0.0
         self._outages = len(link.outages)
@@ -272,7 +275,11 @@ class Run:
             # the device must not play what it has not got yet
             until = min(until, self.start_us + (self.profile.end - 1) * self.period)
         further = until - self._granted
-        if 4 * further >= self._lead or now - self._beaten >= AGAIN:
+        if self.link.newest > self._brought:
+            self._brought, self._again = self.link.newest, AGAIN
+        if 4 * further >= self._lead or now - self._beaten >= self._again:
+            if further <= 0:
+                self._again = min(2.0 * self._again, AT_MOST)
             self._beaten = now
             self._granted = until
             if self.plan.mode == "direct":
