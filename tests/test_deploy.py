@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
+import math
 import os
 import re
 import shutil
@@ -51,6 +53,53 @@ def test_no_optimisation_changes_a_bit(optimise: str, tmp_path: Path) -> None:
 def test_an_emulated_processor_has_the_same_bits(name: str, precision: str, tmp_path: Path) -> None:
     expected = deployed.prepared(CASES[name], tmp_path, precision, 2000)
     assert deployed.cortex_m4(tmp_path, "code") == expected
+
+
+@needs_compiler
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", deployed.CONTROLLERS)
+def test_hostile_inputs_and_changes_of_mode_keep_the_bits(
+    name: str, precision: str, tmp_path: Path
+) -> None:
+    controller = deployed.CONTROLLERS[name]
+    deploy(controller, tmp_path, precision=precision, name="code")
+    flags = ["-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared"]
+    library = tmp_path / "code.so"
+    subprocess.run(
+        [deployed.compilers()[0], *flags, str(tmp_path / "code.c"), "-o", str(library)], check=True
+    )
+    code, real = (
+        ctypes.CDLL(str(library)),
+        ctypes.c_float if precision == "f32" else ctypes.c_double,
+    )
+    code.code_step_with.argtypes = [ctypes.c_void_p, real, real, real]
+    code.code_step_with.restype = real
+    code.code_set_manual.argtypes = [ctypes.c_void_p, real]
+    code.code_set_automatic.argtypes = code.code_init.argtypes = [ctypes.c_void_p]
+    memory = ctypes.create_string_buffer(4096)
+    code.code_init(memory)
+    core: Any = controller.core()
+    core = core.single() if precision == "f32" else core
+    rng = np.random.default_rng(7)
+    hostile = [np.nan, np.inf, -np.inf, 1e300, -1e38, 1e-310, -0.0, 3e38]
+    for k in range(4000):
+        r, y, extra = rng.normal(0.0, 1000.0, 3)
+        if rng.uniform() < 0.05:
+            r, y, extra = (rng.choice(hostile) if rng.uniform() < 0.4 else v for v in (r, y, extra))
+        if rng.uniform() < 0.02:
+            u = float(rng.choice([*hostile[:4], 1.0, -50.0]))
+            taken = code.code_set_manual(memory, u)
+            finite = math.isfinite(u) and (precision == "f64" or abs(u) < 3.5e38)
+            assert bool(taken) == finite
+            if finite:
+                core.set_manual(u)
+        if rng.uniform() < 0.02:
+            code.code_set_automatic(memory)
+            core.set_automatic()
+        # what is too large for single precision is infinite on both sides
+        found, expected = code.code_step_with(memory, r, y, extra), core.step(r, y, extra)
+        assert found == expected, (k, r, y, extra)
+        assert np.isfinite(found)
 
 
 def test_the_sum_of_bits_sees_every_bit_and_the_order() -> None:
@@ -215,7 +264,9 @@ def test_a_model_is_no_function_block(tmp_path: Path) -> None:
 # --- What is refused, and what is written ---------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["", "9x", "Drive", "a-b", "int", "x" * 60, "a b", "../a", "é"])
+@pytest.mark.parametrize(
+    "name", ["", "9x", "Drive", "a-b", "int", "x" * 60, "a b", "../a", "é", "a_test", "fmi3"]
+)
 def test_names_that_are_none_in_c_are_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match="name: expected"):
         deploy(CASES["pi"], tmp_path / "out", name=name)
@@ -288,20 +339,21 @@ def test_an_ensemble_for_no_processor_is_refused(tmp_path: Path) -> None:
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="needs cmake")
 def test_cmake_builds_and_tests_the_folder(tmp_path: Path) -> None:
     deploy(CASES["everything"], tmp_path / "a b", name="loop")
+    deploy(CASES["neural_ss"], tmp_path / "a b", name="plant")
     for command in (
         ["cmake", "-S", tmp_path / "a b", "-B", tmp_path / "build"],
-        ["cmake", "--build", tmp_path / "build", "--target", "loop_test"],
+        ["cmake", "--build", tmp_path / "build", "--target", "loop_test", "plant_test"],
         ["ctest", "--test-dir", tmp_path / "build"],
     ):
-        subprocess.run([str(c) for c in command], check=True, capture_output=True)
+        done = subprocess.run([str(c) for c in command], check=True, capture_output=True, text=True)
+    assert "2 tests passed" in done.stdout or "out of 2" in done.stdout
 
 
 def test_manifests_are_what_their_tools_read(tmp_path: Path) -> None:
     done = deploy(CASES["pi"], tmp_path, name="loop")
     assert {f"loop{end}" for end in (".c", ".h", "_test.c")} <= set(done.files)
     library = json.loads((tmp_path / "library.json").read_text())
-    assert library["name"] == "loop"
-    assert library["build"]["srcFilter"] == ["+<loop.c>"]
+    assert library["build"]["srcFilter"] == ["+<*.c>", "-<*_test.c>"]
     assert "cmake: zephyr" in (tmp_path / "zephyr" / "module.yml").read_text()
 
 

@@ -104,10 +104,12 @@ def deploy(
         raise SettingError(f"precision: expected {' or '.join(PRECISIONS)}, received {precision!r}")
     if name is None:
         name = "controller" if isinstance(what, Controller) else "model"
-    if not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name) or name in c99.KEYWORDS:
+    taken = name in c99.KEYWORDS or name.endswith("_test")
+    if taken or not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name):
         raise SettingError(
             f"name: expected lower-case letters, digits and underscores that are no word of the "
-            f"language, received {name!r}; for example drive"
+            f"language and no name of another file (_test, fmi3), received {name!r}; for example "
+            "drive"
         )
     texts, notes = _WRITERS[to](what, name, precision)
     target = Path(folder)

@@ -30,7 +30,7 @@ KEYWORDS = frozenset(
         "auto bool break case char class const continue default delete do double else enum",
         "extern float for goto if inline int long main namespace new private public register",
         "restrict return short signed sizeof static struct switch template this typedef union",
-        "unsigned using void volatile while",
+        "unsigned using void volatile while fmi3",
     )
     for keyword in line.split()
 )

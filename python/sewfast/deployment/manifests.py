@@ -10,48 +10,55 @@ from ..models import Model
 
 
 def files(name: str, what: Model | Controller) -> dict[str, str]:
-    """Texts by file name."""
+    """Texts by file name; those of the build systems take all that is deployed into the folder."""
     return {
-        "CMakeLists.txt": _CMAKE.replace("@", name),
-        "library.json": _platformio(name),
-        "zephyr/module.yml": f"name: {name}\nbuild:\n  cmake: zephyr\n",
-        "zephyr/CMakeLists.txt": _ZEPHYR.replace("@", name),
-        "README.md": _readme(name, what),
+        "CMakeLists.txt": _CMAKE,
+        "library.json": _platformio(),
+        "zephyr/module.yml": "name: deployed\nbuild:\n  cmake: zephyr\n",
+        "zephyr/CMakeLists.txt": _ZEPHYR,
+        f"{name}.md": _page(name, what),
     }
 
 
 _CMAKE = """cmake_minimum_required(VERSION 3.10)
-project(@ C)
-
-# the bits of sewfast's own step: no fused multiply-add
-add_library(@ STATIC @.c)
-target_include_directories(@ PUBLIC ${CMAKE_CURRENT_SOURCE_DIR})
-set_target_properties(@ PROPERTIES C_STANDARD 99)
-target_compile_options(@ PRIVATE -ffp-contract=off)
-
+project(deployed C)
 enable_testing()
-add_executable(@_test EXCLUDE_FROM_ALL @_test.c)
-target_link_libraries(@_test @)
-add_test(NAME @ COMMAND @_test)
+
+# every NAME.c of this folder is a library NAME, with the test NAME_test
+file(GLOB tests ${CMAKE_CURRENT_SOURCE_DIR}/*_test.c)
+foreach(test ${tests})
+  get_filename_component(file ${test} NAME_WE)
+  string(REGEX REPLACE "_test$" "" name ${file})
+  add_library(${name} STATIC ${CMAKE_CURRENT_SOURCE_DIR}/${name}.c)
+  target_include_directories(${name} PUBLIC ${CMAKE_CURRENT_SOURCE_DIR})
+  set_target_properties(${name} PROPERTIES C_STANDARD 99)
+  # the bits of sewfast's own step: no fused multiply-add
+  target_compile_options(${name} PRIVATE -ffp-contract=off)
+  add_executable(${file} EXCLUDE_FROM_ALL ${test})
+  target_link_libraries(${file} ${name})
+  add_test(NAME ${name} COMMAND ${file})
+endforeach()
 """
 
-_ZEPHYR = """zephyr_library()
-zephyr_library_sources(../@.c)
+_ZEPHYR = """file(GLOB sources ${CMAKE_CURRENT_LIST_DIR}/../*.c)
+list(FILTER sources EXCLUDE REGEX "_test\\.c$")
+zephyr_library()
+zephyr_library_sources(${sources})
 zephyr_library_compile_options(-ffp-contract=off)
 zephyr_include_directories(..)
 """
 
 
-def _platformio(name: str) -> str:
+def _platformio() -> str:
     library = {
-        "name": name,
+        "name": "deployed",
         "version": __version__,
         "description": "Written by sewfast",
         "license": "0BSD",
         "frameworks": "*",
         "platforms": "*",
         "build": {
-            "srcFilter": [f"+<{name}.c>"],
+            "srcFilter": ["+<*.c>", "-<*_test.c>"],
             "srcDir": ".",
             "includeDir": ".",
             "flags": ["-ffp-contract=off"],
@@ -60,7 +67,7 @@ def _platformio(name: str) -> str:
     return json.dumps(library, indent=2) + "\n"
 
 
-def _readme(name: str, what: Model | Controller) -> str:
+def _page(name: str, what: Model | Controller) -> str:
     if isinstance(what, Controller):
         use = (
             f"static {name}_pid pid;\n\n{name}_init(&pid);           /* once */\n"
