@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors fleet bits laws bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors fleet bits killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -89,6 +89,9 @@ c-test: ## the C library and the example firmware, with board, motor and host in
 ifeq ($(shell uname),Linux)
 	! nm target/bare/device_test | grep panicking
 endif
+
+killed: firmware ## kills the host of the emulated board 100 times; its output goes off in time
+	SEWFAST_TRIALS=100 $(BIN)/python -m pytest tests/test_emulated.py -k killed
 
 M4 = thumbv7em-none-eabihf
 firmware: ## the example firmware for an emulated Cortex-M4 (Debian: rustc-web rust-web-src gcc-arm-none-eabi libnewlib-arm-none-eabi)

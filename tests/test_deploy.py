@@ -55,6 +55,32 @@ def test_an_emulated_processor_has_the_same_bits(name: str, precision: str, tmp_
     assert deployed.cortex_m4(tmp_path, "code") == expected
 
 
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
+def test_the_sketch_controls_a_motor_as_the_core_would(tmp_path: Path) -> None:
+    """Each duty of examples/firmware/sketch is that of the core for the same counts."""
+    gains = Gains.standard(Kp=0.01, Ti=0.05, Td=0.0)  # V/RPM, s
+    controller = Controller(gains, Ts=0.001, u_min=-24, u_max=24)
+    deploy(controller, tmp_path)
+    here = Path(__file__).parent
+    sketch = here.parent / "examples" / "firmware" / "sketch"
+    folders = [f"-I{place}" for place in (here / "arduino", sketch, tmp_path)]
+    sources = [str(here / "arduino" / "main.cpp"), str(tmp_path / "controller.c")]
+    built = tmp_path / "sketch"
+    flags = ["-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-x", "c++"]
+    subprocess.run(["g++", *flags, *folders, *sources, "-o", str(built)], check=True)
+    made = subprocess.run([str(built)], check=True, capture_output=True, text=True)
+    counts, duties = np.array([line.split() for line in made.stdout.splitlines()], dtype=int).T
+    # the sketch sees at each period what the motor had done by the one before
+    seen = np.concatenate([[0, 0], counts[:-1]])
+    core = controller.core().single()
+    scale = np.float32(60e6) / np.float32(1572.0) / np.float32(1000.0)
+    for moved, duty in zip(np.diff(seen), duties, strict=True):
+        u = core.step(1000.0, float(np.float32(moved) * scale))
+        assert duty == math.copysign(int(abs(u) / 24 * 255 + 0.5), u)
+    speeds = np.diff(counts) * float(scale)
+    assert abs(speeds[-100:].mean() - 1000.0) < 10.0
+
+
 @needs_compiler
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("name", deployed.CONTROLLERS)

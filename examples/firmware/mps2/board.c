@@ -1,8 +1,9 @@
 /* A board that is an emulated Cortex-M4: QEMU's mps2-an386, with UART0 as port and a computed motor with dry friction as drive
- * (built by `make firmware`).
+ * (built by `make firmware`, started by `sewfast pil`).
  *
- * It runs on credit: once a host has opened a session, its time stands still but for what the host grants, so that a busy
- * computer changes no recording. A serial line does not tell that the host has gone: time then stands until the next host. */
+ * It runs on credit unless told otherwise: once a host has opened a session, its time stands still but for what the host grants,
+ * so that a busy computer changes no recording. A serial line does not tell that the host has gone: time then stands until the
+ * next host. */
 #include "board.h"
 
 #include <math.h>
@@ -25,8 +26,20 @@ static uart_registers *const UART = (uart_registers *)0x40004000u;
 static timer_registers *const TIMER = (timer_registers *)0x40000000u;
 static volatile uint32_t *const ENABLE_INTERRUPTS = (volatile uint32_t *)0xE000E100u;
 static volatile uint32_t *const COPROCESSORS = (volatile uint32_t *)0xE000ED88u;
-/* Boot id and entropy, put there by the emulator: -device loader,addr=0x203ffff0,data=N,data-len=8; else 0. */
-static const volatile uint32_t *const DRAWN = (const volatile uint32_t *)0x203ffff0u;
+
+/* Memory that the computer reads and writes as a file; python/sewfast/link/emulated.py has the same layout. The stack lies
+ * behind it, so that its depth can be seen from there too. All zeros where no file is given. */
+typedef struct {
+    uint32_t boot_id, entropy;
+    uint32_t real_time;   /* from the computer: 1 offers no credit */
+    uint32_t samples;     /* control steps so far, and their ticks from measurement to output */
+    uint32_t least, most;
+    uint64_t total;
+    uint64_t heard;       /* us: when bytes came last */
+    uint64_t safe;        /* us: when the output was switched off last */
+    uint32_t enabled;
+} shared_memory;
+__attribute__((section(".shared"))) static volatile shared_memory shared;
 
 static volatile uint8_t ring[RING];
 static volatile uint32_t written, taken;
@@ -37,6 +50,8 @@ static float applied;     /* V */
 static float speed;       /* RPM */
 static float fraction;    /* counts */
 static int32_t counts;
+static uint32_t measured; /* ticks: when the measurement was handed over that has no output yet */
+static bool pending;
 
 /* A byte that the ring has no room for stays in the UART, which takes no other one then. */
 static void pump(void) {
@@ -100,10 +115,24 @@ bool board_measure(sewfast_measurement *measurement, uint64_t *when) {
     const sewfast_measurement found = {counts, NAN, NULL, 0};
     *measurement = found;
     *when = sampled;
+    pending = true;
+    measured = TIMER->value;
     return true;
 }
 
+static void count_the_step(void) {
+    const uint32_t ticks = measured - TIMER->value;
+    pending = false;
+    if (shared.samples == 0 || ticks < shared.least) shared.least = ticks;
+    if (ticks > shared.most) shared.most = ticks;
+    shared.total += ticks;
+    shared.samples++;
+}
+
 void board_apply(sewfast_output output) {
+    if (pending) count_the_step();
+    if (shared.enabled && !output.enabled) shared.safe = board_time();
+    shared.enabled = output.enabled;
     applied = output.enabled ? output.u : 0.0f;
 }
 
@@ -113,6 +142,7 @@ size_t board_read(uint8_t *bytes, size_t size) {
         bytes[count++] = ring[taken % RING];
         taken++;
     }
+    if (count > 0) shared.heard = board_time();
     __asm__ volatile("cpsid i" ::: "memory");
     pump(); /* what had no room */
     __asm__ volatile("cpsie i" ::: "memory");
@@ -131,13 +161,14 @@ void board_identity(sewfast_identity *identity) {
         {SEWFAST_STEPS, SEWFAST_FROM_COMMAND, 0, 1000, "u", "V"},
         {SEWFAST_FLOAT, SEWFAST_FROM_FEEDBACK, 0, 1, "feedback", "RPM"},
     };
-    identity->boot_id = DRAWN[0];
-    identity->entropy = DRAWN[1];
+    identity->boot_id = shared.boot_id;
+    identity->entropy = shared.entropy;
     identity->name = "emulated drive";
     identity->firmware = "1.0";
     identity->period = PERIOD;
     identity->counts_per_rev = COUNTS_PER_REV;
-    identity->capabilities = SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN | SEWFAST_CAN_CREDIT;
+    identity->capabilities = SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN;
+    if (!shared.real_time) identity->capabilities |= SEWFAST_CAN_CREDIT;
     identity->ceilings = (sewfast_limits){20.0f, 8000.0f, 90000.0f, INFINITY};
     identity->channels = channels;
     identity->channel_count = sizeof channels / sizeof channels[0];

@@ -19,6 +19,7 @@ from . import (
     fleet,
     gains,
     identify,
+    pil,
     recording,
     tune,
 )
@@ -124,6 +125,7 @@ def build_parser() -> argparse.ArgumentParser:
         control.add,
         check.add_analyse,
         deploy.add,
+        pil.add,
         fleet.add,
         drive.add_ports,
         drive.add_doctor,

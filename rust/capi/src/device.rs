@@ -221,7 +221,7 @@ unsafe fn init(storage: *mut Storage, identity: &CIdentity) -> Result<(), Refusa
     // room for a device.
     let device = unsafe {
         let place = &raw mut (*storage).device;
-        place.write(Device::OFF);
+        place.write(Device::off());
         &mut *place
     };
     Ok(device.boot(identity)?)

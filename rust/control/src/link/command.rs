@@ -112,17 +112,22 @@ impl Gains {
     /// # Errors
     /// The field that is outside its range, or beyond the volt limit.
     pub(super) fn check(&self, volt: f32, ts: f32) -> Result<(), Refusal> {
-        let field = |refused: Refused| index_of(refused.name);
+        let refused = |volt| self.refused(volt, ts).map(|refused| index_of(refused.name));
         Refusal::value(SCHEDULE).unless(!self.garbled)?;
-        let free = self.controller(f32::INFINITY, ts);
-        free.map_err(|refused| Refusal::value(field(refused)))?;
+        if let Some(field) = refused(f32::INFINITY) {
+            return Err(Refusal::value(field));
+        }
         let unit = self.counts_per_unit * ts;
         // a feedback that is not finite would leave the controller blind
         let holds = unit > 0.0 && unit.is_finite() && (MOST_COUNTS / unit).is_finite();
         Refusal::value(11).unless(holds)?;
-        let clipped = self.controller(volt, ts);
-        clipped.map_err(|refused| Refusal::limit(field(refused)))?;
-        Ok(())
+        refused(volt).map_or(Ok(()), |field| Err(Refusal::limit(field)))
+    }
+
+    /// What keeps a controller from being made; in a frame of its own, as a controller fills most of a stack.
+    #[inline(never)]
+    pub(super) fn refused(&self, volt: f32, ts: f32) -> Option<Refused> {
+        self.controller(volt, ts).err()
     }
 }
 

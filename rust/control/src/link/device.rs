@@ -134,16 +134,21 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Device<CAPACITY, TRANSMIT> {
     /// # Errors
     /// The first field of the identity that is outside its range.
     pub fn new(identity: Identity) -> Result<Self, Refused> {
-        let mut device = Self::OFF;
+        let mut device = Self::off();
         device.boot(identity)?;
         Ok(device)
     }
 
     /// A device before its boot, for a static place: it can do nothing, and its limits are 0.
-    pub const OFF: Self = Self {
-        deframer: Deframer::new(),
-        core: Core::OFF,
-    };
+    ///
+    /// Inlined, so that it is made where it shall be: as a constant to copy it would lie in flash once more, nearly all zeros.
+    #[inline(always)]
+    pub const fn off() -> Self {
+        Self {
+            deframer: Deframer::new(),
+            core: Core::off(),
+        }
+    }
 
     /// Boots in place, where [`new`](Self::new) would need the device's size on the stack; what was before is forgotten.
     ///
@@ -151,7 +156,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Device<CAPACITY, TRANSMIT> {
     /// As for [`new`](Self::new); nothing is changed then.
     pub fn boot(&mut self, identity: Identity) -> Result<(), Refused> {
         identity.check()?;
-        *self = Self::OFF;
+        *self = Self::off();
         self.core.boot(identity);
         Ok(())
     }
@@ -271,33 +276,36 @@ struct Core<const CAPACITY: usize, const TRANSMIT: usize> {
 }
 
 impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
-    const OFF: Self = Self {
-        identity: Identity::NONE,
-        schema: 0,
-        period: NonZeroU64::MIN,
-        ts: 1.0,
-        transmit: Transmit::new(),
-        session: None,
-        credit: None,
-        watchdog: Watchdog::new(1),
-        limits: None,
-        guard: Guard::new(1, 1.0, 1.0),
-        gains: None,
-        profile: Profile::new(),
-        stream: Stream::new(&[]),
-        run: Run::NONE,
-        state: State::Boot,
-        reason: Reason::None,
-        output: Output::SAFE,
-        owed: false,
-        now: 0,
-        due: 0,
-        last_beat: 0,
-        good: 0,
-        armed: 0,
-        received: 0,
-        refused: 0,
-    };
+    #[inline(always)]
+    const fn off() -> Self {
+        Self {
+            identity: Identity::NONE,
+            schema: 0,
+            period: NonZeroU64::MIN,
+            ts: 1.0,
+            transmit: Transmit::new(),
+            session: None,
+            credit: None,
+            watchdog: Watchdog::new(1),
+            limits: None,
+            guard: Guard::new(1, 1.0, 1.0),
+            gains: None,
+            profile: Profile::new(),
+            stream: Stream::new(&[]),
+            run: Run::NONE,
+            state: State::Boot,
+            reason: Reason::None,
+            output: Output::SAFE,
+            owed: false,
+            now: 0,
+            due: 0,
+            last_beat: 0,
+            good: 0,
+            armed: 0,
+            received: 0,
+            refused: 0,
+        }
+    }
 
     /// From off, with an identity that has been checked.
     fn boot(&mut self, identity: Identity) {

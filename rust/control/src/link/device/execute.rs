@@ -134,6 +134,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         }
     }
 
+    #[inline(never)]
     fn hello(&mut self, from: u8, to: u8, number: u32, body: &mut Body) -> Done {
         Refusal::version(VERSION).unless((from..=to).contains(&VERSION))?;
         Refusal::value(2).unless(number != 0)?;
@@ -292,6 +293,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         }
     }
 
+    #[inline(never)]
     fn set_gains(&mut self, gains: Gains) -> Done {
         self.allow(&[State::Idle, State::Armed])?;
         // what a start was checked with does not change behind its back
@@ -303,6 +305,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         Ok(())
     }
 
+    #[inline(never)]
     fn start(&mut self, start: Start, body: &mut Body) -> Done {
         self.allow(&[State::Armed])?;
         self.check_mode(start.mode)?;
@@ -340,8 +343,8 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         }
         if mode == 1 {
             let gains = self.gains.as_ref().ok_or(Refusal::value(0))?;
-            let limited = gains.controller(self.bounds().volt, self.ts);
-            Refusal::limit(0).unless(limited.is_ok())?;
+            let refused = gains.refused(self.bounds().volt, self.ts);
+            Refusal::limit(0).unless(refused.is_none())?;
         }
         Ok(())
     }

@@ -66,6 +66,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         }
     }
 
+    #[inline(never)]
     fn begin_if_due(&mut self) {
         if self.run.planned.is_none_or(|at| self.due < at) {
             return;

@@ -1,0 +1,141 @@
+"""`sewfast pil`: the firmware on an emulated processor, from doctor to commissioning."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+from ..errors import SettingError
+from .arguments import Commands, add_command, add_overwrite
+from .output import print_json
+
+PIL = """\
+Processor in the loop: compile the example firmware for a Cortex-M4, start it in the emulator QEMU,
+connect to its serial port and do what one does with a drive: examine it, record a chirp, run a
+controller, commission it. The motor is computed on the emulated processor too.
+
+At the end it says how many instructions a control period takes, how deep the stack was used and
+how large the code is. QEMU counts instructions, not cycles.
+
+It needs a source checkout and, on Debian, make, cargo and
+  gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm rustc-web rust-web-src
+or a firmware that is built already, and qemu-system-arm alone.
+"""
+
+EXAMPLES = """\
+examples:
+  sewfast pil                                 in a source checkout; results go to pil/
+  sewfast pil --no-commission                 in a quarter of the time
+  sewfast pil --clock real --watchdog 500     the board's time is the computer's
+  sewfast pil --firmware target/bare/mps2.elf
+"""
+
+LIMITS = "volt=10,speed=8000,acceleration=90000,current=inf"
+"""What the computed motor may do."""
+
+
+def add(commands: Commands) -> None:
+    parser = add_command(
+        commands, "pil", command,
+        summary="the firmware on an emulated processor", text=PIL, examples=EXAMPLES,
+    )  # fmt: skip
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument(
+        "--source", type=Path, default=Path(), metavar="DIR",
+        help="a source checkout of sewfast (the current folder)",
+    )  # fmt: skip
+    place.add_argument("--firmware", type=Path, metavar="FILE.elf", help="built already")
+    parser.add_argument(
+        "--out", type=Path, default=Path("pil"), metavar="DIR", help="folder for what it did (pil)"
+    )
+    parser.add_argument(
+        "--clock", choices=("credit", "real"), default="credit",
+        help="the board's time: what the host grants, or the computer's (credit)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--watchdog", type=float, metavar="MS",
+        help="the board stops when it has not heard from here for this long (as `record` has it)",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of commissioning (0)")
+    parser.add_argument(
+        "--no-commission", dest="commission", action="store_false", help="leave commissioning out"
+    )
+    add_overwrite(parser)
+
+
+def command(args: argparse.Namespace) -> int:
+    from ..control import Controller
+    from ..gains import Gains
+    from ..link.emulated import EmulatedBoard, build_firmware
+
+    if args.out.exists() and not args.overwrite:
+        raise SettingError(
+            f"--out {args.out}: expected a new folder, got one that is there; name another, or "
+            "--overwrite"
+        )
+    firmware = args.firmware
+    if firmware is None:
+        _say("compiling the firmware")
+        firmware = build_firmware(args.source)
+    with EmulatedBoard(firmware, clock=args.clock, boot_id=args.seed + 1) as board:
+        args.out.mkdir(parents=True, exist_ok=True)
+        first = Controller(
+            Gains.standard(Kp=0.02, Ti=0.1, Td=0.002),
+            Ts=0.001, alpha=0.4, N=10, u_min=-10, u_max=10, filter_samples=8,
+        )  # fmt: skip
+        first.save(args.out / "first.json")
+        results: dict[str, Any] = {}
+        for name, words in _stages(args, board.port):
+            code, results[name] = _carried_out(args, words)
+            if code:
+                _say(f"{name} ended with {code}")
+                return code
+        figures = board.figures()
+    if args.json:
+        print_json({"stages": results, "figures": vars(figures)})
+    else:
+        print(figures)
+        print(f"written to {args.out}")
+    return 0
+
+
+def _stages(args: argparse.Namespace, port: str) -> Iterator[tuple[str, list[str]]]:
+    """The commands, as a user would type them."""
+    out = args.out
+    drive = ["--limits", LIMITS, "--live", "none"]
+    if args.watchdog is not None:
+        drive += ["--watchdog", f"{args.watchdog:g}"]
+    if args.overwrite:
+        drive += ["--overwrite"]
+    yield "doctor", ["doctor", port]
+    chirp = ["--signal", "chirp_lo_hi", "-o", str(out / "chirp.mcap")]
+    yield "record", ["record", "--on", port, *chirp, *drive]
+    run = [str(out / "first.json"), "--reference", "trapezoid", "-o", str(out / "first.mcap")]
+    yield "run", ["run", *run, "--on", port, *drive]
+    if args.commission:
+        short = ["--members", "2", "--evaluations", "500", "--seed", str(args.seed)]
+        place = ["--out", str(out / "commission")]
+        yield "commission", ["commission", "--on", port, *place, *short, *drive]
+
+
+def _carried_out(args: argparse.Namespace, words: list[str]) -> tuple[int, Any]:
+    """One stage: its exit code, and with --json what it printed."""
+    from . import main
+
+    _say(f"$ sewfast {' '.join(words)}")
+    if not args.json:
+        return main(words), None
+    with redirect_stdout(StringIO()) as printed:
+        code = main([*words, "--json"])
+    text = printed.getvalue()
+    return code, json.loads(text) if text.strip() else None
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,296 @@
+"""An emulated Cortex-M4 that runs the example firmware: QEMU as a drive behind a port."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import secrets
+import shutil
+import socket
+import struct
+import subprocess
+import tempfile
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Literal
+
+from ..errors import LinkError, SettingError
+
+BOARD = "mps2-an386"
+EMULATOR = "qemu-system-arm"
+PACKAGES = "gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm rustc-web rust-web-src"
+"""What Debian calls all that is needed to build and to run the firmware."""
+
+# as in examples/firmware/mps2/board.c and board.ld
+_SHARED = struct.Struct("<6I3QI")
+_STACK_TOP = 1 << 20
+_STACK = 64 << 10
+_PAINT = b"\xa5"
+_MEMORY = 16 << 20
+
+_SHIFT = 5
+"""An instruction takes 2**5 ns of the board's time, a tick of its timer 40 ns."""
+
+_START = 20.0
+"""Time for the emulator to open its port [s]."""
+
+
+@dataclass(frozen=True)
+class BoardFigures:
+    """What the processor has done since its boot.
+
+    Attributes
+    ----------
+    steps : int
+        Control periods: a measurement handed to the device, an output taken from it.
+    instructions : tuple of (float, float, float) or None
+        Least, mean and most instructions of one, within 2; None where the board keeps real time,
+        which says nothing about them.
+    stack : int
+        Deepest use of the stack [bytes].
+    code : int
+        Code and constants [bytes].
+    memory : int
+        Static memory without the stack [bytes].
+    """
+
+    steps: int
+    instructions: tuple[float, float, float] | None
+    stack: int
+    code: int
+    memory: int
+
+    def __str__(self) -> str:
+        counted = "not counted in real time"
+        if self.instructions is not None:
+            least, mean, most = self.instructions
+            counted = f"{least:.0f} to {most:.0f}, mean {mean:.0f}"
+        return (
+            f"control periods          {self.steps:,}\n"
+            f"instructions a period    {counted}\n"
+            f"stack                    {self.stack:,} bytes\n"
+            f"code and constants       {self.code:,} bytes\n"
+            f"static memory            {self.memory:,} bytes"
+        )
+
+
+def build_firmware(source: str | os.PathLike[str] = ".") -> Path:
+    """Compile the example firmware for the emulated board.
+
+    Parameters
+    ----------
+    source : path
+        A source checkout of sewfast, or a folder in it.
+
+    Returns
+    -------
+    Path
+        The firmware, an ELF file.
+
+    Raises
+    ------
+    SettingError
+        No source checkout; a compiler is missing; it does not compile.
+    """
+    start = Path(source).resolve()
+    places = (start, *start.parents)
+    root = next((p for p in places if (p / "examples/firmware/mps2/board.c").is_file()), None)
+    if root is None:
+        raise SettingError(
+            f"firmware: expected a source checkout of sewfast, got {start}; name one by --source, "
+            "or a firmware that is built already by --firmware FILE.elf"
+        )
+    missing = [t for t in ("make", "cargo", "arm-none-eabi-gcc") if shutil.which(t) is None]
+    if not Path("/usr/bin/rustc").exists():
+        missing.append("/usr/bin/rustc")
+    if missing:
+        raise SettingError(
+            f"firmware: expected {', '.join(missing)}, which is missing; on Debian: apt-get "
+            f"install make cargo {PACKAGES}"
+        )
+    made = subprocess.run(
+        ["make", "--no-print-directory", "-C", str(root), "firmware"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if made.returncode != 0:
+        last = (made.stderr or made.stdout).strip().splitlines()[-8:]
+        raise SettingError("firmware: it does not compile; make says:\n  " + "\n  ".join(last))
+    return root / "target" / "bare" / "mps2.elf"
+
+
+class EmulatedBoard:
+    """A Cortex-M4 with floating-point unit in QEMU (`mps2-an386`), its UART a TCP port.
+
+    Parameters
+    ----------
+    firmware : path
+        ELF file, as of `build_firmware`.
+    clock : {"credit", "real"}
+        On credit the board's time stands still but for what the host grants: a busy computer
+        changes no recording, and instructions are counted. In real time its clock is the
+        computer's.
+    boot_id : int or None
+        What distinguishes this boot from others, and what its random bits begin with; None draws
+        it.
+
+    Raises
+    ------
+    SettingError
+        No emulator; a file that is no firmware for ARM.
+    LinkError
+        The emulator ends, or opens no port.
+
+    Examples
+    --------
+    >>> with EmulatedBoard(build_firmware()) as board:  # doctest: +SKIP
+    ...     print(examine(board.port))
+    """
+
+    def __init__(
+        self,
+        firmware: str | os.PathLike[str],
+        *,
+        clock: Literal["credit", "real"] = "credit",
+        boot_id: int | None = None,
+    ) -> None:
+        if clock not in ("credit", "real"):
+            raise SettingError(f"clock: expected 'credit' or 'real', got {clock!r}")
+        self._code, self._static = _sizes(Path(firmware))
+        if shutil.which(EMULATOR) is None:
+            raise SettingError(
+                f"expected the emulator {EMULATOR}, which is missing; on Debian: apt-get install "
+                f"{EMULATOR}"
+            )
+        self._counts = clock == "credit"
+        drawn = secrets.randbits(32) if boot_id is None else boot_id & 0xFFFFFFFF
+        with ExitStack() as opened:
+            folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="sewfast-"))
+            self._memory = opened.enter_context(_memory(Path(folder) / "memory"))
+            _SHARED.pack_into(
+                self._memory, 0, drawn, drawn ^ 0x9E3779B9, not self._counts, *[0] * 7
+            )
+            self._log = opened.enter_context((Path(folder) / "log").open("w+b"))
+            with socket.socket() as free:
+                free.bind(("127.0.0.1", 0))
+                number = free.getsockname()[1]
+            self.process = opened.enter_context(
+                subprocess.Popen(
+                    self._command(Path(firmware), Path(folder) / "memory", number),
+                    stdin=subprocess.DEVNULL, stdout=self._log, stderr=self._log,
+                    start_new_session=True,  # Ctrl-C is the host's, which stops the motor first
+                )
+            )  # fmt: skip
+            opened.callback(self.process.kill)
+            self.port = f"socket://127.0.0.1:{number}"
+            self._wait_for(number)
+            self._opened = opened.pop_all()
+
+    def _command(self, firmware: Path, memory: Path, number: int) -> list[str]:
+        # QEMU takes a comma in a value where it is doubled
+        place = str(memory).replace(",", ",,")
+        command = [EMULATOR, "-M", f"{BOARD},memory-backend=shared", "-display", "none"]
+        command += ["-monitor", "none", "-kernel", str(firmware)]
+        command += ["-object", f"memory-backend-file,id=shared,mem-path={place},size=16M,share=on"]
+        command += ["-serial", f"tcp:127.0.0.1:{number},server=on,wait=off,nodelay=on"]
+        return [*command, "-icount", f"shift={_SHIFT}"] if self._counts else command
+
+    def _wait_for(self, number: int) -> None:
+        """Until the port listens; a connection to try would be taken for a host."""
+        until = time.monotonic() + _START
+        tables = [p for p in (Path("/proc/net/tcp"),) if p.exists()]
+        while self.process.poll() is None and time.monotonic() < until:
+            if not tables:
+                time.sleep(1.0)
+                return
+            if f"0100007F:{number:04X} 00000000:0000 0A" in tables[0].read_text():
+                return
+            time.sleep(0.02)
+        self._log.seek(0)
+        said = self._log.read().decode(errors="replace").strip().splitlines()[-3:]
+        raise LinkError(
+            f"expected the emulated board to open its port within {_START:g} s, it did not; "
+            f"{EMULATOR} says: {' '.join(said) or 'nothing'}"
+        )
+
+    def figures(self) -> BoardFigures:
+        """Instructions, stack and size, as they are now."""
+        *_, steps, least, most, total, _, _, _ = _SHARED.unpack_from(self._memory)
+        counted = None
+        if self._counts and steps:
+            counted = tuple(t * 40.0 / 2**_SHIFT for t in (least, total / steps, most))
+        stack = self._memory[_STACK_TOP - _STACK : _STACK_TOP]
+        return BoardFigures(
+            steps=steps,
+            instructions=counted,
+            stack=len(stack.lstrip(_PAINT)),
+            code=self._code,
+            memory=self._static,
+        )
+
+    def safe_after(self) -> float | None:
+        """Time from the last bytes that the board heard to its output being off [s].
+
+        None while the output is on.
+        """
+        *_, heard, safe, enabled = _SHARED.unpack_from(self._memory)
+        return None if enabled else (safe - heard) * 1e-6
+
+    def close(self) -> None:
+        """End the emulator."""
+        self._opened.close()
+
+    def __enter__(self) -> EmulatedBoard:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def _memory(path: Path) -> mmap.mmap:
+    """The board's memory as a file, with a stack that shows how deep it was used."""
+    with path.open("w+b") as file:
+        file.truncate(_MEMORY)
+        file.seek(_STACK_TOP - _STACK)
+        file.write(_PAINT * _STACK)
+        file.flush()
+        return mmap.mmap(file.fileno(), _STACK_TOP)
+
+
+def _sizes(firmware: Path) -> tuple[int, int]:
+    """Bytes of code and constants, and of static memory, from an ELF file's program headers.
+
+    Raises
+    ------
+    SettingError
+        No 32-bit little-endian ELF file for ARM.
+    """
+    try:
+        raw = firmware.read_bytes()
+    except OSError as e:
+        raise SettingError(f"{firmware}: expected a firmware, got {e.strerror!r}") from e
+    if len(raw) < 52 or raw[:6] != b"\x7fELF\x01\x01" or raw[18:20] != b"\x28\x00":
+        raise SettingError(
+            f"{firmware}: expected a firmware for ARM (ELF), got another file; build one by "
+            "`make firmware` in a source checkout"
+        )
+    start, size, count = struct.unpack_from("<I10xHH", raw, 28)
+    code = static = 0
+    for k in range(count):
+        header = raw[start + k * size : start + k * size + 32]
+        if len(header) < 32:
+            break
+        kind, _, address, _, in_file, in_memory, _, _ = struct.unpack("<8I", header)
+        if kind != 1:
+            continue
+        code += in_file
+        if 0x20000000 <= address < 0x21000000:
+            static += in_memory
+    return code, static
