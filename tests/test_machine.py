@@ -206,3 +206,40 @@ def test_a_load_slows_the_machine_and_comes_off_again() -> None:
     assert machine.run(np.full(2000, 4.0)).speed_rpm[-1] == pytest.approx(free, abs=25.0)
     with pytest.raises(SettingError, match="finite load"):
         machine.set_load(math.inf)
+
+
+def test_a_second_mass_swings_behind_the_shaft() -> None:
+    machine = VirtualMachine(load_inertia=1e-3, stiffness=150.0, damping=0.0)
+    stiff = VirtualMachine(parameters={"inertia": 3e-3})
+    step = np.full(1500, 4.0)
+    swinging, rigid = machine.run(step).speed_rpm, stiff.run(step).speed_rpm
+    assert abs(swinging[-1] / rigid[-1] - 1.0) < 0.05
+    late = swinging[200:400] - rigid[200:400]
+    spectrum = np.abs(np.fft.rfft(late * np.hanning(200), 4096))
+    hertz = np.fft.rfftfreq(4096, 1e-3)
+    assert hertz[10:][spectrum[10:].argmax()] == pytest.approx(75.5, abs=3.0)
+    assert machine.linearise(1500.0)["T1"] == pytest.approx(stiff.linearise(1500.0)["T1"])
+
+
+def test_a_machine_is_made_again_from_its_name() -> None:
+    for machine in (
+        VirtualMachine(),
+        VirtualMachine(3),
+        VirtualMachine(2, load_inertia=1e-3, backlash=0.01),
+        VirtualMachine(parameters={"inertia": 4e-3}),
+    ):
+        again = VirtualMachine.from_name(machine.name)
+        assert again.parameters == machine.parameters
+        assert again.name == machine.name
+    for wrong in (
+        "virtual?",
+        "virtual?inertia",
+        "virtual?inertia=x",
+        "virtual?mass=1",
+        "virtual:?",
+    ):
+        if wrong == "virtual?":
+            assert VirtualMachine.from_name(wrong).name == "virtual"
+            continue
+        with pytest.raises(SettingError):
+            VirtualMachine.from_name(wrong)

@@ -14,7 +14,7 @@ from .errors import DataError, SettingError
 
 __all__ = ["MachineRun", "VirtualMachine"]
 
-_NAME = re.compile(r"virtual(?::(\d+))?")
+_NAME = re.compile(r"virtual(?::(\d+))?(?:\?(.*))?")
 _LARGEST_SEED = 2**64 - 1
 
 
@@ -49,6 +49,14 @@ class VirtualMachine:
         Whether load, inertia and torque vary over the turn of the crank.
     quantisation
         Whether the encoder gives whole counts. Without it counts are the exact position.
+    load_inertia
+        Inertia of a second mass behind an elastic shaft [kg m^2]; 0 is a rigid machine. The
+        encoder stays on the first. The masses swing against each other at
+        ``sqrt(stiffness (1 / inertia + 1 / load_inertia))`` [rad/s]; the first stands still at
+        ``sqrt(stiffness / load_inertia)``.
+    stiffness, damping, backlash
+        Of the shaft [N m/rad, N m s/rad, rad]; they matter with a second mass only. None leaves
+        what `parameters` say.
     parameters
         Values by name that replace those of the machine chosen so far.
 
@@ -68,6 +76,10 @@ class VirtualMachine:
         u_limit: float = 20.0,
         angle_dependence: bool = True,
         quantisation: bool = True,
+        load_inertia: float | None = None,
+        stiffness: float | None = None,
+        damping: float | None = None,
+        backlash: float | None = None,
         parameters: Mapping[str, float] | None = None,
     ) -> None:
         values = {} if seed is None else Machine.variant_parameters(_checked_seed(seed))
@@ -75,12 +87,22 @@ class VirtualMachine:
         values["angle_dependence"] = float(angle_dependence)
         values["quantisation"] = float(quantisation)
         values.update(parameters or {})
+        shaft = {
+            "load_inertia": load_inertia,
+            "shaft_stiffness": stiffness,
+            "shaft_damping": damping,
+            "shaft_backlash": backlash,
+        }
+        given = {name: value for name, value in shaft.items() if value is not None}
+        values.update(given)
         self._core = Machine(_checked_values(values))
-        self._name = "virtual" if seed is None else f"virtual:{int(seed)}"
+        self._name = _name(seed, {**(parameters or {}), **given})
 
     @classmethod
     def from_name(cls, name: str) -> VirtualMachine:
         """The machine of a command line: ``virtual``, or ``virtual:SEED`` for another of the type.
+
+        Parameters may follow: ``virtual?load_inertia=0.002&shaft_stiffness=150``.
 
         Raises
         ------
@@ -93,7 +115,8 @@ class VirtualMachine:
                 f"expected 'virtual' or 'virtual:SEED' with a whole number, got {name!r}; "
                 "for example 'virtual:1'"
             )
-        return cls(None if match[1] is None else int(match[1]))
+        seed = None if match[1] is None else int(match[1])
+        return cls(seed, parameters=_parameters(match[2] or "", name))
 
     @property
     def core(self) -> Machine:
@@ -189,6 +212,28 @@ class VirtualMachine:
 
     def __repr__(self) -> str:
         return f"VirtualMachine.from_name({self._name!r})"
+
+
+def _name(seed: int | None, parameters: Mapping[str, float]) -> str:
+    """What `VirtualMachine.from_name` makes the machine of again."""
+    name = "virtual" if seed is None else f"virtual:{int(seed)}"
+    query = "&".join(f"{key}={float(value)!r}" for key, value in parameters.items())
+    return f"{name}?{query}" if query else name
+
+
+def _parameters(query: str, name: str) -> dict[str, float]:
+    """Parameters by name, from ``a=1&b=2``."""
+    found = {}
+    for part in query.split("&") if query else ():
+        key, _, value = part.partition("=")
+        try:
+            found[key] = float(value)
+        except ValueError:
+            raise SettingError(
+                f"{name}: expected NAME=NUMBER between '?' and '&', got {part!r}; for example "
+                "'virtual?load_inertia=0.002'"
+            ) from None
+    return found
 
 
 def _checked_seed(seed: int) -> int:

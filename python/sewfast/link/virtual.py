@@ -115,7 +115,7 @@ class VirtualDevice(Unique):
         try:
             self._server = DeviceServer(
                 plant.core,
-                name=plant.name,
+                name=plant.name.split("?")[0],
                 pty=pty,
                 link=Path(folder, "port") if folder is not None else _path(link),
                 address=address,

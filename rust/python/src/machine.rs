@@ -106,12 +106,12 @@ impl Machine {
     fn __reduce__<'py>(
         slf: PyRef<'py, Self>,
         py: Python<'py>,
-    ) -> PyResult<(Bound<'py, PyType>, (Bound<'py, PyDict>,), [f64; 8])> {
+    ) -> PyResult<(Bound<'py, PyType>, (Bound<'py, PyDict>,), [f64; 11])> {
         let parameters = named(py, slf.core.parameters().values())?;
         Ok((py.get_type::<Self>(), (parameters,), slf.core.memory()))
     }
 
-    fn __setstate__(&mut self, py: Python<'_>, memory: [f64; 8]) -> PyResult<()> {
+    fn __setstate__(&mut self, py: Python<'_>, memory: [f64; 11]) -> PyResult<()> {
         self.core.recall(memory).map_err(|e| raise(py, e))
     }
 

@@ -45,8 +45,10 @@ impl Machine {
         }
         let (dead_slope, dry_slope) = d.slopes(current, speed);
         let electrical = (p.resistance + dead_slope) / p.inductance;
-        let mechanical = (p.viscous_friction + dry_slope) / p.inertia;
-        let coupling = p.motor_constant * p.motor_constant / (p.inductance * p.inertia);
+        // the shaft to a second mass is taken as stiff
+        let inertia = p.inertia + p.load_inertia;
+        let mechanical = (p.viscous_friction + dry_slope) / inertia;
+        let coupling = p.motor_constant * p.motor_constant / (p.inductance * inertia);
         let determinant = electrical * mechanical + coupling;
         let half = 0.5 * (electrical + mechanical);
         let root = half * half - determinant;
@@ -57,7 +59,7 @@ impl Machine {
             )));
         }
         let fast = half + root.sqrt();
-        let gain = p.amplifier_gain * p.motor_constant / (p.inductance * p.inertia * determinant);
+        let gain = p.amplifier_gain * p.motor_constant / (p.inductance * inertia * determinant);
         Ok(Linearisation {
             command,
             current,

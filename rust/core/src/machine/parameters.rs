@@ -2,6 +2,13 @@
 
 use crate::random::Random;
 use crate::{Error, Result};
+use std::f64::consts::TAU;
+
+/// The highest frequency of a shaft [Hz].
+const RESONANCE: f64 = 1000.0;
+
+/// The fastest rate at which a shaft's damping may take up a difference of speeds [1/s].
+const RELAXATION: f64 = 5000.0;
 
 /// How much a parameter differs between machines of the same type (uniformly distributed).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -121,6 +128,14 @@ parameters! {
     counts_per_rev: "1" = 1572.0, 1.0, 1e7, Fixed;
     /// Where between two edges the encoder stands after a reset.
     encoder_phase: "counts" = 0.5, 0.0, 0.999_999, Absolute(0.4);
+    /// Inertia of a second mass behind an elastic shaft; 0: there is none.
+    load_inertia: "kg m^2" = 0.0, 0.0, 1.0, Fixed;
+    /// Stiffness of that shaft.
+    shaft_stiffness: "N m/rad" = 200.0, 1e-2, 1e6, Fixed;
+    /// Damping of that shaft.
+    shaft_damping: "N m s/rad" = 0.01, 0.0, 10.0, Fixed;
+    /// Play of that shaft, from one side to the other.
+    shaft_backlash: "rad" = 0.0, 0.0, 1.0, Fixed;
     /// 1: load, inertia and torque vary over the turn; 0: they have their means.
     angle_dependence: "switch" = 1.0, 0.0, 1.0, Fixed;
     /// 1: counts are whole; 0: they are the exact position.
@@ -167,7 +182,32 @@ impl Parameters {
                 return Err(out_of_range(entry, value));
             }
         }
+        self.check_shaft()?;
         Ok(self)
+    }
+
+    /// What the integration of the shaft bears.
+    fn check_shaft(&self) -> Result<()> {
+        if self.load_inertia == 0.0 {
+            return Ok(());
+        }
+        let least = self.inertia * (1.0 - self.angle_dependence * self.inertia_variation);
+        let inverse = 1.0 / least + 1.0 / self.load_inertia;
+        let resonance = (self.shaft_stiffness * inverse).sqrt() / TAU;
+        if resonance > RESONANCE {
+            return Err(Error::setting(format!(
+                "expected a shaft whose masses swing at up to {RESONANCE} Hz, got {resonance:.0} Hz; lower \
+                 'shaft_stiffness', or leave 'load_inertia' at 0 and raise 'inertia'"
+            )));
+        }
+        if self.shaft_damping * inverse > RELAXATION {
+            return Err(Error::setting(format!(
+                "expected machine parameter 'shaft_damping' up to {} N m s/rad with these inertias, got {}",
+                RELAXATION / inverse,
+                self.shaft_damping
+            )));
+        }
+        Ok(())
     }
 
     fn put(&mut self, name: &str, value: f64) -> bool {

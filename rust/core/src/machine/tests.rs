@@ -339,5 +339,118 @@ fn goes_on_from_its_memory_to_the_last_bit() {
     let mut second = nominal();
     second.recall(first.memory()).unwrap();
     assert_eq!(first.run(&u[2000..]), second.run(&u[2000..]));
-    assert!(second.recall([f64::NAN; 8]).is_err());
+    assert!(second.recall([f64::NAN; 11]).is_err());
+}
+
+/// Both masses without any loss: the crank's speed after a blow swings at sqrt(c (1/J + 1/J_load)).
+#[test]
+fn a_shaft_swings_at_its_frequency() {
+    for (stiffness, load) in [(40.0, 2e-3), (400.0, 1e-3), (2000.0, 5e-4)] {
+        let mut crank = machine(&[
+            ("load_inertia", load),
+            ("shaft_stiffness", stiffness),
+            ("shaft_damping", 0.0),
+            ("coulomb_torque", 0.0),
+            ("stribeck_torque", 0.0),
+            ("viscous_friction", 0.0),
+            ("motor_constant", 1e-3),
+            ("angle_dependence", 0.0),
+        ]);
+        let mut memory = crank.memory();
+        memory[1] = 100.0;
+        memory[4] = 1.0;
+        crank.recall(memory).unwrap();
+        let mean = 100.0 * 2e-3 / (2e-3 + load) * RPM;
+        let mut crossings = Vec::new();
+        let mut before = crank.speed_rpm();
+        for k in 0..2000 {
+            crank.advance(0.0);
+            let now = crank.speed_rpm();
+            if before < mean && now >= mean {
+                crossings.push(k as f64 + (mean - before) / (now - before));
+            }
+            before = now;
+        }
+        let (first, last) = (crossings[0], crossings[crossings.len() - 1]);
+        let frequency = 1e3 * (crossings.len() - 1) as f64 / (last - first);
+        let expected = (stiffness * (1.0 / 2e-3 + 1.0 / load)).sqrt() / TAU;
+        assert!(
+            (frequency / expected - 1.0).abs() < 2e-3,
+            "{frequency} {expected}"
+        );
+    }
+}
+
+#[test]
+fn a_second_mass_is_accelerated_with_the_first() {
+    let stiff = machine(&[("inertia", 4e-3), ("angle_dependence", 0.0)]);
+    let two = machine(&[
+        ("load_inertia", 2e-3),
+        ("shaft_stiffness", 2000.0),
+        ("angle_dependence", 0.0),
+    ]);
+    let u = held([3.0].into_iter(), 1500);
+    let (one, other) = (
+        stiff.clone().run(&u).unwrap().1,
+        two.clone().run(&u).unwrap().1,
+    );
+    for k in [200, 500, 1499] {
+        assert!(
+            (one[k] - other[k]).abs() < 5.0,
+            "{k}: {} {}",
+            one[k],
+            other[k]
+        );
+    }
+}
+
+#[test]
+fn play_lets_the_crank_run_free_and_then_hit() {
+    let free = machine(&[
+        ("load_inertia", 2e-3),
+        ("shaft_backlash", 0.5),
+        ("angle_dependence", 0.0),
+    ]);
+    let alone = machine(&[("angle_dependence", 0.0)]);
+    let u = held([4.0].into_iter(), 60);
+    let (with, without) = (
+        free.clone().run(&u).unwrap().1,
+        alone.clone().run(&u).unwrap().1,
+    );
+    let apart = with
+        .iter()
+        .zip(&without)
+        .position(|(a, b)| (a - b).abs() > 1e-6)
+        .unwrap();
+    // until half of the play is used up, 0.25 rad
+    let turned: f64 = without[..apart].iter().map(|n| n / RPM * SAMPLE_TIME).sum();
+    assert!((0.2..0.3).contains(&turned), "{turned}");
+    assert!(with[apart + 3] < without[apart + 3]);
+}
+
+#[test]
+fn a_machine_with_a_shaft_goes_on_where_it_was() {
+    let changes = [
+        ("load_inertia", 1e-3),
+        ("shaft_stiffness", 100.0),
+        ("shaft_backlash", 0.01),
+    ];
+    let (mut first, mut second) = (machine(&changes), machine(&changes));
+    let u = random(5, 400, 10, 15.0);
+    first.run(&u[..200]).unwrap();
+    second.recall(first.memory()).unwrap();
+    assert_eq!(
+        first.run(&u[200..]).unwrap().1,
+        second.run(&u[200..]).unwrap().1
+    );
+}
+
+#[test]
+fn a_shaft_that_is_too_stiff_or_too_damped_is_refused() {
+    for bad in [("shaft_stiffness", 1e5), ("shaft_damping", 10.0)] {
+        let error = Parameters::default()
+            .with([("load_inertia", 1e-3), bad])
+            .unwrap_err();
+        assert!(error.message.contains(bad.0), "{error}");
+    }
 }
