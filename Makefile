@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors fleet bits killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors fleet bits bode killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -141,6 +141,10 @@ battery: $(VENV)/bench.stamp ## identify on simulated systems of known truth (SP
 
 commissioning: $(DEV) ## figures of commissioning on five virtual machines, beside an oracle (docs/RESULTS.md)
 	$(BIN)/python benches/commissioning.py
+
+bode: $(VENV)/bench.stamp ## frequency responses and shafts of machines whose truth is known (docs/bode.md)
+	$(BIN)/python benches/bode.py
+	$(BIN)/python benches/bode.py --held --count 20
 
 drives: $(VENV)/bench.stamp ## commissioning on drives of another simulator (ONLY="shaft60 lash", SEEDS=)
 	$(BIN)/python benches/drives.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))

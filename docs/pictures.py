@@ -21,6 +21,7 @@ from sewfast.report.artefacts import run_file
 ASSETS = Path(__file__).parent / "assets"
 PICTURE = ASSETS / "closed_loop.svg"
 GALLERY = ASSETS / "gallery"
+BODE = ASSETS / "bode" / "compliant.png"
 LARGEST = 150_000
 """Bytes of a picture: a page has to load it."""
 COLOURS = 64
@@ -89,6 +90,13 @@ def gallery(folder: Path) -> dict[str, Any]:
     }
 
 
+def bode(file: Path) -> None:
+    """The response of bode.md."""
+    machine = sewfast.VirtualMachine(load_inertia=1e-3, stiffness=150.0)
+    response = sewfast.bode(machine, speed=1500.0)
+    response.plot(fit=sewfast.fit_shaft(response), file=file)
+
+
 def main() -> None:
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo")
     loops = traces(folder)
@@ -98,8 +106,10 @@ def main() -> None:
     print(f"predicted and measured are {apart:.1f} RPM rms apart")
     written = [PICTURE]
     GALLERY.mkdir(exist_ok=True)
-    for name, plot in gallery(folder).items():
-        path = GALLERY / f"{name}.png"
+    BODE.parent.mkdir(exist_ok=True)
+    drawn = {GALLERY / f"{name}.png": plot for name, plot in gallery(folder).items()}
+    drawn[BODE] = bode
+    for path, plot in drawn.items():
         plot(file=path)
         Image.open(path).convert("RGB").quantize(COLOURS).save(path, optimize=True)
         written.append(path)

@@ -17,7 +17,7 @@ ORDER = """
     writers recordfile dataset readers benchmarks machine live
     dynamic_model validation comparison evidence models
     identification
-    gains rules control tuning trust analysis deployment fleets
+    gains rules control tuning trust analysis frequency deployment fleets
     link recording report commissioning experiment cli __main__
 """
 

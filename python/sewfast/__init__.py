@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from . import rules, signals, trust
     from ._core import __version__
     from .analysis import Analysis, analyse
-    from .commissioning import Commissioning, commission
+    from .commissioning import Commissioning, bode, commission
     from .comparison import Comparison, compare
     from .control.controller import Controller, load_controller, paper_controller
     from .control.loop import ClosedLoopRun, run
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     )
     from .evidence import ReportCard, check
     from .fleets import Fleet, fleet
+    from .frequency import FrequencyResponse, ShaftFit, fit_shaft, load_response
     from .gains import Gains
     from .identification import identify
     from .identification.delays import DelayEstimate, delay
@@ -63,6 +64,7 @@ __all__ = [
     "Experiment",
     "FitError",
     "Fleet",
+    "FrequencyResponse",
     "Gains",
     "Interrupted",
     "LeastSquaresResult",
@@ -80,11 +82,13 @@ __all__ = [
     "ReportCard",
     "SettingError",
     "SewfastError",
+    "ShaftFit",
     "TuningResult",
     "Validation",
     "VirtualMachine",
     "__version__",
     "analyse",
+    "bode",
     "check",
     "commission",
     "compare",
@@ -92,11 +96,13 @@ __all__ = [
     "deploy",
     "diagnose",
     "fit_fopdt",
+    "fit_shaft",
     "fleet",
     "identify",
     "least_squares",
     "load_controller",
     "load_model",
+    "load_response",
     "margins",
     "orders",
     "paper_controller",
@@ -118,7 +124,7 @@ __all__ = [
 # names are loaded when first used, so that `import sewfast` and `sewfast --help` cost nothing
 _HOMES = {
     "_core": "__version__",
-    "commissioning": "Commissioning commission",
+    "commissioning": "Commissioning bode commission",
     "comparison": "Comparison compare",
     "analysis": "Analysis analyse",
     "control": "Controller Gains fit_fopdt load_controller paper_controller table_1",
@@ -129,6 +135,7 @@ _HOMES = {
     "errors": "DataError FitError Interrupted LinkError ModelFileError SettingError SewfastError",
     "evidence": "ReportCard check",
     "fleets": "Fleet fleet",
+    "frequency": "FrequencyResponse ShaftFit fit_shaft load_response",
     "identification": "identify",
     "identification.least_squares": "LeastSquaresResult least_squares",
     "control.loop": "ClosedLoopRun run",

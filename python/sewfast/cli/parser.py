@@ -10,6 +10,7 @@ from typing import Any
 
 from ..errors import SettingError
 from . import (
+    bode,
     check,
     commission,
     control,
@@ -124,6 +125,7 @@ def build_parser() -> argparse.ArgumentParser:
         tune.add,
         control.add,
         check.add_analyse,
+        bode.add,
         deploy.add,
         pil.add,
         fleet.add,

@@ -5,6 +5,7 @@ from .demands import Refusal
 from .fmu import FmuMachine, fmu_bench
 from .procedure import STAGES, commission
 from .result import Commissioning
+from .shaking import bode
 from .training import Rival
 from .verification import Comparison
 
@@ -19,6 +20,7 @@ __all__ = [
     "Rival",
     "Stepped",
     "SteppedBench",
+    "bode",
     "commission",
     "fmu_bench",
 ]

@@ -1,0 +1,208 @@
+"""`sewfast bode`: the frequency response of a machine or of a record, and the shaft in it."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import DataError, FitError, SettingError
+from .arguments import (
+    Commands,
+    add_columns,
+    add_command,
+    add_output,
+    add_plot,
+    require_place,
+    require_plot,
+)
+from .drive import add_drive, is_port, machine_of, opened, require_no_drive_options
+from .output import print_json
+
+if TYPE_CHECKING:
+    from ..dataset import Dataset
+    from ..frequency import FrequencyResponse, ShaftFit
+
+BODE = """\
+The Bode plot of a drive, with error bars, and the resonance of its shaft. A machine (--on) is
+brought to a working speed and shaken there by sines of random phases, so that noise and distortion
+are told apart; of a record averaged spectra are taken. Two masses and a shaft, or a rigid machine,
+are fitted to it.
+
+The machine turns at --speed, a little faster and slower, for a minute or less. Under a controller
+(--controller) the reference is shaken instead, and the loop's margins are printed as measured.
+"""
+
+EXAMPLES = """\
+examples:
+  sewfast bode --on virtual --speed 1500 --plot bode.png
+  sewfast bode --on "virtual?load_inertia=0.001&shaft_stiffness=150" --speed 1500
+  sewfast bode --on /dev/ttyUSB0 --speed 1000 --amplitude 1 -o response.json \\
+      --limits volt=10,speed=3500,acceleration=30000,current=15
+  sewfast bode run.csv --input u --output y --reference r     a record under feedback
+  sewfast bode response.json --controller controller.json     margins on what was measured
+"""
+
+_ON_A_MACHINE = (
+    "speed",
+    "amplitude",
+    "period",
+    "realisations",
+    "periods",
+    "f_min",
+    "f_max",
+    "seed",
+)
+
+
+def add(commands: Commands) -> None:
+    parser = add_command(
+        commands, "bode", command,
+        summary="frequency response with error bars, resonance of the shaft",
+        text=BODE, examples=EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument(
+        "data", metavar="DATA", nargs="?", help="recording, or a response that -o wrote"
+    )
+    parser.add_argument(
+        "--on", metavar="virtual[:SEED]|FILE.fmu?volt=V|PORT", help="shake this machine instead"
+    )
+    parser.add_argument("--speed", type=float, metavar="RPM", help="working speed of the machine")
+    parser.add_argument(
+        "--amplitude", type=float, metavar="V",
+        help="peak of what shakes it (six tenths of what the command has left); with --controller "
+        "of the reference [RPM] (a twentieth of the speed)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--controller", metavar="FILE.json",
+        help="shake the reference of this loop; print its margins on the response",
+    )  # fmt: skip
+    parser.add_argument("--period", type=float, metavar="S", help="of the multisine (2)")
+    parser.add_argument(
+        "--realisations", type=int, metavar="N", help="multisines with other phases (4)"
+    )
+    parser.add_argument("--periods", type=int, metavar="N", help="repetitions of each (4)")
+    parser.add_argument("--f-min", type=float, metavar="HZ", help="lowest frequency (1)")
+    parser.add_argument(
+        "--f-max", type=float, metavar="HZ", help="highest one (four tenths of the sample rate)"
+    )
+    parser.add_argument("--seed", type=int, metavar="N", help="of the phases (0)")
+    parser.add_argument(
+        "--reference", metavar="COL", help="column of a record that its controller followed"
+    )
+    parser.add_argument(
+        "--segment", type=int, metavar="N", help="samples of a record's segments (a ninth of it)"
+    )
+    parser.add_argument("--model", metavar="FILE.json", type=Path, help="write the fit as a model")
+    add_output(parser, "FILE.json", "write the response")
+    add_plot(parser, "draw gain, phase and coherence")
+    add_columns(parser, from_model=False)
+    add_drive(parser)
+
+
+def command(args: argparse.Namespace) -> None:
+    from ..control import load_controller
+    from ..frequency import fit_shaft
+
+    require_place(args.out, (".json",))
+    require_place(args.model, (".json",), option="--model")
+    require_plot(args.plot)
+    if (args.on is None) == (args.data is None):
+        received = "neither" if args.on is None else "both"
+        raise SettingError(
+            f"expected a record, DATA, or a machine, --on virtual, received {received}"
+        )
+    controller = None if args.controller is None else load_controller(args.controller)
+    response = _of_record(args) if args.on is None else _of_machine(args, controller)
+    if args.out is not None:
+        response.save(args.out)
+    try:
+        fit, none = fit_shaft(response), None
+    except (DataError, FitError) as refused:
+        fit, none = None, str(refused)
+    if args.plot is not None:
+        response.plot(fit=fit, file=args.plot)
+    if args.model is not None and fit is not None:
+        fit.to_model().save(args.model)
+    margins = None if controller is None else response.margins(controller, speed=args.speed)
+    _show(args, response, fit, none, margins)
+
+
+def _show(
+    args: argparse.Namespace,
+    response: FrequencyResponse,
+    fit: ShaftFit | None,
+    none: str | None,
+    margins: Any,
+) -> None:
+    if args.json:
+        shaft = {"refused": none} if fit is None else fit.to_dict()
+        found = {"response": response.to_dict(), "shaft": shaft}
+        print_json(found if margins is None else {**found, "margins": vars(margins)})
+        return
+    print(response)
+    print(f"no shaft fitted: {none}" if fit is None else fit)
+    if margins is not None:
+        print(margins)
+    for path in (args.out, args.plot, args.model if fit is not None else None):
+        if path is not None:
+            print(f"written to {path}")
+
+
+def _of_machine(args: argparse.Namespace, controller: Any) -> FrequencyResponse:
+    from ..commissioning import bode
+
+    options = {k: getattr(args, k) for k in _ON_A_MACHINE if getattr(args, k) is not None}
+    if is_port(args.on):
+        with opened(args) as drive:
+            return bode(drive, controller=controller, **options)
+    require_no_drive_options(args)
+    return bode(machine_of(args.on), controller=controller, **options)
+
+
+def _of_record(args: argparse.Namespace) -> FrequencyResponse:
+    from .. import storage
+    from ..commissioning import bode
+    from ..frequency import load_response
+    from ..frequency.response import FORMAT
+    from .data import read_training
+
+    require_no_drive_options(args)
+    for name in _ON_A_MACHINE:
+        if name != "speed" and getattr(args, name) is not None:
+            raise SettingError(
+                f"--{name.replace('_', '-')}: belongs to a machine, --on, received a record; leave "
+                "it out"
+            )
+    if args.data.endswith(".json"):
+        if storage.format_of(args.data) != FORMAT:
+            raise SettingError(
+                f"{args.data}: expected a recording or a response that `sewfast bode -o` wrote"
+            )
+        return load_response(args.data)
+    source, args.data = args.data, [args.data]
+    data = read_training(args)
+    return bode(
+        data if data.counts is None else _unsmoothed(source, data), reference=args.reference,
+        segment=args.segment,
+    )  # fmt: skip
+
+
+def _unsmoothed(source: str, data: Dataset) -> Dataset:
+    """With the difference of counts as its speed: an estimate that looks ahead has no delay."""
+    from dataclasses import replace
+
+    from ..readers import parse_source, read_table
+    from ..speed import speed_from_counts
+
+    assert data.counts is not None
+    column, per_rev = data.counts
+    counts = read_table(parse_source(source)[0])[column]
+    one = data.experiments[0]
+    if len(data.experiments) > 1 or len(counts) != len(one.y):
+        raise DataError(
+            f"{source}: expected one even record without gaps, got {len(data.experiments)} pieces; "
+            "cut one out"
+        )
+    y = speed_from_counts(counts, data.Ts, per_rev, method="difference")
+    return replace(data, experiments=(replace(one, y=y),), looks_ahead=False)

@@ -1,0 +1,418 @@
+"""`bode`: the frequency response of a machine that is shaken about a working speed, or of a record.
+
+A machine is brought to a speed and shaken by a multisine: sines of random phases at odd lines, so
+that even distortion falls between them, whole periods, so that nothing leaks, and none near
+multiples of the turn, where the load over the turn would be taken for a response.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..arrays import FloatArray
+from ..control.controller import Controller
+from ..dataset import Dataset
+from ..errors import DataError, SettingError
+from ..frequency import FrequencyResponse, periodic, spectral
+from ..gains import real
+from ..recording import Recording
+from ..speed import speed_from_counts
+from .bench import Bench, bench_of
+
+SHARE = 0.6
+"""Of what the command has left beside the working point, that the multisine takes."""
+STEPS = 0.05
+"""Of the working speed, that the reference is shaken by under a controller."""
+HIGHEST = 0.4
+"""Of the sample rate, up to which lines are excited."""
+HARMONICS, APART = 8, 1.0
+"""Multiples of the turn that lines keep off, and how far [Hz]."""
+HOLD, LONGEST = 2.0, 32.0
+"""How long a command is held to see its speed, at first and at the most [s]."""
+NEAR, SETTLED = 0.03, 0.02
+"""Of the speed: how near the working point has to be, and what still counts as settled."""
+TRIES = 8
+CLIPPING = 0.8
+"""Of its peak, at which a multisine is clipped again and again to lower its crest factor."""
+ROUNDS = 100
+SWING, MOST = 0.5, 0.8
+"""Of the working speed, by which it may swing as predicted: by itself, and if somebody asks for it.
+Nearer to standstill friction would act like a step."""
+
+
+def bode(
+    on: Any,
+    *,
+    speed: float | None = None,
+    amplitude: float | None = None,
+    controller: Controller | None = None,
+    period: float = 2.0,
+    realisations: int = 4,
+    periods: int = 4,
+    f_min: float = 1.0,
+    f_max: float | None = None,
+    seed: int = 0,
+    reference: str | None = None,
+    segment: int | None = None,
+) -> FrequencyResponse:
+    """The frequency response from command to speed, with error bars.
+
+    Parameters
+    ----------
+    on : machine, Recording or Dataset
+        A machine (`VirtualMachine`, drive, `SteppedBench`) is shaken about a working speed. Of a
+        recording or a data set averaged spectra are taken; their other parameters are `reference`
+        and `segment`.
+    speed : float, optional
+        Working speed [RPM], which a machine needs. It turns at it, and a little faster and slower.
+    amplitude : float, optional
+        Peak of the multisine [V]; six tenths of what the command has left at that speed. Under a
+        controller the peak of the reference's [RPM], a twentieth of the speed.
+    controller : Controller, optional
+        Shake the reference of this loop instead of the command. The response is still that of the
+        plant, not disturbed by the feedback; `response.margins(controller)` are those of the loop.
+    period : float
+        Of the multisine [s]; its lines lie two over it apart.
+    realisations, periods : int
+        How many multisines with other phases, and how often each is repeated after a first period,
+        in which the machine settles.
+    f_min, f_max : float
+        Lowest and highest frequency [Hz]; the highest is four tenths of the sample rate by default.
+    seed : int
+        Of the phases.
+    reference : str, optional
+        Column of a record that the controller follows: without it the response of a record under
+        feedback is biased.
+    segment : int, optional
+        Samples; see `sewfast.frequency.spectral`.
+
+    Returns
+    -------
+    FrequencyResponse
+        From the command [V] to the mean speed over the sample before [RPM] where counts are known,
+        else to the record's output.
+
+    Raises
+    ------
+    SettingError
+        For a machine without a speed, a speed or an amplitude out of reach, parameters that do not
+        belong together.
+    DataError
+        Where the machine comes near to standstill, a command is clipped, nothing of the multisine
+        is seen in the counts, or a record cannot be used.
+    LinkError
+        Where a drive fails or trips.
+
+    Notes
+    -----
+    Pintelon and Schoukens (2012), System Identification, chapters 4 and 5.
+
+    Examples
+    --------
+    >>> machine = VirtualMachine(load_inertia=1e-3, stiffness=150.0)
+    >>> fit_shaft(bode(machine, speed=1500.0)).has_resonance
+    True
+    """
+    if isinstance(on, (Recording, Dataset)):
+        given = {"speed": speed, "amplitude": amplitude, "controller": controller}
+        for name, value in given.items():
+            if value is not None:
+                raise SettingError(
+                    f"{name}: belongs to a machine that is shaken, received a record; leave it out"
+                )
+        return _of_record(on, reference, segment)
+    if reference is not None or segment is not None:
+        raise SettingError(
+            "reference, segment: belong to a record, received a machine; leave them out"
+        )
+    if speed is None:
+        raise SettingError(
+            "speed: expected the working speed to shake the machine about [RPM], received none; "
+            "for example speed=1500"
+        )
+    with bench_of(on, None) as bench:
+        plan = _Plan.of(
+            bench, real("speed", speed), period, realisations, periods, f_min, f_max, seed
+        )
+        if controller is None:
+            return _in_open_loop(bench, plan, amplitude)
+        return _under_feedback(bench, plan, amplitude, controller)
+
+
+# --- A record -------------------------------------------------------------------------------------
+
+
+def _of_record(
+    on: Recording | Dataset, reference: str | None, segment: int | None
+) -> FrequencyResponse:
+    if isinstance(on, Recording):
+        y = speed_from_counts(on.counts, on.Ts, on.counts_per_rev, method="difference")
+        if reference is not None:
+            raise SettingError(
+                f"reference: expected none for a recording of a command, got {reference!r}; a data "
+                "set names its columns"
+            )
+        return spectral(
+            on.u, y, Ts=on.Ts, segment=segment, u_unit="V", y_unit="RPM", from_counts=True,
+            provenance={"recording": on.name},
+        )  # fmt: skip
+    if len(on.experiments) != 1 or len(on.input_names) != 1:
+        raise DataError(
+            f"expected one record with one input, got {len(on.experiments)} with "
+            f"{len(on.input_names)}; take one by data[k] and data.select(input)"
+        )
+    if on.looks_ahead:
+        raise DataError(
+            "expected an output as it was measured, got a speed that was smoothed with samples "
+            "after it, which hides the delay; take bode(recording), or a speed by "
+            'method="difference"'
+        )
+    one = on.experiments[0]
+    r = None
+    if reference is not None:
+        if reference not in one.channels:
+            raise SettingError(
+                f"reference: expected one of {', '.join(one.channels) or 'no columns'}, got "
+                f"{reference!r}"
+            )
+        r = one.channels[reference]
+    return spectral(
+        one.u[:, 0], one.y, Ts=on.Ts, r=r, segment=segment, u_unit=on.input_units[0],
+        y_unit=on.output_unit, from_counts=on.counts is not None,
+        provenance={"recording": one.name},
+    )  # fmt: skip
+
+
+# --- A machine ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Lines and repetitions."""
+
+    speed: float
+    samples: int
+    realisations: int
+    periods: int
+    lines: Any
+    seed: int
+    Ts: float
+
+    @classmethod
+    def of(
+        cls,
+        bench: Bench,
+        speed: float,
+        period: float,
+        realisations: int,
+        periods: int,
+        f_min: float,
+        f_max: float | None,
+        seed: int,
+    ) -> _Plan:
+        Ts = bench.Ts
+        if speed == 0.0 or not abs(speed) < bench.speed:
+            raise SettingError(
+                f"speed: expected a working speed other than 0 and below {bench.speed:g} RPM, got "
+                f"{speed:g}"
+            )
+        for name, count, least in (("realisations", realisations, 1), ("periods", periods, 1)):
+            if isinstance(count, bool) or not isinstance(count, int) or not least <= count <= 1000:
+                raise SettingError(f"{name}: expected a whole number from 1 to 1000, got {count!r}")
+        if realisations * periods < 2:
+            raise SettingError(
+                "periods: expected at least two in all, got one; nothing tells noise"
+            )
+        highest = HIGHEST / Ts if f_max is None else real("f_max", f_max)
+        if not 0.0 < real("f_min", f_min) < highest <= 0.5 / Ts:
+            raise SettingError(
+                f"f_min, f_max: expected 0 < f_min < f_max <= {0.5 / Ts:g} Hz, half the sampling, "
+                f"got {f_min!r} and {highest!r}"
+            )
+        if not 2.0 / f_min <= 2.0 * real("period", period) <= 1e7 * Ts:
+            raise SettingError(
+                f"period: expected at least one of f_min, {1.0 / f_min:g} s, and at most "
+                f"{5e6 * Ts:g} s, got {period!r}"
+            )
+        samples = 2 * round(0.5 * period / Ts)
+        k = np.arange(1, samples // 2, 2)
+        hertz = k / (samples * Ts)
+        turn = abs(speed) / 60.0
+        harmonic = np.round(hertz / turn)
+        off = (np.abs(hertz - harmonic * turn) > APART) | (harmonic < 1) | (harmonic > HARMONICS)
+        k = k[off & (hertz >= f_min) & (hertz <= highest)]
+        if len(k) < 3:
+            raise SettingError(
+                f"expected at least 3 lines between {f_min:g} and {highest:g} Hz, got {len(k)}; "
+                "lengthen the period or widen the band"
+            )
+        return cls(speed, samples, realisations, periods, k, seed, Ts)
+
+    def multisine(self, realisation: int) -> FloatArray:
+        """One period with a peak of 1."""
+        random = np.random.default_rng([self.seed, realisation])
+        phases = random.uniform(0.0, 2.0 * math.pi, len(self.lines))
+        spectrum = np.zeros(self.samples // 2 + 1, dtype=np.complex128)
+        for _ in range(ROUNDS):
+            spectrum[self.lines] = np.exp(1j * phases)
+            x = np.fft.irfft(spectrum, self.samples)
+            bound = CLIPPING * np.abs(x).max()
+            phases = np.angle(np.fft.rfft(np.clip(x, -bound, bound))[self.lines])
+        found: FloatArray = x / np.abs(x).max()
+        return found
+
+    def signal(self) -> FloatArray:
+        """All realisations, each with the period in which the machine settles."""
+        parts = [np.tile(self.multisine(m), self.periods + 1) for m in range(self.realisations)]
+        return np.concatenate(parts)
+
+    def blocks(self, signal: FloatArray, start: int) -> FloatArray:
+        """Shape (realisations, periods, samples), without what settles."""
+        shape = (self.realisations, self.periods + 1, self.samples)
+        kept: FloatArray = signal[start:].reshape(shape)[:, 1:]
+        return kept
+
+
+def _in_open_loop(bench: Bench, plan: _Plan, amplitude: float | None) -> FrequencyResponse:
+    level, lead, time = _working_point(bench, plan.speed)
+    left = bench.volt - abs(level)
+    swing = _swing(plan, plan.speed / level, time)
+    room = min(abs(plan.speed), bench.speed - abs(plan.speed))
+    peak = min(SHARE * left, SWING * room / swing)
+    if amplitude is not None:
+        peak = real("amplitude", amplitude)
+        most = min(left, MOST * room / swing)
+        if not 0.0 < peak <= most:
+            raise SettingError(
+                f"amplitude: expected above 0 and up to {most:.4g} V, got {peak:.4g} V; more than "
+                f"{left:.4g} V would be clipped beside the {level:.4g} V that {plan.speed:g} RPM "
+                f"take, and each V swings the speed by some {swing:.3g} RPM, less with a higher "
+                "f_min"
+            )
+    u = np.concatenate([np.full(lead, level), level + peak * plan.signal()])
+    recording = bench.excite(u, "multisine")
+    return _response(bench, plan, recording, lead, None, {"level": level, "amplitude": peak})
+
+
+def _swing(plan: _Plan, gain: float, time: float) -> float:
+    """Largest deviation of the speed for each volt of the multisine's peak [RPM/V], for one lag."""
+    hertz = np.arange(plan.samples // 2 + 1) / (plan.samples * plan.Ts)
+    lag = gain / (1.0 + 2j * math.pi * hertz * time)
+    multisines = (plan.multisine(m) for m in range(plan.realisations))
+    return max(
+        float(np.abs(np.fft.irfft(np.fft.rfft(x) * lag, plan.samples)).max()) for x in multisines
+    )
+
+
+def _under_feedback(
+    bench: Bench, plan: _Plan, amplitude: float | None, controller: Controller
+) -> FrequencyResponse:
+    peak = STEPS * abs(plan.speed) if amplitude is None else real("amplitude", amplitude)
+    if not 0.0 < peak <= MOST * abs(plan.speed):
+        raise SettingError(
+            f"amplitude: expected above 0 and up to {MOST * abs(plan.speed):g} RPM about "
+            f"{plan.speed:g} RPM, got {peak!r}"
+        )
+    lead = round(HOLD / plan.Ts)
+    ramp = np.minimum(np.arange(lead) / (0.5 * lead), 1.0) * plan.speed
+    r = np.concatenate([ramp, plan.speed + peak * plan.signal()])
+    followed = bench.follow(controller, r, "multisine")
+    limits = (controller.u_min, controller.u_max)
+    limited = np.isin(followed.run.u[lead:], limits)
+    if limited.any():
+        raise DataError(
+            f"expected a command within its limits, got {limited.sum()} samples at one, the first "
+            f"at {(lead + int(limited.argmax())) * plan.Ts:.4g} s: the response would be that of "
+            "the limit; lower the amplitude"
+        )
+    return _response(
+        bench, plan, followed.recording, lead, r, {"amplitude": peak, "feedback": True}
+    )
+
+
+def _response(
+    bench: Bench,
+    plan: _Plan,
+    recording: Recording,
+    lead: int,
+    r: FloatArray | None,
+    more: dict[str, Any],
+) -> FrequencyResponse:
+    y = speed_from_counts(
+        recording.counts, recording.Ts, recording.counts_per_rev, method="difference"
+    )
+    slowest = (recording.y[lead:] * math.copysign(1.0, plan.speed)).min()
+    if not slowest > 0.0:
+        raise DataError(
+            f"expected the speed to keep its sign, it came to {slowest:.4g} RPM: at a reversal "
+            "friction acts like a step; lower the amplitude or raise the speed or f_min"
+        )
+    found = periodic(
+        plan.blocks(recording.u, lead), plan.blocks(y, lead), Ts=plan.Ts, lines=plan.lines,
+        r=None if r is None else plan.blocks(r, lead), u_unit="V", y_unit="RPM", from_counts=True,
+        provenance={"machine": bench.name, "speed": plan.speed, "seed": plan.seed, **more},
+    )  # fmt: skip
+    if found.coherence.max() < 0.5:
+        raise DataError(
+            "expected an answer to the multisine in the counts, none stands out of their rounding "
+            "and of the load; raise the amplitude, or periods"
+        )
+    return found
+
+
+def _working_point(bench: Bench, speed: float) -> tuple[float, int, float]:
+    """Command that holds the speed [V], samples after which it does, time constant [s].
+
+    By the secant method: a machine is less linear than a straight line between two speeds.
+    """
+    tried: list[tuple[float, float]] = [(0.0, 0.0)]
+    u, hold = math.copysign(0.15 * bench.volt, speed), HOLD
+    for _ in range(TRIES):
+        held = _held(bench, u, hold)
+        while not held.settled and hold < LONGEST:
+            hold *= 2.0
+            held = _held(bench, u, hold)
+        reached = held.speed
+        if abs(reached - speed) <= NEAR * abs(speed):
+            return u, round(hold / bench.Ts), held.time
+        if abs(reached) < 0.02 * abs(speed):  # not broken away
+            tried = [(u, 0.0)]
+            u *= 2.0
+        else:
+            tried = sorted([*tried, (u, reached)], key=lambda point: abs(point[1] - speed))[:2]
+            (u0, n0), (u1, n1) = tried
+            u = u0 + (speed - n0) * (u1 - u0) / (n1 - n0) if n1 != n0 else 1.5 * u0
+        if not abs(u) < bench.volt:
+            break
+    raise SettingError(
+        f"speed: expected one that a steady command of up to {bench.volt:g} V holds, got "
+        f"{speed:g} RPM; the nearest was {min(tried, key=lambda p: abs(p[1] - speed))[1]:.4g} RPM"
+    )
+
+
+@dataclass(frozen=True)
+class _Held:
+    """What a steady command does: speed of the last quarter [RPM], whether that of the quarter
+    before was the same, and when two thirds of it were reached [s]."""
+
+    speed: float
+    settled: bool
+    time: float
+
+
+def _held(bench: Bench, u: float, hold: float) -> _Held:
+    n = round(hold / bench.Ts)
+    recording = bench.excite(np.full(n, u), "hold")
+    counts = recording.counts
+    at = [counts[n // 2], counts[3 * n // 4], counts[-1]]
+    if not np.isfinite(at).all():
+        raise DataError("expected every sample of the run, received gaps; see `sewfast doctor`")
+    before, last = np.diff(at) / np.diff([n // 2, 3 * n // 4, n - 1])
+    speed = float(last * 60.0 / (bench.counts_per_rev * bench.Ts))
+    reached = np.flatnonzero(np.abs(recording.y) >= 0.63 * abs(speed))
+    time = float(reached[0] * bench.Ts) if len(reached) else hold
+    return _Held(speed, bool(abs(last - before) <= SETTLED * abs(last) + 1e-9), time)

@@ -1,0 +1,252 @@
+"""Frequency responses from signals: periodic ones line by line, any others by averaged spectra.
+
+Both are unbiased under feedback where a reference is given that the noise does not know: output and
+input are each related to it, and their quotient is the plant (joint input-output method;
+Pintelon and Schoukens 2012, System Identification, sections 2.6 and 7.3).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import FloatArray
+from ..errors import DataError, SettingError
+from .response import Complex, FrequencyResponse
+
+SEGMENTS = 16
+"""Into as many halves of segments a record is cut unless told: bands of a fifth of the gain where
+the coherence is a half."""
+LEAST = 16
+"""Samples of a segment or period, at the least."""
+
+
+def periodic(
+    u: ArrayLike,
+    y: ArrayLike,
+    *,
+    Ts: float,
+    lines: ArrayLike,
+    r: ArrayLike | None = None,
+    **labels: object,
+) -> FrequencyResponse:
+    """The robust best linear approximation from repeated periods of different random excitations.
+
+    Noise is what differs from period to period of one realisation; what differs more than that from
+    one realisation to another is nonlinear distortion (robust method; Pintelon and Schoukens 2012,
+    section 4.3.1). Leakage there is none.
+
+    Parameters
+    ----------
+    u, y : array, shape (M, P, N)
+        Input and output: M realisations of P whole periods of N samples, in the steady state.
+    Ts : float
+        Sample time [s].
+    lines : array of int, shape (n,)
+        Lines that are excited, rising: frequencies k / (N Ts), up to N / 2.
+    r : array, shape (M, P, N), optional
+        Reference of a loop that is closed around the plant.
+    labels
+        `u_unit`, `y_unit`, `from_counts`, `provenance` of the result.
+
+    Raises
+    ------
+    DataError
+        For other shapes, values that are not finite, fewer than two periods in all, lines that are
+        no lines or that u does not have.
+    """
+    u, y = _blocks("u", u), _blocks("y", y)
+    if u.shape != y.shape:
+        raise DataError(f"expected u and y of one shape (M, P, N), got {u.shape} and {y.shape}")
+    realisations, periods, n = u.shape
+    if realisations * periods < 2:
+        raise DataError(
+            "expected at least two periods or realisations, got one: nothing tells how sure it is"
+        )
+    k = _lines(lines, n)
+    U, Y = (np.fft.rfft(x, axis=-1)[..., k] / n for x in (u, y))
+    if r is not None:
+        reference = _blocks("r", r)
+        if reference.shape != u.shape:
+            raise DataError(f"expected r as u, {u.shape}, got {reference.shape}")
+        R = np.fft.rfft(reference, axis=-1)[..., k] / n
+        _require_excited(R, "r")
+        turn = np.conj(R) / np.abs(R)
+        U, Y = U * turn, Y * turn
+    _require_excited(U, "u")
+    if r is None and realisations > 1:
+        # the same phase for all, so that they can be averaged
+        turn = np.conj(U) / np.abs(U)
+        U, Y = U * turn, Y * turn
+    Um, Ym = U.mean(axis=1), Y.mean(axis=1)
+    value = Ym.mean(axis=0) / Um.mean(axis=0)
+    size = np.abs(Um.mean(axis=0)) ** 2
+    within = Y - value * U
+    noise = None
+    if periods > 1:
+        spread = within - within.mean(axis=1, keepdims=True)
+        power = (np.abs(spread) ** 2).sum(axis=(0, 1)) / (realisations * (periods - 1))
+        noise = power / (realisations * periods) / size
+    if realisations > 1:
+        between = within.mean(axis=1)
+        between = between - between.mean(axis=0)
+        power = (np.abs(between) ** 2).sum(axis=0) / (realisations - 1)
+        variance, blocks = power / realisations / size, realisations
+    else:
+        variance, blocks, noise = noise, periods, None
+    output = (np.abs(Y) ** 2).mean(axis=(0, 1))
+    explained = np.abs(value) ** 2 * (np.abs(U) ** 2).mean(axis=(0, 1))
+    residual = (np.abs(within) ** 2).mean(axis=(0, 1))
+    coherence = explained / np.maximum(np.maximum(output, explained + residual), 1e-300)
+    return FrequencyResponse(
+        k / (n * Ts), value, np.maximum(variance, 1e-300), coherence, float(blocks), float(Ts),
+        noise, **labels,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def spectral(
+    u: ArrayLike,
+    y: ArrayLike,
+    *,
+    Ts: float,
+    r: ArrayLike | None = None,
+    segment: int | None = None,
+    **labels: object,
+) -> FrequencyResponse:
+    """From any record: cross spectra over auto spectra, averaged over overlapping segments.
+
+    Welch's method with a Hann window and half of a segment as overlap; each segment without its
+    mean. Without a reference it is `scipy.signal.csd(u, y) / scipy.signal.welch(u)` (H1); its
+    variance follows from the coherence (Bendat and Piersol 2010, table 9.6). A window widens what
+    is narrow: a resonance has to be several times as wide as 1 / (segment Ts).
+
+    Parameters
+    ----------
+    u, y : array, shape (N,)
+        Input and output.
+    Ts : float
+        Sample time [s].
+    r : array, shape (N,), optional
+        Reference of a loop that is closed around the plant, or whatever else moves u and is not
+        moved by the noise. Without it the response under feedback is that of the plant where
+        there is no noise and of minus one over the controller where there is nothing else.
+    segment : int, optional
+        Samples; a sixteenth of the record with the overlap unless told.
+    labels
+        `u_unit`, `y_unit`, `from_counts`, `provenance` of the result.
+
+    Raises
+    ------
+    DataError
+        For other shapes, values that are not finite, fewer than three segments, a constant input,
+        or a reference that has nothing to do with it.
+    """
+    signals = [_signal("u", u), _signal("y", y)]
+    if r is not None:
+        signals.append(_signal("r", r))
+    lengths = [len(s) for s in signals]
+    if len(set(lengths)) > 1:
+        raise DataError(f"expected signals of one length, got {lengths}")
+    n = lengths[0]
+    size = _segment(segment, n)
+    starts = range(0, n - size + 1, size // 2)
+    if len(starts) < 3:
+        raise DataError(
+            f"expected at least three segments of {size} samples, which overlap by half, got {n} "
+            "samples; record longer, or choose a shorter segment"
+        )
+    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(size) / size)
+    power = np.zeros((len(signals), len(signals), size // 2 + 1), dtype=np.complex128)
+    for start in starts:
+        part = np.stack([s[start : start + size] for s in signals])
+        part = (part - part.mean(axis=1, keepdims=True)) * window
+        spectrum = np.fft.rfft(part, axis=1)
+        power += spectrum.conj()[:, None] * spectrum[None]
+    power = power[:, :, 1:] / len(starts)
+    by = len(signals) - 1 if r is not None else 0
+    Suu, Syy, Srr = (power[j, j].real for j in (0, 1, by))
+    Sru, Sry = power[by, 0], power[by, 1]
+    if not np.any(Suu > 0.0):
+        raise DataError("u: expected an input that moves, got a constant one")
+    # halves of Hann windows overlap: each segment counts 11/18 of an independent one
+    blocks = max(len(starts) * 11.0 / 18.0, 2.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = Sry / Sru
+        related = np.abs(Sru) ** 2 / (Suu * Srr)
+        residual = Syy - 2.0 * (value * power[1, 0]).real + np.abs(value) ** 2 * Suu
+        variance = np.maximum(residual, 0.0) * Srr / np.abs(Sru) ** 2 / (blocks - 1.0)
+        coherence = np.abs(power[0, 1]) ** 2 / (Suu * Syy) if r is None else _explained(
+            value, Suu, residual
+        )  # fmt: skip
+    if r is not None and np.nanmedian(related) < 2.0 / blocks:
+        raise DataError(
+            "r: expected a reference that moves u, got one that has nothing to do with it; name "
+            "the column that the controller follows"
+        )
+    known = np.isfinite(value) & np.isfinite(variance)
+    hertz = np.arange(1, size // 2 + 1) / (size * Ts)
+    return FrequencyResponse(
+        hertz[known], value[known], np.maximum(variance[known], 1e-300),
+        np.clip(np.nan_to_num(coherence[known]), 0.0, 1.0), blocks, float(Ts),
+        **labels,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def _explained(value: Complex, Suu: FloatArray, residual: FloatArray) -> FloatArray:
+    explained = np.abs(value) ** 2 * Suu
+    share: FloatArray = explained / (explained + np.maximum(residual, 0.0))
+    return share
+
+
+def _segment(segment: int | None, n: int) -> int:
+    if segment is None:
+        return max(2 * (n // (SEGMENTS + 1)), LEAST)
+    if not isinstance(segment, (int, np.integer)) or isinstance(segment, bool) or segment < LEAST:
+        raise SettingError(f"segment: expected at least {LEAST} samples, got {segment!r}")
+    return int(segment) // 2 * 2
+
+
+def _signal(name: str, values: ArrayLike) -> FloatArray:
+    found = _numbers(name, values)
+    if found.ndim != 1:
+        raise DataError(f"{name}: expected shape (N,), got {found.shape}")
+    return found
+
+
+def _blocks(name: str, values: ArrayLike) -> FloatArray:
+    found = _numbers(name, values)
+    if found.ndim != 3 or found.shape[2] < LEAST or 0 in found.shape:
+        raise DataError(
+            f"{name}: expected shape (realisations, periods, samples) with at least {LEAST} "
+            f"samples, got {found.shape}"
+        )
+    return found
+
+
+def _numbers(name: str, values: ArrayLike) -> FloatArray:
+    try:
+        found = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as e:
+        raise DataError(f"{name}: expected numbers, got {str(values)[:40]!r}") from e
+    bad = np.flatnonzero(~np.isfinite(found.ravel()))
+    if len(bad):
+        raise DataError(
+            f"{name}: expected finite values, got {found.ravel()[bad[0]]} at sample {bad[0]}; cut "
+            "the record there"
+        )
+    return found
+
+
+def _lines(lines: ArrayLike, n: int) -> np.ndarray:
+    k = np.asarray(lines)
+    if k.ndim != 1 or not len(k) or not np.issubdtype(k.dtype, np.integer):
+        raise DataError(f"lines: expected whole numbers, shape (n,), got {lines!r}")
+    if k[0] < 1 or k[-1] > n // 2 or np.any(np.diff(k) <= 0):
+        raise DataError(f"lines: expected rising numbers from 1 to {n // 2}, got {lines!r}")
+    return k
+
+
+def _require_excited(spectrum: Complex, name: str) -> None:
+    size = np.abs(spectrum).mean(axis=(0, 1))
+    if not np.all(size > 1e-9 * max(float(size.max()), 1e-300)):
+        raise DataError(f"{name}: expected power at every line, got none at some of them")

@@ -1,0 +1,396 @@
+"""`FrequencyResponse`: gain and phase, how sure they are, and the loop around them."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import _core, storage
+from ..arrays import FloatArray
+from ..control.controller import Controller
+from ..control.margins import loop_path
+from ..errors import DataError, SettingError
+from ..plotting import LOOKS, Drawing, html_of, stacked
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from .shaft import ShaftFit
+
+Complex = NDArray[np.complex128]
+
+FORMAT = "sewfast-frequency-response"
+VERSION = 1
+
+LEVEL = 0.95
+"""Of the bands."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrequencyResponse:
+    """Frequency response of a sampled system, as measured.
+
+    Attributes
+    ----------
+    hertz : array, shape (n,)
+        Frequencies [Hz], rising, up to half the sample rate.
+    value : array of complex, shape (n,)
+        Output over input [y/u].
+    variance : array, shape (n,)
+        Of `value`: the expected square of its error's magnitude, from noise and, where different
+        excitations were averaged, from nonlinear distortion.
+    noise : array, shape (n,), or None
+        The part of it that repeating the same excitation shows: noise alone.
+    coherence : array, shape (n,)
+        Share of the output's power that the response explains, 0 to 1.
+    blocks : float
+        Independent blocks that were averaged; the variance is known from one fewer.
+    Ts : float
+        Sample time [s].
+    u_unit, y_unit : str
+    from_counts : bool
+        Whether the output is a difference of encoder counts: the mean speed over the sample before.
+    provenance : mapping
+        How it came about: machine, speed, method.
+    """
+
+    hertz: FloatArray
+    value: Complex
+    variance: FloatArray
+    coherence: FloatArray
+    blocks: float
+    Ts: float
+    noise: FloatArray | None = None
+    u_unit: str = ""
+    y_unit: str = ""
+    from_counts: bool = False
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def magnitude_db(self) -> FloatArray:
+        """20 log10 of the gain in y/u, shape (n,)."""
+        return 20.0 * np.log10(np.maximum(np.abs(self.value), 1e-300))
+
+    @property
+    def phase_deg(self) -> FloatArray:
+        """Unwrapped, shape (n,) [deg]; between -180 and 180 at the lowest frequency."""
+        return np.rad2deg(np.unwrap(np.angle(self.value)))
+
+    @property
+    def distortion(self) -> FloatArray | None:
+        """Standard deviation of what is not noise but differs from excitation to excitation [y/u].
+
+        Of one such excitation, shape (n,); None where it was not measured.
+        """
+        if self.noise is None:
+            return None
+        return np.sqrt(np.maximum(self.variance - self.noise, 0.0) * self.blocks)
+
+    def radius(self, level: float = LEVEL) -> FloatArray:
+        """Radius of the circle about `value` in which the response lies [y/u], shape (n,).
+
+        With nu = blocks - 1 complex degrees of freedom the squared error over the estimated
+        variance follows F(2, 2 nu) (Pintelon and Schoukens 2012, section 2.4).
+        """
+        if not 0.0 < level < 1.0:
+            raise SettingError(f"level: expected a share between 0 and 1, got {level!r}")
+        nu = max(self.blocks - 1.0, 1.0)
+        quantile = nu * ((1.0 - level) ** (-1.0 / nu) - 1.0)
+        found: FloatArray = np.sqrt(self.variance * quantile)
+        return found
+
+    def at(self, hertz: float) -> complex:
+        """The response between two measured frequencies, magnitude and phase interpolated.
+
+        Raises
+        ------
+        SettingError
+            Outside of what was measured.
+        """
+        if not self.hertz[0] <= hertz <= self.hertz[-1]:
+            raise SettingError(
+                f"expected a frequency from {self.hertz[0]:.4g} to {self.hertz[-1]:.4g} Hz, which "
+                f"were measured, got {hertz!r}"
+            )
+        size = np.interp(hertz, self.hertz, np.log(np.abs(self.value)))
+        turn = np.interp(hertz, self.hertz, np.unwrap(np.angle(self.value)))
+        return complex(np.exp(size + 1j * turn))
+
+    # --- The loop that a controller closes around it ----------------------------------------------
+
+    def loop(self, controller: Controller, *, speed: float | None = None) -> Complex:
+        """L, broken at the plant's input, at each frequency, shape (n,).
+
+        Raises
+        ------
+        SettingError
+            For another sample time or other units.
+        """
+        return self.value * self._feedback(controller, speed)
+
+    def _feedback(self, controller: Controller, speed: float | None) -> Complex:
+        """From the measured output to the command, with its sign turned."""
+        if not math.isclose(controller.Ts, self.Ts, rel_tol=1e-9):
+            raise SettingError(
+                f"expected a controller at the response's sample time, {self.Ts:g} s, got one at "
+                f"{controller.Ts:g} s"
+            )
+        gains = controller.gains
+        for name, mine, theirs in (
+            ("u", self.u_unit, gains.u_unit),
+            ("y", self.y_unit, gains.y_unit),
+        ):
+            if mine and mine != theirs:
+                raise SettingError(
+                    f"expected a controller whose {name} is in {mine}, got {theirs}; convert it"
+                )
+        path = loop_path(controller, speed=speed)
+        omega = 2.0 * np.pi * self.hertz
+        # the plant is a delay of one sample, which is taken out again
+        one, delay = np.array([1.0]), np.array([0.0, 1.0])
+        found = _core.loop_response(path, delay, one, omega) * np.exp(1j * omega * self.Ts)
+        if self.from_counts and controller.counts_per_rev is not None:
+            # the mean over a sample is in the response already
+            found = found / (0.5 * (1.0 + np.exp(-1j * omega * self.Ts)))
+        feedback: Complex = found
+        return feedback
+
+    def margins(self, controller: Controller, *, speed: float | None = None) -> LoopMargins:
+        """Margins of the loop where the coherence is above a half.
+
+        That it is stable is taken for granted: a response alone does not tell.
+        """
+        feedback, seen = self._feedback(controller, speed), self.coherence > 0.5
+        L, radius = self.value * feedback, self.radius() * np.abs(feedback)
+        return LoopMargins.of(self.hertz[seen], L[seen], radius[seen])
+
+    # --- Files, other tools, pictures -------------------------------------------------------------
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it as JSON; `load_response` reads it."""
+        storage.write(path, FORMAT, VERSION, self.to_dict())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything by name, as JSON values."""
+        return {
+            "hertz": self.hertz.tolist(),
+            "real": self.value.real.tolist(),
+            "imaginary": self.value.imag.tolist(),
+            "variance": self.variance.tolist(),
+            "noise": None if self.noise is None else self.noise.tolist(),
+            "coherence": self.coherence.tolist(),
+            "blocks": self.blocks,
+            "Ts": self.Ts,
+            "u_unit": self.u_unit,
+            "y_unit": self.y_unit,
+            "from_counts": self.from_counts,
+            "provenance": dict(self.provenance),
+        }
+
+    def to_control(self) -> Any:
+        """As `control.FrequencyResponseData` (python-control)."""
+        from ..models.conversion import require_control
+
+        return require_control().FrequencyResponseData(self.value, 2.0 * np.pi * self.hertz)
+
+    def plot(
+        self,
+        ax: Any = None,
+        *,
+        fit: ShaftFit | None = None,
+        file: str | os.PathLike[str] | None = None,
+    ) -> Any:
+        """Gain and phase with their 95 % bands, and coherence; with the curve of a fit, if given.
+
+        Frequencies at which less than half of the output is explained are drawn pale. Other
+        arguments and result are those of `Dataset.plot`.
+        """
+        return self.drawing(fit).plot(ax, file)
+
+    def drawing(self, fit: ShaftFit | None = None) -> Drawing:
+        """The picture."""
+        f, size, radius = self.hertz, np.abs(self.value), self.radius()
+        seen = self.coherence >= 0.5
+        phase = self.phase_deg
+        half = np.rad2deg(np.arcsin(np.minimum(radius / np.maximum(size, 1e-300), 1.0)))
+        unit = f"{self.y_unit}/{self.u_unit}" if self.y_unit else "1"
+        fine = np.geomspace(f[0], f[-1], 1000)
+        curve = None if fit is None else fit.at(fine)
+
+        def dots(ax: Axes, values: FloatArray) -> None:
+            ax.plot(f[seen], values[seen], ".", ms=3, color=LOOKS["measured"]["color"])
+            ax.plot(f[~seen], values[~seen], ".", ms=2, color="0.8", zorder=1)
+            ax.set_xscale("log")
+            ax.grid(True, which="both", alpha=0.3)
+
+        def gain_panel(ax: Axes) -> None:
+            low = 20.0 * np.log10(np.maximum(size - radius, 0.05 * size))
+            high = 20.0 * np.log10(size + radius)
+            _band(ax, f, low, high, seen)
+            dots(ax, self.magnitude_db)
+            if curve is not None:
+                ax.plot(fine, 20.0 * np.log10(np.abs(curve)), color=LOOKS["model"]["color"], lw=1.0)
+            ax.set_ylabel(f"gain [dB re 1 {unit}]")
+
+        def phase_panel(ax: Axes) -> None:
+            _band(ax, f, phase - half, phase + half, seen)
+            dots(ax, phase)
+            if curve is not None:
+                turn = np.rad2deg(np.unwrap(np.angle(curve)))
+                near = turn[np.abs(fine - f[0]).argmin()] - phase[0]
+                turn = turn - 360.0 * round(near / 360.0)
+                ax.plot(fine, turn, color=LOOKS["model"]["color"], lw=1.0)
+            if seen.any():
+                ax.set_ylim(
+                    min(phase[seen].min(), -190.0) - 20.0, max(phase[seen].max(), 0.0) + 20.0
+                )
+            ax.set_ylabel("phase [deg]")
+
+        def coherence_panel(ax: Axes) -> None:
+            dots(ax, self.coherence)
+            ax.set_ylim(0.0, 1.05)
+            ax.set_ylabel("coherence")
+            ax.set_xlabel("frequency [Hz]")
+
+        return stacked((gain_panel, phase_panel, coherence_panel), (2.4, 2.0, 1.2))
+
+    def _repr_html_(self) -> str:
+        return html_of(str(self))
+
+    def __repr__(self) -> str:
+        return f"<{str(self).splitlines()[0]}>"
+
+    def __str__(self) -> str:
+        known = self.coherence > 0.95
+        best = self.hertz[known]
+        span = f"{best[0]:.4g} to {best[-1]:.4g} Hz" if len(best) else "no frequency"
+        db = 20.0 * np.log10(1.0 + self.radius() / np.maximum(np.abs(self.value), 1e-300))
+        lines = [
+            f"frequency response, {len(self.hertz)} lines from {self.hertz[0]:.4g} to "
+            f"{self.hertz[-1]:.4g} Hz, {self.blocks:.4g} blocks",
+            f"  coherence  above .95 at {100 * known.mean():.0f} % of them, {span}",
+            f"  band       95 %: {np.median(db):.2g} dB in the median, {db.max():.2g} dB at most",
+        ]
+        if self.noise is not None:
+            share = np.sqrt(np.median(np.maximum(self.variance - self.noise, 0.0) / self.variance))
+            lines.append(
+                f"  distortion {100 * share:.0f} % of the uncertainty is no noise (in the median)"
+            )
+        return "\n".join(lines)
+
+
+def _band(
+    ax: Axes, x: FloatArray, low: FloatArray, high: FloatArray, where: NDArray[np.bool_]
+) -> None:
+    color = LOOKS["measured"]["color"]
+    ax.fill_between(x, low, high, where=where, alpha=0.25, lw=0, color=color)
+
+
+def load_response(path: str | os.PathLike[str]) -> FrequencyResponse:
+    """Read what `FrequencyResponse.save` wrote.
+
+    Raises
+    ------
+    ModelFileError
+        For any other file.
+    """
+    fields = storage.Fields(str(path), storage.read(path, FORMAT, (VERSION,)))
+    hertz = fields.vector("hertz")
+    noise = None if fields.any("noise") is None else fields.vector("noise")
+    arrays = {name: fields.vector(name) for name in ("real", "imaginary", "variance", "coherence")}
+    Ts = fields.positive("Ts")
+    if (
+        not len(hertz)
+        or np.any(np.diff(hertz) <= 0.0)
+        or not 0.0 < hertz[0] <= hertz[-1] <= 0.5 / Ts
+    ):
+        raise fields.refuse("hertz", "rising frequencies up to half the sample rate", hertz)
+    for name, array in {**arrays, **({} if noise is None else {"noise": noise})}.items():
+        if array.shape != hertz.shape:
+            raise fields.refuse(name, f"{len(hertz)} numbers, one per frequency", len(array))
+    return FrequencyResponse(
+        hertz, arrays["real"] + 1j * arrays["imaginary"], arrays["variance"], arrays["coherence"],
+        fields.positive("blocks"), Ts, noise, fields.text("u_unit"), fields.text("y_unit"),
+        fields.flag("from_counts"), fields.any("provenance"),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LoopMargins:
+    """Margins of a loop that is known at frequencies only.
+
+    Attributes
+    ----------
+    Ms, Ms_hertz : float
+        Largest |S|, and where [Hz].
+    Ms_band : tuple of (float, float)
+        In which it lies at 95 %, as the response is uncertain.
+    phase_margin_deg : float
+        Least turn of L to -1 where |L| is 1 [deg]; inf where it is nowhere 1.
+    gain_margin : float
+        Least factor above 1 that leads through -1; inf where none does.
+    crossovers : tuple of float
+        Where |L| is 1 [Hz].
+    """
+
+    Ms: float
+    Ms_hertz: float
+    Ms_band: tuple[float, float]
+    phase_margin_deg: float
+    gain_margin: float
+    crossovers: tuple[float, ...]
+
+    @classmethod
+    def of(cls, hertz: FloatArray, L: Complex, radius: FloatArray) -> LoopMargins:
+        """From L at rising frequencies and the radius of its uncertainty, all of shape (n,)."""
+        if len(hertz) < 3:
+            raise DataError(f"expected at least 3 frequencies for margins, got {len(hertz)}")
+        # between two lines L is a straight line in log magnitude and phase
+        fine = np.interp(np.arange(0, len(hertz) - 1 + 1e-9, 0.1), np.arange(len(hertz)), hertz)
+        size = np.interp(fine, hertz, np.log(np.maximum(np.abs(L), 1e-300)))
+        turn = np.interp(fine, hertz, np.unwrap(np.angle(L)))
+        distance = np.abs(1.0 + np.exp(size + 1j * turn))
+        off = np.interp(fine, hertz, radius)
+        worst = int(distance.argmin())
+        near = np.maximum(distance - off, 1e-12).min()
+        crossing = _crossings(fine, size, turn)
+        through = _crossings(fine, np.sin(turn), size, np.cos(turn) < 0.0)
+        phases = [abs(math.remainder(t + math.pi, 2.0 * math.pi)) for _, t in crossing]
+        gains = [math.exp(-s) for _, s in through if s < 0.0]
+        return cls(
+            Ms=float(1.0 / distance[worst]),
+            Ms_hertz=float(fine[worst]),
+            Ms_band=(float(1.0 / (distance + off).min()), float(1.0 / near)),
+            phase_margin_deg=math.degrees(min(phases, default=math.inf)),
+            gain_margin=min(gains, default=math.inf),
+            crossovers=tuple(f for f, _ in crossing),
+        )
+
+    def __str__(self) -> str:
+        low, high = self.Ms_band
+        places = ", ".join(f"{f:.4g}" for f in self.crossovers)
+        return (
+            f"Ms {self.Ms:.3f} ({low:.3f} to {high:.3f}) at {self.Ms_hertz:.4g} Hz, phase margin "
+            f"{self.phase_margin_deg:.1f} deg, gain margin {self.gain_margin:.3g}, crossover "
+            f"{places + ' Hz' if places else 'nowhere'}"
+        )
+
+
+def _crossings(
+    x: FloatArray, zero: FloatArray, value: FloatArray, holds: NDArray[np.bool_] | None = None
+) -> list[tuple[float, float]]:
+    """Where `zero` changes its sign (and `holds`): the place and the value there."""
+    at = np.flatnonzero(np.signbit(zero[:-1]) != np.signbit(zero[1:]))
+    if holds is not None:
+        at = at[holds[at] & holds[at + 1]]
+    share = zero[at] / (zero[at] - zero[at + 1])
+    return [
+        (float(x[k] + s * (x[k + 1] - x[k])), float(value[k] + s * (value[k + 1] - value[k])))
+        for k, s in zip(at, share, strict=True)
+    ]

@@ -1,0 +1,356 @@
+"""Two masses and the shaft between them, or one rigid machine, fitted to a frequency response.
+
+With the electrical and mechanical lag `1 + a1 s + a2 s^2`, the motor's speed under a command is
+
+    G(s) = K e^(-s tau) / (1 + a1 s + a2 s^2)  x  (w_r / w_a)^2 A(s) / R(s),
+    A(s) = s^2 + 2 z_a w_a s + w_a^2,   R(s) = s^2 + 2 z_r w_r s + w_r^2
+
+The motor stands still at the antiresonance w_a, where the load swings on the shaft alone, and both
+swing against each other at the resonance w_r; their ratio tells the inertias' (Ellis 2012, Control
+System Design Guide, chapter 16). What is sampled is not G but its response to a held command, as
+the encoder counts it; the fit compares that, exactly, by partial fractions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..arrays import FloatArray
+from ..errors import DataError, FitError
+from ..identification.least_squares import least_squares
+from ..models import LinearOE
+from ..plotting import html_of
+from .response import Complex, FrequencyResponse
+
+LEAST = 20
+"""Frequencies for a fit."""
+CLEAR = 100.0
+"""Times the mean squared error of a frequency, that a resonance has to explain to be believed."""
+NEIGHBOURS = 10
+"""Lines to either side over which the uncertainty is smoothed: a few blocks do not know it well."""
+FLOOR = 0.005
+"""Of the gain, that no fit has to explain: friction and dead time bend every response a little,
+which would else outweigh a resonance that is seen less well."""
+STARTS = 6
+"""Frequencies, evenly in their logarithm, at which a resonance is looked for beside the peaks."""
+DAMPED = 0.5
+"""Damping ratio from which two poles are no resonance."""
+RATIOS = (0.03, 30.0)
+"""Of load to motor inertia; beyond them the pair of zeros and poles is something else."""
+CONFIDENCE = 1.96
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A fitted value and its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+    def __str__(self) -> str:
+        return f"{self.value:.5g} {self.unit} ({self.low:.5g} to {self.high:.5g})"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ShaftFit:
+    """A rigid machine or two masses, with intervals.
+
+    Attributes
+    ----------
+    parameters : mapping of Parameter by name
+        `gain` [y/u], `delay` [s] beyond the hold, `lag_1`, `lag_2` [s] where the lags are real,
+        else `swing_hertz`, `swing_damping`; with a shaft also `resonance_hertz` and
+        `resonance_damping`, to which the motor's back-EMF adds, `antiresonance_hertz`,
+        `antiresonance_damping`, `inertia_ratio` (load over motor).
+    misfit : float
+        Root of the mean squared error over its standard deviation: 1 where noise explains all.
+    response : FrequencyResponse
+        What was fitted.
+    """
+
+    parameters: Mapping[str, Parameter]
+    misfit: float
+    response: FrequencyResponse
+    _theta: FloatArray
+
+    @property
+    def has_resonance(self) -> bool:
+        """Whether a shaft between two masses was found."""
+        return len(self._theta) == 8
+
+    def at(self, hertz: Any) -> Complex:
+        """The fitted response of what was measured, at `hertz`."""
+        f = np.atleast_1d(np.asarray(hertz, dtype=np.float64))
+        return _sampled(self._theta, f, self.response.Ts, self.response.from_counts)
+
+    def to_model(self) -> LinearOE:
+        """The fit as a linear model of the true speed at the samples."""
+        Ts = self.response.Ts
+        whole, part, terms = _terms(self._theta, Ts, counted=False)
+        poles = [np.exp(p * Ts) for p, _ in terms]
+        num: Any = np.zeros(len(poles) + 2, dtype=np.complex128)
+        for j, (p, r) in enumerate(terms):
+            now, before = _held(p, part, Ts)
+            others = np.poly([q for i, q in enumerate(poles) if i != j])
+            num[1:] += r * np.convolve([now, before], np.atleast_1d(others))
+        den = np.atleast_1d(np.poly(poles)).real
+        delayed = np.concatenate([np.zeros(whole), num.real])
+        of = self.response
+        return LinearOE.from_tf(delayed, den, Ts, input_units=(of.u_unit,), output_unit=of.y_unit)  # type: ignore[no-any-return]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Parameters with their intervals, as JSON values."""
+        rows = {name: vars(p) for name, p in self.parameters.items()}
+        return {"resonance": self.has_resonance, "misfit": self.misfit, "parameters": rows}
+
+    def _repr_html_(self) -> str:
+        return html_of(str(self))
+
+    def __repr__(self) -> str:
+        return f"<{str(self).splitlines()[0]}>"
+
+    def __str__(self) -> str:
+        kind = "two masses and a shaft" if self.has_resonance else "rigid"
+        width = max(map(len, self.parameters))
+        rows = [f"  {name:<{width}}  {p}" for name, p in self.parameters.items()]
+        return "\n".join([f"{kind}, misfit {self.misfit:.3g} (95 % intervals)", *rows])
+
+
+def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> ShaftFit:
+    """Fit a rigid machine, or two masses and a shaft, to the frequency response of its speed.
+
+    Parameters
+    ----------
+    response : FrequencyResponse
+        From command to speed, as `sewfast.bode` measures it; lines of a coherence below a half are
+        left out.
+    resonance : bool, optional
+        Whether there is a shaft. None finds out: it is believed where it explains 100 times the
+        mean squared error of a frequency, is damped below .5 and lies within what was measured.
+
+    Raises
+    ------
+    DataError
+        For fewer than 20 usable frequencies.
+    FitError
+        Where nothing converges, or a resonance is asked for and none is found.
+    """
+    usable = response.coherence > 0.5
+    if usable.sum() < LEAST:
+        raise DataError(
+            f"expected at least {LEAST} frequencies with a coherence above .5, got {usable.sum()}; "
+            "excite more, or longer"
+        )
+    f, g = response.hertz[usable], response.value[usable]
+    sigma = np.sqrt(0.5 * _smoothed(response.variance[usable]) + (FLOOR * np.abs(g)) ** 2)
+    task = _Task(f, g, sigma, response.Ts, response.from_counts)
+    rigid = min((_solved(task, x) for x in _rigid_starts(task)), key=lambda s: s[0])
+    best = rigid
+    if resonance is not False:
+        found = [_solved(task, x) for x in _shaft_starts(task, rigid[1])]
+        shaft = min((s for s in found if _is_shaft(s[1], f)), key=lambda s: s[0], default=None)
+        if shaft is None and resonance:
+            raise FitError(
+                "expected a resonance within the measured frequencies, none was found; leave "
+                "resonance=None, or measure to higher frequencies"
+            )
+        if shaft is not None and (resonance or _is_better(task, shaft[0], rigid[0])):
+            best = shaft
+    cost, theta, covariance = best
+    if not math.isfinite(cost):
+        raise FitError(
+            "expected a fit that converges, none did; look at the response: is it a speed?"
+        )
+    freedom = max(2 * len(f) - len(theta), 1)
+    scale = max(1.0, cost / freedom)
+    parameters = _parameters(theta, covariance * scale, response)
+    return ShaftFit(parameters, math.sqrt(cost / freedom), response, theta)
+
+
+# --- The sampled response: partial fractions ------------------------------------------------------
+
+
+def _polynomials(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Numerator and denominator of G without its delay; theta: logarithms, but for the delay."""
+    K, a1, a2 = np.exp(theta[:3])
+    num, den = np.array([K]), np.array([a2, a1, 1.0])
+    if len(theta) == 8:
+        wr, zr, wa, za = np.exp(theta[4:])
+        num = K * np.array([1.0, 2.0 * za * wa, wa * wa]) * (wr / wa) ** 2
+        den = np.convolve(den, [1.0, 2.0 * zr * wr, wr * wr])
+    return num, den
+
+
+def _terms(
+    theta: FloatArray, Ts: float, *, counted: bool
+) -> tuple[int, float, list[tuple[complex, complex]]]:
+    """Whole samples of delay, the rest of it as a share, and poles with their residues.
+
+    Of the speed, or where it is counted of its integral.
+    """
+    num, den = _polynomials(theta)
+    if counted:
+        den = np.concatenate([den, [0.0]])
+    poles = np.roots(den).astype(np.complex128)
+    slope = np.polyder(den)
+    residues = np.polyval(num, poles) / np.polyval(slope, poles)
+    delay = max(float(theta[3]), 0.0)
+    whole = math.floor(delay)
+    return whole, delay - whole, list(zip(poles, residues, strict=True))
+
+
+def _held(p: complex, part: float, Ts: float) -> tuple[complex, complex]:
+    """What a pole has made at a sample's end of this sample's command and of the one before."""
+    if p == 0.0:
+        return (1.0 - part) * Ts, part * Ts
+    now = np.exp(p * (1.0 - part) * Ts)
+    return (now - 1.0) / p, (np.exp(p * Ts) - now) / p
+
+
+def _sampled(theta: FloatArray, hertz: FloatArray, Ts: float, counted: bool) -> Complex:
+    """The response of what is seen: speed at the samples, or its mean over the sample before."""
+    whole, part, terms = _terms(theta, Ts, counted=counted)
+    step = np.exp(-2j * np.pi * hertz * Ts)
+    total: Complex = np.zeros(len(hertz), dtype=np.complex128)
+    for p, r in terms:
+        now, before = _held(p, part, Ts)
+        total += r * (now + before * step) * step / (1.0 - np.exp(p * Ts) * step)
+    total *= step**whole
+    return total * (1.0 - step) / Ts if counted else total
+
+
+# --- The search -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Task:
+    hertz: FloatArray
+    value: Complex
+    sigma: FloatArray
+    Ts: float
+    counted: bool
+
+    def residuals(self, theta: FloatArray) -> FloatArray:
+        with np.errstate(all="ignore"):
+            error = (_sampled(theta, self.hertz, self.Ts, self.counted) - self.value) / self.sigma
+        return np.concatenate([error.real, error.imag])
+
+
+def _smoothed(variance: FloatArray) -> FloatArray:
+    logs = np.log(variance)
+    n = len(logs)
+    around = [
+        np.median(logs[max(0, k - NEIGHBOURS) : min(n, k + NEIGHBOURS + 1)]) for k in range(n)
+    ]
+    return np.exp(around)
+
+
+def _solved(task: _Task, start: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    low, high = np.full(len(start), -40.0), np.full(len(start), 40.0)
+    low[3], high[3] = 0.0, 50.0
+    try:
+        found = least_squares(
+            task.residuals, start, "3-point", bounds=(low, high), max_nfev=200
+        )  # fmt: skip
+    except DataError:  # no finite residual at the start
+        return math.inf, start, np.zeros((len(start), len(start)))
+    covariance = found.covariance
+    if covariance is None:
+        covariance = np.full((len(start), len(start)), math.nan)
+    return 2.0 * found.cost, found.x, covariance
+
+
+def _rigid_starts(task: _Task) -> list[FloatArray]:
+    """The corner where the gain has fallen to .7, and lags beyond it."""
+    size = np.abs(task.value)
+    K = float(size[: max(3, len(size) // 50)].max())
+    below = np.flatnonzero(size < K / math.sqrt(2.0))
+    corner = task.hertz[below[0]] if len(below) else task.hertz[-1]
+    T = 1.0 / (2.0 * math.pi * corner)
+    return [
+        np.array([math.log(K), math.log(T + fast), math.log(T * fast), delay])
+        for fast in (0.03 * T, 0.3 * T)
+        for delay in (0.1, 1.5)
+    ]
+
+
+def _shaft_starts(task: _Task, rigid: FloatArray) -> list[FloatArray]:
+    """Where the response rises most above the rigid machine's, and a few places more."""
+    f = task.hertz
+    ratio = np.abs(task.value) / np.abs(_sampled(rigid, f, task.Ts, task.counted))
+    inner = np.flatnonzero((ratio[1:-1] >= ratio[:-2]) & (ratio[1:-1] >= ratio[2:])) + 1
+    peaks = inner[np.argsort(-ratio[inner])][:4]
+    places = [*f[peaks], *np.geomspace(max(2.0 * f[0], f[-1] / 60.0), 0.9 * f[-1], STARTS)]
+    starts = []
+    for place in places:
+        left = (f > 0.3 * place) & (f < 0.98 * place)
+        valley = f[left][ratio[left].argmin()] if left.any() else 0.75 * place
+        for antiresonance in (valley, 0.75 * place):
+            shaft = np.log([2 * math.pi * place, 0.03, 2 * math.pi * antiresonance, 0.03])
+            starts.append(np.concatenate([rigid, shaft]))
+    return starts
+
+
+def _is_shaft(theta: FloatArray, f: FloatArray) -> bool:
+    wr, zr, wa, za = np.exp(theta[4:])
+    inside = f[0] < wa / (2 * math.pi) and wr / (2 * math.pi) < f[-1]
+    return bool(inside and RATIOS[0] < (wr / wa) ** 2 - 1.0 < RATIOS[1] and max(zr, za) < DAMPED)
+
+
+def _is_better(task: _Task, shaft: float, rigid: float) -> bool:
+    """Whether the shaft explains clearly more, measured by what it leaves itself."""
+    freedom = max(2 * len(task.hertz) - 8, 1)
+    return (rigid - shaft) > CLEAR * shaft / freedom
+
+
+def _parameters(
+    theta: FloatArray, covariance: FloatArray, response: FrequencyResponse
+) -> dict[str, Parameter]:
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+
+    def positive(j: int, unit: str, scale: float = 1.0) -> Parameter:
+        value, factor = math.exp(theta[j]) * scale, math.exp(min(CONFIDENCE * sd[j], 700.0))
+        return Parameter(value, value / factor, value * factor, unit)
+
+    def derived(function: Any, unit: str) -> Parameter:
+        """By linear propagation."""
+        value = function(theta)
+        steps = 1e-5 * np.eye(len(theta))
+        slope = np.array([(function(theta + s) - function(theta - s)) / 2e-5 for s in steps])
+        off = CONFIDENCE * math.sqrt(max(slope @ covariance @ slope, 0.0))
+        return Parameter(value, value - off, value + off, unit)
+
+    unit = f"{response.y_unit}/{response.u_unit}" if response.y_unit else ""
+    off = CONFIDENCE * sd[3] * response.Ts
+    delay = theta[3] * response.Ts
+    found = {
+        "gain": positive(0, unit),
+        "delay": Parameter(delay, max(delay - off, 0.0), delay + off, "s"),
+    }
+    a1, a2 = np.exp(theta[1:3])
+    if a1 * a1 > 4.0 * a2:
+        for name, sign in (("lag_1", 1.0), ("lag_2", -1.0)):
+            found[name] = derived(lambda x, sign=sign: _lag(x, sign), "s")
+    else:
+        found["swing_hertz"] = derived(lambda x: math.exp(-0.5 * x[2]) / (2 * math.pi), "Hz")
+        found["swing_damping"] = derived(lambda x: 0.5 * math.exp(x[1] - 0.5 * x[2]), "")
+    if len(theta) == 8:
+        turn = 1.0 / (2.0 * math.pi)
+        found["resonance_hertz"] = positive(4, "Hz", turn)
+        found["resonance_damping"] = positive(5, "")
+        found["antiresonance_hertz"] = positive(6, "Hz", turn)
+        found["antiresonance_damping"] = positive(7, "")
+        found["inertia_ratio"] = derived(lambda x: math.exp(2.0 * (x[4] - x[6])) - 1.0, "")
+    return found
+
+
+def _lag(theta: FloatArray, sign: float) -> float:
+    a1, a2 = np.exp(theta[1:3])
+    return float(0.5 * (a1 + sign * math.sqrt(max(a1 * a1 - 4.0 * a2, 0.0))))
