@@ -20,6 +20,7 @@ from ..speed import speed_between_gaps
 from .containers import Table, freeze, read_mat, read_npz
 from .delimited import read_delimited
 from .frames import collected, of_arrow, table_of
+from .logs import is_log, read_log
 from .timebase import TOLERANCE, Grid, time_base
 
 # --- Parquet -> Table -----------------------------------------------------------------------------
@@ -72,7 +73,8 @@ def read_mcap(path: Path, raw: bytes) -> Table:
 
 
 def read_table(path: Any) -> Table:
-    """Read all columns of a CSV, `.mat`, `.npz`, Parquet or MCAP file, or of a table in memory.
+    """Read all columns of a CSV, `.mat`, `.npz`, Parquet or MCAP file, of a log of another tool, or
+    of a table in memory.
 
     Parameters
     ----------
@@ -80,7 +82,8 @@ def read_table(path: Any) -> Table:
         The format is told by the file's first bytes, where they tell, else by its extension. A
         table is one of pandas, polars, pyarrow (or anything with `__arrow_c_stream__`), an xarray
         Dataset or a mapping of name to array; null, NA and NaT are NaN, moments become seconds from
-        the first one.
+        the first one. Logs are MDF, TDMS, PX4 ULog, WPILib's data log and ROS bags (`.bag`,
+        `.mcap`); the signal with most samples gives the rows, others are held.
 
     Returns
     -------
@@ -99,6 +102,8 @@ def read_table(path: Any) -> Table:
         return table_of(path)
     path = Path(path)
     raw = _bytes(path)
+    if is_log(raw):
+        return read_log(path, raw)
     if raw.startswith(MAGIC) or path.suffix.lower() == ".mcap":
         return read_mcap(path, raw)
     if raw.startswith(b"PAR1"):
@@ -110,7 +115,8 @@ def read_table(path: Any) -> Table:
     if path.suffix.lower() in (".npz", ".parquet", ".npy"):
         raise DataError(
             f"{path}: expected a {path.suffix} file, but its content is of another kind or "
-            "damaged; supported are CSV, .mat, .npz, Parquet and recordings (.mcap)"
+            "damaged; supported are CSV, .mat, .npz, Parquet, recordings (.mcap) and logs of "
+            "other tools"
         )
     return read_delimited(path, raw)
 
