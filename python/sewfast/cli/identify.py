@@ -102,8 +102,8 @@ def orders_command(args: argparse.Namespace) -> None:
 TEXT = """\
 Identify a model of a drive from recordings of its input and its output.
 
-DATA is a CSV, .mat, .npz, Parquet or MCAP file, or a log (MDF, TDMS, ULog, WPILOG, ROS bag); several
-files are several experiments of one drive.
+DATA is a CSV, .mat, .npz, Parquet or MCAP file, or a log (MDF, TDMS, ULog, WPILOG, ROS bag);
+several files are several experiments of one drive.
 FILE:IN:OUT names the columns of one file, IN1+IN2 several inputs.
 
 The default, auto, fits linear output error of several orders, then networks that start from it, and
