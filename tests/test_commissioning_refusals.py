@@ -20,9 +20,12 @@ from sewfast import (
     SettingError,
     VirtualMachine,
     commission,
+    run,
 )
 from sewfast.commissioning import Bench, Followed, Refusal, gains, procedure, training
 from sewfast.commissioning.bench import MachineBench
+from sewfast.commissioning.demands import demands
+from sewfast.commissioning.gains import held, swing_of
 from sewfast.recording import Recording
 
 
@@ -229,3 +232,20 @@ def test_only_machines_are_commissioned() -> None:
 def test_what_names_no_folder_is_refused(folder: Any) -> None:
     with pytest.raises(SettingError, match="expected a folder's name"):
         commission(VirtualMachine(), **SMALL, folder=folder)
+
+
+def test_a_current_limit_is_not_taken_for_a_swing() -> None:
+    """A level that is approached faster than the current allows winds the loop up: it rings."""
+    machine = VirtualMachine(parameters={"current_limit": 5.0})
+    gains = Gains.standard(Kp=0.0098, Ti=0.0262, Td=0.00275)  # V/RPM, s: a quarter of first gains
+    controller = Controller(gains, Ts=0.001, N=10, u_min=-20, u_max=20, filter_samples=8)
+    fastest = 460.0 * 20.0 / 0.15  # RPM/s, what gain and time constant promise
+    wanted = demands(
+        MachineBench(machine), u_max=None, speed=None, references=None, members=2, evaluations=10,
+        seed=0, threads=1,
+    )  # fmt: skip
+    r, settled = held(wanted, fastest, 0.001)
+    assert swing_of(run(controller, machine, r), settled) is None
+    hurried = np.minimum(r * 6.0, r[-1])
+    reached = int(np.argmax(hurried >= r[-1]))
+    assert swing_of(run(controller, machine, hurried), reached + 200) is not None

@@ -346,6 +346,9 @@ SHARES = (0.25, 0.5, 1.0)
 """Of the gains, one hold after the other."""
 HOLD = 0.4
 """How long the level is held [s], at least; a swing is told from that."""
+GENTLY = 12.0
+"""Times as slowly as the step response promises that the level is reached. A current limit allows a
+fifth of that promise, and a loop that was at a limit swings back for reasons of its own."""
 SETTLE = 0.2
 """Least time after the ramp, before that [s]."""
 PERIODS = 100
@@ -383,7 +386,7 @@ class Swing:
 def held(demands: Demands, fastest: float, Ts: float) -> tuple[FloatArray, int]:
     """A reference to a working speed [RPM], and the sample from which it has settled."""
     level = SHAKEN_AT * demands.speed
-    rise = max(round(2.0 * level / fastest / Ts), 20)
+    rise = max(round(GENTLY * level / fastest / Ts), 20)
     settle = rise + max(round(0.5 * rise), round(SETTLE / Ts), PERIODS // 2)
     hold = max(round(HOLD / Ts), PERIODS)
     return level * np.minimum(1.0, np.arange(settle + hold) / rise), settle
