@@ -102,6 +102,16 @@ def speed_kalman(
     """
 def unwrap_counts(counts: _F, *, bits: int) -> _F: ...
 
+# --- greybox.rs -------------------------------------------------------------------------------------------
+
+GREYBOX_PARAMETERS: list[str]
+
+def greybox_run(
+    theta: _F, free: Sequence[int], u: _F, *, Ts: float, steps: int, speed: float = 0.0,
+    mean: bool = False, angle: _F | None = None,
+) -> tuple[_F, _F, _F, _F]:
+    """Speed [rad/s] and drive [command] (N,), and their derivatives by the free parameters (N, n_free)."""
+
 # --- models.rs --------------------------------------------------------------------------------------------
 
 @final

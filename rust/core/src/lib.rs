@@ -13,6 +13,7 @@ pub mod encoder;
 pub mod error;
 pub mod fopdt;
 mod gram;
+pub mod greybox;
 pub mod guard;
 pub mod iv;
 pub mod lagged;

@@ -3,6 +3,7 @@
 mod arrays;
 mod control;
 mod device;
+mod greybox;
 mod host_loop;
 mod least_squares;
 mod link;
@@ -27,6 +28,7 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     signals::register(module)?;
     machine::register(module)?;
     speed::register(module)?;
+    greybox::register(module)?;
     host_loop::register(module)?;
     models::register(module)?;
     least_squares::register(module)?;

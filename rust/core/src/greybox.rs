@@ -1,0 +1,624 @@
+//! A motor's equations with unknown parameters, in units of the command, and their sensitivities.
+//!
+//! Nothing but command and speed is needed, so torques are told as the command `x` that makes them (the command that
+//! the winding's resistance takes) and every parameter is one that a record can show. With speed `w` \[rad/s\] and
+//! shaft angle `th`:
+//!
+//! ```text
+//! tau dx/dt = u(t - delay) - drop x / sqrt(x^2 + ripple^2) - x - k_e w,          |x| <= limit
+//! k_a(th) dw/dt = x - offset - load(th) - k_b w - k_a'(th) w^2 / 2 - friction
+//! friction = sign(w) (k_s + k_t / (1 + (w / w_s)^2)), and what holds the shaft at standstill
+//! load(th) = load_1c cos th + load_1s sin th + load_2c cos 2 th + load_2s sin 2 th
+//! k_a(th) = k_a + inertia_2c cos 2 th + inertia_2s sin 2 th
+//! ```
+//!
+//! With a resistance R \[command/A\], a motor constant K and G volts per unit of command, `k_e = K/G`,
+//! `k_a = J R/K`, `k_b = B R/K`, `k_s = T R/K`. Derivatives are carried along with the values, as dual numbers
+//! (Griewank and Walther 2008, chapter 3): one more parameter costs one more column and no more code.
+
+use crate::simd::{self, Eight, Kernel};
+use crate::{Error, Result};
+
+/// Names of the parameters, in their order.
+pub const PARAMETERS: [&str; 18] = [
+    "k_e",
+    "k_b",
+    "k_a",
+    "tau",
+    "drop",
+    "ripple",
+    "k_s",
+    "offset",
+    "k_t",
+    "w_s",
+    "load_1c",
+    "load_1s",
+    "load_2c",
+    "load_2s",
+    "inertia_2c",
+    "inertia_2s",
+    "delay",
+    "limit",
+];
+
+const FIRST_OVER_THE_TURN: usize = 10;
+const LAST_OVER_THE_TURN: usize = 15;
+
+/// Newton's steps for the voltage drop; the function is monotone and its start is the value before.
+const NEWTON: usize = 3;
+
+/// A value with its derivatives by `N` parameters.
+#[derive(Clone, Copy, Debug)]
+struct Dual<const N: usize> {
+    value: f64,
+    by: [f64; N],
+}
+
+impl<const N: usize> Dual<N> {
+    const ZERO: Self = Self::constant(0.0);
+
+    const fn constant(value: f64) -> Self {
+        Self {
+            value,
+            by: [0.0; N],
+        }
+    }
+
+    /// A function of `self` with this value and slope.
+    #[inline(always)]
+    fn through(self, value: f64, slope: f64) -> Self {
+        Self {
+            value,
+            by: self.by.map(|d| d * slope),
+        }
+    }
+
+    /// `self + factor other`.
+    #[inline(always)]
+    fn plus(mut self, factor: f64, other: &Self) -> Self {
+        self.value += factor * other.value;
+        for (d, o) in self.by.iter_mut().zip(&other.by) {
+            *d += factor * o;
+        }
+        self
+    }
+
+    #[inline(always)]
+    fn times(self, other: &Self) -> Self {
+        let mut by = [0.0; N];
+        for (d, (a, b)) in by.iter_mut().zip(self.by.iter().zip(&other.by)) {
+            *d = a * other.value + self.value * b;
+        }
+        Self {
+            value: self.value * other.value,
+            by,
+        }
+    }
+
+    #[inline(always)]
+    fn scaled(self, factor: f64) -> Self {
+        self.through(self.value * factor, factor)
+    }
+
+    #[inline(always)]
+    fn inverse(self) -> Self {
+        let value = 1.0 / self.value;
+        self.through(value, -value * value)
+    }
+}
+
+/// What is simulated.
+#[derive(Clone, Copy, Debug)]
+pub struct Run<'a> {
+    /// Values in the order of [`PARAMETERS`]; `limit` may be infinite.
+    pub theta: &'a [f64; PARAMETERS.len()],
+    /// Places of the parameters by which derivatives are wanted.
+    pub free: &'a [usize],
+    /// Sample time \[s\].
+    pub sample_time: f64,
+    /// Integration steps per sample.
+    pub steps: usize,
+    /// Speed at the first sample \[rad/s\].
+    pub speed: f64,
+    /// Whether the output is the mean speed over the sample before, as a difference of counts shows it.
+    pub mean: bool,
+    /// Shaft angle at the samples \[rad\]; integrated from zero where it is not known.
+    pub angle: Option<&'a [f64]>,
+}
+
+/// What a motor did.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Found {
+    /// Speed \[rad/s\], (N).
+    pub speed: Vec<f64>,
+    /// The command that the resistance takes, R i, (N).
+    pub drive: Vec<f64>,
+    /// Derivatives of the speed, row by row, (N, free).
+    pub speed_by: Vec<f64>,
+    /// Derivatives of the drive, (N, free).
+    pub drive_by: Vec<f64>,
+}
+
+/// Speed and drive at every sample, before its command acts.
+///
+/// # Errors
+/// Setting errors for parameters outside their range, a fit of what varies over the turn without an angle, and too
+/// many parameters; data errors for commands that are not finite or an angle of another length.
+pub fn run(task: Run<'_>, u: &[f64]) -> Result<Found> {
+    check(&task, u)?;
+    Ok(match task.free.len() {
+        0 => simd::run(Carried::<0>(task, u)),
+        1..=4 => simd::run(Carried::<4>(task, u)),
+        5..=8 => simd::run(Carried::<8>(task, u)),
+        9..=12 => simd::run(Carried::<12>(task, u)),
+        13..=16 => simd::run(Carried::<16>(task, u)),
+        _ => simd::run(Carried::<20>(task, u)),
+    })
+}
+
+fn check(task: &Run<'_>, u: &[f64]) -> Result<()> {
+    for (j, (&value, name)) in task.theta.iter().zip(PARAMETERS).enumerate() {
+        let infinite = name == "limit" && value == f64::INFINITY;
+        let positive = ["k_a", "ripple", "w_s", "limit"].contains(&name);
+        let not_negative = ["tau", "delay"].contains(&name);
+        if !(value.is_finite() || infinite)
+            || positive && value <= 0.0
+            || not_negative && value < 0.0
+        {
+            let sign = if positive {
+                "above 0"
+            } else if not_negative {
+                "from 0 on"
+            } else {
+                "that is finite"
+            };
+            return Err(Error::setting(format!(
+                "expected a number {sign} as {name}, parameter {j} of theta, got {value}"
+            )));
+        }
+    }
+    if let Some(j) = task.free.iter().find(|&&j| j >= PARAMETERS.len()) {
+        return Err(Error::setting(format!(
+            "expected places of parameters from 0 to {}, got {j}",
+            PARAMETERS.len() - 1
+        )));
+    }
+    if task.free.len() > PARAMETERS.len() {
+        return Err(Error::setting(format!(
+            "expected each parameter once, got {} places",
+            task.free.len()
+        )));
+    }
+    let varies = |j: &usize| (FIRST_OVER_THE_TURN..=LAST_OVER_THE_TURN).contains(j);
+    if task.angle.is_none() && task.free.iter().any(varies) {
+        return Err(Error::setting(
+            "expected the shaft's angle for derivatives by what varies over the turn, got none; pass angle",
+        ));
+    }
+    if !(task.sample_time.is_finite()
+        && task.sample_time > 0.0
+        && (1..=10_000).contains(&task.steps))
+    {
+        return Err(Error::setting(format!(
+            "expected a sample time above 0 s and 1 to 10,000 steps, got {} s and {}",
+            task.sample_time, task.steps
+        )));
+    }
+    if !(task.theta[16] / task.sample_time < 1e9) {
+        return Err(Error::setting(format!(
+            "expected a delay below a billion samples, got {} s",
+            task.theta[16]
+        )));
+    }
+    if !task.speed.is_finite() || u.iter().any(|u| !u.is_finite()) {
+        return Err(Error::data(
+            "expected a finite speed and finite commands, got others; cut gaps out",
+        ));
+    }
+    match task.angle {
+        Some(angle) if angle.len() != u.len() || angle.iter().any(|a| !a.is_finite()) => {
+            Err(Error::data(format!(
+                "expected {} finite angles, one per command, got {}",
+                u.len(),
+                angle.len()
+            )))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// The parameters, as numbers that carry their derivatives.
+struct Equations<const N: usize> {
+    k_e: Dual<N>,
+    k_b: Dual<N>,
+    k_a: Dual<N>,
+    drop: Dual<N>,
+    ripple: Dual<N>,
+    k_s: Dual<N>,
+    offset: Dual<N>,
+    k_t: Dual<N>,
+    w_s: Dual<N>,
+    turn: [Dual<N>; LAST_OVER_THE_TURN - FIRST_OVER_THE_TURN + 1],
+    limit: Option<Dual<N>>,
+    /// What of its way the drive goes in a step, `1 - exp(-h / tau)`.
+    share: Dual<N>,
+    /// What of the start remains in its mean over a step.
+    memory: Dual<N>,
+    step: f64,
+}
+
+/// What depends on the angle.
+struct Turn<const N: usize> {
+    per_inertia: Dual<N>,
+    half_slope: Dual<N>,
+    load: Dual<N>,
+}
+
+impl<const N: usize> Equations<N> {
+    fn new(task: &Run<'_>, step: f64) -> Self {
+        let one = |j: usize| {
+            let mut dual = Dual::constant(task.theta[j]);
+            if let Some(place) = task.free.iter().position(|&free| free == j) {
+                dual.by[place] = 1.0;
+            }
+            dual
+        };
+        let tau = one(3);
+        // a lag far below the step is none; its derivative is nothing then, not infinite
+        let (share, memory) = if tau.value > 1e-3 * step {
+            let left = (-step / tau.value).exp();
+            let share = tau.through(1.0 - left, -left * step / (tau.value * tau.value));
+            (share, share.times(&tau).scaled(1.0 / step))
+        } else {
+            (Dual::constant(1.0), tau.scaled(1.0 / step))
+        };
+        Self {
+            k_e: one(0),
+            k_b: one(1),
+            k_a: one(2),
+            drop: one(4),
+            ripple: one(5),
+            k_s: one(6),
+            offset: one(7),
+            k_t: one(8),
+            w_s: one(9),
+            turn: std::array::from_fn(|j| one(FIRST_OVER_THE_TURN + j)),
+            limit: task.theta[17].is_finite().then(|| one(17)),
+            share,
+            memory,
+            step,
+        }
+    }
+
+    #[inline(always)]
+    fn at(&self, angle: f64) -> Turn<N> {
+        let ((s1, c1), (s2, c2)) = (angle.sin_cos(), (2.0 * angle).sin_cos());
+        let [first_c, first_s, second_c, second_s, c, s] = &self.turn;
+        let inertia = self.k_a.plus(c2, c).plus(s2, s);
+        // an inertia is positive, whatever a search tries
+        let least = 0.05 * self.k_a.value;
+        let inertia = if inertia.value > least {
+            inertia
+        } else {
+            Dual::constant(least)
+        };
+        Turn {
+            per_inertia: inertia.inverse(),
+            half_slope: Dual::ZERO.plus(-s2, c).plus(c2, s),
+            load: self
+                .offset
+                .plus(c1, first_c)
+                .plus(s1, first_s)
+                .plus(c2, second_c)
+                .plus(s2, second_s),
+        }
+    }
+
+    /// Dry friction without its sign.
+    #[inline(always)]
+    fn dry(&self, speed: &Dual<N>) -> Dual<N> {
+        if self.k_t.value == 0.0 && self.k_t.by == [0.0; N] {
+            return self.k_s;
+        }
+        let ratio = speed.times(&self.w_s.inverse());
+        let shape = ratio
+            .times(&ratio)
+            .plus(1.0, &Dual::constant(1.0))
+            .inverse();
+        self.k_s.plus(1.0, &self.k_t.times(&shape))
+    }
+
+    /// The speed after `time` under a drive, with what depends on the speed taken at `middle`.
+    ///
+    /// Dry friction takes what it can of the speed that it would have without, and stops at nothing: Moreau's scheme
+    /// (Acary and Brogliato 2008), which sticks and breaks away without events.
+    #[inline(always)]
+    fn moved(
+        &self,
+        turn: &Turn<N>,
+        from: &Dual<N>,
+        drive: &Dual<N>,
+        middle: &Dual<N>,
+        time: f64,
+    ) -> Dual<N> {
+        let smooth = drive
+            .plus(-1.0, &turn.load)
+            .plus(-1.0, &self.k_b.times(middle))
+            .plus(-1.0, &turn.half_slope.times(&middle.times(middle)));
+        let free = from.plus(time, &smooth.times(&turn.per_inertia));
+        let most = self.dry(middle).times(&turn.per_inertia).scaled(time);
+        if free.value.abs() <= most.value {
+            return Dual::ZERO;
+        }
+        free.plus(-free.value.signum(), &most)
+    }
+
+    /// The drive after a step towards `goal`, and its mean; `x + share drop(x) = x_0 + share (goal - x_0)`.
+    #[inline(always)]
+    fn driven(&self, from: &Dual<N>, goal: &Dual<N>) -> (Dual<N>, Dual<N>) {
+        let aim = from.plus(1.0, &self.share.times(&goal.plus(-1.0, from)));
+        let mut after = aim;
+        let mut taken = Dual::ZERO;
+        if self.drop.value != 0.0 || self.drop.by != [0.0; N] {
+            let (share, drop, ripple) = (self.share.value, self.drop.value, self.ripple.value);
+            let mut x = from.value;
+            for _ in 0..NEWTON {
+                let root = (x * x + ripple * ripple).sqrt();
+                let slope = 1.0 + share * drop * ripple * ripple / (root * root * root);
+                x -= (x + share * drop * x / root - aim.value) / slope.max(0.1);
+            }
+            // one step more, carrying derivatives, makes them exact: those of an implicit function
+            let root = (x * x + ripple * ripple).sqrt();
+            let by_ripple = -x * ripple / (root * root * root);
+            let shape = self.ripple.through(x / root, by_ripple);
+            let taken_at = self.drop.times(&shape);
+            let slope = 1.0 + share * drop * ripple * ripple / (root * root * root);
+            after = Dual::constant(x).plus(
+                1.0 / slope.max(0.1),
+                &aim.plus(-1.0, &Dual::constant(x))
+                    .plus(-1.0, &self.share.times(&taken_at)),
+            );
+            taken = aim.plus(-1.0, &after).times(&self.share.inverse());
+        }
+        let steady = goal.plus(-1.0, &taken);
+        let mean = steady.plus(1.0, &self.memory.times(&from.plus(-1.0, &steady)));
+        (self.limited(after), self.limited(mean))
+    }
+
+    #[inline(always)]
+    fn limited(&self, drive: Dual<N>) -> Dual<N> {
+        match &self.limit {
+            Some(limit) if drive.value.abs() > limit.value => limit.scaled(drive.value.signum()),
+            _ => drive,
+        }
+    }
+
+    /// Drive and speed after a step at this command, and the speed's mean.
+    #[inline(always)]
+    fn advanced(
+        &self,
+        turn: &Turn<N>,
+        x: &Dual<N>,
+        w: &Dual<N>,
+        u: &Dual<N>,
+    ) -> (Dual<N>, Dual<N>) {
+        let middle = self.moved(turn, w, x, w, 0.5 * self.step);
+        let goal = u.plus(-1.0, &self.k_e.times(&middle));
+        let (after, mean) = self.driven(x, &goal);
+        (after, self.moved(turn, w, &mean, &middle, self.step))
+    }
+}
+
+struct Carried<'a, const N: usize>(Run<'a>, &'a [f64]);
+
+impl<const N: usize> Kernel for Carried<'_, N> {
+    type Output = Found;
+
+    #[inline(always)]
+    fn run<V: Eight>(self) -> Found {
+        let Self(task, u) = self;
+        let (n, m) = (u.len(), task.free.len());
+        let step = task.sample_time / task.steps as f64;
+        let is = Equations::<N>::new(&task, step);
+        let mut found = Found {
+            speed: Vec::with_capacity(n),
+            drive: Vec::with_capacity(n),
+            speed_by: Vec::with_capacity(n * m),
+            drive_by: Vec::with_capacity(n * m),
+        };
+        let delay = task.theta[16] / task.sample_time;
+        let (whole, part) = (delay.floor() as usize, delay.fract());
+        let late = task.free.iter().position(|&j| j == 16);
+        let at = |k: usize, back: usize| u[k.saturating_sub(back)];
+        let mut w = Dual::<N>::constant(task.speed);
+        let mut x = match u.first() {
+            Some(&first) => is.limited(Dual::constant(first).plus(-1.0, &is.k_e.times(&w))),
+            None => return found,
+        };
+        let mut shown = w;
+        let mut angle = 0.0;
+        for k in 0..n {
+            found.speed.push(shown.value);
+            found.drive.push(x.value);
+            found.speed_by.extend_from_slice(&shown.by[..m]);
+            found.drive_by.extend_from_slice(&x.by[..m]);
+            let middle = match task.angle {
+                Some(known) => 0.5 * (known[k] + known[(k + 1).min(n - 1)]),
+                None => angle + 0.5 * w.value * task.sample_time,
+            };
+            let turn = is.at(middle);
+            let (now, before) = (at(k, whole), at(k, whole + 1));
+            let mut mean = Dual::ZERO;
+            for j in 0..task.steps {
+                // the command that is late changes within a step: its mean over the step acts
+                let old = part * task.steps as f64 - j as f64;
+                let mut command = Dual::constant(now + old.clamp(0.0, 1.0) * (before - now));
+                if let (Some(place), true) = (late, (0.0..1.0).contains(&old)) {
+                    command.by[place] = (before - now) / step;
+                }
+                let (drive, speed) = is.advanced(&turn, &x, &w, &command);
+                mean = mean.plus(0.5, &w).plus(0.5, &speed);
+                (x, w) = (drive, speed);
+            }
+            let mean = mean.scaled(1.0 / task.steps as f64);
+            angle += mean.value * task.sample_time;
+            shown = if task.mean { mean } else { w };
+        }
+        found
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::Random;
+
+    const THETA: [f64; 18] = [
+        0.019, 0.0006, 0.0049, 0.0073, 0.08, 0.06, 0.25, 0.03, 0.12, 9.0, 0.14, -0.06, 0.05, 0.02,
+        2e-4, -1e-4, 0.0013, 6.0,
+    ];
+
+    fn commands(n: usize) -> Vec<f64> {
+        let mut random = Random::new(3);
+        let mut level = 0.0;
+        (0..n)
+            .map(|k| {
+                if k % 37 == 0 {
+                    level = 16.0 * random.uniform() - 8.0;
+                }
+                level
+            })
+            .collect()
+    }
+
+    fn task<'a>(theta: &'a [f64; 18], free: &'a [usize], angle: Option<&'a [f64]>) -> Run<'a> {
+        Run {
+            theta,
+            free,
+            sample_time: 0.001,
+            steps: 2,
+            speed: 20.0,
+            mean: true,
+            angle,
+        }
+    }
+
+    /// Against differences, wherever no sample lies on a kink between them.
+    #[test]
+    fn derivatives_are_those_of_the_values() {
+        let u = commands(400);
+        let angle: Vec<f64> = (0..400).map(|k| 0.1 * k as f64).collect();
+        let free: Vec<usize> = (0..18).collect();
+        let found = run(task(&THETA, &free, Some(&angle)), &u).unwrap();
+        for j in 0..18 {
+            let h = 1e-6 * THETA[j].abs();
+            let beside = |sign: f64| {
+                let mut theta = THETA;
+                theta[j] += sign * h;
+                run(task(&theta, &[], Some(&angle)), &u).unwrap()
+            };
+            let (more, less) = (beside(1.0), beside(-1.0));
+            for (by, [a, b]) in [
+                (&found.speed_by, [&more.speed, &less.speed]),
+                (&found.drive_by, [&more.drive, &less.drive]),
+            ] {
+                let column: Vec<f64> = (0..400).map(|k| by[18 * k + j]).collect();
+                let scale = column.iter().fold(0.0_f64, |most, d| most.max(d.abs()));
+                assert!(scale > 0.0, "{} moves nothing", PARAMETERS[j]);
+                let off = (0..400)
+                    .filter(|&k| ((a[k] - b[k]) / (2.0 * h) - column[k]).abs() > 2e-4 * scale)
+                    .count();
+                assert!(off <= 4, "{}: {off} samples", PARAMETERS[j]);
+            }
+        }
+    }
+
+    #[test]
+    fn a_linear_motor_reaches_its_steady_speed_with_its_time_constants() {
+        let mut theta = [0.0; 18];
+        theta[..6].copy_from_slice(&[0.02, 0.001, 0.004, 0.005, 0.0, 1.0]);
+        theta[9] = 1.0;
+        theta[17] = f64::INFINITY;
+        let u = vec![3.0; 3000];
+        let mut of = task(&theta, &[], None);
+        (of.speed, of.mean, of.steps) = (0.0, false, 4);
+        let found = run(of, &u).unwrap();
+        // tau k_a w'' + (k_a + tau k_b) w' + (k_e + k_b) w = u, from rest, the drive from its steady value
+        let (a2, a1, a0): (f64, f64, f64) = (0.005 * 0.004, 0.004 + 0.005 * 0.001, 0.021);
+        let root = (a1 * a1 - 4.0 * a2 * a0).sqrt();
+        let (p, q) = ((-a1 + root) / (2.0 * a2), (-a1 - root) / (2.0 * a2));
+        let last = 3.0 / a0;
+        let (start, slope) = (-last, 3.0 / 0.004);
+        let c = (slope - q * start) / (p - q);
+        for k in [1, 5, 20, 100, 400, 2999] {
+            let t = 0.001 * k as f64;
+            let exact = last + c * (p * t).exp() + (start - c) * (q * t).exp();
+            assert!(
+                (found.speed[k] - exact).abs() < 2e-4 * last,
+                "{k}: {} {exact}",
+                found.speed[k]
+            );
+        }
+    }
+
+    #[test]
+    fn friction_holds_what_it_can_and_no_more() {
+        let mut theta = THETA;
+        theta[10..16].fill(0.0);
+        let mut of = task(&theta, &[], None);
+        of.speed = 0.0;
+        let held = run(of, &[0.38; 500]).unwrap(); // below k_s + k_t + offset, drop included
+        assert!(held.speed.iter().all(|&w| w == 0.0));
+        let moving = run(of, &[0.6; 500]).unwrap();
+        assert!(moving.speed[499] > 1.0);
+    }
+
+    #[test]
+    fn a_delay_of_whole_samples_shifts_the_command() {
+        let u = commands(300);
+        let angle = vec![0.4; 300];
+        let (mut none, mut two) = (THETA, THETA);
+        (none[16], two[16]) = (0.0, 0.002);
+        let late: Vec<f64> = [u[0], u[0]].iter().chain(&u[..298]).copied().collect();
+        assert_eq!(
+            run(task(&two, &[], Some(&angle)), &u).unwrap(),
+            run(task(&none, &[], Some(&angle)), &late).unwrap()
+        );
+    }
+
+    #[test]
+    fn the_width_of_the_derivatives_changes_no_value() {
+        let u = commands(200);
+        let angle = vec![0.4; 200];
+        let free: Vec<usize> = (0..18).collect();
+        let plain = run(task(&THETA, &[], Some(&angle)), &u).unwrap();
+        for count in [3, 7, 11, 15, 18] {
+            let found = run(task(&THETA, &free[..count], Some(&angle)), &u).unwrap();
+            assert_eq!(found.speed, plain.speed);
+            assert_eq!(found.drive, plain.drive);
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_simulated_is_refused() {
+        let u = commands(10);
+        let refused = |change: &dyn Fn(&mut [f64; 18])| {
+            let mut theta = THETA;
+            change(&mut theta);
+            run(task(&theta, &[], None), &u).unwrap_err().message
+        };
+        assert!(refused(&|theta| theta[2] = 0.0).contains("k_a"));
+        assert!(refused(&|theta| theta[3] = -1.0).contains("tau"));
+        assert!(refused(&|theta| theta[0] = f64::NAN).contains("k_e"));
+        assert!(
+            run(task(&THETA, &[10], None), &u)
+                .unwrap_err()
+                .message
+                .contains("angle")
+        );
+        assert!(run(task(&THETA, &[99], None), &u).is_err());
+        assert!(run(task(&THETA, &[], None), &[f64::NAN]).is_err());
+        assert!(run(task(&THETA, &[], Some(&[0.0])), &u).is_err());
+        assert!(run(task(&THETA, &[], None), &[]).unwrap().speed.is_empty());
+    }
+}
