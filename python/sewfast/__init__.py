@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .fleets import Fleet, fleet
     from .frequency import FrequencyResponse, ShaftFit, fit_shaft, load_response
     from .gains import Gains
+    from .greybox import Motor, load_motor, physics
     from .identification import identify
     from .identification.delays import DelayEstimate, delay
     from .identification.least_squares import LeastSquaresResult, least_squares
@@ -74,6 +75,7 @@ __all__ = [
     "Margins",
     "Model",
     "ModelFileError",
+    "Motor",
     "NeuralOE",
     "NeuralSS",
     "OrderTable",
@@ -102,11 +104,13 @@ __all__ = [
     "least_squares",
     "load_controller",
     "load_model",
+    "load_motor",
     "load_response",
     "margins",
     "orders",
     "paper_controller",
     "pareto",
+    "physics",
     "read",
     "read_table",
     "record",
@@ -136,6 +140,7 @@ _HOMES = {
     "evidence": "ReportCard check",
     "fleets": "Fleet fleet",
     "frequency": "FrequencyResponse ShaftFit fit_shaft load_response",
+    "greybox": "Motor load_motor physics",
     "identification": "identify",
     "identification.least_squares": "LeastSquaresResult least_squares",
     "control.loop": "ClosedLoopRun run",

@@ -183,12 +183,12 @@ def _of_record(args: argparse.Namespace) -> FrequencyResponse:
     source, args.data = args.data, [args.data]
     data = read_training(args)
     return bode(
-        data if data.counts is None else _unsmoothed(source, data), reference=args.reference,
+        data if data.counts is None else unsmoothed(source, data), reference=args.reference,
         segment=args.segment,
     )  # fmt: skip
 
 
-def _unsmoothed(source: str, data: Dataset) -> Dataset:
+def unsmoothed(source: str, data: Dataset) -> Dataset:
     """With the difference of counts as its speed: an estimate that looks ahead has no delay."""
     from dataclasses import replace
 

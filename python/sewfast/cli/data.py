@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..errors import DataError, SettingError
@@ -16,14 +17,14 @@ if TYPE_CHECKING:
     from ..readers import Table
 
 
-def read_training(args: argparse.Namespace) -> Dataset:
+def read_training(args: argparse.Namespace, channels: Sequence[str] = ()) -> Dataset:
     """Every DATA argument as an experiment; columns from `FILE:IN:OUT` or the options."""
     from ..dataset import Dataset
 
-    return Dataset.concat([_read_named(source, args) for source in args.data])
+    return Dataset.concat([_read_named(source, args, channels) for source in args.data])
 
 
-def _read_named(source: str, args: argparse.Namespace) -> Dataset:
+def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) -> Dataset:
     from ..readers import parse_source, read, read_table
 
     path, inputs, output = parse_source(source)
@@ -44,7 +45,7 @@ def _read_named(source: str, args: argparse.Namespace) -> Dataset:
             Ts=args.ts,
             counts=counts,
             counts_per_rev=args.counts_per_rev,
-            channels=_references(table, (*inputs, output, counts)),
+            channels=[*channels, *_references(table, (*inputs, output, counts, *channels))],
             weights=getattr(args, "weights", None),
         )
     )

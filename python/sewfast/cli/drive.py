@@ -190,7 +190,7 @@ def is_port(text: str) -> bool:
 
 
 def machine_of(text: str) -> VirtualMachine | SteppedBench:
-    """What `--on` names where it is no port: `virtual[:SEED]`, or an FMU with its arguments.
+    """What `--on` names where it is no port: `virtual[:SEED]`, a motor's twin, or an FMU.
 
     Raises
     ------
@@ -201,12 +201,21 @@ def machine_of(text: str) -> VirtualMachine | SteppedBench:
 
     if is_fmu(text):
         return fmu_of(text)
+    if text.endswith(".json"):
+        from ..greybox import load_motor
+
+        return load_motor(text).machine()
     if not text.startswith("virtual"):
         raise SettingError(
-            f"--on {text}: expected virtual[:SEED], FILE.fmu?volt=24, a serial port or "
+            f"--on {text}: expected virtual[:SEED], MOTOR.json, FILE.fmu?volt=24, a serial port or "
             "socket://HOST:PORT, got none of them; `sewfast ports` lists the serial ports"
         )
     return VirtualMachine.from_name(text)
+
+
+def _named(machine: str) -> str:
+    """The name of a virtual machine, also of a motor's twin."""
+    return machine_of(machine).name if machine.endswith(".json") else machine
 
 
 def require_no_drive_options(args: argparse.Namespace) -> None:
@@ -414,8 +423,9 @@ def add_device(commands: Commands) -> None:
         help="--tcp may name an address that other computers reach, and start the motor from",
     )  # fmt: skip
     parser.add_argument(
-        "--machine", default="virtual", metavar="virtual[:SEED]", help="the machine (virtual)"
-    )
+        "--machine", default="virtual", metavar="virtual[:SEED]|MOTOR.json",
+        help="the machine (virtual); a file of `sewfast physics -o` is its twin",
+    )  # fmt: skip
     parser.add_argument(
         "--fast", action="store_true",
         help="as fast as the port allows: time advances only by the host's credit",
@@ -448,7 +458,7 @@ def device_command(args: argparse.Namespace) -> None:
     with _signals_as_interrupts():
         with (
             VirtualDevice(
-                args.machine,
+                _named(args.machine),
                 fast=args.fast,
                 faults=args.faults,
                 seed=args.seed,

@@ -92,18 +92,8 @@ class ShaftFit:
 
     def to_model(self) -> LinearOE:
         """The fit as a linear model of the true speed at the samples."""
-        Ts = self.response.Ts
-        whole, part, terms = _terms(self._theta, Ts, counted=False)
-        poles = [np.exp(p * Ts) for p, _ in terms]
-        num: Any = np.zeros(len(poles) + 2, dtype=np.complex128)
-        for j, (p, r) in enumerate(terms):
-            now, before = _held(p, part, Ts)
-            others = np.poly([q for i, q in enumerate(poles) if i != j])
-            num[1:] += r * np.convolve([now, before], np.atleast_1d(others))
-        den = np.atleast_1d(np.poly(poles)).real
-        delayed = np.concatenate([np.zeros(whole), num.real])
         of = self.response
-        return LinearOE.from_tf(delayed, den, Ts, input_units=(of.u_unit,), output_unit=of.y_unit)  # type: ignore[no-any-return]
+        return sampled_model(self._theta, of.Ts, of.u_unit, of.y_unit)
 
     def to_dict(self) -> dict[str, Any]:
         """Parameters with their intervals, as JSON values."""
@@ -224,6 +214,20 @@ def _sampled(theta: FloatArray, hertz: FloatArray, Ts: float, counted: bool) -> 
         total += r * (now + before * step) * step / (1.0 - np.exp(p * Ts) * step)
     total *= step**whole
     return total * (1.0 - step) / Ts if counted else total
+
+
+def sampled_model(theta: FloatArray, Ts: float, u_unit: str, y_unit: str) -> LinearOE:
+    """G under a held command, at the samples; theta: logarithms, but for the delay in samples."""
+    whole, part, terms = _terms(theta, Ts, counted=False)
+    poles = [np.exp(p * Ts) for p, _ in terms]
+    num: Any = np.zeros(len(poles) + 2, dtype=np.complex128)
+    for j, (p, r) in enumerate(terms):
+        now, before = _held(p, part, Ts)
+        others = np.poly([q for i, q in enumerate(poles) if i != j])
+        num[1:] += r * np.convolve([now, before], np.atleast_1d(others))
+    den = np.atleast_1d(np.poly(poles)).real
+    delayed = np.concatenate([np.zeros(whole), num.real])
+    return LinearOE.from_tf(delayed, den, Ts, input_units=(u_unit,), output_unit=y_unit)  # type: ignore[no-any-return]
 
 
 # --- The search -----------------------------------------------------------------------------------

@@ -1,0 +1,114 @@
+"""`sewfast physics`: friction, inertia and electrical constants of a motor from a record."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from .. import storage
+from ..errors import SettingError
+from .arguments import (
+    Commands,
+    add_columns,
+    add_command,
+    add_output,
+    add_plot,
+    require_place,
+    require_plot,
+)
+from .output import print_json
+
+if TYPE_CHECKING:
+    from ..dataset import Dataset
+
+PHYSICS = """\
+What is my motor: the command that it takes per speed, per acceleration and against friction, its
+lags, what varies over a turn, each with a 95 % interval. With a measured current also resistance,
+and with the volts on the winding R, Ke, J and friction in SI units. What the record cannot tell is
+named, with what would tell it, and not printed as a number.
+"""
+
+EXAMPLES = """\
+examples:
+  sewfast physics steps.csv --input u --counts counts --counts-per-rev 1572 -o motor.json
+  sewfast physics log.csv --input volts --output speed --speed-unit rad/s
+  sewfast physics log.csv --input volts --output rpm --speed-unit rpm --current amps --volts 1
+  sewfast physics log.csv --input u --output rpm --speed-unit rpm --export wpilib gains.json
+  sewfast record --on motor.json --signal chirp -o rehearsal.csv     the twin as a machine
+"""
+
+
+def add(commands: Commands) -> None:
+    parser = add_command(
+        commands, "physics", command,
+        summary="inertia, friction and electrical constants of a motor", text=PHYSICS,
+        examples=EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument("data", metavar="DATA", nargs="+", help="recordings of the same motor")
+    parser.add_argument("--current", metavar="COL", help="column of the motor current [A]")
+    parser.add_argument(
+        "--volts", type=float, metavar="N", help="volts on the winding per unit of command"
+    )
+    parser.add_argument(
+        "--structure", default="dcmotor", metavar="LIST",
+        help="dcmotor (all terms, those that are not shown go), or terms: lag,delay,coulomb,offset,"
+        "drop,stribeck,load_1,load_2,inertia_2,limit",
+    )  # fmt: skip
+    parser.add_argument(
+        "--speed-unit", metavar="UNIT", help="of the output: rpm, rad/s, rev/s, deg/s"
+    )
+    parser.add_argument(
+        "--export", nargs=2, metavar=("TARGET", "FILE"),
+        help="write settings for wpilib, mujoco or urdf",
+    )  # fmt: skip
+    add_output(parser, "FILE.json", "write the motor")
+    add_plot(parser, "draw the free run and what it takes to hold a speed")
+    add_columns(parser, from_model=False)
+
+
+def command(args: argparse.Namespace) -> None:
+    from ..greybox import physics
+
+    require_place(args.out, (".json",))
+    require_plot(args.plot)
+    target, place = args.export or (None, "")
+    if target not in (None, "wpilib", "mujoco", "urdf"):
+        raise SettingError(f"--export: expected wpilib, mujoco or urdf, received {target!r}")
+    structure = args.structure
+    motor = physics(
+        _data(args),
+        structure=structure if structure == "dcmotor" else structure.split(","),
+        current=args.current,
+        volts=args.volts,
+        speed_unit=args.speed_unit,
+    )
+    text = "" if target is None else motor.export(target)
+    if args.out is not None:
+        motor.save(args.out)
+    if text:
+        storage.replace(place, text)
+    if args.plot is not None:
+        motor.plot(file=args.plot)
+    if args.json:
+        print_json(motor.to_dict())
+        return
+    print(motor)
+    for path in (args.out, place, args.plot):
+        if path:
+            print(f"written to {path}")
+
+
+def _data(args: argparse.Namespace) -> Dataset:
+    """The records, of counts their differences: a smoothed speed has lost what friction does."""
+    from ..dataset import Dataset
+    from .bode import unsmoothed
+    from .data import read_training
+
+    sources, found = args.data, []
+    for source in sources:
+        args.data = [source]
+        data = read_training(args, channels=() if args.current is None else (args.current,))
+        whole = data.counts is not None and len(data.experiments) == 1
+        found.append(unsmoothed(source, data) if whole else data)
+    args.data = sources
+    return Dataset.concat(found)

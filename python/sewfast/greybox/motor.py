@@ -1,0 +1,549 @@
+"""`Motor`: what a record says of a motor, what it does not, and what can be made of it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .. import _core, storage
+from ..arrays import FloatArray, as_column
+from ..errors import DataError, SettingError
+from ..frequency.shaft import Parameter, sampled_model
+from ..machine import VirtualMachine
+from ..models import LinearOE
+from ..plotting import LOOKS, Drawing, html_of
+from .records import Records, rad_per_second
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FORMAT = "sewfast-motor"
+VERSION = 1
+NAMES = tuple(_core.GREYBOX_PARAMETERS)
+CONFIDENCE = 1.96
+VAGUE = 1.0
+"""Of its value: the half-width of an interval from which a parameter is not printed."""
+
+Target: TypeAlias = Literal["wpilib", "mujoco", "urdf"]
+Values: TypeAlias = Mapping[str, float]
+
+_SI = ("resistance", "motor_constant", "inertia", "viscous_friction", "coulomb_torque")
+_NO_CURRENT = (
+    "command and speed alone fix only its ratios to the others, in k_v, k_a and k_s; pass current"
+)
+_NO_VOLTS = (
+    "it scales with the volts on the winding per unit of command; pass volts (1 where the command "
+    "is that voltage)"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A point of the search: all parameters, the free ones and their covariance."""
+
+    theta: FloatArray
+    resistance: float | None
+    names: tuple[str, ...]
+    covariance: FloatArray
+    terms: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Motor:
+    """A motor as a record shows it.
+
+    Attributes
+    ----------
+    parameters : mapping of Parameter by name
+        Value, 95 % interval and unit. `k_v`, `k_a`, `k_s`: command per speed, per acceleration and
+        against dry friction; `time_constant`; of the terms that are shown `electrical_lag`,
+        `delay` beyond the hold, `offset`, `drop` (dead zone of the inverter), `stribeck` and
+        `stribeck_speed`, `load_1`, `load_2` (amplitude once, twice per turn), `inertia_2`
+        (relative), `limit`. With a current also `k_e`, `k_b` (back-EMF, viscous) and `resistance`
+        per unit of command; with volts R, Ke, J, friction and inductance in SI units.
+    untold : mapping of str by name
+        Parameters that the record cannot tell, and why.
+    terms : tuple of str
+        What the record shows beside back-EMF and inertia.
+    fit_percent, rmse : float
+        Of the free run on the record, after its start; rmse in `speed_unit`.
+    converged : bool
+        Whether the least squares were confirmed, or have less to gain than noise would give.
+    """
+
+    parameters: Mapping[str, Parameter]
+    untold: Mapping[str, str]
+    terms: tuple[str, ...]
+    fit_percent: float
+    rmse: float
+    converged: bool
+    samples: int
+    spikes: int
+    Ts: float
+    u_unit: str
+    speed_unit: str
+    u_limit: float
+    counts_per_rev: float | None
+    volts: float | None
+    resistance: float | None
+    theta: FloatArray
+    shown: tuple[FloatArray, FloatArray] | None = field(default=None)
+    """Speed, measured and in the free run [rad/s], for the picture; not in a file."""
+
+    def value(self, name: str) -> float:
+        """A parameter's value.
+
+        Raises
+        ------
+        DataError
+            Where the record does not tell it, with the reason.
+        """
+        if name in self.parameters:
+            return self.parameters[name].value
+        known = ", ".join(self.parameters)
+        raise DataError(
+            f"{name}: {self.untold[name]}"
+            if name in self.untold
+            else f"expected a parameter of {known}, received {name!r}"
+        )
+
+    def simulate(self, u: ArrayLike, *, Ts: float | None = None, speed: float = 0.0) -> FloatArray:
+        """Speed [speed_unit] under commands, (N,), from a speed on; the angle starts at zero.
+
+        Raises
+        ------
+        DataError
+            Where the commands are not finite, one-dimensional numbers.
+        """
+        step = self.Ts if Ts is None else float(Ts)
+        factor = rad_per_second(self.speed_unit)
+        steps = int(np.clip(math.ceil(step / self._fine()), 1, 10_000))
+        y, *_ = _core.greybox_run(
+            self.theta, [], as_column(u, "u"), Ts=step, steps=steps, speed=factor * float(speed)
+        )
+        return np.asarray(y / factor)
+
+    def _fine(self) -> float:
+        tau, k_a = self.theta[NAMES.index("tau")], self.theta[NAMES.index("k_a")]
+        fast = k_a / max(self.theta[0] + self.theta[1], 1e-12) / 30.0
+        return float(min(fast, tau / 2.0) if tau > 1e-6 * fast else fast)
+
+    def to_model(self) -> LinearOE:
+        """The turning motor as a linear model at the samples, without dry friction and loads."""
+        of = dict(zip(NAMES, self.theta, strict=True))
+        k_v, tau = of["k_e"] + of["k_b"], max(of["tau"], 1e-3 * self.Ts)
+        gain = 1.0 / (k_v * rad_per_second(self.speed_unit))
+        lags = (of["k_a"] + tau * of["k_b"]) / k_v, tau * of["k_a"] / k_v
+        theta = np.array([*np.log([gain, *lags]), of["delay"] / self.Ts])
+        return sampled_model(theta, self.Ts, self.u_unit, self.speed_unit)
+
+    def machine(self) -> VirtualMachine:
+        """A virtual machine that behaves so under commands: a twin to tune and rehearse on.
+
+        Where R, Ke and J are not known each for itself, it has some that make the same speed; its
+        current is then in no unit. It has no dead time beyond the hold.
+
+        Raises
+        ------
+        SettingError
+            Where the parameters lie outside those of virtual machines.
+        """
+        refused: SettingError | None = None
+        known = None if self.volts is None else self.resistance
+        scales = [] if known is None else [(self.volts or 1.0, known * (self.volts or 1.0))]
+        scales += [(g, r) for g in (15.0, 1.0, 100.0) for r in (10.0, 1.0, 100.0, 1000.0)]
+        for volts, ohms in scales:
+            try:
+                return self._twin(volts, ohms)
+            except SettingError as e:
+                refused = refused or e
+        raise SettingError(f"this motor lies outside virtual machines: {refused}")
+
+    def _twin(self, volts: float, ohms: float) -> VirtualMachine:
+        of = dict(zip(NAMES, self.theta, strict=True))
+        constant = of["k_e"] * volts  # V s/rad, which is N m/A
+        torque = constant * volts / ohms  # N m per unit of command
+        drop, pwm, bus = of["drop"] * volts, 1e4, max(2.0 * self.u_limit * volts, 1.0)
+        first = math.hypot(of["load_1c"], of["load_1s"])
+        second = math.hypot(of["load_2c"], of["load_2s"])
+        wave = math.hypot(of["inertia_2c"], of["inertia_2s"])
+        current = of["limit"] * volts / ohms
+        values = {
+            "amplifier_gain": volts,
+            "bus_voltage": bus,
+            "pwm_frequency": pwm,
+            "dead_time": drop / (pwm * bus),
+            "ripple_current": max(of["ripple"] * volts / ohms, 0.02) if drop else 0.08,
+            "resistance": ohms,
+            "inductance": max(of["tau"] * ohms, 0.01),
+            "motor_constant": constant,
+            "current_limit": current if math.isfinite(current) else 1000.0,
+            "inertia": of["k_a"] * torque,
+            "inertia_variation": wave / of["k_a"],
+            "inertia_angle": 0.5 * math.atan2(of["inertia_2s"], of["inertia_2c"]),
+            "coulomb_torque": of["k_s"] * torque,
+            "stribeck_torque": of["k_t"] * torque,
+            "stribeck_speed": max(of["w_s"], 1.0),
+            "viscous_friction": of["k_b"] * torque,
+            "load_first": first * torque,
+            "load_first_angle": math.atan2(of["load_1s"], of["load_1c"]),
+            "load_second": second * torque,
+            "load_second_angle": 0.5 * math.atan2(of["load_2s"], of["load_2c"]),
+            "torque_ripple": 0.0,
+            "encoder_phase": 0.5,
+            "counts_per_rev": self.counts_per_rev or 1572.0,
+        }
+        values["u_limit"] = max(self.u_limit, 0.1)
+        machine = VirtualMachine(parameters=values)
+        machine.set_load(of["offset"] * torque)
+        return machine
+
+    def export(self, target: Target) -> str:
+        """Settings of another tool, as text.
+
+        Parameters
+        ----------
+        target : "wpilib", "mujoco" or "urdf"
+            `wpilib`: kS, kV, kA as JSON, kV and kA per rad/s and per rad/s^2. `mujoco`: joint and
+            actuator elements; `urdf`: the joint's dynamics. Those two take SI units.
+
+        Raises
+        ------
+        SettingError
+            For another target.
+        DataError
+            Where the record does not tell what the target needs.
+        """
+        if target not in get_args(Target):
+            raise SettingError(
+                f"expected {', '.join(get_args(Target))} as target, received {target!r}"
+            )
+        if target == "wpilib":
+            gains = {"kS": self.theta[NAMES.index("k_s")]}
+            gains |= {"kV": self.value("k_v"), "kA": self.value("k_a")}
+            units = {"kS": self.u_unit, "kV": f"{self.u_unit}/(rad/s)"}
+            units["kA"] = f"{self.u_unit}/(rad/s^2)"
+            return json.dumps({"feedforward": gains, "units": units}, indent=1) + "\n"
+        viscous, dry = self._torques("k_b"), self._torques("k_s")
+        if target == "urdf":
+            return f'<dynamics damping="{viscous:.6g}" friction="{dry:.6g}"/>\n'
+        K, R, G = (self.value(n) for n in ("motor_constant", "resistance_ohm", "volts"))
+        return (
+            f'<joint type="hinge" armature="{self.value("inertia"):.6g}" '
+            f'damping="{viscous:.6g}" frictionloss="{dry:.6g}"/>\n'
+            f'<general gainprm="{K * G / R:.6g}" biastype="affine" '
+            f'biasprm="0 0 {-K * K / R:.6g}"/>\n'
+        )
+
+    def _torques(self, name: str) -> float:
+        """A term in N m, nothing where it is not shown."""
+        K, R = self.value("motor_constant"), self.value("resistance_ohm")
+        return float(self.theta[NAMES.index(name)]) * K * self.value("volts") / R
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it as JSON, whole or not at all.
+
+        Raises
+        ------
+        ModelFileError
+            Where the file cannot be written.
+        """
+        storage.write(path, FORMAT, VERSION, self.to_dict())
+
+    def to_dict(self) -> dict[str, Any]:
+        """All but the picture, as JSON values."""
+        limit = NAMES.index("limit")
+        theta = [None if j == limit and math.isinf(v) else v for j, v in enumerate(self.theta)]
+        return {
+            "parameters": {n: vars(p) for n, p in self.parameters.items()},
+            "untold": dict(self.untold),
+            "terms": list(self.terms),
+            **{n: getattr(self, n) for n in _NUMBERS},
+            "u_unit": self.u_unit,
+            "speed_unit": self.speed_unit,
+            "theta": dict(zip(NAMES, [v if v is None else float(v) for v in theta], strict=True)),
+        }
+
+    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
+        """Measured speed and free run, and what it takes to hold a speed.
+
+        Arguments and result are those of `Dataset.plot`.
+        """
+        return self.drawing().plot(ax, file)
+
+    def drawing(self) -> Drawing:
+        """The picture."""
+        factor = rad_per_second(self.speed_unit)
+
+        def run_panel(ax: Axes) -> None:
+            assert self.shown is not None
+            n = min(len(self.shown[0]), max(200, round(4.0 / self.Ts)))
+            t = self.Ts * np.arange(n)
+            for values, look in zip(self.shown, ("measured", "model"), strict=True):
+                label = "measured" if look == "measured" else "free run"
+                style = {k: v for k, v in LOOKS[look].items() if k != "lw"}
+                ax.plot(t, values[:n] / factor, label=label, lw=0.9, **style)
+            ax.set_xlabel("time [s]")
+            ax.set_ylabel(f"speed [{self.speed_unit}]")
+            ax.legend(loc="upper right")
+
+        def friction_panel(ax: Axes) -> None:
+            top = self.theta[0] + self.theta[1]
+            top = 1.0 if self.shown is None else float(np.abs(self.shown[0]).max())
+            half = np.linspace(1e-3 * top, top, 400)
+            of = dict(zip(NAMES, self.theta, strict=True))
+            dry = of["k_s"] + of["k_t"] / (1.0 + (half / of["w_s"]) ** 2)
+            for sign in (-1.0, 1.0):
+                hold = sign * (dry + of["drop"]) + of["offset"]
+                ax.plot(
+                    sign * half / factor, hold + sign * (of["k_e"] + of["k_b"]) * half,
+                    color=LOOKS["model"]["color"], label="whole" if sign > 0 else None,
+                )  # fmt: skip
+                ax.plot(
+                    sign * half / factor, hold, "--", color=LOOKS["measured"]["color"],
+                    label="dry friction, dead zone, constant load" if sign > 0 else None,
+                )  # fmt: skip
+            ax.axhline(0.0, color="0.8", lw=0.6, zorder=0)
+            ax.set_xlabel(f"speed [{self.speed_unit}]")
+            ax.set_ylabel(f"command to hold it [{self.u_unit}]")
+            ax.legend(loc="upper left")
+
+        panels = (friction_panel,) if self.shown is None else (run_panel, friction_panel)
+        heights = (2.4,) * len(panels)
+        return Drawing(tuple((p,) for p in panels), heights, share_x=False)
+
+    def _repr_html_(self) -> str:
+        return html_of(str(self))
+
+    def __repr__(self) -> str:
+        return f"<{str(self).splitlines()[0]}>"
+
+    def __str__(self) -> str:
+        terms = ", ".join(self.terms) or "no further terms"
+        width = max(map(len, self.parameters), default=0)
+        lines = [
+            f"motor: free run {self.fit_percent:.2f} %, {self.rmse:.3g} {self.speed_unit} rmse of "
+            f"{self.samples:,} samples ({terms}); 95 % intervals"
+        ]
+        lines += [f"  {name:<{width}}  {p}" for name, p in self.parameters.items()]
+        for why in dict.fromkeys(self.untold.values()):
+            names = [name for name, reason in self.untold.items() if reason == why]
+            lines.append(f"  not told: {', '.join(names)}: {why}")
+        if not self.converged:
+            lines.append("  note: the least squares did not converge; intervals may be wrong")
+        if self.spikes:
+            lines.append(f"  note: {self.spikes} spikes left out")
+        return "\n".join(lines)
+
+
+_NUMBERS = (
+    "fit_percent",
+    "rmse",
+    "converged",
+    "samples",
+    "spikes",
+    "Ts",
+    "u_limit",
+    "counts_per_rev",
+    "volts",
+    "resistance",
+)
+
+
+def load_motor(path: str | os.PathLike[str]) -> Motor:
+    """Read what `Motor.save` wrote; nothing in it is executed.
+
+    Raises
+    ------
+    ModelFileError
+        For any other file.
+    """
+    fields = storage.Fields(str(path), storage.read(path, FORMAT, (VERSION,)))
+    fields.require_only(
+        ["version", "parameters", "untold", "terms", *_NUMBERS, "u_unit", "speed_unit", "theta"]
+    )
+    told = fields.object("parameters")
+    parameters = {}
+    for name in told.values:
+        one = told.object(name)
+        one.require_only(["value", "low", "high", "unit"])
+        value, low, high = (one.number(n) for n in ("value", "low", "high"))
+        parameters[name] = Parameter(value, low, high, one.text("unit"))
+    untold = fields.object("untold")
+    theta = fields.object("theta")
+    theta.require_only(NAMES)
+    values = [math.inf if n == "limit" and theta.any(n) is None else theta.number(n) for n in NAMES]
+    for name in ("k_a", "ripple", "w_s"):
+        theta.positive(name)
+    terms = fields.items("terms")
+    if not all(isinstance(t, str) for t in terms):
+        raise fields.refuse("terms", "names", terms)
+    unit = fields.text("speed_unit")
+    try:
+        rad_per_second(unit)
+    except SettingError:
+        raise fields.refuse("speed_unit", "rpm, rev/s, rad/s or deg/s", unit) from None
+    return Motor(
+        parameters,
+        {n: untold.text(n) for n in untold.values},
+        tuple(terms),
+        fields.number("fit_percent"),
+        fields.number("rmse"),
+        fields.flag("converged"),
+        fields.any("samples") if type(fields.any("samples")) is int else 0,
+        fields.integer("spikes"),
+        fields.positive("Ts"),
+        fields.text("u_unit"),
+        unit,
+        fields.positive("u_limit"),
+        fields.optional_number("counts_per_rev"),
+        fields.optional_number("volts"),
+        fields.optional_number("resistance"),
+        np.array(values),
+    )
+
+
+# --- From the estimate to what is printed ---------------------------------------------------------
+
+
+def motor_of(
+    estimate: Estimate,
+    records: Records,
+    outcome: tuple[FloatArray, ...],
+    reasons: Mapping[str, str],
+    volts: float | None,
+    converged: bool,
+) -> Motor:
+    """What the estimate says, each parameter with its interval or the reason why it has none."""
+    known = {**dict(zip(NAMES, estimate.theta, strict=True)), "R": estimate.resistance or math.nan}
+    at = np.array([known[n] for n in estimate.names])
+    parameters: dict[str, Parameter] = {}
+    untold: dict[str, str] = {}
+    for name, unit, of in _quantities(estimate, records.u_unit, volts):
+        value = of(known)
+        slope = np.zeros(len(at))
+        sd = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
+        for j, free in enumerate(estimate.names):
+            h = max(1e-5 * abs(at[j]), 1e-3 * sd[j], 1e-12)
+            more, less = (of({**known, free: at[j] + s * h}) for s in (1.0, -1.0))
+            slope[j] = (more - less) / (2.0 * h)
+        half = CONFIDENCE * math.sqrt(max(float(slope @ estimate.covariance @ slope), 0.0))
+        vague = half >= VAGUE * abs(value) and name not in _MAY_BE_NOTHING
+        if not math.isfinite(half) or vague:
+            untold[name] = (
+                f"its interval, {value - half:.3g} to {value + half:.3g} {unit}, is as wide as its "
+                "value"
+            )
+            continue
+        low = value - half if name in _SIGNED else max(value - half, 0.0)
+        parameters[name] = Parameter(value, low, value + half, unit)
+    for term, why in reasons.items():
+        for name in _OF_TERM[term]:
+            untold.setdefault(name, why)
+    missing = _NO_CURRENT if estimate.resistance is None else _NO_VOLTS
+    if estimate.resistance is None or volts is None:
+        untold |= {"resistance_ohm" if n == "resistance" else n: missing for n in _SI}
+    if volts is not None and estimate.resistance is not None:
+        parameters["volts"] = Parameter(volts, volts, volts, f"V/{records.u_unit}".rstrip("/"))
+    y, model = outcome
+    error, factor = y - model, rad_per_second(records.speed_unit)
+    spread = float(np.linalg.norm(y - y.mean()))
+    return Motor(
+        parameters,
+        untold,
+        estimate.terms,
+        100.0 * (1.0 - float(np.linalg.norm(error)) / max(spread, 1e-300)),
+        float(np.sqrt(np.mean(error**2))) / factor,
+        converged,
+        len(y),
+        records.spikes,
+        records.Ts,
+        records.u_unit,
+        records.speed_unit,
+        float(max(np.abs(p.u).max() for p in records.pieces)),
+        records.counts_per_rev,
+        volts,
+        estimate.resistance,
+        estimate.theta,
+        (y, model),
+    )
+
+
+_MAY_BE_NOTHING = ("delay",)
+_SIGNED = ("offset", "k_b", "viscous_friction")
+
+_OF_TERM = {
+    "lag": ("electrical_lag",),
+    "delay": ("delay",),
+    "coulomb": ("k_s",),
+    "offset": ("offset",),
+    "drop": ("drop",),
+    "stribeck": ("stribeck", "stribeck_speed"),
+    "load_1": ("load_1",),
+    "load_2": ("load_2",),
+    "inertia_2": ("inertia_2",),
+    "limit": ("limit",),
+}
+
+Quantity: TypeAlias = tuple[str, str, Callable[[Values], float]]
+
+
+def _quantities(estimate: Estimate, u: str, volts: float | None) -> list[Quantity]:
+    """Name, unit and value of everything that may be printed."""
+    u = u or "command"
+    found: list[Quantity] = [
+        ("k_v", f"{u}/(rad/s)", lambda p: p["k_e"] + p["k_b"]),
+        ("k_a", f"{u}/(rad/s^2)", lambda p: p["k_a"]),
+        ("time_constant", "s", lambda p: (p["k_a"] + p["tau"] * p["k_b"]) / (p["k_e"] + p["k_b"])),
+    ]
+    of_terms: dict[str, list[Quantity]] = {
+        "lag": [("electrical_lag", "s", lambda p: p["tau"])],
+        "delay": [("delay", "s", lambda p: p["delay"])],
+        "coulomb": [("k_s", u, lambda p: p["k_s"])],
+        "offset": [("offset", u, lambda p: p["offset"])],
+        "drop": [("drop", u, lambda p: p["drop"])],
+        "stribeck": [
+            ("stribeck", u, lambda p: p["k_t"]),
+            ("stribeck_speed", "rad/s", lambda p: p["w_s"]),
+        ],
+        "load_1": [("load_1", u, lambda p: math.hypot(p["load_1c"], p["load_1s"]))],
+        "load_2": [("load_2", u, lambda p: math.hypot(p["load_2c"], p["load_2s"]))],
+        "inertia_2": [
+            ("inertia_2", "1", lambda p: math.hypot(p["inertia_2c"], p["inertia_2s"]) / p["k_a"])
+        ],
+        "limit": [("limit", u, lambda p: p["limit"])],
+    }
+    for term in estimate.terms:
+        found += of_terms[term]
+    if estimate.resistance is None:
+        return found
+    found += [
+        ("k_e", f"{u}/(rad/s)", lambda p: p["k_e"]),
+        ("k_b", f"{u}/(rad/s)", lambda p: p["k_b"]),
+        ("resistance", f"{u}/A", lambda p: p["R"]),
+    ]
+    if volts is None:
+        return found
+    G = volts
+    found += [
+        ("resistance_ohm", "ohm", lambda p: p["R"] * G),
+        ("motor_constant", "V s/rad", lambda p: p["k_e"] * G),
+        ("inertia", "kg m^2", lambda p: p["k_a"] * p["k_e"] * G / p["R"]),
+        ("viscous_friction", "N m s/rad", lambda p: p["k_b"] * p["k_e"] * G / p["R"]),
+    ]
+    if "coulomb" in estimate.terms:
+        found.append(("coulomb_torque", "N m", lambda p: p["k_s"] * p["k_e"] * G / p["R"]))
+    if "stribeck" in estimate.terms:
+        found.append(("stribeck_torque", "N m", lambda p: p["k_t"] * p["k_e"] * G / p["R"]))
+    if "lag" in estimate.terms:
+        found.append(("inductance", "H", lambda p: p["tau"] * p["R"] * G))
+    if "limit" in estimate.terms:
+        found.append(("current_limit", "A", lambda p: p["limit"] / p["R"]))
+    return found

@@ -1,0 +1,257 @@
+"""Recordings as the fit of a motor takes them: in rad/s, cut at gaps, spikes left out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..arrays import REVOLUTIONS_PER_SECOND, FloatArray, as_column, runs
+from ..dataset import Dataset
+from ..errors import DataError, SettingError
+from ..recording import Recording
+
+SHORTEST = 50
+"""Samples of a piece between gaps; a shorter one says less than its unknown start costs."""
+LEAST = 200
+"""Samples of all pieces."""
+SPIKE = 8.0
+"""Standard deviations from the median of its neighbours, from which a sample is a spike."""
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A run without gaps.
+
+    Attributes
+    ----------
+    u, y : array, shape (N,)
+        Command and speed [rad/s].
+    used : array of bool, shape (N,)
+        Samples that the fit compares.
+    speed : float
+        At the first sample [rad/s].
+    angle : array, shape (N,)
+        Of the shaft [rad], from the counts, or as the sum of the speeds.
+    current : array, shape (N,), or None
+        As measured.
+    """
+
+    u: FloatArray
+    y: FloatArray
+    used: NDArray[np.bool_]
+    speed: float
+    angle: FloatArray
+    current: FloatArray | None
+
+
+@dataclass(frozen=True, eq=False)
+class Records:
+    """All pieces, and what their numbers mean.
+
+    `mean` says that a speed is the mean over the sample before it, as a difference of counts is;
+    `quantum` is the step of its values [rad/s], 0 where it has none.
+    """
+
+    pieces: tuple[Piece, ...]
+    Ts: float
+    u_unit: str
+    speed_unit: str
+    mean: bool
+    quantum: float
+    counts_per_rev: float | None
+    spikes: int
+
+    @property
+    def used(self) -> int:
+        return int(sum(p.used.sum() for p in self.pieces))
+
+
+def rad_per_second(unit: str) -> float:
+    """How many rad/s one of a unit of speed is."""
+    known: Mapping[str, float] = REVOLUTIONS_PER_SECOND
+    key = {"rps": "rev/s", "1/s": "rev/s", "r/min": "rpm", "1/min": "rpm"}.get(
+        unit.strip().lower(), unit.strip().lower()
+    )
+    if key not in known:
+        raise SettingError(
+            f"expected a speed in {', '.join(known)}, received the unit {unit!r}; say which it is: "
+            "speed_unit='rpm'"
+        )
+    return 2.0 * math.pi * known[key]
+
+
+def records_of(
+    data: Recording | Dataset, current: str | ArrayLike | None, speed_unit: str | None
+) -> Records:
+    """What is fitted.
+
+    Raises
+    ------
+    DataError
+        Where nothing of use is left, or a current is missing.
+    SettingError
+        Without a unit of the speed.
+    """
+    if isinstance(data, Recording):
+        return _of_recording(data, current, speed_unit)
+    if not isinstance(data, Dataset):
+        raise SettingError(
+            f"expected a Recording or a Dataset, received {type(data).__name__}; "
+            "sewfast.Dataset.from_arrays(u, y, Ts, output_unit='rpm') makes one of arrays"
+        )
+    if len(data.input_names) != 1:
+        raise DataError(
+            f"expected one input, the motor's command, received {list(data.input_names)}; "
+            "choose its column"
+        )
+    unit = speed_unit if speed_unit is not None else data.output_unit
+    factor = rad_per_second(unit)
+    # a speed that was computed from counts without looking ahead is their difference
+    differs = data.counts is not None and not data.looks_ahead
+    quantum = 2.0 * math.pi / data.counts[1] / data.Ts if data.counts and differs else 0.0
+    whole, spikes = [], 0
+    for e in data.experiments:
+        y = np.where(e.weights == 0.0, np.nan, e.y) if e.weights is not None else e.y
+        i = _current(current, e.channels, len(e), len(data.experiments))
+        pieces, left_out = _pieces(e.u[:, 0], factor * y, None, i, data.Ts, quantum, mean=differs)
+        whole += pieces
+        spikes += left_out
+    per_rev = None if data.counts is None else data.counts[1]
+    return _checked(
+        Records(tuple(whole), data.Ts, data.input_units[0], unit, differs, quantum, per_rev, spikes)
+    )
+
+
+def _of_recording(
+    data: Recording, current: str | ArrayLike | None, speed_unit: str | None
+) -> Records:
+    if isinstance(current, str):
+        raise SettingError(
+            "expected the current of a Recording as an array of its length, received the name "
+            f"{current!r}; pass current=array [A]"
+        )
+    per_count = 2.0 * math.pi / data.counts_per_rev
+    angle = per_count * data.counts
+    y = np.diff(angle, prepend=angle[:1]) / data.Ts
+    i = _current(current, {}, len(data), 1)
+    quantum = per_count / data.Ts
+    pieces, spikes = _pieces(data.u, y, angle, i, data.Ts, quantum, mean=True)
+    unit = "rpm" if speed_unit is None else speed_unit
+    rad_per_second(unit)
+    return _checked(
+        Records(
+            tuple(pieces), data.Ts, "V", unit, True, quantum, data.counts_per_rev, spikes
+        )
+    )  # fmt: skip
+
+
+def _current(
+    current: str | ArrayLike | None, channels: Mapping[str, FloatArray], n: int, experiments: int
+) -> FloatArray | None:
+    if current is None:
+        return None
+    if isinstance(current, str):
+        if current not in channels:
+            raise DataError(
+                f"expected the current in a channel, received {current!r}; known are "
+                f"{', '.join(channels) or 'none'}"
+            )
+        return np.asarray(channels[current], dtype=np.float64)
+    if experiments > 1:
+        raise SettingError(
+            f"expected the name of the current's channel for {experiments} experiments, received "
+            "an array; pass channels to Dataset.from_arrays"
+        )
+    return as_column(current, "current", n)
+
+
+def _pieces(
+    u: FloatArray,
+    y: FloatArray,
+    angle: FloatArray | None,
+    current: FloatArray | None,
+    Ts: float,
+    quantum: float,
+    *,
+    mean: bool,
+) -> tuple[list[Piece], int]:
+    """Cut where a command or an angle is missing; a missing speed is only left out."""
+    known = np.isfinite(u)
+    if angle is not None:
+        known &= np.isfinite(angle)
+    if current is not None:
+        known &= np.isfinite(current)
+    found, spikes = [], 0
+    for start, n in runs(known):
+        part = slice(start, start + n)
+        measured = np.isfinite(y[part])
+        if angle is not None and start > 0:
+            measured[0] = False  # a difference across the gap
+        if n < SHORTEST or measured.sum() < SHORTEST:
+            continue
+        k = np.arange(n)
+        speed = np.interp(k, k[measured], y[part][measured])
+        spiked = _spikes(speed, quantum) & measured
+        spikes += int(spiked.sum())
+        good = measured & ~spiked
+        speed = np.interp(k, k[good], speed[good])
+        used = good.copy()
+        used[0] = False  # it is where the simulation starts
+        turned = _integral(speed, Ts, mean=mean) if angle is None else angle[part]
+        first = _first(speed, quantum)
+        i = None if current is None else np.ascontiguousarray(current[part])
+        found.append(
+            Piece(
+                np.ascontiguousarray(u[part]), speed, used, first, np.ascontiguousarray(turned), i
+            )
+        )  # fmt: skip
+    return found, spikes
+
+
+def _spikes(y: FloatArray, quantum: float) -> NDArray[np.bool_]:
+    """Samples far from the median of themselves and their four neighbours."""
+    padded = np.pad(y, 2, mode="edge")
+    off = np.abs(y - np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
+    usual = float(np.quantile(off, 0.99)) if len(off) >= 100 else float(np.quantile(off, 0.9))
+    spread = max(1.4826 * float(np.median(off)), usual, quantum)
+    return off > max(SPIKE * spread, 1e-9 * float(np.abs(y).max()))
+
+
+def _integral(y: FloatArray, Ts: float, *, mean: bool) -> FloatArray:
+    steps = y[1:] if mean else 0.5 * (y[1:] + y[:-1])
+    return np.concatenate([[0.0], np.cumsum(steps) * Ts])
+
+
+def _first(y: FloatArray, quantum: float) -> float:
+    """The speed at the start, by a line through the first samples; standstill where it is that."""
+    head = y[: min(20, len(y))]
+    if np.abs(head[:5]).max() <= 1.01 * quantum or not head[:5].any():
+        return 0.0
+    _, start = np.polyfit(np.arange(len(head)), head, 1)
+    return float(start)
+
+
+def _checked(records: Records) -> Records:
+    n = records.used
+    if n < LEAST:
+        raise DataError(
+            f"expected at least {LEAST} samples in pieces of {SHORTEST} without gaps, received "
+            f"{n}; record longer, 10 s with changes of speed in both directions"
+        )
+    y = np.concatenate([p.y for p in records.pieces])
+    u = np.concatenate([p.u for p in records.pieces])
+    if np.ptp(u) == 0.0:
+        raise DataError(
+            f"expected a command that changes, received {u[0]:g} {records.u_unit} throughout; "
+            "excite with random steps"
+        )
+    if np.ptp(y) <= 3.0 * records.quantum or np.ptp(y) == 0.0:
+        raise DataError(
+            f"expected a speed that changes, received {np.ptp(y):.3g} rad/s from least to most "
+            f"(one count in a sample is {records.quantum:.3g} rad/s); excite more strongly"
+        )
+    return records
