@@ -49,8 +49,8 @@ ALWAYS = {"delay", "limit"}
 """Terms that stay: a delay of nothing is an answer, a limit has a test of its own."""
 STRUCTURES = {"dcmotor": tuple(TERMS)}
 
-SHOWN = 9.0
-"""Wald's statistic from which a term is shown: three standard deviations of a single parameter."""
+SHOWN = 4.0
+"""Wald's statistic from which a term is shown: two standard deviations of a single parameter."""
 LIMITED = 0.9
 """Of the cost without, that a limit of the current has to fall below."""
 EVALUATIONS = 60
@@ -58,6 +58,8 @@ COARSE, FINE = 1e-4, 1e-7
 """Tolerances on the way, and of what is printed."""
 WHITE = 12
 """Order of the autoregression that says how what is left over hangs together."""
+BUMPS = (0.02, 0.06)
+"""Of the usual speed, at which Stribeck's friction is tried to fall off."""
 FLOOR = 0.05
 """Of the power of what is left over, white: a filter does not magnify what is hardly there."""
 WORSE = 1.1
@@ -127,6 +129,9 @@ def physics(
     task = Task(records)
     reasons = _too_fast(records, terms)
     terms = tuple(t for t in terms if t not in reasons)
+    if "stribeck" in terms and _never_slow(records):
+        terms = tuple(t for t in terms if t != "stribeck")
+        reasons["stribeck"] = "the record is hardly ever slow; add reversals"
     if "offset" in terms and not _turns_both_ways(records):
         terms = tuple(t for t in terms if t != "offset")
         reasons["offset"] = (
@@ -155,6 +160,12 @@ def _turns_both_ways(records: Records) -> bool:
     y = np.concatenate([p.y for p in records.pieces])
     clear = max(2.0 * records.quantum, 0.02 * float(np.abs(y).max()))
     return bool(min(np.mean(y > clear), np.mean(y < -clear)) > 0.01)
+
+
+def _never_slow(records: Records) -> bool:
+    """Whether it creeps for less than a hundredth of the time."""
+    y = np.abs(np.concatenate([p.y for p in records.pieces]))
+    return bool(np.mean((y > 0.0) & (y < 0.1 * np.quantile(y, 0.9))) < 0.01)
 
 
 def _too_fast(records: Records, terms: tuple[str, ...]) -> dict[str, str]:
@@ -351,7 +362,7 @@ class Task:
     def stribeck_speeds(self) -> tuple[float, float]:
         """In which friction may fall off: below, there is hardly a sample to show it."""
         usual = float(np.quantile(np.abs(np.concatenate([p.y for p in self.records.pieces])), 0.9))
-        return 0.03 * usual, usual
+        return 0.01 * usual, usual
 
     def settle_steps(self, state: State) -> None:
         """Integration steps for the time constants that were found."""
@@ -573,7 +584,7 @@ def _with_limit(task: Task, state: State, terms: tuple[str, ...]) -> State:
 def _all_terms(task: Task, state: State, terms: tuple[str, ...]) -> tuple[State, dict[str, float]]:
     """All terms fitted together, then without those that are not shown; their statistics."""
     size = max(state.value("k_s"), 0.01 * float(np.std(task.records.pieces[0].u)))
-    slow, fast = task.stribeck_speeds()
+    _, fast = task.stribeck_speeds()
     starts = {
         "drop": 0.2 * size, "ripple": 0.2 * size, "k_t": 0.2 * size, "w_s": 0.1 * fast,
         "load_1c": 0.0, "load_1s": 0.0, "load_2c": 0.0, "load_2s": 0.0,
@@ -583,7 +594,11 @@ def _all_terms(task: Task, state: State, terms: tuple[str, ...]) -> tuple[State,
     state = state.having(whole, **{p: v for p, v in starts.items() if p in new})
     state = _fitted(task, state)
     task.weigh(state)
-    plain, state = state, _fitted(task, state, FINE)
+    plain, tried = state, [_fitted(task, state)]
+    if "stribeck" in whole:  # the speed at which friction falls off has more than one minimum
+        bumps = [state.having(whole, k_t=0.4 * size, w_s=part * fast) for part in BUMPS]
+        tried += [_fitted(task, s) for s in bumps]
+    state = _fitted(task, min(tried, key=task.cost), FINE)
     if task.rmse(state) > WORSE * task.rmse(plain):
         task.weigh(plain, order=0)
         state = _fitted(task, plain, FINE)
@@ -591,8 +606,8 @@ def _all_terms(task: Task, state: State, terms: tuple[str, ...]) -> tuple[State,
     names, covariance, x = state.names(), task.covariance(state), state.vector()
     while True:
         shown = {t: _wald(t, names, x, covariance) for t in kept if t not in ALWAYS}
-        if "stribeck" in kept and not 1.01 * slow < x[names.index("w_s")] < 0.99 * fast:
-            shown["stribeck"] = 0.0
+        if "stribeck" in kept and x[names.index("w_s")] > 0.99 * fast:
+            shown["stribeck"] = 0.0  # it falls off nowhere: that is Coulomb's friction
         weakest = min(shown, key=lambda t: shown[t], default=None)
         if weakest is None or shown[weakest] >= SHOWN:
             break

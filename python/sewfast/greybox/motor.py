@@ -397,7 +397,7 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
         fields.number("fit_percent"),
         fields.number("rmse"),
         fields.flag("converged"),
-        fields.any("samples") if type(fields.any("samples")) is int else 0,
+        fields.integer("samples"),
         fields.integer("spikes"),
         fields.positive("Ts"),
         fields.text("u_unit"),
