@@ -18,7 +18,7 @@ ORDER = """
     dynamic_model validation comparison evidence models
     identification
     gains rules control tuning trust analysis frequency deployment fleets
-    link recording greybox report commissioning experiment cli __main__
+    link recording greybox report commissioning experiment studio cli __main__
 """
 
 LEFT: frozenset[tuple[str, str]] = frozenset()

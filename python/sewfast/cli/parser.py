@@ -23,6 +23,7 @@ from . import (
     physics,
     pil,
     recording,
+    studio,
     tune,
 )
 from .arguments import Commands, Help, add_command
@@ -131,6 +132,7 @@ def build_parser() -> argparse.ArgumentParser:
         deploy.add,
         pil.add,
         fleet.add,
+        studio.add,
         drive.add_ports,
         drive.add_doctor,
         drive.add,

@@ -1,0 +1,53 @@
+"""`sewfast studio`: the way from a recording to a checked model on a local page."""
+
+from __future__ import annotations
+
+import argparse
+
+from .arguments import Commands, add_command
+from .output import print_json
+
+STUDIO = """\
+Open a page in the browser: look at recordings, identify a model, validate it. Every step can be
+copied as Python or as commands, and its result is a file that the command line reads (model.json).
+It needs the package websockets: pip install "sewfast[studio]". Only this computer can reach the
+page, and only with the address that is printed; nothing is loaded from the network.
+"""
+
+EXAMPLES = """\
+examples:
+  sewfast studio                            the recordings of this folder
+  sewfast studio recordings/run.csv         one of them first
+  sewfast studio --no-browser --port 8377   with ssh -L 8377:127.0.0.1:8377 from elsewhere
+"""
+
+
+def add(commands: Commands) -> None:
+    parser = add_command(
+        commands, "studio", studio_command,
+        summary="look, identify, validate on a local page", text=STUDIO, examples=EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument(
+        "place", nargs="?", default=".", metavar="FOLDER|FILE", help="project folder (this one)"
+    )
+    parser.add_argument("--port", type=int, default=0, metavar="N", help="default: a free one")
+    parser.add_argument(
+        "--no-browser", dest="browser", action="store_false", help="only print the address"
+    )
+
+
+def studio_command(args: argparse.Namespace) -> None:
+    import contextlib
+    import threading
+    import webbrowser
+
+    from ..studio import Project, Studio
+
+    with contextlib.suppress(KeyboardInterrupt), Studio(Project(args.place), args.port) as studio:
+        if args.json:
+            print_json({"address": studio.address, "folder": str(studio.project.folder)})
+        else:
+            print(f"{studio.address}\nCtrl-C ends it", flush=True)
+        if args.browser:
+            webbrowser.open(studio.address)
+        threading.Event().wait()

@@ -1,0 +1,132 @@
+// The page: asks the server for steps and shows what they found. Texts of others are only ever set as text.
+import { draw } from "/curves.js";
+
+const $ = id => document.getElementById(id);
+if (location.hash.length > 1) {
+  sessionStorage.setItem("token", location.hash.slice(1));
+  history.replaceState(null, "", "/");  // the token shall not stay in the address bar
+}
+const socket = new WebSocket(`ws://${location.host}/socket`);
+const waiting = new Map();
+let number = 0, writes = false, busy = false, files = "";
+
+socket.onopen = () => socket.send(sessionStorage.getItem("token") || "none");
+socket.onclose = () => { $("control").textContent = "not connected: start sewfast studio again, or open its whole address"; };
+socket.onmessage = ({ data }) => {
+  const message = JSON.parse(data);
+  if (message.event) return EVENTS[message.event](message);
+  const [done, failed] = waiting.get(message.id); waiting.delete(message.id);
+  "error" in message ? failed(new Error(message.error)) : done(message.found);
+};
+
+function ask(name) {
+  const id = ++number, chosen = [...$("inputs").selectedOptions].map(o => o.value);
+  const output = $("output").value, seconds = parseFloat($("resample").value);
+  socket.send(JSON.stringify({
+    id, do: name, file: $("file").value, inputs: chosen, output: output || null,
+    resample: seconds > 0 ? seconds : null, model: $("model").value, seed: parseInt($("seed").value) || 0,
+  }));
+  return new Promise((done, failed) => waiting.set(id, [done, failed]));
+}
+
+function tell(error) { $("error").textContent = error ? error.message : ""; $("error").hidden = !error; }
+
+async function act(name, show) {
+  tell(null); $(name).disabled = true;
+  try { show(await ask(name)); } catch (error) { tell(error); }
+  $(name).disabled = false; enable();
+}
+
+function enable() {
+  $("identify").disabled = busy || !writes; $("cancel").disabled = !busy || !writes; $("bar").hidden = !busy;
+  $("take").hidden = writes;
+}
+
+const EVENTS = {
+  state(s) {
+    writes = s.writes; $("folder").textContent = s.folder;
+    $("control").textContent = (writes ? "this page holds the control" : "this page looks on") + (s.pages > 1 ? `; ${s.pages} pages are open` : "");
+    if (files !== s.recordings.join("/")) {
+      files = s.recordings.join("/"); fill($("file"), s.recordings.map(n => [n, n]), [s.first]);
+      if (s.recordings.length) choose();
+      else tell(new Error("there is no recording in this folder: put a CSV, .mat, .npz, Parquet or MCAP file there and load this page again"));
+    }
+    enable();
+  },
+  progress(p) {
+    busy = true; $("bar").value = p.done / Math.max(p.total, 1);
+    $("progress").textContent = `${p.done} of ${p.total}` + (p.best === null ? "" : `, best ${p.best.toPrecision(4)}`); enable();
+  },
+  identified(m) {
+    busy = false; $("progress").textContent = ""; enable();
+    if (m.error) return tell(new Error(m.error));
+    const f = m.found;
+    $("headline").textContent = `free run explains ${f.fit.toFixed(1)} % of the training data (rmse ${`${f.rmse.toPrecision(4)} ${f.unit}`.trim()})`;
+    curves($("fit"), [f.free_run]); candidates(f.candidates); text("modeltext", f.text); copies("identify", f);
+  },
+};
+
+function fill(select, pairs, chosen) {
+  select.replaceChildren(...pairs.map(([value, label]) => {
+    const option = new Option(label, value); option.selected = chosen.includes(value); return option;
+  }));
+}
+
+async function choose() {
+  tell(null);
+  try {
+    const c = await ask("columns"), names = c.names.map(n => [n, n]);
+    fill($("inputs"), names, c.inputs);
+    fill($("output"), c.encoder ? [["", "speed from counts"], ...names] : names, [c.output ?? ""]);
+  } catch (error) { tell(error); }
+}
+
+function text(id, value) { $(id).textContent = value; $(id).hidden = false; }
+
+function curves(place, panels) {
+  place.replaceChildren();
+  for (const panel of panels) draw(place, panel, panel.map(c => `${c.name} ${c.unit}`).join(" and ") + " over time");
+}
+
+function candidates(rows) {
+  const table = document.createElement("table"), place = $("candidates");
+  place.replaceChildren(); if (!rows.length) return;
+  const best = Math.min(...rows.map(r => r.free_run_rmse ?? Infinity));
+  const head = table.insertRow();
+  for (const name of ["candidate", "settings", "free-run rmse"]) { const th = document.createElement("th"); th.textContent = name; head.append(th); }
+  for (const { kind, free_run_rmse: rmse, ...rest } of rows) {
+    const row = table.insertRow(), settings = Object.entries(rest).map(([k, v]) => `${k} ${v}`).join(", ");
+    const cells = [kind, settings, (rmse === null ? "none" : rmse.toPrecision(4)) + (rmse === best ? " lowest" : "")];
+    for (const cell of cells) row.insertCell().textContent = cell;
+    row.classList.toggle("chosen", rmse === best);
+  }
+  place.className = "scroll"; place.tabIndex = 0; place.append(table);
+}
+
+function copies(name, found) {
+  const place = $(`${name}-copy`); place.replaceChildren();
+  for (const [label, value] of [["Copy as Python", found.python], ["Copy as commands", found.commands]]) {
+    const button = document.createElement("button"), details = document.createElement("details");
+    const summary = document.createElement("summary"), pre = document.createElement("pre");
+    summary.textContent = label.replace("Copy as ", "Show "); pre.textContent = value; details.append(summary, pre);
+    button.textContent = label;
+    button.onclick = () => navigator.clipboard.writeText(value).then(
+      () => { button.textContent = "Copied"; setTimeout(() => { button.textContent = label; }, 1500); },
+      () => { details.open = true; });
+    place.append(button, details);
+  }
+}
+
+$("file").onchange = choose;
+$("what").onsubmit = event => event.preventDefault();
+$("take").onclick = () => ask("take");
+$("cancel").onclick = () => ask("cancel").catch(tell);
+$("look").onclick = () => act("look", f => {
+  curves($("signals"), f.curves.map(c => [c]));
+  $("advice").replaceChildren(...f.advice.map(a => { const li = document.createElement("li"); li.textContent = a; return li; }));
+  text("summary", f.text); copies("look", f);
+});
+$("identify").onclick = () => act("identify", () => { busy = true; $("progress").textContent = "starting"; });
+$("validate").onclick = () => act("validate", f => {
+  $("verdict").textContent = f.verdict; curves($("free"), [f.free_run]); text("card", f.card); copies("validate", f);
+});

@@ -1,0 +1,309 @@
+"""A project folder and the steps on it: each is a call of the public API and can be copied."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
+
+import numpy as np
+
+from ..errors import DataError, SettingError
+
+if TYPE_CHECKING:
+    from ..dataset import Dataset, FloatArray
+
+RECORDINGS = (".csv", ".npz", ".mat", ".parquet", ".mcap")
+MODEL = "model.json"
+Kind: TypeAlias = Literal["auto", "arx", "iv", "oe", "neural_oe", "neural_ss"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+LARGEST = 512 * 2**20
+"""Bytes of a recording that the page opens."""
+
+COLUMNS = 1200
+"""Pairs of lowest and highest value in a drawn curve: about two a pixel of a wide window."""
+
+Progress = Callable[[int, int, float], None]
+
+
+@dataclass(frozen=True)
+class Step:
+    """What to read and how, as the page asked for it.
+
+    Parameters
+    ----------
+    file : str
+        Name of a recording in the project folder.
+    inputs : tuple of str
+    output : str or None
+        None: the speed from the encoder counts that the recording states.
+    resample : float or None
+        Sample time to work at [s]; None: the recording's own.
+    model : str
+        Kind of model to identify.
+    seed : int
+    """
+
+    file: str
+    inputs: tuple[str, ...] = ()
+    output: str | None = None
+    resample: float | None = None
+    model: Kind = "auto"
+    seed: int = 0
+
+    @classmethod
+    def parse(cls, asked: dict[str, Any]) -> Step:
+        """A step from a message; what has the wrong type is refused.
+
+        Raises
+        ------
+        SettingError
+        """
+        inputs, output = asked.get("inputs", []), asked.get("output")
+        resample, model, seed = asked.get("resample"), asked.get("model", "auto"), asked.get("seed")
+        _require(isinstance(asked.get("file"), str), "file", "a name", asked.get("file"))
+        named = isinstance(inputs, list) and all(isinstance(name, str) for name in inputs)
+        _require(named, "inputs", "a list of column names", inputs)
+        _require(output is None or isinstance(output, str), "output", "a column or null", output)
+        number = isinstance(resample, (int, float)) and not isinstance(resample, bool)
+        _require(resample is None or number, "resample", "seconds or null", resample)
+        _require(model in KINDS, "model", f"one of {', '.join(KINDS)}", model)
+        seed = 0 if seed is None else seed
+        whole = isinstance(seed, int) and not isinstance(seed, bool) and 0 <= seed < 2**32
+        _require(whole, "seed", "a whole number from 0", seed)
+        return cls(asked["file"], tuple(inputs), output or None, resample, model, seed)
+
+
+def _require(ok: bool, name: str, expected: str, received: object) -> None:
+    if not ok:
+        raise SettingError(f"{name}: expected {expected}, received {str(received)[:80]!r}")
+
+
+class Project:
+    """A folder with recordings and what was made of them, as the command line writes it.
+
+    Parameters
+    ----------
+    place : path
+        The folder, or one recording in it.
+
+    Raises
+    ------
+    SettingError
+        Where there is no such folder or file.
+    """
+
+    def __init__(self, place: str | os.PathLike[str] = ".") -> None:
+        path = Path(place).resolve()
+        if not path.exists():
+            raise SettingError(f"{place}: expected a folder or a recording, there is none")
+        self.folder = path if path.is_dir() else path.parent
+        self.first = None if path.is_dir() else path.name
+        if self.first is not None:
+            self.path_of(self.first)
+
+    def recordings(self) -> list[str]:
+        """Names of the recordings in the folder itself, sorted.
+
+        A link to somewhere else is no part of the project. `:` stands between file and columns on
+        the command line, so that a copied command could not name such a file.
+        """
+        return sorted(
+            entry.name
+            for entry in self.folder.iterdir()
+            if entry.suffix.lower() in RECORDINGS
+            and ":" not in entry.name
+            and entry.name.isprintable()
+            and entry.is_file()
+            and entry.resolve().parent == self.folder
+        )
+
+    def path_of(self, name: str) -> Path:
+        """The path of one of `recordings`; nothing else is opened.
+
+        Raises
+        ------
+        SettingError
+        """
+        if name not in self.recordings():
+            raise SettingError(
+                f"{name[:80]!r}: expected a recording in the project folder "
+                f"({', '.join(RECORDINGS)}); put the file there"
+            )
+        path = self.folder / name
+        if path.stat().st_size > LARGEST:
+            raise SettingError(f"{name}: expected at most {LARGEST >> 20} MB; cut it first")
+        return path
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "folder": self.folder.name or str(self.folder),
+            "recordings": self.recordings(),
+            "first": self.first,
+            "model": (self.folder / MODEL).is_file(),
+        }
+
+    # --- Steps ------------------------------------------------------------------------------------
+
+    def columns(self, step: Step) -> dict[str, Any]:
+        """Columns of a recording, and which of them are probably the input and the output."""
+        from ..readers import read_table
+
+        table = read_table(self.path_of(step.file))
+        rest = [n for n in table.names if n != "t"]
+        inputs = [n for n in ("u", "input", "voltage") if n in table][:1] or rest[:1]
+        outputs = [n for n in ("y", "speed", "output") if n in table and n not in inputs]
+        outputs = outputs or [n for n in rest if n not in inputs]
+        encoder = table.counts_per_rev is not None and "counts" in table
+        return {
+            "names": list(table.names),
+            "inputs": inputs,
+            "output": outputs[0] if outputs and not encoder else None,
+            "encoder": encoder,
+        }
+
+    def look(self, step: Step) -> dict[str, Any]:
+        """The signals, and what `sewfast look` says of them."""
+        data = self._read(step)
+        summary = data.summary()
+        experiment = data.experiments[0]
+        curves = [
+            {"name": name, "unit": unit, **envelope(np.asarray(values, dtype=float), data.Ts)}
+            for name, unit, values in [
+                *zip(data.input_names, data.input_units, experiment.u.T, strict=True),
+                (data.output_name, data.output_unit, experiment.y),
+            ]
+        ]
+        return {"text": str(summary), "advice": list(summary.advice), "curves": curves}
+
+    def identify(self, step: Step, progress: Progress | None = None) -> dict[str, Any]:
+        """A model from the recording, written to `model.json`."""
+        from ..identification import identify
+
+        data = self._read(step)
+        model = identify(data, model=step.model, seed=step.seed, progress=progress)
+        model.save(self.folder / MODEL)
+        choice = model.training.get("choice", {})
+        return {
+            "text": str(model),
+            "candidates": choice.get("candidates", []),
+            "chosen": choice.get("chosen", model.kind),
+            **self.validate(step),
+        }
+
+    def validate(self, step: Step) -> dict[str, Any]:
+        """Measured against free run, and the report card of `sewfast check`."""
+        from ..evidence import check
+        from ..models import load_model
+        from ..validation import validate
+
+        if not (self.folder / MODEL).is_file():
+            raise SettingError(f"expected {MODEL} in the project folder; identify a model first")
+        model, data = load_model(self.folder / MODEL), self._read(step)
+        found, card = validate(model, data), check(model, data)
+        errors = found.experiments[0]
+        pairs = (("measured", errors.y), ("free run", errors.simulated))
+        curves = [{"name": n, "unit": found.unit, **envelope(c, data.Ts)} for n, c in pairs]
+        return {
+            "fit": found.simulation.fit_percent,
+            "rmse": found.simulation.rmse,
+            "unit": found.unit,
+            "verdict": found.verdict,
+            "card": str(card),
+            "free_run": curves,
+        }
+
+    # --- Copies: the same calls, for a script and for a shell -------------------------------------
+
+    def python(self, step: Step, name: str) -> str:
+        """A script that does the step again, run in the project folder."""
+        lines = ["import sewfast", "", f"data = sewfast.read({self._arguments(step)})"]
+        if step.resample is not None:
+            lines.append(f"data = data.resample({step.resample!r})")
+        if name == "look":
+            lines.append("print(data.summary())")
+        elif name == "identify":
+            call = f"sewfast.identify(data, model={step.model!r}, seed={step.seed})"
+            lines += [f"model = {call}", f"model.save({MODEL!r})", "print(model)"]
+        else:
+            lines.append(f"model = sewfast.load_model({MODEL!r})")
+            lines += ["print(sewfast.validate(model, data))", "print(sewfast.check(model, data))"]
+        return "\n".join(lines) + "\n"
+
+    def commands(self, step: Step, name: str) -> str:
+        """The same for a shell in the project folder."""
+        file = f"./{step.file}" if step.file.startswith("-") else step.file
+        read = self._columns(step)
+        options = [f"--input={c}" for c in read["inputs"]]
+        if "counts" in read:
+            options.append(f"--counts={read['counts']}")
+            options.append(f"--counts-per-rev={read['counts_per_rev']!r}")
+        else:
+            options.append(f"--output={read['output']}")
+        if step.resample is not None:
+            options.append(f"--resample={step.resample!r}")
+        kind = [f"--model={step.model.replace('_', '-')}", f"--seed={step.seed}", "-o", MODEL]
+        rows = {
+            "look": [["look", file, *options]],
+            "identify": [["identify", file, *options, *kind]],
+            "validate": [[c, MODEL, file, *options] for c in ("validate", "check")],
+        }[name]
+        return "".join(shlex.join(["sewfast", *row]) + "\n" for row in rows)
+
+    def _read(self, step: Step) -> Dataset:
+        from ..readers import read
+
+        data = read(self.path_of(step.file), **self._columns(step))
+        return data if step.resample is None else data.resample(step.resample)
+
+    def _arguments(self, step: Step) -> str:
+        return ", ".join([repr(step.file), *(f"{k}={v!r}" for k, v in self._columns(step).items())])
+
+    def _columns(self, step: Step) -> dict[str, Any]:
+        """Arguments of `sewfast.read`; the references go along, as they do on the command line."""
+        from ..dataset import is_reference
+        from ..readers import read_table
+
+        if not step.inputs:
+            raise SettingError(f"{step.file}: expected an input, received none; choose a column")
+        table = read_table(self.path_of(step.file))
+        columns: dict[str, Any] = {"inputs": list(step.inputs)}
+        if step.output is not None:
+            columns["output"] = step.output
+        elif table.counts_per_rev is not None:
+            columns |= {"counts": "counts", "counts_per_rev": table.counts_per_rev}
+        else:
+            raise DataError(f"{step.file}: expected an output, received none; choose a column")
+        used = {table.resolve(n) for n in (*step.inputs, step.output or "counts")}
+        references = [n for n in table.names if is_reference(n) and n not in used]
+        lengths = {len(table[n]) for n in used}
+        references = [n for n in references if {len(table[n])} == lengths]
+        return columns | ({"channels": references} if references else {})
+
+
+def envelope(values: FloatArray, Ts: float, columns: int = COLUMNS) -> dict[str, Any]:
+    """A curve to draw: every sample, or the lowest and the highest of each of `columns` pieces.
+
+    Parameters
+    ----------
+    values : (N,) array
+        NaN is a gap.
+    Ts : float
+        Sample time [s].
+    columns : int
+
+    Returns
+    -------
+    dict
+        ``Ts``, ``n`` and ``low``, ``high``: lists of equal length over the whole time.
+    """
+    n = len(values)
+    if n <= 2 * columns:
+        low = high = values
+    else:
+        starts = np.linspace(0, n, columns, endpoint=False).astype(np.intp)
+        low, high = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
+    return {"Ts": Ts, "n": n, "low": low.tolist(), "high": high.tolist()}

@@ -1,0 +1,397 @@
+"""The studio: who is let in, what its steps find, its copies, and the page in a real browser."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import http.client
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sewfast
+from cli import PROGRAM, environment
+from sewfast.errors import SettingError
+from sewfast.studio import Project, Step, Studio
+from sewfast.studio.project import envelope
+
+websockets = pytest.importorskip("websockets.sync.client")
+
+EVIL = '<script>document.title="run"</script>'
+STEP = {"file": "run.csv", "inputs": ["u"], "output": "y", "resample": 0.02, "model": "oe"}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    excitation = sewfast.signals.excitation("saturating")[:6000]
+    found = sewfast.record(sewfast.VirtualMachine(seed=1), excitation)
+    t = np.arange(len(found)) * found.Ts
+    for name in ("run.csv", "run2.csv"):
+        columns = {"t": t, "u": found.u, "y": found.y, EVIL: found.y}
+        sewfast.write_table(tmp_path / name, columns)
+    return tmp_path
+
+
+@pytest.fixture
+def studio(folder: Path) -> Iterator[Studio]:
+    with Studio(Project(folder)) as running:
+        yield running
+
+
+class Page:
+    """A page without a browser: a socket that gave its token."""
+
+    def __init__(self, studio: Studio, token: str | None = None, **headers: Any) -> None:
+        origin = headers.pop("origin", f"http://127.0.0.1:{studio.port}")
+        place = f"ws://127.0.0.1:{studio.port}/socket"
+        self._left = contextlib.ExitStack()
+        self.socket = self._left.enter_context(websockets.connect(place, origin=origin, **headers))
+        self.socket.send(studio.token if token is None else token)
+
+    def __enter__(self) -> Page:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._left.close()
+
+    def hear(self, wanted: Callable[[dict[str, Any]], bool], timeout: float = 30) -> dict[str, Any]:
+        until = time.monotonic() + timeout
+        while True:
+            heard = json.loads(self.socket.recv(timeout=until - time.monotonic()))
+            if wanted(heard):
+                return dict(heard)
+
+    def event(self, name: str) -> dict[str, Any]:
+        return self.hear(lambda m: m.get("event") == name)
+
+    def ask(self, do: str, **asked: Any) -> dict[str, Any]:
+        self.socket.send(json.dumps({"id": 7, "do": do, **asked}))
+        return self.hear(lambda m: m.get("id") == 7)
+
+
+@pytest.fixture
+def page(studio: Studio) -> Iterator[Page]:
+    with Page(studio) as found:
+        yield found
+
+
+# --- Who is let in --------------------------------------------------------------------------------
+
+
+def _get(studio: Studio, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", studio.port, timeout=10)
+    connection.putrequest("GET", path, skip_host=True)
+    for name, value in {"Host": f"127.0.0.1:{studio.port}", **headers}.items():
+        connection.putheader(name, value)
+    connection.endheaders()
+    answer = connection.getresponse()
+    return answer.status, dict(answer.getheaders()), answer.read()
+
+
+def test_the_page_is_served_with_a_strict_policy(studio: Studio) -> None:
+    status, headers, body = _get(studio, "/")
+    assert status == 200
+    assert b"sewfast studio" in body
+    policy = headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert studio.token.encode() not in body
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:{port}", "127.0.0.1", "0.0.0.0"])
+def test_a_foreign_host_is_refused(studio: Studio, host: str) -> None:
+    assert _get(studio, "/", Host=host.format(port=studio.port))[0] == 403
+
+
+def test_a_rebound_name_is_refused_though_its_origin_agrees(studio: Studio) -> None:
+    evil = f"evil.example:{studio.port}"
+    assert _get(studio, "/", Host=evil, Origin=f"http://{evil}")[0] == 403
+    assert _get(studio, "/", Origin=f"http://{evil}")[0] == 403
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/../project.py", "/%2e%2e/project.py", "/run.csv", "//etc/passwd", "/page/index.html",
+     "/studio.js/../../server.py", "/..%5cproject.py", "/index.html%00"],
+)  # fmt: skip
+def test_only_the_page_s_files_are_served(studio: Studio, path: str) -> None:
+    assert _get(studio, path)[0] == 404
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", None, "https://127.0.0.1"])
+def test_a_socket_of_a_foreign_origin_is_refused(studio: Studio, origin: str | None) -> None:
+    from websockets.exceptions import InvalidStatus
+
+    with pytest.raises(InvalidStatus) as refused:
+        Page(studio, origin=origin)
+    assert refused.value.response.status_code == 403
+
+
+@pytest.mark.parametrize("token", ["", "wrong", "x" * 43, "ü" * 10])
+def test_a_wrong_token_hears_nothing(studio: Studio, token: str) -> None:
+    from websockets.exceptions import ConnectionClosed
+
+    with Page(studio, token) as found, pytest.raises(ConnectionClosed):
+        found.socket.recv(timeout=10)
+
+
+def test_a_large_message_ends_its_socket_and_no_other(studio: Studio, page: Page) -> None:
+    from websockets.exceptions import ConnectionClosed
+
+    with Page(studio) as other:
+        other.event("state")
+        with pytest.raises(ConnectionClosed):
+            other.ask("look", file="x" * 70_000)
+    assert page.ask("columns", **STEP)["found"]["names"][-1] == EVIL
+
+
+def test_a_body_is_refused(studio: Studio) -> None:
+    with socket.create_connection(("127.0.0.1", studio.port), timeout=10) as raw:
+        head = (
+            f"POST / HTTP/1.1\r\nHost: 127.0.0.1:{studio.port}\r\nContent-Length: 9999999\r\n\r\n"
+        )
+        raw.sendall(head.encode())
+        answer = raw.recv(100)
+    assert not answer.startswith(b"HTTP/1.1 200")
+
+
+@pytest.mark.parametrize(
+    "file",
+    ["../secret.csv", "/etc/passwd", "link.csv", "sub/run.csv", "", "run.csv\0", "model.json"],
+)
+def test_nothing_outside_the_project_is_opened(folder: Path, page: Page, file: str) -> None:
+    (folder.parent / "secret.csv").write_text("t,u,y\n0,1,2\n", encoding="utf-8")
+    (folder / "link.csv").symlink_to(folder.parent / "secret.csv")
+    assert "in the project folder" in page.ask("columns", file=file)["error"]
+
+
+@pytest.mark.parametrize(
+    "message", ["", "[]", "1", "{", '{"do":5}', "[" * 5000, '{"do":"__init__"}']
+)
+def test_a_malformed_message_is_answered(page: Page, message: str) -> None:
+    page.socket.send(message)
+    assert page.hear(lambda m: "error" in m)["id"] is None
+    assert "found" in page.ask("columns", **STEP)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"inputs": "u"},
+        {"model": "os"},
+        {"seed": -1},
+        {"resample": "1"},
+        {"seed": True},
+        {"file": 3},
+    ],
+)
+def test_a_wrong_setting_is_named(page: Page, wrong: dict[str, Any]) -> None:
+    assert page.ask("look", **{**STEP, **wrong})["error"].startswith(next(iter(wrong)))
+
+
+def test_one_page_writes_and_others_look_on(studio: Studio, page: Page) -> None:
+    assert page.event("state")["writes"]
+    with Page(studio) as reader:
+        assert not reader.event("state")["writes"]
+        assert "looks on" in reader.ask("identify", **STEP)["error"]
+        assert "curves" in reader.ask("look", **STEP)["found"]
+        reader.ask("take")
+        assert "looks on" in page.ask("identify", **STEP)["error"]
+
+
+# --- Steps ----------------------------------------------------------------------------------------
+
+
+def test_a_model_is_identified_and_validated(folder: Path, page: Page) -> None:
+    assert page.ask("identify", **STEP)["found"] is None
+    assert page.event("progress")["total"] > 0
+    found = page.event("identified")["found"]
+    assert found["fit"] > 50
+    assert (folder / "model.json").is_file()
+    checked = page.ask("validate", **{**STEP, "file": "run2.csv"})["found"]
+    assert "Report card" in checked["card"]
+    assert len(checked["free_run"]) == 2
+
+
+def test_a_cancelled_search_writes_nothing(folder: Path, page: Page) -> None:
+    page.ask("identify", **{**STEP, "model": "auto"})
+    assert "being identified" in page.ask("identify", **STEP)["error"]
+    page.ask("cancel")
+    assert "cancelled" in page.event("identified")["error"]
+    assert not (folder / "model.json").exists()
+
+
+def _model(folder: Path) -> dict[str, Any]:
+    """A model file without the seconds that its search took."""
+    found = json.loads((folder / "model.json").read_text(encoding="utf-8"))
+    found["training"].pop("seconds")
+    return dict(found)
+
+
+@pytest.mark.parametrize("kind", ["oe", "neural_oe"])
+def test_copies_give_the_same_bits(folder: Path, tmp_path: Path, kind: str) -> None:
+    project, step = Project(folder), Step("run.csv", ("u",), "y", 0.02, kind, 3)
+    project.identify(step)
+    first = _model(folder)
+    script = project.python(step, "identify") + project.python(step, "validate")
+    (folder / "model.json").unlink()
+    subprocess.run([sys.executable, "-c", script], cwd=folder, check=True, capture_output=True)
+    assert _model(folder) == first
+    (folder / "model.json").unlink()
+    for name in ("look", "identify", "validate"):
+        for line in project.commands(step, name).splitlines():
+            command = line.replace("sewfast", f"{sys.executable} -m sewfast", 1)
+            subprocess.run(
+                command, shell=True, cwd=folder, env=environment(), check=True, capture_output=True
+            )
+    assert _model(folder) == first
+
+
+def test_a_copy_quotes_names(folder: Path) -> None:
+    name = "it's $(touch hit) 'a'.csv"
+    shutil.copy(folder / "run.csv", folder / name)
+    project, step = Project(folder), Step(name, ("u",), EVIL)
+    for line in project.commands(step, "look").splitlines():
+        command = line.replace("sewfast", f"{sys.executable} -m sewfast", 1)
+        subprocess.run(command, shell=True, cwd=folder, check=True, capture_output=True)
+    script = project.python(step, "look")
+    subprocess.run([sys.executable, "-c", script], cwd=folder, check=True, capture_output=True)
+    assert not (folder / "hit").exists()
+
+
+def test_an_envelope_keeps_every_extreme() -> None:
+    y = np.random.default_rng(0).normal(size=100_003)
+    y[5000:6000] = np.nan
+    found = envelope(y, 0.001, columns=400)
+    assert len(found["low"]) == 400
+    assert min(found["low"]) == np.nanmin(y)
+    assert max(found["high"]) == np.nanmax(y)
+    short = envelope(y[:100], 0.001, columns=400)
+    assert short["low"] == short["high"] == y[:100].tolist()
+
+
+# --- The command ----------------------------------------------------------------------------------
+
+
+def test_a_taken_port_is_refused(folder: Path, studio: Studio) -> None:
+    with pytest.raises(SettingError, match="--port"):
+        Studio(Project(folder), studio.port)
+
+
+def test_a_missing_extra_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "websockets.sync.server", None)
+    with pytest.raises(SettingError, match=r"sewfast\[studio\]"):
+        Studio(Project(folder))
+
+
+def test_ctrl_c_ends_it_cleanly(folder: Path) -> None:
+    command = [*PROGRAM, "studio", str(folder), "--no-browser"]
+    with subprocess.Popen(
+        command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        address = process.stdout.readline()
+        assert address.startswith("http://127.0.0.1:")
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=20)
+    assert (process.returncode, err) == (0, "")
+
+
+# --- In a browser ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def browser() -> Iterator[Any]:
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        pytest.skip("no chromium and chromedriver here: the page is not looked at in a browser")
+    webdriver = pytest.importorskip("selenium.webdriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1200,900"):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    service = webdriver.ChromeService(executable_path=driver)
+    found = webdriver.Chrome(options=options, service=service)
+    yield found
+    found.quit()
+
+
+def _until(true: Callable[[], object], seconds: float = 30) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end, "the page did not get there"
+        time.sleep(0.05)
+
+
+@pytest.mark.alone
+def test_the_way_by_clicks(studio: Studio, browser: Any) -> None:
+    def at(name: str) -> Any:
+        return browser.find_element("id", name)
+
+    browser.get(studio.address)
+    _until(lambda: "u" in at("inputs").text)
+    assert studio.token not in browser.current_url
+    assert EVIL in at("output").text  # shown as text, and not run
+    at("resample").send_keys("0.02")
+    at("look").click()
+    _until(lambda: len(browser.find_elements("css selector", "#signals canvas")) == 2)
+    at("model").send_keys("oe")
+    at("identify").click()
+    _until(lambda: "free run explains" in at("headline").text)
+    at("validate").click()
+    _until(lambda: "Report card" in at("card").text)
+    if "STUDIO_PICTURES" in os.environ:
+        _take_pictures(browser, Path(os.environ["STUDIO_PICTURES"]))
+    wide = "return document.documentElement.scrollWidth - innerWidth"
+    for width in (1200, 600):  # 600: what 200 % zoom leaves of a window of 1200
+        browser.set_window_size(width, 900)
+        assert browser.execute_script(wide) <= 0
+    painted = "return [...document.querySelectorAll('canvas')].every(c => c.getContext('2d')"
+    painted += ".getImageData(0, 0, c.width, c.height).data.some(v => v))"
+    assert browser.execute_script(painted)
+    assert browser.title == "sewfast studio"
+    assert browser.get_log("browser") == []
+
+
+def _take_pictures(browser: Any, folder: Path) -> None:
+    for width in (1200, 600):
+        size = {"width": width, "height": 2600, "deviceScaleFactor": 1, "mobile": False}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        time.sleep(0.3)
+        found = browser.execute_cdp_cmd("Page.captureScreenshot", {})
+        (folder / f"studio-{width}.png").write_bytes(base64.b64decode(found["data"]))
+    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+@pytest.mark.alone
+def test_the_way_by_keyboard(studio: Studio, browser: Any) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    browser.get(studio.address)
+    _until(lambda: browser.execute_script("return document.querySelector('#inputs').length > 0"))
+    for _ in range(12):
+        browser.switch_to.active_element.send_keys(Keys.TAB)
+        if browser.switch_to.active_element.get_attribute("id") == "look":
+            break
+    browser.switch_to.active_element.send_keys(Keys.ENTER)
+    _until(lambda: browser.find_elements("css selector", "#signals canvas"))
+
+
+@pytest.mark.alone
+def test_a_page_without_the_token_is_told(studio: Studio, browser: Any) -> None:
+    browser.get(studio.address.split("#")[0])
+    with contextlib.suppress(AssertionError):
+        _until(lambda: "not connected" in browser.find_element("id", "control").text, 10)
+    assert "not connected" in browser.find_element("id", "control").text
