@@ -295,24 +295,21 @@ class Motor:
             ax.legend(loc="upper right")
 
         def friction_panel(ax: Axes) -> None:
-            top = self.theta[0] + self.theta[1]
-            top = 1.0 if self.shown is None else float(np.abs(self.shown[0]).max())
-            half = np.linspace(1e-3 * top, top, 400)
             of = dict(zip(NAMES, self.theta, strict=True))
-            dry = of["k_s"] + of["k_t"] / (1.0 + (half / of["w_s"]) ** 2)
-            for sign in (-1.0, 1.0):
-                hold = sign * (dry + of["drop"]) + of["offset"]
-                ax.plot(
-                    sign * half / factor, hold + sign * (of["k_e"] + of["k_b"]) * half,
-                    color=LOOKS["model"]["color"], label="whole" if sign > 0 else None,
-                )  # fmt: skip
-                ax.plot(
-                    sign * half / factor, hold, "--", color=LOOKS["measured"]["color"],
-                    label="dry friction, dead zone, constant load" if sign > 0 else None,
-                )  # fmt: skip
-            ax.axhline(0.0, color="0.8", lw=0.6, zorder=0)
+            usual = 100.0 if self.shown is None else float(np.abs(self.shown[0]).max())
+            top = min(usual, 15.0 * of["w_s"]) if of["k_t"] else usual
+            half = np.linspace(1e-4 * top, top, 400)
+            dry = of["k_s"] + of["drop"] + of["k_t"] / (1.0 + (half / of["w_s"]) ** 2)
+            viscous = (of["k_e"] + of["k_b"]) * half
+            speeds = np.concatenate([-half[::-1], half]) / factor
+            for look, sizes, label in (
+                ("model", dry + viscous, "to hold the speed"),
+                ("measured", dry, "of it dry friction, dead zone, constant load"),
+            ):
+                hold = np.concatenate([-sizes[::-1], sizes]) + of["offset"]
+                ax.plot(speeds, hold, label=label, **LOOKS[look])
             ax.set_xlabel(f"speed [{self.speed_unit}]")
-            ax.set_ylabel(f"command to hold it [{self.u_unit}]")
+            ax.set_ylabel(f"command [{self.u_unit}]")
             ax.legend(loc="upper left")
 
         panels = (friction_panel,) if self.shown is None else (run_panel, friction_panel)
