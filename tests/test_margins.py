@@ -13,7 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plants import bent_data
-from sewfast import Controller, Gains, LinearOE, SettingError, identify, margins
+from sewfast import (
+    Controller,
+    Ensemble,
+    Gains,
+    LinearOE,
+    SettingError,
+    identify,
+    margins,
+    operating_point,
+)
 from sewfast.control import Fopdt
 from sewfast.control.margins import loop_response
 from sewfast.evidence import operating_range
@@ -153,6 +162,18 @@ def test_a_nonlinear_model_at_a_speed() -> None:
         margins(controller, model)
     with pytest.raises(SettingError, match="holds at a constant command"):
         margins(controller, model, speed=1e6)
+
+
+def test_an_operating_point_saves_the_search_and_no_bit() -> None:
+    model = identify(bent_data(), model="neural_oe", hidden=4, starts=1, seed=0)
+    point = operating_point(model, 2.0)
+    assert point.y == pytest.approx(2.0, rel=1e-3)
+    for Kp in (0.3, 0.6):
+        controller = Controller(Gains.standard(Kp, 0.2), model.Ts)
+        found, direct = (margins(controller, p, speed=2.0) for p in (point, model))
+        assert found == direct
+    with pytest.raises(SettingError, match="members"):
+        operating_point(Ensemble.of([model, model]), 2.0)
 
 
 def test_what_is_no_plant_is_refused() -> None:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from .comparison import Comparison, compare
     from .control.controller import Controller, load_controller, paper_controller
     from .control.loop import ClosedLoopRun, run
-    from .control.margins import Margins, margins
+    from .control.margins import Margins, margins, operating_point
     from .dataset import Dataset, Diagnosis, Experiment, diagnose
     from .deployment import Deployment, deploy
     from .errors import (
@@ -107,6 +107,7 @@ __all__ = [
     "load_motor",
     "load_response",
     "margins",
+    "operating_point",
     "orders",
     "paper_controller",
     "pareto",
@@ -149,7 +150,7 @@ _HOMES = {
     "identification.order_table": "OrderTable orders",
     "readers": "read read_table",
     "recording": "Recording record",
-    "control.margins": "Margins margins",
+    "control.margins": "Margins margins operating_point",
     "speed": "speed_from_counts",
     "validation": "Validation validate",
     "writers": "write_table",

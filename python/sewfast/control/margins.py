@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from .. import _core
 from ..dataset import FloatArray
 from ..errors import SettingError
-from ..evidence.operating import operating_range, point_at_level
+from ..evidence.operating import OperatingPoint, operating_range, point_at_level
 from ..gains import Gains, real, vector
 from ..models import Model
 from ..models.conversion import from_state_space, polynomials_of, transfer_function
@@ -71,14 +71,35 @@ def _of_model(model: Any, Ts: float, speed: float | None) -> tuple[FloatArray, F
     return _of_point(operating_point(model, speed), Ts)
 
 
-def operating_point(model: Any, speed: float) -> Any:
-    """The `OperatingPoint` of a model with one input whose steady output is `speed`.
+def operating_point(model: Any, speed: float) -> OperatingPoint:
+    """The linear model of a nonlinear one about the steady state whose output is `speed`.
+
+    `margins(controller, point, speed=speed)` is then what `margins(controller, model, speed=speed)`
+    is, to the bit, without the search for the steady state: for whoever tries many controllers.
+
+    Parameters
+    ----------
+    model : Model
+        With one input; of an ensemble take one of its `members`.
+    speed : float
+        Steady output [y].
+
+    Returns
+    -------
+    OperatingPoint
+        Of `sewfast.evidence`.
 
     Raises
     ------
     SettingError
-        Where no command within the range of the training data holds that speed.
+        For an ensemble, or where no command within the range of the training data holds that speed.
     """
+    if model.members:
+        raise SettingError(
+            "expected one plant, received an ensemble; take the operating point of each of its "
+            "members"
+        )
+    speed = real("speed", speed)
     low, high = model.training.get("input_range", [[-1.0, 1.0]])[0]
     grid = operating_range(model, [np.array([u]) for u in np.linspace(low, high, _GRID)]).points
     if not any(p.settled for p in grid) and any(p.drift for p in grid):
@@ -101,7 +122,7 @@ def operating_point(model: Any, speed: float) -> Any:
     return _require_steady(above, speed)
 
 
-def _integrating_point(model: Any, grid: Any, level: float) -> Any:
+def _integrating_point(model: Any, grid: Any, level: float) -> OperatingPoint:
     """Where an integrator keeps its output: at a command of its own, at any level."""
     pairs = [p for p in itertools.pairwise(grid) if p[0].drift * p[1].drift <= 0.0]
     if not pairs:
@@ -120,7 +141,7 @@ def _integrating_point(model: Any, grid: Any, level: float) -> Any:
     return _require_steady(point_at_level(model, above.u, level), level)
 
 
-def _require_steady(point: Any, speed: float) -> Any:
+def _require_steady(point: OperatingPoint, speed: float) -> OperatingPoint:
     if not point.settled or point.saturated:
         raise SettingError(
             f"expected a steady state at {speed:g}, received one that "
