@@ -54,6 +54,8 @@ SHOWN = 4.0
 LIMITED = 0.9
 """Of the cost without, that a limit of the current has to fall below."""
 EVALUATIONS = 60
+STRETCH = 20_000
+"""Samples on which the way is found; all of them then have their say."""
 COARSE, FINE = 1e-4, 1e-7
 """Tolerances on the way, and of what is printed."""
 WHITE = 12
@@ -126,7 +128,6 @@ def physics(
     ):
         raise SettingError(f"expected volts per unit of command above 0, received {volts!r}")
     records = records_of(data, current, speed_unit)
-    task = Task(records)
     reasons = _too_fast(records, terms)
     terms = tuple(t for t in terms if t not in reasons)
     if "stribeck" in terms and _never_slow(records):
@@ -137,12 +138,15 @@ def physics(
         reasons["offset"] = (
             "the speed has one sign, so that k_s holds friction and constant load together"
         )
-    state = _started(task, terms)
-    state = _fitted(task, state)
+    first = Task(records.liveliest(STRETCH))
+    state = _fitted(first, _started(first, terms))
+    first.leave_out_spikes(state)
+    state = _with_limit(first, _fitted(first, state), terms)
+    first.leave_out_spikes(state)
+    state = _all_terms(first, state, terms)
+    task = Task(records, first.steps)
     task.leave_out_spikes(state)
-    state = _with_limit(task, _fitted(task, state), terms)
-    task.leave_out_spikes(state)
-    state, shares = _all_terms(task, state, terms)
+    state, shares = _shown_terms(task, state, terms)
     reasons |= {
         t: f"not shown, if there is any (Wald's statistic {shares[t]:.2g}, it takes {SHOWN:g})"
         for t in shares
@@ -151,7 +155,7 @@ def physics(
     estimate = Estimate(
         state.theta, state.resistance, tuple(state.names()), covariance, tuple(state.terms)
     )
-    records = replace(records, spikes=records.spikes + task.spikes)
+    records = replace(records, spikes=records.spikes + first.spikes + task.spikes)
     return motor_of(estimate, records, task.outcome(state), reasons, volts, task.converged)
 
 
@@ -581,8 +585,8 @@ def _with_limit(task: Task, state: State, terms: tuple[str, ...]) -> State:
     return found if task.cost(found) < LIMITED * before else state
 
 
-def _all_terms(task: Task, state: State, terms: tuple[str, ...]) -> tuple[State, dict[str, float]]:
-    """All terms fitted together, then without those that are not shown; their statistics."""
+def _all_terms(task: Task, state: State, terms: tuple[str, ...]) -> State:
+    """All terms fitted together, roughly."""
     size = max(state.value("k_s"), 0.01 * float(np.std(task.records.pieces[0].u)))
     _, fast = task.stribeck_speeds()
     starts = {
@@ -594,14 +598,25 @@ def _all_terms(task: Task, state: State, terms: tuple[str, ...]) -> tuple[State,
     state = state.having(whole, **{p: v for p, v in starts.items() if p in new})
     state = _fitted(task, state)
     task.weigh(state)
-    plain, tried = state, [_fitted(task, state)]
+    tried = [_fitted(task, state)]
     if "stribeck" in whole:  # the speed at which friction falls off has more than one minimum
         bumps = [state.having(whole, k_t=0.4 * size, w_s=part * fast) for part in BUMPS]
         tried += [_fitted(task, s) for s in bumps]
-    state = _fitted(task, min(tried, key=task.cost), FINE)
-    if task.rmse(state) > WORSE * task.rmse(plain):
-        task.weigh(plain, order=0)
-        state = _fitted(task, plain, FINE)
+    return min(
+        [*tried, state], key=lambda s: (task.rmse(s) > WORSE * task.rmse(state), task.cost(s))
+    )
+
+
+def _shown_terms(
+    task: Task, start: State, terms: tuple[str, ...]
+) -> tuple[State, dict[str, float]]:
+    """All terms fitted together, then without those that are not shown; their statistics."""
+    task.weigh(start)
+    state = _fitted(task, start, FINE)
+    if task.rmse(state) > WORSE * task.rmse(start):
+        task.weigh(start, order=0)
+        state = _fitted(task, start, FINE)
+    _, fast = task.stribeck_speeds()
     kept, out = list(state.terms), {t: 0.0 for t in terms if t not in state.terms}
     names, covariance, x = state.names(), task.covariance(state), state.vector()
     while True:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -64,6 +64,20 @@ class Records:
     quantum: float
     counts_per_rev: float | None
     spikes: int
+
+    def liveliest(self, n: int) -> Records:
+        """Those `n` samples or fewer in a row whose speed varies most; all where there are no more.
+
+        The pieces are views: a sample that is left out of one is left out of the other.
+        """
+        if sum(len(p.u) for p in self.pieces) <= n:
+            return self
+        windows = [
+            _window(p, k, min(k + n, len(p.u)), self.quantum)
+            for p in self.pieces
+            for k in range(0, max(len(p.u) - n // 2, 1), n // 2)
+        ]
+        return replace(self, pieces=(max(windows, key=lambda w: float(np.var(w.y))),))
 
     @property
     def used(self) -> int:
@@ -210,6 +224,13 @@ def _pieces(
             )
         )  # fmt: skip
     return found, spikes
+
+
+def _window(p: Piece, start: int, stop: int, quantum: float) -> Piece:
+    part = slice(start, stop)
+    current = None if p.current is None else p.current[part]
+    first = p.speed if start == 0 else _first(p.y[part], quantum)
+    return Piece(p.u[part], p.y[part], p.used[part], first, p.angle[part], current)
 
 
 def _spikes(y: FloatArray, quantum: float) -> NDArray[np.bool_]:

@@ -17,7 +17,7 @@
 //! (Griewank and Walther 2008, chapter 3): one more parameter costs one more column and no more code.
 
 use crate::simd::{self, Eight, Kernel};
-use crate::{Error, Result};
+use crate::{Error, Monitor, Result};
 
 /// Names of the parameters, in their order.
 pub const PARAMETERS: [&str; 18] = [
@@ -143,17 +143,24 @@ pub struct Found {
 ///
 /// # Errors
 /// Setting errors for parameters outside their range, a fit of what varies over the turn without an angle, and too
-/// many parameters; data errors for commands that are not finite or an angle of another length.
-pub fn run(task: Run<'_>, u: &[f64]) -> Result<Found> {
+/// many parameters; data errors for commands that are not finite or an angle of another length; a fit error where it was
+/// asked to stop.
+pub fn run(task: Run<'_>, u: &[f64], monitor: &Monitor) -> Result<Found> {
     check(&task, u)?;
-    Ok(match task.free.len() {
-        0 => simd::run(Carried::<0>(task, u)),
-        1..=4 => simd::run(Carried::<4>(task, u)),
-        5..=8 => simd::run(Carried::<8>(task, u)),
-        9..=12 => simd::run(Carried::<12>(task, u)),
-        13..=16 => simd::run(Carried::<16>(task, u)),
-        _ => simd::run(Carried::<20>(task, u)),
-    })
+    let found = match task.free.len() {
+        0 => simd::run(Carried::<0>(task, u, monitor)),
+        1..=4 => simd::run(Carried::<4>(task, u, monitor)),
+        5..=8 => simd::run(Carried::<8>(task, u, monitor)),
+        9..=12 => simd::run(Carried::<12>(task, u, monitor)),
+        13..=16 => simd::run(Carried::<16>(task, u, monitor)),
+        _ => simd::run(Carried::<20>(task, u, monitor)),
+    };
+    if monitor.stopped() {
+        return Err(Error::fit(
+            "expected to be left alone, got a request to stop",
+        ));
+    }
+    Ok(found)
 }
 
 fn check(task: &Run<'_>, u: &[f64]) -> Result<()> {
@@ -409,14 +416,17 @@ impl<const N: usize> Equations<N> {
     }
 }
 
-struct Carried<'a, const N: usize>(Run<'a>, &'a [f64]);
+/// Samples between two looks at a request to stop: a few milliseconds.
+const BETWEEN_LOOKS: usize = 1000;
+
+struct Carried<'a, const N: usize>(Run<'a>, &'a [f64], &'a Monitor);
 
 impl<const N: usize> Kernel for Carried<'_, N> {
     type Output = Found;
 
     #[inline(always)]
     fn run<V: Eight>(self) -> Found {
-        let Self(task, u) = self;
+        let Self(task, u, monitor) = self;
         let (n, m) = (u.len(), task.free.len());
         let step = task.sample_time / task.steps as f64;
         let is = Equations::<N>::new(&task, step);
@@ -438,6 +448,9 @@ impl<const N: usize> Kernel for Carried<'_, N> {
         let mut shown = w;
         let mut angle = 0.0;
         for k in 0..n {
+            if k % BETWEEN_LOOKS == 0 && monitor.stopped() {
+                break;
+            }
             found.speed.push(shown.value);
             found.drive.push(x.value);
             found.speed_by.extend_from_slice(&shown.by[..m]);
@@ -471,6 +484,10 @@ impl<const N: usize> Kernel for Carried<'_, N> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn run(task: Run<'_>, u: &[f64]) -> Result<Found> {
+        super::run(task, u, &Monitor::default())
+    }
     use crate::random::Random;
 
     const THETA: [f64; 18] = [

@@ -6,6 +6,7 @@ use sewfast_core::Error;
 use sewfast_core::greybox::{self, PARAMETERS, Run};
 
 use crate::arrays::{array1, array2, raise, slice};
+use crate::watch::watched_over;
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("GREYBOX_PARAMETERS", PARAMETERS)?;
@@ -45,20 +46,18 @@ fn greybox_run<'py>(
         );
         raise(py, Error::setting(message))
     })?;
-    let found = py
-        .detach(|| {
-            let task = Run {
-                theta,
-                free: &free,
-                sample_time: Ts,
-                steps,
-                speed,
-                mean,
-                angle,
-            };
-            greybox::run(task, u)
-        })
-        .map_err(|e| raise(py, e))?;
+    let found = watched_over(py, u.len(), |monitor| {
+        let task = Run {
+            theta,
+            free: &free,
+            sample_time: Ts,
+            steps,
+            speed,
+            mean,
+            angle,
+        };
+        greybox::run(task, u, monitor)
+    })?;
     let columns = free.len();
     Ok((
         array1(py, found.speed),
