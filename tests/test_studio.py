@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,9 @@ import pytest
 import sewfast
 from cli import PROGRAM, environment
 from sewfast.errors import SettingError
-from sewfast.studio import Project, Step, Studio
+from sewfast.studio import Project, Step, Studio, make_demo
 from sewfast.studio.project import envelope
+from sewfast.tuning import costs, first_controller
 
 websockets = pytest.importorskip("websockets.sync.client")
 
@@ -68,7 +70,7 @@ class Page:
     def hear(self, wanted: Callable[[dict[str, Any]], bool], timeout: float = 30) -> dict[str, Any]:
         until = time.monotonic() + timeout
         while True:
-            heard = json.loads(self.socket.recv(timeout=until - time.monotonic()))
+            heard = _unpacked(self.socket.recv(timeout=until - time.monotonic()))
             if wanted(heard):
                 return dict(heard)
 
@@ -78,6 +80,18 @@ class Page:
     def ask(self, do: str, **asked: Any) -> dict[str, Any]:
         self.socket.send(json.dumps({"id": 7, "do": do, **asked}))
         return self.hear(lambda m: m.get("id") == 7)
+
+
+def _unpacked(message: str | bytes) -> dict[str, Any]:
+    if isinstance(message, str):
+        return dict(json.loads(message))
+    end = 4 + int.from_bytes(message[:4], "little")
+    head, rest = json.loads(message[4:end]), np.frombuffer(message[end:], "<f4")
+    lengths = [n for _, n in head["curves"]]
+    parts = np.split(rest, np.cumsum(lengths)[:-1])
+    assert [len(part) for part in parts] == lengths
+    names = [name for name, _ in head["curves"]]
+    return {**head, "curves": dict(zip(names, parts, strict=True))}
 
 
 @pytest.fixture
@@ -210,6 +224,172 @@ def test_one_page_writes_and_others_look_on(studio: Studio, page: Page) -> None:
         assert "looks on" in page.ask("identify", **STEP)["error"]
 
 
+# --- Tuning ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("demo")
+    make_demo(place)
+    return place
+
+
+@pytest.fixture
+def tuned(demo: Path, tmp_path: Path) -> Iterator[Studio]:
+    place = tmp_path / "machine"
+    place.mkdir()
+    shutil.copy(demo / "drive.json", place)
+    with Studio(Project(place, demo=True)) as running:
+        yield running
+
+
+MOVE = {"model": "drive.json", "values": {"Kp": 0.03, "Ti": 0.07}}
+
+
+def test_a_move_gives_what_the_library_gives(tuned: Studio) -> None:
+    model = sewfast.load_model(tuned.project.folder / "drive.json")
+    tuning = tuned.project.tuning("drive.json")
+    start = first_controller(model)
+    gains = sewfast.Gains.standard(0.03, 0.07, start.gains.Td, u_unit="V", y_unit="RPM")
+    wanted = replace(start, gains=gains)
+    with Page(tuned) as page:
+        found = page.ask("tune_move", **MOVE)
+    shown, curves = found["found"], found["curves"]
+    direct = [
+        sewfast.margins(wanted, m, speed=shown_at)
+        for m, shown_at in zip(model.members, [tuning.steps.level] * 4, strict=True)
+    ]
+    assert shown["Ms"] == pytest.approx(max(m.Ms for m in direct), rel=1e-9)
+    assert shown["phase_margin_deg"] == pytest.approx(min(m.phase_margin_deg for m in direct))
+    r = np.interp(np.arange(4 * tuning.steps.samples), [0, tuning.steps.samples], [0, 1])
+    r = tuning.steps.level * r + tuning.steps.step * (np.arange(len(r)) >= 3 * tuning.steps.samples)
+    runs = np.array([sewfast.run(wanted, m, r).y for m in model.members])
+    n = len(curves["reference_y"])
+    np.testing.assert_array_equal(curves["reference_y_high"], runs.max(axis=0)[-n:].astype("f4"))
+    np.testing.assert_array_equal(curves["reference_y"], np.median(runs, 0)[-n:].astype("f4"))
+
+
+def test_costs_are_those_of_tune(tuned: Studio) -> None:
+    model = sewfast.load_model(tuned.project.folder / "drive.json")
+    start = first_controller(model)
+    with Page(tuned) as page:
+        first, second = page.ask("tune_costs", **MOVE)["found"]["costs"]
+    assert first == costs(start, model)[0]
+    assert second != first
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"values": {"Kp": "1"}},
+        {"values": {"Kp": float("inf")}},
+        {"values": {"Kp": True}},
+        {"values": {"filter_samples": 2.5}},
+        {"values": {"filter_samples": 1e30}},
+        {"values": {"u_max": 1.0}},
+        {"values": {"notes": "x"}},
+        {"values": [1]},
+        {"model": "../drive.json"},
+        {"model": ["drive.json"]},
+        {"model": None},
+        {"controller": "drive.json"},
+        {"controller": "/etc/passwd"},
+    ],
+)
+def test_a_wrong_move_is_refused(tuned: Studio, wrong: dict[str, Any]) -> None:
+    with Page(tuned) as page:
+        answer = page.ask("tune_move", **{**MOVE, **wrong})
+        assert "fault" not in answer["error"]
+        assert "found" in page.ask("tune_move", **MOVE)
+
+
+@pytest.mark.parametrize(
+    "file",
+    ["../c.json", "/tmp/c.json", ".c.json", "c.csv", "", "a/b.json", "x" * 80 + ".json", None,
+     "drive.json", "link.json", "c.json\n"],
+)  # fmt: skip
+def test_a_controller_is_written_nowhere_else(tuned: Studio, file: str | None) -> None:
+    folder = tuned.project.folder
+    (folder / "link.json").symlink_to(folder.parent / "outside.json")
+    before = sorted(folder.rglob("*"))
+    model = (folder / "drive.json").read_bytes()
+    with Page(tuned) as page:
+        assert "error" in page.ask("tune_save", file=file, **MOVE)
+    assert sorted(folder.rglob("*")) == before
+    assert (folder / "drive.json").read_bytes() == model
+    assert not (folder.parent / "outside.json").exists()
+
+
+def test_only_the_writer_searches_and_saves(tuned: Studio) -> None:
+    with Page(tuned) as writer:
+        assert writer.event("state")["writes"]
+        with Page(tuned) as reader:
+            for name in ("tune_search", "tune_save", "cancel"):
+                assert "looks on" in reader.ask(name, file="c.json", **MOVE)["error"]
+            assert "found" in reader.ask("tune_move", **MOVE)
+
+
+def _run_copies(folder: Path, script: str, commands: str) -> list[bytes]:
+    """The controller file that each copy writes."""
+    place, found = folder / "controller.json", []
+    shell = f'sewfast() {{ "{sys.executable}" -m sewfast "$@"; }}\nset -e\n{commands}'
+    for command in ([sys.executable, "-c", script], ["sh", "-c", shell]):
+        place.unlink()
+        subprocess.run(command, cwd=folder, env=environment(), check=True, capture_output=True)
+        found.append(place.read_bytes())
+    return found
+
+
+def test_copies_of_a_controller_give_the_same_file(tuned: Studio) -> None:
+    folder = tuned.project.folder
+    with Page(tuned) as page:
+        said = page.ask("tune_save", file="controller.json", **MOVE)["found"]
+    written = (folder / "controller.json").read_bytes()
+    assert _run_copies(folder, said["python"], said["commands"]) == [written, written]
+
+
+def test_copies_of_a_search_give_the_same_file(tuned: Studio) -> None:
+    folder = tuned.project.folder
+    with Page(tuned) as page:
+        page.ask("tune_search", evaluations=60, seed=3, **MOVE)
+        assert page.event("progress")["of"] == "searched"
+        found = page.event("searched")["found"]
+        assert found["cost"] < found["start_cost"]
+        asked = {**MOVE, "values": found["values"], "file": "controller.json"}
+        said = page.ask("tune_save", **asked)["found"]
+    assert "sewfast.tune(" in said["python"]
+    written = (folder / "controller.json").read_bytes()
+    assert _run_copies(folder, said["python"], said["commands"]) == [written, written]
+
+
+def test_a_cancelled_search_gives_its_best_so_far(tuned: Studio) -> None:
+    with Page(tuned) as page:
+        page.ask("tune_search", evaluations=20_000, seed=0, **MOVE)
+        assert "running" in page.ask("tune_search", evaluations=10, seed=0, **MOVE)["error"]
+        page.hear(lambda m: m.get("event") == "progress" and m["done"] > 100)
+        page.ask("cancel")
+        found = page.event("searched")["found"]
+        assert found["interrupted"]
+        asked = {**MOVE, "values": found["values"], "file": "controller.json"}
+        assert "sewfast.tune(" not in page.ask("tune_copy", **asked)["found"]["python"]
+
+
+def test_a_controller_file_is_a_start(tuned: Studio) -> None:
+    with Page(tuned) as page:
+        page.ask("tune_save", file="mine.json", **MOVE)
+        assert tuned.project.state()["controllers"] == ["mine.json"]
+        opened = page.ask("tune_open", model="drive.json", controller="mine.json")["found"]
+    values = {knob["name"]: knob["value"] for knob in opened["knobs"]}
+    assert (values["Kp"], values["Ti"]) == (0.03, 0.07)
+
+
+def test_an_unstable_loop_is_said_to_be_one(tuned: Studio) -> None:
+    with Page(tuned) as page:
+        found = page.ask("tune_move", model="drive.json", values={"Kp": 5.0, "Td": 0.0})["found"]
+    assert not found["stable"]
+    assert found["Ms"] is None
+
+
 # --- Steps ----------------------------------------------------------------------------------------
 
 
@@ -226,7 +406,7 @@ def test_a_model_is_identified_and_validated(folder: Path, page: Page) -> None:
 
 def test_a_cancelled_search_writes_nothing(folder: Path, page: Page) -> None:
     page.ask("identify", **{**STEP, "model": "auto"})
-    assert "being identified" in page.ask("identify", **STEP)["error"]
+    assert "running" in page.ask("identify", **STEP)["error"]
     page.ask("cancel")
     assert "cancelled" in page.event("identified")["error"]
     assert not (folder / "model.json").exists()
@@ -354,24 +534,94 @@ def test_the_way_by_clicks(studio: Studio, browser: Any) -> None:
     _until(lambda: "Report card" in at("card").text)
     if "STUDIO_PICTURES" in os.environ:
         _take_pictures(browser, Path(os.environ["STUDIO_PICTURES"]))
-    wide = "return document.documentElement.scrollWidth - innerWidth"
     for width in (1200, 600):  # 600: what 200 % zoom leaves of a window of 1200
         browser.set_window_size(width, 900)
-        assert browser.execute_script(wide) <= 0
-    painted = "return [...document.querySelectorAll('canvas')].every(c => c.getContext('2d')"
+        assert browser.execute_script(WIDE) <= 0
+    painted = "return [...document.querySelectorAll('#data canvas')].every(c => c.getContext('2d')"
     painted += ".getImageData(0, 0, c.width, c.height).data.some(v => v))"
     assert browser.execute_script(painted)
     assert browser.title == "sewfast studio"
     assert browser.get_log("browser") == []
 
 
-def _take_pictures(browser: Any, folder: Path) -> None:
-    for width in (1200, 600):
-        size = {"width": width, "height": 2600, "deviceScaleFactor": 1, "mobile": False}
+WIDE = "return document.documentElement.scrollWidth - innerWidth"
+NUMBER = """
+const row = [...document.querySelectorAll('#numbers tr')].find(r => r.cells[0].textContent === arguments[0]);
+return row && row.cells[1].textContent;
+"""  # noqa: E501
+
+
+@pytest.mark.alone
+def test_tuning_by_keyboard(tuned: Studio, browser: Any) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    def at(name: str) -> Any:
+        return browser.find_element("id", name)
+
+    def number(title: str) -> Any:
+        return browser.execute_script(NUMBER, title)
+
+    browser.set_window_size(1600, 1000)
+    browser.get(tuned.address)
+    _until(lambda: number("Ms"))
+    _until(lambda: "start" in at("cost").text)
+    before, first = number("Ms"), at("knob-Kp-value").get_attribute("value")
+    at("knob-Kp").send_keys(Keys.ARROW_RIGHT * 10)
+    _until(lambda: number("Ms") != before)
+    _until(lambda: "(" in at("cost").text and "old" not in at("cost").get_attribute("class"))
+    moved = {"Kp": float(at("knob-Kp-value").get_attribute("value"))}
+    shown, _ = tuned.project.tuning("drive.json").move(moved)
+    assert float(number("Ms")) == pytest.approx(shown["Ms"], rel=5e-3)
+    assert float(number("overshoot")) == pytest.approx(shown["overshoot_percent"], rel=5e-3)
+    at("pin-A").click()
+    at("view-tune").send_keys("z")
+    for _ in range(9):
+        at("undo").send_keys(Keys.ENTER)
+    _until(lambda: number("Ms") == before)
+    assert at("knob-Kp-value").get_attribute("value") == first
+    at("take-A").click()
+    _until(lambda: float(at("knob-Kp-value").get_attribute("value")) == moved["Kp"])
+    at("evaluations").clear()
+    at("evaluations").send_keys("40")
+    at("search").click()
+    _until(lambda: "found" in at("tune-progress").text)
+    at("save").click()
+    _until(lambda: "written" in at("saved").text)
+    at("copy-python").click()
+    _until(lambda: "evaluations=40" in at("tune-copy").text)
+    script, place = at("tune-copy").text, tuned.project.folder / "controller.json"
+    written = place.read_bytes()
+    place.unlink()
+    subprocess.run([sys.executable, "-c", script], cwd=place.parent, check=True)
+    assert place.read_bytes() == written
+    if "STUDIO_PICTURES" in os.environ:
+        _take_pictures(browser, Path(os.environ["STUDIO_PICTURES"]), "tune", (2200, 1500, 700))
+    for width in (1600, 1000, 600):
+        browser.set_window_size(width, 900)
+        assert browser.execute_script(WIDE) <= 0
+    assert browser.get_log("browser") == []
+
+
+@pytest.mark.alone
+def test_the_page_finds_its_state_again(tuned: Studio, browser: Any) -> None:
+    browser.get(tuned.address)
+    _until(lambda: browser.execute_script(NUMBER, "Ms"))
+    browser.refresh()
+    _until(lambda: browser.execute_script(NUMBER, "Ms"))
+    assert "holds" in browser.find_element("id", "control").text
+
+
+def _take_pictures(
+    browser: Any, folder: Path, name: str = "look", widths: tuple[int, ...] = (1200, 600)
+) -> None:
+    browser.execute_script("scrollTo(0, 0)")
+    for width in widths:
+        height = 1000 if name == "tune" and width > 800 else 2600
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         time.sleep(0.3)
         found = browser.execute_cdp_cmd("Page.captureScreenshot", {})
-        (folder / f"studio-{width}.png").write_bytes(base64.b64decode(found["data"]))
+        (folder / f"{name}-{width}.png").write_bytes(base64.b64decode(found["data"]))
     browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 

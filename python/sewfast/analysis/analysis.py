@@ -287,7 +287,7 @@ def analyse(
     names = titles(plants)
     points = plant_points(plants, names, speeds)
     main = _main(points, level)
-    slowest = _slowest(controller, points[main])
+    slowest = slowest_time(controller, points[main])
     steps = default_steps(
         controller, points[main], slowest,
         level=level, step=step, disturbance=disturbance, seconds=seconds,
@@ -318,7 +318,7 @@ def _main(points: Sequence[Sequence[PlantPoint]], level: float | None) -> int:
     return int(np.argmin([abs(row[0].y - level) for row in points]))
 
 
-def _slowest(controller: Controller, row: Sequence[PlantPoint]) -> float:
+def slowest_time(controller: Controller, row: Sequence[PlantPoint]) -> float:
     """The slowest closed-loop time constant of all plants [s]; of an unstable loop a tenth of a
     thousand samples."""
     sizes = [

@@ -1,15 +1,17 @@
-"""`sewfast studio`: the way from a recording to a checked model on a local page."""
+"""`sewfast studio`: from a recording to a controller on a local page."""
 
 from __future__ import annotations
 
 import argparse
 
+from ..errors import SettingError
 from .arguments import Commands, add_command
 from .output import print_json
 
 STUDIO = """\
-Open a page in the browser: look at recordings, identify a model, validate it. Every step can be
-copied as Python or as commands, and its result is a file that the command line reads (model.json).
+Open a page in the browser: look at recordings, identify a model, validate it, tune a controller.
+Every step can be copied as Python or as commands, and its result is a file that the command line
+reads (model.json, controller.json).
 It needs the package websockets: pip install "sewfast[studio]". Only this computer can reach the
 page, and only with the address that is printed; nothing is loaded from the network.
 """
@@ -18,6 +20,9 @@ EXAMPLES = """\
 examples:
   sewfast studio                            the recordings of this folder
   sewfast studio recordings/run.csv         one of them first
+  sewfast studio drive.json                 sliders for the controller of a model
+  sewfast studio --demo                     the same with a computed machine, in a folder that
+                                            is gone afterwards
   sewfast studio --no-browser --port 8377   with ssh -L 8377:127.0.0.1:8377 from elsewhere
 """
 
@@ -25,10 +30,11 @@ examples:
 def add(commands: Commands) -> None:
     parser = add_command(
         commands, "studio", studio_command,
-        summary="look, identify, validate on a local page", text=STUDIO, examples=EXAMPLES,
+        summary="look, identify, validate, tune on a local page", text=STUDIO, examples=EXAMPLES,
     )  # fmt: skip
+    parser.add_argument("place", nargs="?", metavar="FOLDER|FILE", help="project folder (this one)")
     parser.add_argument(
-        "place", nargs="?", default=".", metavar="FOLDER|FILE", help="project folder (this one)"
+        "--demo", action="store_true", help="records and a model of the virtual machine"
     )
     parser.add_argument("--port", type=int, default=0, metavar="N", help="default: a free one")
     parser.add_argument(
@@ -38,12 +44,20 @@ def add(commands: Commands) -> None:
 
 def studio_command(args: argparse.Namespace) -> None:
     import contextlib
+    import tempfile
     import threading
     import webbrowser
 
-    from ..studio import Project, Studio
+    from ..studio import Project, Studio, make_demo
 
-    with contextlib.suppress(KeyboardInterrupt), Studio(Project(args.place), args.port) as studio:
+    if args.demo and args.place is not None:
+        raise SettingError(f"--demo: expected no folder, received {args.place}; leave one out")
+    with contextlib.ExitStack() as left, contextlib.suppress(KeyboardInterrupt):
+        place = args.place or "."
+        if args.demo:
+            place = left.enter_context(tempfile.TemporaryDirectory(prefix="sewfast-"))
+            make_demo(place)
+        studio = left.enter_context(Studio(Project(place, demo=args.demo), args.port))
         if args.json:
             print_json({"address": studio.address, "folder": str(studio.project.folder)})
         else:

@@ -1,10 +1,12 @@
-"""Studio: look, identify and validate on a local page; the results are the command line's files.
+"""Studio: look, identify, validate and tune on a local page; its files are the command line's.
 
-`project` says what the steps are, each a call of the public API; `server` shows them to a browser
-on this machine and to nobody else; `page` holds what the browser loads.
+`project` says what the steps are, each a call of the public API; `tuning` what a controller's
+numbers do; `server` shows both to a browser on this machine and to nobody else; `page` holds what
+the browser loads.
 """
 
-from .project import Project, Step
+from .project import Project, Step, make_demo
 from .server import Studio
+from .tuning import Tuning
 
-__all__ = ["Project", "Step", "Studio"]
+__all__ = ["Project", "Step", "Studio", "Tuning", "make_demo"]

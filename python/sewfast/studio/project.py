@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +17,7 @@ from ..errors import DataError, SettingError
 
 if TYPE_CHECKING:
     from ..dataset import Dataset, FloatArray
+    from .tuning import Tuning
 
 RECORDINGS = (".csv", ".npz", ".mat", ".parquet", ".mcap")
 MODEL = "model.json"
@@ -25,6 +28,12 @@ LARGEST = 512 * 2**20
 
 COLUMNS = 1200
 """Pairs of lowest and highest value in a drawn curve: about two a pixel of a wide window."""
+
+DEMO_MEMBERS, DEMO_SAMPLES = 4, 8000
+
+MODEL_FORMAT, CONTROLLER_FORMAT = "sewfast.model", "sewfast.controller"
+LARGEST_DOCUMENT = 16 * 2**20
+"""Bytes of a JSON file that is looked into."""
 
 Progress = Callable[[int, int, float], None]
 
@@ -82,13 +91,38 @@ def _require(ok: bool, name: str, expected: str, received: object) -> None:
         raise SettingError(f"{name}: expected {expected}, received {str(received)[:80]!r}")
 
 
+def make_demo(folder: str | os.PathLike[str]) -> None:
+    """Fill a folder for the demo: four records of the virtual machine, and an ensemble of them.
+
+    Raises
+    ------
+    ModelFileError
+        Where the folder cannot be written to.
+    """
+    from .. import signals
+    from ..identification import identify
+    from ..machine import VirtualMachine
+    from ..models import Ensemble
+    from ..recording import record
+
+    members = []
+    for k in range(DEMO_MEMBERS):
+        excitation = signals.excitation("saturating", k)[:DEMO_SAMPLES]
+        recording = record(VirtualMachine(seed=1), excitation, name=f"record {k + 1}")
+        recording.save(Path(folder) / f"record-{k + 1}.csv")
+        members.append(identify(recording.dataset(), model="oe", seed=k))
+    Ensemble.of(members).save(Path(folder) / "drive.json")
+
+
 class Project:
     """A folder with recordings and what was made of them, as the command line writes it.
 
     Parameters
     ----------
     place : path
-        The folder, or one recording in it.
+        The folder, or one recording or model in it.
+    demo : bool
+        Whether the page begins with the model, as in the demo.
 
     Raises
     ------
@@ -96,13 +130,17 @@ class Project:
         Where there is no such folder or file.
     """
 
-    def __init__(self, place: str | os.PathLike[str] = ".") -> None:
+    def __init__(self, place: str | os.PathLike[str] = ".", *, demo: bool = False) -> None:
         path = Path(place).resolve()
         if not path.exists():
-            raise SettingError(f"{place}: expected a folder or a recording, there is none")
+            raise SettingError(f"{place}: expected a folder, a recording or a model, there is none")
         self.folder = path if path.is_dir() else path.parent
         self.first = None if path.is_dir() else path.name
-        if self.first is not None:
+        self.demo = demo
+        self._formats: dict[Path, tuple[int, str]] = {}
+        self._tuning: tuple[object, Tuning] | None = None
+        self._lock = threading.Lock()
+        if self.first is not None and self.first not in self.documents(MODEL_FORMAT):
             self.path_of(self.first)
 
     def recordings(self) -> list[str]:
@@ -120,6 +158,41 @@ class Project:
             and entry.is_file()
             and entry.resolve().parent == self.folder
         )
+
+    def documents(self, format: str) -> list[str]:
+        """Names of the JSON files of a format in the folder itself, sorted."""
+        return sorted(
+            entry.name
+            for entry in self.folder.iterdir()
+            if entry.suffix == ".json"
+            and entry.name.isprintable()
+            and entry.is_file()
+            and entry.resolve().parent == self.folder
+            and self._format_of(entry) == format
+        )
+
+    def _format_of(self, path: Path) -> str:
+        """What a file says it is, read again only where it has changed."""
+        from .. import storage
+
+        changed = path.stat().st_mtime_ns
+        if self._formats.get(path, (0, ""))[0] != changed:
+            small = path.stat().st_size <= LARGEST_DOCUMENT
+            self._formats[path] = (changed, storage.format_of(path) if small else "")
+        return self._formats[path][1]
+
+    def document(self, name: Any, format: str) -> Path:
+        """The path of one of `documents`; nothing else is opened.
+
+        Raises
+        ------
+        SettingError
+        """
+        if name not in self.documents(format):
+            raise SettingError(
+                f"{str(name)[:80]!r}: expected a file of format {format} in the project folder"
+            )
+        return self.folder / str(name)
 
     def path_of(self, name: str) -> Path:
         """The path of one of `recordings`; nothing else is opened.
@@ -143,8 +216,52 @@ class Project:
             "folder": self.folder.name or str(self.folder),
             "recordings": self.recordings(),
             "first": self.first,
-            "model": (self.folder / MODEL).is_file(),
+            "demo": self.demo,
+            "models": self.documents(MODEL_FORMAT),
+            "controllers": self.documents(CONTROLLER_FORMAT),
         }
+
+    # --- Tuning -----------------------------------------------------------------------------------
+
+    def tuning(self, model: Any, controller: Any = None) -> Tuning:
+        """A model and the controller to begin with; the same as long as neither file has changed.
+
+        Parameters
+        ----------
+        model : str
+            Name of a model file in the folder.
+        controller : str, optional
+            Name of a controller file; None for the first controller of `sewfast.tune`.
+
+        Raises
+        ------
+        SettingError, ModelFileError, FitError
+        """
+        from ..control.controller import load_controller
+        from ..models import load_model
+        from .tuning import Tuning
+
+        paths = [self.document(model, MODEL_FORMAT)]
+        if controller is not None:
+            paths.append(self.document(controller, CONTROLLER_FORMAT))
+        key = [(path, path.stat().st_mtime_ns) for path in paths]
+        with self._lock:
+            if self._tuning is None or self._tuning[0] != key:
+                start = load_controller(paths[1]) if controller is not None else None
+                self._tuning = (key, Tuning(load_model(paths[0]), str(model), start))
+            return self._tuning[1]
+
+    def save_controller(self, tuning: Tuning, values: dict[str, Any], file: str) -> None:
+        """Write a controller into the folder; only another controller is replaced.
+
+        Raises
+        ------
+        SettingError
+        """
+        path = self.folder / checked_name(file)
+        if path.is_symlink() or (path.exists() and file not in self.documents(CONTROLLER_FORMAT)):
+            raise SettingError(f"{file}: expected a new name or that of a controller; choose one")
+        tuning.controller(values).save(path)
 
     # --- Steps ------------------------------------------------------------------------------------
 
@@ -282,6 +399,18 @@ class Project:
         lengths = {len(table[n]) for n in used}
         references = [n for n in references if {len(table[n])} == lengths]
         return columns | ({"channels": references} if references else {})
+
+
+def checked_name(file: Any) -> str:
+    """The name of a controller file to write, which says nothing about a folder.
+
+    Raises
+    ------
+    SettingError
+    """
+    fits = isinstance(file, str) and re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,60}\.json", file)
+    _require(bool(fits), "file", "a name such as controller.json", file)
+    return str(file)
 
 
 def envelope(values: FloatArray, Ts: float, columns: int = COLUMNS) -> dict[str, Any]:

@@ -9,28 +9,41 @@ import json
 import logging
 import math
 import secrets
+import struct
 import threading
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from importlib.resources import files
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from ..errors import SettingError, SewfastError
-from .project import Project, Step
+import numpy as np
+
+from ..errors import Interrupted, SettingError, SewfastError
+from .project import Progress, Project, Step, checked_name
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response
     from websockets.sync.server import ServerConnection
+
+    from ..dataset import FloatArray
 
 ADDRESS = "127.0.0.1"
 LARGEST_MESSAGE = 64 * 1024
 PATIENCE = 5.0
 """Seconds that a socket has for its token."""
 
+BETWEEN_REPORTS = 0.05
+"""Seconds between two messages of a job's progress."""
+WRITES = ("identify", "cancel", "tune_search", "tune_save")
+"""What only the page that holds the control can ask for."""
+
 PAGE = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/studio.js": ("studio.js", "text/javascript; charset=utf-8"),
     "/curves.js": ("curves.js", "text/javascript; charset=utf-8"),
+    "/tune.js": ("tune.js", "text/javascript; charset=utf-8"),
+    "/server.js": ("server.js", "text/javascript; charset=utf-8"),
     "/studio.css": ("studio.css", "text/css; charset=utf-8"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
 }
@@ -48,8 +61,8 @@ HEADERS = {
 }
 
 
-class _Cancelled(Exception):
-    """Raised out of a job's progress."""
+class _Cancelled(KeyboardInterrupt):
+    """Raised out of a job's progress; a search then hands over its best so far."""
 
 
 class Studio:
@@ -164,7 +177,7 @@ class Studio:
             try:
                 self._tell_all()
                 for message in connection:
-                    connection.send(_text(self._answer(connection, message)))
+                    connection.send(self._answer(connection, message))
             finally:
                 with self._lock:
                     self._pages.discard(connection)
@@ -181,18 +194,19 @@ class Studio:
 
     # --- What a page asks for ---------------------------------------------------------------------
 
-    def _answer(self, connection: ServerConnection, message: str | bytes) -> dict[str, Any]:
+    def _answer(self, connection: ServerConnection, message: str | bytes) -> str | bytes:
         number: Any = None
         try:
             asked = json.loads(message)
             if not isinstance(asked, dict):
                 raise SettingError("expected an object")
             number = asked.get("id") if isinstance(asked.get("id"), int) else None
-            return {"id": number, "found": self._do(connection, asked)}
-        except (ValueError, RecursionError, SewfastError, OSError) as e:
-            return {"id": number, "error": str(e)}
+            found = self._do(connection, asked)
+            if isinstance(found, tuple):
+                return _packed({"id": number, "found": found[0]}, found[1])
+            return _text({"id": number, "found": found})
         except Exception as e:
-            return {"id": number, "error": f"a fault in sewfast: {type(e).__name__}: {e}"}
+            return _text({"id": number, "error": _said(e)})
 
     def _do(self, connection: ServerConnection, asked: dict[str, Any]) -> Any:
         name = asked.get("do")
@@ -201,20 +215,49 @@ class Studio:
                 self._writer = connection
             self._tell_all()
             return None
-        if name in ("identify", "cancel") and self._writer is not connection:
+        if name in WRITES and self._writer is not connection:
             raise SettingError("this page looks on; press 'take control' first")
         if name == "cancel":
             self._cancel.set()
             return None
+        if isinstance(name, str) and name.startswith("tune"):
+            return self._tune(name, asked)
         step = Step.parse(asked)
         if name == "columns":
             return self.project.columns(step)
         if name in ("look", "validate"):
             return {**getattr(self.project, name)(step), **self._copies(step, name)}
         if name == "identify":
-            self._start(step)
+            copies = self._copies(step, "identify")  # refuses wrong columns before work is begun
+            self._start(
+                "identified", lambda progress: {**self.project.identify(step, progress), **copies}
+            )
             return None
         raise SettingError(f"expected a known step, received {str(name)[:40]!r}")
+
+    def _tune(self, name: str, asked: dict[str, Any]) -> Any:
+        tuning = self.project.tuning(asked.get("model"), asked.get("controller"))
+        values = asked.get("values", {})
+        if not isinstance(values, dict):
+            raise SettingError("values: expected numbers by name")
+        if name == "tune_open":
+            return tuning.opened()
+        if name == "tune_move":
+            return tuning.move(values)
+        if name == "tune_costs":
+            return {"costs": tuning.costs([{}, values])}
+        if name == "tune_search":
+            n, seed = (asked.get(name, -1) for name in ("evaluations", "seed"))
+            tuning.check_search(n, seed)
+            self._start("searched", lambda progress: tuning.search(values, n, seed, progress))
+            return None
+        file = checked_name(asked.get("file"))
+        if name == "tune_save":
+            self.project.save_controller(tuning, values, file)
+            self._tell_all()
+        elif name != "tune_copy":
+            raise SettingError(f"expected a known step, received {name[:40]!r}")
+        return {"python": tuning.python(values, file), "commands": tuning.commands(values, file)}
 
     def _copies(self, step: Step, name: str) -> dict[str, str]:
         return {
@@ -222,31 +265,36 @@ class Studio:
             "commands": self.project.commands(step, name),
         }
 
-    def _start(self, step: Step) -> None:
-        copies = self._copies(step, "identify")  # refuses wrong columns before work is begun
+    def _start(self, event: str, work: Callable[[Progress], dict[str, Any]]) -> None:
+        """Do something long; its result goes to every page as an event."""
         with self._lock:
             if self._job is not None and self._job.is_alive():
-                raise SettingError("a model is being identified; cancel it or wait for its end")
+                raise SettingError("something else is running; cancel it or wait for its end")
             self._cancel.clear()
-            self._job = threading.Thread(target=self._identify, args=(step, copies))
+            self._job = threading.Thread(target=self._work, args=(event, work))
             self._job.start()
 
-    def _identify(self, step: Step, copies: dict[str, str]) -> None:
+    def _work(self, event: str, work: Callable[[Progress], dict[str, Any]]) -> None:
+        told = -math.inf
+
         def progress(done: int, total: int, best: float) -> None:
+            nonlocal told
             if self._cancel.is_set():
                 raise _Cancelled
-            self._tell({"event": "progress", "done": done, "total": total, "best": best})
+            if time.monotonic() - told > BETWEEN_REPORTS:
+                told = time.monotonic()
+                self._tell(
+                    {"event": "progress", "of": event, "done": done, "total": total, "best": best}
+                )
 
         found: dict[str, Any]
         try:
-            found = {"found": {**self.project.identify(step, progress), **copies}}
-        except _Cancelled:
+            found = {"found": work(progress)}
+        except (KeyboardInterrupt, Interrupted):  # whoever passes it on makes one of the two of it
             found = {"error": "cancelled; nothing was written"}
-        except (SewfastError, OSError) as e:
-            found = {"error": str(e)}
         except Exception as e:
-            found = {"error": f"a fault in sewfast: {type(e).__name__}: {e}"}
-        self._tell({"event": "identified", **found})
+            found = {"error": _said(e)}
+        self._tell({"event": event, **found})
         self._tell_all()
 
     def _tell_all(self) -> None:
@@ -275,6 +323,26 @@ def _answer(
     for name, value in written.items():
         response.headers[name] = value
     return response
+
+
+def _said(error: Exception) -> str:
+    """What the page is told: a refusal in its own words, a fault with its kind."""
+    if isinstance(error, (ValueError, RecursionError, SewfastError, OSError)):
+        return str(error)
+    return f"a fault in sewfast: {type(error).__name__}: {error}"
+
+
+def _packed(head: dict[str, Any], curves: Mapping[str, FloatArray]) -> bytes:
+    """A message with curves: length of the head, head as JSON, then every curve in float32.
+
+    The head's `curves` are names and lengths in order; it is padded so that a browser can lay an
+    array over the rest.
+    """
+    names = [[name, len(values)] for name, values in curves.items()]
+    text = _text({**head, "curves": names}).encode()
+    text += b" " * (-len(text) % 4)
+    rows = [np.asarray(values, dtype="<f4").tobytes() for values in curves.values()]
+    return b"".join([struct.pack("<I", len(text)), text, *rows])
 
 
 def _send(page: ServerConnection, event: dict[str, Any]) -> None:

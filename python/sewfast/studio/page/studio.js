@@ -1,32 +1,25 @@
-// The page: asks the server for steps and shows what they found. Texts of others are only ever set as text.
+// The page: its views, and the way from a recording to a model. Texts of others are only ever set as text.
+import { ask as send, on } from "/server.js";
 import { draw } from "/curves.js";
+import { show } from "/tune.js";
 
 const $ = id => document.getElementById(id);
-if (location.hash.length > 1) {
-  sessionStorage.setItem("token", location.hash.slice(1));
-  history.replaceState(null, "", "/");  // the token shall not stay in the address bar
-}
-const socket = new WebSocket(`ws://${location.host}/socket`);
-const waiting = new Map();
-let number = 0, writes = false, busy = false, files = "";
+let writes = false, busy = false, files = null;
 
-socket.onopen = () => socket.send(sessionStorage.getItem("token") || "none");
-socket.onclose = () => { $("control").textContent = "not connected: start sewfast studio again, or open its whole address"; };
-socket.onmessage = ({ data }) => {
-  const message = JSON.parse(data);
-  if (message.event) return EVENTS[message.event](message);
-  const [done, failed] = waiting.get(message.id); waiting.delete(message.id);
-  "error" in message ? failed(new Error(message.error)) : done(message.found);
-};
+on("closed", () => { $("control").textContent = "not connected: start sewfast studio again, or open its whole address"; });
 
+/** A step on the recording that is chosen. */
 function ask(name) {
-  const id = ++number, chosen = [...$("inputs").selectedOptions].map(o => o.value);
   const output = $("output").value, seconds = parseFloat($("resample").value);
-  socket.send(JSON.stringify({
-    id, do: name, file: $("file").value, inputs: chosen, output: output || null,
+  return send(name, {
+    file: $("file").value, inputs: [...$("inputs").selectedOptions].map(o => o.value), output: output || null,
     resample: seconds > 0 ? seconds : null, model: $("model").value, seed: parseInt($("seed").value) || 0,
-  }));
-  return new Promise((done, failed) => waiting.set(id, [done, failed]));
+  });
+}
+
+function view(name) {
+  for (const v of ["data", "tune"]) { $(v).hidden = v !== name; $(`view-${v}`).setAttribute("aria-pressed", v === name); }
+  if (name === "tune") show();
 }
 
 function tell(error) { $("error").textContent = error ? error.message : ""; $("error").hidden = !error; }
@@ -42,29 +35,30 @@ function enable() {
   $("take").hidden = writes;
 }
 
-const EVENTS = {
-  state(s) {
-    writes = s.writes; $("folder").textContent = s.folder;
-    $("control").textContent = (writes ? "this page holds the control" : "this page looks on") + (s.pages > 1 ? `; ${s.pages} pages are open` : "");
-    if (files !== s.recordings.join("/")) {
-      files = s.recordings.join("/"); fill($("file"), s.recordings.map(n => [n, n]), [s.first]);
-      if (s.recordings.length) choose();
-      else tell(new Error("there is no recording in this folder: put a CSV, .mat, .npz, Parquet or MCAP file there and load this page again"));
-    }
-    enable();
-  },
-  progress(p) {
-    busy = true; $("bar").value = p.done / Math.max(p.total, 1);
-    $("progress").textContent = `${p.done} of ${p.total}` + (p.best === null ? "" : `, best ${p.best.toPrecision(4)}`); enable();
-  },
-  identified(m) {
-    busy = false; $("progress").textContent = ""; enable();
-    if (m.error) return tell(new Error(m.error));
-    const f = m.found;
-    $("headline").textContent = `free run explains ${f.fit.toFixed(1)} % of the training data (rmse ${`${f.rmse.toPrecision(4)} ${f.unit}`.trim()})`;
-    curves($("fit"), [f.free_run]); candidates(f.candidates); text("modeltext", f.text); copies("identify", f);
-  },
-};
+on("state", s => {
+  writes = s.writes; $("folder").textContent = s.folder;
+  $("control").textContent = (writes ? "this page holds the control" : "this page looks on") + (s.pages > 1 ? `; ${s.pages} pages are open` : "");
+  if (files !== s.recordings.join("/")) {
+    const first = files === null;
+    files = s.recordings.join("/"); fill($("file"), s.recordings.map(n => [n, n]), [s.first]);
+    if (s.recordings.length) choose();
+    else tell(new Error("there is no recording in this folder: put a CSV, .mat, .npz, Parquet or MCAP file there and load this page again"));
+    if (first && s.models.length && (s.demo || s.models.includes(s.first))) view("tune");
+  }
+  enable();
+});
+on("progress", p => {
+  if (p.of !== "identified") return;
+  busy = true; $("bar").value = p.done / Math.max(p.total, 1);
+  $("progress").textContent = `${p.done} of ${p.total}` + (p.best === null ? "" : `, best ${p.best.toPrecision(4)}`); enable();
+});
+on("identified", m => {
+  busy = false; $("progress").textContent = ""; enable();
+  if (m.error) return tell(new Error(m.error));
+  const f = m.found;
+  $("headline").textContent = `free run explains ${f.fit.toFixed(1)} % of the training data (rmse ${`${f.rmse.toPrecision(4)} ${f.unit}`.trim()})`;
+  curves($("fit"), [f.free_run]); candidates(f.candidates); text("modeltext", f.text); copies("identify", f);
+});
 
 function fill(select, pairs, chosen) {
   select.replaceChildren(...pairs.map(([value, label]) => {
@@ -119,8 +113,9 @@ function copies(name, found) {
 
 $("file").onchange = choose;
 $("what").onsubmit = event => event.preventDefault();
-$("take").onclick = () => ask("take");
-$("cancel").onclick = () => ask("cancel").catch(tell);
+$("take").onclick = () => send("take");
+for (const v of ["data", "tune"]) $(`view-${v}`).onclick = () => view(v);
+$("cancel").onclick = () => send("cancel").catch(tell);
 $("look").onclick = () => act("look", f => {
   curves($("signals"), f.curves.map(c => [c]));
   $("advice").replaceChildren(...f.advice.map(a => { const li = document.createElement("li"); li.textContent = a; return li; }));

@@ -1,0 +1,418 @@
+"""A controller in the hand: what each of its numbers does to the loop around every model at once.
+
+A move of a slider costs one closed loop per member and step, and the margins about an operating
+point that was found once. What is slower, the cost as `tune` counts it and a search, is asked for
+by itself.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import FitError, Interrupted, SettingError
+
+if TYPE_CHECKING:
+    from ..analysis.points import LoopBode
+    from ..analysis.responses import Responses
+    from ..control.controller import Controller
+    from ..dataset import FloatArray
+    from ..models import Model
+
+MOST_MEMBERS = 16
+READABLE_DB = -60.0
+"""Below it the phase is left out: it jumps at the zeros of a mean over samples."""
+MOST_EVALUATIONS = 20_000
+
+
+@dataclass(frozen=True)
+class Knob:
+    """A number of the controller that is moved, and how far.
+
+    Parameters
+    ----------
+    name, unit : str
+    value, low, high : float
+    log : bool
+        Whether equal ways are equal factors.
+    whole : bool
+    """
+
+    name: str
+    unit: str
+    value: float
+    low: float
+    high: float
+    log: bool = False
+    whole: bool = False
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What a search found, with the call that finds it again."""
+
+    values: dict[str, float]
+    controller: Controller
+    start: Controller
+    evaluations: int
+    seed: int
+
+
+class Tuning:
+    """A model, or an ensemble whose members are all looked at, and a controller that is changed.
+
+    Parameters
+    ----------
+    model : Model
+        With one input.
+    name : str
+        The model's file, as the copies name it.
+    start : Controller, optional
+        With constant gains; by default the first controller of `sewfast.tune`.
+
+    Raises
+    ------
+    SettingError
+        For a model with several inputs, a gain schedule, or a controller for another drive.
+    FitError
+        Where the model has no first controller.
+    """
+
+    def __init__(self, model: Model, name: str, start: Controller | None = None) -> None:
+        from ..analysis.analysis import slowest_time
+        from ..analysis.points import plant_points
+        from ..analysis.responses import default_steps
+        from ..control.loop import check_fits, each_plant, titles
+        from ..tuning import first_controller
+
+        self.model, self.name = model, name
+        start = first_controller(model) if start is None else start
+        # one form for all: copies are written in it
+        self.start = replace(start, gains=start.gains.to("standard"))
+        if self.start.schedule:
+            raise SettingError(
+                "expected a controller with constant gains, received a gain schedule; tune it with "
+                "sewfast tune --variables schedule"
+            )
+        self.members = each_plant([model])[:MOST_MEMBERS]
+        for member in self.members:
+            check_fits(self.start, member)
+        self.titles = titles(self.members)
+        rows = plant_points(self.members, self.titles, None)
+        self.points = rows[len(rows) // 2]
+        self.slowest = slowest_time(self.start, self.points)
+        self.steps = default_steps(
+            self.start, self.points, self.slowest,
+            level=None, step=None, disturbance=None, seconds=None,
+        )  # fmt: skip
+        self._found: list[_Found] = []
+
+    @property
+    def knobs(self) -> list[Knob]:
+        """What there is to move: gains, weights of the reference, filters."""
+        gains, Ts = self.start.gains, self.start.Ts
+        per = f"{gains.u_unit}/{gains.y_unit}" if gains.u_unit and gains.y_unit else ""
+        knobs = [_factors("Kp", per, gains.Kp)]
+        Ti = gains.Ti if math.isfinite(gains.Ti) else 0.0
+        if Ti:
+            knobs.append(_factors("Ti", "s", Ti))
+        knobs.append(
+            _factors("Td", "s", gains.Td)
+            if gains.Td
+            else Knob("Td", "s", 0.0, 0.0, 0.25 * Ti or 50.0 * Ts)
+        )
+        for name in ("alpha", "beta"):
+            value = getattr(self.start, name)
+            knobs.append(Knob(name, "", value, min(-0.5, value), max(1.5, value)))
+        if math.isfinite(self.start.N):
+            N = self.start.N
+            knobs.append(Knob("N", "", N, min(1.0, N), max(100.0, N), log=True))
+        n, lag = self.start.filter_samples, self.start.filter_time
+        knobs.append(Knob("filter_samples", "samples", n, 1, 64, whole=True))
+        knobs.append(Knob("filter_time", "s", lag, 0.0, max(20.0 * Ts, lag)))
+        return knobs
+
+    def opened(self) -> dict[str, Any]:
+        """What the page shows before anything is moved."""
+        gains = self.start.gains
+        return {
+            "model": self.name,
+            "members": len(self.members),
+            "knobs": [vars(knob) for knob in self.knobs],
+            "level": self.steps.level,
+            "step": self.steps.step,
+            "disturbance": self.steps.disturbance,
+            "limits": [self.start.u_min, self.start.u_max],
+            "u_unit": gains.u_unit,
+            "y_unit": gains.y_unit,
+            "notes": self.start.notes,
+        }
+
+    def controller(self, values: Mapping[str, Any]) -> Controller:
+        """The start with these values; one that a search found is that very controller.
+
+        Raises
+        ------
+        SettingError
+            For an unknown name, or what is no number in its range.
+        """
+        from ..tuning.task import applied
+
+        found = self._search_of(values)
+        if found is not None:
+            return found.controller
+        wanted = self._checked(values)
+        unmoved = {knob.name: knob.value for knob in self.knobs}
+        if all(wanted.get(name, value) == value for name, value in unmoved.items()):
+            return self.start
+        return applied(wanted, self.start, "tuned by hand in the studio")
+
+    def _checked(self, values: Mapping[str, Any]) -> dict[str, float]:
+        known = {knob.name: knob for knob in self.knobs}
+        wanted = {}
+        for name, value in values.items():
+            if name not in known:
+                raise SettingError(f"{name[:40]}: expected one of {', '.join(known)}")
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if not (number and math.isfinite(value)):
+                raise SettingError(f"{name}: expected a number, received {str(value)[:40]!r}")
+            if known[name].whole and value != int(value):
+                raise SettingError(f"{name}: expected a whole number, received {value}")
+            wanted[name] = float(value)
+        return wanted
+
+    # --- What a controller does -------------------------------------------------------------------
+
+    def move(self, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, FloatArray]]:
+        """Steps, L, S, T and numbers of the loop with these values.
+
+        Returns
+        -------
+        numbers : dict
+            `stable`, margins of the worst member and metrics of the steps.
+        curves : dict of array
+            By name: the median of all members, their lowest and their highest.
+        """
+        from ..analysis.points import loop_bodes
+        from ..analysis.responses import responses
+
+        controller = self.controller(values)
+        (bode,) = loop_bodes(controller, [self.points], self.slowest)
+        numbers, curves = _margins(bode), _bode_curves(bode)
+        try:
+            tracked, upset = responses(controller, self.members, self.titles, self.steps)
+        except FitError:
+            return {**numbers, "diverges": True}, curves
+        for kind, found in (("reference", tracked), ("disturbance", upset)):
+            numbers |= {name: _worst(found, name) for name in found.metrics()[0]}
+            curves |= {f"{kind}_t": found.t, f"{kind}_r": found.r}
+            for name in "yu":
+                curves |= _band(f"{kind}_{name}", getattr(found, name))
+        inside = tracked.u[:, tracked.t >= 0.0]
+        numbers["u_rms"] = float(np.sqrt(np.mean(inside**2, axis=1)).max())
+        numbers["du_rms"] = float(np.sqrt(np.mean(np.diff(inside) ** 2, axis=1)).max())
+        return {**numbers, "diverges": False}, curves
+
+    def costs(self, several: list[Mapping[str, Any]]) -> list[float]:
+        """What controllers cost on the model, as `sewfast.tune` counts it; inf where one diverges.
+
+        Parameters
+        ----------
+        several : list of dict
+            The values of each.
+        """
+        from ..tuning import costs
+
+        # one weight for all of them: that of the first
+        found = costs([self.controller(values) for values in several], self.model)
+        return [float(cost) for cost in found]
+
+    def search(
+        self,
+        values: Mapping[str, Any],
+        evaluations: int,
+        seed: int,
+        progress: Callable[[int, int, float], None],
+    ) -> dict[str, Any]:
+        """`sewfast.tune` from these values on; of one that is interrupted the best so far.
+
+        Parameters
+        ----------
+        values : dict
+        evaluations, seed : int
+        progress : callable
+            Called with (done, total, lowest cost); a KeyboardInterrupt out of it ends the search.
+
+        Returns
+        -------
+        dict
+            ``values`` by name and whether it was ``interrupted``.
+
+        Raises
+        ------
+        SettingError
+            For evaluations or a seed out of range.
+        FitError
+            Where every controller diverges.
+        """
+        from ..tuning import tune
+
+        self.check_search(evaluations, seed)
+        start = self.controller(values)
+        try:
+            result = tune(
+                self.model, start=start, evaluations=evaluations, seed=seed, progress=progress
+            )
+        except Interrupted as stopped:
+            # when it was stopped cannot be repeated: these are values like any that a hand has set
+            return {"values": self._values_of(stopped.best), "interrupted": True}
+        found = self._values_of(result.controller)
+        self._found.append(_Found(found, result.controller, start, evaluations, seed))
+        return {
+            "values": found,
+            "interrupted": False,
+            "cost": result.cost,
+            "start_cost": result.start_cost,
+        }
+
+    @staticmethod
+    def check_search(evaluations: Any, seed: Any) -> None:
+        """Refuse what a search cannot begin with.
+
+        Raises
+        ------
+        SettingError
+        """
+        for name, value, low, high in (
+            ("evaluations", evaluations, 10, MOST_EVALUATIONS),
+            ("seed", seed, 0, 2**32 - 1),
+        ):
+            whole = isinstance(value, int) and not isinstance(value, bool)
+            if not (whole and low <= value <= high):
+                raise SettingError(
+                    f"{name}: expected a whole number from {low} to {high}, received "
+                    f"{str(value)[:40]!r}"
+                )
+
+    def _values_of(self, controller: Controller) -> dict[str, float]:
+        values = {**vars(controller), **controller.gains.to_dict()}
+        return {knob.name: float(values[knob.name]) for knob in self.knobs}
+
+    def _search_of(self, values: Mapping[str, Any]) -> _Found | None:
+        given = dict(values)
+        return next((found for found in self._found if found.values == given), None)
+
+    # --- Copies -----------------------------------------------------------------------------------
+
+    def python(self, values: Mapping[str, Any], file: str) -> str:
+        """A script that writes the same controller file, run in the project folder."""
+        lines = ["import math", "", "import sewfast", ""]
+        lines.append(f"model = sewfast.load_model({self.name!r})")
+        found = self._search_of(values)
+        if found is None:
+            lines.append(f"controller = {_call(self.controller(values))}")
+        else:
+            lines.append(f"start = {_call(found.start)}")
+            call = f"model, start=start, evaluations={found.evaluations}, seed={found.seed}"
+            lines.append(f"controller = sewfast.tune({call}).controller")
+        lines += [f"controller.save({file!r})", "print(sewfast.analyse(controller, model))"]
+        return "\n".join(lines) + "\n"
+
+    def commands(self, values: Mapping[str, Any], file: str) -> str:
+        """The same for a shell in the project folder."""
+        found = self._search_of(values)
+        model = _word(self.name)
+        if found is None:
+            written, lines = file, []
+        else:
+            written = f"start-{file}"
+            search = f"--evaluations={found.evaluations} --seed={found.seed}"
+            lines = [f"sewfast tune {model} --start {written} {search} -o {file}"]
+        first = self.controller(values) if found is None else found.start
+        document = [f"cat > {written} <<'END'", _document(first), "END"]
+        return "\n".join([*document, *lines, f"sewfast analyse {file} {model}"]) + "\n"
+
+
+def _factors(name: str, unit: str, value: float) -> Knob:
+    """From a quarter to four times: bounds about a sane point."""
+    return Knob(name, unit, value, 0.25 * value, 4.0 * value, log=True)
+
+
+def _margins(bode: LoopBode) -> dict[str, Any]:
+    """Of each number the worst member's."""
+    rows = bode.margins
+    stable = all(row.stable for row in rows)
+    crossovers = [w for row in rows for w in row.gain_crossovers]
+    return {
+        "stable": stable,
+        "Ms": max(row.Ms for row in rows),
+        "Mt": max(row.Mt for row in rows),
+        "gain_margin": min(row.gain_margin for row in rows),
+        "phase_margin_deg": min(row.phase_margin_deg for row in rows),
+        "delay_margin_ms": 1e3 * min(row.delay_margin_s for row in rows),
+        "noise_gain": max(row.noise_gain for row in rows),
+        "crossover_hz": max(crossovers) / (2.0 * math.pi) if crossovers else math.nan,
+    }
+
+
+def _bode_curves(bode: LoopBode) -> dict[str, FloatArray]:
+    curves = {"hertz": bode.hertz}
+    for name in "LST":
+        size = np.maximum(np.abs(getattr(bode, name)), 1e-300)
+        curves |= _band(f"{name}_db", 20.0 * np.log10(size))
+    phase = np.degrees(np.unwrap(np.angle(bode.L), axis=1))
+    curves |= _band("L_deg", np.where(20.0 * np.log10(np.abs(bode.L)) > READABLE_DB, phase, np.nan))
+    return curves
+
+
+def _band(name: str, rows: FloatArray) -> dict[str, FloatArray]:
+    """Median, lowest and highest of the members; of one member its curve alone."""
+    if len(rows) == 1:
+        return {name: rows[0]}
+    found = {name: np.median(rows, axis=0)}
+    return found | {f"{name}_low": rows.min(axis=0), f"{name}_high": rows.max(axis=0)}
+
+
+def _worst(found: Responses, name: str) -> float | None:
+    """The largest of all members; None where one has none, such as a rise that does not end."""
+    values = [row[name] for row in found.metrics()]
+    return None if None in values else max((v for v in values if v is not None), key=abs)
+
+
+def _call(controller: Controller) -> str:
+    """The call that makes a controller, with every bit of its numbers."""
+    gains = controller.gains
+    numbers = ", ".join(_number(getattr(gains, name)) for name in ("Kp", "Ti", "Td"))
+    units = f"u_unit={gains.u_unit!r}, y_unit={gains.y_unit!r}"
+    plain = type(controller)(gains=gains)
+    others = {
+        name: value
+        for name, value in vars(controller).items()
+        if name != "gains" and (name == "Ts" or value != getattr(plain, name))
+    }
+    rows = [f"    gains=sewfast.Gains.standard({numbers}, {units}),"]
+    rows += [f"    {name}={_number(value)}," for name, value in others.items()]
+    return "\n".join(["sewfast.Controller(", *rows, ")"])
+
+
+def _number(value: Any) -> str:
+    if isinstance(value, float) and math.isinf(value):
+        return "math.inf" if value > 0 else "-math.inf"
+    return repr(value)
+
+
+def _document(controller: Controller) -> str:
+    """The text of its file."""
+    from ..control.controller import FORMAT, VERSION
+
+    return json.dumps({"format": FORMAT, "version": VERSION, **controller.to_dict()}, indent=1)
+
+
+def _word(text: str) -> str:
+    return shlex.quote(f"./{text}" if text.startswith("-") else text)
