@@ -147,7 +147,7 @@ bode: $(VENV)/bench.stamp ## frequency responses and shafts of machines whose tr
 	$(BIN)/python benches/bode.py --held --count 20
 
 physics: $(VENV)/bench.stamp ## parameters of motors whose truth is known (docs/physics.md)
-	$(BIN)/python benches/physics.py --count 40 --mujoco 20 --logs 200
+	$(BIN)/python benches/physics.py --count 40 --mujoco 20 --logs 200 --tracked 24
 
 drives: $(VENV)/bench.stamp ## commissioning on drives of another simulator (ONLY="shaft60 lash", SEEDS=)
 	$(BIN)/python benches/drives.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))

@@ -3,6 +3,7 @@
     python benches/physics.py --count 40             virtual machines, 20 s at 1 kHz, 1,572 counts
     python benches/physics.py --mujoco 20            one hinge in MuJoCo, damped and rubbing
     python benches/physics.py --logs 200             logs at 20 ms with gaps, spikes, wrong signs
+    python benches/physics.py --tracked 24           followed online: false alarms, J +10 % seen
 
 Errors are in percent of the truth (delay in samples); `inside` counts 95 % intervals that hold it.
 """
@@ -19,6 +20,7 @@ import numpy as np
 import sewfast
 from sewfast import _core
 from sewfast.errors import DataError, FitError
+from sewfast.greybox import Tracker
 from sewfast.speed import speed_from_counts
 
 SI = ("resistance_ohm", "motor_constant", "inertia", "coulomb_torque", "viscous_friction")
@@ -200,6 +202,40 @@ def logs(count: int) -> Iterator[str]:
             yield "within 5 %" if max(o for o in off if o is not None) < 0.05 else "OFF"
 
 
+def tracked(count: int, seconds: float) -> None:
+    """Machines followed from 5 s on; the same with a tenth more inertia from then on."""
+    start, false, seen, share = 5000, dict.fromkeys(("k_v", "k_a", "k_s"), 0), [], []
+    for seed in range(200, 200 + count):
+        machine = sewfast.VirtualMachine(seed)
+        heavier = {**machine.parameters, "inertia": 1.1 * machine.parameters["inertia"]}
+        u = steps(seconds, 0.001, seed)
+        ys = []
+        for one in (machine, sewfast.VirtualMachine(parameters=heavier)):
+            one.reset()
+            ys.append(np.diff(one.run(u).counts, prepend=0) / 1572 * math.tau / 0.001)
+        lag = truths(machine.parameters)["electrical_lag"]
+        for y, is_same in zip(ys, (True, False), strict=True):
+            tracker = Tracker(Ts=0.001, speed=300.0, lag=lag)
+            tracker.run(u[:start], ys[0][:start])
+            tracker.watch()
+            reference = tracker.estimate["k_a"]
+            track = tracker.run(u[start:], y[start:])
+            if is_same:
+                for name in false:
+                    false[name] += int(np.sum(np.diff(track.moved[name].astype(int)) == 1))
+                share.append(100 * float(track.estimates["k_a"].std()) / reference)
+            else:
+                at = np.flatnonzero(track.moved["k_a"])
+                seen.append(float(at[0]) / 1000 if len(at) else math.inf)
+    hours = count * (seconds - 5.0) / 3600
+    print(
+        f"{count} machines followed for {seconds:g} s: false alarms {false} in {hours:.1f} h, "
+        f"k_a within {np.median(share):.2f} % (standard deviation, median)\n"
+        f"  a tenth more inertia seen after {np.median(seen):.1f} s median, {max(seen):.1f} worst; "
+        f"within 2 s {sum(s <= 2 for s in seen)}/{count}"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=0)
@@ -207,11 +243,14 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--mujoco", type=int, default=0)
     parser.add_argument("--logs", type=int, default=0)
+    parser.add_argument("--tracked", type=int, default=0)
     args = parser.parse_args()
     if args.count:
         virtual(args.count, args.first, args.seconds)
     if args.mujoco:
         simulated(args.mujoco, args.seconds)
+    if args.tracked:
+        tracked(args.tracked, 120.0)
     if args.logs:
         found = list(logs(args.logs))
         print(f"{args.logs} logs at 20 ms")

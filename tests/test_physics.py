@@ -17,6 +17,7 @@ import sewfast
 from sewfast import Motor, VirtualMachine, load_motor, physics
 from sewfast.cli import main
 from sewfast.errors import DataError, FitError, ModelFileError, SettingError, SewfastError
+from sewfast.greybox import Tracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benches"))
 from physics import recorded, steps, truths
@@ -206,6 +207,61 @@ def test_hostile_records_end_in_a_motor_or_a_refusal(values: list[float], Ts: fl
     with suppress(SewfastError):
         data = sewfast.Dataset.from_arrays(u, values, Ts, output_unit="rpm")
         assert isinstance(physics(data), Motor)
+
+
+# --- While it runs --------------------------------------------------------------------------------
+
+
+def speeds(machine: VirtualMachine, u: Any) -> Any:
+    machine.reset()
+    return np.diff(machine.run(u).counts, prepend=0) / 1572 * 2 * np.pi / 0.001
+
+
+def test_a_heavier_load_is_seen_while_it_runs_and_nothing_else() -> None:
+    machine = VirtualMachine(204)
+    heavier = VirtualMachine(
+        parameters={**machine.parameters, "inertia": 1.1 * machine.parameters["inertia"]}
+    )
+    u, truth = steps(30.0, 0.001, 204), truths(machine.parameters)
+    y, other = speeds(machine, u), speeds(heavier, u)
+    tracker = Tracker(Ts=0.001, speed=300.0, lag=truth["electrical_lag"])
+    with pytest.raises(DataError, match="too few samples"):
+        tracker.watch()
+    tracker.run(u[:5000], y[:5000])
+    assert tracker.estimate["k_a"] == pytest.approx(truth["k_a"], rel=0.03)
+    assert tracker.deviation["k_a"] < 0.03 * truth["k_a"]
+    tracker.watch()
+    track = tracker.run(u[5000:], y[5000:])
+    assert not any(m.any() for m in track.moved.values())
+    assert tracker.moved == ()
+    tracker.reset()
+    track = tracker.run(u, other)
+    assert track.moved["k_a"].any()
+    assert not track.moved["k_v"].any()
+    assert track.estimates["k_a"][5000:].mean() == pytest.approx(1.1 * truth["k_a"], rel=0.03)
+
+
+def test_one_sample_at_a_time_is_the_same() -> None:
+    u, y = linear(3000, 0.001)
+    one, other = (Tracker(Ts=0.001, speed=300.0) for _ in range(2))
+    track = one.run(u, y)
+    for a, b in zip(u, y, strict=True):
+        other.step(a, b)
+    assert other.estimate == one.estimate
+    assert {n: v[-1] for n, v in track.estimates.items()} == one.estimate
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"Ts": 0.0}, {"speed": -1.0}, {"lag": float("nan")}, {"memory": 0.01}]
+)
+def test_a_tracker_refuses_what_it_cannot_use(wrong: dict[str, float]) -> None:
+    with pytest.raises(SettingError):
+        Tracker(**{"Ts": 0.001, "speed": 300.0, **wrong})
+    tracker = Tracker(Ts=0.001, speed=300.0)
+    with pytest.raises(SettingError, match="k_v"):
+        tracker.watch({"J": 1.0})
+    with pytest.raises(DataError):
+        tracker.run(np.zeros(3), np.zeros(4))
 
 
 # --- What can be made of it -----------------------------------------------------------------------

@@ -112,6 +112,25 @@ def greybox_run(
 ) -> tuple[_F, _F, _F, _F]:
     """Speed [rad/s] and drive [command] (N,), and their derivatives by the free parameters (N, n_free)."""
 
+@final
+class Tracker:
+    """Motor parameters followed online: ``k_v``, ``k_a``, ``k_s``, ``offset``."""
+
+    def __new__(
+        cls, *, Ts: float, smoothing: float, lag: float, memory: float, speed: float
+    ) -> Tracker: ...
+    def reset(self) -> None: ...
+    def step(self, u: float, y: float) -> None: ...
+    def run(self, u: _F, y: _F) -> tuple[_F, NDArray[np.bool_]]:
+        """Estimates and what has moved after each sample, (N, 4)."""
+    @property
+    def estimate(self) -> list[float]: ...
+    @property
+    def variance(self) -> list[float]: ...
+    @property
+    def moved(self) -> list[bool]: ...
+    def watch(self, reference: Sequence[float], tolerance: Sequence[float]) -> None: ...
+
 # --- models.rs --------------------------------------------------------------------------------------------
 
 @final

@@ -16,6 +16,7 @@ pub mod ramp;
 pub mod real;
 pub mod refused;
 pub mod schedule;
+pub mod tracker;
 
 pub use controller::{Controller, Numbers};
 pub use design::Design;
@@ -27,3 +28,4 @@ pub use ramp::Ramp;
 pub use real::Real;
 pub use refused::Refused;
 pub use schedule::{POINTS, Point, Row, Schedule};
+pub use tracker::{Listening, TRACKED, Tracker};

@@ -1,7 +1,8 @@
-//! Bindings of the core's grey-box motor.
+//! Bindings of the grey-box motor and of the tracker.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1};
 use pyo3::prelude::*;
+use sewfast_control::{Listening, TRACKED, Tracker as Core};
 use sewfast_core::Error;
 use sewfast_core::greybox::{self, PARAMETERS, Run};
 
@@ -10,6 +11,7 @@ use crate::watch::watched_over;
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("GREYBOX_PARAMETERS", PARAMETERS)?;
+    module.add_class::<Tracker>()?;
     module.add_function(wrap_pyfunction!(greybox_run, module)?)
 }
 
@@ -65,4 +67,105 @@ fn greybox_run<'py>(
         array2(py, found.speed_by, columns)?,
         array2(py, found.drive_by, columns)?,
     ))
+}
+
+#[pyclass(module = "sewfast._core")]
+pub struct Tracker(Core<f64>);
+
+#[pymethods]
+#[allow(non_snake_case)]
+impl Tracker {
+    #[new]
+    #[pyo3(signature = (*, Ts, smoothing, lag, memory, speed))]
+    fn new(
+        py: Python<'_>,
+        Ts: f64,
+        smoothing: f64,
+        lag: f64,
+        memory: f64,
+        speed: f64,
+    ) -> PyResult<Self> {
+        let of = Listening {
+            ts: Ts,
+            smoothing,
+            lag,
+            memory,
+            speed,
+        };
+        Core::new(of).map(Self).map_err(|e| refused(py, e))
+    }
+
+    fn reset(&mut self) {
+        self.0.reset();
+    }
+
+    fn step(&mut self, u: f64, y: f64) {
+        self.0.step(u, y);
+    }
+
+    fn run<'py>(
+        &mut self,
+        py: Python<'py>,
+        u: PyReadonlyArray1<'py, f64>,
+        y: PyReadonlyArray1<'py, f64>,
+    ) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<bool>>)> {
+        let (u, y) = (slice(&u, "u")?, slice(&y, "y")?);
+        if u.len() != y.len() {
+            let message = format!(
+                "expected as many commands as speeds, got {} and {}",
+                u.len(),
+                y.len()
+            );
+            return Err(raise(py, Error::data(message)));
+        }
+        let core = &mut self.0;
+        let (estimates, moved) = watched_over(py, u.len(), |monitor| {
+            let mut estimates = Vec::with_capacity(TRACKED * u.len());
+            let mut moved = Vec::with_capacity(TRACKED * u.len());
+            for (k, (&u, &y)) in u.iter().zip(y).enumerate() {
+                if k % 1000 == 0 && monitor.stopped() {
+                    return Err(Error::fit(
+                        "expected to be left alone, got a request to stop",
+                    ));
+                }
+                core.step(u, y);
+                estimates.extend(core.estimate());
+                moved.extend(core.moved());
+            }
+            Ok((estimates, moved))
+        })?;
+        use numpy::PyArrayMethods;
+        let rows = moved.len() / TRACKED;
+        let moved = PyArray1::from_vec(py, moved).reshape([rows, TRACKED])?;
+        Ok((array2(py, estimates, TRACKED)?, moved))
+    }
+
+    #[getter]
+    fn estimate(&self) -> [f64; TRACKED] {
+        self.0.estimate()
+    }
+
+    #[getter]
+    fn variance(&self) -> [f64; TRACKED] {
+        self.0.variance()
+    }
+
+    #[getter]
+    fn moved(&self) -> [bool; TRACKED] {
+        self.0.moved()
+    }
+
+    fn watch(
+        &mut self,
+        py: Python<'_>,
+        reference: [f64; TRACKED],
+        tolerance: [f64; TRACKED],
+    ) -> PyResult<()> {
+        let set = self.0.watch(reference, tolerance);
+        set.map_err(|e| refused(py, e))
+    }
+}
+
+fn refused(py: Python<'_>, refused: sewfast_control::Refused) -> PyErr {
+    raise(py, Error::setting(refused.to_string()))
 }

@@ -1,0 +1,169 @@
+"""`Tracker`: a motor's parameters while it runs, and an alarm where one of them drifts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .. import _core
+from ..arrays import FloatArray, as_column
+from ..errors import DataError, SettingError
+
+NAMES = ("k_v", "k_a", "k_s", "offset")
+TOLERANCE = {"k_v": 0.05, "k_a": 0.03, "k_s": 0.4}
+"""Shares of the reference that a parameter may move by without an alarm."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """What a tracker followed.
+
+    Attributes
+    ----------
+    estimates : mapping of array, shape (N,)
+        By name after each sample, in the tracker's units.
+    moved : mapping of array of bool, shape (N,)
+        By name whether it lies clearly outside its tolerance.
+    """
+
+    estimates: Mapping[str, FloatArray]
+    moved: Mapping[str, NDArray[np.bool_]]
+
+
+class Tracker:
+    """`u = k_v w + k_a dw/dt + k_s sign(w) + offset`, followed by least squares with forgetting.
+
+    The same arithmetic is in the `no_std` crate for firmware (`sewfast_control::Tracker`); signals
+    pass two lags before they are compared, the covariance is kept as `U D U'` [1]_.
+
+    Parameters
+    ----------
+    Ts : float
+        Sample time [s].
+    speed : float
+        The largest speed, in the unit in which speeds come: a scale, no limit.
+    lag : float
+        Electrical lag [s], as `Motor` tells it; 0 where it is not known biases `k_a`.
+    smoothing : float
+        Of each lag [s]; some 20 samples, well below the motor's time constant.
+    memory : float
+        Over which the past fades [s].
+
+    Raises
+    ------
+    SettingError
+        For numbers out of range.
+
+    References
+    ----------
+    .. [1] G. J. Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter V.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sewfast.greybox import Tracker
+    >>> u = np.repeat([5.0, -3.0, 8.0, -6.0, 2.0], 400)
+    >>> w = np.zeros(len(u))
+    >>> for k in range(1, len(u)):
+    ...     w[k] = w[k - 1] + 0.001 * (u[k - 1] - 0.02 * w[k - 1]) / 0.006
+    >>> tracker = Tracker(Ts=0.001, speed=300.0)
+    >>> track = tracker.run(u, w)
+    >>> round(tracker.estimate["k_a"], 4)
+    0.006
+    """
+
+    def __init__(
+        self,
+        *,
+        Ts: float,
+        speed: float,
+        lag: float = 0.0,
+        smoothing: float = 0.02,
+        memory: float = 0.65,
+    ) -> None:
+        self._core = _core.Tracker(
+            Ts=float(Ts), smoothing=float(smoothing), lag=float(lag), memory=float(memory),
+            speed=float(speed),
+        )  # fmt: skip
+
+    def reset(self) -> None:
+        """Forget the past; what is watched stays."""
+        self._core.reset()
+
+    def step(self, u: float, y: float) -> None:
+        """Take the mean speed over the sample before, and the command that acts from now on.
+
+        A sample that is not finite is passed over.
+        """
+        self._core.step(u, y)
+
+    def run(self, u: ArrayLike, y: ArrayLike) -> Track:
+        """Take many samples, shape (N,).
+
+        Raises
+        ------
+        DataError
+            Where the two differ in length or are no columns of numbers.
+        """
+        command = as_column(u, "u")
+        estimates, moved = self._core.run(command, as_column(y, "y", len(command)))
+        return Track(
+            {n: estimates[:, j] for j, n in enumerate(NAMES)},
+            {n: moved[:, j] for j, n in enumerate(NAMES)},
+        )
+
+    @property
+    def estimate(self) -> dict[str, float]:
+        """`k_v`, `k_a`, `k_s`, `offset`: command per speed, per speed a second, and commands."""
+        return dict(zip(NAMES, self._core.estimate, strict=True))
+
+    @property
+    def deviation(self) -> dict[str, float]:
+        """Their standard deviations; inf until something is known."""
+        return {n: math.sqrt(v) for n, v in zip(NAMES, self._core.variance, strict=True)}
+
+    @property
+    def moved(self) -> tuple[str, ...]:
+        """Parameters beyond their tolerance by three standard deviations, ten updates in a row."""
+        return tuple(n for n, moved in zip(NAMES, self._core.moved, strict=True) if moved)
+
+    def watch(
+        self,
+        reference: Mapping[str, float] | None = None,
+        *,
+        tolerance: Mapping[str, float] | None = None,
+    ) -> None:
+        """Raise an alarm (`moved`) from now on where a parameter leaves its reference.
+
+        Parameters
+        ----------
+        reference : mapping of float by name, optional
+            What it is compared with; None is the estimate of now, which has the same small biases
+            as those to come.
+        tolerance : mapping of float by name, optional
+            Shares of the reference, `{"k_v": .05, "k_a": .03, "k_s": .4}` by default; a parameter
+            without one is not watched.
+
+        Raises
+        ------
+        DataError
+            Where there is no estimate yet.
+        SettingError
+            For a name that is none, or numbers out of range.
+        """
+        if reference is None and not all(map(math.isfinite, self.deviation.values())):
+            raise DataError(
+                "expected an estimate to watch from, received too few samples; let it run for a "
+                "second of motion, or pass a reference"
+            )
+        at = self.estimate if reference is None else dict(reference)
+        shares = TOLERANCE if tolerance is None else dict(tolerance)
+        for name in (*at, *shares):
+            if name not in NAMES:
+                raise SettingError(f"expected parameters of {', '.join(NAMES)}, received {name!r}")
+        allowed = [abs(shares[n] * at[n]) if n in shares and n in at else math.inf for n in NAMES]
+        self._core.watch([at.get(n, 0.0) for n in NAMES], allowed)
