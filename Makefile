@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors fleet bits bode physics killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors fleet studio bits bode physics killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -58,6 +58,9 @@ rust-test: $(DEV) ## unit, property and documentation tests of the crates (SEED=
 
 fleet: $(DEV) ## 2,000 recordings on one worker and on two, and with a worker killed every 10 s
 	$(BIN)/python benches/fleet.py
+
+studio: $(DEV) ## the studio in a real browser: from a slider's event to painted plots
+	$(BIN)/python benches/studio.py
 
 bits: $(DEV) ## deployed code against the core over ten million samples of every kind (an hour)
 	$(BIN)/python tests/deployed.py

@@ -1,0 +1,114 @@
+"""The studio in a real browser: from a slider's event to painted plots, first picture, page bytes.
+
+Four members, 4,000 samples a loop. Needs the extra `studio`, selenium, chromium and chromedriver.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from selenium import webdriver
+from selenium.webdriver.common.keys import Keys
+
+from sewfast.studio import Project, Studio, make_demo
+from sewfast.studio.server import PAGE
+
+PRESSES = 150
+DRAG_EVENTS = 300
+BETWEEN_PRESSES = 0.06
+"""Seconds."""
+SAMPLES = 1000
+"""After the step; four times as many are simulated."""
+
+DRAG = """
+const slider = document.getElementById("knob-Kp"), done = arguments[0];
+let k = 0;
+const next = () => {
+  slider.value = .5 + .3 * Math.sin(k / 20);
+  slider.dispatchEvent(new Event("input"));
+  if (++k < %d) requestAnimationFrame(next); else setTimeout(done, 500);
+};
+requestAnimationFrame(next);
+"""
+LISTEN = "window.taken = []; document.addEventListener('drawn', e => window.taken.push(e.detail));"
+FIRST = "return performance.getEntriesByName('first-contentful-paint')[0].startTime"
+BYTES = """
+return performance.getEntriesByType('resource').reduce((n, e) => n + e.decodedBodySize, 0)
+  + performance.getEntriesByType('navigation')[0].decodedBodySize;
+"""
+
+
+def browser() -> Any:
+    options = webdriver.ChromeOptions()
+    options.binary_location = str(shutil.which("chromium"))
+    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1600,1000"):
+        options.add_argument(argument)
+    service = webdriver.ChromeService(executable_path=shutil.which("chromedriver"))
+    return webdriver.Chrome(options=options, service=service)
+
+
+def spread(values: Any) -> dict[str, float]:
+    found = np.asarray(values)
+    return {
+        "n": len(found),
+        "median_ms": round(float(np.median(found)), 1),
+        "p95_ms": round(float(np.quantile(found, 0.95)), 1),
+        "max_ms": round(float(found.max()), 1),
+    }
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        make_demo(folder)
+        project = Project(folder, demo=True)
+        tuning = project.tuning("drive.json")
+        tuning.steps = replace(tuning.steps, samples=SAMPLES)
+        moves = []
+        for k in range(PRESSES):
+            began = time.perf_counter()
+            tuning.move({"Kp": tuning.start.gains.Kp * (1.0 + 0.002 * k)})
+            moves.append(1e3 * (time.perf_counter() - began))
+        with Studio(project) as studio:
+            page = browser()
+            try:
+                found = {"server": spread(moves), **measured(page, studio)}
+            finally:
+                page.quit()
+    print(json.dumps(found, indent=1))
+
+
+def measured(page: Any, studio: Studio) -> dict[str, Any]:
+    began = time.perf_counter()
+    page.get(studio.address)
+    while not page.execute_script("return document.querySelectorAll('#numbers td').length"):
+        time.sleep(0.01)
+    numbers = time.perf_counter() - began
+    time.sleep(2.0)
+    page.execute_script(LISTEN)
+    slider = page.find_element("id", "knob-Kp")
+    for k in range(PRESSES):
+        slider.send_keys(Keys.ARROW_RIGHT if k // 25 % 2 == 0 else Keys.ARROW_LEFT)
+        time.sleep(BETWEEN_PRESSES)
+    time.sleep(1.0)
+    keys = page.execute_script("return window.taken.splice(0)")
+    page.set_script_timeout(60)
+    page.execute_async_script(DRAG % DRAG_EVENTS)
+    drag = page.execute_script("return window.taken.splice(0)")
+    return {
+        "key": spread(keys),
+        "drag": spread(drag),
+        "first_paint_ms": page.execute_script(FIRST),
+        "numbers_after_s": round(numbers, 2),
+        "page_bytes": page.execute_script(BYTES),
+        "files": len(PAGE),
+    }
+
+
+if __name__ == "__main__":
+    main()
