@@ -481,11 +481,16 @@ def test_ctrl_c_ends_it_cleanly(folder: Path) -> None:
         command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
-        address = process.stdout.readline()
-        assert address.startswith("http://127.0.0.1:")
-        process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=20)
+        address, _, token = process.stdout.readline().rstrip().partition("/#")
+        place = address.replace("http", "ws") + "/socket"
+        with websockets.connect(place, origin=address) as deaf:
+            deaf.send(token)
+            deaf.recv()
+            began = time.monotonic()
+            process.send_signal(signal.SIGINT)
+            _, err = process.communicate(timeout=20)
     assert (process.returncode, err) == (0, "")
+    assert time.monotonic() - began < 5.0
 
 
 # --- In a browser ---------------------------------------------------------------------------------

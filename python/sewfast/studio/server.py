@@ -33,6 +33,9 @@ LARGEST_MESSAGE = 64 * 1024
 PATIENCE = 5.0
 """Seconds that a socket has for its token."""
 
+FAREWELL = 1.0
+"""Seconds that a page has to answer the end of its socket."""
+
 BETWEEN_REPORTS = 0.05
 """Seconds between two messages of a job's progress."""
 WRITES = ("identify", "cancel", "tune_search", "tune_save")
@@ -104,7 +107,7 @@ class Studio:
         try:
             self._server = serve(
                 self._talk, ADDRESS, port, process_request=self._admit, max_size=LARGEST_MESSAGE,
-                server_header=None, compression=None, logger=silent,
+                server_header=None, compression=None, close_timeout=FAREWELL, logger=silent,
             )  # fmt: skip
         except OSError as e:
             if e.errno not in (errno.EADDRINUSE, errno.EACCES):
@@ -125,8 +128,12 @@ class Studio:
         self._server.serve_forever()
 
     def close(self) -> None:
-        """End a running job and every socket."""
+        """End a running job and every socket, also those of pages that no longer answer."""
         self._cancel.set()
+        with self._lock:
+            pages = list(self._pages)
+        for page in pages:
+            page.close(1001, "the studio has ended")
         self._server.shutdown()
         if self._job is not None:
             self._job.join()
