@@ -355,7 +355,8 @@ def test_on_the_command_line(
     monkeypatch.chdir(tmp_path)
     record[1].save("run.csv")
     words = ["physics", "run.csv", "--input", "u", "--counts", "counts", "--counts-per-rev", "1572"]
-    assert main([*words, "-o", "motor.json", "--export", "wpilib", "gains.json"]) == 0
+    words += ["-o", "motor.json"]
+    assert main([*words, "--export", "wpilib", "gains.json", "--model", "model.json"]) == 0
     shown = capsys.readouterr().out
     assert "k_v" in shown
     assert "written to motor.json" in shown
@@ -365,5 +366,16 @@ def test_on_the_command_line(
     assert found["parameters"]["k_v"] == vars(load_motor("motor.json").parameters["k_v"])
     assert main(["record", "--on", "motor.json", "--signal", "step", "-o", "twin.csv"]) == 0
     assert Path("twin.csv").exists()
+    gains = sewfast.Gains.standard(Kp=0.01, Ti=0.2, Td=0.0)
+    sewfast.Controller(
+        gains, Ts=0.001, u_min=-20, u_max=20, counts_per_rev=1572, filter_samples=4
+    ).save("controller.json")
+    capsys.readouterr()
+    errors = []
+    for machine in ("motor.json", "model.json", "virtual:11"):
+        run = ["run", "controller.json", "--on", machine, "--reference", "trapezoid", "--json"]
+        assert main(run) == 0
+        errors.append(json.loads(capsys.readouterr().out)["rmse"])
+    assert errors[:2] == pytest.approx([errors[2]] * 2, rel=0.1)
     assert main([*words, "--export", "simulink", "x"]) != 0
     assert "wpilib" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -185,12 +186,16 @@ def _warnings(found: ClosedLoopRun, plant: Plant | None) -> tuple[Line, ...]:
 
 
 def plant_of(text: str) -> Plant:
-    """`virtual`, `virtual:SEED`, else a model file."""
+    """`virtual`, `virtual:SEED`, `virtual?NAME=VALUE`, a motor's twin, else a model file."""
+    from .. import storage
+    from ..greybox.motor import FORMAT, load_motor
     from ..machine import VirtualMachine
     from ..models import load_model
 
-    if text.split(":")[0] == "virtual" and not Path(text).exists():
+    if re.match(r"virtual(?![\w.])", text) and not Path(text).exists():
         return VirtualMachine.from_name(text)
+    if storage.format_of(text) == FORMAT:
+        return load_motor(text).machine()
     return load_model(text)
 
 

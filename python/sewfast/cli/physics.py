@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .. import storage
@@ -61,6 +62,10 @@ def add(commands: Commands) -> None:
         "--export", nargs=2, metavar=("TARGET", "FILE"),
         help="write settings for wpilib, mujoco or urdf",
     )  # fmt: skip
+    parser.add_argument(
+        "--model", metavar="FILE.json", type=Path,
+        help="write the turning motor as a linear model, to tune on",
+    )  # fmt: skip
     add_output(parser, "FILE.json", "write the motor")
     add_plot(parser, "draw the free run and what it takes to hold a speed")
     add_columns(parser, from_model=False)
@@ -70,6 +75,7 @@ def command(args: argparse.Namespace) -> None:
     from ..greybox import physics
 
     require_place(args.out, (".json",))
+    require_place(args.model, (".json",), option="--model")
     require_plot(args.plot)
     target, place = args.export or (None, "")
     if target not in (None, "wpilib", "mujoco", "urdf"):
@@ -87,13 +93,15 @@ def command(args: argparse.Namespace) -> None:
         motor.save(args.out)
     if text:
         storage.replace(place, text)
+    if args.model is not None:
+        motor.to_model().save(args.model)
     if args.plot is not None:
         motor.plot(file=args.plot)
     if args.json:
         print_json(motor.to_dict())
         return
     print(motor)
-    for path in (args.out, place, args.plot):
+    for path in (args.out, place, args.model, args.plot):
         if path:
             print(f"written to {path}")
 

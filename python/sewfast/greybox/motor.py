@@ -144,11 +144,17 @@ class Motor:
         theta = np.array([*np.log([gain, *lags]), of["delay"] / self.Ts])
         return sampled_model(theta, self.Ts, self.u_unit, self.speed_unit)
 
-    def machine(self) -> VirtualMachine:
+    def machine(self, *, u_limit: float | None = None) -> VirtualMachine:
         """A virtual machine that behaves so under commands: a twin to tune and rehearse on.
 
         Where R, Ke and J are not known each for itself, it has some that make the same speed; its
         current is then in no unit. It has no dead time beyond the hold.
+
+        Parameters
+        ----------
+        u_limit : float, optional
+            Where the drive clips the command, which a record does not tell; by default it hardly
+            does.
 
         Raises
         ------
@@ -161,16 +167,16 @@ class Motor:
         scales += [(g, r) for g in (15.0, 1.0, 100.0) for r in (10.0, 1.0, 100.0, 1000.0)]
         for volts, ohms in scales:
             try:
-                return self._twin(volts, ohms)
+                return self._twin(volts, ohms, u_limit)
             except SettingError as e:
                 refused = refused or e
         raise SettingError(f"this motor lies outside virtual machines: {refused}")
 
-    def _twin(self, volts: float, ohms: float) -> VirtualMachine:
+    def _twin(self, volts: float, ohms: float, u_limit: float | None) -> VirtualMachine:
         of = dict(zip(NAMES, self.theta, strict=True))
         constant = of["k_e"] * volts  # V s/rad, which is N m/A
         torque = constant * volts / ohms  # N m per unit of command
-        drop, pwm, bus = of["drop"] * volts, 1e4, max(2.0 * self.u_limit * volts, 1.0)
+        drop, pwm, bus = of["drop"] * volts, 1e4, 2000.0
         first = math.hypot(of["load_1c"], of["load_1s"])
         second = math.hypot(of["load_2c"], of["load_2s"])
         wave = math.hypot(of["inertia_2c"], of["inertia_2s"])
@@ -200,7 +206,7 @@ class Motor:
             "encoder_phase": 0.5,
             "counts_per_rev": self.counts_per_rev or 1572.0,
         }
-        values["u_limit"] = max(self.u_limit, 0.1)
+        values["u_limit"] = min(bus / volts, 1000.0) if u_limit is None else u_limit
         machine = VirtualMachine(parameters=values)
         machine.set_load(of["offset"] * torque)
         return machine

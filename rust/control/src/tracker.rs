@@ -189,7 +189,7 @@ impl<T: Real> Tracker<T> {
             1
         };
         // six time constants until what was before the start has faded
-        if self.samples > 6 * self.every && self.samples % self.every == 0 {
+        if self.samples > 6 * self.every && self.samples.is_multiple_of(self.every) {
             self.update();
         }
     }

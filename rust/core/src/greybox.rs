@@ -211,7 +211,7 @@ fn check(task: &Run<'_>, u: &[f64]) -> Result<()> {
             task.sample_time, task.steps
         )));
     }
-    if !(task.theta[16] / task.sample_time < 1e9) {
+    if task.theta[16] / task.sample_time >= 1e9 {
         return Err(Error::setting(format!(
             "expected a delay below a billion samples, got {} s",
             task.theta[16]

@@ -69,6 +69,9 @@ fn greybox_run<'py>(
     ))
 }
 
+/// Estimates, and what has moved.
+type Followed<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<bool>>);
+
 #[pyclass(module = "sewfast._core")]
 pub struct Tracker(Core<f64>);
 
@@ -108,7 +111,7 @@ impl Tracker {
         py: Python<'py>,
         u: PyReadonlyArray1<'py, f64>,
         y: PyReadonlyArray1<'py, f64>,
-    ) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<bool>>)> {
+    ) -> PyResult<Followed<'py>> {
         let (u, y) = (slice(&u, "u")?, slice(&y, "y")?);
         if u.len() != y.len() {
             let message = format!(
