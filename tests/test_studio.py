@@ -38,11 +38,13 @@ STEP = {"file": "run.csv", "inputs": ["u"], "output": "y", "resample": 0.02, "mo
 def folder(tmp_path: Path) -> Path:
     excitation = sewfast.signals.excitation("saturating")[:6000]
     found = sewfast.record(sewfast.VirtualMachine(seed=1), excitation)
+    place = tmp_path / "machine"
+    place.mkdir()
     t = np.arange(len(found)) * found.Ts
     for name in ("run.csv", "run2.csv"):
         columns = {"t": t, "u": found.u, "y": found.y, EVIL: found.y}
-        sewfast.write_table(tmp_path / name, columns)
-    return tmp_path
+        sewfast.write_table(place / name, columns)
+    return place
 
 
 @pytest.fixture
@@ -390,6 +392,69 @@ def test_an_unstable_loop_is_said_to_be_one(tuned: Studio) -> None:
     assert found["Ms"] is None
 
 
+# --- Commissioning --------------------------------------------------------------------------------
+
+BRIEF = {"machine": "virtual:1", "seed": 0, "members": 1, "evaluations": 100}
+
+
+@pytest.mark.alone
+def test_the_machine_is_commissioned_and_the_copies_do_the_same(tuned: Studio) -> None:
+    folder = tuned.project.folder
+    place = folder / "commissioned" / "controllers" / "tuned.json"
+    with Page(tuned) as page:
+        assert page.ask("commission", **BRIEF)["found"] is None
+        assert page.event("progress")["best"] == "first motion"
+        found = page.hear(lambda m: m.get("event") == "commissioned", 120)["found"]
+        assert found["verdict"].startswith("verified")
+        names = [curve["name"] for curve in found["references"][0]["curves"]]
+        assert names == ["measured", "predicted"]
+        start = "commissioned/controllers/tuned.json"
+        asked = {"model": "commissioned/models/ensemble.json", "controller": start}
+        assert page.ask("tune_move", values={}, **asked)["found"]["stable"]
+    written = place.read_bytes()
+    shell = f'sewfast() {{ "{sys.executable}" -m sewfast "$@"; }}\n{found["commands"]}'
+    for command in ([sys.executable, "-c", found["python"]], ["sh", "-c", shell]):
+        place.unlink()
+        subprocess.run(command, cwd=folder, env=environment(), check=True, capture_output=True)
+        assert place.read_bytes() == written
+
+
+def test_a_cancelled_commissioning_writes_nothing(tuned: Studio) -> None:
+    with Page(tuned) as page:
+        page.ask("commission", **BRIEF)
+        page.event("progress")
+        page.ask("cancel")
+        assert "cancelled" in page.event("commissioned")["error"]
+    assert not (tuned.project.folder / "commissioned").exists()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"machine": "/dev/ttyUSB0"},
+        {"machine": "virtual?u_limit=1e9"},
+        {"machine": "virtual:1;touch hit"},
+        {"machine": 1},
+        {"seed": -1},
+        {"members": 10_000},
+        {"evaluations": 1.5},
+    ],
+)
+def test_no_other_machine_is_commissioned(tuned: Studio, wrong: dict[str, Any]) -> None:
+    with Page(tuned) as page:
+        assert page.ask("commission", **{**BRIEF, **wrong})["error"].startswith(next(iter(wrong)))
+
+
+def test_a_folder_of_somebody_else_is_left_alone(tuned: Studio) -> None:
+    outside = tuned.project.folder.parent / "outside"
+    outside.mkdir()
+    (tuned.project.folder / "commissioned").symlink_to(outside)
+    with Page(tuned) as page:
+        page.ask("commission", **BRIEF)
+        assert "a link" in page.event("commissioned")["error"]
+    assert list(outside.iterdir()) == []
+
+
 # --- Steps ----------------------------------------------------------------------------------------
 
 
@@ -604,6 +669,30 @@ def test_tuning_by_keyboard(tuned: Studio, browser: Any) -> None:
     for width in (1600, 1000, 600):
         browser.set_window_size(width, 900)
         assert browser.execute_script(WIDE) <= 0
+    assert browser.get_log("browser") == []
+
+
+@pytest.mark.alone
+def test_from_the_demo_to_a_verified_controller(tuned: Studio, browser: Any) -> None:
+    def at(name: str) -> Any:
+        return browser.find_element("id", name)
+
+    browser.get(tuned.address)
+    _until(lambda: browser.execute_script(NUMBER, "Ms"))
+    at("view-commission").click()
+    for name, value in (("machine-seed", "1"), ("networks", "1"), ("commission-tries", "100")):
+        at(name).clear()
+        at(name).send_keys(value)
+    at("commission-start").click()
+    _until(lambda: "verified" in at("commission-verdict").text, 120)
+    stages = at("stages").text
+    assert stages.startswith("first motion")
+    assert "verification" in stages
+    assert len(browser.find_elements("css selector", "#loops canvas")) == 4
+    if "STUDIO_PICTURES" in os.environ:
+        _take_pictures(browser, Path(os.environ["STUDIO_PICTURES"]), "commission", (1200,))
+    browser.set_window_size(600, 900)
+    assert browser.execute_script(WIDE) <= 0
     assert browser.get_log("browser") == []
 
 

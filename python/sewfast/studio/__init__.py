@@ -5,8 +5,8 @@ numbers do; `server` shows both to a browser on this machine and to nobody else;
 the browser loads.
 """
 
-from .project import Project, Step, make_demo
+from .project import Commission, Project, Step, make_demo
 from .server import Studio
 from .tuning import Tuning
 
-__all__ = ["Project", "Step", "Studio", "Tuning", "make_demo"]
+__all__ = ["Commission", "Project", "Step", "Studio", "Tuning", "make_demo"]

@@ -29,6 +29,8 @@ LARGEST = 512 * 2**20
 COLUMNS = 1200
 """Pairs of lowest and highest value in a drawn curve: about two a pixel of a wide window."""
 
+COMMISSIONED, _ARTEFACTS = "commissioned", ("controllers", "models")
+"""Folder that a commissioning fills, and where in it the documents are."""
 DEMO_MEMBERS, DEMO_SAMPLES = 4, 8000
 
 MODEL_FORMAT, CONTROLLER_FORMAT = "sewfast.model", "sewfast.controller"
@@ -84,6 +86,58 @@ class Step:
         whole = isinstance(seed, int) and not isinstance(seed, bool) and 0 <= seed < 2**32
         _require(whole, "seed", "a whole number from 0", seed)
         return cls(asked["file"], tuple(inputs), output or None, resample, model, seed)
+
+
+@dataclass(frozen=True)
+class Commission:
+    """Which virtual machine to commission, and with what effort.
+
+    Parameters
+    ----------
+    machine : str
+        ``virtual`` or ``virtual:SEED``.
+    seed, members, evaluations : int
+        As for `sewfast.commission`.
+    """
+
+    machine: str = "virtual"
+    seed: int = 0
+    members: int = 4
+    evaluations: int = 3000
+
+    @classmethod
+    def parse(cls, asked: dict[str, Any]) -> Commission:
+        """From a message; what is out of range is refused.
+
+        Raises
+        ------
+        SettingError
+        """
+        machine = asked.get("machine", "virtual")
+        named = isinstance(machine, str) and re.fullmatch(r"virtual(:\d{1,9})?", machine)
+        _require(bool(named), "machine", "virtual or virtual:SEED", machine)
+        numbers = {}
+        for name, low, high in (
+            ("seed", 0, 2**32 - 1), ("members", 1, 16), ("evaluations", 10, 20_000)
+        ):  # fmt: skip
+            value = asked.get(name, getattr(cls, name))
+            whole = isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
+            _require(whole, name, f"a whole number from {low} to {high}", value)
+            numbers[name] = value
+        return cls(str(machine), **numbers)
+
+    def python(self) -> str:
+        """A script that does it again, run in the project folder."""
+        call = f"machine, seed={self.seed}, members={self.members}, evaluations={self.evaluations}"
+        return (
+            f"import sewfast\n\nmachine = sewfast.VirtualMachine.from_name({self.machine!r})\n"
+            f"found = sewfast.commission({call})\nfound.save({COMMISSIONED!r})\nprint(found)\n"
+        )
+
+    def commands(self) -> str:
+        """The same for a shell in the project folder."""
+        effort = f"--members {self.members} --evaluations {self.evaluations} --seed {self.seed}"
+        return f"sewfast commission --on {self.machine} {effort} --out {COMMISSIONED}\n"
 
 
 def _require(ok: bool, name: str, expected: str, received: object) -> None:
@@ -160,14 +214,17 @@ class Project:
         )
 
     def documents(self, format: str) -> list[str]:
-        """Names of the JSON files of a format in the folder itself, sorted."""
+        """Names of the JSON files of a format, sorted: in the folder itself and commissioned."""
+        places = [self.folder, *(self.folder / COMMISSIONED / name for name in _ARTEFACTS)]
         return sorted(
-            entry.name
-            for entry in self.folder.iterdir()
+            entry.relative_to(self.folder).as_posix()
+            for place in places
+            if place.is_dir()
+            for entry in place.iterdir()
             if entry.suffix == ".json"
             and entry.name.isprintable()
             and entry.is_file()
-            and entry.resolve().parent == self.folder
+            and entry.resolve().parent == place
             and self._format_of(entry) == format
         )
 
@@ -262,6 +319,52 @@ class Project:
         if path.is_symlink() or (path.exists() and file not in self.documents(CONTROLLER_FORMAT)):
             raise SettingError(f"{file}: expected a new name or that of a controller; choose one")
         tuning.controller(values).save(path)
+
+    # --- Commissioning ----------------------------------------------------------------------------
+
+    def commission(self, asked: Commission, progress: Callable[[int, int, str], None]) -> Any:
+        """A virtual machine from rest to a verified controller; fills the folder `commissioned`.
+
+        Raises
+        ------
+        Refusal
+            Where the evidence is not good enough.
+        SettingError
+            For a folder of that name with files of somebody else's.
+        """
+        from ..commissioning import commission
+        from ..commissioning.result import require_own
+        from ..machine import VirtualMachine
+
+        place = self.folder / COMMISSIONED
+        if place.is_symlink():
+            raise SettingError(f"{COMMISSIONED}: expected a folder, received a link; remove it")
+        require_own(place, overwrite=False)
+        found = commission(
+            VirtualMachine.from_name(asked.machine), seed=asked.seed, members=asked.members,
+            evaluations=asked.evaluations, progress=progress,
+        )  # fmt: skip
+        found.save(place)
+        loops = [(c.reference, c.predicted, c.measured) for c in found.comparisons]
+        return {
+            "verdict": found.verdict,
+            "text": str(found),
+            "predicted_cost": found.predicted_cost,
+            "measured_cost": found.measured_cost,
+            "references": [
+                {
+                    "name": name,
+                    "curves": [
+                        {"name": title, "unit": run.units["y"], **envelope(run.r - run.y, run.Ts)}
+                        for title, run in (("measured", measured), ("predicted", predicted))
+                    ],
+                }
+                for name, predicted, measured in loops
+                if measured is not None
+            ],
+            "python": asked.python(),
+            "commands": asked.commands(),
+        }
 
     # --- Steps ------------------------------------------------------------------------------------
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import Interrupted, SettingError, SewfastError
-from .project import Progress, Project, Step, checked_name
+from .project import Commission, Project, Step, checked_name
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response
@@ -38,13 +38,15 @@ FAREWELL = 1.0
 
 BETWEEN_REPORTS = 0.05
 """Seconds between two messages of a job's progress."""
-WRITES = ("identify", "cancel", "tune_search", "tune_save")
+WRITES = ("identify", "commission", "cancel", "tune_search", "tune_save")
 """What only the page that holds the control can ask for."""
 
 PAGE = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/studio.js": ("studio.js", "text/javascript; charset=utf-8"),
     "/curves.js": ("curves.js", "text/javascript; charset=utf-8"),
+    "/commission.js": ("commission.js", "text/javascript; charset=utf-8"),
+    "/copies.js": ("copies.js", "text/javascript; charset=utf-8"),
     "/tune.js": ("tune.js", "text/javascript; charset=utf-8"),
     "/server.js": ("server.js", "text/javascript; charset=utf-8"),
     "/studio.css": ("studio.css", "text/css; charset=utf-8"),
@@ -229,6 +231,10 @@ class Studio:
             return None
         if isinstance(name, str) and name.startswith("tune"):
             return self._tune(name, asked)
+        if name == "commission":
+            wanted = Commission.parse(asked)
+            self._start("commissioned", lambda report: self.project.commission(wanted, report))
+            return None
         step = Step.parse(asked)
         if name == "columns":
             return self.project.columns(step)
@@ -272,7 +278,7 @@ class Studio:
             "commands": self.project.commands(step, name),
         }
 
-    def _start(self, event: str, work: Callable[[Progress], dict[str, Any]]) -> None:
+    def _start(self, event: str, work: Callable[[Any], dict[str, Any]]) -> None:
         """Do something long; its result goes to every page as an event."""
         with self._lock:
             if self._job is not None and self._job.is_alive():
@@ -281,14 +287,15 @@ class Studio:
             self._job = threading.Thread(target=self._work, args=(event, work))
             self._job.start()
 
-    def _work(self, event: str, work: Callable[[Progress], dict[str, Any]]) -> None:
-        told = -math.inf
+    def _work(self, event: str, work: Callable[[Any], dict[str, Any]]) -> None:
+        told, stage = -math.inf, ""
 
-        def progress(done: int, total: int, best: float) -> None:
-            nonlocal told
+        def progress(done: int, total: int, best: float | str) -> None:
+            nonlocal told, stage
             if self._cancel.is_set():
                 raise _Cancelled
-            if time.monotonic() - told > BETWEEN_REPORTS:
+            before, stage = stage, str(best).split(" ")[0] if isinstance(best, str) else ""
+            if stage != before or time.monotonic() - told > BETWEEN_REPORTS:
                 told = time.monotonic()
                 self._tell(
                     {"event": "progress", "of": event, "done": done, "total": total, "best": best}

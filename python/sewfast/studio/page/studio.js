@@ -2,6 +2,8 @@
 import { ask as send, on } from "/server.js";
 import { draw } from "/curves.js";
 import { show } from "/tune.js";
+import { copies } from "/copies.js";
+import "/commission.js";
 
 const $ = id => document.getElementById(id);
 let writes = false, busy = false, files = null;
@@ -18,7 +20,7 @@ function ask(name) {
 }
 
 function view(name) {
-  for (const v of ["data", "tune"]) { $(v).hidden = v !== name; $(`view-${v}`).setAttribute("aria-pressed", v === name); }
+  for (const v of ["data", "tune", "commission"]) { $(v).hidden = v !== name; $(`view-${v}`).setAttribute("aria-pressed", v === name); }
   if (name === "tune") show();
 }
 
@@ -57,7 +59,7 @@ on("identified", m => {
   if (m.error) return tell(new Error(m.error));
   const f = m.found;
   $("headline").textContent = `free run explains ${f.fit.toFixed(1)} % of the training data (rmse ${`${f.rmse.toPrecision(4)} ${f.unit}`.trim()})`;
-  curves($("fit"), [f.free_run]); candidates(f.candidates); text("modeltext", f.text); copies("identify", f);
+  curves($("fit"), [f.free_run]); candidates(f.candidates); text("modeltext", f.text); copies($("identify-copy"), f);
 });
 
 function fill(select, pairs, chosen) {
@@ -97,31 +99,17 @@ function candidates(rows) {
   place.className = "scroll"; place.tabIndex = 0; place.append(table);
 }
 
-function copies(name, found) {
-  const place = $(`${name}-copy`); place.replaceChildren();
-  for (const [label, value] of [["Copy as Python", found.python], ["Copy as commands", found.commands]]) {
-    const button = document.createElement("button"), details = document.createElement("details");
-    const summary = document.createElement("summary"), pre = document.createElement("pre");
-    summary.textContent = label.replace("Copy as ", "Show "); pre.textContent = value; details.append(summary, pre);
-    button.textContent = label;
-    button.onclick = () => navigator.clipboard.writeText(value).then(
-      () => { button.textContent = "Copied"; setTimeout(() => { button.textContent = label; }, 1500); },
-      () => { details.open = true; });
-    place.append(button, details);
-  }
-}
-
 $("file").onchange = choose;
 $("what").onsubmit = event => event.preventDefault();
 $("take").onclick = () => send("take");
-for (const v of ["data", "tune"]) $(`view-${v}`).onclick = () => view(v);
+for (const v of ["data", "tune", "commission"]) $(`view-${v}`).onclick = () => view(v);
 $("cancel").onclick = () => send("cancel").catch(tell);
 $("look").onclick = () => act("look", f => {
   curves($("signals"), f.curves.map(c => [c]));
   $("advice").replaceChildren(...f.advice.map(a => { const li = document.createElement("li"); li.textContent = a; return li; }));
-  text("summary", f.text); copies("look", f);
+  text("summary", f.text); copies($("look-copy"), f);
 });
 $("identify").onclick = () => act("identify", () => { busy = true; $("progress").textContent = "starting"; });
 $("validate").onclick = () => act("validate", f => {
-  $("verdict").textContent = f.verdict; curves($("free"), [f.free_run]); text("card", f.card); copies("validate", f);
+  $("verdict").textContent = f.verdict; curves($("free"), [f.free_run]); text("card", f.card); copies($("validate-copy"), f);
 });
