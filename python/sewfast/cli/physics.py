@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .. import storage
 from ..errors import SettingError
 from .arguments import (
     Commands,
@@ -92,6 +91,8 @@ def command(args: argparse.Namespace) -> None:
     if args.out is not None:
         motor.save(args.out)
     if text:
+        from .. import storage
+
         storage.replace(place, text)
     if args.model is not None:
         motor.to_model().save(args.model)
