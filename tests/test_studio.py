@@ -697,6 +697,18 @@ def test_from_the_demo_to_a_verified_controller(tuned: Studio, browser: Any) -> 
 
 
 @pytest.mark.alone
+def test_no_view_keeps_anybody_out(tuned: Studio, browser: Any) -> None:
+    """No violation that axe knows: names, contrast, landmarks."""
+    axe = pytest.importorskip("axe_selenium_python").Axe(browser)
+    browser.get(tuned.address)
+    _until(lambda: browser.execute_script(NUMBER, "Ms"))
+    axe.inject()
+    for view in ("tune", "data", "commission"):
+        browser.find_element("id", f"view-{view}").click()
+        assert axe.run()["violations"] == [], view
+
+
+@pytest.mark.alone
 def test_the_page_finds_its_state_again(tuned: Studio, browser: Any) -> None:
     browser.get(tuned.address)
     _until(lambda: browser.execute_script(NUMBER, "Ms"))
