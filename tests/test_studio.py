@@ -23,7 +23,7 @@ import pytest
 
 import sewfast
 from cli import PROGRAM, environment
-from sewfast.errors import SettingError
+from sewfast.errors import FitError, SettingError
 from sewfast.studio import Project, Step, Studio, make_demo
 from sewfast.studio.project import envelope
 from sewfast.tuning import costs, first_controller
@@ -694,6 +694,28 @@ def test_from_the_demo_to_a_verified_controller(tuned: Studio, browser: Any) -> 
     browser.set_window_size(600, 900)
     assert browser.execute_script(WIDE) <= 0
     assert browser.get_log("browser") == []
+
+
+@pytest.mark.alone
+def test_a_loop_that_diverges_leaves_no_old_curve(
+    tuned: Studio, browser: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def diverges(*_: object) -> None:
+        raise FitError("runs away")
+
+    painted = "return document.querySelector('#step-plot canvas').getContext('2d')"
+    painted += ".getImageData(0, 0, 900, 200).data.some(v => v)"
+    browser.get(tuned.address)
+    _until(lambda: browser.execute_script(NUMBER, "Ms"))
+    assert browser.execute_script(painted)
+    # a command with limits keeps the loop around a stable model finite
+    monkeypatch.setattr("sewfast.analysis.responses.responses", diverges)
+    browser.find_element("id", "knob-Kp").send_keys("\ue014")  # arrow right
+    _until(lambda: "broken: stable" in browser.find_element("id", "lights").text)
+    assert "diverges" in browser.execute_script(
+        "return document.querySelector('#step-plot canvas').getAttribute('aria-label')"
+    )
+    assert not browser.execute_script(painted)
 
 
 @pytest.mark.alone

@@ -22,11 +22,12 @@ export class Chart {
 
   paint() {
     const { canvas, series, axes } = this, scale = devicePixelRatio || 1, w = canvas.clientWidth, h = canvas.clientHeight;
-    if (!w || !h || !series.length) return;
+    if (!w || !h) return;
     if (canvas.width !== Math.round(w * scale)) canvas.width = w * scale;
     if (canvas.height !== Math.round(h * scale)) canvas.height = h * scale;
     const g = canvas.getContext("2d");
     g.setTransform(scale, 0, 0, scale, 0, 0); g.clearRect(0, 0, w, h); g.font = "12px system-ui, sans-serif";
+    if (!series.length) return;
     let [low, high] = range(series.flatMap(s => [s.y, s.low, s.high])), [from, to] = range(series.map(s => s.x));
     low = Math.max(low, axes.floor);
     if (!(high >= low)) return;

@@ -4,11 +4,11 @@ import { Chart } from "/curves.js";
 
 const $ = id => document.getElementById(id);
 const PINS = ["A", "B"];
-const NUMBERS = [ // name, title, unit, what is better: -1 less, 1 more, 0 neither
-  ["Ms", "Ms", "", -1], ["Mt", "Mt", "", -1], ["phase_margin_deg", "phase margin", "deg", 1], ["gain_margin", "gain margin", "", 1],
-  ["delay_margin_ms", "delay margin", "ms", 1], ["crossover_hz", "crossover", "Hz", 0], ["noise_gain", "noise gain", "u/y", -1],
-  ["rise_ms", "rise 10 to 90 %", "ms", -1], ["overshoot_percent", "overshoot", "%", -1], ["settling_ms", "settling, 2 %", "ms", -1],
-  ["peak", "disturbance peak", "y", 0], ["recovery_ms", "recovery", "ms", -1], ["u_rms", "effort, rms u", "u", 0], ["du_rms", "chatter, rms du", "u", -1],
+const NUMBERS = [ // name, title, unit
+  ["Ms", "Ms", ""], ["Mt", "Mt", ""], ["phase_margin_deg", "phase margin", "deg"], ["gain_margin", "gain margin", ""],
+  ["delay_margin_ms", "delay margin", "ms"], ["crossover_hz", "crossover", "Hz"], ["noise_gain", "noise gain", "u/y"],
+  ["rise_ms", "rise 10 to 90 %", "ms"], ["overshoot_percent", "overshoot", "%"], ["settling_ms", "settling, 2 %", "ms"],
+  ["peak", "disturbance peak", "y"], ["recovery_ms", "recovery", "ms"], ["u_rms", "effort, rms u", "u"], ["du_rms", "chatter, rms du", "u"],
 ];
 const charts = {
   step: new Chart($("step-plot"), {}), command: new Chart($("command-plot"), {}), load: new Chart($("load-plot"), {}),
