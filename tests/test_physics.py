@@ -188,6 +188,26 @@ def test_what_tells_nothing_is_refused(change: Any, error: type, says: str) -> N
         physics(data, **change)
 
 
+def test_a_step_to_one_speed_parts_nothing_but_the_time_constant() -> None:
+    machine = VirtualMachine(31)
+    motor = physics(sewfast.record(machine, sewfast.signals.excitation("step")))
+    assert {"k_v", "k_a", "k_s"} <= set(motor.untold)
+    assert "several speeds" in motor.untold["k_v"]
+    truth = truths(machine.parameters)
+    T = truth["k_a"] / truth["k_v"]
+    assert motor.value("time_constant") == pytest.approx(T, rel=0.02)
+
+
+def test_a_limit_of_the_current_is_found() -> None:
+    machine = VirtualMachine(31)
+    motor = physics(sewfast.record(machine, sewfast.signals.excitation("saturating", 31)))
+    p, truth = machine.parameters, truths(machine.parameters)
+    true = p["current_limit"] * p["resistance"] / p["amplifier_gain"]
+    assert motor.value("limit") == pytest.approx(true, rel=0.05)
+    assert motor.value("k_v") == pytest.approx(truth["k_v"], rel=0.01)
+    assert motor.value("k_a") == pytest.approx(truth["k_a"], rel=0.02)
+
+
 def test_one_direction_leaves_the_offset_untold() -> None:
     u, _ = linear()
     machine = VirtualMachine(3)

@@ -45,14 +45,21 @@ ORDERS = {"load_1": 1, "load_2": 2, "inertia_2": 2}
 """How often a term repeats in a turn."""
 SHAPES = {"ripple", "w_s"}
 """Parameters that say how a term goes, not how large it is."""
-ALWAYS = {"delay", "limit"}
-"""Terms that stay: a delay of nothing is an answer, a limit has a test of its own."""
+ALWAYS = {"delay", "limit", "coulomb"}
+"""Terms that stay: a delay of nothing is an answer, a limit has a test of its own, and without dry
+friction, which every motor has, k_v would take its place unnoticed."""
 STRUCTURES = {"dcmotor": tuple(TERMS)}
 
 SHOWN = 4.0
 """Wald's statistic from which a term is shown: two standard deviations of a single parameter."""
+UNEXPLAINED = 0.005
+"""Share of the speed's variance, from which a limit is looked for with all parameters free."""
 LIMITED = 0.9
 """Of the cost without, that a limit of the current has to fall below."""
+SINGULAR = 1e-11
+"""Of the largest eigenvalue, from which a direction is seen."""
+BOUNDLESS = 1e6
+"""Standard deviations for a direction that is not, at unit noise."""
 EVALUATIONS = 60
 STRETCH = 20_000
 """Samples on which the way is found; all of them then have their say."""
@@ -381,7 +388,7 @@ class Task:
         """Of the estimate; sums of scores over a window stand for their long-run covariance."""
         names = state.names()
         J, r = self.jacobian(state), self.residuals(state)
-        inner = _inverse(J.T @ J)
+        inner, unknown = _inverse(J.T @ J)
         k_v = max(state.theta[0] + state.theta[1], 1e-12)
         settling = 2.0 * state.theta[PLACE["k_a"]] / k_v / self.records.Ts
         middle = np.zeros((len(names), len(names)))
@@ -400,7 +407,7 @@ class Task:
             middle += within.T @ within / window
             total += 1.5 * n / window
         spread = (1.0 + 1.2 / max(total, 1.0)) ** 2  # Student's quantile over the normal one
-        return inner @ middle @ inner * spread
+        return inner @ middle @ inner * spread + unknown
 
 
 def _whitener(parts: Sequence[FloatArray], order: int) -> FloatArray:
@@ -415,12 +422,19 @@ def _whitener(parts: Sequence[FloatArray], order: int) -> FloatArray:
     return np.concatenate([[1.0], -a]) / math.sqrt(max(r[0] - float(a @ r[1:]), 1e-12 * r[0]))
 
 
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Of a positive matrix, scaled; infinite variance for what nothing determines."""
+def _inverse(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Of a positive matrix where it has one, and a covariance beyond all bounds where it has none.
+
+    A step to a single speed, say, does not part friction from back-EMF: what is left in such a
+    direction is rounding, whose inverse would be a lie and whose omission a certainty.
+    """
     d = np.sqrt(np.diag(matrix))
     d[d == 0.0] = 1.0
-    found: FloatArray = np.linalg.pinv(matrix / np.outer(d, d), rcond=1e-14) / np.outer(d, d)
-    return found
+    size, along = np.linalg.eigh(matrix / np.outer(d, d))
+    along /= d[:, None]
+    known = size > SINGULAR * size[-1]
+    unknown = along[:, ~known] * BOUNDLESS
+    return along[:, known] / size[known] @ along[:, known].T, unknown @ unknown.T
 
 
 def _fitted(task: Task, state: State, tolerance: float = COARSE) -> State:
@@ -577,11 +591,15 @@ def _with_limit(task: Task, state: State, terms: tuple[str, ...]) -> State:
     drive = np.concatenate([np.abs(d) for _, d, _, _ in task.simulated(state, ())])
     places = [float(np.quantile(drive, q)) for q in (0.999, 0.98, 0.94, 0.88, 0.8)]
     tried = [state.having([*state.terms, "limit"], limit=max(v, 1e-9)) for v in places]
-    best = min(tried, key=task.cost)
     before = task.cost(state)
-    if task.cost(best) > LIMITED * before:
+    best = min(tried, key=task.cost)
+    y, model = task.outcome(state)
+    if task.cost(best) <= LIMITED * before:
+        tried = [best]
+    elif np.mean((y - model) ** 2) < UNEXPLAINED * np.var(y):
         return state
-    found = _fitted(task, best)
+    # where much is left to explain, other parameters have bent to stand for a limit
+    found = min((_fitted(task, s) for s in tried), key=task.cost)
     return found if task.cost(found) < LIMITED * before else state
 
 

@@ -31,6 +31,9 @@ CONFIDENCE = 1.96
 VAGUE = 1.0
 """Of its value: the half-width of an interval from which a parameter is not printed."""
 
+APART = 10.0
+"""Of its value: the half-width from which others can stand for it."""
+
 Target: TypeAlias = Literal["wpilib", "mujoco", "urdf"]
 Values: TypeAlias = Mapping[str, float]
 
@@ -434,15 +437,18 @@ def motor_of(
         slope = np.zeros(len(at))
         sd = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
         for j, free in enumerate(estimate.names):
-            h = max(1e-5 * abs(at[j]), 1e-3 * sd[j], 1e-12)
+            h = 1e-4 * abs(at[j]) or max(min(1e-3 * float(sd[j]), 1e-6), 1e-12)
             more, less = (of({**known, free: at[j] + s * h}) for s in (1.0, -1.0))
             slope[j] = (more - less) / (2.0 * h)
         half = CONFIDENCE * math.sqrt(max(float(slope @ estimate.covariance @ slope), 0.0))
         vague = half >= VAGUE * abs(value) and name not in _MAY_BE_NOTHING
         if not math.isfinite(half) or vague:
             untold[name] = (
-                f"its interval, {value - half:.3g} to {value + half:.3g} {unit}, is as wide as its "
-                "value"
+                "the record does not part it from the others; add steps to several speeds, in both "
+                "directions"
+                if not half < APART * abs(value)
+                else f"its interval, {value - half:.3g} to {value + half:.3g} {unit}, is as wide "
+                "as its value"
             )
             continue
         low = value - half if name in _SIGNED else max(value - half, 0.0)
