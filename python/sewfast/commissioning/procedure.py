@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -345,10 +346,14 @@ def _pulses(bench: Bench, fopdt: Fopdt, asked: Demands) -> tuple[float, list[Rec
     u = excitations.pulses(fopdt, fastest, asked, bench.Ts, asked.seed)
     found = [bench.excite(u, "pulses")]
     shown = excitations.acceleration_shown(found[0], asked)
+    if math.isinf(shown):
+        shown = excitations.acceleration_from_rest(bench, fastest, asked)
     if shown > FALLS_SHORT * fastest:
         return min(shown, fastest), found
     u = excitations.pulses(fopdt, shown, asked, bench.Ts, asked.seed + 1)
-    return shown, [*found, bench.excite(u, "pulses_limited")]
+    found.append(bench.excite(u, "pulses_limited"))
+    again = excitations.acceleration_shown(found[1], asked)
+    return shown if math.isinf(again) else again, found
 
 
 @dataclass(frozen=True)
