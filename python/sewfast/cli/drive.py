@@ -20,7 +20,7 @@ from .arguments import Commands, add_command, add_view
 from .output import print_json, print_rows
 
 if TYPE_CHECKING:
-    from ..commissioning import SteppedBench
+    from ..control.machine import Machine
     from ..link import Drive, PortInfo
     from ..link.virtual import VirtualDevice
     from ..machine import VirtualMachine
@@ -189,7 +189,7 @@ def is_port(text: str) -> bool:
         return False
 
 
-def machine_of(text: str) -> VirtualMachine | SteppedBench:
+def machine_of(text: str) -> VirtualMachine | Machine:
     """What `--on` names where it is no port: `virtual[:SEED]`, a motor's twin, or an FMU.
 
     Raises
