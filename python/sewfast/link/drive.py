@@ -577,9 +577,7 @@ class Drive(Unique):
         return profiles.commands(plan.values, self.channels[1], limits)
 
     def _baud(self) -> float:
-        port = self._link.port
-        unbound = self.identity.on_credit or port.url.startswith("socket://")
-        return math.inf if unbound else port.baud
+        return math.inf if self.identity.on_credit else self._link.port.max_rate
 
     def _require_idle(self) -> None:
         status = self.status()
