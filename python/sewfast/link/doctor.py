@@ -534,7 +534,7 @@ def examine(url: str, *, baud: int = 115_200, echoes: int = ECHOES) -> Diagnosis
     Parameters
     ----------
     url : str
-        A serial port's path, a COM name or ``socket://host:port``.
+        An address that `open_port` takes.
     baud : int
         Bits per second of a serial port.
     echoes : int

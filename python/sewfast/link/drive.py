@@ -610,7 +610,7 @@ def connect(
     Parameters
     ----------
     url : str
-        A serial port's path, a COM name or ``socket://host:port``.
+        An address that `open_port` takes.
     baud : int
         Bits per second of a serial port.
     watchdog : float or None
