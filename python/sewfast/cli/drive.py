@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..link.virtual import VirtualDevice
     from ..machine import VirtualMachine
 
-PORT_HELP = "serial port or socket://HOST:PORT"
+PORT_HELP = "serial port, socket://HOST:PORT or udp://HOST:PORT"
 
 PORTS = """\
 List the serial ports of this computer, with what speaks against opening one.

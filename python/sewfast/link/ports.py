@@ -1,7 +1,7 @@
 """Ports: bytes to a device and back, over a serial line or a network; how each fails, what to do.
 
-Read in this order: `Port`, what every transport has; `SerialPort`, `SocketPort`; the table
-`TRANSPORTS`, in which a transport is one row, and `open_port`. A new one is a class and its
+Read in this order: `Port`, what every transport has; `SerialPort`, `SocketPort`, `UdpPort`; the
+table `TRANSPORTS`, in which a transport is one row, and `open_port`. A new one is a class and its
 row: its address, how it carries bytes, what its failures mean.
 """
 
@@ -16,6 +16,7 @@ import socket
 import stat
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -388,7 +389,61 @@ class SocketPort(NetworkPort):
             connection.setblocking(False)
 
 
-TRANSPORTS: dict[str, type[Port]] = {"": SerialPort, "socket": SocketPort}
+DATAGRAM = 1200
+"""Bytes of a datagram at most: with any header it passes every network in one piece."""
+
+
+class UdpPort(NetworkPort):
+    """Datagrams to one address and from it: those of anybody else are not heard.
+
+    Each carries whole frames, so that one that is lost costs no other its frames. What the network
+    loses, repeats or delivers late is seen by the frames' numbers, as on any port.
+    """
+
+    form = "udp://HOST:PORT"
+
+    def _connected(self, address: tuple[str, int]) -> socket.socket:
+        failed: OSError | None = None
+        host, port = address
+        ways = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        for family, kind, protocol, _, place in ways:
+            found = socket.socket(family, kind, protocol)
+            try:
+                found.connect(place)
+            except OSError as error:
+                found.close()
+                failed = error
+            else:
+                return found
+        raise failed or OSError("no address")
+
+    def _received(self, connection: socket.socket) -> bytes:
+        return bytes(connection.recv(CHUNK))
+
+    def _sent(self, connection: socket.socket, data: bytes) -> None:
+        for datagram in _datagrams(data):
+            self._write(connection.fileno(), datagram)
+
+    @staticmethod
+    def losing(url: str, number: int | None, error: BaseException) -> Texts:
+        # the other computer says so when a datagram arrives
+        if number == errno.ECONNREFUSED:
+            return NetworkPort.opening(url, number, error)
+        return NetworkPort.losing(url, number, error)
+
+
+def _datagrams(data: bytes) -> Iterator[bytes]:
+    """The bytes in pieces that end where a frame ends; frames end with a zero."""
+    start = 0
+    while start < len(data):
+        end = min(start + DATAGRAM, len(data))
+        if end < len(data):
+            end = data.rfind(b"\0", start, end) + 1 or end
+        yield data[start:end]
+        start = end
+
+
+TRANSPORTS: dict[str, type[Port]] = {"": SerialPort, "socket": SocketPort, "udp": UdpPort}
 """Transports by what stands before `://` in an address; none is a serial port."""
 
 
@@ -419,7 +474,7 @@ def open_port(url: str, baud: int = 115_200) -> Port:
     Parameters
     ----------
     url : str
-        A device's path, a COM name or ``socket://host:port``.
+        A device's path, a COM name, ``socket://host:port`` (TCP) or ``udp://host:port``.
     baud : int
         Bits per second of a serial port.
 
