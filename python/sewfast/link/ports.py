@@ -172,7 +172,7 @@ class Port(Unique, ABC):
     @property
     def max_rate(self) -> float:
         """Bits per second that it carries; inf where nothing bounds them."""
-        return math.inf
+        return self.baud
 
     def describe(self) -> str:
         """What can be said of it once it is open."""
@@ -236,10 +236,6 @@ class SerialPort(Port):
     form = "a serial port's path (/dev/ttyUSB0), a COM name (COM3)"
     is_local = True
     _serial: Any = None
-
-    @property
-    def max_rate(self) -> float:
-        return self.baud
 
     def describe(self) -> str:
         return "opens, and nobody else is seen to have it open"
@@ -309,6 +305,10 @@ class NetworkPort(Port):
     """A socket that is connected to one address, `scheme://host:port`."""
 
     _socket: socket.socket | None = None
+
+    @property
+    def max_rate(self) -> float:
+        return math.inf
 
     def _open(self) -> None:
         address = _address(self.url)
