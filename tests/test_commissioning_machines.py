@@ -83,12 +83,12 @@ def test_first_gains_are_quiet_where_eq_12_alone_would_wake_the_shaft() -> None:
     r, settled = held(wanted, 6000.0, on.Ts)
     wild = first_gains(step, on, wanted)
     assert margins(wild, found.model).Ms > 2.0
-    swing = swing_of(on.follow(wild, r, "wild").run, settled)
+    swing = swing_of(on.follow(wild, r, "wild"), settled)
     assert swing is not None
     assert swing.frequency == pytest.approx(60.0, rel=0.2)
     quiet = first_gains(step, on, wanted, found.model)
     assert margins(quiet, found.model).Ms <= 2.0
-    assert swing_of(on.follow(quiet, r, "quiet").run, settled) is None
+    assert swing_of(on.follow(quiet, r, "quiet"), settled) is None
 
 
 def test_gains_come_in_steps_and_stop_at_the_first_swing() -> None:
@@ -213,5 +213,5 @@ def test_a_machine_of_ones_own_is_a_few_lines() -> None:
     assert recording.speed_true is None
     controller = Controller(gains=Gains.standard(0.05, 0.05), u_min=-10.0, u_max=10.0)
     found = on.follow(controller, np.full(1000, 500.0), "hold")
-    assert np.median(found.run.y[-100:]) == pytest.approx(500.0, rel=0.05)
-    np.testing.assert_array_equal(found.run.u, found.recording.u)
+    assert np.median(found.y[-100:]) == pytest.approx(500.0, rel=0.05)
+    np.testing.assert_array_equal(found.u, found.recording.u)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import _core
+from ..control.machine import Machine
 from ..dataset import FloatArray
 from ..errors import DataError, FitError
 from ..recording import Recording
 from ..rules import Fopdt, fit_fopdt
-from .bench import Bench
 from .demands import Demands, Refusal, require
 
 # --- First motion: which command moves the machine, which way, and about how fast -----------------
@@ -52,7 +52,7 @@ class Motion:
         return self.threshold + speed / self.gain
 
 
-def first_motion(bench: Bench, demands: Demands) -> Motion:
+def first_motion(bench: Machine, demands: Demands) -> Motion:
     """Try commands from small to large until the machine turns at a fair speed.
 
     Raises
@@ -143,7 +143,7 @@ LEAST_FIT = 80.0
 """Percent; below it the machine is no first order with dead time."""
 
 
-def step_response(bench: Bench, demands: Demands, motion: Motion) -> Fopdt:
+def step_response(bench: Machine, demands: Demands, motion: Motion) -> Fopdt:
     """Record steps until one settles, and fit it.
 
     Raises
