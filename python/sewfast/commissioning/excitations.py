@@ -237,7 +237,7 @@ def acceleration_shown(recording: Recording, demands: Demands) -> float:
     return float("inf")
 
 
-def acceleration_from_rest(bench: Bench, fastest: float, demands: Demands) -> float:
+def acceleration_from_rest(bench: Machine, fastest: float, demands: Demands) -> float:
     """The same from single pulses of the largest command [RPM/s], each twice as long as the one
     before, until one brings a fair speed.
 
