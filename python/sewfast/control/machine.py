@@ -339,7 +339,10 @@ class SteppedBench:
         for name in ("Ts", "counts_per_rev", "volt", "speed"):
             value = real(name, getattr(self, name))
             if not value > 0.0 or (math.isinf(value) and name != "speed"):
-                raise SettingError(f"expected {name} above 0, got {value!r}; see the data sheet")
+                raise SettingError(
+                    name=name, expected="a finite number above 0", received=f"{value!r}",
+                    remedy="see the data sheet",
+                )  # fmt: skip
 
     def excite(self, u: FloatArray, name: str) -> Recording:
         _require_finite("command", u)
@@ -397,6 +400,7 @@ def _require_finite(what: str, values: FloatArray) -> None:
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
         raise DataError(
-            f"expected a finite {what}, got {len(bad)} of {len(values)} samples that are not, the "
-            f"first at {bad[0]}; mend the signal"
-        )
+            name=what, expected="finite numbers",
+            received=f"{len(bad)} of {len(values)} that are not, the first at {bad[0]}",
+            remedy="mend the signal",
+        )  # fmt: skip
