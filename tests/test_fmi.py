@@ -17,6 +17,7 @@ import pytest
 
 import kinds
 import sewfast
+from foreign_fmu import OF_MOTOR, motor_fmu
 from sewfast import deploy, paper_controller
 from sewfast.cli import main
 from sewfast.commissioning import FmuMachine, SteppedBench, fmu_bench
@@ -179,42 +180,11 @@ def test_what_cannot_be_an_fmu_is_refused(
 
 # --- Plants of other tools ------------------------------------------------------------------------
 
-MOTOR = """
-import math
-from pythonfmu import Fmi2Causality, Fmi2Slave, Real
-
-class Motor(Fmi2Slave):
-    def __init__(self, **kwargs):
-        super().__init__(**kwargs)
-        self.voltage = self.speed = self.angle = 0.0
-        self.register_variable(Real("voltage", causality=Fmi2Causality.input))
-        self.register_variable(Real("speed", causality=Fmi2Causality.output))
-        self.register_variable(Real("angle", causality=Fmi2Causality.output))
-
-    def do_step(self, current_time, step_size):
-        for _ in range(10):
-            friction = 0.3 * math.tanh(self.speed / 5.0)
-            self.speed += 0.1 * step_size / 0.08 * (300.0 * (self.voltage - friction) - self.speed)
-            self.angle += 0.1 * step_size * self.speed / 60.0
-        return True
-"""
-OF_MOTOR: dict[str, Any] = {
-    "input": "voltage", "speed": "speed", "angle": "angle", "speed_unit": "RPM",
-    "angle_unit": "rev", "volt": 10.0,
-}  # fmt: skip
-
 
 @pytest.fixture(scope="module")
 def motor(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A motor that PythonFMU has made an FMU 2.0 of."""
     return motor_fmu(tmp_path_factory.mktemp("a motor"))
-
-
-def motor_fmu(folder: Path) -> Path:
-    builder = pytest.importorskip("pythonfmu.builder", reason="needs pythonfmu")
-    (folder / "motor.py").write_text(MOTOR)
-    made = builder.FmuBuilder.build_FMU(folder / "motor.py", dest=folder)
-    return Path(made)
 
 
 def test_a_foreign_plant_is_recorded_identified_and_run(motor: Path) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import sewfast
+from foreign_fmu import OF_MOTOR, motor_fmu
 from sewfast import Controller, Gains, Machine, Recording, VirtualMachine, record, run
 from sewfast.arrays import FloatArray
 from sewfast.commissioning import SteppedBench
@@ -24,6 +25,7 @@ from sewfast.link import VirtualDevice, connect
 from sewfast.recordfile import read_recording
 
 pytestmark = pytest.mark.alone
+sys.path.insert(0, str(Path(__file__).parent.parent / "benches"))
 
 CONTROLLER = Controller(Gains.standard(0.004, 0.1), u_min=-10.0, u_max=10.0)
 STEP = np.concatenate([np.zeros(50), np.full(350, 4.0)])
@@ -94,15 +96,12 @@ def fmu(folder: Path) -> Iterator[Machine]:
     pytest.importorskip("fmpy")
     if shutil.which("cc") is None or not sys.platform.startswith("linux"):
         pytest.skip("needs Linux and a C compiler")
-    from test_fmi import OF_MOTOR, motor_fmu
-
     yield sewfast.commissioning.fmu_bench(motor_fmu(folder), **OF_MOTOR)
 
 
 @contextmanager
 def mujoco(folder: Path) -> Iterator[Machine]:
-    from test_mujoco import motors
-
+    motors = pytest.importorskip("mujoco_motors", reason="needs mujoco")
     yield motors.bench_of(motors.drawn(0))
 
 
