@@ -6,6 +6,7 @@ import json
 import random
 import struct
 import sys
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -216,3 +217,80 @@ def test_a_frame_from_a_host_is_an_echo_and_no_frame_of_the_device():
     assert receiver.feed(keep) == []
     assert receiver.anomalies() == [("echoed", 3, 1)]
     assert receiver.counters["frames"] == 0
+
+
+# --- bodies: the core's beside struct, which shares no code with it -------------------------------
+
+U8, U16, U32, U64 = (st.integers(0, 2**bits - 1) for bits in (8, 16, 32, 64))
+SINGLE = st.floats(width=32, allow_nan=False)
+TEXT = st.text(max_size=10)
+
+
+@given(U8, U16, U32, U32, U64, SINGLE, st.binary(max_size=200))
+def test_a_commands_body_is_its_fields_one_after_the_other(byte, short, a, b, long, u, values):
+    bodies = _core.LinkBodies
+    assert bodies.hello(a) == struct.pack("<BBI", 3, 3, a)
+    assert bodies.arm(a, b) == struct.pack("<II", a, b)
+    assert bodies.keep(a) == struct.pack("<I", a)
+    assert bodies.drive(a, u) == struct.pack("<If", a, u)
+    assert bodies.credit(a, long) == struct.pack("<IQ", a, long)
+    assert bodies.limits((u, 1.0, 2.0, 3.0)) == struct.pack("<4f", u, 1.0, 2.0, 3.0)
+    assert bodies.upload(byte, a, values) == struct.pack("<BI", byte, a) + values
+    told = struct.pack("<BIQIHB", byte, a, long, b, short, 7)
+    assert bodies.start(byte, a, long, b, short, 7) == told
+    assert bodies.host_time(a, long) == a << 32 | long & 0xFFFFFFFF
+
+
+@given(st.tuples(*[SINGLE] * 12), U8, SINGLE, st.lists(st.tuples(*[SINGLE] * 4), max_size=8))
+def test_gains_are_followed_by_what_a_device_may_not_know(values, samples, u, points):
+    bodies, gains = _core.LinkBodies, struct.pack("<12fB", *values, samples)
+    assert bodies.gains(values, samples) == gains
+    rows = b"".join(struct.pack("<4f", *point) for point in points)
+    design = struct.pack("<ffB", u, np.inf, len(points)) + rows
+    assert bodies.gains(values, samples, (u, np.inf, points)) == gains + design
+    assert bodies.biquads(points) == bytes([len(points)]) + rows
+
+
+def test_a_body_that_no_frame_holds_is_refused():
+    with pytest.raises(SettingError, match="expected a body of at most 231 bytes"):
+        _core.LinkBodies.upload(0, 0, bytes(227))
+    for wrong in (-1, 2**32):
+        with pytest.raises(OverflowError):
+            _core.LinkBodies.keep(wrong)
+
+
+@given(U8, U16, U32, U64, SINGLE, TEXT, TEXT)
+def test_a_reply_is_read_field_by_field(byte, short, a, long, u, name, unit):
+    bodies = _core.LinkBodies
+
+    def text(value):
+        raw = value.encode()
+        return bytes([len(raw)]) + raw
+
+    assert bodies.reply(struct.pack("<IB", a, byte) + b"rest") == (a, byte, b"rest")
+    greeting = struct.pack("<BIIBBIIIf", byte, a, 1, 2, 3, 4, 5, 6, u) + text(name) + text(unit)
+    told = (name, unit, byte, a, 1, 2, 3, 4, 5, 6, u)
+    assert bodies.greeting(greeting + struct.pack("<II", 7, a)) == (told, 7, a)
+    description = struct.pack("<BBI", byte, 1, a) + text(name) + text(unit)
+    assert bodies.description(description) == (byte, 1, a, name, unit)
+    fields = (byte, 1, 2, short, a, long, 3, 4, 5, u, -6, 7, 8, 9, 10, 11, 12)
+    status = struct.pack("<BBBHIQIIIfiIIIIII", *fields)
+    assert bodies.status(status) == (fields[:9], fields[9:])
+    assert bodies.limits_of(struct.pack("<8f", u, *range(7))) == [u, *range(7)]
+    assert bodies.started(struct.pack("<IQ", a, long)) == (a, long)
+    assert bodies.uploaded(struct.pack("<II", a, 5)) == (a, 5)
+    event = struct.pack("<BBBIIf", byte, 1, 2, a, 4, u)
+    assert bodies.event(event) == (byte, 1, 2, a, 4, u)
+    assert bodies.event(event + b"\0") is None
+    for read, body in (
+        (bodies.greeting, greeting), (bodies.description, description), (bodies.status, status),
+        (bodies.event, event), (bodies.started, event), (bodies.limits_of, event),
+    ):  # fmt: skip
+        for size in range(0, 8):
+            assert read(body[:size]) is None
+
+
+@given(U8, U32, st.lists(st.binary(max_size=40), max_size=16))
+def test_the_schema_is_the_crc_of_all_descriptions(version, period, replies):
+    told = struct.pack("<BI", version, period) + b"".join(replies)
+    assert _core.LinkBodies.schema(version, period, replies) == zlib.crc32(told)

@@ -694,6 +694,87 @@ def search_front(
 def link_frame(kind: int, tag: int, sequence: int, time: int, body: bytes) -> bytes:
     """A frame as it is sent, with its closing zero; a body of more than 231 bytes is a SettingError."""
 
+@final
+class LinkBodies:
+    """The bodies of a host's frames, and of a device's replies (docs/PROTOCOL.md).
+
+    Numbers beyond single precision become infinite. A body of more than 231 bytes is a SettingError.
+    What reads a reply returns None where that is too short, or no such thing.
+    """
+
+    VERSION: int
+    MAX_BODY: int
+    AROUND: int
+    @staticmethod
+    def host_time(session: int, us: int) -> int: ...
+    @staticmethod
+    def hello(session: int) -> bytes: ...
+    @staticmethod
+    def arm(watchdog: int, key: int) -> bytes: ...
+    @staticmethod
+    def keep(watchdog: int) -> bytes: ...
+    @staticmethod
+    def drive(watchdog: int, u: float) -> bytes: ...
+    @staticmethod
+    def credit(watchdog: int, until: int) -> bytes: ...
+    @staticmethod
+    def limits(values: Sequence[float]) -> bytes:
+        """Volt, speed, acceleration, current; zeros ask for those in force."""
+    @staticmethod
+    def upload(table: int, offset: int, values: bytes) -> bytes: ...
+    @staticmethod
+    def gains(
+        values: Sequence[float],
+        filter_samples: int,
+        design: tuple[float, float, Sequence[Sequence[float]]] | None = None,
+    ) -> bytes:
+        """Twelve numbers and the filter's samples; the design is observer time, r rate, schedule."""
+    @staticmethod
+    def biquads(sections: Sequence[Sequence[float]]) -> bytes:
+        """Sections of c0, c1, a1, a2."""
+    @staticmethod
+    def start(mode: int, watchdog: int, at: int, length: int, mask: int, batch: int) -> bytes: ...
+    @staticmethod
+    def reply(body: bytes) -> tuple[int, int, bytes] | None:
+        """Sequence, result, and what is behind them."""
+    @staticmethod
+    def detail(rest: bytes) -> int | None:
+        """Of a refusal."""
+    @staticmethod
+    def greeting(
+        body: bytes,
+    ) -> tuple[tuple[str, str, int, int, int, int, int, int, int, int, float], int, int] | None:
+        """Name, firmware, version, boot, schema, state, channels, period, capabilities, capacity, counts; session; key."""
+    @staticmethod
+    def description(body: bytes) -> tuple[int, int, int, str, str] | None:
+        """Number, encoding, steps per unit, name, unit of a channel."""
+    @staticmethod
+    def schema(version: int, period_us: int, replies: Sequence[bytes]) -> int:
+        """CRC-32 of version, period and the replies to all DESCRIBE."""
+    @staticmethod
+    def status(
+        body: bytes,
+    ) -> (
+        tuple[
+            tuple[int, int, int, int, int, int, int, int, int],
+            tuple[float, int, int, int, int, int, int, int],
+        ]
+        | None
+    ):
+        """State, reason, mode, mask, run, start, taken, length, end; speed, counts, received, refused, dropped, late, session, foreign."""
+    @staticmethod
+    def limits_of(
+        body: bytes,
+    ) -> list[float] | None:
+        """Volt, speed, acceleration, current in force, then their ceilings."""
+    @staticmethod
+    def started(body: bytes) -> tuple[int, int] | None: ...
+    @staticmethod
+    def uploaded(body: bytes) -> tuple[int, int] | None: ...
+    @staticmethod
+    def event(body: bytes) -> tuple[int, int, int, int, int, float] | None:
+        """Code, state, reason, run, samples, value."""
+
 _Anomaly: TypeAlias = Literal[
     "missing", "repeated", "late", "reset", "rejected", "echoed", "malformed", "untaken"
 ]

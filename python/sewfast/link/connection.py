@@ -481,7 +481,7 @@ class Connection(Unique):
 
     def keep(self) -> None:
         """Tell the device that the host is there."""
-        self._beat(Kind.KEEP, wire.watchdog(self.watchdog_us))
+        self._beat(Kind.KEEP, wire.keep(self.watchdog_us))
 
     def drive(self, u: float) -> None:
         """The command of a direct run [V]; a heartbeat too."""

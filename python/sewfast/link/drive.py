@@ -107,10 +107,8 @@ def gains(controller: Controller, streamed: Sequence[Channel], identity: Identit
         g.Kp, g.Ti, g.Td, c.alpha, c.beta, c.N, c.Tt, c.u_min, c.u_max, c.slew, c.filter_time,
         counts_per_unit(identity.counts_per_rev, g.y_unit),
     )  # fmt: skip
-    body = wire.gains(values, c.filter_samples)
-    if not further:
-        return body
-    return body + wire.design(c.observer_time, c.r_rate, c.schedule_rows())
+    design = (c.observer_time, c.r_rate, c.schedule_rows()) if further else None
+    return wire.gains(values, c.filter_samples, design)
 
 
 def _require_units(given: str, device: str, what: str) -> None:

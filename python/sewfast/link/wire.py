@@ -1,22 +1,23 @@
-"""Bodies of the link's frames as values, and back (docs/PROTOCOL.md); refusals."""
+"""What the bodies of the link's frames stand for (docs/PROTOCOL.md): values, names, refusals.
+
+Their bytes are the compiled core's, which is one for this client and the loop on the host.
+"""
 
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
-from zlib import crc32
+from typing import TypeVar
 
+from .._core import LinkBodies
 from ..errors import LinkError
 
 # --- Bodies of the link's frames as values, and values as bodies (docs/PROTOCOL.md) ---------------
 
 
-VERSION = 3
-MAX_BODY = 231
+VERSION, MAX_BODY = LinkBodies.VERSION, LinkBodies.MAX_BODY
 LARGEST = 3.4028234e38
 """Of single precision."""
 
@@ -227,162 +228,130 @@ class Reply:
         return self.body
 
 
-_REPLY = struct.Struct("<IB")
-_HELLO = struct.Struct("<BIIBBIIIf")
-_SESSION = struct.Struct("<II")
-"""At the end of the reply to HELLO: session and key."""
-_CHANNEL = struct.Struct("<BBI")
-_STATUS = struct.Struct("<BBBHIQIIIfiIIIIII")
-_LIMITS = struct.Struct("<8f")
-_EVENT = struct.Struct("<BBBIIf")
-_START = struct.Struct("<BIQIHB")
-_STARTED = struct.Struct("<IQ")
-_UPLOADED = struct.Struct("<II")
-_GAINS = struct.Struct("<12fB")
-
-
 def reply(kind: int, time_us: int, body: bytes) -> tuple[int, Reply] | None:
     """The command's sequence and its reply; None for what is no reply."""
-    if len(body) < _REPLY.size:
+    head = LinkBodies.reply(body)
+    if head is None:
         return None
-    sequence, result = _REPLY.unpack_from(body)
-    rest = body[_REPLY.size :]
-    if result and len(rest) != 4:
+    sequence, result, rest = head
+    detail = LinkBodies.detail(rest) if result else 0
+    if detail is None:
         return None
-    detail = int.from_bytes(rest, "little") if result else 0
     return sequence, Reply(kind & ~REPLY, result, detail, b"" if result else rest, time_us)
 
 
 def identity(body: bytes) -> Identity:
     """The reply to HELLO."""
-    values, rest = _start(_HELLO, body, "HELLO")
-    version, boot, schema, state, channels, period, capabilities, capacity, counts = values
-    name, rest = _text(rest, "HELLO")
-    firmware, rest = _text(rest, "HELLO")
-    (session, key), _ = _start(_SESSION, rest, "HELLO")
+    told, session, key = _whole(LinkBodies.greeting(body), body, "HELLO")
+    (
+        name, firmware, version, boot, schema, state, channels, period, capabilities, capacity,
+        counts,
+    ) = told  # fmt: skip
     if not 2 <= channels <= 16 or period == 0 or not (math.isfinite(counts) and counts >= 0):
         raise LinkError(
             "expected a device with 2 to 16 channels, a control period and counts per turn, got "
             f"{channels}, {period} us and {counts}; mend the firmware"
         )
     return Identity(
-        name, firmware, version, boot, schema, name_of(STATES, state), channels, period,
-        capabilities, capacity, counts, session, key,
+        _shown(name), _shown(firmware), version, boot, schema, name_of(STATES, state), channels,
+        period, capabilities, capacity, counts, session, key,
     )  # fmt: skip
 
 
 def greets(reply: Reply, session: int) -> bool:
     """Whether a reply to HELLO is to that of `session`, not to another host's before."""
-    return reply.result != 0 or reply.body[-8:-4] == struct.pack("<I", session)
+    told = None if reply.result else LinkBodies.greeting(reply.body)
+    return bool(reply.result) or (told is not None and told[1] == session)
 
 
 def channel(body: bytes) -> Channel:
     """The reply to DESCRIBE."""
-    (number, encoding, steps), rest = _start(_CHANNEL, body, "DESCRIBE")
-    name, rest = _text(rest, "DESCRIBE")
-    unit, rest = _text(rest, "DESCRIBE")
+    told = _whole(LinkBodies.description(body), body, "DESCRIBE")
+    number, encoding, steps, name, unit = told
     if encoding > 2 or (encoding == 1 and steps == 0):
         raise LinkError(
             f"expected channel {number} in encoding 0, 1 (with steps per unit) or 2, got "
             f"{encoding} with {steps} steps; update sewfast or mend the firmware"
         )
-    return Channel(number, encoding, steps, name, unit)
+    return Channel(number, encoding, steps, _shown(name), _shown(unit))
 
 
-def host_time(session: int, us: int) -> int:
-    """What stands for the time in a host's frames: its session above its clock, which wraps."""
-    return session << 32 | us & 0xFFFFFFFF
+host_time = LinkBodies.host_time
+"""What stands for the time in a host's frames: its session above its clock, which wraps."""
 
-
-def schema_hash(version: int, period_us: int, descriptions: Sequence[bytes]) -> int:
-    """CRC-32 of version, period and the bodies of all DESCRIBE replies in order."""
-    return crc32(b"".join([struct.pack("<BI", version, period_us), *descriptions]))
+schema_hash = LinkBodies.schema
+"""CRC-32 of version, period and the bodies of all DESCRIBE replies in order."""
 
 
 def status(answer: Reply) -> Status:
     """The reply to STATUS."""
-    values: Any = _start(_STATUS, answer.checked(), "STATUS")[0]
-    names = (name_of(STATES, values[0]), name_of(REASONS, values[1]))
-    told = (*values[2:-1], answer.time_us, values[-1])
-    return Status(*names, *told)
+    body = answer.checked()
+    run, counted = _whole(LinkBodies.status(body), body, "STATUS")
+    names = (name_of(STATES, run[0]), name_of(REASONS, run[1]))
+    speed, counts, received, refused, dropped, late, session, foreign = counted
+    return Status(
+        *names, *run[2:], speed, counts, received, refused, dropped, late, session, answer.time_us,
+        foreign,
+    )  # fmt: skip
 
 
 def limits(body: bytes) -> Limits:
     """The reply to LIMITS."""
-    values: Any = _start(_LIMITS, body, "LIMITS")[0]
-    return Limits(*values[:4], ceilings=values[4:])  # type: ignore[misc]
+    volt, speed, acceleration, current, *ceilings = _whole(
+        LinkBodies.limits_of(body), body, "LIMITS"
+    )
+    a, b, c, d = ceilings
+    return Limits(volt, speed, acceleration, current, (a, b, c, d))
 
 
 def event(time_us: int, body: bytes) -> Event | None:
     """An event; None where its body is not one."""
-    if len(body) != _EVENT.size:
+    told = LinkBodies.event(body)
+    if told is None:
         return None
-    code, state, reason, run, samples, value = _EVENT.unpack(body)
+    code, state, reason, run, samples, value = told
     names = (name_of(EVENTS, code), name_of(STATES, state), name_of(REASONS, reason))
     return Event(*names, run, samples, value, time_us)
 
 
 def started(body: bytes) -> tuple[int, int]:
     """Number of the run and its start [us]."""
-    (run, at), _ = _start(_STARTED, body, "START")
-    return run, at
+    return _whole(LinkBodies.started(body), body, "START")
 
 
 def uploaded(body: bytes) -> tuple[int, int]:
     """End of the profile and room behind it [values]."""
-    (end, room), _ = _start(_UPLOADED, body, "UPLOAD")
-    return end, room
+    return _whole(LinkBodies.uploaded(body), body, "UPLOAD")
+
+
+T = TypeVar("T")
+
+
+def _whole(told: T | None, body: bytes, name: str) -> T:
+    if told is None:
+        raise LinkError(
+            f"expected a whole reply to {name}, got {len(body)} bytes; mend the firmware "
+            "(docs/PROTOCOL.md)"
+        )
+    return told
+
+
+def _shown(name: str) -> str:
+    """A name that goes to terminals and files."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
 
 
 # --- commands -----------------------------------------------------------------------------------
 
 
-def hello(session: int) -> bytes:
-    return struct.pack("<BBI", VERSION, VERSION, session)
-
-
-def watchdog(us: int) -> bytes:
-    return struct.pack("<I", us)
-
-
-def arm(us: int, key: int) -> bytes:
-    return struct.pack("<II", us, key)
+hello, arm, keep, drive = LinkBodies.hello, LinkBodies.arm, LinkBodies.keep, LinkBodies.drive
+set_limits, upload, gains = LinkBodies.limits, LinkBodies.upload, LinkBodies.gains
+biquads, start = LinkBodies.biquads, LinkBodies.start
 
 
 def credit(us: int, until: int) -> bytes:
-    return struct.pack("<IQ", us, min(until, 2**64 - 1))
-
-
-def drive(us: int, u: float) -> bytes:
-    return struct.pack("<If", us, _single(u))
-
-
-def set_limits(values: Sequence[float]) -> bytes:
-    return struct.pack("<4f", *map(_single, values))
-
-
-def upload(table: int, offset: int, values: bytes) -> bytes:
-    return struct.pack("<BI", table, offset) + values
-
-
-def gains(values: Sequence[float], filter_samples: int) -> bytes:
-    return _GAINS.pack(*map(_single, values), filter_samples)
-
-
-def design(observer_time: float, r_rate: float, points: Sequence[Sequence[float]]) -> bytes:
-    """What follows the gains for a device that knows observer, ramp and schedule."""
-    rows = [struct.pack("<4f", *map(_single, point)) for point in points]
-    head = struct.pack("<ffB", _single(observer_time), _single(r_rate), len(rows))
-    return b"".join((head, *rows))
-
-
-def start(mode: int, us: int, at: int, length: int, mask: int, batch: int) -> bytes:
-    return _START.pack(mode, us, at, length, mask, batch)
-
-
-def _single(value: float) -> float:
-    """What single precision holds; beyond its range is infinite."""
-    return value if abs(value) <= LARGEST else math.copysign(math.inf, value)
+    """Of a computed device, whose time may advance to `until` [us]; as far as there is time."""
+    return LinkBodies.credit(us, min(until, 2**64 - 1))
 
 
 def body_size(encodings: Sequence[int], batch: int) -> int:
@@ -393,31 +362,8 @@ def body_size(encodings: Sequence[int], batch: int) -> int:
 
 def wire_size(body: int) -> int:
     """Bytes on the wire of a frame: header, CRC, stuffing and the closing zero."""
-    return body + 21
-
-
-def _start(shape: struct.Struct, body: bytes, name: str) -> tuple[tuple[int, ...], bytes]:
-    if len(body) < shape.size:
-        raise _short(name, shape.size, len(body))
-    return shape.unpack_from(body), body[shape.size :]
-
-
-def _text(body: bytes, name: str) -> tuple[str, bytes]:
-    size = body[0] if body else 0
-    if len(body) < 1 + size:
-        raise _short(name, 1 + size, len(body))
-    text = body[1 : 1 + size].decode("utf-8", "replace")
-    # a name goes to terminals and files
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text), body[
-        1 + size :
-    ]
-
-
-def _short(name: str, expected: int, received: int) -> LinkError:
-    return LinkError(
-        f"expected at least {expected} bytes in the reply to {name}, got {received}; "
-        "mend the firmware (docs/PROTOCOL.md)"
-    )
+    around: int = LinkBodies.AROUND
+    return body + around
 
 
 # --- Refusals: what a device's result codes mean and what to do about them ------------------------

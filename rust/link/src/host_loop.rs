@@ -15,17 +15,16 @@ mod outcome;
 mod port;
 mod request;
 mod settings;
-mod status;
 mod tick;
 mod ticks;
 
+pub use crate::bodies::Status;
 pub use history::History;
 pub use memory::Locked;
 pub use outcome::Outcome;
 #[cfg(unix)]
 pub use port::run;
 pub use settings::Settings;
-pub use status::Status;
 pub use tick::HostLoop;
 pub use ticks::{Tick, Ticks};
 

@@ -1,6 +1,7 @@
 //! The host's end of the link to a drive (docs/PROTOCOL.md), as parts without a port of their own.
 
 pub mod anomalies;
+pub mod bodies;
 pub mod host_loop;
 pub mod receiver;
 pub mod samples;

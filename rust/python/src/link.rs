@@ -1,18 +1,21 @@
-//! Bindings of the link: frames out, received bytes to frames and columns of samples.
+//! Bindings of the link: frames and their bodies out, received bytes to frames, replies and columns of samples.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use numpy::PyArray1;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyList};
-use sewfast_control::link::{Header, MAX_BODY, MAX_WIRE, encode};
+use sewfast_control::link::identity::VERSION;
+use sewfast_control::link::{Body, Fields, Header, MAX_BODY, MAX_WIRE, encode};
 use sewfast_core::{Error, Result};
+use sewfast_link::bodies::{self, Description, Event, Greeting, Start, Status};
 use sewfast_link::{Channel, Receiver};
 
 use crate::arrays::{array1, raise};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<LinkReceiver>()?;
+    module.add_class::<LinkBodies>()?;
     module.add_function(wrap_pyfunction!(link_frame, module)?)
 }
 
@@ -32,14 +35,202 @@ fn link_frame<'py>(
         time,
     };
     let mut wire = [0; MAX_WIRE];
-    let length = encode(&header, body, &mut wire).ok_or_else(|| {
-        let message = format!(
-            "expected a body of at most {MAX_BODY} bytes, got {}; split it over several frames",
-            body.len()
-        );
-        raise(py, Error::setting(message))
-    })?;
+    let length =
+        encode(&header, body, &mut wire).ok_or_else(|| too_long(py, &body.len().to_string()))?;
     Ok(PyBytes::new(py, &wire[..length]))
+}
+
+fn too_long(py: Python<'_>, received: &str) -> PyErr {
+    let message = format!(
+        "expected a body of at most {MAX_BODY} bytes, got {received}; split it over several frames"
+    );
+    raise(py, Error::setting(message))
+}
+
+/// The bodies of a host's frames, and of a device's replies; see docs/PROTOCOL.md.
+#[pyclass(frozen, module = "sewfast._core")]
+struct LinkBodies;
+
+type Wire<'py> = PyResult<Bound<'py, PyBytes>>;
+
+fn wire<'py>(py: Python<'py>, body: &Body) -> Wire<'py> {
+    let bytes = body.bytes().ok_or_else(|| too_long(py, "more"))?;
+    Ok(PyBytes::new(py, bytes))
+}
+
+type Greeted = (String, String, u8, u32, u32, u8, u8, u32, u32, u32, f32);
+type Described = (u8, u8, u32, String, String);
+type Run = (u8, u8, u8, u16, u32, u64, u32, u32, u32);
+type Counted = (f32, i32, u32, u32, u32, u32, u32, u32);
+
+#[pymethods]
+impl LinkBodies {
+    #[classattr]
+    const VERSION: u8 = VERSION;
+    #[classattr]
+    const MAX_BODY: usize = MAX_BODY;
+    /// Bytes of a frame on the wire beside its body.
+    #[classattr]
+    const AROUND: usize = MAX_WIRE - MAX_BODY;
+
+    #[staticmethod]
+    fn host_time(session: u32, us: u64) -> u64 {
+        Header::host_time(session, us)
+    }
+
+    #[staticmethod]
+    fn hello(py: Python<'_>, session: u32) -> Wire<'_> {
+        wire(py, &bodies::hello(session))
+    }
+
+    #[staticmethod]
+    fn arm(py: Python<'_>, watchdog: u32, key: u32) -> Wire<'_> {
+        wire(py, &bodies::arm(watchdog, key))
+    }
+
+    #[staticmethod]
+    fn keep(py: Python<'_>, watchdog: u32) -> Wire<'_> {
+        wire(py, &bodies::keep(watchdog))
+    }
+
+    #[staticmethod]
+    fn drive(py: Python<'_>, watchdog: u32, u: f64) -> Wire<'_> {
+        wire(py, &bodies::drive(watchdog, u))
+    }
+
+    #[staticmethod]
+    fn credit(py: Python<'_>, watchdog: u32, until: u64) -> Wire<'_> {
+        wire(py, &bodies::credit(watchdog, until))
+    }
+
+    #[staticmethod]
+    fn limits(py: Python<'_>, values: [f64; 4]) -> Wire<'_> {
+        wire(py, &bodies::limits(values))
+    }
+
+    #[staticmethod]
+    fn upload<'py>(py: Python<'py>, table: u8, offset: u32, values: &[u8]) -> Wire<'py> {
+        wire(py, &bodies::upload(table, offset, values))
+    }
+
+    #[staticmethod]
+    #[pyo3(signature = (values, filter_samples, design = None))]
+    fn gains(
+        py: Python<'_>,
+        values: [f64; 12],
+        filter_samples: u8,
+        design: Option<(f64, f64, Vec<[f64; 4]>)>,
+    ) -> Wire<'_> {
+        let mut body = bodies::gains(values, filter_samples);
+        if let Some((observer_time, r_rate, schedule)) = design {
+            bodies::design(&mut body, observer_time, r_rate, &schedule);
+        }
+        wire(py, &body)
+    }
+
+    #[staticmethod]
+    fn biquads(py: Python<'_>, sections: Vec<[f64; 4]>) -> Wire<'_> {
+        wire(py, &bodies::biquads(&sections))
+    }
+
+    #[staticmethod]
+    fn start(
+        py: Python<'_>,
+        mode: u8,
+        watchdog: u32,
+        at: u64,
+        length: u32,
+        mask: u16,
+        batch: u8,
+    ) -> Wire<'_> {
+        let start = Start {
+            mode,
+            watchdog,
+            at,
+            length,
+            mask,
+            batch,
+        };
+        wire(py, &start.body())
+    }
+
+    #[staticmethod]
+    fn reply<'py>(py: Python<'py>, body: &[u8]) -> Option<(u32, u8, Bound<'py, PyBytes>)> {
+        let mut fields = Fields::new(body);
+        let (sequence, result) = bodies::reply(&mut fields)?;
+        Some((sequence, result, PyBytes::new(py, fields.rest())))
+    }
+
+    #[staticmethod]
+    fn detail(rest: &[u8]) -> Option<u32> {
+        let mut fields = Fields::new(rest);
+        fields.u32().filter(|_| fields.is_empty())
+    }
+
+    #[staticmethod]
+    fn greeting(body: &[u8]) -> Option<(Greeted, u32, u32)> {
+        let g = Greeting::of(&mut Fields::new(body))?;
+        let who = (
+            g.name,
+            g.firmware,
+            g.version,
+            g.boot,
+            g.schema,
+            g.state,
+            g.channels,
+            g.period,
+            g.capabilities,
+            g.capacity,
+            g.counts_per_rev,
+        );
+        Some((who, g.session, g.key))
+    }
+
+    #[staticmethod]
+    fn description(body: &[u8]) -> Option<Described> {
+        let d = Description::of(&mut Fields::new(body))?;
+        Some((d.number, d.encoding, d.steps_per_unit, d.name, d.unit))
+    }
+
+    #[staticmethod]
+    fn schema(version: u8, period_us: u32, replies: Vec<Vec<u8>>) -> u32 {
+        bodies::schema(version, period_us, replies.iter().map(Vec::as_slice))
+    }
+
+    #[staticmethod]
+    fn status(body: &[u8]) -> Option<(Run, Counted)> {
+        let s = Status::of(&mut Fields::new(body))?;
+        let run = (
+            s.state, s.reason, s.mode, s.mask, s.run, s.start, s.samples, s.length, s.end,
+        );
+        let counted = (
+            s.speed, s.counts, s.received, s.refused, s.dropped, s.late, s.session, s.foreign,
+        );
+        Some((run, counted))
+    }
+
+    #[staticmethod]
+    fn limits_of(body: &[u8]) -> Option<[f32; 8]> {
+        bodies::limits_of(&mut Fields::new(body))
+    }
+
+    #[staticmethod]
+    fn started(body: &[u8]) -> Option<(u32, u64)> {
+        bodies::started(&mut Fields::new(body))
+    }
+
+    #[staticmethod]
+    fn uploaded(body: &[u8]) -> Option<(u32, u32)> {
+        bodies::uploaded(&mut Fields::new(body))
+    }
+
+    #[staticmethod]
+    fn event(body: &[u8]) -> Option<(u8, u8, u8, u32, u32, f32)> {
+        let mut fields = Fields::new(body);
+        let e = Event::of(&mut fields)?;
+        fields.end()?;
+        Some((e.code, e.state, e.reason, e.run, e.samples, e.value))
+    }
 }
 
 /// Receives what a device sends; see docs/PROTOCOL.md.

@@ -4,8 +4,8 @@ use sewfast_control::link::{Body, Fields, Frame};
 
 use super::kind;
 use super::outcome::Outcome;
-use super::status::Status;
 use super::tick::{HostLoop, Phase, State};
+use crate::bodies::{self, Status};
 
 /// States of the device, by the protocol's numbers.
 const BOOT: u8 = 0;
@@ -71,7 +71,7 @@ impl State {
     }
 
     fn reply(&mut self, now: u64, fields: &mut Fields<'_>) -> Option<()> {
-        let (sequence, result) = (fields.u32()?, fields.u8()?);
+        let (sequence, result) = bodies::reply(fields)?;
         if sequence != self.request.sequence || self.request.sent == 0 {
             return None;
         }
@@ -94,7 +94,7 @@ impl State {
                 self.request(kind::START, self.start_body());
             }
             Phase::Starting => {
-                let (_run, start) = (fields.u32()?, fields.u64()?);
+                let (_run, start) = bodies::started(fields)?;
                 self.begin(now, start);
             }
             Phase::Stopping => {
@@ -161,13 +161,12 @@ impl State {
     }
 
     fn event(&mut self, fields: &mut Fields<'_>) -> Option<()> {
-        let (code, _state, reason) = (fields.u8()?, fields.u8()?, fields.u8()?);
-        let (_run, _samples, value) = (fields.u32()?, fields.u32()?, fields.f32()?);
+        let event = bodies::Event::of(fields)?;
         if self.phase == Phase::Running {
-            match code {
+            match event.code {
                 FINISHED => self.finished(),
                 DISARMED => self.stop(Outcome::Ended),
-                TRIP => self.tripped(reason, value),
+                TRIP => self.tripped(event.reason, event.value),
                 _ => {}
             }
         }

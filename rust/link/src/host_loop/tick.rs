@@ -2,6 +2,7 @@
 
 use sewfast_control::Controller;
 use sewfast_control::link::{Body, Header, MAX_WIRE, encode};
+
 use sewfast_core::Result;
 
 use super::age::Age;
@@ -10,9 +11,9 @@ use super::kind;
 use super::outcome::Outcome;
 use super::request::Request;
 use super::settings::Settings;
-use super::status::Status;
 use super::ticks::{Tick, Ticks};
 use crate::anomalies::Counters;
+use crate::bodies::{self, Status};
 use crate::receiver::Receiver;
 use crate::samples::Channel;
 
@@ -84,8 +85,7 @@ impl HostLoop {
         let mut receiver = Receiver::new();
         receiver.expect(channels, settings.device_period)?;
         let samples = (reference.len() * settings.ratio as usize).min(super::ROOM);
-        let mut body = Body::new();
-        body.u32(settings.watchdog).u32(settings.key);
+        let body = bodies::arm(settings.watchdog, settings.key);
         let state = State {
             settings,
             controller,
@@ -277,14 +277,12 @@ impl State {
         }
         let u = self.control(now, late, r);
         self.next += 1;
-        let mut body = Body::new();
-        body.u32(self.settings.watchdog).f32(u as f32);
+        let body = bodies::drive(self.settings.watchdog, u);
         Some((self.heartbeat(kind::DRIVE, now), body))
     }
 
     fn keep(&mut self, now: u64) -> (Header, Body) {
-        let mut body = Body::new();
-        body.u32(self.settings.watchdog);
+        let body = bodies::keep(self.settings.watchdog);
         (self.heartbeat(kind::KEEP, now), body)
     }
 
@@ -345,10 +343,15 @@ impl State {
     /// START of mode 2, at the next sample; the host stops it before it ends by itself.
     pub fn start_body(&self) -> Body {
         let s = &self.settings;
-        let mut body = Body::new();
-        body.u8(2).u32(s.watchdog).u64(0).u32(self.length());
-        body.u16(s.mask).u8(s.batch);
-        body
+        let start = bodies::Start {
+            mode: 2,
+            watchdog: s.watchdog,
+            at: 0,
+            length: self.length(),
+            mask: s.mask,
+            batch: s.batch,
+        };
+        start.body()
     }
 
     /// Most samples of the device in the run: the reference, the batch before its first tick, and a period for what is late.

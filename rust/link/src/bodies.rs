@@ -1,0 +1,386 @@
+//! The host's side of the bodies in docs/PROTOCOL.md: what it says, and what a device's replies say to it.
+//!
+//! Each command is written by the function of its name. A reply is read by the `of` of its value from the fields behind
+//! sequence and result; `None` is a body that is too short.
+
+use sewfast_control::link::crc::Crc;
+use sewfast_control::link::identity::VERSION;
+use sewfast_control::link::{Body, Fields};
+
+fn written(write: impl FnOnce(&mut Body)) -> Body {
+    let mut body = Body::new();
+    write(&mut body);
+    body
+}
+
+/// HELLO of a host that speaks one version.
+#[must_use]
+pub fn hello(session: u32) -> Body {
+    written(|b| _ = b.u8(VERSION).u8(VERSION).u32(session))
+}
+
+/// ARM, with the key that HELLO was answered with.
+#[must_use]
+pub fn arm(watchdog: u32, key: u32) -> Body {
+    written(|b| _ = b.u32(watchdog).u32(key))
+}
+
+/// KEEP: the device may go on for `watchdog` \[us\].
+#[must_use]
+pub fn keep(watchdog: u32) -> Body {
+    written(|b| _ = b.u32(watchdog))
+}
+
+/// DRIVE: the command of a direct run, which is a heartbeat too.
+#[must_use]
+pub fn drive(watchdog: u32, u: f64) -> Body {
+    written(|b| _ = b.u32(watchdog).f32(u as f32))
+}
+
+/// CREDIT: the device's time may advance to `until` \[us\]; a heartbeat too.
+#[must_use]
+pub fn credit(watchdog: u32, until: u64) -> Body {
+    written(|b| _ = b.u32(watchdog).u64(until))
+}
+
+/// LIMITS: volt, speed, acceleration, current; zeros ask for those in force.
+#[must_use]
+pub fn limits(values: [f64; 4]) -> Body {
+    written(|b| numbers(b, &values))
+}
+
+/// UPLOAD of values as they are in the table, from its value `offset` on.
+#[must_use]
+pub fn upload(table: u8, offset: u32, values: &[u8]) -> Body {
+    written(|b| _ = b.u8(table).u32(offset).add(values))
+}
+
+/// GAINS: Kp, Ti, Td, alpha, beta, N, Tt, `u_min`, `u_max`, slew, `filter_time`, counts per unit, then the filter's samples.
+#[must_use]
+pub fn gains(values: [f64; 12], filter_samples: u8) -> Body {
+    written(|b| {
+        numbers(b, &values);
+        b.u8(filter_samples);
+    })
+}
+
+/// What follows the gains for a device that knows observer, ramp and schedule (speed, Kp, Ti, Td each).
+pub fn design(body: &mut Body, observer_time: f64, r_rate: f64, schedule: &[[f64; 4]]) {
+    numbers(body, &[observer_time, r_rate]);
+    body.u8(u8::try_from(schedule.len()).unwrap_or(u8::MAX));
+    for point in schedule {
+        numbers(body, point);
+    }
+}
+
+/// BIQUADS: sections of c0, c1, a1, a2.
+#[must_use]
+pub fn biquads(sections: &[[f64; 4]]) -> Body {
+    written(|b| {
+        b.u8(u8::try_from(sections.len()).unwrap_or(u8::MAX));
+        for section in sections {
+            numbers(b, section);
+        }
+    })
+}
+
+/// What single precision holds of each; beyond its range that is infinite.
+fn numbers(body: &mut Body, values: &[f64]) {
+    for &value in values {
+        body.f32(value as f32);
+    }
+}
+
+/// START of a run: its mode, its place in time (0 for the next sample), its length and what is streamed of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Start {
+    /// 0 commands, 1 controller, 2 direct.
+    pub mode: u8,
+    /// Time of the watchdog \[us\].
+    pub watchdog: u32,
+    /// Device's time of the first sample \[us\]; 0 for the next one.
+    pub at: u64,
+    /// Samples.
+    pub length: u32,
+    /// A bit for each channel that is streamed.
+    pub mask: u16,
+    /// Samples in a frame.
+    pub batch: u8,
+}
+
+impl Start {
+    /// The body.
+    #[must_use]
+    pub fn body(&self) -> Body {
+        written(|b| {
+            b.u8(self.mode).u32(self.watchdog).u64(self.at);
+            b.u32(self.length).u16(self.mask).u8(self.batch);
+        })
+    }
+}
+
+/// The head of every reply: the command's number and 0, or why it was refused. What is left is the reply itself.
+pub fn reply(fields: &mut Fields<'_>) -> Option<(u32, u8)> {
+    Some((fields.u32()?, fields.u8()?))
+}
+
+/// A text; what is not UTF-8 in it is shown as such.
+fn text(fields: &mut Fields<'_>) -> Option<String> {
+    let length = fields.u8()?;
+    let bytes = fields.take(length.into())?;
+    Some(String::from_utf8_lossy(bytes).into_owned())
+}
+
+/// The reply to HELLO.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Greeting {
+    /// Of the protocol.
+    pub version: u8,
+    /// Another one after a reset.
+    pub boot: u32,
+    /// CRC-32 of the channels, see [`schema`].
+    pub schema: u32,
+    /// When it was asked.
+    pub state: u8,
+    /// How many.
+    pub channels: u8,
+    /// Control period \[us\].
+    pub period: u32,
+    /// Bits of `sewfast_control::link::capability`.
+    pub capabilities: u32,
+    /// Values that its profile memory holds.
+    pub capacity: u32,
+    /// Of the encoder.
+    pub counts_per_rev: f32,
+    /// Of the device.
+    pub name: String,
+    /// Its version.
+    pub firmware: String,
+    /// Whose HELLO it answers.
+    pub session: u32,
+    /// What ARM repeats.
+    pub key: u32,
+}
+
+impl Greeting {
+    /// The fields of a reply.
+    pub fn of(fields: &mut Fields<'_>) -> Option<Self> {
+        Some(Self {
+            version: fields.u8()?,
+            boot: fields.u32()?,
+            schema: fields.u32()?,
+            state: fields.u8()?,
+            channels: fields.u8()?,
+            period: fields.u32()?,
+            capabilities: fields.u32()?,
+            capacity: fields.u32()?,
+            counts_per_rev: fields.f32()?,
+            name: text(fields)?,
+            firmware: text(fields)?,
+            session: fields.u32()?,
+            key: fields.u32()?,
+        })
+    }
+}
+
+/// The reply to DESCRIBE.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Description {
+    /// Of the channel.
+    pub number: u8,
+    /// How its samples are written.
+    pub encoding: u8,
+    /// Of encoding 1.
+    pub steps_per_unit: u32,
+    /// Of the quantity.
+    pub name: String,
+    /// Its unit.
+    pub unit: String,
+}
+
+impl Description {
+    /// The fields of a reply.
+    pub fn of(fields: &mut Fields<'_>) -> Option<Self> {
+        Some(Self {
+            number: fields.u8()?,
+            encoding: fields.u8()?,
+            steps_per_unit: fields.u32()?,
+            name: text(fields)?,
+            unit: text(fields)?,
+        })
+    }
+}
+
+/// CRC-32 of version, period and the replies to all DESCRIBE, which HELLO has announced.
+#[must_use]
+pub fn schema<'a>(version: u8, period: u32, replies: impl IntoIterator<Item = &'a [u8]>) -> u32 {
+    let head = Crc::new().update(&[version]).update(&period.to_le_bytes());
+    let all = replies.into_iter().fold(head, Crc::update);
+    all.value()
+}
+
+/// The reply to STATUS; of the run that is under way, or of the last one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Status {
+    /// The device's state.
+    pub state: u8,
+    /// Reason of its last trip.
+    pub reason: u8,
+    /// Of the run.
+    pub mode: u8,
+    /// Channels that are streamed.
+    pub mask: u16,
+    /// Its number.
+    pub run: u32,
+    /// Its first sample \[us\].
+    pub start: u64,
+    /// Samples taken in it.
+    pub samples: u32,
+    /// Of so many.
+    pub length: u32,
+    /// End of the profile.
+    pub end: u32,
+    /// Speed \[RPM\].
+    pub speed: f32,
+    /// The counter.
+    pub counts: i32,
+    /// Frames that it received.
+    pub received: u32,
+    /// Frames that it refused.
+    pub refused: u32,
+    /// Frames that it dropped, as its transmit memory was full.
+    pub dropped: u32,
+    /// Its latest control period \[us late\].
+    pub late: u32,
+    /// Whose session it is in.
+    pub session: u32,
+    /// Frames of other sessions.
+    pub foreign: u32,
+}
+
+impl Status {
+    /// The fields of a reply.
+    pub fn of(fields: &mut Fields<'_>) -> Option<Self> {
+        Some(Self {
+            state: fields.u8()?,
+            reason: fields.u8()?,
+            mode: fields.u8()?,
+            mask: fields.u16()?,
+            run: fields.u32()?,
+            start: fields.u64()?,
+            samples: fields.u32()?,
+            length: fields.u32()?,
+            end: fields.u32()?,
+            speed: fields.f32()?,
+            counts: fields.i32()?,
+            received: fields.u32()?,
+            refused: fields.u32()?,
+            dropped: fields.u32()?,
+            late: fields.u32()?,
+            session: fields.u32()?,
+            foreign: fields.u32()?,
+        })
+    }
+}
+
+/// The reply to LIMITS: volt, speed, acceleration and current in force, then the device's ceilings.
+pub fn limits_of(fields: &mut Fields<'_>) -> Option<[f32; 8]> {
+    let mut found = [0.0; 8];
+    for value in &mut found {
+        *value = fields.f32()?;
+    }
+    Some(found)
+}
+
+/// The reply to START: the run's number and its first sample \[us\].
+pub fn started(fields: &mut Fields<'_>) -> Option<(u32, u64)> {
+    Some((fields.u32()?, fields.u64()?))
+}
+
+/// The reply to UPLOAD: end of the profile, values that fit behind it.
+pub fn uploaded(fields: &mut Fields<'_>) -> Option<(u32, u32)> {
+    Some((fields.u32()?, fields.u32()?))
+}
+
+/// Something that happened on the device, `samples` into a run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Event {
+    /// What.
+    pub code: u8,
+    /// The state that it led to.
+    pub state: u8,
+    /// Of a trip.
+    pub reason: u8,
+    /// The run.
+    pub run: u32,
+    /// Its samples so far.
+    pub samples: u32,
+    /// What tripped it.
+    pub value: f32,
+}
+
+impl Event {
+    /// The fields of an event.
+    pub fn of(fields: &mut Fields<'_>) -> Option<Self> {
+        Some(Self {
+            code: fields.u8()?,
+            state: fields.u8()?,
+            reason: fields.u8()?,
+            run: fields.u32()?,
+            samples: fields.u32()?,
+            value: fields.f32()?,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn any_reply_is_read_or_too_short(body in prop::collection::vec(any::<u8>(), 0..120)) {
+            let fields = || Fields::new(&body);
+            prop_assert_eq!(Status::of(&mut fields()).is_some(), body.len() >= 61);
+            prop_assert_eq!(Event::of(&mut fields()).is_some(), body.len() >= 15);
+            prop_assert_eq!(limits_of(&mut fields()).is_some(), body.len() >= 32);
+            prop_assert_eq!(started(&mut fields()).is_some(), body.len() >= 12);
+            prop_assert_eq!(uploaded(&mut fields()).is_some(), body.len() >= 8);
+            prop_assert_eq!(reply(&mut fields()).is_some(), body.len() >= 5);
+            prop_assert!(Greeting::of(&mut fields()).is_none() || body.len() >= 37);
+            prop_assert!(Description::of(&mut fields()).is_none() || body.len() >= 8);
+        }
+    }
+
+    #[test]
+    fn commands_are_as_the_protocol_says() {
+        let bytes = |body: &Body| body.bytes().unwrap().to_vec();
+        assert_eq!(bytes(&hello(0x0403_0201)), [3, 3, 1, 2, 3, 4]);
+        assert_eq!(bytes(&arm(1, 2)), [1, 0, 0, 0, 2, 0, 0, 0]);
+        assert_eq!(bytes(&keep(256)), [0, 1, 0, 0]);
+        assert_eq!(bytes(&drive(1, 1.0)), [1, 0, 0, 0, 0, 0, 0x80, 0x3F]);
+        assert_eq!(bytes(&credit(1, 2)), [1, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0]);
+        assert_eq!(bytes(&upload(1, 2, b"ab")), [1, 2, 0, 0, 0, b'a', b'b']);
+        assert_eq!(
+            bytes(&limits([0.0, 0.0, 0.0, 1e300]))[12..],
+            f32::INFINITY.to_le_bytes()
+        );
+        assert_eq!(upload(0, 0, &[0; 227]).bytes(), None);
+        let start = Start {
+            mode: 2,
+            watchdog: 1,
+            at: 2,
+            length: 3,
+            mask: 4,
+            batch: 5,
+        };
+        let expected = [2, 1, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0, 4, 0, 5];
+        assert_eq!(bytes(&start.body()), expected);
+        assert_eq!(bytes(&biquads(&[[0.0; 4]; 3])).len(), 49);
+        let mut body = gains([0.0; 12], 7);
+        design(&mut body, 0.0, f64::INFINITY, &[[1.0; 4]; 2]);
+        assert_eq!(bytes(&body).len(), 49 + 9 + 32);
+        assert_eq!((bytes(&body)[48], bytes(&body)[57]), (7, 2));
+    }
+}
