@@ -169,7 +169,7 @@ class Commissioning:
         Parameters
         ----------
         folder : path
-            Made where it is not there; see docs/ARCHITECTURE.md for the layout.
+            Made where it is not there; see docs/CONVENTIONS.md for the layout.
         overwrite : bool
             Whether files of these names may be replaced that no commissioning has left.
 
