@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..arrays import counts_per_unit
 from ..control.controller import Controller
-from ..control.machine import RecordedRun
+from ..control.machine import RecordedRun, Watch
 from ..errors import LinkError, SettingError
 from ..gains import Gains, real
 from ..live import Kind as View
@@ -485,6 +485,7 @@ class Drive(Unique):
         file: str | os.PathLike[str] | None = None,
         live: str | View = "none",
         overwrite: bool = False,
+        watch: Watch | None = None,
     ) -> RecordedRun:
         """Run a controller on the device along a reference; `sewfast.run` with a drive does this.
 
@@ -497,6 +498,8 @@ class Drive(Unique):
             Of the reference, in messages and reports.
         file, live, overwrite
             As for `sewfast.run`.
+        watch : Watch, optional
+            Sees the samples as they come; what it raises stops the motor and goes on.
 
         Returns
         -------
@@ -508,7 +511,9 @@ class Drive(Unique):
         SettingError, LinkError, Interrupted
             As for `sewfast.run`.
         """
-        return follow(self, controller, r, name, file=file, live=live, overwrite=overwrite)
+        return follow(
+            self, controller, r, name, file=file, live=live, overwrite=overwrite, watch=watch
+        )
 
     def _stream(self, plan: Plan, sink: Sink, cancel: threading.Event | None) -> Outcome:
         run = self._prepare(plan, sink)
