@@ -36,6 +36,7 @@ class Kind(IntEnum):
     GAINS = 0x09
     START = 0x0A
     ECHO = 0x0B
+    BIQUADS = 0x0C
     KEEP = 0x20
     DRIVE = 0x21
     CREDIT = 0x22
@@ -52,7 +53,7 @@ REASONS = (
 EVENTS = ("", "boot", "armed", "started", "finished", "stopped", "tripped", "cleared")
 MODES = {"commands": 0, "controller": 1, "direct": 2}
 
-PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED, DESIGN = (1 << bit for bit in range(7))
+PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED, DESIGN, BIQUADS = (1 << b for b in range(8))
 """Capabilities of a device."""
 
 
@@ -378,6 +379,7 @@ _FIELDS: dict[int, tuple[str, ...]] = {
         "Kp", "Ti", "Td", "alpha", "beta", "N", "Tt", "u_min", "u_max", "slew", "filter_time",
         "counts per unit", "filter_samples", "observer_time", "r_rate", "schedule",
     ),
+    Kind.BIQUADS: ("the number of biquads",),
     Kind.START: ("mode", "watchdog", "at", "length", "mask", "batch"),
 }  # fmt: skip
 
@@ -415,6 +417,8 @@ def _refused(kind: int, result: int, detail: int) -> str:
 def _field(kind: int, index: int) -> str:
     if kind == Kind.UPLOAD:
         return f"value {index}"
+    if kind == Kind.BIQUADS and index:
+        return f"biquad {1 + (index - 1) // 4}"
     names = _FIELDS.get(kind, ())
     return names[index] if index < len(names) else f"field {index}"
 
