@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -164,6 +165,7 @@ def record(
     live: str | Kind = "none",
     settings: Mapping[str, Any] | None = None,
     overwrite: bool = False,
+    cancel: threading.Event | None = None,
 ) -> Recording:
     """Excite a machine from rest and record it.
 
@@ -189,6 +191,8 @@ def record(
     overwrite : bool
         Whether `file` may replace a recording of a drive, which cannot be had again; one of a
         virtual machine is replaced anyway.
+    cancel : threading.Event, optional
+        Of a drive: set in another thread, it ends the run as Ctrl-C does.
 
     Returns
     -------
@@ -206,7 +210,8 @@ def record(
         Where the port or the drive failed or tripped; the motor is stopped, `recording` holds what
         came.
     Interrupted
-        On Ctrl-C, of a drive; the motor is stopped, `best` is the recording up to there.
+        On Ctrl-C or `cancel`, of a drive; the motor is stopped, `best` is the recording up to
+        there.
     """
     if not isinstance(machine, VirtualMachine) and not (
         hasattr(machine, "stream") or hasattr(machine, "excite")
@@ -230,7 +235,7 @@ def record(
         )
     if hasattr(machine, "stream"):
         return _record_on(
-            cast("Drive", machine), command, name, method, file, live, settings, overwrite
+            cast("Drive", machine), command, name, method, file, live, settings, overwrite, cancel
         )
     if file is not None:
         require_replaceable(file, overwrite=overwrite)
@@ -259,6 +264,7 @@ def _record_on(
     live: str | Kind,
     settings: Mapping[str, Any] | None,
     overwrite: bool,
+    cancel: threading.Event | None,
 ) -> Recording:
     from .link.plan import Plan, Played, Stopped, play
 
@@ -270,7 +276,7 @@ def _record_on(
         return recording(
             play(
                 drive, plan, name=name, file=file, live=live, settings=settings,
-                overwrite=overwrite,
+                overwrite=overwrite, cancel=cancel,
             )
         )  # fmt: skip
     except Stopped as stopped:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
@@ -197,9 +198,10 @@ class SteppedBench:
 
 @dataclass(eq=False)
 class DriveBench:
-    """A drive behind a port, whose limits have been set."""
+    """A drive behind a port, whose limits have been set; `cancel` ends its run as Ctrl-C does."""
 
     drive: Drive
+    cancel: threading.Event | None = field(default=None, kw_only=True)
 
     @property
     def name(self) -> str:
@@ -240,7 +242,7 @@ class DriveBench:
         """
         for _ in range(2):
             try:
-                played = play(self.drive, plan, name=name)
+                played = play(self.drive, plan, name=name, cancel=self.cancel)
             except Stopped as stopped:
                 raise stopped.cause from None
             if played.outcome.is_complete:
@@ -312,7 +314,9 @@ def told_of(bench: Bench) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 @contextmanager
-def bench_of(on: object, u_max: float | None) -> Iterator[Bench]:
+def bench_of(
+    on: object, u_max: float | None, cancel: threading.Event | None = None
+) -> Iterator[Bench]:
     """The bench of a machine; a drive's volt limit is at most `u_max` as long as it lasts.
 
     Raises
@@ -328,7 +332,7 @@ def bench_of(on: object, u_max: float | None) -> Iterator[Bench]:
         if u_max is not None and u_max < before:
             drive.set_limits(volt=u_max)
         try:
-            yield DriveBench(drive)
+            yield DriveBench(drive, cancel=cancel)
         finally:
             if drive.limits().volt != before:
                 drive.set_limits(volt=before)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
@@ -182,6 +183,7 @@ class Follower(Protocol):
         file: str | os.PathLike[str] | None,
         live: str | Kind,
         overwrite: bool,
+        cancel: threading.Event | None = None,
     ) -> ClosedLoopRun:
         """Run along the reference `r` [y], shape (N,), from rest; arguments as of `run`."""
 
@@ -234,6 +236,7 @@ def run(
     file: str | os.PathLike[str] | None = None,
     live: str | Kind = "none",
     overwrite: bool = False,
+    cancel: threading.Event | None = None,
 ) -> ClosedLoopRun:
     """Run a controller on a model, on a virtual machine or on a drive, from rest.
 
@@ -266,6 +269,8 @@ def run(
         Of a drive: see `sewfast.live.open_view`.
     overwrite : bool
         Whether `file` may replace a recording of a drive, which cannot be had again.
+    cancel : threading.Event, optional
+        Of a drive: set in another thread, it ends the run as Ctrl-C does.
 
     Returns
     -------
@@ -286,7 +291,7 @@ def run(
         Where the port or the drive failed or tripped; the motor is stopped, `recording` holds what
         came.
     Interrupted
-        On Ctrl-C, of a drive; the motor is stopped, `best` is the run up to there.
+        On Ctrl-C or `cancel`, of a drive; the motor is stopped, `best` is the run up to there.
     """
     require_controller(controller, on, "run(controller, plant, reference)")
     if reference is None:
@@ -299,8 +304,10 @@ def run(
         if hasattr(drive, "excite"):  # a machine of the user's own, which says what it saw as well
             found: ClosedLoopRun = drive.follow(controller, r, title).run
         else:
+            # a follower that cannot be cancelled is asked only where somebody may want to
+            further = {} if cancel is None else {"cancel": cancel}
             found = drive.follow(
-                controller, r, name=title, file=file, live=live, overwrite=overwrite
+                controller, r, name=title, file=file, live=live, overwrite=overwrite, **further
             )
         return found
     check_fits(controller, on)

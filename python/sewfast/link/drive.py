@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
 from types import TracebackType
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,6 +169,9 @@ def let_pass(link: Connection, us: int) -> None:
 PATIENCE = 3.0
 
 
+_Drive = TypeVar("_Drive", bound="Drive")
+
+
 class Drive(Unique):
     """A motor drive behind a port, made by `connect`; a context manager whose end stops the motor.
 
@@ -188,7 +191,30 @@ class Drive(Unique):
         self.outcome: Outcome | None = None
         await_measurement(link)
 
-    def __enter__(self) -> Drive:
+    @classmethod
+    def open(
+        cls: type[_Drive],
+        url: str,
+        *,
+        baud: int = 115_200,
+        watchdog: float | None = None,
+        resume: float = 1.0,
+    ) -> _Drive:
+        """As `connect`, for a drive of a class of one's own."""
+        if watchdog is not None and not 0.001 <= real("watchdog", watchdog) <= 10.0:
+            raise SettingError(
+                f"expected a watchdog of .001 to 10 s, got {watchdog}; .1 suits most"
+            )
+        if not 0.0 <= real("resume", resume) < math.inf:
+            raise SettingError(f"expected resume of 0 s or more, got {resume}; 1 suits most")
+        port = open_port(url, baud)
+        try:
+            return cls(Connection(port, watchdog=watchdog, patience=PATIENCE, resume=resume))
+        except BaseException:
+            port.close()
+            raise
+
+    def __enter__(self: _Drive) -> _Drive:
         return self
 
     def __exit__(
@@ -424,6 +450,7 @@ class Drive(Unique):
         file: str | os.PathLike[str] | None = None,
         live: str | View = "none",
         overwrite: bool = False,
+        cancel: threading.Event | None = None,
     ) -> ClosedLoopRun:
         """Run a controller on the device along a reference; `sewfast.run` with a drive does this.
 
@@ -434,7 +461,7 @@ class Drive(Unique):
             Reference at the device's sample time [y].
         name : str
             Of the reference, in messages and reports.
-        file, live, overwrite
+        file, live, overwrite, cancel
             As for `sewfast.run`.
 
         Returns
@@ -447,14 +474,18 @@ class Drive(Unique):
         SettingError, LinkError, Interrupted
             As for `sewfast.run`.
         """
-        return follow(self, controller, r, name=name, file=file, live=live, overwrite=overwrite)
+        return follow(
+            self, controller, r, name=name, file=file, live=live, overwrite=overwrite, cancel=cancel
+        )
 
     def _stream(self, plan: Plan, sink: Sink, cancel: threading.Event | None) -> Outcome:
         run = self._prepare(plan, sink)
         try:
             run.upload()
-            run.begin()
-            self.outcome = run.finish() if run.play(cancel) else run.abort(None)
+            wanted = cancel is None or not cancel.is_set()
+            if wanted:
+                run.begin()
+            self.outcome = run.finish() if wanted and run.play(cancel) else run.abort(None)
         except BaseException as error:
             self.outcome = run.abort(error)
             self._settle()
@@ -573,13 +604,4 @@ def connect(
     SettingError
         For a setting outside its range.
     """
-    if watchdog is not None and not 0.001 <= real("watchdog", watchdog) <= 10.0:
-        raise SettingError(f"expected a watchdog of .001 to 10 s, got {watchdog}; .1 suits most")
-    if not 0.0 <= real("resume", resume) < math.inf:
-        raise SettingError(f"expected resume of 0 s or more, got {resume}; 1 suits most")
-    port = open_port(url, baud)
-    try:
-        return Drive(Connection(port, watchdog=watchdog, patience=PATIENCE, resume=resume))
-    except BaseException:
-        port.close()
-        raise
+    return Drive.open(url, baud=baud, watchdog=watchdog, resume=resume)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -429,6 +430,7 @@ def play(
     live: str | Kind = "none",
     overwrite: bool = False,
     settings: Mapping[str, Any] | None = None,
+    cancel: threading.Event | None = None,
 ) -> Played:
     """Run a plan and keep its samples.
 
@@ -448,6 +450,8 @@ def play(
         Whether a recording of a drive may be replaced; one of a virtual machine may.
     settings : mapping, optional
         What else the file says of the run.
+    cancel : threading.Event, optional
+        Set in another thread, it ends the run as Ctrl-C does.
 
     Raises
     ------
@@ -467,7 +471,9 @@ def play(
     with open_view(live, feed):
         writer = _writer(file, drive, plan, name, columns, settings or {})
         recorder = Recorder(columns, n, writer=writer, feed=feed)
-        played = _streamed(drive, plan, recorder, writer)
+        played = _streamed(drive, plan, recorder, writer, cancel)
+    if played.outcome.reason == "cancelled" and cancel is not None and cancel.is_set():
+        raise Stopped(played, KeyboardInterrupt())
     if played.outcome.reason != "finished":
         raise Stopped(played, LinkError(_not_finished(played.outcome, n, drive)))
     return played
@@ -482,6 +488,7 @@ def follow(
     file: str | os.PathLike[str] | None = None,
     live: str | Kind = "none",
     overwrite: bool = False,
+    cancel: threading.Event | None = None,
 ) -> ClosedLoopRun:
     """A controller on a drive along a reference; see `Drive.follow`."""
 
@@ -490,7 +497,11 @@ def follow(
 
     plan = Plan("controller", r, controller)
     try:
-        return made(play(drive, plan, name=name, file=file, live=live, overwrite=overwrite))
+        return made(
+            play(
+                drive, plan, name=name, file=file, live=live, overwrite=overwrite, cancel=cancel
+            )
+        )  # fmt: skip
     except Stopped as stopped:
         raise stopped.as_error(made) from stopped.cause
 
@@ -567,12 +578,18 @@ def _finite(limits: tuple[float, ...]) -> dict[str, float | None]:
     return {name: value if np.isfinite(value) else None for name, value in pairs}
 
 
-def _streamed(drive: Drive, plan: Plan, recorder: Recorder, writer: RecordWriter | None) -> Played:
+def _streamed(
+    drive: Drive,
+    plan: Plan,
+    recorder: Recorder,
+    writer: RecordWriter | None,
+    cancel: threading.Event | None,
+) -> Played:
     """Stream, close the file whatever happens, and give what came."""
     # of this run, not of one before it
     drive.outcome = None
     try:
-        outcome = drive.stream(plan, recorder)
+        outcome = drive.stream(plan, recorder, cancel=cancel)
     except BaseException as error:
         ended = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
         _closed(recorder, ended, drive.outcome, error)
