@@ -49,7 +49,7 @@ class Page:
 
 
 class Watching:
-    """A page that answers beats unless it is `frozen`; it keeps what it hears, and when."""
+    """A page that answers beats unless it is `frozen`; it keeps what it hears."""
 
     def __init__(self, studio: Any) -> None:
         self._page = Page(studio)
@@ -79,7 +79,7 @@ class Watching:
                         self.send("alive", n=heard["n"])
                     continue
                 with self._more:
-                    self._heard.append({**heard, "at": time.monotonic()})
+                    self._heard.append(heard)
                     self._more.notify_all()
 
     def send(self, do: str, **asked: Any) -> None:

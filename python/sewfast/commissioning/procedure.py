@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from .. import signals
 from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun
+from ..control.machine import Machine, RecordedRun
 from ..dataset import FloatArray
 from ..errors import DataError, Interrupted, SettingError
 from ..gains import vector
@@ -26,7 +27,7 @@ from ..threads import available
 from ..tuning.objective import Cost
 from ..tuning.search import TuningResult
 from . import excitations
-from .bench import Bench, Followed, NotedBench, bench_of, told_of
+from .bench import NotedBench, bench_of, told_of
 from .demands import MS, Demands, Refusal, demands
 from .excitations import first_motion, standard, step_response
 from .gains import Requirements, cause, cautious, cost_of, first_gains, ruled, search, start_of
@@ -45,9 +46,6 @@ from .small_signal import SmallSignal, small_signal
 from .training import ORDERS, THINNED, Rival, Trained, linear_rival, train
 from .verification import Disagreement, agreeing, judged, measure, predict, require_unsaturated
 
-if TYPE_CHECKING:
-    from ..link import Drive
-
 __all__ = ["STAGES", "commission"]
 
 MEMBERS = 4
@@ -60,7 +58,7 @@ Between = Callable[[str, Commissioning], object]
 
 
 def commission(
-    on: VirtualMachine | Drive | Bench,
+    on: VirtualMachine | Machine,
     *,
     u_max: float | None = None,
     speed: float | None = None,
@@ -93,7 +91,7 @@ def commission(
 
     Parameters
     ----------
-    on : VirtualMachine, Drive or Bench
+    on : VirtualMachine, Drive or another Machine
         The machine; of a drive the limits must have been set. It turns forward only, but for what
         a controller does at the end of a reference.
     u_max : float, optional
@@ -203,7 +201,7 @@ def commission(
             journal.heed()
             return None if taken is None else taken.found(journal.stage, name, key)
 
-        def kept_run(name: str, key: str, controller: Controller) -> Followed | None:
+        def kept_run(name: str, key: str, controller: Controller) -> RecordedRun | None:
             journal.heed()
             if taken is None:
                 return None
@@ -225,7 +223,7 @@ def commission(
 
 
 def _place(
-    name: str | os.PathLike[str], bench: Bench, asked: Demands, *, overwrite: bool, resume: bool
+    name: str | os.PathLike[str], bench: Machine, asked: Demands, *, overwrite: bool, resume: bool
 ) -> Taken:
     """Where the recordings go as they come, made before anything moves."""
     if not isinstance(name, (str, os.PathLike)) or not str(name) or "\0" in str(name):
@@ -242,7 +240,9 @@ def _place(
     return taken
 
 
-def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal) -> Commissioning:
+def _carry_out(
+    bench: NotedBench, asked: Demands, cost: Cost | None, journal: Journal
+) -> Commissioning:
     """The stages."""
     journal.enter("first motion")
     motion = first_motion(bench, asked)
@@ -269,7 +269,7 @@ def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal
     journal.keep(first=first, controller=first)
     r = excitations.trapezoids(step, fastest, asked, bench.Ts)
     trapezoids = bench.follow(first, r, "trapezoids")
-    require_unsaturated(trapezoids.run)
+    require_unsaturated(trapezoids)
     r = excitations.levels(step, fastest, asked, bench.Ts, asked.seed)
     levels = bench.follow(first, r, "levels")
 
@@ -352,7 +352,7 @@ def _instead(rival: Rival | None, judge: Recording, refusal: Refusal, journal: J
     return rival.alone(judge)
 
 
-def _pulses(bench: Bench, fopdt: Fopdt, asked: Demands) -> tuple[float, list[Recording]]:
+def _pulses(bench: Machine, fopdt: Fopdt, asked: Demands) -> tuple[float, list[Recording]]:
     """The acceleration at the command's limit [RPM/s], and recordings of pulses.
 
     The first ones are planned without a current limit, and where there is one they fall short of
@@ -362,10 +362,14 @@ def _pulses(bench: Bench, fopdt: Fopdt, asked: Demands) -> tuple[float, list[Rec
     u = excitations.pulses(fopdt, fastest, asked, bench.Ts, asked.seed)
     found = [bench.excite(u, "pulses")]
     shown = excitations.acceleration_shown(found[0], asked)
+    if math.isinf(shown):
+        shown = excitations.acceleration_from_rest(bench, fastest, asked)
     if shown > FALLS_SHORT * fastest:
         return min(shown, fastest), found
     u = excitations.pulses(fopdt, shown, asked, bench.Ts, asked.seed + 1)
-    return shown, [*found, bench.excite(u, "pulses_limited")]
+    found.append(bench.excite(u, "pulses_limited"))
+    again = excitations.acceleration_shown(found[1], asked)
+    return shown if math.isinf(again) else again, found
 
 
 @dataclass(frozen=True)
@@ -429,7 +433,7 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
 
 
 def _references(
-    fastest: float, asked: Demands, bench: Bench
+    fastest: float, asked: Demands, bench: Machine
 ) -> tuple[Mapping[str, FloatArray], Mapping[str, FloatArray]]:
     """To verify on, and to tune on."""
     if asked.references is not None:
@@ -441,7 +445,7 @@ def _references(
 
 
 def _samples(
-    references: References | None, bench: Bench, seed: int
+    references: References | None, bench: Machine, seed: int
 ) -> Mapping[str, FloatArray] | None:
     if references is None:
         return None

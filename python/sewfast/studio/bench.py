@@ -44,6 +44,8 @@ LOOK = 0.2
 LAST_WORDS = 10.0
 """Seconds that a run which was stopped has to close its file, where the server is gone."""
 
+STOPPED = "stopped; what was recorded until then is kept"
+
 Send = Callable[..., None]
 
 
@@ -284,9 +286,11 @@ class Bench:
                 "found": getattr(driving, kind)(drive, Path(folder), self, **asked)
             }
         except (KeyboardInterrupt, Interrupted):
-            found = {"error": "stopped; what was recorded until then is kept"}
+            found = {"error": STOPPED}
         except Exception as e:
-            found = {"error": said(e)}
+            # what ends may meet the thread that stops at the port, and is refused
+            met = isinstance(e, SettingError) and self.cancel.is_set()
+            found = {"error": STOPPED if met else said(e)}
             # a trip or a lost port is looked at by a person before anything moves again
             self._armed = self._armed and not isinstance(e, LinkError)
         self.job = ""

@@ -96,7 +96,7 @@ def record(
 ) -> dict[str, Any]:
     """Play a named excitation; written to a file as it comes."""
     from .. import signals
-    from ..recording import record
+    from ..control.machine import record
 
     u = scale * signals.excitation(signal, seed)
     made = record(drive, u, name=signal, file=folder / file, cancel=bench.cancel)
