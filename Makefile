@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors fleet studio bits bode physics killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors fleet studio bits bode notches physics killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -148,6 +148,10 @@ commissioning: $(DEV) ## figures of commissioning on five virtual machines, besi
 bode: $(VENV)/bench.stamp ## frequency responses and shafts of machines whose truth is known (docs/bode.md)
 	$(BIN)/python benches/bode.py
 	$(BIN)/python benches/bode.py --held --count 20
+
+notches: $(VENV)/bench.stamp ## what a notch brings on machines with a shaft (docs/bode.md)
+	$(BIN)/python benches/notches.py
+	$(BIN)/python benches/notches.py --held --again --count 20
 
 physics: $(VENV)/bench.stamp ## parameters of motors whose truth is known (docs/physics.md)
 	$(BIN)/python benches/physics.py --count 40 --mujoco 20 --logs 200 --tracked 24
