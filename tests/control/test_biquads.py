@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import sewfast
+from link_kept import Kept
 from sewfast import (
     Biquad,
     Constraints,
@@ -33,7 +34,6 @@ from sewfast.control.margins import loop_response
 from sewfast.control.systems import LinearLoop, response, simulate
 from sewfast.frequency import FrequencyResponse, propose
 from sewfast.link import Plan, VirtualDevice, connect
-from test_link_drive import Kept
 
 TS = 1e-3
 ALL = (
