@@ -98,9 +98,12 @@ def gains(controller: Controller, streamed: Sequence[Channel], identity: Identit
     g, c = fitting(controller, streamed), controller
     named = ("observer_time", bool(c.observer_time)), ("r_rate", c.r_rate != math.inf)
     further = [name for name, used in (*named, ("schedule", bool(c.schedule))) if used]
-    if further and not identity.capabilities & wire.DESIGN:
+    unknown = [] if identity.capabilities & wire.DESIGN else list(further)
+    if c.biquads and not identity.capabilities & wire.BIQUADS:
+        unknown.append("biquads")
+    if unknown:
         raise SettingError(
-            f"expected a controller without {' and '.join(further)} for this device, whose "
+            f"expected a controller without {' and '.join(unknown)} for this device, whose "
             "firmware does not know them; leave them out, or build the firmware with this sewfast"
         )
     values = (
@@ -332,6 +335,9 @@ class Drive(Unique):
         """
         body = gains(controller, self.channels, self.identity)
         self._link.ask(Kind.GAINS, body)
+        # GAINS leave none
+        if controller.biquads:
+            self._link.ask(Kind.BIQUADS, wire.biquads(controller.sections()))
 
     def arm(self) -> None:
         """Make it ready to start; its watchdog takes it back to idle when the host falls silent."""
