@@ -69,3 +69,67 @@ impl Measured {
         self.lines.iter().fold(0.0, largest)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::loop_transfer::{Loop, Plant, peak_sensitivity};
+    use sewfast_control::Standard;
+
+    const TS: f64 = 1e-3;
+
+    #[test]
+    fn a_response_without_error_has_the_sensitivity_of_its_plant() {
+        let gains = Standard {
+            kp: 0.02,
+            ti: 0.1,
+            td: 0.0,
+        };
+        let plant = Plant::fopdt(490.0, 0.25, 0.0083, TS).unwrap();
+        for counted in [false, true] {
+            let path = Path {
+                encoder: counted,
+                ..Path::new(gains, TS)
+            };
+            let omega: Vec<f64> = (1..20_000).map(|k| f64::from(k) * 0.15).collect();
+            let of = |w: &f64| {
+                let at = Place::at(w * TS);
+                plant.response(&at)
+                    * if counted {
+                        path.encoder_response(&at)
+                    } else {
+                        Complex::new(1.0, 0.0)
+                    }
+            };
+            let response: Vec<_> = omega.iter().map(of).collect();
+            let exact = peak_sensitivity(&Loop::new(&path, &plant).unwrap());
+            let none = vec![0.0; omega.len()];
+            let measured = Measured::new(&omega, &response, &none, counted, TS).unwrap();
+            assert!((measured.peak_sensitivity(&path) / exact - 1.0).abs() < 1e-4);
+            // circles can only make it worse, and -1 inside of one has no bound
+            let radius: Vec<f64> = response.iter().map(|g| 0.1 * g.norm()).collect();
+            let wide = Measured::new(&omega, &response, &radius, counted, TS).unwrap();
+            assert!(wide.peak_sensitivity(&path) > 1.02 * exact);
+            let radius: Vec<f64> = response.iter().map(|g| 2.0 * g.norm()).collect();
+            let wide = Measured::new(&omega, &response, &radius, counted, TS).unwrap();
+            assert!(wide.peak_sensitivity(&path).is_infinite());
+        }
+    }
+
+    #[test]
+    fn refuses_what_is_no_response() {
+        let one = Complex::new(1.0, 0.0);
+        for (omega, value, radius) in [
+            (vec![], vec![], vec![]),
+            (vec![1.0], vec![one, one], vec![0.0]),
+            (vec![1.0], vec![one], vec![]),
+            (vec![0.0], vec![one], vec![0.0]),
+            (vec![4e3], vec![one], vec![0.0]),
+            (vec![1.0], vec![one], vec![-1.0]),
+            (vec![1.0], vec![one], vec![f64::INFINITY]),
+            (vec![1.0], vec![Complex::new(f64::NAN, 0.0)], vec![0.0]),
+        ] {
+            assert!(Measured::new(&omega, &value, &radius, false, TS).is_err());
+        }
+    }
+}

@@ -62,9 +62,7 @@ impl Parameter {
             let inner = name.strip_prefix(gain)?.strip_prefix('[')?;
             inner.strip_suffix(']')?.parse().ok()
         };
-        let numbered = NUMBERED
-            .iter()
-            .find_map(|(known, of)| point(known).map(of));
+        let numbered = NUMBERED.iter().find_map(|(known, of)| point(known).map(of));
         numbered.ok_or_else(|| {
             Error::setting(format!(
                 "expected a variable named {}, Kp[0], Ti[0], Td[0] .. of a schedule's points, or notch_frequency[0], \

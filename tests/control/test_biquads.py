@@ -13,6 +13,7 @@ import pytest
 from test_link_drive import Kept
 
 import sewfast
+from link_kept import Kept
 from sewfast import (
     Biquad,
     Constraints,
