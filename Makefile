@@ -96,16 +96,21 @@ endif
 killed: firmware ## kills the host of the emulated board 100 times; its output goes off in time
 	SEWFAST_TRIALS=100 $(BIN)/python -m pytest tests/test_emulated.py -k killed
 
+# the library is the M4's: an M7 runs it as it is, and its external memory lies elsewhere
 M4 = thumbv7em-none-eabihf
-firmware: ## the example firmware for an emulated Cortex-M4 (Debian: rustc-web rust-web-src gcc-arm-none-eabi libnewlib-arm-none-eabi)
+firmware: ## the example firmware for emulated boards, Cortex-M4 and M7 (Debian: rustc-web rust-web-src gcc-arm-none-eabi libnewlib-arm-none-eabi)
 	RUSTC=/usr/bin/rustc RUSTC_BOOTSTRAP=1 cargo rustc --package sewfast-capi --profile firmware --crate-type staticlib \
 	  --quiet -Zbuild-std=core --target $(M4)
 	mkdir -p target/bare
-	arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16 -O2 -std=c99 -Wall -Wextra -Werror \
-	  -nostartfiles -Wl,--gc-sections -T examples/firmware/mps2/board.ld -I rust/capi/include -I examples/firmware \
-	  -o target/bare/mps2.elf examples/firmware/mps2/board.c examples/firmware/firmware.c \
-	  $(or $(CARGO_TARGET_DIR),target)/$(M4)/firmware/libsewfast_capi.a -lm
-	arm-none-eabi-size target/bare/mps2.elf
+	set -e; for board in mps2-an386:cortex-m4:fpv4-sp-d16:0x21000000 mps2-an500:cortex-m7:fpv5-sp-d16:0x60000000; do \
+	  set -- $$(echo $$board | tr : ' '); \
+	  arm-none-eabi-gcc -mcpu=$$2 -mthumb -mfloat-abi=hard -mfpu=$$3 -O2 -std=c99 -Wall -Wextra -Werror \
+	    -nostartfiles -Wl,--gc-sections,-z,noexecstack,--defsym=EXTERNAL=$$4 -T examples/firmware/mps2/board.ld \
+	    -I rust/capi/include -I examples/firmware -o target/bare/$$1.elf \
+	    examples/firmware/mps2/board.c examples/firmware/firmware.c \
+	    $(or $(CARGO_TARGET_DIR),target)/$(M4)/firmware/libsewfast_capi.a -lm; \
+	  arm-none-eabi-size target/bare/$$1.elf; \
+	done
 
 python-test: $(DEV) ## pytest, with every snippet of the documentation and every example
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not alone'
