@@ -23,10 +23,10 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors fleet studio bits bode physics killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors fleet studio bits bode physics aarch64 licences killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
+	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
 
 demo: $(REPORT) ## the whole experiment on the virtual machine; the report goes to demo/report.html
 	$(BIN)/sewfast demo --out $(OUT)
@@ -92,6 +92,16 @@ c-test: ## the C library and the example firmware, with board, motor and host in
 ifeq ($(shell uname),Linux)
 	! nm target/bare/device_test | grep panicking
 endif
+
+ARM64 = aarch64-unknown-linux-gnu
+aarch64: ## unit and property tests on an emulated 64-bit ARM (Debian: rustc-web rust-web-src gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user; CASES=16)
+	RUSTC=/usr/bin/rustc RUSTDOC=/usr/bin/rustdoc RUSTC_BOOTSTRAP=1 PROPTEST_RNG_SEED=$(SEED) PROPTEST_CASES=$(or $(CASES),16) \
+	  CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc \
+	  CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER='qemu-aarch64 -L /usr/aarch64-linux-gnu' \
+	  cargo test --package sewfast-control --package sewfast-core --lib --profile checked --quiet -Zbuild-std --target $(ARM64)
+
+licences: ## LICENSE-THIRD-PARTY, from what the crates of a wheel say
+	$(PYTHON) tests/licences.py
 
 killed: firmware ## kills the host of the emulated board 100 times; its output goes off in time
 	SEWFAST_TRIALS=100 $(BIN)/python -m pytest tests/test_emulated.py -k killed

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from sewfast import Controller, Gains, Model, deploy
+from sewfast import Controller, Gains, Model, _core, deploy
 from sewfast.deployment.c99 import combined_run, embedded_members
 
 EMULATED = Path(__file__).parent / "emulated"
@@ -179,6 +179,25 @@ def _size(controller: Controller) -> float:
     return 8000.0 if controller.schedule else 4000.0
 
 
+class WithBiquads(Controller):
+    """With a notch, a low pass and a lead on reference and feedback."""
+
+    def core(self) -> _core.Controller:
+        g = self.gains.to("standard")
+        sections = [
+            _core.biquad("notch", [60.0, 0.1, 0.5], Ts=self.Ts),
+            _core.biquad("low_pass", [200.0, 0.7], Ts=self.Ts),
+            _core.biquad("lead_lag", [40.0, 160.0], Ts=self.Ts),
+        ]
+        return _core.Controller(
+            Kp=g.Kp, Ti=g.Ti, Td=g.Td, alpha=self.alpha, beta=self.beta, N=self.N, Tt=self.Tt,
+            u_min=self.u_min, u_max=self.u_max, slew=self.slew, Ts=self.Ts,
+            filter_samples=self.filter_samples, filter_time=self.filter_time,
+            observer_time=self.observer_time, r_rate=self.r_rate, schedule=self.schedule_rows(),
+            biquads=sections,
+        )  # fmt: skip
+
+
 CONTROLLERS = {
     "pi": Controller(Gains.standard(0.02, 0.25)),
     "paper": Controller(
@@ -191,7 +210,8 @@ CONTROLLERS = {
     "tracking": Controller(Gains.standard(0.02, 0.05), Tt=0.02, u_min=-8.0, u_max=8.0),
     "slew": Controller(Gains.standard(0.02, 0.05), slew=900.0, u_min=-8.0, u_max=8.0, alpha=-0.1),
     "ramp": Controller(Gains.standard(0.01, 0.2), r_rate=30000.0, u_min=2.0, u_max=20.0),
-    "everything": Controller(
+    "biquads": WithBiquads(Gains.standard(0.02, 0.05, 0.002), N=10.0, u_min=-8.0, u_max=8.0),
+    "everything": WithBiquads(
         Gains.standard(0.02, 0.25, 0.004), alpha=0.4, beta=0.2, N=8.0, Tt=0.05, u_min=-20.0,
         u_max=20.0, slew=4000.0, filter_samples=8, filter_time=0.002, observer_time=0.003,
         r_rate=20000.0,
