@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors fleet studio bits bode physics aarch64 licences killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors fleet studio bits bode notches physics aarch64 licences killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -47,7 +47,7 @@ types: $(DEV)
 	$(BIN)/mypy
 
 stubs: $(DEV)
-	MYPYPATH=python $(BIN)/python -m mypy.stubtest --allowlist tests/stubtest.txt sewfast._core
+	MYPYPATH=python $(BIN)/python -m mypy.stubtest --allowlist tests/support/stubtest.txt sewfast._core
 
 # the seed of every property comes from the commit: a build that passed passes again, and the next commit tries others
 SEED ?= $(shell printf '%d' "0x$$(git rev-parse HEAD 2>/dev/null | cut -c1-8 | grep . || echo 1)")
@@ -63,10 +63,10 @@ studio: $(DEV) ## the studio in a real browser: from a slider's event to painted
 	$(BIN)/python benches/studio.py
 
 bits: $(DEV) ## deployed code against the core over ten million samples of every kind (an hour)
-	$(BIN)/python tests/deployed.py
+	$(BIN)/python tests/support/deployed.py
 
 laws: $(DEV) ## every property of the crates under 20 seeds with 10,000 cases each (hours; SEEDS=, CASES=, ONLY=word)
-	$(BIN)/python tests/laws.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(CASES),--cases $(CASES)) $(if $(ONLY),--only $(ONLY))
+	$(BIN)/python tests/support/laws.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(CASES),--cases $(CASES)) $(if $(ONLY),--only $(ONLY))
 
 no-std: ## links the controller crate without the standard library, and its frames without a path that panics
 	cargo build --package sewfast-control --release --quiet
@@ -101,10 +101,10 @@ aarch64: ## unit and property tests on an emulated 64-bit ARM (Debian: rustc-web
 	  cargo test --package sewfast-control --package sewfast-core --lib --profile checked --quiet -Zbuild-std --target $(ARM64)
 
 licences: ## LICENSE-THIRD-PARTY, from what the crates of a wheel say
-	$(PYTHON) tests/licences.py
+	$(PYTHON) tests/support/licences.py
 
 killed: firmware ## kills the host of the emulated board 100 times; its output goes off in time
-	SEWFAST_TRIALS=100 $(BIN)/python -m pytest tests/test_emulated.py -k killed
+	SEWFAST_TRIALS=100 $(BIN)/python -m pytest tests/system/test_emulated.py -k killed
 
 # the library is the M4's: an M7 runs it as it is, and its external memory lies elsewhere
 M4 = thumbv7em-none-eabihf
@@ -137,7 +137,7 @@ package: $(DEV) ## source archive -> wheel -> import in a clean environment
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir target/package/wheels target/package/sewfast-*/
 	$(PYTHON) -m venv target/package/venv
 	target/package/venv/bin/pip install --quiet target/package/wheels/sewfast-*.whl
-	cd target/package/venv && bin/python -I $(CURDIR)/tests/clean_import.py
+	cd target/package/venv && bin/python -I $(CURDIR)/tests/support/clean_import.py
 
 bench: $(VENV)/bench.stamp ## sewfast and its rivals in one run; writes docs/PERFORMANCE.md (QUICK=1, ONLY=word)
 	$(BIN)/python benches/performance.py $(if $(QUICK),--quick) $(if $(ONLY),--only $(ONLY))
@@ -164,6 +164,10 @@ bode: $(VENV)/bench.stamp ## frequency responses and shafts of machines whose tr
 	$(BIN)/python benches/bode.py
 	$(BIN)/python benches/bode.py --held --count 20
 
+notches: $(VENV)/bench.stamp ## what a notch brings on machines with a shaft (docs/bode.md)
+	$(BIN)/python benches/notches.py
+	$(BIN)/python benches/notches.py --held --again --count 20
+
 physics: $(VENV)/bench.stamp ## parameters of motors whose truth is known (docs/physics.md)
 	$(BIN)/python benches/physics.py --count 40 --mujoco 20 --logs 200 --tracked 24
 
@@ -173,8 +177,8 @@ drives: $(VENV)/bench.stamp ## commissioning on drives of another simulator (ONL
 motors: $(DEV) ## commissioning on 20 motors of MuJoCo, beside an oracle (ONLY="3 7", SEEDS=)
 	$(BIN)/python benches/mujoco_motors.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))
 
-SOAKED := tests/test_soak.py tests/test_watchdog.py tests/test_recordfile_kill.py tests/test_recordfile_damage.py \
-  tests/test_link_connection.py tests/test_link_drive.py tests/test_link_virtual.py
+SOAKED := tests/system/test_soak.py tests/link/test_watchdog.py tests/recordfile/test_recordfile_kill.py tests/recordfile/test_recordfile_damage.py \
+  tests/link/test_link_connection.py tests/link/test_link_drive.py tests/link/test_link_virtual.py
 
 soak: $(DEV) ## the link's figures at full count: hours of faults, kills, flips, hostile bytes (docs/RESULTS.md)
 	SEWFAST_SOAK=1 cargo test --package sewfast-control --package sewfast-link --release --quiet
