@@ -40,8 +40,9 @@ from .result import (
     Taken,
     require_own,
 )
+from .shaking import margins_at_work
 from .slow import Thinning, turn_load
-from .small_signal import SmallSignal, small_signal
+from .small_signal import SHAKEN_AT, SmallSignal, small_signal
 from .training import ORDERS, THINNED, Rival, Trained, linear_rival, train
 from .verification import Disagreement, agreeing, judged, measure, predict, require_unsaturated
 
@@ -241,7 +242,7 @@ def _carry_out(
     journal.keep(small_signal=small)
     # the step response's dead time and constant have friction and the current limit in them
     fopdt = step if small is None or small.fopdt is None else small.fopdt
-    first = first_gains(fopdt, bench, asked, None if small is None else small.model)
+    first = first_gains(fopdt, bench, asked, small)
     journal.keep(first=first, controller=first)
 
     journal.enter("limits")
@@ -316,6 +317,12 @@ def _carry_out(
     )  # fmt: skip
     journal.keep(comparisons=comparisons, judgement=judged(comparisons, ensemble))
     measure(controller, bench, comparisons, verify, lambda new: journal.keep(comparisons=new))
+    if small is not None and small.resonance is not None:
+        speed = SHAKEN_AT * asked.speed
+        at_work = margins_at_work(bench, controller, small.model, speed, asked.seed)
+        journal.keep(margins=at_work)
+        if at_work is None:
+            journal.say(f"the margins could not be measured at {speed:g} RPM")
     journal.finish()
     found = journal.result(VERIFIED)
     return replace(found, verdict=VERIFIED_POORLY) if found.is_predicted_poorly else found

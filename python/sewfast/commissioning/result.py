@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 import warnings
@@ -94,6 +95,9 @@ class Commissioning:
         What speaks against the loops as predicted.
     comparisons : tuple of Comparison
         Predicted and measured, per reference.
+    margins : mapping or None
+        Of a machine with a resonance: `predicted` by its small signals and `measured` on it, at
+        `speed` [RPM]: `Ms`, `phase_margin_deg`, `gain_margin`.
     sample_time : float or None
         Of what is simulated [s]: for a slow drive a multiple of the machine's.
     notes : tuple of str
@@ -125,6 +129,7 @@ class Commissioning:
     card: ReportCard | None = None
     judgement: Judgement | None = None
     comparisons: tuple[Comparison, ...] = ()
+    margins: Mapping[str, Any] | None = None
     sample_time: float | None = None
     notes: tuple[str, ...] = ()
     taken_in: Path | None = None
@@ -284,9 +289,25 @@ def _evidence(c: Commissioning) -> list[str]:
         lines.append(
             f"  load of {volt:.3g} V   recovery {tuned:.0f} ms at most, by Eq. 12 {rule:.0f} ms"
         )
+    if c.margins is not None:
+        lines.append(_margins(c.margins))
     if c.judgement is not None:
         lines.append(f"  loops          {c.judgement.verdict}{_named(c.judgement.lines)}")
     return lines
+
+
+def _margins(found: Mapping[str, Any]) -> str:
+    one, other = found["predicted"], found["measured"]
+
+    def db(share: float) -> str:
+        return f"{20.0 * math.log10(share):.3g}" if math.isfinite(share) else "inf"
+
+    return (
+        f"  margins        at {found['speed']:.4g} RPM predicted / measured: Ms {one['Ms']:.3g} / "
+        f"{other['Ms']:.3g}, phase {one['phase_margin_deg']:.3g} / "
+        f"{other['phase_margin_deg']:.3g} deg, gain {db(one['gain_margin'])} / "
+        f"{db(other['gain_margin'])} dB"
+    )
 
 
 def _named(lines: Sequence[Line]) -> str:
@@ -620,6 +641,7 @@ def numbers(c: Commissioning) -> dict[str, Any]:
         },
         "cost": None if c.cost is None else dict(vars(c.cost)),
         "met": None if c.met is None else dict(c.met),
+        "margins": _finite(c.margins),
         "evidence": {
             name: {"verdict": judged.verdict, "lines": [x.to_json() for x in judged.lines]}
             for name, judged in (("report card", c.card), ("closed loops", c.judgement))
@@ -629,6 +651,21 @@ def numbers(c: Commissioning) -> dict[str, Any]:
         "measured_cost": c.measured_cost,
         "references": {x.reference: _comparison(x) for x in c.comparisons},
     }
+
+
+def _finite(found: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Numbers of JSON: an infinite margin is null."""
+    if found is None:
+        return None
+
+    def one(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {name: one(x) for name, x in value.items()}
+        if isinstance(value, list):
+            return [one(x) for x in value]
+        return value if math.isfinite(value) else None
+
+    return {name: one(value) for name, value in found.items()}
 
 
 def _small_signals(c: Commissioning) -> dict[str, Any] | None:
