@@ -58,7 +58,7 @@ def measured(name: str, seeds: int) -> None:
     recorded = {key: bench.excite(u, key).dataset() for key, u in signals.items()}
 
     def on_the_drive(controller: Controller) -> float:
-        return cost.of([bench.follow(controller, r, key).run for key, r in verify.items()])
+        return cost.of([bench.follow(controller, r, key) for key, r in verify.items()])
 
     rival = identify(Dataset.concat([recorded["chirp"], recorded["step"]]), model="oe")
     for keys in (("chirp", "step", "pulses"), ("chirp", "step")):

@@ -27,13 +27,13 @@ from sewfast import (
     read_table,
 )
 from sewfast.commissioning import Followed
-from sewfast.commissioning.bench import MachineBench
 from sewfast.commissioning.result import Taken, prepare, require_own
 from sewfast.control.loop import run as closed_loop
+from sewfast.control.machine import MachineBench, record
 from sewfast.dataset import FloatArray
 from sewfast.link import VirtualDevice
 from sewfast.recordfile import read_recording
-from sewfast.recording import Recording, record
+from sewfast.recording import Recording
 
 
 @contextmanager

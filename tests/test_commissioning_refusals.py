@@ -23,9 +23,9 @@ from sewfast import (
     run,
 )
 from sewfast.commissioning import Bench, Followed, Refusal, gains, procedure, training
-from sewfast.commissioning.bench import MachineBench
 from sewfast.commissioning.demands import demands
 from sewfast.commissioning.gains import held, swing_of
+from sewfast.control.machine import MachineBench
 from sewfast.recording import Recording
 
 
@@ -224,7 +224,7 @@ def test_a_reference_that_cannot_be_run_is_refused(samples: list[float]) -> None
 
 
 def test_only_machines_are_commissioned() -> None:
-    with pytest.raises(SettingError, match="VirtualMachine, a Drive or a Bench"):
+    with pytest.raises(SettingError, match="VirtualMachine, a Drive or a Machine"):
         commission("virtual")  # type: ignore[arg-type]
 
 

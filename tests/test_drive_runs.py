@@ -17,12 +17,12 @@ from moments import is_on, once_on, until
 from sewfast import signals
 from sewfast.control import Controller, Gains
 from sewfast.control.loop import run
+from sewfast.control.machine import record
 from sewfast.errors import Interrupted, LinkError, SettingError
 from sewfast.link import Drive, VirtualDevice, connect
 from sewfast.machine import VirtualMachine
 from sewfast.readers import read
 from sewfast.recordfile import read_recording
-from sewfast.recording import record
 
 STEP = 0.001
 """Of the device's command [V]."""

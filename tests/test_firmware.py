@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from cli import refused, sewfast
+from sewfast.control.machine import record
 from sewfast.errors import LinkError
 from sewfast.link import Plan, connect, examine
 from sewfast.recordfile import read_recording
-from sewfast.recording import record
 
 DESK = Path(__file__).resolve().parents[1] / "target" / "bare" / "desk"
 LIMITS = "volt=8,speed=3500,acceleration=40000,current=inf"

@@ -207,8 +207,11 @@ OF_MOTOR: dict[str, Any] = {
 @pytest.fixture(scope="module")
 def motor(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A motor that PythonFMU has made an FMU 2.0 of."""
+    return motor_fmu(tmp_path_factory.mktemp("a motor"))
+
+
+def motor_fmu(folder: Path) -> Path:
     builder = pytest.importorskip("pythonfmu.builder", reason="needs pythonfmu")
-    folder = tmp_path_factory.mktemp("a motor")
     (folder / "motor.py").write_text(MOTOR)
     made = builder.FmuBuilder.build_FMU(folder / "motor.py", dest=folder)
     return Path(made)

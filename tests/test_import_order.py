@@ -14,11 +14,11 @@ import sewfast
 
 ORDER = """
     errors arrays storage plotting threads speed signals
-    writers recordfile dataset readers benchmarks machine live
+    writers recordfile dataset readers benchmarks machine live recording
     dynamic_model validation comparison evidence models
     identification
     gains rules control tuning trust analysis frequency deployment fleets
-    link recording greybox report commissioning experiment studio cli __main__
+    link greybox report commissioning experiment studio cli __main__
 """
 
 LEFT: frozenset[tuple[str, str]] = frozenset()

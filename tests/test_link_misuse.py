@@ -18,10 +18,10 @@ from link_device import RUNNING, ScriptedDevice
 from sewfast import Controller, Gains, VirtualMachine
 from sewfast.cli import main
 from sewfast.control.loop import run
+from sewfast.control.machine import record
 from sewfast.errors import DataError, LinkError, SettingError
 from sewfast.link import Drive, Outcome, Plan, VirtualDevice, connect, examine, run_on_host
 from sewfast.recordfile import Header, RecordWriter, export, read_recording
-from sewfast.recording import record
 
 U = np.ones(100)
 CONTROLLER = Controller(Gains.standard(0.005, 0.1), u_min=-10.0, u_max=10.0)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from sewfast import signals
+from sewfast.control.machine import record
 from sewfast.errors import DataError
 from sewfast.machine import VirtualMachine
 from sewfast.readers import read, read_table
-from sewfast.recording import Recording, record
+from sewfast.recording import Recording
 
 
 @pytest.fixture(scope="module")

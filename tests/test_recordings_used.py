@@ -11,11 +11,11 @@ import sewfast as api
 from cli import refused, sewfast
 from recordings_made import header
 from sewfast.cli import main
+from sewfast.control.machine import record
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError, SettingError
 from sewfast.machine import VirtualMachine
 from sewfast.recordfile import RecordWriter, read_recording
-from sewfast.recording import record
 from sewfast.speed import speed_from_counts
 
 GAP = (1500, 40)

@@ -11,10 +11,10 @@ import pytest
 
 from cli import refused, sewfast
 from sewfast import _core, load_controller, signals
-from sewfast.commissioning.bench import MachineBench
 from sewfast.commissioning.demands import demands
 from sewfast.commissioning.training import linear_rival
 from sewfast.control import Fopdt
+from sewfast.control.machine import MachineBench
 from sewfast.errors import Interrupted, SettingError
 from sewfast.machine import VirtualMachine
 from sewfast.models import LinearOE

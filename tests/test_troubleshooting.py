@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from documents import blocks
-from sewfast.link.ports import explain
+from sewfast.errors import SettingError
+from sewfast.link.ports import explain, open_port
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "troubleshooting.md"
@@ -38,6 +39,9 @@ def _explained() -> Iterator[str]:
     yield str(explain("/dev/ttyUSB0", "open", ValueError("rate")))
     for error in (ConnectionRefusedError(errno.ECONNREFUSED, ""), TimeoutError("")):
         yield str(explain("socket://drive:1", "open", error))
+    with pytest.raises(SettingError) as another:
+        open_port("another://drive")
+    yield str(another.value)
 
 
 @cache

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .comparison import Comparison, compare
     from .control.controller import Controller, load_controller, paper_controller
     from .control.loop import ClosedLoopRun, run
+    from .control.machine import Machine, record
     from .control.margins import Margins, margins, operating_point
     from .dataset import Dataset, Diagnosis, Experiment, diagnose
     from .deployment import Deployment, deploy
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from .machine import VirtualMachine
     from .models import ARX, IV, Ensemble, LinearOE, Model, NeuralOE, NeuralSS, load_model
     from .readers import read, read_table
-    from .recording import Recording, record
+    from .recording import Recording
     from .rules import fit_fopdt, table_1
     from .speed import speed_from_counts
     from .tuning.front import ParetoFront, pareto
@@ -72,6 +73,7 @@ __all__ = [
     "LinearOE",
     "LinkError",
     "LoadStep",
+    "Machine",
     "Margins",
     "Model",
     "ModelFileError",
@@ -145,11 +147,12 @@ _HOMES = {
     "identification": "identify",
     "identification.least_squares": "LeastSquaresResult least_squares",
     "control.loop": "ClosedLoopRun run",
+    "control.machine": "Machine record",
     "machine": "VirtualMachine",
     "models": "ARX IV Ensemble LinearOE Model NeuralOE NeuralSS load_model",
     "identification.order_table": "OrderTable orders",
     "readers": "read read_table",
-    "recording": "Recording record",
+    "recording": "Recording",
     "control.margins": "Margins margins operating_point",
     "speed": "speed_from_counts",
     "validation": "Validation validate",

@@ -498,6 +498,11 @@ class SingleController:
     def numbers(self) -> dict[str, Any]:
         """What the step computes with: as ``Controller.numbers``, in single precision."""
 
+def biquad(kind: str, numbers: Sequence[float], *, Ts: float) -> tuple[float, float, float, float]:
+    """c0, c1, a1, a2 of 1 + (1 - q)(c0 + c1 q)/(1 + a1 q + a2 q^2), q = 1/z: a ``notch`` (frequency [Hz], depth, width), ``low_pass``
+    (frequency, damping), ``lead_lag`` (zero, pole) or ``resonance`` (zero frequency, damping, pole frequency, damping).
+    """
+
 @final
 class Controller:
     """The controller's arithmetic, one sample at a time (paper Fig. 16). Gains in standard form."""
@@ -507,8 +512,9 @@ class Controller:
         u_min: float, u_max: float, slew: float, Ts: float, filter_samples: int, filter_time: float,
         observer_time: float = 0.0, r_rate: float = ...,
         schedule: Sequence[tuple[float, float, float, float]] = ...,
+        biquads: Sequence[tuple[float, float, float, float]] = ...,
     ) -> Controller:
-        """``schedule`` has rows of speed, Kp, Ti, Td; empty for constant gains."""
+        """``schedule`` has rows of speed, Kp, Ti, Td; empty for constant gains. ``biquads`` are rows of `biquad`."""
 
     def step(self, r: float, y: float, feedforward: float = 0.0) -> float: ...
     def set_design(self, other: Controller) -> None:

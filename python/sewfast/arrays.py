@@ -36,9 +36,9 @@ def require_same_units(one: HasUnits, other: HasSource) -> None:
     for unit, received in zip(mine, (*other.input_units, other.output_unit), strict=True):
         if unit and received and unit != received:
             raise DataError(
-                f"{other.source}: expected the unit {unit!r}, received {received!r}; convert "
-                "the data"
-            )
+                name=other.source, expected=f"the unit {unit!r}", received=f"{received!r}",
+                remedy="convert the data",
+            )  # fmt: skip
 
 
 def labelled(name: str, unit: str) -> str:
@@ -59,8 +59,9 @@ def as_float(values: ArrayLike, what: str) -> FloatArray:
     array = np.asarray(values)
     if array.dtype.kind not in "biuf":
         raise DataError(
-            f"{what}: expected real numbers, received dtype {array.dtype}; convert it to float64"
-        )
+            name=what, expected="real numbers", received=f"dtype {array.dtype}",
+            remedy="convert it to float64",
+        )  # fmt: skip
     if array.dtype != np.float64 or array.flags.writeable or not array.flags.c_contiguous:
         array = np.array(array, dtype=np.float64, order="C")
         array.flags.writeable = False
@@ -78,14 +79,14 @@ def as_column(values: ArrayLike, what: str, n: int | None = None) -> FloatArray:
     array = as_float(values, what)
     if array.ndim != 1:
         raise DataError(
-            f"{what}: expected shape (N,), received {array.shape}; nothing is transposed or "
-            "flattened by guess, pass one column"
-        )
+            name=what, expected="shape (N,)", received=f"{array.shape}",
+            remedy="nothing is transposed or flattened by guess, pass one column",
+        )  # fmt: skip
     if n is not None and len(array) != n:
         raise DataError(
-            f"{what}: expected {n} samples, as many as the output, received {len(array)}; "
-            "cut both to the same range"
-        )
+            name=what, expected=f"{n} samples, as many as the output", received=f"{len(array)}",
+            remedy="cut both to the same range",
+        )  # fmt: skip
     return array
 
 
@@ -96,9 +97,9 @@ def as_inputs(values: ArrayLike, n: int) -> FloatArray:
         array = array.reshape(-1, 1)
     if array.ndim != 2 or array.shape[0] != n or array.shape[1] == 0:
         raise DataError(
-            f"u: expected shape ({n},) or ({n}, n_inputs), time first, as long as y; received "
-            f"{np.shape(values)}; nothing is transposed by guess"
-        )
+            name="u", expected=f"shape ({n},) or ({n}, n_inputs), time first, as long as y",
+            received=f"{np.shape(values)}", remedy="nothing is transposed by guess",
+        )  # fmt: skip
     return array
 
 

@@ -7,7 +7,71 @@ from typing import Any
 
 
 class SewfastError(Exception):
-    """Anything that sewfast refuses; the message says what was expected, what came, what to do."""
+    """Anything that sewfast refuses; the message says what was expected, what came, what to do.
+
+    It is given by its fields, and the message is made of them: ``name: expected ..., received ...;
+    remedy``. Or it is given whole, and the fields are read from it where it has this shape; so are
+    those of the compiled core.
+
+    Attributes
+    ----------
+    name : str or None
+        Of what is refused: an argument, a column, a file, a port.
+    expected, received, remedy : str or None
+        What was expected, what came instead, what to do.
+
+    Examples
+    --------
+    >>> error = SewfastError(name="u", expected="one column", received="two", remedy="use u[:, 0]")
+    >>> str(error)
+    'u: expected one column, received two; use u[:, 0]'
+    >>> SewfastError("expected 1 or 2 as mode, got 3").received
+    '3'
+    """
+
+    name: str | None
+    expected: str | None
+    received: str | None
+    remedy: str | None
+
+    def __init__(
+        self,
+        message: str = "",
+        *,
+        name: str | None = None,
+        expected: str | None = None,
+        received: str | None = None,
+        remedy: str | None = None,
+    ) -> None:
+        if expected is not None:
+            message = f"expected {expected}"
+            message = f"{name}: {message}" if name else message
+            message += f", received {received}" if received else ""
+            message += f"; {remedy}" if remedy else ""
+            found: tuple[str | None, ...] = (name or None, expected, received, remedy)
+        else:
+            found = _fields(str(message))
+        super().__init__(message)
+        self.name, self.expected, self.received, self.remedy = found
+
+
+def _fields(message: str) -> tuple[str | None, ...]:
+    """Name, expected, received and remedy of a message; all None for one of another shape."""
+    name, shaped, rest = f": {message}".partition(": expected ")
+    if not shaped:
+        return None, None, None, None
+    marks = [rest.find(mark) for mark in (", received ", ", got ", "; received ", "; got ")]
+    at = min((m for m in marks if m >= 0), default=-1)
+    if at < 0:
+        expected, _, remedy = rest.partition("; ")
+        expected, _, received = expected.partition(", ")
+    else:
+        expected, received = rest[:at], rest[at + 2 :].partition(" ")[2]
+        ends = [i for i in range(len(received)) if received.startswith("; ", i)]
+        # a text in quotes may hold a semicolon
+        end = next((i for i in ends if received.count("'", 0, i) % 2 == 0), len(received))
+        received, remedy = received[:end], received[end + 2 :]
+    return name[2:] or None, expected, received or None, remedy or None
 
 
 class DataError(SewfastError, ValueError):

@@ -1,4 +1,9 @@
-"""Analysis of a controller on models: responses, Bode of L, S, T, gain sensitivity, what-if."""
+"""Analysis of a controller on models: responses, Bode of L, S, T, gain sensitivity, what-if.
+
+Read in this order: `analysis` (`analyse` and what it gives), `points` (operating points and their
+Bode), `responses` (steps of reference and load), `sensitivity` and `changes` (what other gains or
+another drive would do), `figures`.
+"""
 
 from ..control.systems import LinearLoop
 from .analysis import Analysis, analyse

@@ -21,6 +21,7 @@ from .arguments import (
     require_plot,
 )
 from .drive import (
+    PORT_HELP,
     add_drive,
     is_port,
     machine_of,
@@ -277,7 +278,7 @@ def at_loops_period(args: argparse.Namespace, controller: Controller) -> Control
 
     if not is_port(args.on):
         raise SettingError(
-            f"--host-loop: expected --on PORT or socket://HOST:PORT, got {args.on!r}; leave "
+            f"--host-loop: expected --on PORT ({PORT_HELP}), got {args.on!r}; leave "
             "--host-loop out to simulate"
         )
     require_place(args.out, TABLES)

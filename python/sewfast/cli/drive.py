@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import signal
-import stat
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -20,10 +18,12 @@ from .arguments import Commands, add_command, add_view
 from .output import print_json, print_rows
 
 if TYPE_CHECKING:
-    from ..commissioning import SteppedBench
+    from ..control.machine import Machine
     from ..link import Drive, PortInfo
     from ..link.virtual import VirtualDevice
     from ..machine import VirtualMachine
+
+PORT_HELP = "serial port, socket://HOST:PORT or udp://HOST:PORT"
 
 PORTS = """\
 List the serial ports of this computer, with what speaks against opening one.
@@ -101,7 +101,7 @@ def add_doctor(commands: Commands) -> None:
         commands, "doctor", doctor_command,
         summary="what is wrong with a port", text=DOCTOR, examples=DOCTOR_EXAMPLES,
     )  # fmt: skip
-    parser.add_argument("port", metavar="PORT", help="serial port or socket://HOST:PORT")
+    parser.add_argument("port", metavar="PORT", help=PORT_HELP)
     parser.add_argument(
         "--baud", type=int, default=115_200, metavar="N", help="bits/s of a serial port (115200)"
     )
@@ -149,7 +149,7 @@ def add(commands: Commands) -> None:
             summary={"stop": "stop a drive", "clear": "take back a drive's trip"}[name], text=text,
             examples=f"example:\n  sewfast {name} /dev/ttyUSB0",
         )  # fmt: skip
-        parser.add_argument("port", metavar="PORT", help="serial port or socket://HOST:PORT")
+        parser.add_argument("port", metavar="PORT", help=PORT_HELP)
         _add_baud(parser)
 
 
@@ -161,7 +161,7 @@ def _add_baud(parser: argparse._ActionsContainer) -> None:
 
 def add_drive(parser: argparse.ArgumentParser) -> None:
     """Options that matter on a drive only."""
-    group = parser.add_argument_group("on a drive (PORT or socket://HOST:PORT)")
+    group = parser.add_argument_group(f"on a drive (PORT: {PORT_HELP})")
     _add_baud(group)
     group.add_argument(
         "--limits", metavar="LIST",
@@ -178,18 +178,13 @@ def add_drive(parser: argparse.ArgumentParser) -> None:
 
 
 def is_port(text: str) -> bool:
-    """Whether a text names a serial port or a socket rather than a file or a virtual machine."""
-    if text.startswith("socket://") or re.fullmatch(r"COM\d+", text, re.IGNORECASE):
-        return True
-    if text.startswith("/dev/"):
-        return True
-    try:
-        return stat.S_ISCHR(Path(text).stat().st_mode)
-    except (OSError, ValueError):
-        return False
+    """Whether a text names a port rather than a file or a virtual machine."""
+    from ..link.ports import is_port as names_port
+
+    return names_port(text)
 
 
-def machine_of(text: str) -> VirtualMachine | SteppedBench:
+def machine_of(text: str) -> VirtualMachine | Machine:
     """What `--on` names where it is no port: `virtual[:SEED]`, a motor's twin, or an FMU.
 
     Raises
@@ -207,8 +202,8 @@ def machine_of(text: str) -> VirtualMachine | SteppedBench:
         return load_motor(text).machine()
     if not text.startswith("virtual"):
         raise SettingError(
-            f"--on {text}: expected virtual[:SEED], MOTOR.json, FILE.fmu?volt=24, a serial port or "
-            "socket://HOST:PORT, got none of them; `sewfast ports` lists the serial ports"
+            f"--on {text}: expected virtual[:SEED], MOTOR.json, FILE.fmu?volt=24 or a port "
+            f"({PORT_HELP}), got none of them; `sewfast ports` lists the serial ports"
         )
     return VirtualMachine.from_name(text)
 

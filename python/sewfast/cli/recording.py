@@ -102,7 +102,7 @@ def record_command(args: argparse.Namespace) -> int | None:
     place = recording_place(args.out, overwrite=args.overwrite)
     try:
         with opened(args) as drive:
-            from ..recording import record
+            from ..control.machine import record
 
             _require_period(args, Ts, drive.identity.Ts)
             made = record(
@@ -162,8 +162,8 @@ def _require_period(args: argparse.Namespace, given: float, machine: float) -> N
 
 
 def _record_virtual(args: argparse.Namespace, u: FloatArray, Ts: float) -> None:
+    from ..control.machine import record
     from ..recordfile.writer import require_replaceable
-    from ..recording import record
 
     if args.out is not None:
         require_replaceable(args.out, overwrite=args.overwrite)

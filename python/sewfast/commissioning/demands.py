@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from ..control.machine import Machine
 from ..dataset import FloatArray
 from ..errors import FitError, SettingError
 from ..gains import real, whole
 from ..report.commissioned import file_name
 from ..tuning.objective import Constraints
 from ..tuning.task import budget
-from .bench import Bench
 
 if TYPE_CHECKING:
     from .result import Commissioning
@@ -102,7 +102,7 @@ class Demands:
 
 
 def demands(
-    bench: Bench,
+    bench: Machine,
     *,
     u_max: float | None,
     speed: float | None,

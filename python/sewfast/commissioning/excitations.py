@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from .. import _core
+from ..control.machine import Machine
 from ..dataset import FloatArray
 from ..errors import DataError, FitError
 from ..recording import Recording
 from ..rules import Fopdt, fit_fopdt
-from .bench import Bench
 from .demands import Demands, Refusal, require
 
 # --- First motion: which command moves the machine, which way, and about how fast -----------------
@@ -51,7 +52,7 @@ class Motion:
         return self.threshold + speed / self.gain
 
 
-def first_motion(bench: Bench, demands: Demands) -> Motion:
+def first_motion(bench: Machine, demands: Demands) -> Motion:
     """Try commands from small to large until the machine turns at a fair speed.
 
     Raises
@@ -142,7 +143,7 @@ LEAST_FIT = 80.0
 """Percent; below it the machine is no first order with dead time."""
 
 
-def step_response(bench: Bench, demands: Demands, motion: Motion) -> Fopdt:
+def step_response(bench: Machine, demands: Demands, motion: Motion) -> Fopdt:
     """Record steps until one settles, and fit it.
 
     Raises
@@ -187,8 +188,13 @@ def _checked(fopdt: Fopdt, demands: Demands) -> None:
 # --- Signals for a machine that is known as a first order with dead time only ---------------------
 
 
-SPAN = 0.02
-"""Over which a change of speed is an acceleration and not the encoder's noise [s]."""
+SPANS = 0.02, 0.01, 0.005
+"""Over which a change of speed is an acceleration and not the encoder's noise [s]; the shorter ones
+where a fast machine's pulses are shorter."""
+FIRST_SHARE, FAIR_SHARE = 0.2, 0.35
+"""Of the top speed, that a single pulse is planned for and that ends the series."""
+LONGEST_PULSE = 1.0
+"""Of the series [s]."""
 LEAST_HARD = 50
 """Samples near the largest command from which an acceleration is told."""
 LONGEST = 60.0
@@ -217,14 +223,43 @@ def acceleration(fopdt: Fopdt, demands: Demands) -> float:
 
 
 def acceleration_shown(recording: Recording, demands: Demands) -> float:
-    """What the machine does under the pulses [RPM/s]: the ninth decile of its changes of speed."""
-    span = max(1, round(SPAN / recording.Ts))
-    hard = np.abs(recording.u) >= 0.7 * demands.u_max
-    whole = np.convolve(hard, np.ones(span), "valid")[:-1] >= span
-    change = np.abs(recording.y[span:] - recording.y[:-span])[: len(whole)][whole]
-    if len(change) < LEAST_HARD:
-        return float("inf")
-    return float(np.quantile(change, 0.9)) / (span * recording.Ts)
+    """What the machine does when it speeds up under the largest commands [RPM/s]: the ninth decile
+    of its changes of speed; inf where there are no such commands.
+
+    How it brakes is not asked: friction helps there as much as it hinders here.
+    """
+    hard = recording.u >= 0.7 * demands.u_max
+    for span in (max(1, round(seconds / recording.Ts)) for seconds in SPANS):
+        whole = np.convolve(hard, np.ones(span), "valid")[:-1] >= span
+        change = (recording.y[span:] - recording.y[:-span])[: len(whole)][whole]
+        if len(change) >= LEAST_HARD and np.quantile(change, 0.9) > 0.0:
+            return float(np.quantile(change, 0.9)) / (span * recording.Ts)
+    return float("inf")
+
+
+def acceleration_from_rest(bench: Machine, fastest: float, demands: Demands) -> float:
+    """The same from single pulses of the largest command [RPM/s], each twice as long as the one
+    before, until one brings a fair speed.
+
+    Where pulses between speeds are planned with far more acceleration than a drive's current limit
+    allows, they are over within milliseconds.
+    """
+    samples = max(1, round(FIRST_SHARE * demands.top / (fastest * bench.Ts)))
+    while True:
+        seconds = samples * bench.Ts
+        recording = bench.excite(_single(demands.u_max, samples, bench.Ts), f"limit_{samples}")
+        reached = float(np.max(recording.y))
+        # a pulse of twice the length brings at most about twice the speed
+        if reached >= FAIR_SHARE * demands.top or seconds >= LONGEST_PULSE:
+            return max(reached, 1e-3 * demands.top) / seconds
+        samples *= 2
+
+
+def _single(u: float, samples: int, Ts: float) -> FloatArray:
+    before, after = round(0.05 / Ts), round(0.15 / Ts)
+    command = np.zeros(before + samples + after)
+    command[before : before + samples] = u
+    return command
 
 
 def step(u: float, seconds: float, Ts: float) -> FloatArray:
@@ -330,6 +365,8 @@ def standard(fastest: float, demands: Demands, Ts: float, *, short: bool) -> dic
     share = SHORT if short else 1.0
     # a slow machine's whole sweeps would be minutes of every loop that a search simulates
     brief = min(pace, BRIEF) if short else pace
+    # the change of random levels is half a cosine, steepest in its middle
+    change = max(0.2 * pace, 0.5 * math.pi * 1800.0 * size / (GENTLE * fastest))
     return {
         "trapezoid": _core.trapezoid(
             duration=2.0 * pace, Ts=Ts, start=0.1 * pace, rise=0.4 * pace, hold=0.6 * pace,
@@ -339,7 +376,7 @@ def standard(fastest: float, demands: Demands, Ts: float, *, short: bool) -> dic
         "chirp_lo_hi": _sweep((50.0, 250.0), (50.0, 350.0), size, pace, brief * share, Ts),
         "random": _core.random_steps(
             duration=5.0 * brief if short else 10.0 * pace, Ts=Ts, low=200.0 * size,
-            high=2000.0 * size, hold_min=0.25 * pace, hold_max=0.9 * pace, smoothing=0.2 * pace,
+            high=2000.0 * size, hold_min=1.25 * change, hold_max=4.5 * change, smoothing=change,
             seed=demands.seed + short, start=0.0,
         ),
     }  # fmt: skip

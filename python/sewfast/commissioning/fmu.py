@@ -15,8 +15,8 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from ..control.machine import SteppedBench
 from ..errors import ModelFileError, SettingError
-from .bench import SteppedBench
 
 MOST_BYTES = 2 * 1024**3
 """Of all files of an FMU, unpacked."""

@@ -14,6 +14,7 @@ import numpy as np
 from .. import _core
 from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun, run
+from ..control.machine import Machine
 from ..control.margins import margins, sampled
 from ..dataset import FloatArray
 from ..errors import DataError, FitError, SettingError
@@ -23,7 +24,6 @@ from ..models import Ensemble, Model
 from ..rules import Fopdt, Rule, eq_12, simc
 from ..tuning.objective import Constraints, Cost, LoadStep
 from ..tuning.search import TuningResult, costs, recoveries, tune
-from .bench import Bench
 from .demands import Demands, Refusal
 from .excitations import pace_of
 from .slow import Thinning
@@ -48,7 +48,7 @@ RATIOS = (0.01, 2.0)
 
 
 def first_gains(
-    fopdt: Fopdt, bench: Bench, demands: Demands, plant: Model | None = None
+    fopdt: Fopdt, bench: Machine, demands: Demands, plant: Model | None = None
 ) -> Controller:
     """Gains by Eq. 12 with a limit of Ms; the feedback filter's delay counts as dead time.
 
@@ -415,7 +415,7 @@ def swing_of(
 
 
 def cautious(
-    bench: Bench,
+    bench: Machine,
     controller: Controller,
     demands: Demands,
     fastest: float,
@@ -440,7 +440,7 @@ def cautious(
         expected = 0.0
         if models is not None:
             expected = _chatter(tried, models, r, settled, thinning or Thinning())
-        found = bench.follow(tried, r, f"{name}_{100 * share:g}").run
+        found = bench.follow(tried, r, f"{name}_{100 * share:g}")
         swing = swing_of(found, settled, share, expected)
         if swing is None:
             continue

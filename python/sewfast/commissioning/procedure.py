@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from .. import signals
 from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun
+from ..control.machine import Machine, RecordedRun
 from ..dataset import FloatArray
 from ..errors import DataError, Interrupted, SettingError
 from ..gains import vector
@@ -25,7 +26,7 @@ from ..threads import available
 from ..tuning.objective import Cost
 from ..tuning.search import TuningResult
 from . import excitations
-from .bench import Bench, Followed, NotedBench, bench_of, told_of
+from .bench import NotedBench, bench_of, told_of
 from .demands import MS, Demands, Refusal, demands
 from .excitations import first_motion, standard, step_response
 from .gains import Requirements, cause, cautious, cost_of, first_gains, ruled, search, start_of
@@ -44,9 +45,6 @@ from .small_signal import SmallSignal, small_signal
 from .training import ORDERS, THINNED, Rival, Trained, linear_rival, train
 from .verification import Disagreement, agreeing, judged, measure, predict, require_unsaturated
 
-if TYPE_CHECKING:
-    from ..link import Drive
-
 __all__ = ["STAGES", "commission"]
 
 MEMBERS = 4
@@ -58,7 +56,7 @@ References = Mapping[str, ArrayLike] | Sequence[str]
 
 
 def commission(
-    on: VirtualMachine | Drive | Bench,
+    on: VirtualMachine | Machine,
     *,
     u_max: float | None = None,
     speed: float | None = None,
@@ -89,7 +87,7 @@ def commission(
 
     Parameters
     ----------
-    on : VirtualMachine, Drive or Bench
+    on : VirtualMachine, Drive or another Machine
         The machine; of a drive the limits must have been set. It turns forward only, but for what
         a controller does at the end of a reference.
     u_max : float, optional
@@ -190,7 +188,7 @@ def commission(
         def kept(name: str, key: str) -> Recording | None:
             return None if taken is None else taken.found(journal.stage, name, key)
 
-        def kept_run(name: str, key: str, controller: Controller) -> Followed | None:
+        def kept_run(name: str, key: str, controller: Controller) -> RecordedRun | None:
             if taken is None:
                 return None
             return taken.found_run(journal.stage, name, key, controller, bench.name)
@@ -209,7 +207,7 @@ def commission(
 
 
 def _place(
-    name: str | os.PathLike[str], bench: Bench, asked: Demands, *, overwrite: bool, resume: bool
+    name: str | os.PathLike[str], bench: Machine, asked: Demands, *, overwrite: bool, resume: bool
 ) -> Taken:
     """Where the recordings go as they come, made before anything moves."""
     if not isinstance(name, (str, os.PathLike)) or not str(name) or "\0" in str(name):
@@ -226,7 +224,9 @@ def _place(
     return taken
 
 
-def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal) -> Commissioning:
+def _carry_out(
+    bench: Machine, asked: Demands, cost: Cost | None, journal: Journal
+) -> Commissioning:
     """The stages."""
     journal.enter("first motion")
     motion = first_motion(bench, asked)
@@ -253,7 +253,7 @@ def _carry_out(bench: Bench, asked: Demands, cost: Cost | None, journal: Journal
     journal.keep(first=first, controller=first)
     r = excitations.trapezoids(step, fastest, asked, bench.Ts)
     trapezoids = bench.follow(first, r, "trapezoids")
-    require_unsaturated(trapezoids.run)
+    require_unsaturated(trapezoids)
     r = excitations.levels(step, fastest, asked, bench.Ts, asked.seed)
     levels = bench.follow(first, r, "levels")
 
@@ -335,7 +335,7 @@ def _instead(rival: Rival | None, judge: Recording, refusal: Refusal, journal: J
     return rival.alone(judge)
 
 
-def _pulses(bench: Bench, fopdt: Fopdt, asked: Demands) -> tuple[float, list[Recording]]:
+def _pulses(bench: Machine, fopdt: Fopdt, asked: Demands) -> tuple[float, list[Recording]]:
     """The acceleration at the command's limit [RPM/s], and recordings of pulses.
 
     The first ones are planned without a current limit, and where there is one they fall short of
@@ -345,10 +345,14 @@ def _pulses(bench: Bench, fopdt: Fopdt, asked: Demands) -> tuple[float, list[Rec
     u = excitations.pulses(fopdt, fastest, asked, bench.Ts, asked.seed)
     found = [bench.excite(u, "pulses")]
     shown = excitations.acceleration_shown(found[0], asked)
+    if math.isinf(shown):
+        shown = excitations.acceleration_from_rest(bench, fastest, asked)
     if shown > FALLS_SHORT * fastest:
         return min(shown, fastest), found
     u = excitations.pulses(fopdt, shown, asked, bench.Ts, asked.seed + 1)
-    return shown, [*found, bench.excite(u, "pulses_limited")]
+    found.append(bench.excite(u, "pulses_limited"))
+    again = excitations.acceleration_shown(found[1], asked)
+    return shown if math.isinf(again) else again, found
 
 
 @dataclass(frozen=True)
@@ -412,7 +416,7 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
 
 
 def _references(
-    fastest: float, asked: Demands, bench: Bench
+    fastest: float, asked: Demands, bench: Machine
 ) -> tuple[Mapping[str, FloatArray], Mapping[str, FloatArray]]:
     """To verify on, and to tune on."""
     if asked.references is not None:
@@ -424,7 +428,7 @@ def _references(
 
 
 def _samples(
-    references: References | None, bench: Bench, seed: int
+    references: References | None, bench: Machine, seed: int
 ) -> Mapping[str, FloatArray] | None:
     if references is None:
         return None

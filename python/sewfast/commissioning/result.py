@@ -19,6 +19,7 @@ from .. import __version__, storage
 from ..analysis.analysis import NUMBERS as ANALYSIS
 from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun
+from ..control.machine import RecordedRun
 from ..errors import DataError, SettingError
 from ..evidence import Line, ReportCard
 from ..models import Ensemble
@@ -33,7 +34,6 @@ from ..trust import Judgement
 from ..tuning.objective import Cost
 from ..tuning.search import TuningResult
 from ..writers import write_table
-from .bench import Followed
 from .excitations import Motion
 from .slow import Thinning, TurnLoad
 from .small_signal import SmallSignal
@@ -168,7 +168,7 @@ class Commissioning:
         Parameters
         ----------
         folder : path
-            Made where it is not there; see docs/ARCHITECTURE.md for the layout.
+            Made where it is not there; see docs/CONVENTIONS.md for the layout.
         overwrite : bool
             Whether files of these names may be replaced that no commissioning has left.
 
@@ -493,17 +493,16 @@ class Taken:
 
     def found_run(
         self, stage: str, name: str, key: str, controller: Controller, plant: str
-    ) -> Followed | None:
+    ) -> RecordedRun | None:
         """The same of a closed loop."""
         file, recording = self._found(stage, name, key), self.found(stage, name, key)
         if file is None or recording is None:
             return None
         c = file.columns
         t = np.arange(len(c["u"]), dtype=np.float64) * recording.Ts
-        run = ClosedLoopRun(
-            t, c["r"], c["u"], c["speed"], c["feedback"], controller, plant, name
-        )  # fmt: skip
-        return Followed(run, recording)
+        return RecordedRun(
+            t, c["r"], c["u"], c["speed"], c["feedback"], controller, plant, name, recording
+        )
 
     def _found(self, stage: str, name: str, key: str) -> RecordedFile | None:
         if not self.resume:

@@ -15,13 +15,14 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..control.controller import Controller
+from ..control.machine import Machine
 from ..dataset import Dataset
 from ..errors import DataError, SettingError
 from ..frequency import FrequencyResponse, periodic, spectral
 from ..gains import real
 from ..recording import Recording
 from ..speed import speed_from_counts
-from .bench import Bench, bench_of
+from .bench import bench_of
 
 SHARE = 0.6
 """Of what the command has left beside the working point, that the multisine takes."""
@@ -205,7 +206,7 @@ class _Plan:
     @classmethod
     def of(
         cls,
-        bench: Bench,
+        bench: Machine,
         speed: float,
         period: float,
         realisations: int,
@@ -277,7 +278,7 @@ class _Plan:
         return kept
 
 
-def _in_open_loop(bench: Bench, plan: _Plan, amplitude: float | None) -> FrequencyResponse:
+def _in_open_loop(bench: Machine, plan: _Plan, amplitude: float | None) -> FrequencyResponse:
     level, lead, time = _working_point(bench, plan.speed)
     left = bench.volt - abs(level)
     swing = _swing(plan, plan.speed / level, time)
@@ -309,7 +310,7 @@ def _swing(plan: _Plan, gain: float, time: float) -> float:
 
 
 def _under_feedback(
-    bench: Bench, plan: _Plan, amplitude: float | None, controller: Controller
+    bench: Machine, plan: _Plan, amplitude: float | None, controller: Controller
 ) -> FrequencyResponse:
     peak = STEPS * abs(plan.speed) if amplitude is None else real("amplitude", amplitude)
     if not 0.0 < peak <= MOST * abs(plan.speed):
@@ -322,7 +323,7 @@ def _under_feedback(
     r = np.concatenate([ramp, plan.speed + peak * plan.signal()])
     followed = bench.follow(controller, r, "multisine")
     limits = (controller.u_min, controller.u_max)
-    limited = np.isin(followed.run.u[lead:], limits)
+    limited = np.isin(followed.u[lead:], limits)
     if limited.any():
         raise DataError(
             f"expected a command within its limits, got {limited.sum()} samples at one, the first "
@@ -335,7 +336,7 @@ def _under_feedback(
 
 
 def _response(
-    bench: Bench,
+    bench: Machine,
     plan: _Plan,
     recording: Recording,
     lead: int,
@@ -364,7 +365,7 @@ def _response(
     return found
 
 
-def _working_point(bench: Bench, speed: float) -> tuple[float, int, float]:
+def _working_point(bench: Machine, speed: float) -> tuple[float, int, float]:
     """Command that holds the speed [V], samples after which it does, time constant [s].
 
     By the secant method: a machine is less linear than a straight line between two speeds.
@@ -404,7 +405,7 @@ class _Held:
     time: float
 
 
-def _held(bench: Bench, u: float, hold: float) -> _Held:
+def _held(bench: Machine, u: float, hold: float) -> _Held:
     n = round(hold / bench.Ts)
     recording = bench.excite(np.full(n, u), "hold")
     counts = recording.counts

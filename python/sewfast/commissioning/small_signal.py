@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import _core
+from ..control.machine import Machine
 from ..dataset import Dataset, FloatArray
 from ..errors import DataError, FitError
 from ..identification.folds import Errors, Split, compared, errors_of, folds, free_runs
@@ -24,7 +25,6 @@ from ..identification.task import arrays, wrap
 from ..models import LinearOE, Model
 from ..recording import Recording
 from ..rules import Fopdt, fit_fopdt
-from .bench import Bench
 from .demands import Demands
 from .excitations import Motion
 
@@ -102,7 +102,7 @@ class SmallSignal:
 
 
 def small_signal(
-    bench: Bench, demands: Demands, motion: Motion, fopdt: Fopdt
+    bench: Machine, demands: Demands, motion: Motion, fopdt: Fopdt
 ) -> SmallSignal | None:
     """Shake the machine about half its top speed; None where that shows nothing.
 

@@ -9,11 +9,11 @@ import numpy as np
 
 from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun, run
+from ..control.machine import Machine
 from ..dataset import FloatArray
 from ..errors import FitError
 from ..models import Ensemble, Model
 from ..trust import Judgement, judge
-from .bench import Bench
 from .demands import Refusal, require
 from .slow import Thinning
 
@@ -164,7 +164,7 @@ def predict(
 
 def measure(
     controller: Controller,
-    bench: Bench,
+    bench: Machine,
     predicted: tuple[Comparison, ...],
     references: Mapping[str, FloatArray],
     keep: Callable[[tuple[Comparison, ...]], object],
@@ -179,7 +179,7 @@ def measure(
     found = dict(enumerate(predicted))
     for i in sorted(found, key=lambda i: len(found[i].predicted.r)):
         name = found[i].reference
-        run = bench.follow(controller, references[name], name).run
+        run = bench.follow(controller, references[name], name)
         found[i] = replace(found[i], measured=run)
         keep(tuple(found[k] for k in range(len(predicted))))
         require_alike(found[i])

@@ -1,8 +1,9 @@
 """The controller and its loop.
 
 Read in this order: `controller` (settings, files, first gains), `loop` (`run`: on a model or a
-machine), `defaults` (what is taken for a drive where nothing is stated), `margins` (of the linear
-loop), `systems` (the linear loop as state space), `forms` (a PID as MATLAB's and python-control's).
+machine), `machine` (`Machine`: all that is known of one; `record`), `defaults` (what is taken for a
+drive where nothing is stated), `margins` (of the linear loop), `systems` (the linear loop as state
+space), `forms` (a PID as MATLAB's and python-control's).
 """
 
 from ..gains import Form, Gains, vector

@@ -23,6 +23,7 @@ from .defaults import default_references, drive_references, pace_of
 
 if TYPE_CHECKING:
     from ..live import Kind
+    from .machine import Machine
 
 Plant: TypeAlias = Model | VirtualMachine
 
@@ -170,29 +171,6 @@ class ClosedLoopRun:
         return "\n".join(lines)
 
 
-class Follower(Protocol):
-    """A machine that runs the controller itself, as a drive does; all that `run` knows of it."""
-
-    def follow(
-        self,
-        controller: Controller,
-        r: FloatArray,
-        *,
-        name: str,
-        file: str | os.PathLike[str] | None,
-        live: str | Kind,
-        overwrite: bool,
-    ) -> ClosedLoopRun:
-        """Run along the reference `r` [y], shape (N,), from rest; arguments as of `run`."""
-
-
-class OwnMachine(Protocol):
-    """A machine of the user's own, such as a `sewfast.commissioning.SteppedBench`."""
-
-    def follow(self, controller: Controller, r: FloatArray, name: str) -> Any:
-        """Run along the reference `r` [y], shape (N,), from rest; `run` is what came of it."""
-
-
 class HasMetrics(Protocol):
     """A run of a closed loop, whoever has carried it out."""
 
@@ -224,7 +202,7 @@ def run_html(found: HasMetrics, caption: str) -> str:
 
 def run(
     controller: Controller,
-    on: Plant | Follower | OwnMachine,
+    on: Plant | Machine,
     reference: str | ArrayLike | None = None,
     *,
     feedforward: ArrayLike | None = None,
@@ -243,10 +221,10 @@ def run(
     Parameters
     ----------
     controller : Controller
-    on : Model, VirtualMachine or Drive
+    on : Model, VirtualMachine, Drive or another Machine
         The plant. A model needs one input and is not changed; so is a virtual machine. A drive
         (`sewfast.link`) runs the controller itself, in single precision; its limits must have been
-        set.
+        set. A `sewfast.Machine` of your own does what its `follow` does.
     reference : str or array, shape (N,), optional
         Name of a reference (`sewfast.signals`) or its samples at the controller's sample time [y].
         On a model that is not in RPM at 1 ms a name is the same shape over the model's recorded
@@ -295,14 +273,7 @@ def run(
     title = name or (reference if isinstance(reference, str) else "reference")
     beside = _beside(on, feedforward, disturbance)
     if not isinstance(on, (Model, VirtualMachine)):
-        drive = _require_follower(on)
-        if hasattr(drive, "excite"):  # a machine of the user's own, which says what it saw as well
-            found: ClosedLoopRun = drive.follow(controller, r, title).run
-        else:
-            found = drive.follow(
-                controller, r, name=title, file=file, live=live, overwrite=overwrite
-            )
-        return found
+        return _on_machine(controller, on, r, title, file=file, live=live, overwrite=overwrite)
     check_fits(controller, on)
     record = _core.closed_loop(
         single_core(on),
@@ -367,13 +338,19 @@ def require_controller(controller: Any, plant: Any, call: str) -> None:
     )
 
 
-def _require_follower(on: Any) -> Any:
+def _on_machine(
+    controller: Controller, on: Machine, r: FloatArray, name: str, **options: Any
+) -> ClosedLoopRun:
+    from .machine import is_streaming
+
     if not hasattr(on, "follow"):
         raise SettingError(
             "expected a Model, a VirtualMachine or a Drive to run on, got "
             f"{type(on).__name__}; load a model with load_model, or connect to a drive"
         )
-    return on
+    if is_streaming(on):
+        return on.follow(controller, r, name, **options)
+    return on.follow(controller, r, name)
 
 
 def reference_samples(

@@ -1,4 +1,9 @@
-"""Evidence that a model can be trusted: tests, covariance, bands, region, linearisation."""
+"""Evidence that a model can be trusted: tests, covariance, bands, region, linearisation.
+
+Read in this order: `checking` (`check`), `card` and `questions` (the report card and its verdicts);
+what they rest on: `residuals`, `correlations` and `portmanteau` (tests), `parameters` (covariance),
+`simulation_bands`, `region` (what was trained on), `operating` (linearisation), `figures`.
+"""
 
 from .card import Line, ReportCard
 from .checking import check, remembered, training_evidence

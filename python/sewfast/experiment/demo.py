@@ -169,7 +169,7 @@ def run_demo(
     Parameters
     ----------
     out : path
-        Result folder (docs/ARCHITECTURE.md); artefacts of an earlier experiment are replaced once
+        Result folder (docs/CONVENTIONS.md); artefacts of an earlier experiment are replaced once
         this one is through.
     seed : int
         Of the random signals, of the networks' starts and of the search for gains.

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from .. import _core, signals
 from ..commissioning import Commissioning, commission
-from ..commissioning.bench import DriveBench, Followed
+from ..commissioning.bench import DriveBench
 from ..commissioning.result import run_numbers
 from ..control.controller import Controller, paper_controller
 from ..control.loop import ClosedLoopRun, run
+from ..control.machine import RecordedRun, record
 from ..dataset import Dataset
 from ..errors import FitError, LinkError
 from ..evidence.figures import figures
@@ -27,7 +28,7 @@ from ..link import VirtualDevice, connect
 from ..machine import VirtualMachine
 from ..models import LinearOE, Model
 from ..plotting import style, svg
-from ..recording import Recording, record
+from ..recording import Recording
 from ..report.artefacts import PLANTS, REFERENCES, SCORED, record_of
 from ..report.pictures import CAPTIONS
 from ..rules import Fopdt, fit_fopdt, table_1
@@ -47,7 +48,7 @@ class Rig(DriveBench):
 
     Attributes
     ----------
-    drive : Drive
+    inner : Drive
     machine : VirtualMachine
         What is behind the port; asked only for what no drive could tell.
     port : str
@@ -67,13 +68,13 @@ class Rig(DriveBench):
         """Excite the drive, as a bench of commissioning."""
         return self.record(u, name)
 
-    def follow(self, controller: Controller, r: NDArray[np.float64], name: str) -> Followed:
+    def follow(self, controller: Controller, r: NDArray[np.float64], name: str) -> RecordedRun:
         """Run a controller on the drive, as a bench of commissioning."""
         began = time.perf_counter()
         return self._counted(super().follow(controller, r, name), began)
 
     def record(self, u: NDArray[np.float64], name: str) -> Recording:
-        """Excite the drive from rest; see `sewfast.recording.record`."""
+        """Excite the drive from rest; see `sewfast.record`."""
         began = time.perf_counter()
         return self._counted(record(self.drive, u, name=name), began)
 

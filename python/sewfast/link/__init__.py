@@ -1,4 +1,11 @@
-"""The link to a real or virtual drive: ports, sessions, runs (docs/PROTOCOL.md)."""
+"""The link to a real or virtual drive: ports, sessions, runs (docs/PROTOCOL.md).
+
+Read in this order: `ports` (transports, their failures), `wire` (what bodies stand for),
+`connection` (a session: commands repeated until answered, heartbeats, the clocks), `drive`
+(`Drive`), `plan` (what a run is to do, and what became of it), `run` (the pump of a run with its
+way out). Beside them: `host_loop` (a controller on this computer), `doctor`, `virtual` and
+`emulated` (devices without a motor).
+"""
 
 from .connection import ClockBounds
 from .doctor import Diagnosis, Finding, examine

@@ -16,7 +16,7 @@ from ..errors import LinkError, SettingError
 from . import wire
 from .connection import Connection
 from .drive import PATIENCE, Drive
-from .ports import CONNECT_TIMEOUT, NO_PORT, Port, list_ports, open_port
+from .ports import CONNECT_TIMEOUT, NO_PORT, Port, list_ports, open_port, transport_of
 
 SYS = Path("/sys/class/tty")
 PROC = Path("/proc")
@@ -281,6 +281,13 @@ class Metered(Port):
         self.frames += 1
         self._port.write(data)
 
+    @property
+    def max_rate(self) -> float:
+        return self._port.max_rate
+
+    def describe(self) -> str:
+        return self._port.describe()
+
     def fileno(self) -> int:
         return self._port.fileno()
 
@@ -527,7 +534,7 @@ def examine(url: str, *, baud: int = 115_200, echoes: int = ECHOES) -> Diagnosis
     Parameters
     ----------
     url : str
-        A serial port's path, a COM name or ``socket://host:port``.
+        An address that `open_port` takes.
     baud : int
         Bits per second of a serial port.
     echoes : int
@@ -551,7 +558,7 @@ def _findings(url: str, baud: int, echoes: int) -> Iterator[Finding]:
         yield _unopened(url, error)
         return
     try:
-        yield _opened(url)
+        yield _opened(url, port)
         yield from _latency(url)
         try:
             yield from checkup(port, echoes)
@@ -572,10 +579,10 @@ def _failure(name: str, error: LinkError) -> Finding:
 def _unopened(url: str, error: LinkError) -> Finding:
     """Why a port does not open: permission, who has it, which others there are."""
     finding = _failure("port", error)
-    if url.startswith("socket://"):
+    if not _is_local(url):
         return finding
     if not os.path.exists(url):
-        if "socket://" in finding.remedy:
+        if "://" in finding.remedy:
             return finding  # an address, whatever ports there are
         others = ", ".join(p.path for p in list_ports()) or "none"
         return _with(finding, f"{finding.remedy}; ports there are: {others}", others=others)
@@ -607,20 +614,24 @@ def _named(held: list[tuple[int, str]]) -> str:
     return ", ".join(f"{name} (process {number})" for number, name in held)
 
 
-def _opened(url: str) -> Finding:
-    if url.startswith("socket://"):
-        return Finding("port", "ok", "connected")
-    if held := holders(url):
+def _opened(url: str, port: Port) -> Finding:
+    if _is_local(url) and (held := holders(url)):
         return Finding(
             "port", "warn", f"opens, but {_named(held)} has it open too and takes bytes away",
             "end that program (a serial monitor, ModemManager)", {"holders": held},
         )  # fmt: skip
-    return Finding("port", "ok", "opens, and nobody else is seen to have it open")
+    return Finding("port", "ok", port.describe())
+
+
+def _is_local(url: str) -> bool:
+    """Whether it is a device of this computer, which other programs may have open."""
+    kind = transport_of(url)
+    return kind is None or kind.is_local
 
 
 def _latency(url: str) -> Iterator[Finding]:
     """Only for adapters that have such a timer; read after opening, which tries to shorten it."""
-    if url.startswith("socket://") or (found := latency_timer(url)) is None:
+    if not _is_local(url) or (found := latency_timer(url)) is None:
         return
     milliseconds, file = found
     values = {"latency_timer_ms": milliseconds}

@@ -6,24 +6,26 @@ import math
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from types import TracebackType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import counts_per_unit
 from ..control.controller import Controller
-from ..control.loop import ClosedLoopRun
+from ..control.machine import RecordedRun
 from ..errors import LinkError, SettingError
 from ..gains import Gains, real
 from ..live import Kind as View
+from ..recording import Recording
+from ..speed import Method
 from . import run as profiles
 from . import wire
 from .connection import ClockBounds, Connection, DeviceReset, Loan
-from .plan import Layout, Outcome, Plan, Sink, follow, layout, require_capable
+from .plan import Layout, Outcome, Plan, Sink, excite, follow, layout, require_capable
 from .ports import Unique, open_port
 from .run import Run
 from .wire import Channel, Identity, Kind, Limits, Status
@@ -172,6 +174,8 @@ PATIENCE = 3.0
 class Drive(Unique):
     """A motor drive behind a port, made by `connect`; a context manager whose end stops the motor.
 
+    It is a `sewfast.Machine`.
+
     One thread uses it; `stop` and `close` may come from another one and end its run. Nothing here
     starts a motor but `stream`.
 
@@ -218,6 +222,31 @@ class Drive(Unique):
     def identity(self) -> Identity:
         """Who the device is and what it offers."""
         return self._link.identity
+
+    @property
+    def name(self) -> str:
+        """As the device calls itself."""
+        return self.identity.name
+
+    @property
+    def Ts(self) -> float:
+        """Sample time [s]."""
+        return self.identity.Ts
+
+    @property
+    def counts_per_rev(self) -> float:
+        """Encoder counts of one turn."""
+        return self.identity.counts_per_rev
+
+    @property
+    def volt(self) -> float:
+        """Largest command to either side [V]: its limit in force, which it is asked for."""
+        return self.limits().values[0]
+
+    @property
+    def speed(self) -> float:
+        """Speed beyond which it trips [RPM]: its limit in force, which it is asked for."""
+        return self.limits().values[1]
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -415,16 +444,48 @@ class Drive(Unique):
         with self._link.owned():
             return self._stream(plan, sink, cancel)
 
+    def excite(
+        self,
+        u: NDArray[np.float64],
+        name: str = "array",
+        *,
+        method: Method = "kalman",
+        file: str | os.PathLike[str] | None = None,
+        live: str | View = "none",
+        settings: Mapping[str, Any] | None = None,
+        overwrite: bool = False,
+    ) -> Recording:
+        """Play commands from rest and record them; `sewfast.record` with a drive does this.
+
+        Parameters
+        ----------
+        u : array, shape (N,)
+            Commands at the device's sample time [V].
+        name : str
+            Of the excitation, in messages and files.
+        method, file, live, settings, overwrite
+            As for `sewfast.record`.
+
+        Raises
+        ------
+        SettingError, LinkError, Interrupted
+            As for `sewfast.record`.
+        """
+        return excite(
+            self, u, name, method=method, file=file, live=live, settings=settings,
+            overwrite=overwrite,
+        )  # fmt: skip
+
     def follow(
         self,
         controller: Controller,
         r: NDArray[np.float64],
-        *,
         name: str = "reference",
+        *,
         file: str | os.PathLike[str] | None = None,
         live: str | View = "none",
         overwrite: bool = False,
-    ) -> ClosedLoopRun:
+    ) -> RecordedRun:
         """Run a controller on the device along a reference; `sewfast.run` with a drive does this.
 
         Parameters
@@ -439,7 +500,7 @@ class Drive(Unique):
 
         Returns
         -------
-        ClosedLoopRun
+        RecordedRun
             `y` is the speed estimated from the counts, or the true speed of a virtual drive.
 
         Raises
@@ -447,7 +508,7 @@ class Drive(Unique):
         SettingError, LinkError, Interrupted
             As for `sewfast.run`.
         """
-        return follow(self, controller, r, name=name, file=file, live=live, overwrite=overwrite)
+        return follow(self, controller, r, name, file=file, live=live, overwrite=overwrite)
 
     def _stream(self, plan: Plan, sink: Sink, cancel: threading.Event | None) -> Outcome:
         run = self._prepare(plan, sink)
@@ -516,9 +577,7 @@ class Drive(Unique):
         return profiles.commands(plan.values, self.channels[1], limits)
 
     def _baud(self) -> float:
-        port = self._link.port
-        unbound = self.identity.on_credit or port.url.startswith("socket://")
-        return math.inf if unbound else port.baud
+        return math.inf if self.identity.on_credit else self._link.port.max_rate
 
     def _require_idle(self) -> None:
         status = self.status()
@@ -551,7 +610,7 @@ def connect(
     Parameters
     ----------
     url : str
-        A serial port's path, a COM name or ``socket://host:port``.
+        An address that `open_port` takes.
     baud : int
         Bits per second of a serial port.
     watchdog : float or None

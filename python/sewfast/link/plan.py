@@ -7,20 +7,21 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray
 from ..control.controller import Controller
-from ..control.loop import ClosedLoopRun
+from ..control.machine import RecordedRun
 from ..errors import Interrupted, LinkError, SettingError, SewfastError
 from ..gains import vector
 from ..live import Feed, Kind, open_view
 from ..recordfile import Header, RecordWriter, read_recording
 from ..recordfile.writer import require_ending, require_replaceable
-from ..speed import speed_or_nan
+from ..recording import Recording
+from ..speed import Method, speed_or_nan
 from . import wire
 from .connection import ClockBounds
 from .wire import Channel, Identity
@@ -28,6 +29,7 @@ from .wire import Channel, Identity
 if TYPE_CHECKING:
     from .drive import Drive
 
+T = TypeVar("T")
 Mode: TypeAlias = Literal["commands", "controller", "direct"]
 Columns: TypeAlias = Mapping[str, NDArray[np.float64]]
 
@@ -473,51 +475,74 @@ def play(
     return played
 
 
-def follow(
+def excite(
     drive: Drive,
-    controller: Controller,
-    r: FloatArray,
-    *,
+    u: FloatArray,
     name: str,
-    file: str | os.PathLike[str] | None = None,
-    live: str | Kind = "none",
-    overwrite: bool = False,
-) -> ClosedLoopRun:
+    *,
+    method: Method = "kalman",
+    settings: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Recording:
+    """Commands on a drive; see `Drive.excite`."""
+
+    def made(played: Played) -> Recording:
+        return _recording(played.columns, drive, name, method)
+
+    return _made(drive, Plan("commands", u), made, name=name, settings=settings, **options)
+
+
+def follow(
+    drive: Drive, controller: Controller, r: FloatArray, name: str, **options: Any
+) -> RecordedRun:
     """A controller on a drive along a reference; see `Drive.follow`."""
 
-    def made(played: Played) -> ClosedLoopRun:
-        return run_of_drive(played.columns, drive, controller, r, name)
+    def made(played: Played) -> RecordedRun:
+        return _run(played.columns, drive, controller, r, name)
 
-    plan = Plan("controller", r, controller)
+    return _made(drive, Plan("controller", r, controller), made, name=name, **options)
+
+
+def _made(drive: Drive, plan: Plan, made: Callable[[Played], T], **options: Any) -> T:
+    """What `made` makes of the run; an error carries what it makes of what had come."""
     try:
-        return made(play(drive, plan, name=name, file=file, live=live, overwrite=overwrite))
+        return made(play(drive, plan, **options))
     except Stopped as stopped:
         raise stopped.as_error(made) from stopped.cause
 
 
-def run_of_drive(
+def _recording(
+    columns: Mapping[str, FloatArray], drive: Drive, name: str, method: Method
+) -> Recording:
+    """Counts from the first sample on; the speed as far as gaps let it be known."""
+    Ts, per_rev = drive.identity.Ts, drive.identity.counts_per_rev
+    counts = columns["counts"]
+    known = counts[np.isfinite(counts)]
+    counts = counts - known[0] if len(known) else counts
+    y = speed_or_nan(counts, Ts, per_rev, method)
+    return Recording(columns["u"], counts, y, columns.get("speed_true"), Ts, per_rev, name)
+
+
+def _run(
     columns: Mapping[str, FloatArray],
     drive: Drive,
     controller: Controller,
     r: FloatArray,
     name: str,
-) -> ClosedLoopRun:
+) -> RecordedRun:
     """The run as the drive streamed it; what it left out is computed, or is NaN."""
-    identity = drive.identity
-    counts = columns["counts"]
-    speed = columns.get("speed_true")
-    n = len(counts)
-    if speed is None:
-        speed = speed_or_nan(counts, identity.Ts, identity.counts_per_rev, "kalman")
-    return ClosedLoopRun(
-        t=np.arange(n, dtype=np.float64) * identity.Ts,
+    recording = _recording(columns, drive, name, "kalman")
+    n, true = len(recording), recording.speed_true
+    return RecordedRun(
+        t=np.arange(n, dtype=np.float64) * recording.Ts,
         r=r[:n],
-        u=columns["u"],
-        y=speed,
+        u=recording.u,
+        y=recording.y if true is None else true,
         feedback=columns.get("feedback", np.full(n, np.nan)),
         controller=controller,
-        plant=identity.name,
+        plant=drive.identity.name,
         reference=name,
+        recording=recording,
     )
 
 

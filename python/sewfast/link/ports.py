@@ -1,8 +1,14 @@
-"""Serial ports and sockets: what owns one, how it can fail and what to do."""
+"""Ports: bytes to a device and back, over a serial line or a network; how each fails, what to do.
+
+Read in this order: `Port`, what every transport has; `SerialPort`, `SocketPort`, `UdpPort`; the
+table `TRANSPORTS`, in which a transport is one row, and `open_port`. A new one is a class and its
+row: its address, how it carries bytes, what its failures mean.
+"""
 
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 import select
@@ -10,9 +16,11 @@ import socket
 import stat
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Literal, NoReturn, SupportsIndex
+from pathlib import Path
+from typing import Any, ClassVar, Literal, NoReturn, SupportsIndex, TypeAlias
 from urllib.parse import urlsplit
 
 from ..errors import LinkError, SettingError
@@ -34,11 +42,8 @@ _BUSY = {errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK}
 _NO_TERMINAL = {errno.ENOTTY, errno.EINVAL, errno.EISDIR}
 _UNREACHABLE = {errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN}
 
-_BUSY_TEXT = (
-    "a port that nobody else uses",
-    "it is in use",
-    "close the other program (a serial monitor, ModemManager, another sewfast)",
-)
+Texts: TypeAlias = tuple[str, str, str]
+"""Of a failure: expected, received, remedy."""
 
 NO_PORT = "expected a serial port, it is something else"
 """In the message about a file, a folder or a device of another kind."""
@@ -48,65 +53,10 @@ def explain(url: str, doing: Literal["open", "read", "write"], error: BaseExcept
     """The error as it is raised: expected, received, remedy."""
     if isinstance(error, LinkError):
         return LinkError(f"{url}: expected an open port, {error}; connect again")
-    number = _number(error)
-    texts = _opening(url, number, error) if doing == "open" else _losing(number, error)
-    expected, received, remedy = texts
+    number, kind = _number(error), transport_of(url) or SerialPort
+    meant = kind.opening if doing == "open" else kind.losing
+    expected, received, remedy = meant(url, number, error)
     return LinkError(f"{url}: expected {expected}, {received} ({_plain(error)}); {remedy}")
-
-
-def _opening(url: str, number: int | None, error: BaseException) -> tuple[str, str, str]:
-    if url.startswith("socket://"):
-        return _connecting(number, error)
-    if number in _BUSY or (os.name == "nt" and number in _DENIED):
-        return _BUSY_TEXT
-    if number in _MISSING:
-        remedy = "plug the cable in and see `sewfast ports`"
-        if re.fullmatch(r"[^/\\]+:\d+", url):
-            remedy = f"an address is written socket://{url}"
-        return "a serial port of this name", "there is none", remedy
-    if number in _DENIED:
-        return "a port that you may open", "permission was denied", _permission(url)
-    if number in _NO_TERMINAL:
-        remedy = "see `sewfast ports` for what there is"
-        return "a serial port", "it is something else", remedy
-    if isinstance(error, ValueError):
-        remedy = "give a rate that the adapter offers, such as 115200"
-        return "a baud rate of this port", "it takes another", remedy
-    return "a serial port that opens", "it did not", "unplug it, plug it in again and retry"
-
-
-def _connecting(number: int | None, error: BaseException) -> tuple[str, str, str]:
-    server = "a device that listens there"
-    if number == errno.ECONNREFUSED:
-        return server, "nobody does", "start it (`sewfast device` for a virtual one)"
-    if isinstance(error, TimeoutError) or number in _UNREACHABLE:
-        return server, "nothing answered", "check the address, the network and the firewall"
-    return server, "there is no such way", "check host and port"
-
-
-def _losing(number: int | None, error: BaseException) -> tuple[str, str, str]:
-    if isinstance(error, TimeoutError) or "timeout" in str(error).lower():
-        remedy = "check that the device runs; unplug it if it hangs"
-        return "the port to take bytes", f"it took none within {1:g} s", remedy
-    if number in (errno.ECONNRESET, errno.EPIPE) or isinstance(error, ConnectionError):
-        remedy = "see why it ended, then connect again"
-        return "an open connection", "the other side ended it", remedy
-    remedy = "check cable and supply, then connect again"
-    return "an open port", "it vanished", remedy
-
-
-def _permission(url: str) -> str:
-    """Linux gives serial ports to a group; its name differs between distributions."""
-    group = "dialout"
-    try:
-        import grp
-
-        found = os.stat(url)
-        if stat.S_IMODE(found.st_mode) & stat.S_IWGRP:
-            group = grp.getgrgid(found.st_gid).gr_name
-    except (ImportError, OSError, KeyError):
-        pass
-    return f"join its group (sudo usermod -aG {group} $USER) and log in again"
 
 
 def _number(error: BaseException) -> int | None:
@@ -161,6 +111,10 @@ CONNECT_TIMEOUT = 5.0
 class Port(Unique, ABC):
     """Bytes in and out; every way it can fail is a `LinkError`.
 
+    A transport says how its addresses are written (`form`) and whether they are devices of this
+    computer (`is_local`), opens, reads, writes and closes, and knows what its failures mean
+    (`opening`, `losing`).
+
     Parameters
     ----------
     url : str
@@ -168,6 +122,9 @@ class Port(Unique, ABC):
     baud : int
         Bits per second; a socket has none and keeps the number only.
     """
+
+    form: ClassVar[str]
+    is_local: ClassVar[bool] = False
 
     def __init__(self, url: str, baud: int) -> None:
         self.url = url
@@ -212,6 +169,39 @@ class Port(Unique, ABC):
     def close(self) -> None:
         """Give it back; more than once does no harm, and nothing is raised."""
 
+    @property
+    def max_rate(self) -> float:
+        """Bits per second that it carries; inf where nothing bounds them."""
+        return self.baud
+
+    def describe(self) -> str:
+        """What can be said of it once it is open."""
+        return "connected"
+
+    @staticmethod
+    def opening(url: str, number: int | None, error: BaseException) -> Texts:
+        """What was expected, what came and what to do where it does not open.
+
+        Parameters
+        ----------
+        url : str
+        number : int or None
+            The operating system's number of the error.
+        error : BaseException
+        """
+        return "a port that opens", "it did not", "see `sewfast ports` for what there is"
+
+    @staticmethod
+    def losing(url: str, number: int | None, error: BaseException) -> Texts:
+        """The same of one that was open."""
+        if isinstance(error, TimeoutError) or "timeout" in str(error).lower():
+            remedy = "check that the device runs; unplug it if it hangs"
+            return "the port to take bytes", f"it took none within {WRITE_TIMEOUT:g} s", remedy
+        if number in (errno.ECONNRESET, errno.EPIPE) or isinstance(error, ConnectionError):
+            remedy = "see why it ended, then connect again"
+            return "an open connection", "the other side ended it", remedy
+        return "an open port", "it vanished", "check cable and supply, then connect again"
+
     def reopen(self, timeout: float = CONNECT_TIMEOUT) -> None:
         """Close it and open the same again.
 
@@ -243,7 +233,32 @@ class Port(Unique, ABC):
 class SerialPort(Port):
     """A serial device by its path or COM name; nobody else may open it meanwhile."""
 
+    form = "a serial port's path (/dev/ttyUSB0), a COM name (COM3)"
+    is_local = True
     _serial: Any = None
+
+    def describe(self) -> str:
+        return "opens, and nobody else is seen to have it open"
+
+    @staticmethod
+    def opening(url: str, number: int | None, error: BaseException) -> Texts:
+        if number in _BUSY or (os.name == "nt" and number in _DENIED):
+            remedy = "close the other program (a serial monitor, ModemManager, another sewfast)"
+            return "a port that nobody else uses", "it is in use", remedy
+        if number in _MISSING:
+            remedy = "plug the cable in and see `sewfast ports`"
+            if re.fullmatch(r"[^/\\]+:\d+", url):
+                remedy = f"an address is written socket://{url}"
+            return "a serial port of this name", "there is none", remedy
+        if number in _DENIED:
+            return "a port that you may open", "permission was denied", _permission(url)
+        if number in _NO_TERMINAL:
+            remedy = "see `sewfast ports` for what there is"
+            return "a serial port", "it is something else", remedy
+        if isinstance(error, ValueError):
+            remedy = "give a rate that the adapter offers, such as 115200"
+            return "a baud rate of this port", "it takes another", remedy
+        return "a serial port that opens", "it did not", "unplug it, plug it in again and retry"
 
     def _open(self) -> None:
         module = _pyserial()
@@ -286,42 +301,48 @@ class SerialPort(Port):
             self._serial = None
 
 
-class SocketPort(Port):
-    """A TCP connection, `socket://host:port`; bytes that wait when it opens are kept."""
+class NetworkPort(Port):
+    """A socket that is connected to one address, `scheme://host:port`."""
 
     _socket: socket.socket | None = None
+
+    @property
+    def max_rate(self) -> float:
+        return math.inf
 
     def _open(self) -> None:
         address = _address(self.url)
         try:
-            self._socket = socket.create_connection(address, self._patience)
-            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._socket = self._connected(address)
             self._socket.setblocking(False)
         except FAILURES as error:
+            self.close()
             raise explain(self.url, "open", error) from error
+
+    @abstractmethod
+    def _connected(self, address: tuple[str, int]) -> socket.socket: ...
+
+    @abstractmethod
+    def _received(self, connection: socket.socket) -> bytes:
+        """What a socket that is ready holds."""
+
+    @abstractmethod
+    def _sent(self, connection: socket.socket, data: bytes) -> None: ...
 
     def read(self, timeout: float) -> bytes:
         try:
             connection = _require(self._socket)
             if not select.select((connection,), (), (), timeout)[0]:
                 return b""
-            data = bytes(connection.recv(CHUNK))
+            return self._received(connection)
         except BlockingIOError:
             return b""
         except FAILURES as error:
             raise explain(self.url, "read", error) from error
-        if not data:
-            raise explain(self.url, "read", ConnectionError("the other side closed it"))
-        return data
 
     def write(self, data: bytes) -> None:
         try:
-            connection = _require(self._socket)
-            connection.settimeout(WRITE_TIMEOUT)
-            try:
-                connection.sendall(data)
-            finally:
-                connection.setblocking(False)
+            self._sent(_require(self._socket), data)
         except FAILURES as error:
             raise explain(self.url, "write", error) from error
 
@@ -334,14 +355,126 @@ class SocketPort(Port):
                 self._socket.close()
             self._socket = None
 
+    @staticmethod
+    def opening(url: str, number: int | None, error: BaseException) -> Texts:
+        server = "a device that listens there"
+        if number == errno.ECONNREFUSED:
+            return server, "nobody does", "start it (`sewfast device` for a virtual one)"
+        if isinstance(error, TimeoutError) or number in _UNREACHABLE:
+            return server, "nothing answered", "check the address, the network and the firewall"
+        return server, "there is no such way", "check host and port"
+
+
+class SocketPort(NetworkPort):
+    """A TCP connection; bytes that wait when it opens are kept."""
+
+    form = "socket://HOST:PORT"
+
+    def _connected(self, address: tuple[str, int]) -> socket.socket:
+        connection = socket.create_connection(address, self._patience)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return connection
+
+    def _received(self, connection: socket.socket) -> bytes:
+        data = bytes(connection.recv(CHUNK))
+        if not data:
+            raise ConnectionError("the other side closed it")
+        return data
+
+    def _sent(self, connection: socket.socket, data: bytes) -> None:
+        connection.settimeout(WRITE_TIMEOUT)
+        try:
+            connection.sendall(data)
+        finally:
+            connection.setblocking(False)
+
+
+DATAGRAM = 1200
+"""Bytes of a datagram at most: with any header it passes every network in one piece."""
+
+
+class UdpPort(NetworkPort):
+    """Datagrams to one address and from it: those of anybody else are not heard.
+
+    Each carries whole frames, so that one that is lost costs no other its frames. What the network
+    loses, repeats or delivers late is seen by the frames' numbers, as on any port.
+    """
+
+    form = "udp://HOST:PORT"
+
+    def _connected(self, address: tuple[str, int]) -> socket.socket:
+        failed: OSError | None = None
+        host, port = address
+        ways = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        for family, kind, protocol, _, place in ways:
+            found = socket.socket(family, kind, protocol)
+            try:
+                found.connect(place)
+            except OSError as error:
+                found.close()
+                failed = error
+            else:
+                return found
+        raise failed or OSError("no address")
+
+    def _received(self, connection: socket.socket) -> bytes:
+        return bytes(connection.recv(CHUNK))
+
+    def _sent(self, connection: socket.socket, data: bytes) -> None:
+        for datagram in _datagrams(data):
+            self._write(connection.fileno(), datagram)
+
+    @staticmethod
+    def losing(url: str, number: int | None, error: BaseException) -> Texts:
+        # the other computer says so when a datagram arrives
+        if number == errno.ECONNREFUSED:
+            return NetworkPort.opening(url, number, error)
+        return NetworkPort.losing(url, number, error)
+
+
+def _datagrams(data: bytes) -> Iterator[bytes]:
+    """The bytes in pieces that end where a frame ends; frames end with a zero."""
+    start = 0
+    while start < len(data):
+        end = min(start + DATAGRAM, len(data))
+        if end < len(data):
+            end = data.rfind(b"\0", start, end) + 1 or end
+        yield data[start:end]
+        start = end
+
+
+TRANSPORTS: dict[str, type[Port]] = {"": SerialPort, "socket": SocketPort, "udp": UdpPort}
+"""Transports by what stands before `://` in an address; none is a serial port."""
+
+
+def transport_of(url: str) -> type[Port] | None:
+    """The transport of an address; None for a name of another kind."""
+    scheme, separated, _ = url.partition("://")
+    if separated:
+        return TRANSPORTS.get(scheme) if scheme else None
+    return SerialPort if url and url.split(":")[0] != "virtual" else None
+
+
+def is_port(text: str) -> bool:
+    """Whether a text names a port rather than a file or a virtual machine."""
+    kind = transport_of(text)
+    if kind is not SerialPort:
+        return kind is not None
+    if text.startswith("/dev/") or re.fullmatch(r"COM\d+", text, re.IGNORECASE):
+        return True
+    try:
+        return stat.S_ISCHR(Path(text).stat().st_mode)
+    except (OSError, ValueError):
+        return False
+
 
 def open_port(url: str, baud: int = 115_200) -> Port:
-    """Open a serial port or a socket.
+    """Open a port by its address.
 
     Parameters
     ----------
     url : str
-        A device's path, a COM name or ``socket://host:port``.
+        A device's path, a COM name, ``socket://host:port`` (TCP) or ``udp://host:port``.
     baud : int
         Bits per second of a serial port.
 
@@ -359,14 +492,14 @@ def open_port(url: str, baud: int = 115_200) -> Port:
             f"expected a port's name as text, got {url!r}; as in '/dev/ttyUSB0' or "
             "'socket://localhost:5000'"
         )
-    if url.startswith("socket://"):
-        return SocketPort(url, baud)
-    if "://" in url or not url or url.split(":")[0] == "virtual":
+    kind = transport_of(url)
+    if kind is None:
+        *others, last = (transport.form for transport in TRANSPORTS.values())
         raise SettingError(
-            f"expected a serial port's path (/dev/ttyUSB0), a COM name (COM3) or "
-            f"socket://HOST:PORT, got {url!r}; `sewfast ports` lists the serial ports"
+            f"expected {', '.join(others)} or {last}, got {url!r}; `sewfast ports` lists the "
+            "serial ports"
         )
-    return SerialPort(url, baud)
+    return kind(url, baud)
 
 
 @dataclass(frozen=True)
@@ -437,7 +570,22 @@ def _pyserial() -> Any:
     return serial
 
 
+def _permission(url: str) -> str:
+    """Linux gives serial ports to a group; its name differs between distributions."""
+    group = "dialout"
+    try:
+        import grp
+
+        found = os.stat(url)
+        if stat.S_IMODE(found.st_mode) & stat.S_IWGRP:
+            group = grp.getgrgid(found.st_gid).gr_name
+    except (ImportError, OSError, KeyError):
+        pass
+    return f"join its group (sudo usermod -aG {group} $USER) and log in again"
+
+
 def _address(url: str) -> tuple[str, int]:
+    scheme = url.partition("://")[0]
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
@@ -445,8 +593,8 @@ def _address(url: str) -> tuple[str, int]:
         host = port = None
     if not host or not port or parts.path not in ("", "/"):
         raise SettingError(
-            f"expected socket://HOST:PORT with a port of 1 to 65535, got {url!r}; "
-            "as in socket://localhost:5000"
+            f"expected {scheme}://HOST:PORT with a port of 1 to 65535, got {url!r}; "
+            f"as in {scheme}://localhost:5000"
         )
     return host, port
 

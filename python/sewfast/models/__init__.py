@@ -1,4 +1,8 @@
-"""Identified models: linear ones and networks, with their files."""
+"""Identified models: linear ones and networks, with their files.
+
+Read in this order: `base` (`Model`, `Ensemble`), `linear`, `neural`, `files` (and the table of
+kinds), `conversion` (linear models in other forms).
+"""
 
 from ..dynamic_model import FreeRunJacobian
 from .base import Ensemble, Model, NotLinearError

@@ -1,4 +1,8 @@
-"""Recordings as MCAP files: written while the drive runs, readable after whatever happened."""
+"""Recordings as MCAP files: written while the drive runs, readable after whatever happened.
+
+Read in this order: `format` (the bytes), `writer` (by whole chunks), `filing` (where and over what
+it may write), `reader` (which salvages what is damaged).
+"""
 
 from .format import Header
 from .reader import RecordedFile, read_recording

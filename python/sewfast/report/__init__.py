@@ -1,4 +1,8 @@
-"""The report: one self-contained HTML page from the artefacts of an experiment."""
+"""The report: one self-contained HTML page from the artefacts of an experiment.
+
+Read in this order: `artefacts` (what a folder holds), `pictures`, `page`, `commissioned` (the page
+of a commissioning).
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,7 @@ def report(folder: str | os.PathLike[str]) -> Path:
     ----------
     folder : path
         What `sewfast demo --out DIR` or `sewfast commission --out DIR` left: see
-        docs/ARCHITECTURE.md for the layouts.
+        docs/CONVENTIONS.md for the layouts.
 
     Returns
     -------

@@ -154,10 +154,10 @@ def make_demo(folder: str | os.PathLike[str]) -> None:
         Where the folder cannot be written to.
     """
     from .. import signals
+    from ..control.machine import record
     from ..identification import identify
     from ..machine import VirtualMachine
     from ..models import Ensemble
-    from ..recording import record
 
     members = []
     for k in range(DEMO_MEMBERS):

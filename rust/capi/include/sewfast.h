@@ -38,6 +38,7 @@ extern "C" {
 #define SEWFAST_CAN_CURRENT 16u /* measures the current */
 #define SEWFAST_COMPUTED 32u    /* computed devices only: ARM takes them back to their initial state */
 #define SEWFAST_CAN_DESIGN 64u  /* its PID has observer, reference ramp and gain schedule */
+#define SEWFAST_CAN_BIQUADS 128u /* its PID has biquads */
 
 /* How a channel's samples are written. */
 enum sewfast_encoding {
@@ -201,6 +202,15 @@ typedef struct sewfast_pid_point {
     float td;    /* s */
 } sewfast_pid_point;
 
+/* The most biquads. */
+#define SEWFAST_PID_BIQUADS 4
+
+/* A second-order section H = 1 + (1 - q)(c0 + c1 q)/(1 + a1 q + a2 q^2), q = 1/z, on reference and feedback; make it with
+ * sewfast_pid_notch and its like. */
+typedef struct sewfast_pid_biquad {
+    float c0, c1, a1, a2;
+} sewfast_pid_biquad;
+
 /* Two-degree-of-freedom PID in standard form with its feedback filter; INFINITY switches off what it limits. */
 typedef struct sewfast_pid_settings {
     float kp;          /*  1: u/y */
@@ -220,16 +230,30 @@ typedef struct sewfast_pid_settings {
     float r_rate;           /* 15: y/s, ramp of the reference; INFINITY: none */
     uint8_t schedule_count; /* 16: points that are used; 0: the constant gains above */
     sewfast_pid_point schedule[SEWFAST_PID_POINTS];
+    uint8_t biquad_count;   /* 17: biquads that are used; 0: none */
+    sewfast_pid_biquad biquads[SEWFAST_PID_BIQUADS];
 } sewfast_pid_settings;
 
 /* Enough bytes on any target. */
-#define SEWFAST_PID_SIZE 1024
+#define SEWFAST_PID_SIZE 1280
 
 size_t sewfast_pid_size(void);
 
 /* A controller at rest in `size` bytes at `storage`, aligned for float and size_t. NULL where something is refused; `refusal`, unless it is
  * NULL, is then the number of the setting, or -1 for the storage. */
 sewfast_pid *sewfast_pid_init(void *storage, size_t size, const sewfast_pid_settings *settings, int32_t *refusal);
+
+/* Biquads at a sample time of `ts` s; false where a frequency (Hz) is not between 0 and half the sample rate or another number is
+ * outside its range, `biquad` is then left as it was. */
+
+/* Gain `depth`, 0 to 1, at `frequency`; `width` times as wide as it is high. */
+bool sewfast_pid_notch(sewfast_pid_biquad *biquad, float frequency, float depth, float width, float ts);
+bool sewfast_pid_low_pass(sewfast_pid_biquad *biquad, float frequency, float damping, float ts);
+/* (1 + s/zero)/(1 + s/pole), both in Hz. */
+bool sewfast_pid_lead_lag(sewfast_pid_biquad *biquad, float zero, float pole, float ts);
+/* A pair of zeros and one of poles, each with its frequency (Hz) and its damping. */
+bool sewfast_pid_resonance(sewfast_pid_biquad *biquad, float zero_frequency, float zero_damping, float pole_frequency,
+                           float pole_damping, float ts);
 
 /* From reference and measured output to the command. A measurement that is not finite leaves the command as it was. */
 float sewfast_pid_step(sewfast_pid *pid, float r, float y);

@@ -3,7 +3,10 @@
 use crate::{place, tell};
 use core::ffi::c_void;
 use core::ptr::null_mut;
-use sewfast_control::{Controller, Design, POINTS, Point, Refused, Schedule, Settings, Standard};
+use sewfast_control::{
+    BIQUADS, Biquad, Cascade, Controller, Design, POINTS, Point, Refused, Schedule, Settings,
+    Standard,
+};
 
 /// `sewfast_pid_point`.
 #[repr(C)]
@@ -17,6 +20,20 @@ pub struct CPoint {
     pub ti: f32,
     /// \[s\].
     pub td: f32,
+}
+
+/// `sewfast_pid_biquad`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct CBiquad {
+    /// Answer to a step at its own sample, less 1.
+    pub c0: f32,
+    /// The same a sample later, before the poles.
+    pub c1: f32,
+    /// Coefficients of the denominator.
+    pub a1: f32,
+    /// Coefficients of the denominator.
+    pub a2: f32,
 }
 
 /// `sewfast_pid_settings`.
@@ -57,6 +74,10 @@ pub struct CSettings {
     pub schedule_count: u8,
     /// Gains over speed.
     pub schedule: [CPoint; POINTS],
+    /// Biquads that are used.
+    pub biquad_count: u8,
+    /// On reference and feedback.
+    pub biquads: [CBiquad; BIQUADS],
 }
 
 /// The number of the setting, in the header's order and from 1; 0 is none.
@@ -78,6 +99,7 @@ fn number(name: &str) -> i32 {
         "observer_time",
         "r_rate",
         "schedule",
+        "biquads",
     ];
     let found = (1..).zip(names).find(|(_, known)| *known == name);
     found.map_or(-1, |(number, _)| number)
@@ -145,6 +167,17 @@ impl CSettings {
         Schedule::new(named.unwrap_or(&points))
     }
 
+    fn biquads(&self) -> Result<Cascade<f32>, Refused> {
+        let mut sections = [Biquad::NONE; BIQUADS + 1];
+        for (place, section) in sections.iter_mut().zip(&self.biquads) {
+            let CBiquad { c0, c1, a1, a2 } = *section;
+            *place = Biquad { c0, c1, a1, a2 };
+        }
+        // a count beyond the array is one section too many, and refused
+        let named = sections.get(..self.biquad_count.into());
+        Cascade::new(named.unwrap_or(&sections))
+    }
+
     fn design(&self) -> Result<Design<f32>, Refused> {
         let pid = Settings {
             gains: Standard {
@@ -168,8 +201,110 @@ impl CSettings {
             observer_time: self.observer_time,
             r_rate: self.r_rate,
             schedule: self.schedule()?,
+            biquads: self.biquads()?,
         })
     }
+}
+
+/// Whether `made` is a section, which is then in `place`.
+///
+/// # Safety
+/// `place` is null or can be written to.
+unsafe fn put(place: *mut CBiquad, made: Result<Biquad<f32>, Refused>) -> bool {
+    // SAFETY: by contract.
+    let (Some(place), Ok(made)) = (unsafe { place.as_mut() }, made) else {
+        return false;
+    };
+    let Biquad { c0, c1, a1, a2 } = made;
+    *place = CBiquad { c0, c1, a1, a2 };
+    true
+}
+
+/// [`Biquad::notch`].
+///
+/// # Safety
+/// `biquad` is null or can be written to.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn sewfast_pid_notch(
+    biquad: *mut CBiquad,
+    frequency: f32,
+    depth: f32,
+    width: f32,
+    ts: f32,
+) -> bool {
+    let made = Biquad::notch(frequency.into(), depth.into(), width.into(), ts.into());
+    // SAFETY: by contract.
+    unsafe { put(biquad, made) }
+}
+
+/// [`Biquad::low_pass`].
+///
+/// # Safety
+/// `biquad` is null or can be written to.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn sewfast_pid_low_pass(
+    biquad: *mut CBiquad,
+    frequency: f32,
+    damping: f32,
+    ts: f32,
+) -> bool {
+    let made = Biquad::low_pass(frequency.into(), damping.into(), ts.into());
+    // SAFETY: by contract.
+    unsafe { put(biquad, made) }
+}
+
+/// [`Biquad::lead_lag`].
+///
+/// # Safety
+/// `biquad` is null or can be written to.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn sewfast_pid_lead_lag(
+    biquad: *mut CBiquad,
+    zero: f32,
+    pole: f32,
+    ts: f32,
+) -> bool {
+    let made = Biquad::lead_lag(zero.into(), pole.into(), ts.into());
+    // SAFETY: by contract.
+    unsafe { put(biquad, made) }
+}
+
+/// [`Biquad::resonance`].
+///
+/// # Safety
+/// `biquad` is null or can be written to.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn sewfast_pid_resonance(
+    biquad: *mut CBiquad,
+    zero_frequency: f32,
+    zero_damping: f32,
+    pole_frequency: f32,
+    pole_damping: f32,
+    ts: f32,
+) -> bool {
+    let [
+        zero_frequency,
+        zero_damping,
+        pole_frequency,
+        pole_damping,
+        ts,
+    ] = [
+        zero_frequency,
+        zero_damping,
+        pole_frequency,
+        pole_damping,
+        ts,
+    ]
+    .map(f64::from);
+    let made = Biquad::resonance(
+        zero_frequency,
+        zero_damping,
+        pole_frequency,
+        pole_damping,
+        ts,
+    );
+    // SAFETY: by contract.
+    unsafe { put(biquad, made) }
 }
 
 /// [`Controller::step`]; 0 where there is no controller.

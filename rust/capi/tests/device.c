@@ -111,7 +111,8 @@ void board_identity(sewfast_identity *identity) {
     identity->firmware = "1.0";
     identity->period = 1000;
     identity->counts_per_rev = 1572.0f;
-    identity->capabilities = SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN;
+    identity->capabilities =
+        SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN | SEWFAST_CAN_BIQUADS;
     identity->ceilings = (sewfast_limits){20.0f, 4000.0f, 60000.0f, INFINITY};
     identity->channels = channels;
     identity->channel_count = sizeof channels / sizeof channels[0];
@@ -342,7 +343,7 @@ static void pid_is_its_equation(void) {
     } place;
     sewfast_pid_settings settings = {0.02f, 0.25f, 0.0f,     0.4f,  0.2f, INFINITY, 0.0f,
                                      -20.0f, 20.0f, INFINITY, 0.001f, 0.0f, 1,     0.0f,
-                                     INFINITY, 0, {{0.0f, 0.0f, 0.0f, 0.0f}}};
+                                     INFINITY, 0, {{0.0f, 0.0f, 0.0f, 0.0f}}, 0, {{0.0f, 0.0f, 0.0f, 0.0f}}};
     int32_t refusal = -1;
     CHECK(sewfast_pid_size() <= SEWFAST_PID_SIZE);
     sewfast_pid *pid = sewfast_pid_init(&place, sizeof place, &settings, &refusal);
@@ -373,6 +374,28 @@ static void pid_is_its_equation(void) {
     settings.ti = 0.0f;
     CHECK(sewfast_pid_init(&place, sizeof place, &settings, &refusal) == NULL && refusal == 2);
     CHECK(sewfast_pid_init(&place, 8, &settings, &refusal) == NULL && refusal == -1);
+
+    /* a notch stops its sine, and passes what stands still */
+    sewfast_pid_biquad notch = {0.0f, 0.0f, 0.0f, 0.0f};
+    CHECK(!sewfast_pid_notch(&notch, 500.0f, 0.0f, 0.5f, 1e-3f) && notch.c0 == 0.0f && notch.a2 == 0.0f);
+    CHECK(!sewfast_pid_notch(NULL, 50.0f, 0.0f, 0.5f, 1e-3f) && sewfast_pid_low_pass(&notch, 50.0f, 0.7f, 1e-3f));
+    CHECK(sewfast_pid_lead_lag(&notch, 10.0f, 50.0f, 1e-3f) && sewfast_pid_resonance(&notch, 70.0f, 0.02f, 60.0f, 0.3f, 1e-3f));
+    CHECK(sewfast_pid_notch(&notch, 50.0f, 0.0f, 0.5f, 1e-3f));
+    sewfast_pid_settings stopped = {1.0f, INFINITY, 0.0f,     0.0f,  0.0f, INFINITY, 0.0f,
+                                    -20.0f, 20.0f,   INFINITY, 1e-3f, 0.0f, 1,        0.0f, INFINITY, 0,
+                                    {{0.0f, 0.0f, 0.0f, 0.0f}}, 1, {notch}};
+    pid = sewfast_pid_init(&place, sizeof place, &stopped, &refusal);
+    CHECK(pid != NULL);
+    float most = 0.0f;
+    for (int k = 0; k < 2000; k++) {
+        float u = sewfast_pid_step(pid, 3.0f, 1.0f + sinf(0.314159265f * (float)k));
+        most = k > 1900 && fabsf(u - 2.0f) > most ? fabsf(u - 2.0f) : most;
+    }
+    CHECK(most < 1e-3f);
+    stopped.biquads[0].a2 = 1.0f;
+    CHECK(sewfast_pid_change(pid, &stopped) == 17);
+    stopped.biquad_count = 5;
+    CHECK(sewfast_pid_init(&place, sizeof place, &stopped, &refusal) == NULL && refusal == 17);
 }
 
 static sewfast_device *computed;

@@ -52,7 +52,8 @@ impl Host {
                 | capability::PID
                 | capability::DRIVE
                 | capability::CURRENT
-                | capability::DESIGN,
+                | capability::DESIGN
+                | capability::BIQUADS,
             ceilings: Limits {
                 volt: 20.0,
                 speed: 4000.0,

@@ -66,7 +66,8 @@ impl<B: Board> Firmware<B> {
             capabilities: capability::PROFILE
                 | capability::PID
                 | capability::DRIVE
-                | capability::DESIGN,
+                | capability::DESIGN
+                | capability::BIQUADS,
             ceilings: Limits {
                 volt: 20.0,
                 speed: 4000.0,

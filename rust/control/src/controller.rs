@@ -1,5 +1,10 @@
-//! The whole controller of the paper's Fig. 16: feedback filter, reference ramp, then two-degree-of-freedom PID.
+//! The whole controller of the paper's Fig. 16: feedback filter, reference ramp, biquads, then two-degree-of-freedom PID.
+//!
+//! Biquads act on the reference and on the feedback alike. As the PID is linear in both, that is what they would do behind it,
+//! on the command, where drives have them: the machine's resonance is neither fed back nor excited by the reference. But limits,
+//! slew, anti-windup and the operator's command stay where they are, on the command that the machine gets.
 
+use crate::biquad::Memory;
 use crate::pid::Terms;
 use crate::schedule::{Row, Table};
 use crate::{Design, Feedback, Pid, Ramp, Real, Refused, Settings};
@@ -22,12 +27,16 @@ pub struct Numbers<T> {
     pub ramp: T,
 }
 
-/// Feedback filter, reference ramp, gain schedule and PID behind one step.
+/// Feedback filter, reference ramp, biquads, gain schedule and PID behind one step.
 #[derive(Clone, Debug)]
 pub struct Controller<T> {
     design: Design<T>,
     filter: Feedback<T>,
     ramp: Ramp<T>,
+    /// The biquads' memory of the feedback.
+    of_y: Memory<T>,
+    /// The biquads' memory of the reference.
+    of_r: Memory<T>,
     table: Option<Table<T>>,
     pid: Pid<T>,
     filtered: T,
@@ -46,12 +55,15 @@ impl<T: Real> Controller<T> {
             observer_time,
             r_rate,
             schedule,
+            biquads: _,
         } = design;
         let ts = pid.ts;
         Ok(Self {
             pid: Pid::new(pid)?,
             filter: Feedback::new(filter_samples, filter_time, observer_time, ts)?,
             ramp: Ramp::new(r_rate, ts)?,
+            of_y: Memory::new(),
+            of_r: Memory::new(),
             table: Table::new(&schedule, &pid),
             design,
             filtered: T::ZERO,
@@ -62,6 +74,8 @@ impl<T: Real> Controller<T> {
     pub fn reset(&mut self) {
         self.filter.reset();
         self.ramp.reset();
+        self.of_y.started = false;
+        self.of_r.started = false;
         self.pid.reset();
         self.filtered = T::ZERO;
     }
@@ -86,8 +100,18 @@ impl<T: Real> Controller<T> {
             self.filter.reset();
             return self.pid.hold();
         }
+        let sections = self.design.biquads.sections();
+        if !self.of_y.started {
+            self.of_y.rest_at(filtered);
+        }
+        let filtered = self.of_y.step(sections, filtered);
+        if !filtered.is_finite() {
+            self.of_y.started = false;
+            return self.pid.hold();
+        }
         self.filtered = filtered;
-        let r = self.ramp.step(r, self.filtered);
+        let ramped = self.ramp.step(r, filtered);
+        let r = self.referred(ramped);
         let terms = match &self.table {
             Some(table) => table.at(self.filtered),
             None => self.pid.terms(),
@@ -95,8 +119,23 @@ impl<T: Real> Controller<T> {
         self.pid.step_by(terms, r, self.filtered, feedforward)
     }
 
+    /// The reference after the biquads, which stood at the first output before it, as the ramp did: a step of the reference is
+    /// filtered too. One that is not finite passes them by, and the PID skips it.
+    fn referred(&mut self, r: T) -> T {
+        if !r.is_finite() {
+            return r;
+        }
+        if !self.of_r.started {
+            self.of_r.rest_at(self.filtered);
+        }
+        let filtered = self.of_r.step(self.design.biquads.sections(), r);
+        self.of_r.started = filtered.is_finite();
+        filtered
+    }
+
     /// Another design from the next sample on, without a bump in the command: filter, ramp and derivative keep what they
-    /// remember, and the integral term takes up what the other terms change by.
+    /// remember, other biquads begin at rest where the former's signals were, and the integral term takes up what the other
+    /// terms change by.
     ///
     /// Without integral action what it took up stays; [`reset`](Self::reset) forgets it.
     ///
@@ -113,6 +152,16 @@ impl<T: Real> Controller<T> {
             Some(table) => table.at(self.filtered),
             None => new.pid.terms(),
         };
+        if design.biquads != self.design.biquads {
+            for (memory, last) in [
+                (&mut self.of_y, self.filtered),
+                (&mut self.of_r, self.pid.reference()),
+            ] {
+                if memory.started {
+                    memory.rest_at(last);
+                }
+            }
+        }
         self.pid.change(design.pid, terms);
         (self.table, self.design) = (new.table, design);
         Ok(())
@@ -154,10 +203,11 @@ impl<T: Real> Controller<T> {
         self.table.as_ref().map_or(&[], Table::rows)
     }
 
-    /// What a step computes with; `None` where the gains follow a schedule.
+    /// What a step computes with; `None` where the gains follow a schedule or there are biquads.
     pub fn numbers(&self) -> Option<Numbers<T>> {
         let (samples, lag, observer) = self.filter.parts();
-        self.table.is_none().then(|| Numbers {
+        let constant = self.table.is_none() && self.design.biquads.is_empty();
+        constant.then(|| Numbers {
             terms: self.pid.terms(),
             tracking: self.settings().tracking(),
             samples,

@@ -1,6 +1,6 @@
 //! Everything that a [`Controller`](crate::Controller) is made from.
 
-use crate::{Real, Schedule, Settings};
+use crate::{Cascade, Real, Schedule, Settings};
 
 /// The settings of a whole controller; symbols as in docs/CONVENTIONS.md.
 ///
@@ -26,10 +26,12 @@ pub struct Design<T> {
     pub r_rate: T,
     /// Gains over speed; empty for the constant ones of `pid`.
     pub schedule: Schedule<T>,
+    /// Notches and the like on reference and feedback; none by default.
+    pub biquads: Cascade<T>,
 }
 
 impl<T: Real> Design<T> {
-    /// The PID alone: no filter, no observer, no ramp, no schedule.
+    /// The PID alone: no filter, no observer, no ramp, no schedule, no biquads.
     pub fn new(pid: Settings<T>) -> Self {
         Self {
             pid,
@@ -38,6 +40,7 @@ impl<T: Real> Design<T> {
             observer_time: T::ZERO,
             r_rate: T::INFINITY,
             schedule: Schedule::NONE,
+            biquads: Cascade::NONE,
         }
     }
 }

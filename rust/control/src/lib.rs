@@ -4,6 +4,7 @@
 #[cfg(test)]
 extern crate std;
 
+pub mod biquad;
 pub mod controller;
 pub mod design;
 pub mod filter;
@@ -18,6 +19,7 @@ pub mod refused;
 pub mod schedule;
 pub mod tracker;
 
+pub use biquad::{BIQUADS, Biquad, Cascade};
 pub use controller::{Controller, Numbers};
 pub use design::Design;
 pub use filter::{CAPACITY, Feedback};

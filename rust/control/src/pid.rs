@@ -297,6 +297,11 @@ impl<T: Real> Pid<T> {
         self.u
     }
 
+    /// The reference at the last sample.
+    pub(crate) fn reference(&self) -> T {
+        self.r
+    }
+
     /// The settings it was made from.
     pub fn settings(&self) -> &Settings<T> {
         &self.settings

@@ -34,6 +34,8 @@ pub trait Real:
     fn is_finite(self) -> bool;
     /// A count of samples as a number.
     fn from_count(count: usize) -> Self;
+    /// The nearest value.
+    fn from_f64(value: f64) -> Self;
     /// The value for a message.
     fn to_f64(self) -> f64;
     /// The hyperbolic tangent ([`model::tanh`](crate::model::tanh)).
@@ -73,6 +75,9 @@ macro_rules! real {
             }
             fn from_count(count: usize) -> Self {
                 count as $float
+            }
+            fn from_f64(value: f64) -> Self {
+                value as $float
             }
             fn to_f64(self) -> f64 {
                 self.into()

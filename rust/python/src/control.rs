@@ -1,6 +1,6 @@
 //! Bindings of the core's control: the controller, the closed loop, tuning rules, tuning.
 
-mod controller;
+pub mod controller;
 mod plant;
 mod tuning;
 
@@ -24,6 +24,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Controller>()?;
     module.add_class::<SingleController>()?;
     module.add_function(wrap_pyfunction!(convert_gains, module)?)?;
+    module.add_function(wrap_pyfunction!(controller::biquad, module)?)?;
     module.add_function(wrap_pyfunction!(closed_loop, module)?)?;
     module.add_function(wrap_pyfunction!(step_metrics, module)?)?;
     module.add_function(wrap_pyfunction!(effort, module)?)?;

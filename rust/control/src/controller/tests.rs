@@ -1,8 +1,9 @@
 //! The whole controller: what it was before, changes without a bump, constant cost.
 
 use super::*;
+use crate::biquad::tests::{any_section, section};
 use crate::real::counted::{Counted, operations};
-use crate::{Point, Schedule, Standard};
+use crate::{Biquad, Cascade, Point, Schedule, Standard};
 use proptest::prelude::*;
 use std::vec::Vec;
 
@@ -35,19 +36,26 @@ fn free() -> impl Strategy<Value = Design<f64>> {
         ])
         .unwrap()),
     ];
-    (gains, n, filter, rate, points).prop_map(|(g, n, filter, r_rate, schedule)| Design {
-        pid: Settings {
-            alpha: g.3,
-            beta: g.4,
-            n,
-            ..pid(g.0, g.1, g.2)
+    let biquads = prop::collection::vec(any_section(), 0..=2).prop_map(|given| {
+        let sections: Vec<_> = given.into_iter().map(section).collect();
+        Cascade::new(&sections).unwrap()
+    });
+    (gains, n, filter, rate, points, biquads).prop_map(
+        |(g, n, filter, r_rate, schedule, biquads)| Design {
+            pid: Settings {
+                alpha: g.3,
+                beta: g.4,
+                n,
+                ..pid(g.0, g.1, g.2)
+            },
+            filter_samples: filter.0,
+            filter_time: filter.1,
+            observer_time: filter.2,
+            r_rate,
+            schedule,
+            biquads,
         },
-        filter_samples: filter.0,
-        filter_time: filter.1,
-        observer_time: filter.2,
-        r_rate,
-        schedule,
-    })
+    )
 }
 
 /// The integral's own move in one sample, at most.
@@ -186,6 +194,79 @@ fn feeds_back_the_filtered_output_and_skips_a_lost_measurement() {
 }
 
 #[test]
+fn biquads_act_as_on_the_command() {
+    // linear in reference and output, so that they may stand behind the PID as well
+    let gains = pid(0.7, 0.05, 0.004);
+    let notch = Biquad::notch(60.0, 0.05, 0.6, TS).unwrap();
+    let low_pass = Biquad::low_pass(200.0, 0.7, TS).unwrap();
+    let sections = [notch, low_pass];
+    let design = Design {
+        biquads: Cascade::new(&sections).unwrap(),
+        ..Design::new(Settings {
+            alpha: 0.3,
+            beta: 0.6,
+            n: 5.0,
+            ..gains
+        })
+    };
+    let mut filtered = Controller::new(design).unwrap();
+    let plain = Design {
+        biquads: Cascade::NONE,
+        ..design
+    };
+    let mut plain = Controller::new(plain).unwrap();
+    let mut behind = crate::biquad::Memory::new();
+    behind.rest_at(0.0);
+    for k in 0..500_i32 {
+        let (r, y) = (f64::from((k / 50) % 3), f64::from((k * k) % 17) * 0.1);
+        let (r, y) = if k == 0 { (0.0, 0.0) } else { (r, y) };
+        let exact = behind.step(&sections, plain.step(r, y));
+        let found = filtered.step(r, y);
+        assert!((found - exact).abs() < 1e-8, "{k} {found} {exact}");
+    }
+}
+
+#[test]
+fn biquads_filter_a_step_of_the_reference_at_the_first_sample() {
+    let low_pass = Biquad::low_pass(5.0, 1.0, TS).unwrap();
+    let design = Design {
+        biquads: Cascade::new(&[low_pass]).unwrap(),
+        ..Design::new(pid(1.0, f64::INFINITY, 0.0))
+    };
+    let mut controller = Controller::new(design).unwrap();
+    for _ in 0..2 {
+        let first = controller.step(100.0, 20.0);
+        assert!(first > 0.0 && first < 0.05, "{first}");
+        let later = (0..2000).map(|_| controller.step(100.0, 20.0)).last();
+        assert!((later.unwrap() - 80.0).abs() < 1e-9);
+        controller.reset();
+    }
+}
+
+#[test]
+fn biquads_outlive_what_is_no_number() {
+    let notch = Biquad::notch(60.0, 0.05, 0.6, TS).unwrap();
+    let design = Design {
+        biquads: Cascade::new(&[notch; 4]).unwrap(),
+        ..Design::new(pid(1.0, f64::INFINITY, 0.0))
+    };
+    let mut controller = Controller::new(design).unwrap();
+    controller.step(3.0, 1.0);
+    for (r, y) in [
+        (f64::NAN, 1.0),
+        (3.0, f64::NAN),
+        (f64::INFINITY, 1.0),
+        (f64::MAX, 1.0),
+        (-f64::MAX, -f64::MAX),
+        (f64::MAX, f64::MAX),
+    ] {
+        assert!(controller.step(r, y).is_finite());
+    }
+    let later = (0..20_000).map(|_| controller.step(3.0, 1.0)).last();
+    assert!((later.unwrap() - 2.0).abs() < 1e-9, "{later:?}");
+}
+
+#[test]
 fn anti_windup_sees_the_feedforward() {
     // The sum is limited, so the integral must not go on; without feedforward it may.
     let design = Design::new(Settings {
@@ -320,6 +401,7 @@ fn whole() -> Design<Counted> {
         observer_time: c(0.004),
         r_rate: c(5000.0),
         schedule: Schedule::new(&points).unwrap(),
+        biquads: Cascade::new(&[section((40.0, 0.2, 70.0, 0.5, 3)); 4]).unwrap(),
     }
 }
 
@@ -366,13 +448,14 @@ fn costs(design: Design<Counted>, manual: bool) -> (Vec<u64>, Vec<u64>) {
 fn a_step_costs_the_same_whatever_comes() {
     let constant = Design {
         schedule: Schedule::NONE,
+        biquads: Cascade::NONE,
         ..whole()
     };
     let plain = Design::new(Settings {
         tt: Counted(0.0),
         ..whole().pid
     });
-    for (design, most) in [(whole(), 150), (constant, 120), (plain, 90)] {
+    for (design, most) in [(whole(), 240), (constant, 125), (plain, 95)] {
         for manual in [false, true] {
             let (taken, skipped) = costs(design, manual);
             let first = taken[0];

@@ -3,7 +3,10 @@
 use super::Fields;
 use super::device::State;
 use super::identity::Limits;
-use crate::{Controller, Design, POINTS, Point, Refused, Schedule, Settings, Standard};
+use crate::{
+    BIQUADS, Biquad, Cascade, Controller, Design, POINTS, Point, Refused, Schedule, Settings,
+    Standard,
+};
 
 /// Shortest and longest time of a watchdog \[us\].
 const WATCHDOG: core::ops::RangeInclusive<u32> = 1_000..=10_000_000;
@@ -109,6 +112,11 @@ impl Gains {
         })
     }
 
+    /// Biquads from the next start on; GAINS come without any.
+    pub(super) fn set_biquads(&mut self, biquads: Cascade<f32>) {
+        self.design.biquads = biquads;
+    }
+
     /// # Errors
     /// The field that is outside its range, or beyond the volt limit.
     pub(super) fn check(&self, volt: f32, ts: f32) -> Result<(), Refusal> {
@@ -169,17 +177,28 @@ pub(super) struct Start {
 /// A command with its fields, of the right length but otherwise as they came.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Command<'a> {
-    Hello { from: u8, to: u8, session: u32 },
-    Describe { channel: u8 },
+    Hello {
+        from: u8,
+        to: u8,
+        session: u32,
+    },
+    Describe {
+        channel: u8,
+    },
     Status,
     Limits(Limits),
-    Arm { watchdog: u32, key: u32 },
+    Arm {
+        watchdog: u32,
+        key: u32,
+    },
     Stop,
     Clear,
     Upload(Upload<'a>),
     Gains(Gains),
     Start(Start),
     Echo(&'a [u8]),
+    /// The number of sections, and what they are where they make sense.
+    Biquads(Result<Cascade<f32>, Refusal>),
 }
 
 impl<'a> Command<'a> {
@@ -199,6 +218,7 @@ impl<'a> Command<'a> {
             0x09 => gains(&mut fields),
             0x0A => start(&mut fields),
             0x0B => Some(Self::Echo(fields.rest())).filter(|_| body.len() <= MAX_ECHO),
+            0x0C => biquads(&mut fields).map(Self::Biquads),
             _ => return Err(Refusal::unknown(kind)),
         };
         let whole = command.filter(|_| fields.is_empty());
@@ -308,6 +328,29 @@ fn schedule(fields: &mut Fields<'_>) -> Option<Result<Schedule<f32>, Refused>> {
     fields.take(16 * count.saturating_sub(points.len()))?;
     let named = points.get(..count).unwrap_or(&points);
     Some(Schedule::new(named))
+}
+
+/// `None` where the body is too short for its sections.
+fn biquads(fields: &mut Fields<'_>) -> Option<Result<Cascade<f32>, Refusal>> {
+    let count = usize::from(fields.u8()?);
+    let mut sections = [Biquad::NONE; BIQUADS];
+    let Some(named) = sections.get_mut(..count) else {
+        fields.take(16 * count)?;
+        return Some(Err(Refusal::value(0)));
+    };
+    let mut good = Ok(());
+    for (index, section) in (0u32..).zip(&mut *named) {
+        *section = Biquad {
+            c0: fields.f32()?,
+            c1: fields.f32()?,
+            a1: fields.f32()?,
+            a2: fields.f32()?,
+        };
+        let alone = Cascade::new(core::slice::from_ref(section));
+        good = good.and(alone.map(drop).map_err(|_| Refusal::value(1 + 4 * index)));
+    }
+    let whole = Cascade::new(named).map_err(|_| Refusal::value(0));
+    Some(good.and(whole))
 }
 
 fn start<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {

@@ -14,7 +14,8 @@
 //!     firmware: "0.1",
 //!     period: 1000,
 //!     counts_per_rev: 1572.0,
-//!     capabilities: capability::PROFILE | capability::PID | capability::DRIVE | capability::DESIGN,
+//!     capabilities: capability::PROFILE | capability::PID | capability::DRIVE | capability::DESIGN
+//!         | capability::BIQUADS,
 //!     ceilings: Limits { volt: 20.0, speed: 4000.0, acceleration: f32::INFINITY, current: f32::INFINITY },
 //!     channels: &CHANNELS,
 //! })?;

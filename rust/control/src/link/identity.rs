@@ -28,6 +28,8 @@ pub mod capability {
     pub const COMPUTED: u32 = 1 << 5;
     /// Its PID has observer, reference ramp and gain schedule.
     pub const DESIGN: u32 = 1 << 6;
+    /// Its PID has biquads.
+    pub const BIQUADS: u32 = 1 << 7;
 }
 
 /// How a channel's samples are written.

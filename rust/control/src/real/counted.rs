@@ -82,6 +82,9 @@ impl Real for Counted {
     fn from_count(count: usize) -> Self {
         Self(count as f64)
     }
+    fn from_f64(value: f64) -> Self {
+        Self(value)
+    }
     fn to_f64(self) -> f64 {
         self.0
     }

@@ -17,7 +17,8 @@ const CAPABILITIES: u32 = capability::PROFILE
     | capability::DRIVE
     | capability::CURRENT
     | capability::COMPUTED
-    | capability::DESIGN;
+    | capability::DESIGN
+    | capability::BIQUADS;
 
 const CHANNELS: [Channel; 6] = [
     channel("counts", "1", Encoding::Counts, 1, Source::Counts),

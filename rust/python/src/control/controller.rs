@@ -3,7 +3,7 @@
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_control::{
-    Controller as Core, Design, Point, Refused, Row, Schedule, Settings, Standard,
+    Biquad, Cascade, Controller as Core, Design, Point, Refused, Row, Schedule, Settings, Standard,
 };
 use sewfast_core::Error;
 
@@ -23,6 +23,36 @@ pub struct SingleController {
 
 /// Speed, then Kp, Ti, Td in standard form.
 type Given = (f64, f64, f64, f64);
+
+/// `c0`, `c1`, `a1`, `a2` of a biquad.
+pub type Section = (f64, f64, f64, f64);
+
+pub fn cascade(sections: &[Section]) -> Result<Cascade<f64>, Refused> {
+    let section = |&(c0, c1, a1, a2): &Section| Biquad { c0, c1, a1, a2 };
+    Cascade::new(&sections.iter().map(section).collect::<Vec<_>>())
+}
+
+/// The coefficients of a biquad of `kind` with its numbers, at sample time `Ts` \[s\].
+#[pyfunction]
+#[pyo3(signature = (kind, numbers, *, Ts))]
+#[expect(non_snake_case, reason = "the field's names")]
+pub fn biquad(py: Python<'_>, kind: &str, numbers: Vec<f64>, Ts: f64) -> PyResult<Section> {
+    let made = match (kind, &numbers[..]) {
+        ("notch", &[frequency, depth, width]) => Biquad::notch(frequency, depth, width, Ts),
+        ("low_pass", &[frequency, damping]) => Biquad::low_pass(frequency, damping, Ts),
+        ("lead_lag", &[zero, pole]) => Biquad::lead_lag(zero, pole, Ts),
+        ("resonance", &[zero, zero_damping, pole, pole_damping]) => {
+            Biquad::resonance(zero, zero_damping, pole, pole_damping, Ts)
+        }
+        _ => Err(Refused {
+            name: "biquads",
+            expected: "notch, low_pass, lead_lag or resonance with 3, 2, 2 or 4 numbers",
+            received: numbers.len() as f64,
+        }),
+    };
+    let Biquad::<f64> { c0, c1, a1, a2 } = made.map_err(|e| raise(py, Error::from(e)))?;
+    Ok((c0, c1, a1, a2))
+}
 
 fn schedule(rows: &[Given]) -> Result<Schedule<f64>, Refused> {
     let point = |&(speed, kp, ti, td): &Given| Point {
@@ -44,6 +74,13 @@ fn single(design: &Design<f64>) -> Result<Design<f32>, Refused> {
         gains: gains(p.gains),
     };
     let points: Vec<_> = design.schedule.points().iter().map(point).collect();
+    let section = |s: &Biquad<f64>| Biquad {
+        c0: s.c0 as f32,
+        c1: s.c1 as f32,
+        a1: s.a1 as f32,
+        a2: s.a2 as f32,
+    };
+    let sections: Vec<_> = design.biquads.sections().iter().map(section).collect();
     let s = &design.pid;
     Ok(Design {
         pid: Settings {
@@ -62,6 +99,7 @@ fn single(design: &Design<f64>) -> Result<Design<f32>, Refused> {
         observer_time: design.observer_time as f32,
         r_rate: design.r_rate as f32,
         schedule: Schedule::new(&points)?,
+        biquads: Cascade::new(&sections)?,
     })
 }
 
@@ -104,7 +142,8 @@ macro_rules! controller_methods {
             #[getter]
             fn numbers<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
                 let (design, found) = (*self.core.design(), PyDict::new(py));
-                let constant = Design { schedule: Schedule::NONE, ..design };
+                let (schedule, biquads) = (Schedule::NONE, Cascade::NONE);
+                let constant = Design { schedule, biquads, ..design };
                 let constant = Core::new(constant).map_err(|e| raise(py, Error::from(e)))?;
                 let Some(numbers) = constant.numbers() else {
                     return Ok(found);
@@ -138,6 +177,9 @@ macro_rules! controller_methods {
                 };
                 let rows: Vec<_> = self.core.rows().iter().map(row).collect();
                 found.set_item("rows", rows)?;
+                let section = |s: &Biquad<$float>| [s.c0, s.c1, s.a1, s.a2].map(f64::from);
+                let sections: Vec<_> = design.biquads.sections().iter().map(section).collect();
+                found.set_item("biquads", sections)?;
                 Ok(found)
             }
         }
@@ -146,7 +188,7 @@ macro_rules! controller_methods {
 
 controller_methods!(Controller, f64 {
     #[new]
-    #[pyo3(signature = (*, Kp, Ti, Td, alpha, beta, N, Tt, u_min, u_max, slew, Ts, filter_samples, filter_time, observer_time=0.0, r_rate=f64::INFINITY, schedule=Vec::new()))]
+    #[pyo3(signature = (*, Kp, Ti, Td, alpha, beta, N, Tt, u_min, u_max, slew, Ts, filter_samples, filter_time, observer_time=0.0, r_rate=f64::INFINITY, schedule=Vec::new(), biquads=Vec::new()))]
     #[expect(non_snake_case, reason = "the field's names")]
     #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
     fn new(
@@ -167,6 +209,7 @@ controller_methods!(Controller, f64 {
         observer_time: f64,
         r_rate: f64,
         schedule: Vec<Given>,
+        biquads: Vec<Section>,
     ) -> PyResult<Self> {
         let gains = Standard {
             kp: Kp,
@@ -184,14 +227,15 @@ controller_methods!(Controller, f64 {
             slew,
             ts: Ts,
         };
-        let made = self::schedule(&schedule).and_then(|schedule| {
+        let made = cascade(&biquads).and_then(|biquads| {
             Core::new(Design {
                 pid,
                 filter_samples,
                 filter_time,
                 observer_time,
                 r_rate,
-                schedule,
+                schedule: self::schedule(&schedule)?,
+                biquads,
             })
         });
         let core = made.map_err(|refused| raise(py, Error::from(refused)))?;

@@ -1,6 +1,7 @@
 //! The safety law: whatever comes, the command is finite, within its limits and its slew; and the controller finds back.
 
-use crate::{Controller, Design, Point, Real, Schedule, Settings, Standard};
+use crate::biquad::tests::{any_section, section};
+use crate::{Cascade, Controller, Design, Point, Real, Schedule, Settings, Standard};
 use proptest::prelude::*;
 use std::vec::Vec;
 
@@ -63,8 +64,9 @@ macro_rules! laws {
                 let time = || prop_oneof![Just(0.0), POSITIVE | NORMAL, 0.0..0.02 as $float];
                 let points = prop::collection::vec((0.0..50.0 as $float, gains()), 0..=8);
                 let pid = (gains(), number(), number(), positive(), tt, limits(), positive());
-                let rest = (1..=64_usize, time(), time(), positive(), points);
-                (pid, rest).prop_map(move |(p, (filter_samples, filter_time, observer_time, r_rate, points))| {
+                let biquads = prop::collection::vec(any_section(), 0..=4);
+                let rest = (1..=64_usize, time(), time(), positive(), points, biquads);
+                (pid, rest).prop_map(move |(p, (filter_samples, filter_time, observer_time, r_rate, points, biquads))| {
                     let points: Vec<_> = points.into_iter().map(|(speed, gains)| Point { speed, gains }).collect();
                     let finite = |x: $float| if x.is_finite() { x } else { 0.0 };
                     let pid = Settings {
@@ -72,7 +74,9 @@ macro_rules! laws {
                         slew: p.6, ts,
                     };
                     let schedule = Schedule::new(&points).unwrap_or(Schedule::NONE);
-                    let whole = Design { pid, filter_samples, filter_time, observer_time, r_rate, schedule };
+                    let sections: Vec<_> = biquads.into_iter().map(section).collect();
+                    let biquads = Cascade::new(&sections).unwrap();
+                    let whole = Design { pid, filter_samples, filter_time, observer_time, r_rate, schedule, biquads };
                     // a ramp so slow that a sample of it is 0 is refused
                     if Controller::new(whole).is_ok() { whole } else { Design { r_rate: $float::INFINITY, ..whole } }
                 })
@@ -119,12 +123,15 @@ macro_rules! laws {
                 fn the_controller_finds_back_after_anything(
                     kp in 0.01..2.0 as $float, td in 0.0..0.05 as $float, n in 1.0..20.0 as $float,
                     samples in 1..=64_usize, filter_time in 0.0..2e-3 as $float, observer_time in 0.0..2e-3 as $float,
+                    given in prop::collection::vec((20.0..400.0, 0.1..1.0, 20.0..400.0, 0.1..1.0, 0..4_u8), 0..=2),
                     garbage in prop::collection::vec((number(), number(), number()), 1..80),
                     r in -3.0..3.0 as $float, y in -3.0..3.0 as $float,
                 ) {
                     let gains = Standard { kp, ti: $float::INFINITY, td };
                     let pid = Settings { n, u_min: -20.0, u_max: 20.0, ..Settings::new(gains, 1e-3) };
-                    let design = Design { filter_samples: samples, filter_time, observer_time, ..Design::new(pid) };
+                    let sections: Vec<_> = given.into_iter().map(section).collect();
+                    let biquads = Cascade::new(&sections).unwrap();
+                    let design = Design { filter_samples: samples, filter_time, observer_time, biquads, ..Design::new(pid) };
                     let mut controller = Controller::new(design).unwrap();
                     for (r, y, feedforward) in garbage {
                         controller.step_with(r, y, feedforward);

@@ -1,6 +1,7 @@
 //! What the host says is done, or refused.
 
 use super::{Core, Event, Reason, Run, State, Weight};
+use crate::Cascade;
 use crate::link::command::{
     Beat, Command, Gains, HELLO, Heartbeat, Refusal, STOP, Start, Upload, check_watchdog,
 };
@@ -126,6 +127,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
             Command::Clear => self.clear(),
             Command::Upload(upload) => self.upload(upload, body),
             Command::Gains(gains) => self.set_gains(gains),
+            Command::Biquads(biquads) => self.set_biquads(biquads),
             Command::Start(start) => self.start(start, body),
             Command::Echo(bytes) => {
                 body.add(bytes);
@@ -302,6 +304,17 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         Refusal::unsupported(13).unless(!gains.long || self.can(capability::DESIGN))?;
         gains.check(self.bounds().volt, self.ts)?;
         self.gains = Some(gains);
+        Ok(())
+    }
+
+    #[inline(never)]
+    fn set_biquads(&mut self, biquads: Result<Cascade<f32>, Refusal>) -> Done {
+        self.allow(&[State::Idle, State::Armed])?;
+        Refusal::state(self.state).unless(self.run.planned.is_none())?;
+        Refusal::unsupported(0).unless(self.can(capability::BIQUADS))?;
+        let biquads = biquads?;
+        let gains = self.gains.as_mut().ok_or(Refusal::value(0))?;
+        gains.set_biquads(biquads);
         Ok(())
     }
 

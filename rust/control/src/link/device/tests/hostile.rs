@@ -1,6 +1,7 @@
 //! Bytes that mean harm.
 
 use super::rig::*;
+use crate::Biquad;
 use crate::link::dice::{Dice, trials};
 use crate::link::identity::capability as can;
 use crate::link::{Deframer, Identity, MAX_BODY, Measurement, Reason, State};
@@ -61,6 +62,14 @@ fn body(dice: &mut Dice, kind: u8, now: u64) -> Vec<u8> {
             };
             body.bytes().unwrap().to_vec()
         }
+        0x0C => {
+            let section = Biquad::notch(60.0, 0.1, 0.5, 1e-3).unwrap();
+            let count = dice.below(6);
+            biquads(&std::vec![section; count])
+                .bytes()
+                .unwrap()
+                .to_vec()
+        }
         0x0A => {
             let at = if dice.below(2) == 0 {
                 0
@@ -107,9 +116,9 @@ fn body(dice: &mut Dice, kind: u8, now: u64) -> Vec<u8> {
 }
 
 /// Mostly what gets a run going and keeps it up.
-const KINDS: [u8; 26] = [
-    0x01, 0x02, 0x03, 0x04, 0x04, 0x05, 0x05, 0x06, 0x07, 0x07, 0x08, 0x09, 0x0A, 0x0A, 0x0B, 0x20,
-    0x20, 0x21, 0x22, 0xC0, 0x05, 0x0A, 0x0A, 0x20, 0x21, 0x22,
+const KINDS: [u8; 27] = [
+    0x0C, 0x01, 0x02, 0x03, 0x04, 0x04, 0x05, 0x05, 0x06, 0x07, 0x07, 0x08, 0x09, 0x0A, 0x0A, 0x0B,
+    0x20, 0x20, 0x21, 0x22, 0xC0, 0x05, 0x0A, 0x0A, 0x20, 0x21, 0x22,
 ];
 
 /// A frame, whole or not, with the next number or another.

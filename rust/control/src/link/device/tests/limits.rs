@@ -1,6 +1,7 @@
 //! Limits hold, whatever is asked for.
 
 use super::rig::*;
+use crate::Biquad;
 use crate::link::identity::capability as can;
 use crate::link::{Identity, Limits, Reason, State};
 
@@ -272,6 +273,53 @@ fn a_device_without_them_refuses_observer_ramp_and_schedule() {
     let answer = rig.command(0x09, long.bytes().unwrap());
     assert_eq!(answer, (8, std::vec![13, 0, 0, 0]));
     assert_eq!(rig.command(0x09, gains(good, 8).bytes().unwrap()).0, 0);
+}
+
+#[test]
+fn biquads_that_make_no_sense_are_refused_by_field() {
+    let good = Biquad::notch(60.0, 0.1, 0.5, 1e-3).unwrap();
+    let mut rig = Rig::ready();
+    let mut set = |sections: &[Biquad<f32>]| {
+        let (result, body) = rig.command(0x0C, biquads(sections).bytes().unwrap());
+        (result, body.first().copied().unwrap_or(0))
+    };
+    assert_eq!(set(&[good]), (3, 0), "no gains");
+    let body = gains(
+        [
+            0.02, 0.25, 0.004, 0.4, 0.2, INF, 0.0, -20.0, 20.0, INF, 0.0, 25.0,
+        ],
+        8,
+    );
+    assert_eq!(rig.command(0x09, body.bytes().unwrap()).0, 0);
+    let mut set = |sections: &[Biquad<f32>]| {
+        let (result, body) = rig.command(0x0C, biquads(sections).bytes().unwrap());
+        (result, body.first().copied().unwrap_or(0))
+    };
+    for count in 0..=4 {
+        assert_eq!(set(&[good; 4][..count]), (0, 0));
+    }
+    assert_eq!((set(&[good; 5]), set(&[good; 9])), ((3, 0), (3, 0)));
+    let (a2, c0) = (1.0, f32::NAN);
+    assert_eq!(set(&[Biquad { a2, ..good }, good]), (3, 1));
+    assert_eq!(set(&[good, good, Biquad { c0, ..good }]), (3, 9));
+    let whole = biquads(&[good; 3]);
+    for length in 0..whole.len() {
+        let cut = rig.command(0x0C, &whole.bytes().unwrap()[..length]);
+        assert_eq!(cut, (2, std::vec![length as u8, 0, 0, 0]));
+    }
+}
+
+#[test]
+fn a_device_without_them_refuses_biquads() {
+    let capabilities = identity().capabilities & !crate::link::capability::BIQUADS;
+    let mut rig = Rig::with(Identity {
+        capabilities,
+        ..identity()
+    });
+    rig.hello(77);
+    rig.samples(150);
+    let refused = rig.command(0x0C, biquads(&[]).bytes().unwrap());
+    assert_eq!(refused, (8, std::vec![0; 4]));
 }
 
 #[test]

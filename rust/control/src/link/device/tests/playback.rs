@@ -1,8 +1,9 @@
 //! What was uploaded is what the motor gets, and what it did is what the host hears.
 
 use super::rig::*;
+use crate::biquad::tests::{any_section, section};
 use crate::link::{Fields, Reason, State};
-use crate::{Controller, Design, Point, Schedule, Settings, Standard};
+use crate::{Biquad, Cascade, Controller, Design, Point, Schedule, Settings, Standard};
 use proptest::prelude::*;
 use std::vec;
 use std::vec::Vec;
@@ -63,6 +64,7 @@ proptest! {
         kp in 0.001f32..0.05, ti in 0.01f32..1.0, td in 0f32..0.01, tt in prop_oneof![Just(0f32), 0.01f32..1.0],
         observer in prop_oneof![Just(0f32), 0.001f32..0.02], rate in prop_oneof![Just(INF), 100f32..1e5],
         kps in prop::collection::vec(0.001f32..0.05, 0..=8), long: bool,
+        given in prop::collection::vec(any_section(), 0..=4),
     ) {
         let per_unit = 25.0;
         let values = [kp, ti, td, 0.4, 0.2, 10.0, tt, -20.0, 8.0, 2000.0, 0.002, per_unit];
@@ -72,6 +74,10 @@ proptest! {
         let (observer_time, r_rate, points) = if long { (observer, rate, points) } else { (0.0, INF, vec![]) };
         let body = if long { design(values, filter, observer_time, r_rate, &points) } else { gains(values, filter) };
         prop_assert_eq!(rig.command(0x09, body.bytes().unwrap()).0, 0);
+        let sections: Vec<Biquad<f32>> = given.into_iter().map(section).collect();
+        if !sections.is_empty() {
+            prop_assert_eq!(rig.command(0x0C, biquads(&sections).bytes().unwrap()).0, 0);
+        }
         let points: Vec<_> = points
             .iter()
             .map(|&[speed, kp, ti, td]| Point { speed, gains: Standard { kp, ti, td } })
@@ -88,7 +94,7 @@ proptest! {
         };
         let design = Design {
             pid: settings, filter_samples: filter.into(), filter_time: 0.002, observer_time, r_rate,
-            schedule: Schedule::new(&points).unwrap(),
+            schedule: Schedule::new(&points).unwrap(), biquads: Cascade::new(&sections).unwrap(),
         };
         let mut controller = Controller::<f32>::new(design).unwrap();
         let mut expected = Vec::new();

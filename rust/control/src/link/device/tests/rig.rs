@@ -1,5 +1,6 @@
 //! A host, a clock and a motor for tests.
 
+use crate::Biquad;
 use crate::link::identity::capability as can;
 use crate::link::{
     Body, Channel, Deframer, Device, Encoding, Fields, Header, Identity, Limits, MAX_WIRE,
@@ -43,7 +44,12 @@ pub fn identity() -> Identity {
         firmware: "test",
         period: PERIOD as u32,
         counts_per_rev: 1500.0,
-        capabilities: can::PROFILE | can::PID | can::DRIVE | can::CURRENT | can::DESIGN,
+        capabilities: can::PROFILE
+            | can::PID
+            | can::DRIVE
+            | can::CURRENT
+            | can::DESIGN
+            | can::BIQUADS,
         ceilings: Limits {
             volt: 20.0,
             speed: 5000.0,
@@ -358,6 +364,17 @@ pub fn design(
     points.iter().flatten().for_each(|&value| {
         body.f32(value);
     });
+    body
+}
+
+/// The body of BIQUADS.
+pub fn biquads(sections: &[Biquad<f32>]) -> Body {
+    let mut body = Body::new();
+    body.u8(sections.len() as u8);
+    for section in sections {
+        body.f32(section.c0).f32(section.c1);
+        body.f32(section.a1).f32(section.a2);
+    }
     body
 }
 

@@ -29,7 +29,10 @@ fn hello_tells_the_identity() {
     // zlib.crc32 of the same fields, packed by Python
     assert_eq!(fields.u32(), Some(SCHEMA));
     assert_eq!((fields.u8(), fields.u8()), (Some(0), Some(6)));
-    assert_eq!((fields.u32(), fields.u32()), (Some(1000), Some(0b101_0111)));
+    assert_eq!(
+        (fields.u32(), fields.u32()),
+        (Some(1000), Some(0b1101_0111))
+    );
     assert_eq!((fields.u32(), fields.f32()), (Some(64), Some(1500.0)));
     assert_eq!(
         (fields.text(24), fields.text(16)),

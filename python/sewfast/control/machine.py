@@ -1,0 +1,406 @@
+"""`Machine`: all that recording, running and commissioning know of any machine; `record`.
+
+Read in this order: the protocol, `record`, then the machines of this process: the virtual one and
+any that is advanced sample by sample. A drive behind a port is a `Machine` by itself
+(`sewfast.link.Drive`).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import FloatArray
+from ..errors import DataError, SettingError
+from ..gains import real
+from ..machine import VirtualMachine
+from ..recordfile.writer import require_replaceable
+from ..recording import Recording
+from ..speed import Method, speed_from_counts
+from .controller import Controller
+from .loop import ClosedLoopRun, run
+
+if TYPE_CHECKING:
+    from ..live import Kind
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedRun(ClosedLoopRun):
+    """A closed loop on a machine, scored by the true speed where the machine is a virtual one.
+
+    Attributes
+    ----------
+    recording : Recording
+        The same with what its encoder saw: what may be learned from.
+    """
+
+    recording: Recording
+
+    @classmethod
+    def of(cls, run: ClosedLoopRun, recording: Recording) -> RecordedRun:
+        """A run with its recording."""
+        known = {f.name: getattr(run, f.name) for f in fields(ClosedLoopRun)}
+        return cls(**known, recording=recording)
+
+    @property
+    def run(self) -> ClosedLoopRun:
+        """Itself; there was a pair of run and recording before."""
+        return self
+
+
+def Followed(run: ClosedLoopRun, recording: Recording) -> RecordedRun:
+    """`RecordedRun.of`, by the name that machines written so far know."""
+    return RecordedRun.of(run, recording)
+
+
+class Machine(Protocol):
+    """A motor with an encoder that can be excited and run, each time from rest.
+
+    Whatever has these members can be recorded (`record`), run (`run`), commissioned (`commission`)
+    and shaken (`bode`): a drive behind a port, an FMU, a model of MuJoCo, a rig of your own. A
+    `VirtualMachine` is taken as it is. Every run ends without command on the motor, also one that
+    is broken off.
+    """
+
+    @property
+    def name(self) -> str:
+        """Of the machine, for messages and files."""
+
+    @property
+    def Ts(self) -> float:
+        """Sample time [s]."""
+
+    @property
+    def counts_per_rev(self) -> float:
+        """Encoder counts of one turn."""
+
+    @property
+    def volt(self) -> float:
+        """Largest command that it takes to either side [V]."""
+
+    @property
+    def speed(self) -> float:
+        """Speed beyond which it stops by itself [RPM]; inf where there is none."""
+
+    def excite(self, u: FloatArray, name: str) -> Recording:
+        """Play commands [V], shape (N,), one each sample."""
+
+    def follow(self, controller: Controller, r: FloatArray, name: str) -> RecordedRun:
+        """Run a controller along a reference [RPM], shape (N,)."""
+
+
+class Streaming(Machine, Protocol):
+    """A machine whose samples arrive while it runs, as a drive's: it fills files and views itself.
+
+    Its `excite` and `follow` take `file`, `live` and `overwrite` as `record` and `run` do, `excite`
+    `method` and `settings` as well.
+    """
+
+    def excite(self, u: FloatArray, name: str, **options: Any) -> Recording: ...
+    def follow(
+        self, controller: Controller, r: FloatArray, name: str, **options: Any
+    ) -> RecordedRun: ...
+    def stream(self, *arguments: Any, **options: Any) -> Any: ...
+
+
+def is_streaming(machine: object) -> TypeGuard[Streaming]:
+    """Whether a machine's samples arrive while it runs."""
+    return hasattr(machine, "stream")
+
+
+MEMBERS = ("name", "Ts", "counts_per_rev", "volt", "speed", "excite", "follow")
+
+
+def machine_of(on: object) -> Machine:
+    """What is given as a machine: a virtual one with the members that it lacks, others as they are.
+
+    Raises
+    ------
+    SettingError
+        For anything else; the message names the members that are missing.
+    """
+    if isinstance(on, VirtualMachine):
+        return MachineBench(on)
+    # a property is looked up at its class: asking a drive for its limits would be a question to it
+    missing = [m for m in MEMBERS if not hasattr(type(on), m) and not hasattr(on, m)]
+    if missing:
+        lacking = "" if len(missing) == len(MEMBERS) else f" without {', '.join(missing)}"
+        raise SettingError(
+            "expected a VirtualMachine, a Drive or a Machine to commission, got "
+            f"{type(on).__name__}{lacking}; sewfast.VirtualMachine(), connect to a drive, or give "
+            "yours the members of sewfast.Machine"
+        )
+    return cast(Machine, on)
+
+
+# --- Recording ------------------------------------------------------------------------------------
+
+
+def record(
+    machine: VirtualMachine | Machine,
+    u: ArrayLike,
+    *,
+    name: str = "array",
+    method: Method = "kalman",
+    file: str | os.PathLike[str] | None = None,
+    live: str | Kind = "none",
+    settings: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+) -> Recording:
+    """Excite a machine from rest and record it.
+
+    Parameters
+    ----------
+    machine : VirtualMachine, Drive or a machine of your own
+        A virtual machine is reset first, and left where the run ends. A drive (`sewfast.link`)
+        waits for rest, is armed and started; its limits must have been set. One of your own is a
+        `Machine`; a simulator stands in a `sewfast.commissioning.SteppedBench`.
+    u : array, shape (N,)
+        Command [V] at the machine's sample time; see `sewfast.signals.excitation`.
+    name : str
+        Of the excitation, for messages and files.
+    method : "kalman", "savgol" or "difference"
+        How the speed of a virtual machine or a drive is estimated from the counts.
+    file : path, optional
+        Of a drive an MCAP recording, written while it runs, so that nothing is lost; of another
+        machine any format, written at the end.
+    live : str
+        Of a drive: see `sewfast.live.open_view`.
+    settings : mapping, optional
+        What else the file says of the recording.
+    overwrite : bool
+        Whether `file` may replace a recording of a drive, which cannot be had again; one of a
+        virtual machine is replaced anyway.
+
+    Returns
+    -------
+    Recording
+        Of a virtual machine the command as given: beyond its limit the machine clips it. Of a
+        drive the command as applied.
+
+    Raises
+    ------
+    DataError
+        Where `u` is not one-dimensional and finite, or too short for a speed.
+    SettingError
+        Where `file` has an unknown ending or is a recording that is kept, before anything moves.
+    LinkError
+        Where the port or the drive failed or tripped; the motor is stopped, `recording` holds what
+        came.
+    Interrupted
+        On Ctrl-C, of a drive; the motor is stopped, `best` is the recording up to there.
+    """
+    if not isinstance(machine, VirtualMachine) and not hasattr(machine, "excite"):
+        raise SettingError(
+            f"expected a VirtualMachine or a Drive to record, got {type(machine).__name__}; the "
+            "machine comes first: record(machine, u)"
+        )
+    command = _command(u)
+    if is_streaming(machine):
+        return machine.excite(
+            command, name, method=method, file=file, live=live, settings=settings,
+            overwrite=overwrite,
+        )  # fmt: skip
+    if file is not None:
+        require_replaceable(file, overwrite=overwrite)
+    if isinstance(machine, VirtualMachine):
+        found = MachineBench(machine, method=method).excite(command, name)
+    else:
+        found = machine.excite(command, name)
+    if file is not None:
+        found.save(file, overwrite=overwrite)
+    return found
+
+
+def _command(u: ArrayLike) -> FloatArray:
+    try:
+        if np.iscomplexobj(u):
+            raise TypeError("complex numbers")
+        command = np.array(u, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as e:
+        raise DataError(
+            f"expected an excitation as numbers, got {str(u)[:60]!r}; a named one is "
+            "sewfast.signals.excitation('step')"
+        ) from e
+    if command.ndim != 1:
+        raise DataError(
+            f"expected an excitation of shape (N,), received {command.shape}; pass one column"
+        )
+    return command
+
+
+# --- Machines of this process ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MachineBench:
+    """A virtual machine as a `Machine`.
+
+    Parameters
+    ----------
+    machine : VirtualMachine
+    speed : float
+        Speed beyond which it stops by itself [RPM].
+    method : "kalman", "savgol" or "difference"
+        How the speed is estimated from the counts.
+    """
+
+    machine: VirtualMachine
+    speed: float = float("inf")
+    method: Method = "kalman"
+
+    @property
+    def name(self) -> str:
+        return self.machine.name
+
+    @property
+    def Ts(self) -> float:
+        return self.machine.Ts
+
+    @property
+    def counts_per_rev(self) -> float:
+        return self.machine.counts_per_rev
+
+    @property
+    def volt(self) -> float:
+        return self.machine.parameters["u_limit"]
+
+    def excite(self, u: FloatArray, name: str) -> Recording:
+        u = np.array(u, dtype=np.float64)
+        self.machine.reset()
+        done = self.machine.run(u)
+        y = speed_from_counts(done.counts, self.Ts, self.counts_per_rev, method=self.method)
+        return Recording(u, done.counts, y, done.speed_rpm, self.Ts, self.counts_per_rev, name)
+
+    def follow(self, controller: Controller, r: FloatArray, name: str) -> RecordedRun:
+        # undisturbed, the machine does the same again and shows its counts
+        found = run(controller, self.machine, r, name=name)
+        return RecordedRun.of(found, self.excite(found.u, name))
+
+
+class Stepped(Protocol):
+    """A machine that is advanced one sample at a time: a simulator, or a test rig without a clock.
+
+    `speed_rpm`, where there is one, is its true speed [RPM]: runs are then scored by it, and by the
+    speed estimated from counts otherwise.
+    """
+
+    @property
+    def counts(self) -> float:
+        """What its encoder shows now."""
+
+    def reset(self) -> None:
+        """Bring it to rest."""
+
+    def step(self, u: float) -> None:
+        """Hold a command [V] for one sample."""
+
+
+@dataclass(frozen=True, eq=False)
+class SteppedBench:
+    """Any machine that can be advanced sample by sample, with sewfast's own controller around it.
+
+    Every run ends with a sample at 0 V, also one that is broken off.
+
+    Parameters
+    ----------
+    machine : Stepped
+        With `reset()`, `step(u)` and `counts`.
+    Ts : float
+        Sample time [s].
+    counts_per_rev : float
+        Encoder counts of one turn.
+    volt : float
+        Largest command that it takes to either side [V]; larger ones are clipped.
+    name : str
+    speed : float
+        Speed beyond which it stops by itself [RPM].
+
+    Raises
+    ------
+    SettingError
+        For a number that is not above 0.
+    """
+
+    machine: Stepped
+    Ts: float
+    counts_per_rev: float
+    volt: float
+    name: str = "machine"
+    speed: float = float("inf")
+
+    def __post_init__(self) -> None:
+        for name in ("Ts", "counts_per_rev", "volt", "speed"):
+            value = real(name, getattr(self, name))
+            if not value > 0.0 or (math.isinf(value) and name != "speed"):
+                raise SettingError(
+                    name=name, expected="a finite number above 0", received=f"{value!r}",
+                    remedy="see the data sheet",
+                )  # fmt: skip
+
+    def excite(self, u: FloatArray, name: str) -> Recording:
+        _require_finite("command", u)
+        return self._recording(u, *self._played(lambda k, counts: float(u[k]), len(u)), name)
+
+    def follow(self, controller: Controller, r: FloatArray, name: str) -> RecordedRun:
+        if not math.isclose(controller.Ts, self.Ts, rel_tol=0.01):
+            raise SettingError(
+                f"expected machine and controller at one sample time, got {self.Ts} s and "
+                f"{controller.Ts} s; tune a controller for this machine"
+            )
+        _require_finite("reference", r)
+        core = controller.core()
+        per_count = 60.0 / (self.counts_per_rev * self.Ts)
+        u, feedback, before = np.zeros(len(r)), np.zeros(len(r)), [0.0]
+
+        def decide(k: int, counts: float) -> float:
+            u[k] = core.step(float(r[k]), (counts - before[0]) * per_count)
+            feedback[k], before[0] = core.filtered, counts
+            return float(u[k])
+
+        recording = self._recording(u, *self._played(decide, len(r)), name)
+        truth = recording.speed_true
+        t = np.arange(len(r), dtype=np.float64) * self.Ts
+        y = recording.y if truth is None else truth
+        return RecordedRun(
+            t, np.array(r), u, y, feedback, controller, self.name, name, recording=recording
+        )
+
+    def _played(
+        self, decide: Callable[[int, float], float], samples: int
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Counts, from 0, and true speeds, each read before the sample's command acts."""
+        machine = self.machine
+        machine.reset()
+        first, counts, speed = machine.counts, np.zeros(samples), np.zeros(samples)
+        try:
+            for k in range(samples):
+                counts[k], speed[k] = machine.counts - first, getattr(machine, "speed_rpm", np.nan)
+                machine.step(min(max(decide(k, float(counts[k])), -self.volt), self.volt))
+        finally:
+            # a rig holds its last command: no run leaves it turning, however it ends
+            machine.step(0.0)
+        return counts, speed if hasattr(machine, "speed_rpm") else None
+
+    def _recording(
+        self, u: FloatArray, counts: FloatArray, speed: FloatArray | None, name: str
+    ) -> Recording:
+        y = speed_from_counts(counts, self.Ts, self.counts_per_rev, method="kalman")
+        u = np.clip(u, -self.volt, self.volt)
+        return Recording(u, counts, y, speed, self.Ts, self.counts_per_rev, name)
+
+
+def _require_finite(what: str, values: FloatArray) -> None:
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        raise DataError(
+            name=what, expected="finite numbers",
+            received=f"{len(bad)} of {len(values)} that are not, the first at {bad[0]}",
+            remedy="mend the signal",
+        )  # fmt: skip
