@@ -237,6 +237,19 @@ def test_feedthrough_is_found_before_further_states_make_up_for_it(nk: int) -> N
     assert search.best.structure.nk == nk
 
 
+def test_a_model_without_a_delay_says_that_no_loop_can_be_closed_around_it() -> None:
+    rng = np.random.default_rng(1)
+    u = rng.uniform(-2.0, 2.0, 600)
+    y = np.tanh(2.0 * u) + 0.01 * rng.normal(size=len(u))
+    y[1:] += 0.3 * np.tanh(2.0 * u[:-1])
+    settings: dict[str, Any] = {"nx": 1, "hidden": 4, "starts": 2, "iterations": 30}
+    model = identify(Dataset.from_arrays(u, y, 0.01), **settings)
+    assert {m.orders["nk"] for m in model.members or (model,)} == {0}
+    assert any("identify with nk = 1" in note for note in model.training["notes"])
+    asked = identify(Dataset.from_arrays(u, y, 0.01), nk=0, **settings)
+    assert not any("nk = 1" in note for note in asked.training.get("notes", []))
+
+
 def test_the_best_of_every_number_of_states_is_trained_beyond_the_screening() -> None:
     data = bent_data(1000, noise=0.1)
     search = Search(task(data, starts=1), folds(data), pool())

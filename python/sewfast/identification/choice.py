@@ -580,6 +580,11 @@ class Choice:
                 f"free-run error on data not trained on: {100 * error / linear.rmse:.1f} % of the "
                 "best linear model's; consider model oe"
             )
+        if self.task.nk is None and any(m.orders["nk"] == 0 for m in model.members or (model,)):
+            notes.append(
+                "the output depends on the input of the same sample (nk = 0), so that no loop can "
+                "be closed around the model; for a controller identify with nk = 1"
+            )
         extra: Provenance = {"notes": notes} if notes else {}
         extra["verdict"] = verdict(self, error)
         return replace(with_provenance(model, extra), alternatives=tuple(alternatives))

@@ -21,7 +21,7 @@ from ..errors import FitError
 from ..models.base import EnsembleCore
 from .effort import Look, Pool
 from .folds import RUNAWAY, Errors, Split, compared, errors_of, free_runs
-from .orders import LinearTable, slowest_pole
+from .orders import MISLED, LinearTable, slowest_pole
 from .outputs import ABS, LINEAR, Output, named, rectified_start, rms_error, suggested
 from .task import Provenance, Task, arrays, finite
 from .training import Network, Request, Start, Structure, train
@@ -238,14 +238,17 @@ class Search:
         return sorted(found, key=lambda c: c.error)
 
     def _at_once(self, likely: Sequence[Structure]) -> list[Structure]:
-        """Sizes of the linear order without any delay; asked early, while sizes are small.
+        """Networks without any delay, of the smallest order whose linear model is not far behind.
 
-        Later further states have made up for the missing sample of input where the input changes
-        slowly, and at great expense.
+        Further states make up for the missing sample of an input that changes slowly, at great
+        expense: among large networks the question comes too late.
         """
         if self.task.nk is not None or self.task.data.counts is not None or self.nk != 1:
             return []
-        order = self.task.nx or (self.linear.choice.order if self.linear.eligible else 2)
+        linear = self.linear
+        most = MISLED * linear.best.rmse if linear.eligible else math.inf
+        able = [s.nx for s in likely if linear.error(s.nx, linear.nk) <= most]
+        order = min(able, default=min((s.nx for s in likely), default=1))
         return [replace(s, nk=0) for s in likely if s.nx == order and s.output == LINEAR]
 
     def _is_halved(self, s: Structure) -> bool:
