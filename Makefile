@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors fleet studio bits bode physics killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors fleet studio bits bode notches physics killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -47,7 +47,7 @@ types: $(DEV)
 	$(BIN)/mypy
 
 stubs: $(DEV)
-	MYPYPATH=python $(BIN)/python -m mypy.stubtest --allowlist tests/stubtest.txt sewfast._core
+	MYPYPATH=python $(BIN)/python -m mypy.stubtest --allowlist tests/support/stubtest.txt sewfast._core
 
 # the seed of every property comes from the commit: a build that passed passes again, and the next commit tries others
 SEED ?= $(shell printf '%d' "0x$$(git rev-parse HEAD 2>/dev/null | cut -c1-8 | grep . || echo 1)")
@@ -63,10 +63,10 @@ studio: $(DEV) ## the studio in a real browser: from a slider's event to painted
 	$(BIN)/python benches/studio.py
 
 bits: $(DEV) ## deployed code against the core over ten million samples of every kind (an hour)
-	$(BIN)/python tests/deployed.py
+	$(BIN)/python tests/support/deployed.py
 
 laws: $(DEV) ## every property of the crates under 20 seeds with 10,000 cases each (hours; SEEDS=, CASES=, ONLY=word)
-	$(BIN)/python tests/laws.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(CASES),--cases $(CASES)) $(if $(ONLY),--only $(ONLY))
+	$(BIN)/python tests/support/laws.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(CASES),--cases $(CASES)) $(if $(ONLY),--only $(ONLY))
 
 no-std: ## links the controller crate without the standard library, and its frames without a path that panics
 	cargo build --package sewfast-control --release --quiet
@@ -94,7 +94,7 @@ ifeq ($(shell uname),Linux)
 endif
 
 killed: firmware ## kills the host of the emulated board 100 times; its output goes off in time
-	SEWFAST_TRIALS=100 $(BIN)/python -m pytest tests/test_emulated.py -k killed
+	SEWFAST_TRIALS=100 $(BIN)/python -m pytest tests/system/test_emulated.py -k killed
 
 M4 = thumbv7em-none-eabihf
 firmware: ## the example firmware for an emulated Cortex-M4 (Debian: rustc-web rust-web-src gcc-arm-none-eabi libnewlib-arm-none-eabi)
@@ -149,6 +149,10 @@ bode: $(VENV)/bench.stamp ## frequency responses and shafts of machines whose tr
 	$(BIN)/python benches/bode.py
 	$(BIN)/python benches/bode.py --held --count 20
 
+notches: $(VENV)/bench.stamp ## what a notch brings on machines with a shaft (docs/bode.md)
+	$(BIN)/python benches/notches.py
+	$(BIN)/python benches/notches.py --held --again --count 20
+
 physics: $(VENV)/bench.stamp ## parameters of motors whose truth is known (docs/physics.md)
 	$(BIN)/python benches/physics.py --count 40 --mujoco 20 --logs 200 --tracked 24
 
@@ -158,8 +162,8 @@ drives: $(VENV)/bench.stamp ## commissioning on drives of another simulator (ONL
 motors: $(DEV) ## commissioning on 20 motors of MuJoCo, beside an oracle (ONLY="3 7", SEEDS=)
 	$(BIN)/python benches/mujoco_motors.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))
 
-SOAKED := tests/test_soak.py tests/test_watchdog.py tests/test_recordfile_kill.py tests/test_recordfile_damage.py \
-  tests/test_link_connection.py tests/test_link_drive.py tests/test_link_virtual.py
+SOAKED := tests/system/test_soak.py tests/link/test_watchdog.py tests/recordfile/test_recordfile_kill.py tests/recordfile/test_recordfile_damage.py \
+  tests/link/test_link_connection.py tests/link/test_link_drive.py tests/link/test_link_virtual.py
 
 soak: $(DEV) ## the link's figures at full count: hours of faults, kills, flips, hostile bytes (docs/RESULTS.md)
 	SEWFAST_SOAK=1 cargo test --package sewfast-control --package sewfast-link --release --quiet

@@ -1,6 +1,6 @@
 """Draws assets/architecture.svg: the package's units in their order, and what each imports.
 
-python docs/architecture.py        (tests/test_architecture.py says when it is out of date)
+python docs/architecture.py        (tests/system/test_architecture.py says when it is out of date)
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from .analysis import Analysis, analyse
     from .commissioning import Commissioning, bode, commission
     from .comparison import Comparison, compare
+    from .control.biquad import Biquad
     from .control.controller import Controller, load_controller, paper_controller
     from .control.loop import ClosedLoopRun, run
     from .control.machine import Machine, record
@@ -51,6 +52,7 @@ __all__ = [
     "ARX",
     "IV",
     "Analysis",
+    "Biquad",
     "ClosedLoopRun",
     "Commissioning",
     "Comparison",
@@ -134,7 +136,7 @@ _HOMES = {
     "commissioning": "Commissioning bode commission",
     "comparison": "Comparison compare",
     "analysis": "Analysis analyse",
-    "control": "Controller Gains fit_fopdt load_controller paper_controller table_1",
+    "control": "Biquad Controller Gains fit_fopdt load_controller paper_controller table_1",
     "tuning": "Constraints Cost LoadStep ParetoFront TuningResult pareto tune",
     "dataset": "Dataset Diagnosis Experiment diagnose",
     "identification.delays": "DelayEstimate delay",

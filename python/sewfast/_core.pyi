@@ -575,7 +575,8 @@ class _Task(TypedDict):
 
     Every plant is taken in every variation (gain, extra delay in samples). Load steps are (reference, disturbance, band [y],
     samples of the mean). ``variables`` are (name, bounds or None); none at all stands for the usual ones. Weights left out of ``cost``
-    keep their defaults. ``linear_plants`` are (num, den) in powers of z^-1. ``disturbances`` are commands behind the limits, one
+    keep their defaults. ``linear_plants`` are (num, den) in powers of z^-1, ``measured`` ones
+    (omega [rad/s], responses, radii of their circles, whether the output was counted). ``disturbances`` are commands behind the limits, one
     for each reference or none at all.
     """
 
@@ -591,6 +592,7 @@ class _Task(TypedDict):
     aggregate: str
     limits: _Limits
     linear_plants: Sequence[tuple[_F, _F]]
+    measured: Sequence[tuple[_F, NDArray[np.complex128], _F, bool]]
 
 def tune(
     task: _Task, *, method: str, evaluations: int, seed: int, threads: int, progress: _Progress = None
@@ -654,6 +656,7 @@ class LoopPath:
     def __new__(
         cls, *, Kp: float, Ti: float, Td: float, N: float, Ts: float, filter_samples: int,
         filter_time: float, observer_time: float, encoder: bool, slope: float = 0.0,
+        biquads: Sequence[tuple[float, float, float, float]] = ...,
     ) -> LoopPath: ...
 
 def sampled_fopdt(K: float, T: float, L: float, *, Ts: float) -> tuple[_F, _F]:

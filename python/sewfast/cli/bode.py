@@ -41,6 +41,7 @@ examples:
       --limits volt=10,speed=3500,acceleration=30000,current=15
   sewfast bode run.csv --input u --output y --reference r     a record under feedback
   sewfast bode response.json --controller controller.json     margins on what was measured
+  sewfast bode response.json --propose new.json --u-max 10 --counts-per-rev 1572
 """
 
 _ON_A_MACHINE = (
@@ -94,6 +95,15 @@ def add(commands: Commands) -> None:
         "--segment", type=int, metavar="N", help="samples of a record's segments (a ninth of it)"
     )
     parser.add_argument("--model", metavar="FILE.json", type=Path, help="write the fit as a model")
+    parser.add_argument(
+        "--propose", metavar="FILE.json", type=Path,
+        help="write a controller for the machine: PID gains of the largest bandwidth, with a notch "
+        "where that pays; limits and filters of --controller, if given",
+    )  # fmt: skip
+    parser.add_argument(
+        "--Ms", type=float, metavar="MS", help="largest sensitivity of --propose (1.7)"
+    )
+    parser.add_argument("--u-max", type=float, metavar="V", help="limit of --propose's command")
     add_output(parser, "FILE.json", "write the response")
     add_plot(parser, "draw gain, phase and coherence")
     add_columns(parser, from_model=False)
@@ -106,7 +116,13 @@ def command(args: argparse.Namespace) -> None:
 
     require_place(args.out, (".json",))
     require_place(args.model, (".json",), option="--model")
+    require_place(args.propose, (".json",), option="--propose")
     require_plot(args.plot)
+    for name in ("Ms", "u_max"):
+        if getattr(args, name) is not None and args.propose is None:
+            raise SettingError(
+                f"--{name.replace('_', '-')}: belongs to --propose FILE.json; give that as well"
+            )
     if (args.on is None) == (args.data is None):
         received = "neither" if args.on is None else "both"
         raise SettingError(
@@ -126,6 +142,34 @@ def command(args: argparse.Namespace) -> None:
         fit.to_model().save(args.model)
     margins = None if controller is None else response.margins(controller, speed=args.speed)
     _show(args, response, fit, none, margins)
+    if args.propose is not None:
+        _propose(args, fit, controller)
+
+
+def _propose(args: argparse.Namespace, fit: ShaftFit | None, controller: Any) -> None:
+    """Write a controller, and say what it does.
+
+    Raises
+    ------
+    SettingError
+        Without a fit to make it for.
+    """
+    from ..frequency import propose
+
+    if fit is None:
+        raise SettingError(
+            "--propose: expected a response that a machine can be fitted to, got one that it "
+            "cannot; excite more, or longer"
+        )
+    given = {"Ms": args.Ms, "u_max": args.u_max}
+    found = propose(
+        fit, like=controller, counts_per_rev=args.counts_per_rev,
+        **{name: value for name, value in given.items() if value is not None},
+    )  # fmt: skip
+    found.controller.save(args.propose)
+    if not args.json:
+        print(found)
+        print(f"written to {args.propose}")
 
 
 def _show(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from .control import reference_of
 from .output import Progress, print_json, print_rows
 
 if TYPE_CHECKING:
+    from ..control.biquad import Biquad
     from ..control.controller import Controller
     from ..gains import Gains
     from ..tuning.front import ParetoFront
@@ -64,6 +66,7 @@ examples:
   sewfast tune one.json two.json --aggregate worst --variables Kp,Ti,alpha -o controller.json
   sewfast tune drive.json -o controller.json --plot tuned.png
   sewfast tune network.json --rival linear.json -o controller.json
+  sewfast tune shaft.json --notch 75 --constraint Ms=1.7 --response response.json -o controller.json
   sewfast tune drive.json --pareto tracking,chatter --front front.png -o controller.json
 """
 
@@ -104,6 +107,16 @@ def add(commands: Commands) -> None:
         "Table 1 on the first model's step response",
     )  # fmt: skip
     parser.add_argument(
+        "--notch", action="append", metavar="HZ[:DEPTH[:WIDTH]]",
+        help="a notch to begin with, searched together with the gains; may repeat (depth .1, width "
+        ".5; sewfast bode names it)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--response", metavar="RESPONSE.json",
+        help="what sewfast bode measured: Ms is taken on its bands as well; needs "
+        "--constraint Ms=..",
+    )  # fmt: skip
+    parser.add_argument(
         "--rival", metavar="MODEL.json",
         help="a model of another kind of the same drive, for a second opinion on the gains: a "
         "linear one beside a network",
@@ -117,7 +130,7 @@ def _add_search(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--variables", metavar="NAME[=LOW:HIGH],..",
         help="what to search (Kp,Ti,Td,alpha,beta,N); also Tt, filter_samples, filter_time, "
-        "observer_time, r_rate",
+        "observer_time, r_rate, notches",
     )  # fmt: skip
     parser.add_argument(
         "--cost", action="append", metavar="NAME=WEIGHT", help="weight of a term; may repeat"
@@ -184,6 +197,7 @@ def tune_command(args: argparse.Namespace) -> int | None:
         reference_of(text, first.Ts, first.output_unit) for text in args.reference or ()
     ] or None
     settings = _settings(args)
+    settings["constraints"] = _on_response(args, settings["constraints"], models)
     try:
         if args.pareto is None:
             found = _tuned(args, models, references, settings)
@@ -215,6 +229,70 @@ def _settings(args: argparse.Namespace) -> dict[str, Any]:
     if args.evaluations is not None:
         settings["evaluations"] = args.evaluations
     return settings
+
+
+def _on_response(
+    args: argparse.Namespace, constraints: Constraints, models: list[Any]
+) -> Constraints:
+    """Ms on the linear models and on the bands of a measured response.
+
+    Raises
+    ------
+    SettingError
+        For a response without a limit of Ms, or without a linear model.
+    """
+    if args.response is None:
+        return constraints
+    from ..frequency import load_response
+
+    response = load_response(args.response)
+    if constraints.Ms is None:
+        raise SettingError(
+            "--response: expected a limit of Ms to take on it as well; give --constraint Ms=1.7"
+        )
+    linear = [model for model in models if hasattr(model, "to_tf")]
+    if not linear:
+        raise SettingError(
+            "--response: expected a linear model among those to tune on, as a response does not "
+            "tell whether a loop is stable; add that of sewfast bode --model"
+        )
+    return replace(constraints, plant=[*linear, response])
+
+
+def _notches(given: list[str] | None) -> list[Biquad]:
+    """Of every --notch.
+
+    Raises
+    ------
+    SettingError
+        For what is not HZ[:DEPTH[:WIDTH]].
+    """
+    from ..control.biquad import Biquad
+
+    found = []
+    for text in given or ():
+        try:
+            numbers = [float(number) for number in text.split(":")]
+        except ValueError:
+            numbers = []
+        if not 1 <= len(numbers) <= 3:
+            raise SettingError(
+                f"--notch {text}: expected HZ, HZ:DEPTH or HZ:DEPTH:WIDTH, as in --notch 75:0.1:0.5"
+            )
+        found.append(Biquad.notch(*numbers))
+    return found
+
+
+def _started(args: argparse.Namespace, models: list[Any]) -> dict[str, Any]:
+    """`_first` with the notches that are asked for."""
+    first = _first(args)
+    notches = _notches(args.notch)
+    if not notches:
+        return first
+    from ..tuning.task import first_controller
+
+    start = first.get("start") or first_controller(models[0], **first)
+    return {"start": replace(start, biquads=(*start.biquads, *notches))}
 
 
 def _first(args: argparse.Namespace) -> dict[str, Any]:
@@ -263,8 +341,8 @@ def _tuned(
     rival = None if args.rival is None else load_model(args.rival)
     with Progress("tune") as progress:
         return tune(
-            models, references, **_first(args), **settings, rival=rival, method=args.method,
-            time_budget=args.time_budget, progress=progress,
+            models, references, **_started(args, models), **settings, rival=rival,
+            method=args.method, time_budget=args.time_budget, progress=progress,
         )  # fmt: skip
 
 
@@ -274,7 +352,7 @@ def _front(
     from ..tuning.front import pareto
     from ..tuning.task import first_controller
 
-    first = _first(args)
+    first = _started(args, models)
     start = first.get("start") or first_controller(models[0], **first)
     with Progress("tune") as progress:
         return pareto(

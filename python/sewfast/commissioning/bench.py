@@ -20,11 +20,13 @@ from ..control.machine import (
     RecordedRun,
     Stepped,
     SteppedBench,
+    Watch,
     is_streaming,
+    is_watched,
     machine_of,
 )  # fmt: skip
 from ..dataset import FloatArray
-from ..errors import LinkError
+from ..errors import FitError, LinkError
 from ..link import Drive
 from ..link.plan import conditions_of, device_of
 from ..recording import Recording
@@ -33,6 +35,18 @@ __all__ = ["Bench", "Followed", "MachineBench", "Stepped", "SteppedBench"]
 
 Bench = Machine
 """`sewfast.Machine` by its earlier name."""
+
+
+ABORTED = "_aborted"
+"""Ends the name of the recording of a run that was ended on the way."""
+
+
+class Aborted(FitError):
+    """A run that was ended on the way, with what it had recorded."""
+
+    def __init__(self, reason: str, recording: Recording) -> None:
+        super().__init__(reason)
+        self.recording = recording
 
 
 @dataclass
@@ -64,8 +78,14 @@ class Around:
     def excite(self, u: FloatArray, name: str) -> Recording:
         return self.inner.excite(u, name)
 
-    def follow(self, controller: Controller, r: FloatArray, name: str) -> RecordedRun:
-        return self.inner.follow(controller, r, name)
+    def follow(
+        self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
+    ) -> RecordedRun:
+        if watch is None or not is_watched(self.inner):
+            return self.inner.follow(controller, r, name)
+        watched: Any = self.inner
+        found: RecordedRun = watched.follow(controller, r, name, watch=watch)
+        return found
 
 
 class DriveBench(Around):
@@ -86,10 +106,12 @@ class DriveBench(Around):
         self._require_whole(name)
         return recording
 
-    def follow(self, controller: Controller, r: FloatArray, name: str) -> RecordedRun:
-        run = super().follow(controller, r, name)
+    def follow(
+        self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
+    ) -> RecordedRun:
+        run = super().follow(controller, r, name, watch=watch)
         if not self._is_whole:
-            run = super().follow(controller, r, name)
+            run = super().follow(controller, r, name, watch=watch)
         self._require_whole(name)
         return run
 
@@ -124,9 +146,18 @@ class NotedBench(Around):
         self.note(name, key, recording, None)
         return recording
 
-    def follow(self, controller: Controller, r: FloatArray, name: str) -> RecordedRun:
+    def follow(
+        self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
+    ) -> RecordedRun:
         key = key_of(r, controller)
-        found = self.kept_run(name, key, controller) or self.inner.follow(controller, r, name)
+        found = self.kept_run(name, key, controller)
+        if found is None:
+            try:
+                found = super().follow(controller, r, name, watch=watch)
+            except Aborted as stop:
+                # of another name: whoever goes on is to run it again, and whole
+                self.note(f"{name}{ABORTED}", key, stop.recording, None)
+                raise
         self.note(name, key, found.recording, found)
         return found
 

@@ -225,7 +225,7 @@ def _place(
 
 
 def _carry_out(
-    bench: Machine, asked: Demands, cost: Cost | None, journal: Journal
+    bench: NotedBench, asked: Demands, cost: Cost | None, journal: Journal
 ) -> Commissioning:
     """The stages."""
     journal.enter("first motion")

@@ -34,6 +34,7 @@ from ..trust import Judgement
 from ..tuning.objective import Cost
 from ..tuning.search import TuningResult
 from ..writers import write_table
+from .bench import ABORTED
 from .excitations import Motion
 from .slow import Thinning, TurnLoad
 from .small_signal import SmallSignal
@@ -387,7 +388,7 @@ class Journal:
 
     def note(self, name: str, recording: Recording) -> None:
         """A recording, but for those along the references, which are runs."""
-        if self.stage != STAGES[-1] or name.startswith("hold_"):
+        if self.stage != STAGES[-1] or name.startswith("hold_") or name.endswith(ABORTED):
             self._values["recordings"] = {**self._values["recordings"], name: recording}
 
     def result(self, verdict: str, reason: str = "") -> Commissioning:

@@ -16,6 +16,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..control.controller import Controller
 from ..control.machine import Machine
+from ..control.margins import margins
 from ..dataset import Dataset
 from ..errors import DataError, SettingError
 from ..frequency import FrequencyResponse, periodic, spectral
@@ -142,6 +143,43 @@ def bode(
         if controller is None:
             return _in_open_loop(bench, plan, amplitude)
         return _under_feedback(bench, plan, amplitude, controller)
+
+
+# --- Margins, predicted and measured --------------------------------------------------------------
+
+
+AGAIN, LEAST_SHAKEN = 0.5, 0.2
+"""What is left of the amplitude where the command came to a limit; the least share of it."""
+MARGINS = ("Ms", "phase_margin_deg", "gain_margin")
+
+
+def margins_at_work(
+    bench: Machine, controller: Controller, plant: Any, speed: float, seed: int
+) -> dict[str, Any] | None:
+    """Margins of a loop as a linear plant predicts them and as the machine shows them at a speed.
+
+    The reference is shaken by a multisine, half a minute in all. None where the answer is too
+    small, or the command comes to its limits however little it is shaken.
+    """
+    share = 1.0
+    while share >= LEAST_SHAKEN:
+        try:
+            response = bode(
+                bench, speed=speed, controller=controller, amplitude=share * STEPS * abs(speed),
+                realisations=2, seed=seed,
+            )  # fmt: skip
+            measured = response.margins(controller, speed=speed)
+        except DataError:
+            share *= AGAIN
+            continue
+        predicted = margins(controller, plant, speed=speed)
+        return {
+            "speed": speed,
+            "predicted": {name: getattr(predicted, name) for name in MARGINS},
+            "measured": {name: getattr(measured, name) for name in MARGINS}
+            | {"Ms_band": list(measured.Ms_band)},
+        }
+    return None
 
 
 # --- A record -------------------------------------------------------------------------------------
@@ -355,7 +393,10 @@ def _response(
     found = periodic(
         plan.blocks(recording.u, lead), plan.blocks(y, lead), Ts=plan.Ts, lines=plan.lines,
         r=None if r is None else plan.blocks(r, lead), u_unit="V", y_unit="RPM", from_counts=True,
-        provenance={"machine": bench.name, "speed": plan.speed, "seed": plan.seed, **more},
+        provenance={
+            "machine": bench.name, "speed": plan.speed, "seed": plan.seed,
+            "counts_per_rev": bench.counts_per_rev, **more,
+        },
     )  # fmt: skip
     if found.coherence.max() < 0.5:
         raise DataError(

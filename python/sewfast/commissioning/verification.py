@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -9,11 +10,14 @@ import numpy as np
 
 from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun, run
-from ..control.machine import Machine
+from ..control.machine import WATCHED
 from ..dataset import FloatArray
 from ..errors import FitError
 from ..models import Ensemble, Model
+from ..recording import Recording
+from ..speed import speed_or_nan
 from ..trust import Judgement, judge
+from .bench import ABORTED, Aborted, NotedBench
 from .demands import Refusal, require
 from .slow import Thinning
 
@@ -68,6 +72,7 @@ APART = 0.05
 """Largest distance of measurement from prediction, rms over the reference's span."""
 SATURATED = 0.5
 """Largest share of samples at a limit."""
+RAILED_REMEDY = "raise u_max, or lower speed"
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,26 +169,137 @@ def predict(
 
 def measure(
     controller: Controller,
-    bench: Machine,
+    bench: NotedBench,
     predicted: tuple[Comparison, ...],
     references: Mapping[str, FloatArray],
     keep: Callable[[tuple[Comparison, ...]], object],
 ) -> tuple[Comparison, ...]:
-    """The same on the machine: the shortest reference first, each judged as it ends.
+    """The same on the machine: the shortest reference first, each watched while it runs where the
+    machine allows it, and judged as it ends.
 
     Raises
     ------
     Refusal
-        As `require_alike`, before the next reference is run.
+        As `require_alike`, before the next reference is run; where `Watching` ends one.
     """
     found = dict(enumerate(predicted))
     for i in sorted(found, key=lambda i: len(found[i].predicted.r)):
         name = found[i].reference
-        run = bench.follow(controller, references[name], name)
+        watch = Watching(found[i].predicted, controller, bench.counts_per_rev)
+        try:
+            run = bench.follow(controller, references[name], name, watch=watch).run
+        except Aborted as stop:
+            raise Refusal(str(stop)) from stop
         found[i] = replace(found[i], measured=run)
         keep(tuple(found[k] for k in range(len(predicted))))
         require_alike(found[i])
     return tuple(found[k] for k in range(len(predicted)))
+
+
+WINDOW = 0.25
+"""Over which a command's chatter is taken [s]."""
+TIMES, FLOOR = 4.0, 0.05
+"""Chatter of the command that ends a run: times the largest predicted, at least so much of the
+largest command from sample to sample."""
+SURE = 1.1
+"""Times the distance that a verified run may have: beyond it there is no doubt about the rest."""
+
+
+class Watching:
+    """Ends a run that is going wrong, instead of judging it once it is over.
+
+    That is where the command chatters by `TIMES` its predicted chatter, as a loop that swings does,
+    and where the machine is so far from the prediction, or has been at a limit for so long, that
+    the run would be refused whatever came.
+
+    Parameters
+    ----------
+    predicted : ClosedLoopRun
+        At the machine's samples, or for a slow drive at every k-th of them.
+    controller : Controller
+        As the machine runs it.
+    counts_per_rev : float
+    """
+
+    def __init__(
+        self, predicted: ClosedLoopRun, controller: Controller, counts_per_rev: float
+    ) -> None:
+        self._predicted, self._controller, self._Ts = predicted, controller, controller.Ts
+        self._k = max(1, round(predicted.Ts / controller.Ts))
+        self._per_turn = counts_per_rev
+        n = self._k * len(predicted.r)
+        self._u, self._counts = np.full(n, np.nan), np.full(n, np.nan)
+        self._judged, self._squares, self._railed = 0, 0.0, 0
+        self._allowed = n * (SURE * APART * float(np.ptp(predicted.r))) ** 2
+        self._window = max(10, round(WINDOW / self._Ts))
+        self._most = max(
+            TIMES * self._chatter_predicted(), FLOOR * max(abs(controller.u_min), controller.u_max)
+        )
+
+    def __call__(self, first: int, u: FloatArray, counts: FloatArray) -> None:
+        """Samples `first`, `first + 1`, ...
+
+        Raises
+        ------
+        Aborted
+        """
+        end = min(first + len(u), len(self._u))
+        self._u[first:end], self._counts[first:end] = u[: end - first], counts[: end - first]
+        self._chatters(end)
+        self._parts(end)
+
+    def _chatter_predicted(self) -> float:
+        """The largest of any window, from sample to sample of the machine [V]."""
+        changes = np.diff(self._predicted.u) / math.sqrt(self._k)
+        span = min(len(changes), max(5, self._window // self._k))
+        return float(np.sqrt(np.convolve(changes**2, np.ones(span) / span, "valid").max()))
+
+    def _chatters(self, end: int) -> None:
+        recent = self._u[max(0, end - self._window) : end]
+        chatter = float(np.sqrt(np.nanmean(np.diff(recent) ** 2))) if len(recent) > 9 else 0.0
+        if len(recent) == self._window and chatter > self._most:
+            self._end(
+                end, f"expected a command that moves by up to {self._most:.3g} V rms a sample, it "
+                f"moved by {chatter:.3g} for {WINDOW:g} s, as in a loop that swings; look for "
+                "play, for a shaft that gives, for a delay",
+            )  # fmt: skip
+
+    def _parts(self, end: int) -> None:
+        """Speeds are means over a block: of single samples the encoder's counts would be noise."""
+        p, c = self._predicted, self._controller
+        block = WATCHED * self._k
+        for begin in range(self._judged, end - block, block):
+            stop = begin + block
+            counted = self._counts[stop] - self._counts[begin]
+            speed = 60.0 * counted / (self._per_turn * block * self._Ts)
+            distance = speed - float(np.mean(p.y[begin // self._k : stop // self._k]))
+            self._squares += 0.0 if math.isnan(distance) else block * distance**2
+            u = self._u[begin:stop]
+            self._railed += int(np.sum((u >= c.u_max - 1e-9) | (u <= c.u_min + 1e-9)))
+            self._judged = stop
+        if self._squares > self._allowed:
+            self._end(
+                end, f"expected the machine within {100 * APART:g} % of the span from the "
+                "prediction, it was already further from it than that allows over the whole "
+                "reference; the machine may have changed since it was recorded",
+            )  # fmt: skip
+        if self._railed > SATURATED * len(self._u) + block:
+            self._end(
+                end, "expected the command within its limits most of the time, it was already at "
+                f"one for half of the whole reference; {RAILED_REMEDY}",
+            )  # fmt: skip
+
+    def _end(self, end: int, reason: str) -> None:
+        at = f"{self._predicted.reference!r}, ended after {end * self._Ts:.3g} s"
+        counts = self._counts[:end] - self._counts[0]
+        y = speed_or_nan(counts, self._Ts, self._per_turn, "kalman")
+        raise Aborted(
+            f"{at}: {reason}; the controller is not verified",
+            Recording(
+                self._u[:end].copy(), counts, y, None, self._Ts, self._per_turn,
+                f"{self._predicted.reference}{ABORTED}",
+            ),
+        )  # fmt: skip
 
 
 def judged(predicted: tuple[Comparison, ...], ensemble: Ensemble) -> Judgement:
@@ -225,5 +341,5 @@ def require_unsaturated(found: ClosedLoopRun) -> None:
     require(
         saturated <= SATURATED,
         f"expected the command within its limits most of the time on {found.reference!r}, it was "
-        f"at one for {100 * saturated:.0f} % of the samples; raise u_max, or lower speed",
+        f"at one for {100 * saturated:.0f} % of the samples; {RAILED_REMEDY}",
     )

@@ -1,16 +1,18 @@
 """The controller and its loop.
 
-Read in this order: `controller` (settings, files, first gains), `loop` (`run`: on a model or a
-machine), `machine` (`Machine`: all that is known of one; `record`), `defaults` (what is taken for a
-drive where nothing is stated), `margins` (of the linear loop), `systems` (the linear loop as state
-space), `forms` (a PID as MATLAB's and python-control's).
+Read in this order: `biquad` (notches and the like), `controller` (settings, files, first gains),
+`loop` (`run`: on a model or a machine), `machine` (`Machine`: all that is known of one; `record`),
+`defaults` (what is taken for a drive where nothing is stated), `margins` (of the linear loop),
+`systems` (the linear loop as state space), `forms` (a PID as MATLAB's and python-control's).
 """
 
 from ..gains import Form, Gains, vector
 from ..rules import Fopdt, Rule, fit_fopdt, table_1
+from .biquad import Biquad
 from .controller import Controller, load_controller, paper_controller
 
 __all__ = [
+    "Biquad",
     "Controller",
     "Fopdt",
     "Form",

@@ -14,10 +14,12 @@ from ..errors import ModelFileError, SettingError, SewfastError
 from ..gains import Gains, real, whole
 from ..plotting import html_of
 from ..storage import Fields
+from .biquad import MOST, NUMBERS, Biquad
 
 FORMAT = "sewfast.controller"
-VERSION = 2
-"""Of the files that are written; version 1 had no observer, ramp or schedule."""
+VERSION = 3
+"""Of the files that are written; version 1 had no observer, ramp or schedule, version 2 no biquads.
+"""
 
 _UNBOUNDED = {
     "N": math.inf,
@@ -66,6 +68,9 @@ class Controller:
         Gains over the size of the filtered output [y]: up to 8 points with growing speeds of 0 or
         more. Kp, Kp/Ti and Kp Td are linear between them and held outside. Where it is not empty,
         `gains` has no part in the command.
+    biquads : sequence of Biquad
+        Up to 4 filters, one after the other, on the reference and on the filtered output:
+        `Biquad.notch(60.0)` and the like.
     counts_per_rev : float or None
         The encoder that measures a model's output; None for ideal feedback. A machine has its own.
     notes : str
@@ -91,6 +96,7 @@ class Controller:
     observer_time: float = 0.0
     r_rate: float = math.inf
     schedule: tuple[tuple[float, Gains], ...] = ()
+    biquads: tuple[Biquad, ...] = ()
     counts_per_rev: float | None = None
     notes: str = ""
 
@@ -103,6 +109,7 @@ class Controller:
                 "Gains.parallel or Gains.per_sample"
             )
         object.__setattr__(self, "schedule", _points(self.schedule))
+        object.__setattr__(self, "biquads", _sections(self.biquads))
         self._check_gains(self.gains)
         for _, gains in self.schedule:
             self._check_gains(gains)
@@ -147,6 +154,7 @@ class Controller:
             Td=gains.Td,
             filter_samples=self.filter_samples,
             schedule=self.schedule_rows(),
+            biquads=self.sections(),
             **{name: getattr(self, name) for name in _REALS},
         )
 
@@ -154,6 +162,10 @@ class Controller:
         """Speed [y], Kp [u/y], Ti [s], Td [s] of each point of the schedule."""
         standard = [(speed, gains.to("standard")) for speed, gains in self.schedule]
         return [(speed, g.Kp, g.Ti, g.Td) for speed, g in standard]
+
+    def sections(self) -> list[tuple[float, float, float, float]]:
+        """Coefficients of each biquad at the controller's sample time: `Biquad.coefficients`."""
+        return [biquad.coefficients(self.Ts) for biquad in self.biquads]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write it as JSON (docs/CONVENTIONS.md, Files); the file appears whole or not at all.
@@ -175,6 +187,7 @@ class Controller:
             **values,
             "filter_samples": self.filter_samples,
             "schedule": [{"speed": v, "gains": _gains_to_dict(g)} for v, g in self.schedule],
+            "biquads": [biquad.to_dict() for biquad in self.biquads],
             "counts_per_rev": self.counts_per_rev,
             "notes": self.notes,
         }
@@ -203,6 +216,7 @@ class Controller:
             f"  derivative filter N {self.N:.6g}",
             f"  limits    {self.u_min:g} to {self.u_max:g} {u}, slew {self.slew:g} {u}/s; {windup}",
             f"  feedback  {encoder}, mean of {self.filter_samples} samples{lag}",
+            *(f"  biquad    {biquad}" for biquad in self.biquads),
         ]
         return "\n".join([*lines, f"  notes     {self.notes}"] if self.notes else lines)
 
@@ -216,16 +230,18 @@ def load_controller(path: str | os.PathLike[str]) -> Controller:
         Where the file is missing, damaged, of another format or of an unknown version, or holds a
         setting outside its range; the message names the file and the field.
     """
-    fields = Fields(os.fspath(path), storage.read(path, FORMAT, (1, VERSION)))
-    first = fields.integer("version") == 1
-    reals = _FIRST_REALS if first else _REALS
-    fields.require_only((*_OTHERS, *reals, *(() if first else ("schedule",))))
+    fields = Fields(os.fspath(path), storage.read(path, FORMAT, (1, 2, VERSION)))
+    version = fields.integer("version")
+    reals = _FIRST_REALS if version == 1 else _REALS
+    later = (("schedule",) if version > 1 else ()) + (("biquads",) if version > 2 else ())
+    fields.require_only((*_OTHERS, *reals, *later))
     units = {"u_unit": fields.text("u_unit"), "y_unit": fields.text("y_unit")}
     try:
         return Controller(
             gains=_gains(fields.object("gains"), units),
             filter_samples=fields.integer("filter_samples"),
-            schedule=() if first else _schedule(fields, units),
+            schedule=_schedule(fields, units) if version > 1 else (),
+            biquads=_biquads(fields) if version > 2 else (),
             counts_per_rev=fields.optional_number("counts_per_rev"),
             notes=fields.text("notes"),
             **{name: _unbounded(fields, name, _UNBOUNDED) for name in reals},
@@ -241,6 +257,18 @@ def _schedule(fields: Fields, units: Mapping[str, str]) -> tuple[tuple[float, Ga
     for point in points:
         point.require_only(("speed", "gains"))
     return tuple((p.number("speed"), _gains(p.object("gains"), units)) for p in points)
+
+
+def _biquads(fields: Fields) -> tuple[Biquad, ...]:
+    found = []
+    for part in fields.objects("biquads"):
+        kind = part.text("kind")
+        names = NUMBERS.get(kind)
+        if names is None:
+            raise part.refuse("kind", ", ".join(NUMBERS), kind)
+        part.require_only(("kind", *names))
+        found.append(Biquad(kind, tuple(part.number(name) for name in names)))
+    return tuple(found)
 
 
 def _gains(part: Fields, units: Mapping[str, str]) -> Gains:
@@ -273,6 +301,18 @@ def _points(schedule: Any) -> tuple[tuple[float, Gains], ...]:
                 "Gains.standard, Gains.parallel or Gains.per_sample"
             )
     return tuple((real("speed", speed), gains) for speed, gains in points)
+
+
+def _sections(biquads: Any) -> tuple[Biquad, ...]:
+    """The biquads as a tuple; anything else is refused."""
+    given = (biquads,) if isinstance(biquads, Biquad) else biquads
+    if not isinstance(given, (tuple, list)) or not all(isinstance(b, Biquad) for b in given):
+        raise SettingError(
+            f"expected a list of biquads, got {biquads!r}; for example biquads=[Biquad.notch(60.0)]"
+        )
+    if len(given) > MOST:
+        raise SettingError(f"expected at most {MOST} biquads, got {len(given)}")
+    return tuple(given)
 
 
 def _unbounded(fields: Fields, name: str, unbounded: Mapping[str, float]) -> float:

@@ -7,11 +7,12 @@ any that is advanced sample by sample. A drive behind a port is a `Machine` by i
 
 from __future__ import annotations
 
+import inspect
 import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, cast
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeGuard, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -59,13 +60,21 @@ def Followed(run: ClosedLoopRun, recording: Recording) -> RecordedRun:
     return RecordedRun.of(run, recording)
 
 
+Watch: TypeAlias = Callable[[int, FloatArray, FloatArray], object]
+"""Looks at a run as it goes on: called with the number of a sample, and with the commands [V] and
+counts from it on. What it raises ends the run, and the motor is stopped."""
+WATCHED = 20
+"""Samples that a machine of this process hands to a watch at a time."""
+
+
 class Machine(Protocol):
     """A motor with an encoder that can be excited and run, each time from rest.
 
     Whatever has these members can be recorded (`record`), run (`run`), commissioned (`commission`)
     and shaken (`bode`): a drive behind a port, an FMU, a model of MuJoCo, a rig of your own. A
     `VirtualMachine` is taken as it is. Every run ends without command on the motor, also one that
-    is broken off.
+    is broken off. Where its `follow` takes a `watch` as well (`Watch`), a run that goes wrong is
+    ended while it does.
     """
 
     @property
@@ -112,6 +121,11 @@ class Streaming(Machine, Protocol):
 def is_streaming(machine: object) -> TypeGuard[Streaming]:
     """Whether a machine's samples arrive while it runs."""
     return hasattr(machine, "stream")
+
+
+def is_watched(machine: Machine) -> bool:
+    """Whether its runs can be watched."""
+    return "watch" in inspect.signature(machine.follow).parameters
 
 
 MEMBERS = ("name", "Ts", "counts_per_rev", "volt", "speed", "excite", "follow")
@@ -278,10 +292,16 @@ class MachineBench:
         y = speed_from_counts(done.counts, self.Ts, self.counts_per_rev, method=self.method)
         return Recording(u, done.counts, y, done.speed_rpm, self.Ts, self.counts_per_rev, name)
 
-    def follow(self, controller: Controller, r: FloatArray, name: str) -> RecordedRun:
+    def follow(
+        self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
+    ) -> RecordedRun:
         # undisturbed, the machine does the same again and shows its counts
         found = run(controller, self.machine, r, name=name)
-        return RecordedRun.of(found, self.excite(found.u, name))
+        recording = self.excite(found.u, name)
+        for k in range(0, len(r) if watch is not None else 0, WATCHED):
+            assert watch is not None
+            watch(k, recording.u[k : k + WATCHED], recording.counts[k : k + WATCHED])
+        return RecordedRun.of(found, recording)
 
 
 class Stepped(Protocol):
@@ -348,7 +368,9 @@ class SteppedBench:
         _require_finite("command", u)
         return self._recording(u, *self._played(lambda k, counts: float(u[k]), len(u)), name)
 
-    def follow(self, controller: Controller, r: FloatArray, name: str) -> RecordedRun:
+    def follow(
+        self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
+    ) -> RecordedRun:
         if not math.isclose(controller.Ts, self.Ts, rel_tol=0.01):
             raise SettingError(
                 f"expected machine and controller at one sample time, got {self.Ts} s and "
@@ -358,10 +380,13 @@ class SteppedBench:
         core = controller.core()
         per_count = 60.0 / (self.counts_per_rev * self.Ts)
         u, feedback, before = np.zeros(len(r)), np.zeros(len(r)), [0.0]
+        seen = np.zeros(len(r))
 
         def decide(k: int, counts: float) -> float:
+            if watch is not None and k and k % WATCHED == 0:
+                watch(k - WATCHED, u[k - WATCHED : k], seen[k - WATCHED : k])
             u[k] = core.step(float(r[k]), (counts - before[0]) * per_count)
-            feedback[k], before[0] = core.filtered, counts
+            feedback[k], before[0], seen[k] = core.filtered, counts, counts
             return float(u[k])
 
         recording = self._recording(u, *self._played(decide, len(r)), name)

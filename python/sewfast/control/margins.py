@@ -359,6 +359,7 @@ def loop_path(controller: Controller, *, speed: float | None = None) -> _core.Lo
         filter_samples=controller.filter_samples,
         filter_time=controller.filter_time,
         observer_time=controller.observer_time,
+        biquads=controller.sections(),
         encoder=controller.counts_per_rev is not None,
     )
 

@@ -85,6 +85,22 @@ def observer(time: float, Ts: float) -> StateSpace:
     return series(pole, pole)
 
 
+def cascade(controller: Controller) -> StateSpace:
+    """The controller's biquads, one after the other.
+
+    In the canonical form of H = 1 + (1 - q)(c0 + c1 q)/(1 + a1 q + a2 q^2), q = 1/z, whose
+    numerator less the constant c0 is (c1 - c0 - a1 c0) q - (c1 + a2 c0) q^2.
+    """
+    found = gain(1.0)
+    for c0, c1, a1, a2 in controller.sections():
+        section = StateSpace(
+            np.array([[-a1, -a2], [1.0, 0.0]]), np.array([[1.0], [0.0]]),
+            np.array([[c1 - c0 - a1 * c0, -c1 - a2 * c0]]), np.array([[1.0 + c0]]),
+        )  # fmt: skip
+        found = series(found, section)
+    return found
+
+
 def _first_order(a: float, c: float, d: float) -> StateSpace:
     return StateSpace(
         np.array([[a]]), np.array([[1.0]]), np.array([[c]]), np.array([[d]])
@@ -92,7 +108,7 @@ def _first_order(a: float, c: float, d: float) -> StateSpace:
 
 
 def measurement(controller: Controller, encoder: bool) -> StateSpace:
-    """From the plant's output to what the PID is fed: encoder and feedback filters.
+    """From the plant's output to what the PID is fed: encoder, feedback filters, biquads.
 
     Parameters
     ----------
@@ -104,11 +120,13 @@ def measurement(controller: Controller, encoder: bool) -> StateSpace:
     if encoder:
         found = series(moving_average(2), found)
     found = series(found, lag(controller.filter_time, controller.Ts))
-    return series(found, observer(controller.observer_time, controller.Ts))
+    found = series(found, observer(controller.observer_time, controller.Ts))
+    return series(found, cascade(controller))
 
 
 def pid(controller: Controller, speed: float = 0.0) -> StateSpace:
-    """From reference and filtered output, in this order, to the command.
+    """From reference and filtered output, in this order, to the command; the reference passes the
+    biquads first.
 
     Parameters
     ----------
@@ -125,7 +143,8 @@ def pid(controller: Controller, speed: float = 0.0) -> StateSpace:
     b, c = 1.0 - controller.alpha, 1.0 - controller.beta
     integral = series(gain([[ki, -ki]]), _first_order(1.0, 1.0, 1.0))
     derivative = series(gain([[c, -1.0]]), _first_order(pole, kd * (pole - 1.0), kd))
-    return plus(gain([[g.Kp * b, -g.Kp - slope]]), plus(integral, derivative))
+    found = plus(gain([[g.Kp * b, -g.Kp - slope]]), plus(integral, derivative))
+    return series(beside(cascade(controller), gain(1.0)), found) if controller.biquads else found
 
 
 @dataclass(frozen=True, eq=False)

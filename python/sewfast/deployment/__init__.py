@@ -96,6 +96,11 @@ def deploy(
             f"expected a model or a controller, got {type(what).__name__}; load it with "
             "sewfast.load_model or sewfast.load_controller"
         )
+    if isinstance(what, Controller) and what.biquads:
+        raise SettingError(
+            "expected a controller without biquads, which deployed code does not hold yet, got "
+            f"{len(what.biquads)}; leave them out, or run it by sewfast.h"
+        )
     if to not in TARGETS:
         raise SettingError(f"to: expected one of {', '.join(TARGETS)}, received {to!r}")
     if precision is None:

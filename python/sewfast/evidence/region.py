@@ -21,7 +21,7 @@ coordinate is divided by half its own range.
 
 What a new stretch exceeds by depends on how many independent pieces the record holds; the margins
 below were set on PRBS, steps, multisines and chirps into lags of first and second order, and are
-measured on others by tests/test_region.py.
+measured on others by tests/evidence/test_region.py.
 """
 
 from __future__ import annotations

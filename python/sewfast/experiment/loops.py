@@ -18,7 +18,7 @@ from ..commissioning.bench import DriveBench
 from ..commissioning.result import run_numbers
 from ..control.controller import Controller, paper_controller
 from ..control.loop import ClosedLoopRun, run
-from ..control.machine import RecordedRun, record
+from ..control.machine import RecordedRun, Watch, record
 from ..dataset import Dataset
 from ..errors import FitError, LinkError
 from ..evidence.figures import figures
@@ -68,10 +68,17 @@ class Rig(DriveBench):
         """Excite the drive, as a bench of commissioning."""
         return self.record(u, name)
 
-    def follow(self, controller: Controller, r: NDArray[np.float64], name: str) -> RecordedRun:
+    def follow(
+        self,
+        controller: Controller,
+        r: NDArray[np.float64],
+        name: str,
+        *,
+        watch: Watch | None = None,
+    ) -> RecordedRun:
         """Run a controller on the drive, as a bench of commissioning."""
         began = time.perf_counter()
-        return self._counted(super().follow(controller, r, name), began)
+        return self._counted(super().follow(controller, r, name, watch=watch), began)
 
     def record(self, u: NDArray[np.float64], name: str) -> Recording:
         """Excite the drive from rest; see `sewfast.record`."""

@@ -30,6 +30,10 @@ VERSION = 1
 
 LEVEL = 0.95
 """Of the bands."""
+LEAST_LINES = 3
+"""For margins."""
+BETWEEN = 4
+"""Places for each measured line at which a search looks at the sensitivity."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -160,6 +164,27 @@ class FrequencyResponse:
             found = found / (0.5 * (1.0 + np.exp(-1j * omega * self.Ts)))
         feedback: Complex = found
         return feedback
+
+    def lines(self, controller: Controller) -> tuple[FloatArray, Complex, FloatArray, bool]:
+        """Frequencies [rad/s], response and radius where the coherence is above a half, and whether
+        the controller's encoder is in it: what `sewfast.tune` takes Ms on.
+
+        Between two measured lines the response is interpolated, as for `margins`.
+        """
+        self._feedback(controller, controller.schedule[0][0] if controller.schedule else None)
+        seen = self.coherence > 0.5
+        if seen.sum() < LEAST_LINES:
+            raise DataError(
+                f"expected at least {LEAST_LINES} frequencies with a coherence above .5, got "
+                f"{seen.sum()}; excite more, or longer"
+            )
+        hertz, value, radius = self.hertz[seen], self.value[seen], self.radius()[seen]
+        n = len(hertz)
+        fine = np.interp(np.arange(0, n - 1 + 1e-9, 1.0 / BETWEEN), np.arange(n), hertz)
+        size = np.interp(fine, hertz, np.log(np.maximum(np.abs(value), 1e-300)))
+        turn = np.interp(fine, hertz, np.unwrap(np.angle(value)))
+        found: Complex = np.exp(size + 1j * turn)
+        return 2.0 * np.pi * fine, found, np.interp(fine, hertz, radius), self.from_counts
 
     def margins(self, controller: Controller, *, speed: float | None = None) -> LoopMargins:
         """Margins of the loop where the coherence is above a half.
@@ -349,8 +374,10 @@ class LoopMargins:
     @classmethod
     def of(cls, hertz: FloatArray, L: Complex, radius: FloatArray) -> LoopMargins:
         """From L at rising frequencies and the radius of its uncertainty, all of shape (n,)."""
-        if len(hertz) < 3:
-            raise DataError(f"expected at least 3 frequencies for margins, got {len(hertz)}")
+        if len(hertz) < LEAST_LINES:
+            raise DataError(
+                f"expected at least {LEAST_LINES} frequencies for margins, got {len(hertz)}"
+            )
         # between two lines L is a straight line in log magnitude and phase
         fine = np.interp(np.arange(0, len(hertz) - 1 + 1e-9, 0.1), np.arange(len(hertz)), hertz)
         size = np.interp(fine, hertz, np.log(np.maximum(np.abs(L), 1e-300)))

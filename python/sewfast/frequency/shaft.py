@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import FloatArray
+from ..control.biquad import Biquad
 from ..errors import DataError, FitError
 from ..identification.least_squares import least_squares
 from ..models import LinearOE
@@ -43,6 +44,8 @@ DAMPED = 0.5
 RATIOS = (0.03, 30.0)
 """Of load to motor inertia; beyond them the pair of zeros and poles is something else."""
 CONFIDENCE = 1.96
+DEPTHS, WIDTHS = (0.02, 0.7), (0.1, 2.0)
+"""Of a proposed notch."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,37 @@ class ShaftFit:
         of = self.response
         return sampled_model(self._theta, of.Ts, of.u_unit, of.y_unit)
 
+    def notch(self) -> Biquad:
+        """The notch that levels the resonance: its zeros are the swing's poles.
+
+        At w_r the shaft lifts the gain by g = (w_r/w_a)^2 |A/R|; a depth of 1/g takes that back,
+        and with a width of 2 z_r g the notch's zeros are damped as the resonance is.
+
+        Raises
+        ------
+        FitError
+            For a rigid machine, or a resonance beyond half the sample rate.
+        """
+        if not self.has_resonance:
+            raise FitError(
+                "expected a machine with a resonance for a notch, the fit found a rigid one; leave "
+                "the notch out, or give Biquad.notch(frequency)"
+            )
+        p = {name: found.value for name, found in self.parameters.items()}
+        fr, fa, zr = p["resonance_hertz"], p["antiresonance_hertz"], p["resonance_damping"]
+        if fr * self.response.Ts >= 0.5:
+            raise FitError(
+                f"expected a resonance below half the sample rate for a notch, it lies at {fr:.4g} "
+                "Hz; sample faster"
+            )
+        ratio = fa / fr
+        rises = abs(ratio**2 - 1.0 + 2j * p["antiresonance_damping"] * ratio) / (
+            2.0 * zr * ratio**2
+        )
+        depth, width = 1.0 / max(rises, 1.0), 2.0 * zr * max(rises, 1.0)
+        low, high = DEPTHS
+        return Biquad.notch(fr, min(max(depth, low), high), min(max(width, WIDTHS[0]), WIDTHS[1]))
+
     def to_dict(self) -> dict[str, Any]:
         """Parameters with their intervals, as JSON values."""
         rows = {name: vars(p) for name, p in self.parameters.items()}
@@ -110,7 +144,8 @@ class ShaftFit:
         kind = "two masses and a shaft" if self.has_resonance else "rigid"
         width = max(map(len, self.parameters))
         rows = [f"  {name:<{width}}  {p}" for name, p in self.parameters.items()]
-        return "\n".join([f"{kind}, misfit {self.misfit:.3g} (95 % intervals)", *rows])
+        found = [f"{kind}, misfit {self.misfit:.3g} (95 % intervals)", *rows]
+        return "\n".join([*found, f"  {self.notch()}"] if self.has_resonance else found)
 
 
 def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> ShaftFit:

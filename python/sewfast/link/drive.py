@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..arrays import counts_per_unit
 from ..control.controller import Controller
-from ..control.machine import RecordedRun
+from ..control.machine import RecordedRun, Watch
 from ..errors import LinkError, SettingError
 from ..gains import Gains, real
 from ..live import Kind as View
@@ -98,9 +98,12 @@ def gains(controller: Controller, streamed: Sequence[Channel], identity: Identit
     g, c = fitting(controller, streamed), controller
     named = ("observer_time", bool(c.observer_time)), ("r_rate", c.r_rate != math.inf)
     further = [name for name, used in (*named, ("schedule", bool(c.schedule))) if used]
-    if further and not identity.capabilities & wire.DESIGN:
+    unknown = [] if identity.capabilities & wire.DESIGN else list(further)
+    if c.biquads and not identity.capabilities & wire.BIQUADS:
+        unknown.append("biquads")
+    if unknown:
         raise SettingError(
-            f"expected a controller without {' and '.join(further)} for this device, whose "
+            f"expected a controller without {' and '.join(unknown)} for this device, whose "
             "firmware does not know them; leave them out, or build the firmware with this sewfast"
         )
     values = (
@@ -332,6 +335,9 @@ class Drive(Unique):
         """
         body = gains(controller, self.channels, self.identity)
         self._link.ask(Kind.GAINS, body)
+        # GAINS leave none
+        if controller.biquads:
+            self._link.ask(Kind.BIQUADS, wire.biquads(controller.sections()))
 
     def arm(self) -> None:
         """Make it ready to start; its watchdog takes it back to idle when the host falls silent."""
@@ -485,6 +491,7 @@ class Drive(Unique):
         file: str | os.PathLike[str] | None = None,
         live: str | View = "none",
         overwrite: bool = False,
+        watch: Watch | None = None,
     ) -> RecordedRun:
         """Run a controller on the device along a reference; `sewfast.run` with a drive does this.
 
@@ -497,6 +504,8 @@ class Drive(Unique):
             Of the reference, in messages and reports.
         file, live, overwrite
             As for `sewfast.run`.
+        watch : Watch, optional
+            Sees the samples as they come; what it raises stops the motor and goes on.
 
         Returns
         -------
@@ -508,7 +517,9 @@ class Drive(Unique):
         SettingError, LinkError, Interrupted
             As for `sewfast.run`.
         """
-        return follow(self, controller, r, name, file=file, live=live, overwrite=overwrite)
+        return follow(
+            self, controller, r, name, file=file, live=live, overwrite=overwrite, watch=watch
+        )
 
     def _stream(self, plan: Plan, sink: Sink, cancel: threading.Event | None) -> Outcome:
         run = self._prepare(plan, sink)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray
 from ..control.controller import Controller
-from ..control.machine import RecordedRun
+from ..control.machine import RecordedRun, Watch
 from ..errors import Interrupted, LinkError, SettingError, SewfastError
 from ..gains import vector
 from ..live import Feed, Kind, open_view
@@ -284,6 +284,8 @@ class Recorder:
         kept in memory.
     feed : Feed, optional
         Of a live view.
+    watch : Watch, optional
+        What it raises ends the run.
     """
 
     def __init__(
@@ -293,11 +295,13 @@ class Recorder:
         *,
         writer: RecordWriter | None = None,
         feed: Feed | None = None,
+        watch: Watch | None = None,
     ) -> None:
         size = 0 if writer else n
         self._kept = {name: np.full(size, np.nan) for name in columns}
         self._file = writer
         self._feed = feed
+        self._watch = watch
         self._end = 0
         self._begun = False
         self._early: list[tuple[str, int | None, dict[str, Any]]] = []
@@ -320,6 +324,8 @@ class Recorder:
             self._end = max(self._end, stop)
         if self._feed is not None:
             self._feed.put(first, columns)
+        if self._watch is not None:
+            self._watch(first, columns["u"], columns["counts"])
 
     def event(self, kind: str, index: int | None = None, **detail: Any) -> None:
         """Something that happened on the way; see `samples`."""
@@ -431,6 +437,7 @@ def play(
     live: str | Kind = "none",
     overwrite: bool = False,
     settings: Mapping[str, Any] | None = None,
+    watch: Watch | None = None,
 ) -> Played:
     """Run a plan and keep its samples.
 
@@ -450,6 +457,8 @@ def play(
         Whether a recording of a drive may be replaced; one of a virtual machine may.
     settings : mapping, optional
         What else the file says of the run.
+    watch : Watch, optional
+        Sees the samples as they come, and ends the run by what it raises.
 
     Raises
     ------
@@ -468,7 +477,7 @@ def play(
     feed = Feed(columns, drive.identity.Ts, n, name, counts_per_rev=_counts_per_rev(drive))
     with open_view(live, feed):
         writer = _writer(file, drive, plan, name, columns, settings or {})
-        recorder = Recorder(columns, n, writer=writer, feed=feed)
+        recorder = Recorder(columns, n, writer=writer, feed=feed, watch=watch)
         played = _streamed(drive, plan, recorder, writer)
     if played.outcome.reason != "finished":
         raise Stopped(played, LinkError(_not_finished(played.outcome, n, drive)))

@@ -35,6 +35,7 @@ class Kind(IntEnum):
     GAINS = 0x09
     START = 0x0A
     ECHO = 0x0B
+    BIQUADS = 0x0C
     KEEP = 0x20
     DRIVE = 0x21
     CREDIT = 0x22
@@ -51,7 +52,7 @@ REASONS = (
 EVENTS = ("", "boot", "armed", "started", "finished", "stopped", "tripped", "cleared")
 MODES = {"commands": 0, "controller": 1, "direct": 2}
 
-PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED, DESIGN = (1 << bit for bit in range(7))
+PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED, DESIGN, BIQUADS = (1 << b for b in range(8))
 """Capabilities of a device."""
 
 
@@ -376,6 +377,11 @@ def design(observer_time: float, r_rate: float, points: Sequence[Sequence[float]
     return b"".join((head, *rows))
 
 
+def biquads(sections: Sequence[Sequence[float]]) -> bytes:
+    rows = [struct.pack("<4f", *map(_single, section)) for section in sections]
+    return b"".join((bytes([len(rows)]), *rows))
+
+
 def start(mode: int, us: int, at: int, length: int, mask: int, batch: int) -> bytes:
     return _START.pack(mode, us, at, length, mask, batch)
 
@@ -432,6 +438,7 @@ _FIELDS: dict[int, tuple[str, ...]] = {
         "Kp", "Ti", "Td", "alpha", "beta", "N", "Tt", "u_min", "u_max", "slew", "filter_time",
         "counts per unit", "filter_samples", "observer_time", "r_rate", "schedule",
     ),
+    Kind.BIQUADS: ("the number of biquads",),
     Kind.START: ("mode", "watchdog", "at", "length", "mask", "batch"),
 }  # fmt: skip
 
@@ -469,6 +476,8 @@ def _refused(kind: int, result: int, detail: int) -> str:
 def _field(kind: int, index: int) -> str:
     if kind == Kind.UPLOAD:
         return f"value {index}"
+    if kind == Kind.BIQUADS and index:
+        return f"biquad {1 + (index - 1) // 4}"
     names = _FIELDS.get(kind, ())
     return names[index] if index < len(names) else f"field {index}"
 

@@ -169,8 +169,9 @@ class Constraints:
     load : float or Controller, optional
         Largest rms deviation under any load step [y], likewise.
     plant : linear plant or list of them, optional
-        Where Ms is taken: whatever `sewfast.margins` takes. By default the linear models among the
-        plants that are tuned on.
+        Where Ms is taken: whatever `sewfast.margins` takes. A `FrequencyResponse` beside one of
+        these counts with its bands: Ms is the largest that they allow. By default the linear models
+        among the plants that are tuned on.
     speed : float, optional
         Where a nonlinear `plant` is linearised [y].
 

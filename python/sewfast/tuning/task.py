@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from .. import _core
 from ..arrays import REVOLUTIONS_PER_SECOND
+from ..control.biquad import Biquad
 from ..control.controller import Controller
 from ..control.defaults import (
     beyond_record,
@@ -111,7 +112,8 @@ class TuningTask:
 
     def core(self, names: Sequence[Wanted] | None = None, *, ms: bool = False) -> _core._Task:
         """As the core takes it, with variables by name; `ms`: Ms is asked for anyway."""
-        loops = self._loops() if ms or self.constraints.Ms is not None else []
+        asked = ms or self.constraints.Ms is not None
+        loops, measured = self._loops() if asked else ([], [])
         return {
             "plants": [plant.core for plant in self.plants],
             "references": self.references,
@@ -127,10 +129,11 @@ class TuningTask:
             "aggregate": self.aggregate,
             "limits": self.constraints.limits,
             "linear_plants": loops,
+            "measured": measured,
         }
 
-    def _loops(self) -> list[Any]:
-        """The linear plants that Ms is taken on, as fractions."""
+    def _loops(self) -> tuple[list[Any], list[Any]]:
+        """The linear plants that Ms is taken on, as fractions, and the measured ones, as lines."""
         given = self.constraints.plant
         if given is None:
             plants = [p for p in self.plants if hasattr(p, "to_tf")]
@@ -142,7 +145,17 @@ class TuningTask:
                 "Constraints(plant=...), for example a linear model of the same drive, or add one "
                 "to the plants"
             )
-        return [sampled(plant, self.start.Ts, self.constraints.speed) for plant in plants]
+        seen = [plant for plant in plants if hasattr(plant, "lines")]
+        if len(seen) == len(plants):
+            raise SettingError(
+                "expected a linear plant beside the measured response, which does not tell whether "
+                "a loop is stable; give plant=[response, fit_shaft(response).to_model()]"
+            )
+        known = [plant for plant in plants if not hasattr(plant, "lines")]
+        return (
+            [sampled(plant, self.start.Ts, self.constraints.speed) for plant in known],
+            [response.lines(self.start) for response in seen],
+        )
 
 
 def _assumed(start: Controller, given: list[Any], *, derived: bool) -> str:
@@ -232,6 +245,7 @@ def _checked(variations: Sequence[tuple[float, int]]) -> list[tuple[float, int]]
 Wanted: TypeAlias = str | tuple[str, float, float]
 
 GAIN_NAMES = ("Kp", "Ti", "Td")
+NOTCH_NAMES = ("notch_frequency", "notch_depth", "notch_width")
 SETTINGS = (
     "alpha", "beta", "N", "Tt", "filter_samples", "filter_time", "observer_time", "r_rate",
 )  # fmt: skip
@@ -245,7 +259,8 @@ class Variable:
     Attributes
     ----------
     name : str
-        ``Kp``, ``Ti``, ``Td``, a setting of `Controller`, or ``Kp[0]``.. of a schedule's point.
+        ``Kp``, ``Ti``, ``Td``, a setting of `Controller`, ``Kp[0]``.. of a schedule's point, or
+        ``notch_frequency[0]``, ``notch_depth[0]``, ``notch_width[0]``.. of a biquad.
     low, high : float
         Its bounds.
     value : float
@@ -272,7 +287,8 @@ class Variable:
 def wanted(
     variables: Sequence[Wanted] | None, start: Controller
 ) -> list[tuple[str, tuple[float, float] | None]]:
-    """Names and bounds as the core takes them; ``schedule`` stands for the gains of all points.
+    """Names and bounds as the core takes them; ``schedule`` stands for the gains of all points,
+    ``notches`` for all that the start's notches are made from.
 
     Raises
     ------
@@ -299,7 +315,8 @@ def usual_variables(start: Controller) -> list[Wanted] | None:
     if start.schedule or not 0.0 < Ti < 8.0 * start.Ts:
         return None
     names: list[Wanted] = ["Kp", ("Ti", 0.1 * Ti, 1e3 * Ti), "Td", "alpha", "beta"]
-    return [*names, "N"] if np.isfinite(start.N) else names
+    names += ["N"] if np.isfinite(start.N) else []
+    return [*names, "notches"] if any(b.kind == "notch" for b in start.biquads) else names
 
 
 def _one(given: Any, start: Controller) -> list[tuple[str, tuple[float, float] | None]]:
@@ -311,6 +328,14 @@ def _one(given: Any, start: Controller) -> list[tuple[str, tuple[float, float] |
                 "constant gains; search 'Kp', 'Ti', 'Td'"
             )
         return [(f"{gain}[{k}]", None) for k in range(points) for gain in GAIN_NAMES]
+    if given == "notches":
+        found = [k for k, biquad in enumerate(start.biquads) if biquad.kind == "notch"]
+        if not found:
+            raise SettingError(
+                "expected a start with a notch for the variable 'notches', got none; give "
+                "start=dataclasses.replace(start, biquads=[Biquad.notch(60.0)])"
+            )
+        return [(f"{name}[{k}]", None) for k in found for name in NOTCH_NAMES]
     if isinstance(given, str):
         return [(given, None)]
     if not (isinstance(given, tuple) and len(given) == 3 and isinstance(given[0], str)):
@@ -341,7 +366,19 @@ def applied(values: Mapping[str, float], start: Controller, notes: str) -> Contr
             (speed, _standard(point, values, [f"{gain}[{k}]" for gain in GAIN_NAMES]))
             for k, (speed, point) in enumerate(schedule)
         )
+    if start.biquads:
+        changes["biquads"] = tuple(_notch(b, k, values) for k, b in enumerate(start.biquads))
     return replace(start, gains=gains, notes=notes, **changes)
+
+
+def _notch(own: Biquad, k: int, values: Mapping[str, float]) -> Biquad:
+    """Biquad number `k` with the values that are its own."""
+    names = [f"{name}[{k}]" for name in NOTCH_NAMES]
+    if not any(name in values for name in names):
+        return own
+    return Biquad.notch(
+        *(values.get(name, x) for name, x in zip(names, own.numbers, strict=True))
+    )  # fmt: skip
 
 
 def _standard(own: Gains, values: Mapping[str, float], names: Sequence[str]) -> Gains:

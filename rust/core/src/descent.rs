@@ -2,6 +2,21 @@
 //!
 //! What a linearisation is and how its damping follows success and failure is a [`Method`]: normal equations with
 //! Marquardt's factors ([`crate::lm`]), or a triangle with a trust region ([`crate::least_squares`]).
+//!
+//! ```text
+//!   cost(start), keep
+//!   repeat                         iterate
+//!     linearise                    one Jacobian
+//!     finished?                    tests for a minimum
+//!     repeat                       improve
+//!       propose a step             for the damping at hand
+//!       cost of the trial          one simulation
+//!       judge                      accept: damping falls, keep; reject: damping grows
+//!     settled?                     no progress any more
+//! ```
+//!
+//! The loop owns the outcome (theta, cost, trace), the method its linearisation and its damping; `keep` tells it that the point whose cost
+//! was taken last is the one to linearise at, so that nothing is simulated twice.
 
 use crate::Monitor;
 

@@ -117,6 +117,11 @@ pub fn minimize(
 
 /// The step that follows a rejection: where two costs at once take hardly longer than one, it is tried beside the one
 /// before it.
+///
+/// After a rejection `J'J` and `J'e` stay and only `mu` grows, by a known factor: the next step is known before the trial at hand is
+/// judged. A free run is a chain that leaves units idle, so two of them take 102 cycles a sample where one takes 76. No decision
+/// changes, for the second cost is looked at only after the first is rejected. It pays by the share of rejections: with 1.1 of them an
+/// iteration, 3 % (median) to 6 % (least of 7) of a training of 100 iterations; where hardly a step is rejected it costs 3 %.
 #[derive(Default)]
 struct Next {
     two: bool,
@@ -248,6 +253,10 @@ fn length(values: &[f64]) -> f64 {
 }
 
 /// The damped normal equations with all buffers of an iteration.
+///
+/// From `e(theta + d) ~ e - J d` the cost's quadratic model is least where `J'J d = J'e`; `mu D` bends the step from Gauss and Newton's
+/// (mu = 0) to a short one along the gradient (mu large), and keeps a singular system solvable. `J'J` is at hand as a sum over rows
+/// ([`crate::gram`]), n^2 numbers whatever the samples, so a factorisation anew for each mu costs n^3/6, nothing beside a simulation.
 struct System {
     size: usize,
     jtj: Vec<f64>,

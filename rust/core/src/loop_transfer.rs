@@ -11,11 +11,13 @@
 
 mod curve;
 mod margins;
+mod measured;
 mod path;
 mod plant;
 mod states;
 
 pub use margins::{Margins, margins, peak_sensitivity};
+pub use measured::Measured;
 pub use path::Path;
 pub use plant::Plant;
 

@@ -8,6 +8,7 @@ use sewfast_core::Result;
 use sewfast_core::loop_transfer::{self, Loop, Path, Plant};
 
 use crate::arrays::{array1, raise, slice};
+use crate::control::controller::{Section, cascade};
 use crate::watch::watched;
 
 type Values<'py> = PyReadonlyArray1<'py, f64>;
@@ -26,10 +27,11 @@ pub struct LoopPath(Path);
 #[pymethods]
 impl LoopPath {
     #[new]
-    #[pyo3(signature = (*, Kp, Ti, Td, N, Ts, filter_samples, filter_time, observer_time, encoder, slope=0.0))]
+    #[pyo3(signature = (*, Kp, Ti, Td, N, Ts, filter_samples, filter_time, observer_time, encoder, slope=0.0, biquads=Vec::new()))]
     #[expect(non_snake_case, reason = "the field's names")]
     #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
     fn new(
+        py: Python<'_>,
         Kp: f64,
         Ti: f64,
         Td: f64,
@@ -40,22 +42,25 @@ impl LoopPath {
         observer_time: f64,
         encoder: bool,
         slope: f64,
-    ) -> Self {
+        biquads: Vec<Section>,
+    ) -> PyResult<Self> {
         let gains = Standard {
             kp: Kp,
             ti: Ti,
             td: Td,
         };
-        Self(Path {
+        let biquads = cascade(&biquads).map_err(|e| raise(py, e.into()))?;
+        Ok(Self(Path {
             gains,
             slope,
             n: N,
             filter_samples,
             filter_time,
             observer_time,
+            biquads,
             encoder,
             ts: Ts,
-        })
+        }))
     }
 }
 

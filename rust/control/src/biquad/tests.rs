@@ -71,6 +71,25 @@ pub(crate) fn section<T: Real>((f, d, g, e, kind): (f64, f64, f64, f64, u8)) -> 
     made.unwrap()
 }
 
+/// Samples in which all that the sections remember fades by `exp(-fade)`, one after the other: a notch of 20 Hz and a
+/// hundredth of it wide takes a hundred times longer than the filters before it.
+pub(crate) fn settling<T: Real>(cascade: &Cascade<T>, fade: f64) -> u32 {
+    let slowest = |section: &Biquad<T>| {
+        let (a1, a2) = (section.a1.to_f64(), section.a2.to_f64());
+        let root = a1 * a1 / 4.0 - a2;
+        if root < 0.0 {
+            a2.sqrt()
+        } else {
+            a1.abs() / 2.0 + root.sqrt()
+        }
+    };
+    let times = cascade
+        .sections()
+        .iter()
+        .map(|s| fade / -slowest(s).max(1e-9).ln());
+    times.sum::<f64>().ceil() as u32
+}
+
 proptest! {
     #[test]
     fn sections_are_their_transfer_functions(

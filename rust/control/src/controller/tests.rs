@@ -1,7 +1,7 @@
 //! The whole controller: what it was before, changes without a bump, constant cost.
 
 use super::*;
-use crate::biquad::tests::{any_section, section};
+use crate::biquad::tests::{any_section, section, settling};
 use crate::real::counted::{Counted, operations};
 use crate::{Biquad, Cascade, Point, Schedule, Standard};
 use proptest::prelude::*;
@@ -73,7 +73,8 @@ proptest! {
     ) {
         let mut controller = Controller::new(old).unwrap();
         controller.step_with(r, y / 2.0, feedforward);
-        let before = (0..20_000).map(|_| controller.step_with(r, y, feedforward)).last().unwrap();
+        let samples = 20_000 + settling(&old.biquads, 40.0);
+        let before = (0..samples).map(|_| controller.step_with(r, y, feedforward)).last().unwrap();
         controller.set_design(new).unwrap();
         let after = controller.step_with(r, y, feedforward);
         let scale = 1e-11 * (1.0 + before.abs() + 400.0);
@@ -119,7 +120,7 @@ proptest! {
         controller.step_with(r, y / 3.0, feedforward);
         controller.set_manual(manual).unwrap();
         let mut u = 0.0;
-        for _ in 0..20_000 {
+        for _ in 0..20_000 + settling(&design.biquads, 40.0) {
             u = controller.step_with(r, y, feedforward);
             prop_assert_eq!(u, manual.clamp(-10.0, 10.0));
         }

@@ -1,4 +1,13 @@
 //! Plants that kernels know, and their steps in registers.
+//!
+//! A lagged model in a loop is its regressor and its position. One loop alone ([`Alone`]) holds them as numbers, the lanes of a
+//! network being its hidden units; eight loops ([`Beside`]) hold them as [`Group`], a lane being a loop. Asked for
+//! the bits of a lane, one loop does the operations of eight in the same order, so that a controller is worth the same wherever it is judged.
+//!
+//! Why a plant is known to a kernel at all: through [`Plant`] alone, one call a sample that the compiler cannot see through, a loop takes
+//! 61 to 64 ns a sample instead of 43 (`closed_loop` of the kernels' example, Zen 4). [`Second`], two outputs and two inputs in
+//! registers, takes 43 where [`Any`] takes 46 (6.7 %); the bits of a lane cost a
+//! loop of its own 1 to 2 %.
 
 use std::marker::PhantomData;
 

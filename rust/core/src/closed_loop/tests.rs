@@ -4,7 +4,7 @@ use nalgebra::{Matrix3, Vector3};
 
 mod state_space;
 
-use sewfast_control::{Design, Settings, Standard};
+use sewfast_control::{Biquad, Cascade, Design, Settings, Standard};
 
 use super::*;
 use crate::lagged::Lagged;

@@ -1,7 +1,7 @@
 //! The feedback path of a controller: encoder, filters and PID between the plant's output and its input.
 
 use nalgebra::Complex;
-use sewfast_control::{CAPACITY, Refused, Standard};
+use sewfast_control::{Biquad, CAPACITY, Cascade, Refused, Standard};
 
 use super::Place;
 use crate::{Error, Result};
@@ -22,6 +22,8 @@ pub struct Path {
     pub filter_time: f64,
     /// Time constant of the alpha-beta observer \[s\]; 0 for none.
     pub observer_time: f64,
+    /// Notches and the like on the feedback.
+    pub biquads: Cascade<f64>,
     /// Whether the output is measured as a difference of positions: the mean over the sample before.
     pub encoder: bool,
     /// Sample time \[s\].
@@ -38,6 +40,7 @@ impl Path {
             filter_samples: 1,
             filter_time: 0.0,
             observer_time: 0.0,
+            biquads: Cascade::NONE,
             encoder: false,
             ts,
         }
@@ -114,7 +117,8 @@ impl Path {
     ///
     /// ```text
     /// R = (Kp + slope + Ki/(1 - 1/z) + Kd (1 - 1/z)/(1 - pole/z)) F,
-    /// F = (1 - z^-n)/(n (1 - 1/z))  w/(1 - (1 - w)/z)  ((1 - theta)/(1 - theta/z))^2
+    /// F = (1 - z^-n)/(n (1 - 1/z))  w/(1 - (1 - w)/z)  ((1 - theta)/(1 - theta/z))^2  H,
+    /// H = product of 1 + (1 - 1/z) (c0 + c1/z)/(1 + a1/z + a2/z^2) over the biquads
     /// ```
     pub(super) fn response(&self, at: &Place) -> Complex<f64> {
         let (d, one) = (at.difference, Complex::new(1.0, 0.0));
@@ -136,6 +140,10 @@ impl Path {
         if self.observer_time > 0.0 {
             let once = lag(self.theta());
             response *= once * once;
+        }
+        for &Biquad { c0, c1, a1, a2 } in self.biquads.sections() {
+            let poles = one + at.back * a1 + at.back * at.back * a2;
+            response *= one + d * (at.back * c1 + c0) / poles;
         }
         response
     }

@@ -79,8 +79,8 @@ impl States {
 struct Memory<'a> {
     path: &'a Path,
     plant: &'a Plant,
-    /// Where each part begins: plant, encoder, average, lag, observer, integral, derivative.
-    at: [usize; 8],
+    /// Where each part begins: plant, encoder, average, lag, observer, biquads, integral, derivative.
+    at: [usize; 9],
 }
 
 impl<'a> Memory<'a> {
@@ -93,10 +93,11 @@ impl<'a> Memory<'a> {
             path.filter_samples - 1,
             one(path.filter_time > 0.0),
             2 * one(path.observer_time > 0.0),
+            3 * path.biquads.sections().len(),
             one(path.ki() != 0.0),
             2 * one(path.kd() != 0.0),
         ];
-        let mut at = [0; 8];
+        let mut at = [0; 9];
         for (i, size) in sizes.into_iter().enumerate() {
             at[i + 1] = at[i] + size;
         }
@@ -104,7 +105,7 @@ impl<'a> Memory<'a> {
     }
 
     fn size(&self) -> usize {
-        self.at[7]
+        self.at[8]
     }
 
     /// One sample with reference 0: the command, and `x` becomes the next state.
@@ -118,6 +119,7 @@ impl<'a> Memory<'a> {
         y = self.averaged(&mut x[self.at[2]..self.at[3]], y);
         y = self.lagged(&mut x[self.at[3]..self.at[4]], y);
         y = self.observed(&mut x[self.at[4]..self.at[5]], y);
+        y = self.notched(&mut x[self.at[5]..self.at[6]], y);
         let u = self.commanded(x, y);
         self.advance(&mut x[..self.at[1]], u);
         u
@@ -148,13 +150,27 @@ impl<'a> Memory<'a> {
         *speed
     }
 
+    /// Section by section the last input and the two states of transposed direct form II on its change.
+    fn notched(&self, memory: &mut [f64], mut y: f64) -> f64 {
+        let sections = self.path.biquads.sections().iter();
+        for (state, section) in memory.chunks_exact_mut(3).zip(sections) {
+            let change = y - state[0];
+            let d = section.c0 * change + state[1];
+            state[0] = y;
+            state[1] = section.c1 * change - section.a1 * d + state[2];
+            state[2] = -(section.a2 * d);
+            y += d;
+        }
+        y
+    }
+
     fn commanded(&self, x: &mut [f64], y: f64) -> f64 {
         let mut u = -(self.path.gains.kp + self.path.slope) * y;
-        if let [sum] = &mut x[self.at[5]..self.at[6]] {
+        if let [sum] = &mut x[self.at[6]..self.at[7]] {
             *sum -= self.path.ki() * y;
             u += *sum;
         }
-        if let [derivative, before] = &mut x[self.at[6]..self.at[7]] {
+        if let [derivative, before] = &mut x[self.at[7]..self.at[8]] {
             *derivative = self.path.pole() * *derivative - self.path.kd() * (y - *before);
             *before = y;
             u += *derivative;

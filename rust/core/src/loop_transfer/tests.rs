@@ -1,6 +1,6 @@
 use super::*;
 use proptest::prelude::*;
-use sewfast_control::{Controller, Design, Settings, Standard};
+use sewfast_control::{Biquad, Cascade, Controller, Design, Settings, Standard};
 
 use crate::Monitor;
 use crate::closed_loop::{LaggedPlant, Run};
@@ -18,6 +18,12 @@ fn drive() -> Plant {
     Plant::fopdt(490.0, 0.25, 0.0083, TS).unwrap()
 }
 
+fn notches() -> Cascade<f64> {
+    let notch = Biquad::notch(35.0, 0.1, 0.6, TS).unwrap();
+    let lead = Biquad::lead_lag(20.0, 60.0, TS).unwrap();
+    Cascade::new(&[notch, lead]).unwrap()
+}
+
 fn margins_of(path: &Path, plant: &Plant) -> Margins {
     margins(&Loop::new(path, plant).unwrap())
 }
@@ -32,6 +38,7 @@ fn controller(path: &Path) -> Controller<f64> {
         filter_samples: path.filter_samples,
         filter_time: path.filter_time,
         observer_time: path.observer_time,
+        biquads: path.biquads,
         ..Design::new(settings)
     };
     Controller::new(design).unwrap()
@@ -53,6 +60,7 @@ fn the_path_is_the_controllers() {
     let mut path = path(0.02, 0.1, 0.02);
     (path.n, path.filter_samples, path.filter_time) = (6.0, 8, 0.004);
     path.observer_time = 0.003;
+    path.biquads = notches();
     for period in [10_usize, 40, 200] {
         let theta = std::f64::consts::TAU / period as f64;
         let mut controller = controller(&path);
@@ -113,6 +121,7 @@ fn noise_gain_is_that_of_the_impulse_response() {
     let mut path = path(0.01, 0.08, 0.012);
     (path.n, path.filter_samples, path.filter_time) = (8.0, 5, 0.002);
     path.observer_time = 0.004;
+    path.biquads = notches();
     let plant = drive();
     let mut controller = controller(&path);
     let mut past = vec![0.0; plant.num.len()];

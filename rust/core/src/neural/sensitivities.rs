@@ -4,6 +4,27 @@
 //!
 //! The free run is known, so that slopes and gains of a block are computed first, each sample for itself; then a few
 //! groups of columns run through the block with their last rows in registers.
+//!
+//! For `y = w2'h + b2 + l'phi`, `h = tanh(W1 phi + b1)` and `r = w2 (1 - h^2)`, unit by unit,
+//!
+//! ```text
+//!   df/dW1_c = r phi_c     df/db1 = r     df/dw2 = h     df/db2 = 1     df/dl = phi
+//!   df/dphi_m = sum r W1_m + l_m    =: gain m, for the past outputs m = 1..na
+//!   S(k) = df/dtheta(k) + sum_m gain_m(k) S(k-m)
+//! ```
+//!
+//! A row S(k) is laid out so that eight columns are eight hidden units of one kind, and no gain or regressor is looked up by column:
+//!
+//! ```text
+//!   | W1 by phi_1, all units | W1 by phi_2 .. | b1 | w2 | b2, l | past outputs | error |
+//!     source r, scale phi_1    r, phi_2         r,1  h,1  tail,1
+//! ```
+//!
+//! A `Column` is a group of eight with its source (r, h or tail) and its scale (an entry of phi, or ones). Within a block the
+//! sources and gains are known, so one group at a time passes over all 64 samples with its last `na` values in registers: the rows
+//! are written once and never read back. Known numbers of past outputs keep these values in registers and not in an array: `na` = 2
+//! instead of any number saves 9 % of a training, `na` = 3 as much (12 hidden units 6 %); `na` = 1 saves 3 %. The one-pass
+//! way of the usual shape saves 2 to 6 % (Zen 4, processor time).
 
 use super::network::{Network, Shape};
 use super::regressor;

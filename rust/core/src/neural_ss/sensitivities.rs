@@ -2,6 +2,22 @@
 //!
 //! With `X = dx/d(theta, x0)`: `X(k+1) = (dx+/dx) X(k) + dx+/dtheta` and `dy(k) = f'(s) ((ds/dx) X(k) + ds/dtheta)`,
 //! all at the states and hidden outputs that the simulation left behind.
+//!
+//! With `h = tanh(Wx x + Wu v + bh)` and `R = diag(1 - h^2)` the slopes are `dx+/dx = A + E R Wx` and `ds/dx = C + G R Wx`, and the
+//! columns of theta come in kinds with one rule each:
+//!
+//! | columns | dx+/dtheta | ds/dtheta |
+//! |---|---|---|
+//! | Wx, Wu, bh: argument c of unit i | `E_i r_i c` | `G_i r_i c` |
+//! | row q of E: unit i | `h_i` in state q | 0 |
+//! | G: unit i | 0 (no recursion) | `h_i` |
+//! | row q of [A B]: argument c | `c` in state q | 0 |
+//! | x0 | 0, begins as the unit matrix | 0 |
+//! | [C D c] | 0 (no recursion) | argument |
+//!
+//! In a row they stand by kinds with the hidden units side by side (`Columns`), so that eight columns share every scalar factor. Parts
+//! behind each other may overlap: a group whose last units are missing writes zeros over the next group's first columns, which come later.
+//! One output and up to four states take a block of samples at a time (`super::single`); the rest goes sample by sample here.
 
 use super::free_run::Trajectory;
 use super::network::{Network, Scratch, rises_of, unrolled};

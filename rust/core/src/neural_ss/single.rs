@@ -1,6 +1,33 @@
 //! The sensitivity recursion for one output and up to four states, a block of samples at a time: what the columns have
 //! in common is prepared for all of its samples, then each group of columns passes over them with its states in
 //! registers.
+//!
+//! With `X(k) = dx(k)/dtheta`, `F = dx+/dx` and `f'` the slope of the output function,
+//!
+//! ```text
+//!   X(k+1) = F(k) X(k) + dx+/dtheta(k)         NX x p,  a column a parameter
+//!   dy(k)  = f'(k) (ds/dx(k) X(k) + ds/dtheta(k))
+//! ```
+//!
+//! Columns do not see each other: eight of them, for all NX states, are NX registers (`[V; NX]`), and F is the same for all
+//! columns. So the work is turned round. First everything that depends on the sample alone, for a block of 32 samples (`Block`):
+//!
+//! ```text
+//!   slopes     F and f' ds/dx, NX (NX + 1) numbers a sample      broadcast while a column passes
+//!   rises      1 - h^2                                           feeds the two below
+//!   weighted   E diag(1 - h^2)    group, sample, state           dx+/dtheta of Wx, Wu, bh
+//!   direct     f' G diag(1 - h^2) group, sample                  ds/dtheta of the same
+//!   spaced     | 0 .. 0 | x v |   one run of zeros a sample      dx+/dtheta of [A B]: row q of A is (x v) shifted by q rows
+//! ```
+//!
+//! Then one or two groups of columns pass over the 32 samples. What a kind of columns adds is a `Source`: weights of an argument
+//! (`OfArgument`), a row of E (`OfUnits`: only state q is moved), `[A B x0]` (`OfStates`). A source says `None` where it adds nothing, so
+//! that no zeros are added. What is owned: `Sensitivities` owns X between blocks, `Block` the block's numbers, the rows are the
+//! caller's (`Rows`).
+//!
+//! Why it is there: against the general recursion, sample by sample, a training of 3 states and 15 units takes 5 % less by the least and
+//! 11 % by the median of 7 runs (processor time, Zen 4; 150 against 166 ns a sample for the recursion alone on an Intel Xeon). Two groups
+//! at once fill the latency of the products where there are 32 registers; a Zen 4 does not show it (-2 to -3 %).
 
 use super::network::{Network, rises_of};
 use super::sensitivities::{Recursion, Sensitivities, weigh};

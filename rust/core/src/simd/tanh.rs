@@ -1,4 +1,30 @@
 //! The hyperbolic tangent, eight at a time: as a quotient, by the shortest chain of operations that every processor has.
+//!
+//! tanh is odd, so with `s = x^2`
+//!
+//! ```text
+//!   tanh(x) = x P(s) / Q(s)
+//! ```
+//!
+//! with P and Q of degree 7 up to |x| = NEAR and of degree 10 from there to SATURATED, where tanh is 1 to the last bit. The
+//! coefficients are minimax fits (tests/golden/tanh.py) and stand in `sewfast_control::model::tanh`, since the code for
+//! microcontrollers takes the same: what a model does here, its deployed form does there.
+//!
+//! Polynomials are in Estrin's form, `(c0 + c1 s) + s^2 (c2 + c3 s) + s^4 (..)`: more multiplications than Horner's, but a chain of
+//! 3 steps instead of 7, and in a free run the chain is all that counts.
+//!
+//! There are three ways because there are two kinds of users:
+//!
+//! | way | of | when | what it costs on AVX-512 |
+//! |---|---|---|---|
+//! | quotients (here) | every level | single steps, state space; AVX2 and baseline always | 33 operations and a division, chain of 46 cycles |
+//! | `pieces` | AVX-512 | free runs: each waits for the last | chain of 36 cycles |
+//! | `sums` | AVX-512 | lanes: none waits, throughput counts | 20 operations, half a division |
+//!
+//! Measured end to end: `sums` took a candidate's step from 34.5 to 28.5 cycles (docs/PERFORMANCE.md, Zen 5). `pieces` depends on
+//! the processor: counted, it saves 10 of 86 cycles of a free run's sample where a permutation of two registers takes 3 cycles; on a
+//! Zen 4, whose registers are half as wide inside, it saves nothing (`free_run` of the kernels' example, least of 300 calls: 22.17 ns with,
+//! 21.86 without). It may go when that is so on the processors that the figures are kept for.
 
 #[cfg(target_arch = "x86_64")]
 pub(super) mod pieces;

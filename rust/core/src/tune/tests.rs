@@ -5,7 +5,7 @@ mod beside;
 use super::*;
 use crate::closed_loop::{LaggedPlant, Varied};
 use crate::linear::LinearModel;
-use sewfast_control::{Point, Schedule, Standard};
+use sewfast_control::{Biquad, Cascade, Point, Schedule, Standard};
 
 const TS: f64 = 1e-3;
 
@@ -456,6 +456,59 @@ fn a_front_trades_tracking_for_calm() {
 }
 
 #[test]
+fn notches_are_searched_and_other_biquads_keep_their_bits() {
+    let notch = |f: f64, d, w| Biquad::notch(f, d, w, TS).unwrap();
+    let low_pass = Biquad::low_pass(200.0, 0.7, TS).unwrap();
+    with_task(self::start(), |task| {
+        let start = Design {
+            biquads: Cascade::new(&[low_pass, notch(60.0, 0.1, 0.5)]).unwrap(),
+            ..task.start
+        };
+        let variables = Variable::usual(&start).unwrap();
+        let names: Vec<_> = variables.iter().map(|v| v.parameter.name()).collect();
+        assert!(names.contains(&"notch_frequency[1]".into()));
+        assert!(!names.iter().any(|name| name.contains("[0]")));
+        for (v, exact) in variables.iter().rev().take(3).rev().zip([60.0, 0.1, 0.5]) {
+            assert!((v.parameter.of(&start) / exact - 1.0).abs() < 1e-9);
+        }
+        let task = Task {
+            start,
+            variables: &variables,
+            ..task.clone()
+        };
+        let tuned = tune(&task, Method::Genetic, options(200, 1), &Monitor::default()).unwrap();
+        let sections = tuned.design.biquads.sections();
+        assert!(sections[0] == low_pass && sections[1] != start.biquads.sections()[1]);
+        assert!(tuned.cost < tuned.start_cost);
+        let values = variables.iter().map(|v| (v, v.parameter.of(&tuned.design)));
+        for (v, value) in values {
+            assert!(value >= v.low * (1.0 - 1e-9) && value <= v.high * (1.0 + 1e-9));
+        }
+        // a design alone costs what it did among others
+        let judged = costs(&task, &[tuned.design; 3], 2, &Monitor::default()).unwrap();
+        assert!(
+            judged
+                .iter()
+                .all(|j| j.cost.to_bits() == tuned.cost.to_bits())
+        );
+    });
+    let start = Design {
+        biquads: Cascade::new(&[low_pass]).unwrap(),
+        ..Design::new(self::start())
+    };
+    for k in [0, 1] {
+        let refused = Variable::new(Parameter::NotchDepth(k), None, &start).unwrap_err();
+        assert!(refused.message.contains("biquad of that number is a notch"));
+    }
+    let start = Design {
+        biquads: Cascade::new(&[notch(60.0, 0.1, 0.5)]).unwrap(),
+        ..start
+    };
+    let beyond = Variable::new(Parameter::NotchFrequency(0), Some((10.0, 600.0)), &start);
+    assert!(beyond.unwrap_err().message.contains("half the sample rate"));
+}
+
+#[test]
 fn variables_that_make_no_sense_are_refused() {
     let start = Design::new(start());
     let refused = |parameter, bounds| {
@@ -471,7 +524,7 @@ fn variables_that_make_no_sense_are_refused() {
     assert!(refused(Parameter::RRate, None).contains("r_rate"));
     assert!(refused(Parameter::KpAt(0), None).contains("0 points"));
     assert!(Parameter::named("Kq").is_err() && Parameter::named("Kp[").is_err());
-    for name in ["Kp", "alpha", "observer_time", "Td[3]"] {
+    for name in ["Kp", "alpha", "observer_time", "Td[3]", "notch_width[1]"] {
         assert_eq!(Parameter::named(name).unwrap().name(), name);
     }
     with_task(self::start(), |task| {

@@ -1,6 +1,8 @@
 //! What of a controller is searched: variables with their bounds and scales.
 
-use sewfast_control::{Design, Point, Schedule, Standard};
+use std::f64::consts::PI;
+
+use sewfast_control::{Biquad, Cascade, Design, Point, Schedule, Standard};
 
 use crate::{Error, Result};
 
@@ -26,6 +28,10 @@ pub enum Parameter {
     KpAt(usize),
     TiAt(usize),
     TdAt(usize),
+    /// Of a biquad that is a notch, counted from 0.
+    NotchFrequency(usize),
+    NotchDepth(usize),
+    NotchWidth(usize),
 }
 
 const NAMES: [(&str, Parameter); 11] = [
@@ -43,7 +49,8 @@ const NAMES: [(&str, Parameter); 11] = [
 ];
 
 impl Parameter {
-    /// By its name; gains of a schedule's points are `Kp[0]`, `Ti[0]`, `Td[0]`, `Kp[1]` and so on.
+    /// By its name; gains of a schedule's points are `Kp[0]`, `Ti[0]`, `Td[0]`, `Kp[1]` and so on, those of notches
+    /// `notch_frequency[0]`, `notch_depth[0]`, `notch_width[0]` by the number of the biquad.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for an unknown name.
@@ -55,15 +62,14 @@ impl Parameter {
             let inner = name.strip_prefix(gain)?.strip_prefix('[')?;
             inner.strip_suffix(']')?.parse().ok()
         };
-        match (point("Kp"), point("Ti"), point("Td")) {
-            (Some(k), _, _) => Ok(Self::KpAt(k)),
-            (_, Some(k), _) => Ok(Self::TiAt(k)),
-            (_, _, Some(k)) => Ok(Self::TdAt(k)),
-            _ => Err(Error::setting(format!(
-                "expected a variable named {} or Kp[0], Ti[0], Td[0] .. of a schedule's points, got '{name}'",
+        let numbered = NUMBERED.iter().find_map(|(known, of)| point(known).map(of));
+        numbered.ok_or_else(|| {
+            Error::setting(format!(
+                "expected a variable named {}, Kp[0], Ti[0], Td[0] .. of a schedule's points, or notch_frequency[0], \
+                 notch_depth[0], notch_width[0] .. of a notch, got '{name}'",
                 NAMES.map(|(known, _)| known).join(", ")
-            ))),
-        }
+            ))
+        })
     }
 
     /// Its name.
@@ -74,15 +80,23 @@ impl Parameter {
             (Self::KpAt(k), _) => format!("Kp[{k}]"),
             (Self::TiAt(k), _) => format!("Ti[{k}]"),
             (Self::TdAt(k), _) => format!("Td[{k}]"),
+            (Self::NotchFrequency(k), _) => format!("notch_frequency[{k}]"),
+            (Self::NotchDepth(k), _) => format!("notch_depth[{k}]"),
+            (Self::NotchWidth(k), _) => format!("notch_width[{k}]"),
             _ => String::new(),
         }
     }
 
-    /// Its value in a design; NaN for a point that the schedule does not have.
+    /// Its value in a design; NaN for a point that the schedule does not have, or a biquad that is no notch.
     pub fn of(self, design: &Design<f64>) -> f64 {
         let point = |k: usize, gain: fn(&Standard<f64>) -> f64| {
             let points = design.schedule.points();
             points.get(k).map_or(f64::NAN, |point| gain(&point.gains))
+        };
+        let notch = |k: usize, of: fn(&Notch) -> f64| {
+            let section = design.biquads.sections().get(k);
+            let notch = section.and_then(|section| Notch::of(section, design.pid.ts));
+            notch.map_or(f64::NAN, |notch| of(&notch))
         };
         match self {
             Self::Kp => design.pid.gains.kp,
@@ -99,10 +113,35 @@ impl Parameter {
             Self::KpAt(k) => point(k, |g| g.kp),
             Self::TiAt(k) => point(k, |g| g.ti),
             Self::TdAt(k) => point(k, |g| g.td),
+            Self::NotchFrequency(k) => notch(k, |n| n.frequency),
+            Self::NotchDepth(k) => notch(k, |n| n.depth),
+            Self::NotchWidth(k) => notch(k, |n| n.width),
         }
     }
 
-    fn set(self, design: &mut Design<f64>, points: &mut [Point<f64>], value: f64) {
+    /// The biquad that it belongs to.
+    fn section(self) -> Option<usize> {
+        match self {
+            Self::NotchFrequency(k) | Self::NotchDepth(k) | Self::NotchWidth(k) => Some(k),
+            _ => None,
+        }
+    }
+
+    fn set(
+        self,
+        design: &mut Design<f64>,
+        points: &mut [Point<f64>],
+        notches: &mut [Option<Notch>],
+        value: f64,
+    ) {
+        if let Some(Some(notch)) = self.section().and_then(|k| notches.get_mut(k)) {
+            match self {
+                Self::NotchFrequency(_) => notch.frequency = value,
+                Self::NotchDepth(_) => notch.depth = value,
+                _ => notch.width = value,
+            }
+            return;
+        }
         match self {
             Self::Kp => design.pid.gains.kp = value,
             Self::Ti => design.pid.gains.ti = value,
@@ -118,6 +157,7 @@ impl Parameter {
             Self::KpAt(k) => points[k].gains.kp = value,
             Self::TiAt(k) => points[k].gains.ti = value,
             Self::TdAt(k) => points[k].gains.td = value,
+            Self::NotchFrequency(_) | Self::NotchDepth(_) | Self::NotchWidth(_) => {}
         }
     }
 
@@ -141,7 +181,50 @@ impl Parameter {
             Self::FilterTime | Self::ObserverTime => Some((0.25 * ts, 30.0 * ts)),
             Self::RRate if own.is_finite() => Some((own / 10.0, own * 10.0)),
             Self::RRate => None,
+            Self::NotchFrequency(_) => Some((own / 1.5, (own * 1.5).min(0.45 / ts))),
+            Self::NotchDepth(_) => Some((0.01, 1.0)),
+            Self::NotchWidth(_) => Some((0.05, 3.0)),
         }
+    }
+}
+
+/// A parameter of the point or the biquad of a number.
+type Numbered = fn(usize) -> Parameter;
+
+const NUMBERED: [(&str, Numbered); 6] = [
+    ("Kp", Parameter::KpAt),
+    ("Ti", Parameter::TiAt),
+    ("Td", Parameter::TdAt),
+    ("notch_frequency", Parameter::NotchFrequency),
+    ("notch_depth", Parameter::NotchDepth),
+    ("notch_width", Parameter::NotchWidth),
+];
+
+/// A notch by what it is made from.
+#[derive(Clone, Copy, Debug)]
+struct Notch {
+    frequency: f64,
+    depth: f64,
+    width: f64,
+}
+
+impl Notch {
+    /// What [`Biquad::notch`] was given; `None` for another section.
+    ///
+    /// With `D0 = 1 + D1 + D2` the denominator is `4/D0` at `q = 1` and `4 D2/D0` at `q = -1`; `c0 - c1 = 2 (N2 - D2)/D0` and
+    /// `c0 + c1 = 2 (N1 - D1)/D0` say how far the numerator is from it. A notch has `N2 = D2`.
+    fn of(section: &Biquad<f64>, ts: f64) -> Option<Self> {
+        let Biquad { c0, c1, a1, a2 } = *section;
+        let d0 = 4.0 / (1.0 + a1 + a2);
+        let d2 = (1.0 - a1 + a2) / (1.0 + a1 + a2);
+        let d1 = d0 - 1.0 - d2;
+        let is_notch = (c0 - c1).abs() <= 1e-9 * (c0.abs() + c1.abs()) && d2 > 0.0;
+        let t = d2.sqrt().recip();
+        is_notch.then(|| Self {
+            frequency: t.atan() / (PI * ts),
+            depth: (1.0 + 0.5 * d0 * (c0 + c1) / d1).clamp(0.0, 1.0),
+            width: d1 * t,
+        })
     }
 }
 
@@ -179,6 +262,13 @@ impl Variable {
         start: &Design<f64>,
     ) -> Result<Self> {
         let name = parameter.name();
+        if parameter.section().is_some() && parameter.of(start).is_nan() {
+            return Err(Error::setting(format!(
+                "expected a variable of a controller whose biquad of that number is a notch, got {name} with {} biquads; they \
+                 count from 0",
+                start.biquads.sections().len()
+            )));
+        }
         if parameter.of(start).is_nan() {
             return Err(Error::setting(format!(
                 "expected a variable of a controller with {} points in its schedule, got {name}; points count from 0",
@@ -229,7 +319,7 @@ impl Variable {
             .map(drop)
     }
 
-    /// The usual variables of a controller: its gains, alpha and beta, and `N` where it has a derivative filter.
+    /// The usual variables of a controller: its gains, alpha and beta, `N` where it has a derivative filter, its notches.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for a start without usual bounds.
@@ -244,6 +334,15 @@ impl Variable {
         all.extend([Parameter::Alpha, Parameter::Beta]);
         if start.pid.n.is_finite() {
             all.push(Parameter::N);
+        }
+        for (k, section) in start.biquads.sections().iter().enumerate() {
+            if Notch::of(section, start.pid.ts).is_some() {
+                all.extend([
+                    Parameter::NotchFrequency(k),
+                    Parameter::NotchDepth(k),
+                    Parameter::NotchWidth(k),
+                ]);
+            }
         }
         all.into_iter()
             .map(|parameter| Self::new(parameter, None, start))
@@ -307,10 +406,33 @@ pub(super) fn designed(
 ) -> Result<Design<f64>> {
     let mut design = *start;
     let mut points = start.schedule.points().to_vec();
+    // notches that are not searched keep their bits
+    let searched = |k| variables.iter().any(|v| v.parameter.section() == Some(k));
+    let sections = start.biquads.sections();
+    let mut notches: Vec<_> = (0..sections.len())
+        .map(|k| {
+            searched(k)
+                .then(|| Notch::of(&sections[k], start.pid.ts))
+                .flatten()
+        })
+        .collect();
     for (variable, place) in variables.iter().zip(point) {
         let value = variable.value(*place);
-        variable.parameter.set(&mut design, &mut points, value);
+        variable
+            .parameter
+            .set(&mut design, &mut points, &mut notches, value);
     }
     design.schedule = Schedule::new(&points)?;
+    let section = |(own, notch): (&Biquad<f64>, &Option<Notch>)| match *notch {
+        Some(Notch {
+            frequency,
+            depth,
+            width,
+        }) => Biquad::notch(frequency, depth, width, start.pid.ts),
+        None => Ok(*own),
+    };
+    let sections = sections.iter().zip(&notches).map(section);
+    let sections: std::result::Result<Vec<_>, _> = sections.collect();
+    design.biquads = Cascade::new(&sections?)?;
     Ok(design)
 }

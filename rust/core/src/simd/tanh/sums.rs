@@ -1,5 +1,15 @@
 //! The hyperbolic tangent from that of the nearest quarter and that of what is beyond it, where a processor picks numbers
 //! from tables in registers.
+//!
+//! ```text
+//!   |x| = a + t,   a the nearest quarter,   |t| <= 1/8
+//!   A = tanh(a)  from a table of 16,        B = tanh(t) = t + t^3 p(t^2)
+//!   tanh(|x|) = (A + B) / (1 + A B)
+//! ```
+//!
+//! The table's 16 numbers fill two registers, and one instruction (`vpermi2pd`) picks eight of them by the low bits of the
+//! rounded argument. Because p has degree 4 only, the whole is 20 operations; the division is shared by two results,
+//! `1/(d1 d2)` giving `d2/(d1 d2)` and `d1/(d1 d2)`, since a division takes as long as 8 products and there is one unit for it.
 
 use crate::simd::Group;
 use crate::simd::x86::Wide;

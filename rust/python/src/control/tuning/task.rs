@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use numpy::{Complex64, PyReadonlyArray1};
 use pyo3::prelude::*;
 use sewfast_control::Design;
 use sewfast_core::closed_loop::{Varied, encoder};
@@ -57,6 +58,7 @@ pub struct Asked<'py> {
     aggregate: String,
     limits: Limits<'py>,
     linear_plants: Vec<Fraction<'py>>,
+    measured: Vec<Lines<'py>>,
 }
 
 /// The same, owned.
@@ -77,6 +79,7 @@ pub struct Given {
     recovery: Option<OwnedMost>,
     load: Option<OwnedMost>,
     loops: Vec<linear::Plant>,
+    measured: Vec<linear::Measured>,
 }
 
 struct OwnedLoad {
@@ -136,6 +139,24 @@ impl OwnedMost {
     }
 }
 
+/// Frequencies \[rad/s\], responses and radii of a measured plant; whether its output was counted.
+type Lines<'py> = (
+    Values<'py>,
+    PyReadonlyArray1<'py, Complex64>,
+    Values<'py>,
+    bool,
+);
+
+fn measured(given: &[Lines<'_>], ts: f64) -> PyResult<Vec<linear::Measured>> {
+    let of = |(omega, response, radius, counted): &Lines<'_>| {
+        let py = omega.py();
+        let (omega, radius) = (slice(omega, "omega")?, slice(radius, "radius")?);
+        let response = response.as_slice()?;
+        linear::Measured::new(omega, response, radius, *counted, ts).map_err(|e| raise(py, e))
+    };
+    given.iter().map(of).collect()
+}
+
 /// Numerator and denominator in powers of `z^-1`.
 type Fraction<'py> = (Values<'py>, Values<'py>);
 
@@ -181,6 +202,7 @@ impl Given {
             recovery: limits.recovery.as_ref().map(OwnedMost::new),
             load: limits.load.as_ref().map(OwnedMost::new),
             loops: loops(&asked.linear_plants)?,
+            measured: measured(&asked.measured, start.pid.ts)?,
         })
     }
 
@@ -194,21 +216,28 @@ impl Given {
         let references: Vec<&[f64]> = self.references.iter().map(Vec::as_slice).collect();
         let disturbances: Vec<&[f64]> = self.disturbances.iter().map(Vec::as_slice).collect();
         let load_steps: Vec<LoadStep<'_>> = self.load_steps.iter().map(OwnedLoad::step).collect();
-        if self.ms.is_some() && self.loops.is_empty() {
+        if self.ms.is_some() && self.loops.is_empty() && self.measured.is_empty() {
             return Err(Error::setting(
                 "expected a linear plant to take Ms on, got none; give Constraints(plant=...)",
             ));
         }
         let encoder = encoder(self.counts_per_unit, 0.5)?;
         let sensitivity = |design: &Design<f64>| {
-            let all = self.loops.iter();
-            let of = |plant| peak_sensitivity(design, encoder.is_some(), plant);
-            all.map(of).fold(1.0, f64::max)
+            let paths = paths(design, encoder.is_some());
+            let of = |path: &linear::Path| {
+                let plants = self.loops.iter().map(|plant| {
+                    linear::Loop::new(path, plant)
+                        .map_or(f64::INFINITY, |closed| linear::peak_sensitivity(&closed))
+                });
+                let measured = self.measured.iter().map(|m| m.peak_sensitivity(path));
+                plants.chain(measured).fold(1.0, f64::max)
+            };
+            paths.iter().map(of).fold(1.0, f64::max)
         };
         let sensitivity: &Sensitivity<'_> = &sensitivity;
         // Without a limit Ms may still be an objective.
         let ms = match self.ms {
-            None if self.loops.is_empty() => None,
+            None if self.loops.is_empty() && self.measured.is_empty() => None,
             limit => Some((limit.unwrap_or(f64::MAX), sensitivity)),
         };
         let mut task = Task {
@@ -272,24 +301,21 @@ impl Given {
     }
 }
 
-/// `Ms` of a design around a linear plant, of a schedule that of its worst point; infinite where there is no loop.
-fn peak_sensitivity(design: &Design<f64>, encoder: bool, plant: &linear::Plant) -> f64 {
+/// The feedback paths of a design: one, or one for each point of its schedule.
+fn paths(design: &Design<f64>, encoder: bool) -> Vec<linear::Path> {
     let points = design.schedule.points();
     let constant = points.is_empty().then_some(design.pid.gains);
     let all = points.iter().map(|p| p.gains).chain(constant);
-    let of = |gains| {
-        let path = linear::Path {
-            n: design.pid.n,
-            filter_samples: design.filter_samples,
-            filter_time: design.filter_time,
-            observer_time: design.observer_time,
-            encoder,
-            ..linear::Path::new(gains, design.pid.ts)
-        };
-        linear::Loop::new(&path, plant)
-            .map_or(f64::INFINITY, |closed| linear::peak_sensitivity(&closed))
+    let of = |gains| linear::Path {
+        n: design.pid.n,
+        filter_samples: design.filter_samples,
+        filter_time: design.filter_time,
+        observer_time: design.observer_time,
+        biquads: design.biquads,
+        encoder,
+        ..linear::Path::new(gains, design.pid.ts)
     };
-    all.map(of).fold(1.0, f64::max)
+    all.map(of).collect()
 }
 
 fn variables(wanted: &[Wanted], start: &Design<f64>) -> Result<Vec<Variable>> {

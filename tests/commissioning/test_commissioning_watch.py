@@ -1,0 +1,143 @@
+"""A run of the verification that goes wrong is ended while it does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from commissioned import SMALL, short
+from loops import QUIET, drive
+from sewfast import Controller, Gains, VirtualMachine, commission, run
+from sewfast.commissioning import Refusal
+from sewfast.commissioning.bench import Aborted, NotedBench
+from sewfast.commissioning.verification import Watching, measure, predict
+from sewfast.control.machine import MachineBench, RecordedRun, SteppedBench, Watch
+from sewfast.dataset import FloatArray
+from sewfast.link import VirtualDevice, connect
+from sewfast.models import Ensemble
+from sewfast.recording import Recording
+
+R = np.concatenate([np.linspace(0.0, 1500.0, 400), np.full(4600, 1500.0)])
+FIERCE = Controller(
+    Gains.standard(0.5, 0.05), u_min=-20.0, u_max=20.0, filter_samples=8, counts_per_rev=1572.0
+)
+"""Swings on the virtual machine from limit to limit."""
+
+
+def watching(controller: Controller = QUIET) -> Watching:
+    """Of a loop that is predicted to be quiet."""
+    return Watching(run(QUIET, VirtualMachine(), R, name="hold"), controller, 1572.0)
+
+
+def test_a_run_that_does_as_predicted_ends_by_itself() -> None:
+    found = MachineBench(VirtualMachine()).follow(QUIET, R, "hold", watch=watching())
+    assert len(found.r) == len(R)
+
+
+def on_virtual(watch: Watch) -> None:
+    MachineBench(VirtualMachine()).follow(FIERCE, R, "hold", watch=watch)
+
+
+def on_stepped(watch: Watch) -> None:
+    on = SteppedBench(Steps(), Ts=1e-3, counts_per_rev=1572.0, volt=20.0)
+    on.follow(FIERCE, R, "hold", watch=watch)
+
+
+def on_drive(watch: Watch) -> None:
+    with VirtualDevice() as device, connect(device.port) as there:
+        there.set_limits(volt=20.0, speed_rpm=4000.0)
+        try:
+            there.follow(FIERCE, R, "hold", watch=watch)
+        finally:
+            assert there.status().state == "idle"
+
+
+@pytest.mark.parametrize("followed", [on_virtual, on_stepped, on_drive])
+def test_a_loop_that_swings_is_ended_within_a_second(followed: Callable[[Watch], None]) -> None:
+    with pytest.raises(Aborted, match=r"'hold', ended after .* as in a loop that swings") as stop:
+        followed(watching(FIERCE))
+    recording = stop.value.recording
+    assert 0.25 <= len(recording) * 1e-3 < 1.0
+    assert np.ptp(recording.u) > 2.0
+
+
+class Steps:
+    """The virtual machine, sample by sample."""
+
+    def __init__(self) -> None:
+        self.machine, self.held = VirtualMachine(), [0.0]
+
+    def reset(self) -> None:
+        self.machine.reset()
+
+    def step(self, u: float) -> None:
+        self.counts = float(self.machine.run(np.array([u])).counts[-1])
+
+    counts = 0.0
+
+
+def test_a_machine_that_parts_from_the_prediction_is_stopped_where_that_is_certain() -> None:
+    weak = MachineBench(VirtualMachine(parameters={"current_limit": 0.7}))
+    with pytest.raises(Aborted, match=r"within 5 % of the span|within its limits") as stop:
+        weak.follow(QUIET, R, "hold", watch=watching())
+    ended = len(stop.value.recording)
+    assert ended < 0.7 * len(R)
+    # run to its end it would have been refused as well
+    predicted = run(QUIET, VirtualMachine(), R).y
+    whole = weak.follow(QUIET, R, "hold")
+    assert np.sqrt(np.mean((whole.y - predicted) ** 2)) > 0.05 * 1500.0
+
+
+def test_what_was_recorded_is_kept_and_a_machine_that_cannot_be_watched_runs_on() -> None:
+    kept: dict[str, Recording] = {}
+
+    class Own:
+        name, Ts, counts_per_rev, volt, speed = "own", 1e-3, 1572.0, 20.0, np.inf
+        inner = MachineBench(VirtualMachine(parameters={"current_limit": 0.7}))
+
+        def excite(self, u: FloatArray, name: str) -> Recording:
+            return self.inner.excite(u, name)
+
+        def follow(self, controller: Controller, r: FloatArray, name: str) -> RecordedRun:
+            return self.inner.follow(controller, r, name)
+
+    class Watched(Own):
+        def follow(
+            self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
+        ) -> RecordedRun:
+            return self.inner.follow(controller, r, name, watch=watch)
+
+    def note(name: str, key: str, recording: Recording, found: Any) -> None:
+        kept[name] = recording
+
+    predicted = predict(QUIET, Ensemble.of([drive()]), {"hold": R})
+    for machine, name in ((Watched(), "hold_aborted"), (Own(), "hold")):
+        kept.clear()
+        on = NotedBench(machine, note, lambda *_: None, lambda *_: None)
+        with pytest.raises(Refusal, match=r"the controller is not verified|limits most"):
+            measure(QUIET, on, predicted, {"hold": R}, lambda _: None)
+        assert list(kept) == [name]
+    assert len(kept["hold"]) == len(R)
+
+
+def test_a_commissioning_names_the_reference_and_keeps_what_was_recorded(tmp_path: Path) -> None:
+    class Changes(MachineBench):
+        """Loses most of its current as the references begin."""
+
+        def follow(
+            self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
+        ) -> RecordedRun:
+            if watch is not None:
+                weak = VirtualMachine(parameters={"current_limit": 0.7})
+                object.__setattr__(self, "machine", weak)
+            return super().follow(controller, r, name, watch=watch)
+
+    with short(), pytest.raises(Refusal, match=r"ended after .* s: expected") as refused:
+        commission(Changes(VirtualMachine()), **SMALL, folder=tmp_path)
+    assert refused.value.so_far is not None
+    assert any(name.endswith("_aborted") for name in refused.value.so_far.recordings)
+    assert list((tmp_path / "unfinished").glob("*_aborted.mcap"))

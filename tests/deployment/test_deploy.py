@@ -1,0 +1,399 @@
+"""Deployed code: to the last bit the step of the core, on every compiler and processor here."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import math
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import deployed
+import kinds
+from sewfast import Controller, Ensemble, Gains, LinearOE, Model, _core, deploy
+from sewfast.cli import main
+from sewfast.deployment import c99
+from sewfast.errors import FitError, SettingError
+
+needs_compiler = pytest.mark.skipif(not deployed.compilers(), reason="needs gcc or clang")
+PRECISIONS = ("f64", "f32")
+CASES = dict(deployed.cases())
+EMULATED = ("neural_oe", "neural_ss, saturation", "ensemble of mixed kinds", "everything")
+SAMPLES = 20_000
+
+
+@needs_compiler
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", CASES)
+def test_the_code_has_the_bits_of_the_core(name: str, precision: str, tmp_path: Path) -> None:
+    expected = deployed.prepared(CASES[name], tmp_path, precision, SAMPLES)
+    for compiler in deployed.compilers():
+        assert deployed.host(tmp_path, "code", compiler) == expected
+
+
+@needs_compiler
+@pytest.mark.parametrize("optimise", ["-O0", "-Os", "-O3"])
+def test_no_optimisation_changes_a_bit(optimise: str, tmp_path: Path) -> None:
+    expected = deployed.prepared(CASES["ensemble of mixed kinds"], tmp_path, "f64", SAMPLES)
+    for compiler in deployed.compilers():
+        assert deployed.host(tmp_path, "code", compiler, optimise) == expected
+
+
+@pytest.mark.skipif(not deployed.emulator(), reason="needs arm-none-eabi-gcc and qemu-system-arm")
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", EMULATED)
+def test_an_emulated_processor_has_the_same_bits(name: str, precision: str, tmp_path: Path) -> None:
+    expected = deployed.prepared(CASES[name], tmp_path, precision, 2000)
+    assert deployed.cortex_m4(tmp_path, "code") == expected
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
+def test_the_sketch_controls_a_motor_as_the_core_would(tmp_path: Path) -> None:
+    """Each duty of examples/firmware/sketch is that of the core for the same counts."""
+    gains = Gains.standard(Kp=0.01, Ti=0.05, Td=0.0)  # V/RPM, s
+    controller = Controller(gains, Ts=0.001, u_min=-24, u_max=24)
+    deploy(controller, tmp_path)
+    here = Path(__file__).parents[1] / "support"
+    sketch = here.parents[1] / "examples" / "firmware" / "sketch"
+    folders = [f"-I{place}" for place in (here / "arduino", sketch, tmp_path)]
+    sources = [str(here / "arduino" / "main.cpp"), str(tmp_path / "controller.c")]
+    built = tmp_path / "sketch"
+    flags = ["-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-x", "c++"]
+    subprocess.run(["g++", *flags, *folders, *sources, "-o", str(built)], check=True)
+    made = subprocess.run([str(built)], check=True, capture_output=True, text=True)
+    counts, duties = np.array([line.split() for line in made.stdout.splitlines()], dtype=int).T
+    # the sketch sees at each period what the motor had done by the one before
+    seen = np.concatenate([[0, 0], counts[:-1]])
+    core = controller.core().single()
+    scale = np.float32(60e6) / np.float32(1572.0) / np.float32(1000.0)
+    for moved, duty in zip(np.diff(seen), duties, strict=True):
+        u = core.step(1000.0, float(np.float32(moved) * scale))
+        assert duty == math.copysign(int(abs(u) / 24 * 255 + 0.5), u)
+    speeds = np.diff(counts) * float(scale)
+    assert abs(speeds[-100:].mean() - 1000.0) < 10.0
+
+
+@needs_compiler
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", deployed.CONTROLLERS)
+def test_hostile_inputs_and_changes_of_mode_keep_the_bits(
+    name: str, precision: str, tmp_path: Path
+) -> None:
+    controller = deployed.CONTROLLERS[name]
+    deploy(controller, tmp_path, precision=precision, name="code")
+    flags = ["-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared"]
+    library = tmp_path / "code.so"
+    subprocess.run(
+        [deployed.compilers()[0], *flags, str(tmp_path / "code.c"), "-o", str(library)], check=True
+    )
+    code, real = (
+        ctypes.CDLL(str(library)),
+        ctypes.c_float if precision == "f32" else ctypes.c_double,
+    )
+    code.code_step_with.argtypes = [ctypes.c_void_p, real, real, real]
+    code.code_step_with.restype = real
+    code.code_set_manual.argtypes = [ctypes.c_void_p, real]
+    code.code_set_automatic.argtypes = code.code_init.argtypes = [ctypes.c_void_p]
+    memory = ctypes.create_string_buffer(4096)
+    code.code_init(memory)
+    core: Any = controller.core()
+    core = core.single() if precision == "f32" else core
+    rng = np.random.default_rng(7)
+    hostile = [np.nan, np.inf, -np.inf, 1e300, -1e38, 1e-310, -0.0, 3e38]
+    for k in range(4000):
+        r, y, extra = rng.normal(0.0, 1000.0, 3)
+        if rng.uniform() < 0.05:
+            r, y, extra = (rng.choice(hostile) if rng.uniform() < 0.4 else v for v in (r, y, extra))
+        if rng.uniform() < 0.02:
+            u = float(rng.choice([*hostile[:4], 1.0, -50.0]))
+            taken = code.code_set_manual(memory, u)
+            finite = math.isfinite(u) and (precision == "f64" or abs(u) < 3.5e38)
+            assert bool(taken) == finite
+            if finite:
+                core.set_manual(u)
+        if rng.uniform() < 0.02:
+            code.code_set_automatic(memory)
+            core.set_automatic()
+        # what is too large for single precision is infinite on both sides
+        found, expected = code.code_step_with(memory, r, y, extra), core.step(r, y, extra)
+        assert found == expected, (k, r, y, extra)
+        assert np.isfinite(found)
+
+
+def test_the_sum_of_bits_sees_every_bit_and_the_order() -> None:
+    y = np.random.default_rng(0).normal(size=100)
+    sums = {deployed.checksum(y, "f64"), deployed.checksum(y[::-1], "f64")}
+    for k in (0, 57, 99):
+        other = y.copy()
+        other[k] = np.nextafter(y[k], 9.0)
+        sums.add(deployed.checksum(other, "f64"))
+    assert len(sums) == 5
+
+
+@needs_compiler
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", ["neural_ss, two inputs", "everything"])
+def test_the_test_beside_the_code_passes_and_can_fail(
+    name: str, precision: str, tmp_path: Path
+) -> None:
+    deploy(CASES[name], tmp_path, precision=precision, name="drive")
+
+    def outcome(source: str) -> int:
+        (tmp_path / "drive.c").write_text(source)
+        files = [str(tmp_path / f) for f in ("drive.c", "drive_test.c")]
+        built = [deployed.compilers()[0], *deployed.WARNINGS, "-ffp-contract=off", *files]
+        subprocess.run([*built, "-o", str(tmp_path / "test")], check=True)
+        return subprocess.run([tmp_path / "test"], capture_output=True).returncode
+
+    right = (tmp_path / "drive.c").read_text()
+    assert outcome(right) == 0
+    # one digit of the first long number
+    number = re.search(r"(\d\.\d{4,})", right)
+    assert number
+    changed = number[1][:3] + str((int(number[1][3]) + 5) % 10) + number[1][4:]
+    assert outcome(right.replace(number[1], changed, 1)) == 1
+
+
+def test_double_precision_is_the_baselines_free_run() -> None:
+    """In a process of its own: the level of the kernels is chosen as the package is loaded."""
+    program = """
+import kinds, numpy as np
+from sewfast.deployment import c99
+for name in kinds.CASES:
+    model = kinds.model_of(name)
+    u = kinds.levels(3000, 4, len(model.input_names))
+    u[0] = 0.0
+    free = model.core.simulate(u, model.core.rest_state())
+    step = c99.combined_run(*c99.embedded_members(model, "f64"), u, "f64")
+    exact = all(
+        m.kind != "neural_ss" or (m.orders["nx"] <= 4 and m.settings["output"] == "linear")
+        for m in model.members or (model,)
+    )
+    span = np.ptp(free)
+    assert np.abs(free - step).max() <= (0.0 if exact else 1e-13 * span), name
+print("alike")
+"""
+    environment = {**os.environ, "SEWFAST_CPU": "baseline"}
+    paths = [str(Path(deployed.__file__).parent), environment.get("PYTHONPATH", "")]
+    environment["PYTHONPATH"] = os.pathsep.join(paths)
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True
+    )
+    assert done.stdout == "alike\n", done.stderr
+
+
+# --- Structured text ------------------------------------------------------------------------------
+
+
+class Block:
+    """A function block, run in Python: its statements have the same words in another order.
+
+    Only what the package writes is understood; numbers are numpy's of the block's type.
+    """
+
+    def __init__(self, text: str) -> None:
+        text = re.sub(r"\(\*.*?\*\)", "", text, flags=re.S)
+        self.real: Any = np.float32 if ": REAL" in text else np.float64
+        declared, body = re.match(
+            r"\s*FUNCTION_BLOCK \w+(.*END_VAR)(.*)END_FUNCTION_BLOCK\s*$", text, flags=re.S
+        ).groups()  # type: ignore[union-attr]
+        self.values: dict[str, Any] = {"real": self.real, "NOT": None}
+        for names, kind, first in re.findall(
+            r"([\w, ]+) : ([\w.\[\] ]+?)(?: := (.+?))?;", declared
+        ):
+            for name in names.split(","):
+                self.values[name.strip()] = self._first(kind, first)
+        self.program = compile("\n".join(self._lines(body)), "block", "exec")
+
+    def _first(self, kind: str, first: str) -> Any:
+        array = re.match(r"ARRAY\[0\.\.(\d+)\] OF", kind)
+        if array:
+            return [self.real(0.0)] * (int(array[1]) + 1)
+        if kind in ("BOOL", "INT"):
+            return False if kind == "BOOL" else 0
+        return eval(self._expression(first), {"real": self.real}) if first else self.real(0.0)
+
+    def _expression(self, text: str) -> str:
+        text = re.sub(r"L?REAL#(-?[\d.]+(?:E[-+]?\d+)?)", r"real('\1')", text)
+        text = re.sub(r"(?<![:<>])=", "==", text)
+        words = {"NOT": "not", "AND": "and", "OR": "or", "TRUE": "True", "FALSE": "False"}
+        return re.sub(r"\b(NOT|AND|OR|TRUE|FALSE)\b", lambda m: words[m[1]], text)
+
+    def _lines(self, body: str) -> list[str]:
+        lines, depth = [], 0
+        for line in filter(None, (raw.strip() for raw in body.splitlines())):
+            indent = "    " * depth
+            if line in ("END_IF;", "END_FOR;"):
+                depth -= 1
+            elif line == "ELSE":
+                lines.append("    " * (depth - 1) + "else:")
+            elif found := re.fullmatch(r"IF (.*) THEN", line):
+                lines.append(f"{indent}if {self._expression(found[1])}:")
+                depth += 1
+            elif found := re.fullmatch(r"FOR (\w+) := (\d+) TO (\d+) DO", line):
+                lines.append(f"{indent}for {found[1]} in range({found[2]}, {found[3]} + 1):")
+                depth += 1
+            else:
+                found = re.fullmatch(r"([\w\[\]]+) := (.*);", line)
+                assert found, line
+                lines.append(f"{indent}{found[1]} = {self._expression(found[2])}")
+        assert depth == 0
+        return lines
+
+    def step(self, **inputs: Any) -> float:
+        self.values.update(inputs)
+        with np.errstate(all="ignore"):
+            exec(self.program, self.values)
+        return float(self.values["u"])
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", deployed.CONTROLLERS)
+def test_structured_text_has_the_bits_of_the_core(
+    name: str, precision: str, tmp_path: Path
+) -> None:
+    controller = deployed.CONTROLLERS[name]
+    deploy(controller, tmp_path, to="st", precision=precision, name="speed_loop")
+    block = Block((tmp_path / "speed_loop.st").read_text())
+    real: Any = np.float32 if precision == "f32" else np.float64
+    core: Any = controller.core()
+    core = core.single() if precision == "f32" else core
+    rng = np.random.default_rng(1)
+    for k in range(600):
+        if k == 250:
+            core.set_manual(1.0)
+        if k == 300:
+            core.set_automatic()
+        r, y = real(rng.uniform(-2000, 2000) if k % 40 == 0 else 500.0), real(rng.normal(0, 900))
+        if k % 50 == 49:
+            y = real(np.nan)
+        manual = 250 <= k < 300
+        found = block.step(
+            r=r, y=y, feedforward=real(-0.0), manual=manual, u_manual=real(1.0), restart=False
+        )
+        assert found == core.step(float(r), float(y), -0.0), k
+
+
+def test_a_model_is_no_function_block(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="structured text"):
+        deploy(kinds.model_of("oe"), tmp_path, to="st")
+
+
+# --- What is refused, and what is written ---------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name", ["", "9x", "Drive", "a-b", "int", "x" * 60, "a b", "../a", "é", "a_test", "fmi3"]
+)
+def test_names_that_are_none_in_c_are_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="name: expected"):
+        deploy(CASES["pi"], tmp_path / "out", name=name)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_cannot_be_deployed_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="precision: expected"):
+        deploy(CASES["pi"], tmp_path, precision="f16")
+    with pytest.raises(SettingError, match="to: expected"):
+        deploy(CASES["pi"], tmp_path, to="rust")
+    with pytest.raises(SettingError, match="a model or a controller"):
+        deploy("controller.json", tmp_path)  # type: ignore[arg-type]
+    (tmp_path / "file").write_text("kept")
+    with pytest.raises(SettingError, match="a folder"):
+        deploy(CASES["pi"], tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+def _linear(a: list[float], b: list[float]) -> Model:
+    core = _core.LinearModel(np.array(a), np.array([b]), 1, 0.0)
+    return LinearOE(core, 0.001, ("u",), "y", ("V",), "RPM")
+
+
+def test_poles_that_single_precision_cannot_keep_are_refused(tmp_path: Path) -> None:
+    # two poles at 1 - 1e-4: as coefficients they are 1e-8 from the circle, below 2^-24
+    slow = _linear([-2 * 0.9999, 0.9999**2], [1e-8, 0.0])
+    with pytest.raises(SettingError, match=r"slowest pole is 0\.9999.*precision f64"):
+        deploy(slow, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    assert "double" in deploy(slow, tmp_path / "out", precision="f64").notes[0]
+
+
+def test_a_model_that_runs_away_is_refused_in_single_precision(tmp_path: Path) -> None:
+    with pytest.raises(FitError, match="stays finite"):
+        deploy(_linear([-1.5], [1.0]), tmp_path)
+
+
+def test_what_single_precision_costs_is_said_and_true(tmp_path: Path) -> None:
+    model = kinds.model_of("neural_oe")
+    note = deploy(model, tmp_path).notes[1]
+    said = float(re.search(r"by ([\d.e-]+) of its span", note)[1])  # type: ignore[index]
+    u = kinds.levels(4000, 9, 1)
+    double = c99.combined_run(*c99.embedded_members(model, "f64"), u, "f64")
+    single = c99.combined_run(*c99.embedded_members(model, "f32"), u, "f32")
+    loss = np.abs(double - single).max() / np.ptp(double)
+    assert 0.1 * said < loss < 10 * said
+
+
+@needs_compiler
+def test_texts_of_a_user_stay_in_their_comments(tmp_path: Path) -> None:
+    hostile = '*/ int main(void){} /* @_step @@_TS \n#error R(1.0) \\\n"'
+    controller = Controller(Gains.standard(0.02, 0.25, u_unit="V*/", y_unit="(*@m_"), notes=hostile)
+    deploy(controller, tmp_path, name="c")
+    for compiler in deployed.compilers():
+        built = [compiler, "-std=c99", "-Wall", "-c", str(tmp_path / "c.c"), "-o"]
+        subprocess.run([*built, str(tmp_path / "c.o")], check=True)
+    text = (
+        deploy(controller, tmp_path / "st", to="st", name="c").folder.joinpath("c.st").read_text()
+    )
+    assert Block(text).step(r=np.float32(1.0), y=np.float32(0.0)) != 0.0
+
+
+def test_an_ensemble_for_no_processor_is_refused(tmp_path: Path) -> None:
+    many = Ensemble.of([_linear([-0.9], [0.1])] * 65)
+    with pytest.raises(SettingError, match="at most 64 members"):
+        deploy(many, tmp_path)
+
+
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="needs cmake")
+def test_cmake_builds_and_tests_the_folder(tmp_path: Path) -> None:
+    deploy(CASES["everything"], tmp_path / "a b", name="loop")
+    deploy(CASES["neural_ss"], tmp_path / "a b", name="plant")
+    for command in (
+        ["cmake", "-S", tmp_path / "a b", "-B", tmp_path / "build"],
+        ["cmake", "--build", tmp_path / "build", "--target", "loop_test", "plant_test"],
+        ["ctest", "--test-dir", tmp_path / "build"],
+    ):
+        done = subprocess.run([str(c) for c in command], check=True, capture_output=True, text=True)
+    assert "2 tests passed" in done.stdout or "out of 2" in done.stdout
+
+
+def test_manifests_are_what_their_tools_read(tmp_path: Path) -> None:
+    done = deploy(CASES["pi"], tmp_path, name="loop")
+    assert {f"loop{end}" for end in (".c", ".h", "_test.c")} <= set(done.files)
+    library = json.loads((tmp_path / "library.json").read_text())
+    assert library["build"]["srcFilter"] == ["+<*.c>", "-<*_test.c>"]
+    assert "cmake: zephyr" in (tmp_path / "zephyr" / "module.yml").read_text()
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    CASES["pi"].save(tmp_path / "controller.json")
+    kinds.model_of("oe").save(tmp_path / "model.json")
+    folder = tmp_path / "with a space"
+    assert main(["deploy", str(tmp_path / "controller.json"), str(folder), "--json"]) == 0
+    files = json.loads(capsys.readouterr().out)["files"]
+    assert all(Path(f).is_file() for f in files)
+    assert str(folder / "controller.c") in files
+    assert main(["deploy", str(tmp_path / "model.json"), str(folder), "--name", "plant"]) == 0
+    assert "plant.c" in capsys.readouterr().out
+    assert main(["deploy", str(tmp_path / "nix.json"), str(folder)]) == 2
+    (tmp_path / "other.json").write_text('{"format": "something", "version": 1}')
+    assert main(["deploy", str(tmp_path / "other.json"), str(folder)]) == 2
+    assert "other.json" in capsys.readouterr().err

@@ -1,0 +1,100 @@
+"""The documentation does what it says: its snippets run, its site is whole and works offline."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from documents import Block, Command, blocks
+from sewfast.cli.parser import build_parser
+from terminal import Terminal
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
+_URL = r"""=["']?(?:https?:)?//"""
+_ELSEWHERE = (
+    rf"<(?:script|img|iframe)\b[^>]*\ssrc{_URL}"
+    rf"|<link\b(?=[^>]*\srel=[\"']?(?:stylesheet|preconnect|preload))[^>]*\shref{_URL}"
+)
+"""Tags that would load something from the network."""
+RUN = [p for p in PAGES if any(b.language in ("python", "console") for b in blocks(p))]
+
+
+@pytest.mark.parametrize("page", RUN, ids=lambda p: p.stem)
+def test_page_runs(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    """Every snippet of a page, in order, in one folder and one namespace."""
+    if "SEWFAST_DATA" in page.read_text(encoding="utf-8"):
+        request.getfixturevalue("recordings")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {"__name__": page.stem}
+    with Terminal(page.name, monkeypatch.setenv) as terminal:
+        for block in blocks(page):
+            if block.language == "python":
+                _execute(block, page, names)
+            for command in block.commands if block.language == "console" else ():
+                terminal.run(command)
+
+
+def _execute(block: Block, page: Path, names: dict[str, object]) -> None:
+    # the blank lines make a traceback point into the page
+    exec(compile("\n" * (block.line - 1) + block.text, str(page), "exec"), names)
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed", "same"),
+    [
+        ("a b\n", "a  b", True),
+        ("a ... d\n", "a b\nc d\n", True),
+        ("...\nd\n", "a b\nd\n", True),
+        ("a\n", "a b", False),
+        ("a.b\n", "axb", False),
+        ("a ... d\n", "a b\nc d e\n", False),
+    ],
+)
+def test_what_is_shown_is_compared(shown: str, printed: str, same: bool) -> None:
+    assert Command("sewfast", shown).shows(printed) == same
+
+
+def test_every_command_is_on_its_page() -> None:
+    page = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
+    commands = re.findall(r"<!-- help (\w+) -->", page)
+    _, _, listed = build_parser().format_help().partition("COMMAND\n")
+    known = re.findall(r"^    (\w+)(?: |$)", listed, re.MULTILINE)
+    assert sorted(commands) == sorted(known)
+
+
+def test_pages_have_snippets() -> None:
+    assert {p.stem for p in RUN} >= {"README", "tutorial", "cli", "first-run", "real-data"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
+def test_links_of_a_page_lead_somewhere(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
+        if not target.startswith("https://"):
+            assert (page.parent / target).exists(), f"{page}: {target}"
+
+
+def test_site_builds_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason="needs the docs extra")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    pages = list(tmp_path.rglob("*.html"))
+    assert len(pages) >= 9
+    loads = re.compile(_ELSEWHERE)
+    for page in pages:
+        assert not loads.search(page.read_text(encoding="utf-8")), page
+    help_page = (tmp_path / "cli.html").read_text(encoding="utf-8")
+    assert "&lt;!-- help" not in help_page
+    assert "--counts-per-rev" in help_page

@@ -1,0 +1,155 @@
+"""The example firmware in C on an emulated Cortex-M4, as a host sees it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sewfast
+from sewfast.cli import main
+from sewfast.errors import LinkError, SettingError
+from sewfast.link import connect, examine
+from sewfast.link.emulated import EmulatedBoard, build_firmware
+
+ROOT = Path(__file__).resolve().parents[2]
+FIRMWARE = ROOT / "target" / "bare" / "mps2.elf"
+LIMITS = {"volt": 10.0, "speed_rpm": 8000.0, "acceleration": 90_000.0, "current": float("inf")}
+
+TRIALS = int(os.environ.get("SEWFAST_TRIALS", "3"))
+"""How often the host is killed; `make killed` asks for 100."""
+
+needs_board = pytest.mark.skipif(
+    shutil.which("qemu-system-arm") is None or not FIRMWARE.exists(),
+    reason="needs qemu-system-arm and the firmware for the emulated board: make firmware",
+)
+
+
+def controller() -> sewfast.Controller:
+    """Everything that a controller may have: the deepest stack."""
+    gains = sewfast.Gains.standard(Kp=0.02, Ti=0.1, Td=0.002)
+    return sewfast.Controller(
+        gains, Ts=0.001, alpha=0.4, N=10, u_min=-10, u_max=10, slew=4000, filter_samples=8,
+        observer_time=0.003, r_rate=20_000,
+    )  # fmt: skip
+
+
+@needs_board
+@pytest.mark.parametrize("clock", ["credit", "real"])
+def test_the_doctor_finds_nothing_wrong(clock: str) -> None:
+    with EmulatedBoard(FIRMWARE, clock=clock) as board:  # type: ignore[arg-type]
+        found = examine(board.port)
+    assert found["device"].values["device"] == "emulated drive"
+    assert found["clock"].verdict == "ok"
+    # a busy computer may be slow, which is the computer's
+    worse = [f.name for f in found.findings if f.verdict != "ok"]
+    assert set(worse) <= {"round trip"}, found
+
+
+@needs_board
+def test_recordings_on_credit_are_equal_and_the_processor_is_measured() -> None:
+    made = []
+    for _ in range(2):
+        with EmulatedBoard(FIRMWARE, boot_id=7) as board, connect(board.port) as drive:
+            drive.set_limits(**LIMITS)
+            chirp = sewfast.record(drive, sewfast.signals.excitation("chirp_lo_hi")[:3000])
+            run = sewfast.run(controller(), drive, np.full(1000, 1000.0))
+            figures = board.figures()
+            made.append((chirp.counts, run.y, run.u))
+    for first, second in zip(*made, strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert abs(made[0][1][-1] - 1000.0) < 20.0
+    # ceilings, as an embedded developer plans by them
+    assert figures.code <= 40 * 1024
+    assert figures.stack <= 4096
+    assert figures.memory <= 16 * 1024
+    assert figures.steps >= 4000
+    assert figures.instructions is not None
+    least, mean, most = figures.instructions
+    assert 100 < least < mean < most < 10_000
+
+
+@needs_board
+def test_a_killed_host_leaves_the_output_off_in_time() -> None:
+    """In real time: within the watchdog and one period of the last bytes heard."""
+    watchdog = 0.4
+    host = (
+        "import numpy, sewfast, sys\n"
+        "from sewfast.link import connect\n"
+        f"with connect(sys.argv[1], watchdog={watchdog}) as drive:\n"
+        "    drive.set_limits(volt=10, speed_rpm=8000, acceleration=90000, current=float('inf'))\n"
+        "    sewfast.record(drive, numpy.full(60_000, 5.0))\n"
+    )
+    late = []
+    with EmulatedBoard(FIRMWARE, clock="real") as board:
+        for trial in range(TRIALS):
+            running = subprocess.Popen([sys.executable, "-c", host, board.port])
+            until = time.monotonic() + 30.0
+            while board.safe_after() is not None and time.monotonic() < until:
+                assert running.poll() is None
+                time.sleep(0.002)
+            time.sleep(0.02 + 0.3 * np.random.default_rng(trial).random())
+            running.send_signal(signal.SIGKILL)
+            running.wait()
+            while (after := board.safe_after()) is None and time.monotonic() < until:
+                time.sleep(0.002)
+            assert after is not None
+            late.append(after)
+            with connect(board.port) as drive:
+                assert drive.status().reason == "watchdog"
+                drive.clear()
+    assert max(late) <= watchdog + 0.001, late
+    # the last bytes need not be a whole heartbeat; a switch-off long before would be another cause
+    assert min(late) > 0.5 * watchdog, late
+
+
+@needs_board
+def test_the_command_goes_from_doctor_to_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a folder, with a comma"
+    words = ["pil", "--firmware", str(FIRMWARE), "--out", str(out), "--no-commission"]
+    assert main(words) == 0
+    printed = capsys.readouterr()
+    assert "nothing is wrong with it" in printed.out
+    assert "instructions a period" in printed.out
+    assert {p.name for p in out.iterdir()} >= {"chirp.mcap", "first.json", "first.mcap"}
+    assert main(words) == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+
+def test_what_is_no_firmware_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="source checkout"):
+        build_firmware(tmp_path)
+    with pytest.raises(SettingError, match="expected a firmware"):
+        EmulatedBoard(tmp_path / "none.elf")
+    other = tmp_path / "other.elf"
+    for content in (b"", b"\x7fELF", b"\x7fELF\x02\x01" + bytes(100), bytes(1000)):
+        other.write_bytes(content)
+        with pytest.raises(SettingError, match="expected a firmware for ARM"):
+            EmulatedBoard(other)
+    with pytest.raises(SettingError, match="'credit' or 'real'"):
+        EmulatedBoard(other, clock="none")  # type: ignore[arg-type]
+
+
+def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(SettingError, match=r"arm-none-eabi-gcc.*apt-get install"):
+        build_firmware(ROOT)
+
+
+@needs_board
+def test_an_emulator_that_ends_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = tmp_path / "qemu-system-arm"
+    broken.write_text("#!/bin/sh\necho out of order >&2\nexit 1\n")
+    broken.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    with pytest.raises(LinkError, match="out of order"):
+        EmulatedBoard(FIRMWARE)
