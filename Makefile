@@ -23,7 +23,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors fleet studio bits bode notches physics killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors fleet fuzz-logs studio bits bode notches physics killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -61,6 +61,9 @@ fleet: $(DEV) ## 2,000 recordings on one worker and on two, and with a worker ki
 
 studio: $(DEV) ## the studio in a real browser: from a slider's event to painted plots
 	$(BIN)/python benches/studio.py
+
+fuzz-logs: $(DEV) ## damaged logs of every format, refused or read (COUNT=100000; a tenth of it where a library reads)
+	SEWFAST_DAMAGED=$(or $(COUNT),100000) $(BIN)/python -m pytest tests/readers/test_logs.py -k damaged_log
 
 bits: $(DEV) ## deployed code against the core over ten million samples of every kind (an hour)
 	$(BIN)/python tests/support/deployed.py
@@ -112,6 +115,7 @@ python-test: $(DEV) ## pytest, with every snippet of the documentation and every
 	$(BIN)/python -m pytest -m alone
 
 docs: $(DEV) ## the site, in site/index.html; works offline
+	$(BIN)/python docs/build.py
 	$(BIN)/mkdocs build --strict --quiet
 
 # the wheel comes from the source archive alone and is imported where only numpy is installed

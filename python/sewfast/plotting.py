@@ -38,6 +38,8 @@ else:
 # --- Numbers as a reader likes them: few digits, a unit, a dash where there is none ---------------
 
 
+SHADE = "#e6e6e6"
+"""Of a range that a line may be in."""
 NONE = "–"
 _SPACE = "\N{NO-BREAK SPACE}"
 

@@ -86,8 +86,12 @@ def test_first_gains_are_quiet_where_eq_12_alone_would_wake_the_shaft() -> None:
     swing = swing_of(on.follow(wild, r, "wild"), settled)
     assert swing is not None
     assert swing.frequency == pytest.approx(60.0, rel=0.2)
-    quiet = first_gains(step, on, wanted, found.model)
+    quiet = first_gains(step, on, wanted, found)
     assert margins(quiet, found.model).Ms <= 2.0
+    assert [b.kind for b in quiet.biquads] == ["notch"]
+    # it allows more than gains that are lowered alone
+    plain = lowered(wild, found.model, 2.0)
+    assert quiet.gains.to("parallel").Ki > 1.2 * plain.gains.to("parallel").Ki
     assert swing_of(on.follow(quiet, r, "quiet"), settled) is None
 
 

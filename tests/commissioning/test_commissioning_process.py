@@ -26,10 +26,9 @@ from sewfast import (
     commission,
     read_table,
 )
-from sewfast.commissioning import Followed
 from sewfast.commissioning.result import Taken, prepare, require_own
 from sewfast.control.loop import run as closed_loop
-from sewfast.control.machine import MachineBench, record
+from sewfast.control.machine import MachineBench, RecordedRun, Watch, record
 from sewfast.dataset import FloatArray
 from sewfast.link import VirtualDevice
 from sewfast.recordfile import read_recording
@@ -224,26 +223,51 @@ class Trips(MachineBench):
         self._next(name)
         return super().excite(u, name)
 
-    def follow(self, controller: Controller, r: FloatArray, name: str) -> Followed:
+    def follow(
+        self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
+    ) -> RecordedRun:
         self._next(name)
-        return super().follow(controller, r, name)
+        return super().follow(controller, r, name, watch=watch)
 
 
-@pytest.mark.parametrize("at", ["step", "pulses", "levels", "chirp_lo_hi"])
-def test_it_goes_on_after_a_trip_to_the_same_controller(tmp_path: Path, at: str) -> None:
+@pytest.fixture(scope="module")
+def whole() -> tuple[Commissioning, list[str]]:
+    """One that nothing interrupts, and what it played."""
+    machine = Trips(None)
     with short():
-        whole = Trips(None)
-        expected = commission(whole, **SMALL)
-        tripping, again = Trips(at), Trips(None)
+        found = commission(machine, **SMALL)
+    return found, machine.played  # type: ignore[attr-defined]
+
+
+PLAYED = (
+    "motion_1", "step", "small_signals", "pulses", "hold_first_50", "trapezoids", "levels",
+    "hold_tuned_50", "trapezoid", "chirp_lo_hi",
+)  # fmt: skip
+"""Of every stage that moves the machine."""
+
+
+@pytest.mark.parametrize("at", [*PLAYED, "training", "tuning"])
+def test_it_goes_on_after_a_trip_to_the_same_controller(
+    whole: tuple[Commissioning, list[str]], tmp_path: Path, at: str
+) -> None:
+    expected, played = whole
+    tripping, again = Trips(at), Trips(None)
+
+    def fails(done: int, total: int, stage: str) -> None:
+        if at not in PLAYED and stage.startswith(f"{at} "):
+            raise LinkError(f"{at}: the cable fell out")
+
+    with short():
         with pytest.raises(LinkError, match="fell out"):
-            commission(tripping, **SMALL, folder=tmp_path)
+            commission(tripping, **SMALL, folder=tmp_path, progress=fails)
         found = commission(again, **SMALL, folder=tmp_path, resume=True)
     assert expected.controller is not None
     assert found.controller is not None
     assert found.controller.to_dict() == expected.controller.to_dict()
     assert found.measured_cost == expected.measured_cost
     # nothing is recorded twice but what had failed
-    assert tripping.played[:-1] + again.played == whole.played  # type: ignore[attr-defined]
+    first = tripping.played[: -1 if at in PLAYED else None]  # type: ignore[attr-defined]
+    assert first + again.played == played  # type: ignore[attr-defined]
 
 
 def test_what_was_recorded_under_other_settings_is_not_taken(tmp_path: Path) -> None:

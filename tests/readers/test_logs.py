@@ -126,6 +126,122 @@ def _ros(path: Path, version: str) -> Path:
     return next(folder.glob("*.mcap"))
 
 
+HEADER = """\
+H Product:Blackbox flight data recorder by Nicholas Sherlock
+H Data version:2
+H I interval:32
+H P interval:1/2
+H Field I name:loopIteration,time,axisP[0],axisP[1],axisP[2],rc[0],rc[1],rc[2],rc[3],vbat,motor[0],motor[1],u,y,debug
+H Field I signed:0,0,1,1,1,1,1,1,0,0,0,0,1,1,0
+H Field I predictor:0,0,0,0,0,0,0,0,4,9,11,5,0,0,0
+H Field I encoding:1,1,0,0,0,0,0,0,1,3,1,0,0,0,1
+H Field P predictor:6,2,1,1,1,1,1,1,1,1,3,3,1,1,1
+H Field P encoding:9,0,7,7,7,8,8,8,8,6,6,6,6,6,0
+H Field S name:flightModeFlags,stateFlags
+H Field S signed:0,0
+H Field S predictor:0,0
+H Field S encoding:1,1
+H minthrottle:1070
+H vbatref:1600
+H motorOutput:158,2047
+"""  # noqa: E501
+"""As a flight controller writes it, with the fields `u` and `y` of a drive for once."""
+COUNTS = RNG.integers(-1000, 1000, (200, 13))
+COUNTS[:, [6, 7, 8, 9, 12]] = np.abs(COUNTS[:, [6, 7, 8, 9, 12]]) + 1070
+
+
+def unsigned(value: int) -> bytes:
+    out = b""
+    while value > 127:
+        out, value = out + bytes([value & 127 | 128]), value >> 7
+    return out + bytes([value])
+
+
+def signed(value: int) -> bytes:
+    return unsigned((value << 1) ^ (value >> 31) if value >= 0 else ((-value) << 1) - 1)
+
+
+def halves(values: list[int]) -> bytes:
+    """TAG8_4S16, version 2: a selector, then 0, 4, 8 or 16 bits of each."""
+    kinds = [0 if v == 0 else 1 if -8 <= v < 8 else 2 if -128 <= v < 128 else 3 for v in values]
+    digits = "".join(
+        f"{v & 15:x}" if k == 1 else f"{v & 255:02x}" if k == 2 else f"{v & 65535:04x}" if k else ""
+        for v, k in zip(values, kinds, strict=True)
+    )
+    selector = sum(k << 2 * i for i, k in enumerate(kinds))
+    return bytes([selector]) + bytes.fromhex(digits + "0" * (len(digits) % 2))
+
+
+def triple(values: list[int], k: int) -> bytes:
+    """TAG2_3S32 in the smallest form that holds the values."""
+    if all(-2 <= v < 2 for v in values):
+        return bytes([sum((v & 3) << s for v, s in zip(values, (4, 2, 0), strict=True))])
+    if all(-8 <= v < 8 for v in values):
+        return bytes([64 | values[0] & 15, (values[1] & 15) << 4 | values[2] & 15])
+    if all(-32 <= v < 32 for v in values):
+        return bytes([128 | values[0] & 63, values[1] & 63, values[2] & 63])
+    sizes = [1 if -128 <= v < 128 else 2 for v in values]
+    lead = 192 | sum((n - 1) << 2 * i for i, n in enumerate(sizes))
+    return bytes([lead]) + b"".join(
+        v.to_bytes(n, "little", signed=True) for v, n in zip(values, sizes, strict=True)
+    )
+
+
+def tagged(values: list[int]) -> bytes:
+    """TAG8_8SVB: a bit for each field that is not 0."""
+    tag = sum((v != 0) << i for i, v in enumerate(values))
+    return bytes([tag]) + b"".join(signed(v) for v in values if v)
+
+
+def blackbox_rows() -> list[list[int]]:
+    """What the log below holds: loop, time, then the counts; the first three rows hardly change."""
+    counts = COUNTS.copy()
+    counts[1] = counts[0]
+    counts[2] = counts[0] + 1
+    counts[3] = counts[2] + RNG.integers(-7, 7, 13)
+    times = [round(t * 1e6) for t in T]
+    return [[2 * k, times[k], *map(int, counts[k])] for k in range(200)]
+
+
+ROWS = blackbox_rows()
+
+
+def average(a: int, b: int) -> int:
+    return int((a + b) / 2)
+
+
+def blackbox(path: Path) -> Path:
+    raw = HEADER.encode()
+    for k, row in enumerate(ROWS):
+        if row[0] % 32 == 0:
+            motor = row[10]
+            raw += b"I" + unsigned(row[0]) + unsigned(row[1])
+            raw += b"".join(signed(v) for v in row[2:8])
+            raw += unsigned(row[8] - 1070) + unsigned((1600 - row[9]) & 0x3FFF)
+            raw += unsigned(motor - 158) + signed(row[11] - motor)
+            raw += signed(row[12]) + signed(row[13]) + unsigned(row[14])
+            one = two = row
+        else:
+            change = [new - old for new, old in zip(row, one, strict=True)]
+            raw += b"P" + signed(row[1] - (2 * one[1] - two[1]))
+            raw += triple(change[2:5], k) + halves(change[5:9])
+            motors = [row[i] - average(one[i], two[i]) for i in (10, 11)]
+            raw += tagged([change[9], *motors, change[12], change[13]]) + signed(change[14])
+            one, two = row, one
+        if k == 0:
+            raw += b"S" + unsigned(5) + unsigned(1)
+        if k == 50:
+            raw += b"E\x1e" + unsigned(3) + unsigned(5) + b"S" + unsigned(7) + unsigned(300)
+    path.write_bytes(raw + b"E\xffEnd of log\0")
+    return path
+
+
+def saleae(path: Path) -> Path:
+    head = struct.pack("<8siidQQQ", b"<SALEAE>", 0, 1, 10.0, 1000, 2, 200)
+    path.write_bytes(head + U.astype("<f4").tobytes())
+    return path
+
+
 KINDS: dict[str, tuple[Callable[[Path], Path], str, str]] = {
     "run.mf4": (mdf, "u", "y"),
     "run.tdms": (tdms, "u", "y"),
@@ -145,6 +261,79 @@ def test_values_are_those_that_were_written(name: str, tmp_path: Path) -> None:
     data = sewfast.read(table, inputs=u, output=y)
     assert data.Ts == pytest.approx(0.002, rel=1e-6)
     np.testing.assert_array_equal(data.experiments[0].y, Y)
+
+
+def test_a_black_box_holds_what_was_written(tmp_path: Path) -> None:
+    """Every encoding and predictor that flight controllers use, in each of its forms."""
+    table = read_table(blackbox(tmp_path / "run.bbl"))
+    rows = np.array(ROWS)
+    names = HEADER.split("Field I name:")[1].split("\n")[0].replace("[", ".").replace("]", "")
+    for k, name in enumerate(names.split(",")):
+        if name != "time":
+            np.testing.assert_array_equal(table[name], rows[:, k], err_msg=name)
+    np.testing.assert_allclose(table["t"], T - T[0], atol=1e-9)
+    np.testing.assert_array_equal(table["flightModeFlags"], [0] + 50 * [5] + 149 * [7])
+    data = sewfast.read(table, inputs="u", output="y")
+    assert data.Ts == pytest.approx(0.002)
+
+
+def test_a_black_box_is_read_as_orangebox_reads_it(tmp_path: Path) -> None:
+    orangebox = pytest.importorskip("orangebox")
+    path = blackbox(tmp_path / "run.bbl")
+    parser = orangebox.Parser.load(str(path))
+    # before the first slow frame it has texts
+    theirs = np.array([[float(v or 0) for v in frame.data] for frame in parser.frames()])
+    table = read_table(path)
+    names = [n.replace("[", ".").replace("]", "") for n in parser.field_names]
+    ours = np.column_stack([table[n] for n in names if n != "time"])
+    np.testing.assert_array_equal(ours, np.delete(theirs, names.index("time"), axis=1))
+
+
+def test_a_black_box_goes_on_behind_what_is_damaged(tmp_path: Path) -> None:
+    raw = bytearray(blackbox(tmp_path / "run.bbl").read_bytes())
+    at = len(raw) // 2
+    raw[at : at + 40] = b"\x00" * 40
+    (tmp_path / "run.bbl").write_bytes(raw)
+    found = read_table(tmp_path / "run.bbl")
+    kept = set(map(int, found["loopIteration"]))
+    written = {row[0]: row for row in ROWS}
+    assert 150 <= len(kept & written.keys()) < 200
+    rows = {int(k): v for k, v in zip(found["loopIteration"], found["y"], strict=True)}
+    wrong = sum(rows[k] != written[k][13] for k in kept & written.keys())
+    assert wrong <= 1, "a frame that ends where another begins cannot be told from a sound one"
+
+
+def test_of_several_flights_the_longest_is_read(tmp_path: Path) -> None:
+    whole = blackbox(tmp_path / "run.bbl").read_bytes()
+    (tmp_path / "run.bbl").write_bytes(whole[: len(whole) // 3] + whole + whole[: len(whole) // 2])
+    assert len(read_table(tmp_path / "run.bbl")["y"]) == 200
+
+
+def test_saleae_analogue_values_are_exact(tmp_path: Path) -> None:
+    table = read_table(saleae(tmp_path / "analog_0.bin"))
+    np.testing.assert_array_equal(table["voltage"], U.astype("<f4").astype(float))
+    np.testing.assert_allclose(table["t"], 0.002 * np.arange(200), atol=1e-12)
+    assert table.unit("voltage") == "V"
+
+
+@pytest.mark.parametrize(
+    ("head", "words"),
+    [
+        ((0, 0, 10.0, 1000, 2, 200), "a digital channel"),
+        ((1, 1, 10.0, 1000, 2, 200), "version 1"),
+        ((0, 1, 10.0, 0, 2, 200), "a sample rate of 0"),
+        ((0, 1, float("nan"), 1000, 2, 200), "a sample rate"),
+        ((0, 1, 10.0, 1000, 2, 201), "201 samples are promised, 200 are there"),
+        ((0, 1, 10.0, 1000, 2, 2**63), "are promised"),
+    ],
+)
+def test_other_saleae_files_are_refused(
+    tmp_path: Path, head: tuple[float, ...], words: str
+) -> None:
+    raw = struct.pack("<8siidQQQ", b"<SALEAE>", *head) + U.astype("<f4").tobytes()
+    (tmp_path / "a.bin").write_bytes(raw)
+    with pytest.raises(DataError, match=words):
+        read_table(tmp_path / "a.bin")
 
 
 @pytest.mark.parametrize("name", ["run.mf4", "run.tdms"])
@@ -194,15 +383,20 @@ def test_a_log_that_was_cut_off_keeps_what_came(tmp_path: Path) -> None:
     np.testing.assert_array_equal(table["u"], U[:count])
 
 
-@pytest.mark.parametrize("name", KINDS)
+OWN = ("run.wpilog", "run.bbl", "run.bin")
+"""Read here and not by a library in a process of its own."""
+
+
+@pytest.mark.parametrize("name", [*KINDS, "run.bbl", "run.bin"])
 def test_a_damaged_log_is_refused_or_read(name: str, tmp_path: Path) -> None:
     """Cut, flipped, filled: a table or a DataError, nothing else."""
-    raw = KINDS[name][0](tmp_path / name).read_bytes()
+    make = {"run.bbl": blackbox, "run.bin": saleae} | {n: kind[0] for n, kind in KINDS.items()}
+    raw = make[name](tmp_path / name).read_bytes()
     rng = np.random.default_rng(1)
     place = tmp_path / f"damaged-{name}"
     outcomes = set()
     # a reader in a process of its own takes a second to start
-    for _ in range(DAMAGED if name == "run.wpilog" else DAMAGED // 10):
+    for _ in range(DAMAGED if name in OWN else DAMAGED // 10):
         content = bytearray(raw)
         for at in rng.integers(8, len(raw), rng.integers(1, 30)):
             content[at] = rng.integers(0, 256)

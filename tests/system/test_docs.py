@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +16,7 @@ from sewfast.cli.parser import build_parser
 from terminal import Terminal
 
 ROOT = Path(__file__).resolve().parents[2]
+BUILD = runpy.run_path(str(ROOT / "docs" / "build.py"))
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
 _URL = r"""=["']?(?:https?:)?//"""
 _ELSEWHERE = (
@@ -83,6 +86,7 @@ def test_links_of_a_page_lead_somewhere(page: Path) -> None:
 
 def test_site_builds_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs", reason="needs the docs extra")
+    subprocess.run([sys.executable, ROOT / "docs" / "build.py"], check=True)
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path)],
         cwd=ROOT,
@@ -98,3 +102,57 @@ def test_site_builds_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
     help_page = (tmp_path / "cli.html").read_text(encoding="utf-8")
     assert "&lt;!-- help" not in help_page
     assert "--counts-per-rev" in help_page
+    theory = (tmp_path / "theory.html").read_text(encoding="utf-8")
+    assert 'id="equation-2"' in theory
+    assert "<mfrac>" in theory
+    assert "$$" not in theory
+    for name in BUILD["NOTEBOOKS"]:
+        assert (tmp_path / "notebooks" / f"{name}.ipynb").is_file()
+
+
+def test_the_navigation_is_short() -> None:
+    """Five groups by task, none with more than twelve entries; every page is in one of them."""
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    listed = text[text.index("nav:") : text.index("markdown_extensions:")]
+    groups = re.split(r"^  - ", listed, flags=re.MULTILINE)[1:]
+    entries = [re.findall(r"(\S+\.md)$", group, re.MULTILINE) for group in groups]
+    assert len(groups) <= 12
+    assert max(map(len, entries)) <= 12
+    assert sorted(itertools.chain(*entries)) == sorted(p.name for p in (ROOT / "docs").glob("*.md"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
+def test_commands_and_code_fit_their_column(page: Path) -> None:
+    """A page is 110 characters wide at 1,280 pixels; what is typed is not to be broken there.
+
+    What a command prints goes on below itself (docs/assets/tables.css).
+    """
+    for block in blocks(page):
+        typed = "\n".join(_typed(block)) if block.language == "console" else block.text
+        for line in typed.splitlines() if block.language in ("console", "python", "sh") else ():
+            assert len(line) <= 108, f"{page.name}: {line}"
+
+
+def test_a_notebook_has_the_code_of_its_page() -> None:
+    nbformat = pytest.importorskip("nbformat", reason="needs the docs extra")
+    for name in BUILD["NOTEBOOKS"]:
+        page = ROOT / "docs" / f"{name}.md"
+        made = nbformat.reads(BUILD["notebook"](page.read_text(encoding="utf-8")), 4)
+        code = [cell.source for cell in made.cells if cell.cell_type == "code"]
+        expected = [
+            b.text.rstrip() if b.language == "python" else "\n".join(f"!{c}" for c in _typed(b))
+            for b in blocks(page) if b.language in ("python", "console")
+        ]  # fmt: skip
+        assert code == expected
+
+
+def _typed(block: Block) -> list[str]:
+    return re.findall(r"^\$ ((?:.*\\\n)*.*)$", block.text, re.MULTILINE)
+
+
+def test_formulas_are_numbered_and_examples_are_left_alone() -> None:
+    pytest.importorskip("latex2mathml", reason="needs the docs extra")
+    shown = BUILD["complete"]("$$\nx^2 \\tag{7}\n$$\n```text\n$$\ny\n$$\n```\n")
+    assert '<div class="formula" id="equation-7"><math' in shown
+    assert "(7)</span></div>" in shown
+    assert "```text\n$$\ny\n$$\n```" in shown

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from ..errors import SettingError, SewfastError
+from . import project
 from .drive import is_port
 from .parser import build_parser
 
@@ -32,13 +33,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 done, 1 a fault in sewfast, 2 refused, 130 interrupted.
     """
     try:
-        args = build_parser().parse_args(argv)
+        args = _parsed(argv)
     except KeyboardInterrupt:
         return _say("sewfast: interrupted; nothing was written", INTERRUPTED)
     except SewfastError as e:
         return _say(f"sewfast: {e}", REFUSED)
     began = time.time()
     try:
+        if args.out_of is not None and args.out is None:
+            args.out = args.out_of(args)
         require_apart(args)
         code: int | None = args.command(args)
         if sys.stdout is not None:  # as it is where it was closed before the start
@@ -64,6 +67,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     except Exception as e:
         return _fault(args, e)
+
+
+def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
+    """The command line, with what the project file says where that says nothing."""
+    parser = build_parser()
+    try:
+        found = project.find()
+    except SewfastError:
+        # help is to be had with a faulty file, too; any command then says what is wrong with it
+        parser.parse_args(argv)
+        raise
+    found.relax(parser)
+    args = parser.parse_args(argv)
+    found.fill(args)
+    return args
 
 
 def _interrupted(args: argparse.Namespace, began: float) -> str:

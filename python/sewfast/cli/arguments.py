@@ -35,12 +35,13 @@ def add_command(
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     parser.add_argument("--debug", action="store_true", help="show where a fault comes from")
-    parser.set_defaults(command=command)
+    parser.set_defaults(command=command, out_of=None)
     return parser
 
 
 def add_columns(parser: argparse.ArgumentParser, *, from_model: bool) -> None:
     """Which columns of a recording are input and output, and how it is sampled."""
+    parser.set_defaults(columns_of="model" if from_model else "file")
     default = "; default: as stored in the model" if from_model else ""
     parser.add_argument(
         "--input", action="append", metavar="COL",
@@ -101,6 +102,22 @@ def add_output(
     parser: argparse.ArgumentParser, metavar: str, help: str, *, required: bool = False
 ) -> None:
     parser.add_argument("-o", dest="out", metavar=metavar, type=Path, required=required, help=help)
+
+
+def add_named_output(parser: argparse.ArgumentParser, what: str, source: str, help: str) -> None:
+    """An output that is named after the first file of an argument: `run.csv` -> `run-WHAT.json`.
+
+    It lies in the working folder, wherever that file does. A model's own `-model` goes.
+    """
+
+    def named(args: argparse.Namespace) -> Path:
+        from ..readers import parse_source
+
+        first, _, _ = parse_source(getattr(args, source)[0])
+        return Path(f"{Path(first).stem.removesuffix('-model')}-{what}.json")
+
+    add_output(parser, f"{what.upper()}.json", f"{help}; default: FILE-{what}.json")
+    parser.set_defaults(out_of=named)
 
 
 def add_overwrite(parser: argparse._ActionsContainer) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import DataError, SettingError
 from .arguments import Commands, add_columns, add_command, add_plot, require_plot
 from .output import print_json, print_result
+from .project import with_units
 
 if TYPE_CHECKING:
     from ..dataset import ColumnSummary, Dataset
@@ -25,14 +26,17 @@ def read_training(args: argparse.Namespace, channels: Sequence[str] = ()) -> Dat
 
 
 def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) -> Dataset:
-    from ..readers import parse_source, read, read_table
+    from ..readers import parse_source, read, read_table, roles
 
     path, inputs, output = parse_source(source)
-    table = read_table(path)
+    table = with_units(read_table(path), args)
     inputs, output = inputs or tuple(args.input or ()), output or args.output
     counts = args.counts
     if table.counts_per_rev is not None:
         inputs, counts = _of_recording(table, inputs, output, counts)
+    if not inputs and not output and not counts and (found := roles(table)) is not None:
+        inputs, output = (found.input,), found.output
+        print(f"{path}: input {found.input}, output {found.output}", file=sys.stderr)
     if not inputs:
         raise _unnamed(table, "input", "--input COL")
     if not output and not counts:
@@ -93,7 +97,7 @@ def read_for_model(
     from ..readers import parse_source, read, read_table
 
     path, inputs, output = parse_source(source)
-    table = read_table(path)
+    table = with_units(read_table(path), args)
     columns = model.columns
     columns["inputs"] = inputs or args.input or columns["inputs"]
     columns |= _output_columns(output or args.output, args, columns)
@@ -334,7 +338,7 @@ def _unnamed_columns(args: argparse.Namespace) -> list[Table]:
     sources = [parse_source(source) for source in args.data]
     if any(inputs or output for _, inputs, output in sources):
         return []
-    tables = [read_table(path) for path, _, _ in sources]
+    tables = [with_units(read_table(path), args) for path, _, _ in sources]
     return [] if all(t.counts_per_rev is not None for t in tables) else tables
 
 

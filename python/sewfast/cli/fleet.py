@@ -39,7 +39,8 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--input", action="append", metavar="COL", help="column of the input (u); repeat it"
     )
-    parser.add_argument("--output", default="y", metavar="COL", help="column of the output (y)")
+    parser.add_argument("--output", metavar="COL", help="column of the output (y)")
+    parser.set_defaults(columns_of="file", counts=None)
     parser.add_argument(
         "--ts", "--Ts", type=float, metavar="S", help="sample time [s]; default: the time column's"
     )
@@ -69,7 +70,7 @@ def fleet_command(args: argparse.Namespace) -> None:
         found = fleet(
             args.recordings,
             inputs=args.input or "u",
-            output=args.output,
+            output=args.output or "y",
             Ts=args.ts,
             model=args.model,
             controller=controller,

@@ -14,6 +14,7 @@ from .arguments import (
     Commands,
     add_columns,
     add_command,
+    add_named_output,
     add_output,
     add_plot,
     add_split,
@@ -114,6 +115,9 @@ tune a controller on, and what to do next.
 
 EXAMPLES = """\
 examples:
+  sewfast identify run.csv
+      input and output by their names and units; the model goes to run-model.json
+
   sewfast identify run.csv --input u --output speed -o drive.json
       columns u and speed [unit from the header], sample time from the column t
 
@@ -170,7 +174,7 @@ def add(commands: Commands) -> None:
         "last fifth is held out to choose, and learned from in the end",
     )  # fmt: skip
     add_plot(parser, "draw the free run on the data held out, else on the training data")
-    add_output(parser, "MODEL.json", "model file to write", required=True)
+    add_named_output(parser, "model", "data", "model file to write")
 
 
 def _add_model(parser: argparse.ArgumentParser) -> None:

@@ -22,6 +22,7 @@ from . import (
     identify,
     physics,
     pil,
+    project,
     recording,
     studio,
     tune,
@@ -113,6 +114,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     # in the order in which the help shows them
     makers = (
+        project.add,
         commission.add_demo,
         commission.add,
         recording.add,

@@ -13,7 +13,7 @@ from .arguments import (
     TABLES,
     Commands,
     add_command,
-    add_output,
+    add_named_output,
     add_plot,
     require_place,
     require_plot,
@@ -123,7 +123,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     _add_search(parser)
     add_plot(parser, "draw the tuned loop beside the start's; of --pareto the front")
-    add_output(parser, "CONTROLLER.json", "controller file to write", required=True)
+    add_named_output(parser, "controller", "model", "controller file to write")
 
 
 def _add_search(parser: argparse.ArgumentParser) -> None:

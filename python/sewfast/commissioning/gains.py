@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .. import _core
+from ..control.biquad import Biquad
 from ..control.controller import Controller
 from ..control.loop import ClosedLoopRun, run
 from ..control.machine import Machine
@@ -27,7 +28,7 @@ from ..tuning.search import TuningResult, costs, recoveries, tune
 from .demands import Demands, Refusal
 from .excitations import pace_of
 from .slow import Thinning
-from .small_signal import SHAKEN_AT, SmallSignal
+from .small_signal import SHAKEN_AT, Resonance, SmallSignal
 
 # --- Gains: first ones by rule from the step response, then by search on the ensemble -------------
 
@@ -41,6 +42,10 @@ LOWER, STEPS = 0.85, 29
 """Factor by which gains are lowered, and how often."""
 SEARCHED = ("Kp", "Ti", "Td", "alpha", "beta", "N", "filter_samples", "filter_time")
 """What is searched: the feedback's filter is worth as much as the gains."""
+NOTCH_DEPTHS, NOTCH_WIDTHS = (0.05, 0.2), (0.3, 0.6, 1.2)
+"""Of a notch among which the first one is chosen; the search goes on from there."""
+WORTH = 1.2
+"""Times the integral gain without it, that a notch has to allow."""
 ALPHAS, BETAS = (0.0, 0.1, 0.2, 0.4), (-1.0, 0.0, 0.5)
 """Among which the search's start is chosen."""
 RATIOS = (0.01, 2.0)
@@ -48,12 +53,12 @@ RATIOS = (0.01, 2.0)
 
 
 def first_gains(
-    fopdt: Fopdt, bench: Machine, demands: Demands, plant: Model | None = None
+    fopdt: Fopdt, bench: Machine, demands: Demands, small: SmallSignal | None = None
 ) -> Controller:
     """Gains by Eq. 12 with a limit of Ms; the feedback filter's delay counts as dead time.
 
-    Where a linear `plant` shows more than first order with dead time, a resonance above all, the
-    gains are lowered until its Ms is within the limit, too.
+    Where the small signals show more than first order with dead time, the gains are lowered until
+    the Ms of their model is within the limit, too; where that has a resonance, with a notch there.
     """
     samples = max(1, min(64, round(FILTER / bench.Ts)))
     rule = _rule(fopdt, (samples - 1) / 2 * bench.Ts, FIRST_MS)
@@ -69,7 +74,40 @@ def first_gains(
         counts_per_rev=bench.counts_per_rev,
         notes=f"{rule.name} on the recorded step response",
     )
-    return found if plant is None else lowered(found, plant, SAFE_MS)
+    if small is None:
+        return found
+    if small.resonance is None:
+        return lowered(found, small.model, SAFE_MS)
+    return notched(found, small.model, small.resonance, SAFE_MS)
+
+
+def notched(controller: Controller, plant: Model, resonance: Resonance, Ms: float) -> Controller:
+    """The controller lowered to this Ms, with the notch on the resonance that leaves most of it.
+
+    What is left is measured by the integral gain, which fights disturbances down. A notch that
+    is not worth it costs phase for nothing and is left out.
+    """
+    tried = [()] + [
+        (Biquad.notch(resonance.frequency, depth, width),)
+        for depth, width in product(NOTCH_DEPTHS, NOTCH_WIDTHS)
+    ]
+    found: list[Controller] = []
+    refused: Refusal | None = None
+    for biquads in tried:
+        try:
+            found.append(lowered(replace(controller, biquads=biquads), plant, Ms))
+        except Refusal as refusal:
+            refused = refused or refusal
+    if not found:
+        assert refused is not None
+        raise refused
+    best = max(found, key=_integral)
+    plain = next((c for c in found if not c.biquads), None)
+    return best if plain is None or _integral(best) >= WORTH * _integral(plain) else plain
+
+
+def _integral(controller: Controller) -> float:
+    return abs(controller.gains.to("parallel").Ki)
 
 
 def lowered(controller: Controller, plant: Model, Ms: float) -> Controller:
@@ -200,7 +238,7 @@ def search(
             models,
             list(references.values()),
             start=start,
-            variables=SEARCHED,
+            variables=[*SEARCHED, "notches"] if start.biquads else SEARCHED,
             cost=cost,
             constraints=asked.constraints,
             loads=asked.loads,

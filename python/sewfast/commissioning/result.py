@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -94,6 +96,9 @@ class Commissioning:
         What speaks against the loops as predicted.
     comparisons : tuple of Comparison
         Predicted and measured, per reference.
+    margins : mapping or None
+        Of a machine with a resonance: `predicted` by its small signals and `measured` on it, at
+        `speed` [RPM]: `Ms`, `phase_margin_deg`, `gain_margin`.
     sample_time : float or None
         Of what is simulated [s]: for a slow drive a multiple of the machine's.
     notes : tuple of str
@@ -125,6 +130,7 @@ class Commissioning:
     card: ReportCard | None = None
     judgement: Judgement | None = None
     comparisons: tuple[Comparison, ...] = ()
+    margins: Mapping[str, Any] | None = None
     sample_time: float | None = None
     notes: tuple[str, ...] = ()
     taken_in: Path | None = None
@@ -284,9 +290,25 @@ def _evidence(c: Commissioning) -> list[str]:
         lines.append(
             f"  load of {volt:.3g} V   recovery {tuned:.0f} ms at most, by Eq. 12 {rule:.0f} ms"
         )
+    if c.margins is not None:
+        lines.append(_margins(c.margins))
     if c.judgement is not None:
         lines.append(f"  loops          {c.judgement.verdict}{_named(c.judgement.lines)}")
     return lines
+
+
+def _margins(found: Mapping[str, Any]) -> str:
+    one, other = found["predicted"], found["measured"]
+
+    def db(share: float) -> str:
+        return f"{20.0 * math.log10(share):.3g}" if math.isfinite(share) else "inf"
+
+    return (
+        f"  margins        at {found['speed']:.4g} RPM predicted / measured: Ms {one['Ms']:.3g} / "
+        f"{other['Ms']:.3g}, phase {one['phase_margin_deg']:.3g} / "
+        f"{other['phase_margin_deg']:.3g} deg, gain {db(one['gain_margin'])} / "
+        f"{db(other['gain_margin'])} dB"
+    )
 
 
 def _named(lines: Sequence[Line]) -> str:
@@ -331,10 +353,20 @@ class Journal:
     ----------
     machine : str
     progress : callable or None
+    cancel : threading.Event or None
+    between : callable or None
+        See `commission`.
     """
 
-    def __init__(self, machine: str, progress: Progress | None) -> None:
+    def __init__(
+        self,
+        machine: str,
+        progress: Progress | None,
+        cancel: threading.Event | None = None,
+        between: Callable[[str, Commissioning], object] | None = None,
+    ) -> None:
         self._progress = progress
+        self._cancel, self._between = cancel, between
         self._began: list[tuple[str, float]] = []
         self._values: dict[str, Any] = {"machine": machine, "recordings": {}}
 
@@ -365,9 +397,29 @@ class Journal:
         # begun before it is told: whoever is told may stop
         self._began.append((stage, time.perf_counter()))
         self._tell(STAGES.index(stage), stage)
+        self.pause(stage)
+        # a person's time is not the stage's
+        self._began[-1] = (stage, time.perf_counter())
+
+    def pause(self, following: str) -> None:
+        """Say what comes next, with what there is; whoever listens may take time over it."""
+        if self._between is not None:
+            self._between(following, self.result("under way"))
+        self.heed()
+
+    def heed(self) -> None:
+        """End where that was asked for.
+
+        Raises
+        ------
+        KeyboardInterrupt
+        """
+        if self._cancel is not None and self._cancel.is_set():
+            raise KeyboardInterrupt
 
     def within(self, done: int, total: int) -> None:
         """Tell how far the stage is."""
+        self.heed()
         self._tell(STAGES.index(self.stage), f"{self.stage} {done}/{total}")
 
     def finish(self) -> None:
@@ -620,6 +672,7 @@ def numbers(c: Commissioning) -> dict[str, Any]:
         },
         "cost": None if c.cost is None else dict(vars(c.cost)),
         "met": None if c.met is None else dict(c.met),
+        "margins": _finite(c.margins),
         "evidence": {
             name: {"verdict": judged.verdict, "lines": [x.to_json() for x in judged.lines]}
             for name, judged in (("report card", c.card), ("closed loops", c.judgement))
@@ -629,6 +682,21 @@ def numbers(c: Commissioning) -> dict[str, Any]:
         "measured_cost": c.measured_cost,
         "references": {x.reference: _comparison(x) for x in c.comparisons},
     }
+
+
+def _finite(found: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Numbers of JSON: an infinite margin is null."""
+    if found is None:
+        return None
+
+    def one(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {name: one(x) for name, x in value.items()}
+        if isinstance(value, list):
+            return [one(x) for x in value]
+        return value if math.isfinite(value) else None
+
+    return {name: one(value) for name, value in found.items()}
 
 
 def _small_signals(c: Commissioning) -> dict[str, Any] | None:

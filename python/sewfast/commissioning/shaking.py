@@ -151,6 +151,7 @@ def bode(
 AGAIN, LEAST_SHAKEN = 0.5, 0.2
 """What is left of the amplitude where the command came to a limit; the least share of it."""
 MARGINS = ("Ms", "phase_margin_deg", "gain_margin")
+UNBOUNDED = 1e6
 
 
 def margins_at_work(
@@ -159,7 +160,8 @@ def margins_at_work(
     """Margins of a loop as a linear plant predicts them and as the machine shows them at a speed.
 
     The reference is shaken by a multisine, half a minute in all. None where the answer is too
-    small, or the command comes to its limits however little it is shaken.
+    small, the command comes to its limits however little it is shaken, or the machine cannot be
+    shaken at that speed.
     """
     share = 1.0
     while share >= LEAST_SHAKEN:
@@ -172,12 +174,16 @@ def margins_at_work(
         except DataError:
             share *= AGAIN
             continue
+        except SettingError:
+            # a machine or a sample time that cannot be shaken so
+            return None
         predicted = margins(controller, plant, speed=speed)
         return {
             "speed": speed,
             "predicted": {name: getattr(predicted, name) for name in MARGINS},
             "measured": {name: getattr(measured, name) for name in MARGINS}
-            | {"Ms_band": list(measured.Ms_band)},
+            # a circle that holds -1 bounds nothing
+            | {"Ms_band": [x if x < UNBOUNDED else math.inf for x in measured.Ms_band]},
         }
     return None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ from ..evidence.operating import OperatingPoint, operating_range, point_at_level
 from ..gains import Gains, real, vector
 from ..models import Model
 from ..models.conversion import from_state_space, polynomials_of, transfer_function
+from ..plotting import SHADE, html_of, legend, stacked
 from ..rules import Fopdt
 from .controller import Controller
 from .loop import plant_units, require_controller, require_units
@@ -255,6 +257,63 @@ class Margins:
     def to_dict(self) -> dict[str, Any]:
         """Everything by name."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
+        """Draw the margins in the plane of the loop transfer L.
+
+        L stays outside the circle of radius 1/Ms about -1. Arrows lead from -1 to where L may come
+        to on the real axis (gain) and on the unit circle (phase) before the loop is unstable.
+
+        Parameters
+        ----------
+        ax : Axes or sequence of Axes, optional
+            One panel.
+        file : path, optional
+            Where to write the figure: PNG, SVG or PDF by its ending.
+
+        Returns
+        -------
+        Axes or array of Axes
+            `ax`, or the panels of a new figure.
+
+        Raises
+        ------
+        SettingError
+            Where the loop is unstable, matplotlib is not installed, or the file cannot be written.
+        """
+        if not self.stable:
+            raise SettingError(
+                "expected the margins of a stable loop, received those of an unstable one, which "
+                "has none to draw; lower the gains"
+            )
+        return stacked([self._draw], (4.0,)).plot(ax, file)
+
+    def _draw(self, ax: Any) -> None:
+        turn = np.linspace(0.0, 2.0 * np.pi, 361)
+        ax.plot(
+            np.cos(turn), np.sin(turn), color="gray", linewidth=0.8, linestyle=":", label="|L| = 1"
+        )
+        x, y = -1.0 + np.cos(turn) / self.Ms, np.sin(turn) / self.Ms
+        ax.fill(x, y, color=SHADE)
+        ax.plot(x, y, label=f"Ms {self.Ms:.3g}")
+        ax.plot(-1.0, 0.0, linestyle="none", marker="+", color="black", markersize=9)
+        for factor, name in ((self.gain_margin, "gain"), (self.gain_reduction, "gain, down to")):
+            if math.isfinite(factor) and factor > 0.0:
+                # what is drawn further out than this would make the rest too small to see
+                at = -min(1.0 / factor, 4.0)
+                ax.plot([-1.0, at], [0.0, 0.0], marker="o", label=f"{name} {factor:.3g}")
+        if math.isfinite(self.phase_margin_deg):
+            angle = -np.pi + np.linspace(0.0, math.radians(self.phase_margin_deg), 61)
+            label = f"phase {self.phase_margin_deg:.3g} deg"
+            ax.plot(np.cos(angle), np.sin(angle), linewidth=2.5, label=label)
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.set_xlabel("real part of L")
+        ax.set_ylabel("imaginary part of L")
+        legend(ax, columns=3)
+
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        return html_of(f"margins\n{self}")
 
     def __str__(self) -> str:
         if not self.stable:

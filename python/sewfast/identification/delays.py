@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ from .. import _core
 from ..dataset import Dataset, Experiment, FloatArray, require_dataset
 from ..dataset.experiment import in_effect
 from ..errors import DataError, FitError, SettingError
+from ..plotting import SHADE, html_of, lettered, stacked
 
 CHUNK = 4096
 DEPENDENT = 1e-10
@@ -197,11 +200,59 @@ class DelayEstimate:
         inputs = [i.to_json() for i in self.inputs]
         return {"nk": self.nk, "Ts": self.Ts, "confidence": self.confidence, "inputs": inputs}
 
+    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
+        """Draw, for each input, the free-run error over the delay, and the correlation below.
+
+        Parameters
+        ----------
+        ax : Axes or sequence of Axes, optional
+            One shows the errors of the first input; several take as many panels.
+        file : path, optional
+            Where to write the figure: PNG, SVG or PDF by its ending.
+
+        Returns
+        -------
+        Axes or array of Axes
+            `ax`, or the panels of a new figure.
+
+        Raises
+        ------
+        SettingError
+            Where matplotlib is not installed, or the file cannot be written.
+        """
+        panels: list[Any] = []
+        for found in self.inputs:
+            panels += [partial(_draw_costs, found=found), partial(_draw_correlation, found=found)]
+        return stacked(panels, (2.0, 1.8) * len(self.inputs)).plot(ax, file)
+
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        return html_of(str(self))
+
     def __str__(self) -> str:
         head = f"delay: {self.nk} sample(s), {1e3 * self.nk * self.Ts:g} ms"
         return "\n".join([head, *(f"  {i}" for i in self.inputs)])
 
     __repr__ = __str__
+
+
+def _draw_costs(ax: Any, found: InputDelay) -> None:
+    """The rms error of a model with each delay; those that are plausible are shaded."""
+    known = np.isfinite(found.cost)
+    ax.axvspan(found.low - 0.4, found.high + 0.4, color=SHADE)
+    ax.plot(found.lags[known], np.sqrt(found.cost[known]), marker="o", markersize=3)
+    ax.axvline(found.nk, color="black", linewidth=0.8)
+    ax.set_title(lettered(f"{found.name}: nk = {found.nk}"), loc="left")
+    ax.set_ylabel("free-run error, rms")
+
+
+def _draw_correlation(ax: Any, found: InputDelay) -> None:
+    """The correlation at each lag, and how large chance makes it."""
+    ax.axhspan(-found.bound, found.bound, color=SHADE)
+    ax.vlines(found.lags, 0.0, found.correlation)
+    ax.plot(found.lags, found.correlation, linestyle="none", marker="o", markersize=3)
+    ax.set_ylabel("correlation")
+    ax.set_xlabel("lag, delay [samples]")
 
 
 def delay(

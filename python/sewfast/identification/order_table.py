@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -15,6 +16,7 @@ from ..dataset import Dataset, Experiment, FloatArray, labelled, require_dataset
 from ..dataset.experiment import in_effect
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, SettingError
+from ..plotting import Table, legend, lettered, significant, stacked
 from .delays import LONGEST, DelayEstimate, LaggedRegression, Solution, delay
 
 Progress: TypeAlias = Callable[[int, int, float], object]
@@ -117,6 +119,63 @@ class OrderTable:
             "rows": rows,
         }
 
+    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
+        """Draw the free-run error of every structure over its number of parameters.
+
+        A line for each delay goes through its best structures; the choice is circled.
+
+        Parameters
+        ----------
+        ax : Axes or sequence of Axes, optional
+            One panel.
+        file : path, optional
+            Where to write the figure: PNG, SVG or PDF by its ending.
+
+        Returns
+        -------
+        Axes or array of Axes
+            `ax`, or the panels of a new figure.
+
+        Raises
+        ------
+        SettingError
+            Where matplotlib is not installed, or the file cannot be written.
+        """
+        return stacked([self._draw], (2.8,)).plot(ax, file)
+
+    def _draw(self, ax: Any) -> None:
+        for nk in sorted({row.nk for row in self.rows}):
+            best: dict[int, float] = {}
+            for row in self.rows:
+                if row.nk == nk and math.isfinite(row.free_run):
+                    size = row.na + row.nb
+                    best[size] = min(row.free_run, best.get(size, math.inf))
+            sizes = sorted(best)
+            ax.plot(sizes, [best[s] for s in sizes], marker="o", markersize=3, label=f"nk = {nk}")
+        chosen = self.choice
+        label = f"choice: {chosen.na}, {chosen.nb}, {chosen.nk}"
+        if math.isfinite(chosen.free_run):
+            ax.plot(
+                chosen.na + chosen.nb, chosen.free_run, linestyle="none", marker="o", markersize=10,
+                markerfacecolor="none", markeredgecolor="black", label=label,
+            )  # fmt: skip
+        ax.set_xlabel("na + nb")
+        ax.set_ylabel(lettered(f"free-run error of {self.output}, rms"))
+        if ax.lines:
+            legend(ax)
+
+    def _repr_html_(self) -> str:
+        """A table for a notebook: the best structures, the choice in bold."""
+        ranked = sorted(self.rows, key=lambda r: r.free_run)[:SHOWN]
+        shown = ranked if self.choice in ranked else [*ranked[:-1], self.choice]
+        rows = tuple(
+            (f"{r.na} {r.nb} {r.nk}", *(significant(v, 5) for v in _numbers(r))) for r in shown
+        )
+        header = ("na nb nk", "free run", "one step", "AIC", "BIC", "FPE", "Lipschitz")
+        best = frozenset((shown.index(self.choice), j) for j in range(len(header)))
+        caption = f"Orders and delay, errors of {self.output} on later data"
+        return Table(caption, header, rows, best).to_html([f"choice: {self.reason}"])
+
     def __str__(self) -> str:
         head = " na  nb  nk   free run   one step        AIC        BIC        FPE  Lipschitz"
         ranked = sorted(self.rows, key=lambda r: r.free_run)[:SHOWN]
@@ -142,9 +201,12 @@ class OrderTable:
     __repr__ = __str__
 
 
+def _numbers(r: Structure) -> tuple[float, ...]:
+    return r.free_run, r.one_step, r.aic, r.bic, r.fpe, r.lipschitz
+
+
 def _line(r: Structure, mark: str) -> str:
-    values = (r.free_run, r.one_step, r.aic, r.bic, r.fpe, r.lipschitz)
-    numbers = " ".join(f"{v:10.5g}" for v in values)
+    numbers = " ".join(f"{v:10.5g}" for v in _numbers(r))
     return f"{r.na:3d} {r.nb:3d} {r.nk:3d} {numbers}  {mark}".rstrip()
 
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from types import TracebackType
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -174,6 +174,9 @@ def let_pass(link: Connection, us: int) -> None:
 PATIENCE = 3.0
 
 
+_Drive = TypeVar("_Drive", bound="Drive")
+
+
 class Drive(Unique):
     """A motor drive behind a port, made by `connect`; a context manager whose end stops the motor.
 
@@ -195,7 +198,30 @@ class Drive(Unique):
         self.outcome: Outcome | None = None
         await_measurement(link)
 
-    def __enter__(self) -> Drive:
+    @classmethod
+    def open(
+        cls: type[_Drive],
+        url: str,
+        *,
+        baud: int = 115_200,
+        watchdog: float | None = None,
+        resume: float = 1.0,
+    ) -> _Drive:
+        """As `connect`, for a drive of a class of one's own."""
+        if watchdog is not None and not 0.001 <= real("watchdog", watchdog) <= 10.0:
+            raise SettingError(
+                f"expected a watchdog of .001 to 10 s, got {watchdog}; .1 suits most"
+            )
+        if not 0.0 <= real("resume", resume) < math.inf:
+            raise SettingError(f"expected resume of 0 s or more, got {resume}; 1 suits most")
+        port = open_port(url, baud)
+        try:
+            return cls(Connection(port, watchdog=watchdog, patience=PATIENCE, resume=resume))
+        except BaseException:
+            port.close()
+            raise
+
+    def __enter__(self: _Drive) -> _Drive:
         return self
 
     def __exit__(
@@ -460,6 +486,7 @@ class Drive(Unique):
         live: str | View = "none",
         settings: Mapping[str, Any] | None = None,
         overwrite: bool = False,
+        cancel: threading.Event | None = None,
     ) -> Recording:
         """Play commands from rest and record them; `sewfast.record` with a drive does this.
 
@@ -469,7 +496,7 @@ class Drive(Unique):
             Commands at the device's sample time [V].
         name : str
             Of the excitation, in messages and files.
-        method, file, live, settings, overwrite
+        method, file, live, settings, overwrite, cancel
             As for `sewfast.record`.
 
         Raises
@@ -479,7 +506,7 @@ class Drive(Unique):
         """
         return excite(
             self, u, name, method=method, file=file, live=live, settings=settings,
-            overwrite=overwrite,
+            overwrite=overwrite, cancel=cancel,
         )  # fmt: skip
 
     def follow(
@@ -492,6 +519,7 @@ class Drive(Unique):
         live: str | View = "none",
         overwrite: bool = False,
         watch: Watch | None = None,
+        cancel: threading.Event | None = None,
     ) -> RecordedRun:
         """Run a controller on the device along a reference; `sewfast.run` with a drive does this.
 
@@ -502,7 +530,7 @@ class Drive(Unique):
             Reference at the device's sample time [y].
         name : str
             Of the reference, in messages and reports.
-        file, live, overwrite
+        file, live, overwrite, cancel
             As for `sewfast.run`.
         watch : Watch, optional
             Sees the samples as they come; what it raises stops the motor and goes on.
@@ -518,15 +546,18 @@ class Drive(Unique):
             As for `sewfast.run`.
         """
         return follow(
-            self, controller, r, name, file=file, live=live, overwrite=overwrite, watch=watch
-        )
+            self, controller, r, name, file=file, live=live, overwrite=overwrite, watch=watch,
+            cancel=cancel,
+        )  # fmt: skip
 
     def _stream(self, plan: Plan, sink: Sink, cancel: threading.Event | None) -> Outcome:
         run = self._prepare(plan, sink)
         try:
             run.upload()
-            run.begin()
-            self.outcome = run.finish() if run.play(cancel) else run.abort(None)
+            wanted = cancel is None or not cancel.is_set()
+            if wanted:
+                run.begin()
+            self.outcome = run.finish() if wanted and run.play(cancel) else run.abort(None)
         except BaseException as error:
             self.outcome = run.abort(error)
             self._settle()
@@ -643,13 +674,4 @@ def connect(
     SettingError
         For a setting outside its range.
     """
-    if watchdog is not None and not 0.001 <= real("watchdog", watchdog) <= 10.0:
-        raise SettingError(f"expected a watchdog of .001 to 10 s, got {watchdog}; .1 suits most")
-    if not 0.0 <= real("resume", resume) < math.inf:
-        raise SettingError(f"expected resume of 0 s or more, got {resume}; 1 suits most")
-    port = open_port(url, baud)
-    try:
-        return Drive(Connection(port, watchdog=watchdog, patience=PATIENCE, resume=resume))
-    except BaseException:
-        port.close()
-        raise
+    return Drive.open(url, baud=baud, watchdog=watchdog, resume=resume)

@@ -6,5 +6,6 @@ Read in this order: `recording` (`read`, `read_table`), `timebase` (the sample t
 
 from .containers import Table
 from .recording import parse_source, read, read_table
+from .roles import Roles, roles
 
-__all__ = ["Table", "parse_source", "read", "read_table"]
+__all__ = ["Roles", "Table", "parse_source", "read", "read_table", "roles"]

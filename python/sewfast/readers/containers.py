@@ -115,13 +115,34 @@ def split_unit(header: str) -> tuple[str, str]:
     return match[1], (match[2] or match[3] or "").strip()
 
 
+_SUFFIX = {
+    "V": "V", "mV": "mV", "A": "A", "mA": "mA", "rpm": "RPM", "RPM": "RPM", "radps": "rad/s",
+    "rad_s": "rad/s", "degps": "deg/s", "deg_s": "deg/s", "deg": "deg", "rad": "rad", "Nm": "Nm",
+    "mm": "mm", "Hz": "Hz",
+}  # fmt: skip
+_CURRENT = re.compile(r"i|curr(ent)?|strom|amps?|i_?motor|motor_?current")
+_SUFFIXED = re.compile(rf"(.+)[_ ]({'|'.join(sorted(_SUFFIX, key=len, reverse=True))})")
+
+
+def unit_in_name(name: str) -> tuple[str, str]:
+    """`speed_rpm` -> `("speed", "RPM")`; a name that ends with no unit gives an empty one.
+
+    Only endings that hardly mean anything else count. A lone `A` is also a phase or a channel, so
+    that it is a unit only behind a word for a current.
+    """
+    match = _SUFFIXED.fullmatch(name)
+    if match is None or (match[2] == "A" and not _CURRENT.fullmatch(match[1].lower())):
+        return name, ""
+    return match[1], _SUFFIX[match[2]]
+
+
 def split_units(headers: Sequence[str]) -> tuple[list[str], list[str]]:
     """Names and units of a header row; a name that would then occur twice keeps its unit."""
     headers = [printable(h.strip()) for h in headers]
     pairs = [split_unit(h) for h in headers]
     bare = [name for name, _ in pairs]
     names = [n if bare.count(n) == 1 else h.strip() for n, h in zip(bare, headers, strict=True)]
-    return names, [unit for _, unit in pairs]
+    return names, [unit or unit_in_name(name)[1] for name, unit in pairs]
 
 
 def from_headers(
@@ -148,7 +169,8 @@ def from_headers(
 
 def freeze(values: np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> FloatArray:
     """A read-only contiguous float64 copy."""
-    array = np.array(values, dtype=np.float64, order="C")
+    with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file becomes a quiet one
+        array = np.array(values, dtype=np.float64, order="C")
     array.flags.writeable = False
     return array
 

@@ -1,4 +1,4 @@
-"""Logs of other tools -> `Table`: MDF, TDMS, PX4 ULog, WPILib's data log, ROS bags.
+"""Logs of other tools -> `Table`: MDF, TDMS, ULog, WPILOG, ROS bags, Betaflight, Saleae.
 
 Such a log holds signals that each have time stamps of their own. The signal with the most samples
 gives the rows; those with the same stamps stand beside it as they are, any other is held: each row
@@ -26,6 +26,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import DataError, SettingError, printable
 from ..recordfile.format import MAGIC
+from .blackbox import BLACKBOX, SALEAE, blackbox_series, saleae_series
 from .containers import MAX_COLUMNS, Table, freeze
 
 LARGEST = 50_000_000
@@ -333,6 +334,18 @@ def _control(payload: bytes, kinds: dict[int, tuple[str, np.dtype[Any], bool]]) 
         kinds[entry] = name, np.dtype(_FORMATS[kind.removesuffix("[]")]), kind.endswith("[]")
 
 
+def _blackbox(path: Path, raw: bytes) -> Iterator[Signal]:
+    """Betaflight's black box, read here: fields of the main frames, `motor.0` and the like."""
+    for name, t, values in blackbox_series(raw):
+        yield Signal(name, t, values)
+
+
+def _saleae(path: Path, raw: bytes) -> Iterator[Signal]:
+    """An analogue channel of Saleae's Logic 2, exported as binary, read here."""
+    t, values = saleae_series(raw)
+    yield Signal("voltage", t, values, "V")
+
+
 @dataclass(frozen=True)
 class _Kind:
     """How a log begins, what it is called, who reads it (None: we), and how."""
@@ -349,6 +362,8 @@ _KINDS = {
     "ulog": _Kind((b"ULog\x01\x12\x35",), "a PX4 ULog", "pyulog", _ulog),
     "wpilog": _Kind((b"WPILOG",), "a WPILib data log", None, _wpilog),
     "rosbag": _Kind((b"#ROSBAG V2.0",), "a ROS bag", "rosbags", _rosbag),
+    "blackbox": _Kind((BLACKBOX,), "a Betaflight black box log", None, _blackbox),
+    "saleae": _Kind((SALEAE,), "a Saleae export", None, _saleae),
 }
 
 

@@ -27,7 +27,8 @@ def report(folder: str | os.PathLike[str]) -> Path:
     Returns
     -------
     Path
-        The page: one HTML file without scripts or anything to load; an existing one is replaced.
+        The page: one HTML file that loads nothing, its one script named by its hash; an existing
+        one is replaced.
 
     Raises
     ------

@@ -1,0 +1,391 @@
+"""`sewfast init`, and the project file `sewfast.toml`: what every command need not be told again.
+
+The file is looked for in the working folder and in those above it. Whatever is given on the command
+line wins, and so do the columns that a model was made from.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import importlib
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import SettingError
+from .arguments import Commands, add_command
+from .drive import LIMITS, is_port
+from .output import print_json
+
+if TYPE_CHECKING:
+    from ..readers import Table
+
+NAME = "sewfast.toml"
+_LARGEST = 1_000_000
+_RANGE = ("u_min", "u_max")
+_KEYS: dict[str, tuple[str, ...]] = {
+    "columns": ("input", "output", "counts", "counts_per_rev", "ts", "weights"),
+    "limits": (*LIMITS, *_RANGE),
+}
+_TOP = ("port", "columns", "units", "limits")
+
+
+@dataclass(frozen=True)
+class Project:
+    """What a project file says; each field is empty where it says nothing.
+
+    Attributes
+    ----------
+    path : Path or None
+        The file; None where there is none.
+    port : str or None
+        Serial port or socket of the drive.
+    columns : mapping
+        `input` (a list), `output`, `counts`, `counts_per_rev`, `ts`, `weights`.
+    units : mapping of str to str
+        Of columns whose file states none.
+    limits : mapping of str to float
+        What the drive enforces: volt, speed, acceleration, current; all four or none.
+    command : mapping of str to float
+        `u_min` and `u_max`, the range of a controller's command.
+    """
+
+    path: Path | None = None
+    port: str | None = None
+    columns: Mapping[str, Any] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    limits: Mapping[str, float] = field(default_factory=dict)
+    command: Mapping[str, float] = field(default_factory=dict)
+
+    def relax(self, parser: argparse.ArgumentParser) -> None:
+        """Let commands do without the port that the file states."""
+        if self.port is None:
+            return
+        for action in parser._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                for command in action.choices.values():
+                    self.relax(command)
+            elif action.dest == "on":
+                action.required = False
+            elif action.dest == "port" and not action.option_strings:
+                action.required, action.nargs = False, "?"
+
+    def fill(self, args: argparse.Namespace) -> None:
+        """Put what the file says in place of what the command line leaves out, and say so."""
+        args.units = dict(self.units)
+        taken: dict[str, Any] = {}
+        self._fill_port(args, taken)
+        if getattr(args, "columns_of", None) == "file":
+            self._fill_columns(args, taken)
+        port = getattr(args, "on", None) or getattr(args, "port", None)
+        if self.limits and isinstance(port, str) and is_port(port):
+            text = ",".join(f"{name}={value:g}" for name, value in self.limits.items())
+            self._take(args, taken, "limits", text)
+        if getattr(args, "start", None) is None and getattr(args, "limits_of", None) is None:
+            for name, value in self.command.items():
+                self._take(args, taken, name, value)
+        if taken:
+            shown = ", ".join(f"{name} = {value}" for name, value in taken.items())
+            print(f"from {self.path}: {shown}", file=sys.stderr)
+
+    def _fill_port(self, args: argparse.Namespace, taken: dict[str, Any]) -> None:
+        if args.name in ("record", "commission", "run") and getattr(args, "plant", None) is None:
+            self._take(args, taken, "on", self.port)
+        if args.name in ("doctor", "stop", "clear"):
+            self._take(args, taken, "port", self.port)
+
+    def _fill_columns(self, args: argparse.Namespace, taken: dict[str, Any]) -> None:
+        names = dict(self.columns)
+        if args.counts is not None or args.output is not None:
+            # one output on the command line is not to meet another one from the file
+            for name in ("output", "counts", "counts_per_rev"):
+                names.pop(name, None)
+        for name, value in names.items():
+            self._take(args, taken, name, value)
+
+    def _take(self, args: argparse.Namespace, taken: dict[str, Any], name: str, value: Any) -> None:
+        if value is not None and getattr(args, name, 0) is None:
+            setattr(args, name, value)
+            taken[name] = "+".join(value) if isinstance(value, list) else value
+
+
+def find(folder: Path | None = None) -> Project:
+    """The project that a folder belongs to: its own file's, or that of the next folder above.
+
+    Raises
+    ------
+    SettingError
+        Where the file cannot be read or says something that is not understood.
+    """
+    folder = Path.cwd() if folder is None else folder
+    for place in (folder, *folder.parents):
+        path = place / NAME
+        if path.is_file():
+            return load(path)
+    return Project()
+
+
+def load(path: Path) -> Project:
+    """The project that a file describes.
+
+    Raises
+    ------
+    SettingError
+    """
+    found = _parsed(path)
+    _require_known(path, "", found, _TOP)
+    tables = {name: _table(path, found, name) for name in ("columns", "units", "limits")}
+    for name, known in _KEYS.items():
+        _require_known(path, f"[{name}] ", tables[name], known)
+    numbers = {
+        name: _number(path, f"[limits] {name}", value) for name, value in tables["limits"].items()
+    }
+    limits = {name: numbers[name] for name in LIMITS if name in numbers}
+    if limits and len(limits) < len(LIMITS):
+        missing = ", ".join(name for name in LIMITS if name not in limits)
+        raise SettingError(
+            f"{path}: [limits]: expected volt, speed, acceleration and current together, {missing} "
+            "missing; inf means that there is no limit"
+        )
+    port = found.get("port")
+    return Project(
+        path,
+        None if port is None else _text(path, "port", port),
+        {name: _column(path, name, value) for name, value in tables["columns"].items()},
+        {name: _text(path, f"[units] {name}", value) for name, value in tables["units"].items()},
+        limits,
+        {name: numbers[name] for name in _RANGE if name in numbers},
+    )
+
+
+def _parsed(path: Path) -> dict[str, Any]:
+    toml: Any
+    try:
+        toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
+    except ModuleNotFoundError:
+        raise SettingError(
+            f"{path}: reading it on Python 3.10 needs tomli, which is not installed: "
+            "pip install tomli, or use Python 3.11 or newer"
+        ) from None
+    try:
+        raw = path.read_bytes()
+    except OSError as e:
+        raise SettingError(f"{path}: cannot be read: {e.strerror}") from e
+    if len(raw) > _LARGEST:
+        raise SettingError(f"{path}: expected a few lines of settings, received {len(raw)} bytes")
+    try:
+        found: dict[str, Any] = toml.loads(raw.decode("utf-8"))
+    except (UnicodeDecodeError, ValueError, RecursionError) as e:
+        raise SettingError(f"{path}: expected TOML, received something else: {e}") from e
+    return found
+
+
+def _require_known(
+    path: Path, where: str, given: Mapping[str, Any], known: tuple[str, ...]
+) -> None:
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.6)
+            guess = f"did you mean {near[0]!r}? " if near else ""
+            raise SettingError(
+                f"{path}: {where}{name!r} is not a setting; {guess}expected {', '.join(known)}"
+            )
+
+
+def _table(path: Path, found: Mapping[str, Any], name: str) -> dict[str, Any]:
+    value = found.get(name, {})
+    if not isinstance(value, dict):
+        raise SettingError(f"{path}: {name}: expected a table, [{name}], received {value!r}")
+    return value
+
+
+def _column(path: Path, name: str, value: Any) -> Any:
+    where = f"[columns] {name}"
+    if name == "input":
+        names = value if isinstance(value, list) else [value]
+        if not names:
+            raise SettingError(f"{path}: {where}: expected at least one name, received none")
+        return [_text(path, where, one) for one in names]
+    if name in ("counts_per_rev", "ts"):
+        number = _number(path, where, value)
+        if not 0.0 < number < math.inf:
+            raise SettingError(f"{path}: {where}: expected a positive number, received {number:g}")
+        return number
+    return _text(path, where, value)
+
+
+def _text(path: Path, where: str, value: Any) -> str:
+    if not isinstance(value, str) or not value:
+        raise SettingError(f'{path}: {where}: expected a text, as in "speed", received {value!r}')
+    return value
+
+
+def _number(path: Path, where: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+        raise SettingError(f"{path}: {where}: expected a number, received {value!r}")
+    return float(value)
+
+
+def with_units(table: Table, args: argparse.Namespace) -> Table:
+    """A table with the project's units for columns whose file states none.
+
+    Raises
+    ------
+    SettingError
+        Where the file states another one: one of the two is wrong, and no rule says which.
+    """
+    units: dict[str, str] = getattr(args, "units", {})
+    known = {name: unit for name, unit in units.items() if name in table}
+    if not known:
+        return table
+    from dataclasses import replace
+
+    for name, unit in known.items():
+        stated = table.units.get(name, "")
+        if stated and stated != unit:
+            raise SettingError(
+                f"{table.path}: column {name!r} is in {stated}, but {NAME} says {unit}; correct "
+                "one of them"
+            )
+    return replace(table, units={**table.units, **known})
+
+
+# --- `sewfast init` -------------------------------------------------------------------------------
+
+
+INIT = """\
+Lay out a folder for one drive: sewfast.toml with limits, columns, units and port, a folder for
+recordings and a README with the commands in their order. Files that are there stay as they are.
+
+Every command reads sewfast.toml from the working folder or from one above it. What is given on the
+command line wins. On Python 3.10 reading it needs tomli (pip install tomli).
+"""
+
+EXAMPLES = """\
+examples:
+  sewfast init spindle
+  sewfast init --recording bench.csv        columns and units as in this file, in this folder
+"""
+
+_TOML = """\
+# Settings of this drive, for every sewfast command that runs in this folder or below it.
+# Take the # away from what you want to set. What is given on the command line wins.
+
+# port = "/dev/ttyUSB0"       # or "COM3", or "socket://localhost:5000"
+
+[columns]
+{columns}
+[units]                       # of columns whose file states none
+{units}
+[limits]
+# What the drive enforces; it stops when it does more. All four or none; inf: no limit.
+# volt = 10.0                 # V
+# speed = 3500.0              # RPM
+# acceleration = 30000.0      # RPM/s
+# current = 15.0              # A
+
+# Range of a controller's command; without it, what the drive was recorded with.
+# u_min = -10.0
+# u_max = 10.0
+"""
+
+_COLUMNS = """\
+# input = "u"                 # or a list: ["u", "load"]
+# output = "speed"
+# counts = "encoder"          # encoder counts instead of an output, and
+# counts_per_rev = 4096       # how many make one turn
+# ts = 0.001                  # s, where a file has no time column
+"""
+
+_UNITS = """\
+# u = "V"
+# speed = "RPM"
+"""
+
+_README = """\
+# {name}
+
+Recordings lie in `recordings/`; what is the same for all of them stands in `sewfast.toml`.
+
+    sewfast look recordings/one.csv                       # what is in it, and what to mend
+    sewfast identify recordings/one.csv -o drive.json     # a model
+    sewfast validate drive.json recordings/two.csv        # on a recording it has never seen
+    sewfast tune drive.json -o controller.json            # a controller, on the model alone
+    sewfast run controller.json drive.json -o loop.csv    # the closed loop on the model
+
+`sewfast COMMAND --help` explains each of them.
+"""
+
+
+def add(commands: Commands) -> None:
+    parser = add_command(
+        commands, "init", init_command,
+        summary="a folder for a drive, with its settings", text=INIT, examples=EXAMPLES,
+    )  # fmt: skip
+    parser.add_argument(
+        "folder", nargs="?", type=Path, default=Path(), metavar="DIR", help="folder (this one)"
+    )
+    parser.add_argument(
+        "--recording", metavar="FILE", help="take names and units of the columns from this file"
+    )
+
+
+def init_command(args: argparse.Namespace) -> None:
+    folder: Path = args.folder
+    columns, units = (_COLUMNS, _UNITS) if args.recording is None else _described(args.recording)
+    if folder.exists() and not folder.is_dir():
+        raise SettingError(f"{folder}: expected a folder, received a file; name another one")
+    place = folder / NAME
+    if place.exists():
+        raise SettingError(f"{place}: there is one already; change it, or take it away first")
+    texts = {
+        place: _TOML.format(columns=columns, units=units),
+        folder / "README.md": _README.format(name=folder.resolve().name),
+    }
+    try:
+        (folder / "recordings").mkdir(parents=True, exist_ok=True)
+        made = [path for path in texts if not path.exists()]
+        for path in made:
+            path.write_text(texts[path], encoding="utf-8")
+    except OSError as e:
+        raise SettingError(f"{folder}: cannot be written to: {e.strerror}") from e
+    load(place)  # what is written here can be read here
+    if args.json:
+        print_json({"folder": str(folder), "files": [str(path) for path in made]})
+        return
+    for path in made:
+        print(f"written to {path}")
+    print(f"put recordings into {folder / 'recordings'}; then: sewfast look FILE")
+
+
+def _described(recording: str) -> tuple[str, str]:
+    """The lines on columns and units of a recording.
+
+    Raises
+    ------
+    SettingError
+        Where its columns do not show which is the input and which the output.
+    """
+    from ..readers import read_table, roles
+
+    table = read_table(recording)
+    found = roles(table)
+    if found is None:
+        raise SettingError(
+            f"{recording}: expected columns that show which is the input and which the output, "
+            f"received {', '.join(table.names)}; leave --recording out and name them in {NAME}"
+        )
+    units = {n: table.unit(n) for n in (found.input, found.output) if table.unit(n)}
+    columns = f"input = {_quoted(found.input)}\noutput = {_quoted(found.output)}\n"
+    return columns, "".join(f"{_quoted(n)} = {_quoted(u)}\n" for n, u in units.items()) or _UNITS
+
+
+def _quoted(text: str) -> str:
+    """A TOML string; names from files hold whatever they like."""
+    import json
+
+    return json.dumps(text)

@@ -1,0 +1,314 @@
+"""`sewfast init`, `sewfast.toml`, and a stranger's CSV taken to a controller without an option."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import sewfast as api
+from cli import refused, sewfast
+from sewfast.cli.project import NAME, find, load
+from sewfast.errors import SettingError
+from sewfast.readers import read_table, roles
+from sewfast.readers.containers import unit_in_name
+
+LIMITS = "volt = 8\nspeed = 3500\nacceleration = 40000\ncurrent = 15\n"
+
+
+def fan(seed: int, count: int = 2000) -> tuple[np.ndarray, np.ndarray]:
+    """Command [V] and speed [RPM] of a first-order fan, every 10 ms."""
+    random = np.random.default_rng(seed)
+    u = np.repeat(random.uniform(0.0, 12.0, count // 20), 20)
+    y = np.zeros(count)
+    for k in range(1, count):
+        y[k] = 0.95 * y[k - 1] + 6.25 * u[k - 1]
+    return u, y + random.normal(0.0, 2.0, count)
+
+
+def stranger(path: Path, header: str, seed: int = 0, *, above: str = "Instrument;X-1\n\n") -> None:
+    """A file as an instrument writes it: lines above the header, semicolons, decimal commas."""
+    u, y = fan(seed)
+    rows = (f"{10 * k},0;{a:.4f};{b:.3f}" for k, (a, b) in enumerate(zip(u, y, strict=True)))
+    path.write_text(above + header + "\n" + "\n".join(rows).replace(".", ",") + "\n")
+
+
+def toml(folder: Path, text: str) -> Path:
+    (folder / NAME).write_text(text)
+    return folder / NAME
+
+
+# --- a stranger's CSV -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("header", "seed"),
+    [
+        ("time_ms;voltage_V;speed_rpm", 0),
+        ("Time (ms);Spannung [V];Drehzahl [rpm]", 1),
+        ("t [ms];u;y", 2),
+        ("time_ms;cmd;channel 2", 3),
+    ],
+)
+def test_three_commands_without_an_option_reach_a_verified_controller(
+    tmp_path: Path, header: str, seed: int
+) -> None:
+    stranger(tmp_path / "bench.csv", header, seed)
+    sewfast(tmp_path, "identify", "bench.csv")
+    sewfast(tmp_path, "tune", "bench-model.json")
+    said = sewfast(tmp_path, "run", "bench-controller.json", "bench-model.json").err
+    assert "overshoot" in said
+    model = api.load_model(tmp_path / "bench-model.json")
+    assert model.Ts == pytest.approx(0.01)
+    # a file that nothing was learned from, and the loop on the model
+    stranger(tmp_path / "other.csv", header, seed + 100)
+    data = api.read(tmp_path / "other.csv", **model.columns)
+    assert model.validate(data).simulation.fit_percent > 95.0
+    run = api.run(api.load_controller(tmp_path / "bench-controller.json"), model)
+    assert run.metrics()["rmse"] < 0.05 * np.ptp(run.r)
+
+
+def table(tmp_path: Path, *names: str) -> api.readers.Table:
+    rng = np.random.default_rng(0)
+    columns = {name: rng.normal(size=50) for name in names} | {"t": 0.01 * np.arange(50)}
+    api.write_table(tmp_path / "x.csv", columns)
+    return read_table(tmp_path / "x.csv")
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("u", "y"), ("u", "y")),
+        (("u", "y", "counts", "speed_true"), ("u", "y")),
+        (("r", "u", "y"), ("u", "y")),
+        (("voltage [V]", "current [A]", "speed [rad/s]"), ("voltage", "speed")),
+        (("current [A]", "speed [rad/s]"), ("current", "speed")),
+        (("pwm", "omega"), ("pwm", "omega")),
+        (("left", "speed_rpm"), ("left", "speed_rpm")),
+        (("a", "b"), None),
+        (("u", "speed [RPM]", "angle [rad]"), None),
+        (("v1 [V]", "v2 [V]", "speed [RPM]"), None),
+        (("u", "foo", "bar"), None),
+    ],
+)
+def test_columns_are_recognised_or_left_open(
+    tmp_path: Path, names: tuple[str, ...], expected: tuple[str, str] | None
+) -> None:
+    found = roles(table(tmp_path, *names))
+    assert (None if found is None else (found.input, found.output)) == expected
+
+
+def test_a_column_that_never_changes_is_neither(tmp_path: Path) -> None:
+    columns = {
+        "t": 0.01 * np.arange(9),
+        "gain": np.ones(9),
+        "in": np.arange(9.0),
+        "x": np.arange(9.0) ** 2,
+    }
+    api.write_table(tmp_path / "x.csv", columns)
+    found = roles(read_table(tmp_path / "x.csv"))
+    assert found is not None
+    assert (found.input, found.output) == ("in", "x")
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("speed_rpm", "RPM"), ("u_V", "V"), ("current_A", "A"), ("w_rad_s", "rad/s"),
+        ("phase_A", ""), ("rpm", ""), ("i_a", ""), ("pos_m", ""), ("speed", ""), ("", ""),
+    ],
+)  # fmt: skip
+def test_units_in_names(name: str, unit: str) -> None:
+    assert unit_in_name(name)[1] == unit
+
+
+def test_in_doubt_it_asks(tmp_path: Path) -> None:
+    stranger(tmp_path / "bench.csv", "time_ms;a;b")
+    said = refused(tmp_path, "identify", "bench.csv")
+    assert "which column is the input?" in said
+    assert "--input COL" in said
+
+
+# --- init -----------------------------------------------------------------------------------------
+
+
+def test_init_lays_out_a_folder_that_can_be_read(tmp_path: Path) -> None:
+    done = sewfast(tmp_path, "init", "spindle", "--json").json()
+    assert [Path(f).name for f in done["files"]] == [NAME, "README.md"]
+    assert (tmp_path / "spindle" / "recordings").is_dir()
+    assert load(tmp_path / "spindle" / NAME).columns == {}
+    assert "there is one already" in refused(tmp_path, "init", "spindle")
+
+
+def test_every_line_that_init_comments_out_is_a_setting(tmp_path: Path) -> None:
+    sewfast(tmp_path, "init")
+    text = (tmp_path / NAME).read_text()
+    lines = [x.removeprefix("# ") if " = " in x else x for x in text.splitlines()]
+    found = load(toml(tmp_path, "\n".join(lines)))
+    assert found.port == "/dev/ttyUSB0"
+    assert set(found.columns) == {"input", "output", "counts", "counts_per_rev", "ts"}
+    assert len(found.limits) == 4
+    assert found.command == {"u_min": -10.0, "u_max": 10.0}
+    assert found.units == {"u": "V", "speed": "RPM"}
+
+
+def test_init_takes_the_columns_of_a_recording_and_keeps_what_is_there(tmp_path: Path) -> None:
+    stranger(tmp_path / "bench.csv", 'time_ms;"vol""tage_V";speed_rpm')
+    (tmp_path / "README.md").write_text("mine")
+    sewfast(tmp_path, "init", "--recording", "bench.csv")
+    found = load(tmp_path / NAME)
+    assert found.columns == {"input": ['vol"tage_V'], "output": "speed_rpm"}
+    assert found.units == {'vol"tage_V': "V", "speed_rpm": "RPM"}
+    assert (tmp_path / "README.md").read_text() == "mine"
+
+
+def test_init_refuses_a_file_and_columns_in_doubt(tmp_path: Path) -> None:
+    (tmp_path / "f").touch()
+    assert "expected a folder" in refused(tmp_path, "init", "f")
+    stranger(tmp_path / "bench.csv", "time_ms;a;b")
+    assert "leave --recording out" in refused(tmp_path, "init", "--recording", "bench.csv")
+
+
+# --- sewfast.toml ---------------------------------------------------------------------------------
+
+
+def test_columns_and_units_come_from_the_file_above_and_options_win(tmp_path: Path) -> None:
+    toml(tmp_path, '[columns]\ninput = "a"\noutput = "b"\n[units]\na = "V"\nb = "RPM"\n')
+    folder = tmp_path / "deep" / "down"
+    folder.mkdir(parents=True)
+    stranger(folder / "bench.csv", "time_ms;a;b")
+    done = sewfast(folder, "identify", "bench.csv", "--model", "oe")
+    assert f"from {tmp_path / NAME}: input = a, output = b" in done.err
+    model = api.load_model(folder / "bench-model.json")
+    assert (model.input_names, model.output_name) == (("a",), "b")
+    assert (tuple(model.input_units), model.output_unit) == (("V",), "RPM")
+    sewfast(folder, "validate", "bench-model.json", "bench.csv")
+    other = ("--input", "b", "--output", "a", "-o", "swapped.json")
+    done = sewfast(folder, "identify", "bench.csv", "--model", "arx", *other)
+    assert "from" not in done.err.splitlines()[0]
+    assert api.load_model(folder / "swapped.json").output_name == "a"
+
+
+def test_units_that_contradict_the_file_are_refused(tmp_path: Path) -> None:
+    toml(tmp_path, '[units]\nspeed_rpm = "rad/s"\n')
+    stranger(tmp_path / "bench.csv", "time_ms;voltage_V;speed_rpm")
+    said = refused(tmp_path, "identify", "bench.csv")
+    assert "is in RPM, but sewfast.toml says rad/s" in said
+
+
+def test_the_range_of_the_command_is_for_tuning(tmp_path: Path) -> None:
+    stranger(tmp_path / "bench.csv", "time_ms;u;y")
+    sewfast(tmp_path, "identify", "bench.csv", "--model", "oe", "-o", "drive.json")
+    toml(tmp_path, "[limits]\nu_min = -2\nu_max = 11\n")
+    few = ("--evaluations", "20")
+    sewfast(tmp_path, "tune", "drive.json", *few, "--u-min", "-1")
+    controller = api.load_controller(tmp_path / "drive-controller.json")
+    assert (controller.u_min, controller.u_max) == (-1.0, 11.0)
+    # a controller to start with brings its own
+    sewfast(
+        tmp_path, "tune", "drive.json", *few, "--start", "drive-controller.json", "-o", "b.json"
+    )
+    assert api.load_controller(tmp_path / "b.json").u_max == 11.0
+
+
+def test_limits_and_port_are_for_drives_alone(tmp_path: Path) -> None:
+    toml(tmp_path, f'port = "socket://localhost:1"\n[limits]\n{LIMITS}')
+    # a virtual machine refuses --limits; those of the file are not meant for it
+    sewfast(tmp_path, "record", "--on", "virtual", "--signal", "step", "-o", "step.csv")
+    for command in (
+        ("doctor",), ("stop",), ("record", "--signal", "step", "-o", "a.mcap"),
+        ("commission", "--out", "x"),
+    ):  # fmt: skip
+        done = sewfast(tmp_path, *command, done=2)
+        assert "socket://localhost:1" in done.err, command
+    assert "limits = volt=8,speed=3500" in done.err
+
+
+def test_without_a_port_it_is_asked_for(tmp_path: Path) -> None:
+    assert "--on" in refused(tmp_path, "record", "--signal", "step")
+    assert "PORT" in refused(tmp_path, "stop")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('prot = "COM3"', "'prot' is not a setting; did you mean 'port'?"),
+        ('[columns]\nouptut = "y"', "[columns] 'ouptut' is not a setting; did you mean 'output'?"),
+        ("[limits]\nvolts = 3", "did you mean 'volt'?"),
+        ("[limits]\nvolt = 3", "speed, acceleration, current missing"),
+        ('[limits]\nu_max = "9"', "[limits] u_max: expected a number, received '9'"),
+        ("[limits]\nu_max = nan", "expected a number"),
+        ("[limits]\nu_max = true", "expected a number"),
+        ("limits = 3", "expected a table, [limits], received 3"),
+        ("port = 3", "expected a text"),
+        ("[columns]\ninput = []", "expected at least one name"),
+        ("[columns]\ninput = [1]", "expected a text"),
+        ("[columns]\nts = 0", "expected a positive number"),
+        ("[columns]\nts = inf", "expected a positive number"),
+        ("[units]\nu = 1", "[units] u: expected a text"),
+        ("port = ", "expected TOML"),
+        ('port = "a"\nport = "b"', "expected TOML"),
+    ],
+)
+def test_faults_are_named(tmp_path: Path, text: str, words: str) -> None:
+    path = toml(tmp_path, text)
+    with pytest.raises(SettingError) as refusal:
+        load(path)
+    assert words in str(refusal.value)
+    assert str(path) in str(refusal.value)
+
+
+def test_help_is_to_be_had_with_a_faulty_file(tmp_path: Path) -> None:
+    toml(tmp_path, "prot = 3")
+    assert "usage" in sewfast(tmp_path, "tune", "--help").out
+    assert "did you mean 'port'" in refused(tmp_path, "signals")
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    (tmp_path / NAME).write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SettingError, match="expected TOML"):
+        load(tmp_path / NAME)
+    (tmp_path / NAME).write_bytes(b"#" * 2_000_000)
+    with pytest.raises(SettingError, match="a few lines"):
+        load(tmp_path / NAME)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.binary(max_size=200))
+def test_any_bytes_are_settings_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, raw: bytes
+) -> None:
+    path = tmp_path_factory.getbasetemp() / NAME
+    path.write_bytes(raw)
+    try:
+        load(path)
+    except SettingError:
+        pass
+    finally:
+        path.unlink()
+
+
+def test_without_a_file_there_are_no_settings(tmp_path: Path) -> None:
+    assert find(tmp_path).path is None
+
+
+@pytest.mark.skipif(sys.version_info >= (3, 11), reason="tomllib is there")
+def test_on_python_3_10_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "tomli", None)
+    with pytest.raises(SettingError, match="pip install tomli"):
+        load(toml(tmp_path, ""))
+
+
+def test_a_model_keeps_its_own_columns(tmp_path: Path) -> None:
+    stranger(tmp_path / "bench.csv", "time_ms;u;y")
+    sewfast(tmp_path, "identify", "bench.csv", "--model", "oe", "-o", "drive.json")
+    toml(tmp_path, '[columns]\ninput = "y"\noutput = "u"\n')
+    found = json.loads(sewfast(tmp_path, "validate", "drive.json", "bench.csv", "--json").out)
+    assert found["grade"] == "good"
