@@ -59,8 +59,9 @@ rust-test: $(DEV) ## unit, property and documentation tests of the crates (SEED=
 fleet: $(DEV) ## 2,000 recordings on one worker and on two, and with a worker killed every 10 s
 	$(BIN)/python benches/fleet.py
 
-studio: $(DEV) ## the studio in a real browser: from a slider's event to painted plots
+studio: $(DEV) ## the studio in a real browser: from a slider's event to painted plots, from Esc to output off
 	$(BIN)/python benches/studio.py
+	$(BIN)/python benches/studio_stops.py
 
 fuzz-logs: $(DEV) ## damaged logs of every format, refused or read (COUNT=100000; a tenth of it where a library reads)
 	SEWFAST_DAMAGED=$(or $(COUNT),100000) $(BIN)/python -m pytest tests/readers/test_logs.py -k damaged_log
