@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import shutil
 import signal
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
@@ -28,7 +32,8 @@ hypothesis.settings.load_profile("untimed")
 
 ALONE = re.compile(
     r"test_(link|live|device|virtual_device|doctor|drive_runs|host_loop|keeping|locks|soak|two_hosts"
-    r"|watchdog|deaf_host|recordfile_kill|commissioning_process|firmware|emulated|choice|cli)"
+    r"|watchdog|deaf_host|recordfile_kill|commissioning_process|studio_drive|firmware|emulated"
+    r"|choice|cli)"
 )
 """Files whose tests wait for processes and ports, or bind to a time budget: marked `alone`."""
 
@@ -46,3 +51,21 @@ def recordings() -> Path:
     if folder is None:
         pytest.skip("needs public recordings: set SEWFAST_DATA to their folder (docs/real-data.md)")
     return Path(folder)
+
+
+@pytest.fixture
+def browser() -> Iterator[Any]:
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        pytest.skip("no chromium and chromedriver here: the page is not looked at in a browser")
+    webdriver = pytest.importorskip("selenium.webdriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1200,900"):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    service = webdriver.ChromeService(executable_path=driver)
+    found = webdriver.Chrome(options=options, service=service)
+    yield found
+    with contextlib.suppress(Exception):  # a test may have killed it
+        found.quit()

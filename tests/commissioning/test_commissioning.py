@@ -20,6 +20,7 @@ import pytest
 
 from cli import sewfast
 from commissioned import SMALL, short
+from moments import once_on
 from sewfast import (
     Commissioning,
     Controller,
@@ -299,6 +300,47 @@ def test_ctrl_c_does_not_wait_for_what_cannot_be_stopped(monkeypatch: pytest.Mon
         over.set()
         signal.signal(signal.SIGALRM, before)
     assert caught.value.best.stage == "training"
+
+
+@pytest.mark.parametrize("stage", ["step response", "training", "tuning", "verification"])
+def test_cancelled_it_ends_as_after_ctrl_c(stage: str) -> None:
+    cancel = threading.Event()
+
+    def progress(done: int, total: int, text: str) -> None:
+        if text == stage:
+            cancel.set()
+
+    with pytest.raises(Interrupted) as caught:
+        commission(VirtualMachine(), **SMALL, progress=progress, cancel=cancel)
+    best = caught.value.best
+    assert (best.verdict, best.reason, best.stage) == ("interrupted", "cancelled", stage)
+    assert (best.controller is not None) == (stage != "step response")
+
+
+def test_cancelled_it_stops_a_drive_that_runs() -> None:
+    cancel = threading.Event()
+    with VirtualDevice(fast=True) as device, connect(device.port) as drive:
+        drive.set_limits()
+        once_on(device, cancel.set, after=0.0)
+        with pytest.raises(Interrupted) as caught:
+            commission(drive, **SMALL, cancel=cancel)
+        assert drive.outcome is not None
+        assert drive.outcome.reason == "cancelled"
+        assert drive.status().state == "idle"
+        assert device.trace()[-1]["event"] == "off"
+    assert caught.value.best.stage == "first motion"
+
+
+def test_between_stages_somebody_is_asked(whole: Commissioning) -> None:
+    seen: list[tuple[str, Commissioning]] = []
+    found = commission(
+        VirtualMachine(), **SMALL, between=lambda stage, so_far: seen.append((stage, so_far))
+    )
+    assert [stage for stage, _ in seen] == [*STAGES, "references"]
+    predicted = seen[-1][1].comparisons
+    assert all(c.measured is None for c in predicted)
+    assert [c.reference for c in predicted] == [c.reference for c in found.comparisons]
+    assert found.controller == whole.controller
 
 
 def test_an_interrupted_search_keeps_its_best_gains(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -186,6 +187,36 @@ def test_a_vanished_port_ends_the_run_and_keeps_what_came(tmp_path: Path) -> Non
     kept = read_recording(path)
     assert kept.outcome == "failed"
     assert 0 < len(kept) == len(caught.value.recording) < 5000
+
+
+@pytest.mark.parametrize("what", ["record", "run"])
+def test_cancelled_it_stops_the_motor_and_gives_what_came(tmp_path: Path, what: str) -> None:
+    path, cancel = tmp_path / "step.mcap", threading.Event()
+    with VirtualDevice(fast=False) as device, connect(device.port, watchdog=5.0) as drive:
+        drive.set_limits()
+        once_on(device, cancel.set, after=0.2)
+        calls = {
+            "record": lambda: record(drive, np.full(20_000, 3.0), file=path, cancel=cancel),
+            "run": lambda: run(
+                controller(), drive, np.full(20_000, 500.0), file=path, cancel=cancel
+            ),
+        }
+        with pytest.raises(Interrupted) as caught:
+            calls[what]()
+        assert drive.status().state == "idle"
+    best = caught.value.best
+    assert 0 < len(best.u) < 20_000
+    kept = read_recording(path)
+    assert (kept.outcome, len(kept)) == ("cancelled", len(best.u))
+
+
+def test_cancelled_before_the_start_nothing_moves(device: VirtualDevice, drive: Drive) -> None:
+    cancel = threading.Event()
+    cancel.set()
+    with pytest.raises(Interrupted) as caught:
+        record(drive, command(), cancel=cancel)
+    assert len(caught.value.best) == 0
+    assert "on" not in {entry["event"] for entry in device.trace()}
 
 
 def test_ctrl_c_stops_the_motor_and_keeps_the_recording(tmp_path: Path) -> None:

@@ -25,10 +25,9 @@ import sewfast
 from cli import PROGRAM, environment
 from sewfast.errors import FitError, SettingError
 from sewfast.studio import Project, Step, Studio, make_demo
-from sewfast.studio.project import envelope
+from sewfast.studio.commissioning import envelope
 from sewfast.tuning import costs, first_controller
-
-websockets = pytest.importorskip("websockets.sync.client")
+from studio_page import Page, websockets
 
 EVIL = '<script>document.title="run"</script>'
 STEP = {"file": "run.csv", "inputs": ["u"], "output": "y", "resample": 0.02, "model": "oe"}
@@ -51,49 +50,6 @@ def folder(tmp_path: Path) -> Path:
 def studio(folder: Path) -> Iterator[Studio]:
     with Studio(Project(folder)) as running:
         yield running
-
-
-class Page:
-    """A page without a browser: a socket that gave its token."""
-
-    def __init__(self, studio: Studio, token: str | None = None, **headers: Any) -> None:
-        origin = headers.pop("origin", f"http://127.0.0.1:{studio.port}")
-        place = f"ws://127.0.0.1:{studio.port}/socket"
-        self._left = contextlib.ExitStack()
-        self.socket = self._left.enter_context(websockets.connect(place, origin=origin, **headers))
-        self.socket.send(studio.token if token is None else token)
-
-    def __enter__(self) -> Page:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._left.close()
-
-    def hear(self, wanted: Callable[[dict[str, Any]], bool], timeout: float = 30) -> dict[str, Any]:
-        until = time.monotonic() + timeout
-        while True:
-            heard = _unpacked(self.socket.recv(timeout=until - time.monotonic()))
-            if wanted(heard):
-                return dict(heard)
-
-    def event(self, name: str) -> dict[str, Any]:
-        return self.hear(lambda m: m.get("event") == name)
-
-    def ask(self, do: str, **asked: Any) -> dict[str, Any]:
-        self.socket.send(json.dumps({"id": 7, "do": do, **asked}))
-        return self.hear(lambda m: m.get("id") == 7)
-
-
-def _unpacked(message: str | bytes) -> dict[str, Any]:
-    if isinstance(message, str):
-        return dict(json.loads(message))
-    end = 4 + int.from_bytes(message[:4], "little")
-    head, rest = json.loads(message[4:end]), np.frombuffer(message[end:], "<f4")
-    lengths = [n for _, n in head["curves"]]
-    parts = np.split(rest, np.cumsum(lengths)[:-1])
-    assert [len(part) for part in parts] == lengths
-    names = [name for name, _ in head["curves"]]
-    return {**head, "curves": dict(zip(names, parts, strict=True))}
 
 
 @pytest.fixture
@@ -559,23 +515,6 @@ def test_ctrl_c_ends_it_cleanly(folder: Path) -> None:
 
 
 # --- In a browser ---------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def browser() -> Iterator[Any]:
-    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if chromium is None or driver is None:
-        pytest.skip("no chromium and chromedriver here: the page is not looked at in a browser")
-    webdriver = pytest.importorskip("selenium.webdriver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1200,900"):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    service = webdriver.ChromeService(executable_path=driver)
-    found = webdriver.Chrome(options=options, service=service)
-    yield found
-    found.quit()
 
 
 def _until(true: Callable[[], object], seconds: float = 30) -> None:

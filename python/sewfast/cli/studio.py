@@ -9,7 +9,8 @@ from .arguments import Commands, add_command
 from .output import print_json
 
 STUDIO = """\
-Open a page in the browser: look at recordings, identify a model, validate it, tune a controller.
+Open a page in the browser: look at recordings, identify a model, validate it, tune a controller,
+record, run and commission a drive.
 Every step can be copied as Python or as commands, and its result is a file that the command line
 reads (model.json, controller.json).
 It needs the package websockets: pip install "sewfast[studio]". Only this computer can reach the

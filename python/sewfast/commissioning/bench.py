@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
@@ -21,6 +22,7 @@ from ..control.machine import (
     Stepped,
     SteppedBench,
     Watch,
+    cancelled_by,
     is_streaming,
     is_watched,
     machine_of,
@@ -88,30 +90,39 @@ class Around:
         return found
 
 
+@dataclass
 class DriveBench(Around):
     """A drive behind a port, whose limits have been set, and of whose runs nothing is missing.
 
     What the link has lost of a run that ended well is no danger to the machine: the run is made
     once more, from rest as every run.
+
+    Attributes
+    ----------
+    cancel : threading.Event or None
+        Ends a run as Ctrl-C does.
     """
+
+    cancel: threading.Event | None = field(default=None, kw_only=True)
 
     @property
     def drive(self) -> Drive:
         return cast(Drive, self.inner)
 
     def excite(self, u: FloatArray, name: str) -> Recording:
-        recording = super().excite(u, name)
+        recording = self.drive.excite(u, name, **cancelled_by(self.cancel))
         if not self._is_whole:
-            recording = super().excite(u, name)
+            recording = self.drive.excite(u, name, **cancelled_by(self.cancel))
         self._require_whole(name)
         return recording
 
     def follow(
         self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
     ) -> RecordedRun:
-        run = super().follow(controller, r, name, watch=watch)
+        options = {**cancelled_by(self.cancel), "watch": watch}
+        run = self.drive.follow(controller, r, name, **options)
         if not self._is_whole:
-            run = super().follow(controller, r, name, watch=watch)
+            run = self.drive.follow(controller, r, name, **options)
         self._require_whole(name)
         return run
 
@@ -177,7 +188,9 @@ def told_of(bench: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 @contextmanager
-def bench_of(on: object, u_max: float | None) -> Iterator[Machine]:
+def bench_of(
+    on: object, u_max: float | None, cancel: threading.Event | None = None
+) -> Iterator[Machine]:
     """A machine as commissioning takes it; a drive's volt limit is at most `u_max` meanwhile.
 
     Raises
@@ -194,7 +207,7 @@ def bench_of(on: object, u_max: float | None) -> Iterator[Machine]:
     if u_max is not None and u_max < before:
         drive.set_limits(volt=u_max)
     try:
-        yield DriveBench(drive)
+        yield DriveBench(drive, cancel=cancel)
     finally:
         if drive.limits().volt != before:
             drive.set_limits(volt=before)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -54,6 +55,7 @@ FALLS_SHORT = 0.7
 """Of the planned acceleration: below it a drive limits its current."""
 
 References = Mapping[str, ArrayLike] | Sequence[str]
+Between = Callable[[str, Commissioning], object]
 
 
 def commission(
@@ -75,6 +77,8 @@ def commission(
     folder: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     resume: bool = False,
+    cancel: threading.Event | None = None,
+    between: Between | None = None,
 ) -> Commissioning:
     """From a machine at rest to a controller that was verified on it.
 
@@ -134,6 +138,14 @@ def commission(
         Go on from what an earlier attempt has left in `folder`: what it has recorded of the very
         same commands and references is not recorded again. With the same settings the controller
         is, bit by bit, that of an attempt without interruption on the same recordings.
+    cancel : threading.Event, optional
+        Set in another thread, it ends the commissioning as Ctrl-C does: a drive that runs is
+        stopped at once, everything else at its next step.
+    between : callable(next, so_far), optional
+        Called as each stage begins, before it moves the machine, and once more with
+        ``"references"`` when the loops of the verification are predicted (`so_far.comparisons`) and
+        not run yet. It may wait for a person; a KeyboardInterrupt out of it ends the
+        commissioning.
 
     Returns
     -------
@@ -151,9 +163,9 @@ def commission(
     LinkError
         Where port or drive failed or tripped; the motor is stopped.
     Interrupted
-        On Ctrl-C; the motor is stopped, `best` is the `Commissioning` so far.
+        On Ctrl-C or `cancel`; the motor is stopped, `best` is the `Commissioning` so far.
     """
-    with bench_of(on, u_max) as bench:
+    with bench_of(on, u_max, cancel) as bench:
         asked = demands(
             bench,
             u_max=u_max,
@@ -168,7 +180,7 @@ def commission(
             Ms=Ms,
             time_budget=time_budget,
         )
-        journal = Journal(bench.name, progress)
+        journal = Journal(bench.name, progress, cancel, between)
         if resume and folder is None:
             raise SettingError(
                 "expected the folder of the attempt to resume, got none; give folder='DIR'"
@@ -187,9 +199,11 @@ def commission(
                 taken.keep(journal.stage, name, key, recording, run)
 
         def kept(name: str, key: str) -> Recording | None:
+            journal.heed()
             return None if taken is None else taken.found(journal.stage, name, key)
 
         def kept_run(name: str, key: str, controller: Controller) -> RecordedRun | None:
+            journal.heed()
             if taken is None:
                 return None
             return taken.found_run(journal.stage, name, key, controller, bench.name)
@@ -204,7 +218,9 @@ def commission(
             best = getattr(stop, "best", None)
             if isinstance(best, Controller):
                 journal.keep(controller=best)
-            raise Interrupted(journal.result("interrupted", "Ctrl-C")) from stop
+            cancelled = cancel is not None and cancel.is_set()
+            reason = "cancelled" if cancelled else "Ctrl-C"
+            raise Interrupted(journal.result("interrupted", reason)) from stop
 
 
 def _place(
@@ -316,6 +332,7 @@ def _carry_out(
         thinning.pushes(load, verify, bench.Ts),
     )  # fmt: skip
     journal.keep(comparisons=comparisons, judgement=judged(comparisons, ensemble))
+    journal.pause("references")
     measure(controller, bench, comparisons, verify, lambda new: journal.keep(comparisons=new))
     if small is not None and small.resonance is not None:
         speed = SHAKEN_AT * asked.speed

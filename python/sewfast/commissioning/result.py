@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -352,10 +353,20 @@ class Journal:
     ----------
     machine : str
     progress : callable or None
+    cancel : threading.Event or None
+    between : callable or None
+        See `commission`.
     """
 
-    def __init__(self, machine: str, progress: Progress | None) -> None:
+    def __init__(
+        self,
+        machine: str,
+        progress: Progress | None,
+        cancel: threading.Event | None = None,
+        between: Callable[[str, Commissioning], object] | None = None,
+    ) -> None:
         self._progress = progress
+        self._cancel, self._between = cancel, between
         self._began: list[tuple[str, float]] = []
         self._values: dict[str, Any] = {"machine": machine, "recordings": {}}
 
@@ -386,9 +397,29 @@ class Journal:
         # begun before it is told: whoever is told may stop
         self._began.append((stage, time.perf_counter()))
         self._tell(STAGES.index(stage), stage)
+        self.pause(stage)
+        # a person's time is not the stage's
+        self._began[-1] = (stage, time.perf_counter())
+
+    def pause(self, following: str) -> None:
+        """Say what comes next, with what there is; whoever listens may take time over it."""
+        if self._between is not None:
+            self._between(following, self.result("under way"))
+        self.heed()
+
+    def heed(self) -> None:
+        """End where that was asked for.
+
+        Raises
+        ------
+        KeyboardInterrupt
+        """
+        if self._cancel is not None and self._cancel.is_set():
+            raise KeyboardInterrupt
 
     def within(self, done: int, total: int) -> None:
         """Tell how far the stage is."""
+        self.heed()
         self._tell(STAGES.index(self.stage), f"{self.stage} {done}/{total}")
 
     def finish(self) -> None:

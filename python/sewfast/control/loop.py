@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
@@ -212,6 +213,7 @@ def run(
     file: str | os.PathLike[str] | None = None,
     live: str | Kind = "none",
     overwrite: bool = False,
+    cancel: threading.Event | None = None,
 ) -> ClosedLoopRun:
     """Run a controller on a model, on a virtual machine or on a drive, from rest.
 
@@ -244,6 +246,8 @@ def run(
         Of a drive: see `sewfast.live.open_view`.
     overwrite : bool
         Whether `file` may replace a recording of a drive, which cannot be had again.
+    cancel : threading.Event, optional
+        Of a drive: set in another thread, it ends the run as Ctrl-C does.
 
     Returns
     -------
@@ -264,7 +268,7 @@ def run(
         Where the port or the drive failed or tripped; the motor is stopped, `recording` holds what
         came.
     Interrupted
-        On Ctrl-C, of a drive; the motor is stopped, `best` is the run up to there.
+        On Ctrl-C or `cancel`, of a drive; the motor is stopped, `best` is the run up to there.
     """
     require_controller(controller, on, "run(controller, plant, reference)")
     if reference is None:
@@ -273,7 +277,9 @@ def run(
     title = name or (reference if isinstance(reference, str) else "reference")
     beside = _beside(on, feedforward, disturbance)
     if not isinstance(on, (Model, VirtualMachine)):
-        return _on_machine(controller, on, r, title, file=file, live=live, overwrite=overwrite)
+        return _on_machine(
+            controller, on, r, title, cancel, file=file, live=live, overwrite=overwrite
+        )
     check_fits(controller, on)
     record = _core.closed_loop(
         single_core(on),
@@ -339,9 +345,14 @@ def require_controller(controller: Any, plant: Any, call: str) -> None:
 
 
 def _on_machine(
-    controller: Controller, on: Machine, r: FloatArray, name: str, **options: Any
+    controller: Controller,
+    on: Machine,
+    r: FloatArray,
+    name: str,
+    cancel: threading.Event | None,
+    **options: Any,
 ) -> ClosedLoopRun:
-    from .machine import is_streaming
+    from .machine import cancelled_by, is_streaming
 
     if not hasattr(on, "follow"):
         raise SettingError(
@@ -349,7 +360,7 @@ def _on_machine(
             f"{type(on).__name__}; load a model with load_model, or connect to a drive"
         )
     if is_streaming(on):
-        return on.follow(controller, r, name, **options)
+        return on.follow(controller, r, name, **options, **cancelled_by(cancel))
     return on.follow(controller, r, name)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import inspect
 import math
 import os
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeGuard, cast
@@ -107,8 +108,8 @@ class Machine(Protocol):
 class Streaming(Machine, Protocol):
     """A machine whose samples arrive while it runs, as a drive's: it fills files and views itself.
 
-    Its `excite` and `follow` take `file`, `live` and `overwrite` as `record` and `run` do, `excite`
-    `method` and `settings` as well.
+    Its `excite` and `follow` take `file`, `live`, `overwrite` and `cancel` as `record` and `run`
+    do, `excite` `method` and `settings` as well.
     """
 
     def excite(self, u: FloatArray, name: str, **options: Any) -> Recording: ...
@@ -166,6 +167,7 @@ def record(
     live: str | Kind = "none",
     settings: Mapping[str, Any] | None = None,
     overwrite: bool = False,
+    cancel: threading.Event | None = None,
 ) -> Recording:
     """Excite a machine from rest and record it.
 
@@ -191,6 +193,8 @@ def record(
     overwrite : bool
         Whether `file` may replace a recording of a drive, which cannot be had again; one of a
         virtual machine is replaced anyway.
+    cancel : threading.Event, optional
+        Of a drive: set in another thread, it ends the run as Ctrl-C does.
 
     Returns
     -------
@@ -208,7 +212,8 @@ def record(
         Where the port or the drive failed or tripped; the motor is stopped, `recording` holds what
         came.
     Interrupted
-        On Ctrl-C, of a drive; the motor is stopped, `best` is the recording up to there.
+        On Ctrl-C or `cancel`, of a drive; the motor is stopped, `best` is the recording up to
+        there.
     """
     if not isinstance(machine, VirtualMachine) and not hasattr(machine, "excite"):
         raise SettingError(
@@ -219,7 +224,7 @@ def record(
     if is_streaming(machine):
         return machine.excite(
             command, name, method=method, file=file, live=live, settings=settings,
-            overwrite=overwrite,
+            overwrite=overwrite, **cancelled_by(cancel),
         )  # fmt: skip
     if file is not None:
         require_replaceable(file, overwrite=overwrite)
@@ -230,6 +235,11 @@ def record(
     if file is not None:
         found.save(file, overwrite=overwrite)
     return found
+
+
+def cancelled_by(cancel: threading.Event | None) -> dict[str, Any]:
+    """The option for a streaming machine; one that knows none is asked only where it is wanted."""
+    return {} if cancel is None else {"cancel": cancel}
 
 
 def _command(u: ArrayLike) -> FloatArray:

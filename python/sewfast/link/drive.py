@@ -9,7 +9,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from types import TracebackType
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from . import wire
 from .connection import ClockBounds, Connection, DeviceReset, Loan
 from .plan import Layout, Outcome, Plan, Sink, excite, follow, layout, require_capable
 from .ports import Unique, open_port
-from .run import Run
+from .run import REST_US, STEP_US, Run
 from .wire import Channel, Identity, Kind, Limits, Status
 
 # --- Terms of host and device: its channels, limits within its ceilings, controllers in its units -
@@ -127,9 +127,6 @@ def _require_units(given: str, device: str, what: str) -> None:
 # --- Rest: time that passes on the device until its motor stands still or it has measured well ----
 
 
-REST_US = 120_000
-"""Device's time without a count after which a motor is at rest; ARM wants 100 ms."""
-STEP_US = 20_000
 MEASURED_WITHIN = 1.0
 
 
@@ -145,7 +142,7 @@ def wait_for_rest(link: Connection, timeout: float) -> None:
                 f"expected the motor at rest within {timeout:g} s, it turns at "
                 f"{status.speed_rpm:.0f} RPM; brake it or wait longer"
             )
-        let_pass(link, STEP_US)
+        link.let_pass(STEP_US)
         before, status = status, link.status()
         if status.counts != before.counts:
             since = status.time_us
@@ -155,23 +152,16 @@ def await_measurement(link: Connection) -> None:
     """Boot ends by itself after some good samples; a device on credit needs time for them."""
     deadline = time.monotonic() + MEASURED_WITHIN
     while link.status().state == "boot" and time.monotonic() < deadline:
-        let_pass(link, STEP_US)
-
-
-def let_pass(link: Connection, us: int) -> None:
-    """Grant time to a device on credit; take turns for as long with another."""
-    if link.identity.on_credit:
-        link.grant(link.newest + us)
-        return
-    until = time.monotonic() + us * 1e-6
-    while (rest := until - time.monotonic()) > 0.0:
-        link.turn(rest)
+        link.let_pass(STEP_US)
 
 
 # --- `Drive`: a motor drive behind a port; `connect` opens it -------------------------------------
 
 
 PATIENCE = 3.0
+
+
+_Drive = TypeVar("_Drive", bound="Drive")
 
 
 class Drive(Unique):
@@ -195,7 +185,30 @@ class Drive(Unique):
         self.outcome: Outcome | None = None
         await_measurement(link)
 
-    def __enter__(self) -> Drive:
+    @classmethod
+    def open(
+        cls: type[_Drive],
+        url: str,
+        *,
+        baud: int = 115_200,
+        watchdog: float | None = None,
+        resume: float = 1.0,
+    ) -> _Drive:
+        """As `connect`, for a drive of a class of one's own."""
+        if watchdog is not None and not 0.001 <= real("watchdog", watchdog) <= 10.0:
+            raise SettingError(
+                f"expected a watchdog of .001 to 10 s, got {watchdog}; .1 suits most"
+            )
+        if not 0.0 <= real("resume", resume) < math.inf:
+            raise SettingError(f"expected resume of 0 s or more, got {resume}; 1 suits most")
+        port = open_port(url, baud)
+        try:
+            return cls(Connection(port, watchdog=watchdog, patience=PATIENCE, resume=resume))
+        except BaseException:
+            port.close()
+            raise
+
+    def __enter__(self: _Drive) -> _Drive:
         return self
 
     def __exit__(
@@ -460,6 +473,7 @@ class Drive(Unique):
         live: str | View = "none",
         settings: Mapping[str, Any] | None = None,
         overwrite: bool = False,
+        cancel: threading.Event | None = None,
     ) -> Recording:
         """Play commands from rest and record them; `sewfast.record` with a drive does this.
 
@@ -469,7 +483,7 @@ class Drive(Unique):
             Commands at the device's sample time [V].
         name : str
             Of the excitation, in messages and files.
-        method, file, live, settings, overwrite
+        method, file, live, settings, overwrite, cancel
             As for `sewfast.record`.
 
         Raises
@@ -479,7 +493,7 @@ class Drive(Unique):
         """
         return excite(
             self, u, name, method=method, file=file, live=live, settings=settings,
-            overwrite=overwrite,
+            overwrite=overwrite, cancel=cancel,
         )  # fmt: skip
 
     def follow(
@@ -492,6 +506,7 @@ class Drive(Unique):
         live: str | View = "none",
         overwrite: bool = False,
         watch: Watch | None = None,
+        cancel: threading.Event | None = None,
     ) -> RecordedRun:
         """Run a controller on the device along a reference; `sewfast.run` with a drive does this.
 
@@ -502,7 +517,7 @@ class Drive(Unique):
             Reference at the device's sample time [y].
         name : str
             Of the reference, in messages and reports.
-        file, live, overwrite
+        file, live, overwrite, cancel
             As for `sewfast.run`.
         watch : Watch, optional
             Sees the samples as they come; what it raises stops the motor and goes on.
@@ -518,15 +533,18 @@ class Drive(Unique):
             As for `sewfast.run`.
         """
         return follow(
-            self, controller, r, name, file=file, live=live, overwrite=overwrite, watch=watch
-        )
+            self, controller, r, name, file=file, live=live, overwrite=overwrite, watch=watch,
+            cancel=cancel,
+        )  # fmt: skip
 
     def _stream(self, plan: Plan, sink: Sink, cancel: threading.Event | None) -> Outcome:
         run = self._prepare(plan, sink)
         try:
             run.upload()
-            run.begin()
-            self.outcome = run.finish() if run.play(cancel) else run.abort(None)
+            wanted = cancel is None or not cancel.is_set()
+            if wanted:
+                run.begin()
+            self.outcome = run.finish() if wanted and run.play(cancel) else run.abort(None)
         except BaseException as error:
             self.outcome = run.abort(error)
             self._settle()
@@ -643,13 +661,4 @@ def connect(
     SettingError
         For a setting outside its range.
     """
-    if watchdog is not None and not 0.001 <= real("watchdog", watchdog) <= 10.0:
-        raise SettingError(f"expected a watchdog of .001 to 10 s, got {watchdog}; .1 suits most")
-    if not 0.0 <= real("resume", resume) < math.inf:
-        raise SettingError(f"expected resume of 0 s or more, got {resume}; 1 suits most")
-    port = open_port(url, baud)
-    try:
-        return Drive(Connection(port, watchdog=watchdog, patience=PATIENCE, resume=resume))
-    except BaseException:
-        port.close()
-        raise
+    return Drive.open(url, baud=baud, watchdog=watchdog, resume=resume)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray
 from ..control.controller import Controller
-from ..control.machine import RecordedRun, Watch
+from ..control.machine import RecordedRun, Watch, cancelled_by
 from ..errors import Interrupted, LinkError, SettingError, SewfastError
 from ..gains import vector
 from ..live import Feed, Kind, open_view
@@ -438,6 +439,7 @@ def play(
     overwrite: bool = False,
     settings: Mapping[str, Any] | None = None,
     watch: Watch | None = None,
+    cancel: threading.Event | None = None,
 ) -> Played:
     """Run a plan and keep its samples.
 
@@ -459,6 +461,8 @@ def play(
         What else the file says of the run.
     watch : Watch, optional
         Sees the samples as they come, and ends the run by what it raises.
+    cancel : threading.Event, optional
+        Set in another thread, it ends the run as Ctrl-C does.
 
     Raises
     ------
@@ -478,7 +482,9 @@ def play(
     with open_view(live, feed):
         writer = _writer(file, drive, plan, name, columns, settings or {})
         recorder = Recorder(columns, n, writer=writer, feed=feed, watch=watch)
-        played = _streamed(drive, plan, recorder, writer)
+        played = _streamed(drive, plan, recorder, writer, cancel)
+    if played.outcome.reason == "cancelled" and cancel is not None and cancel.is_set():
+        raise Stopped(played, KeyboardInterrupt())
     if played.outcome.reason != "finished":
         raise Stopped(played, LinkError(_not_finished(played.outcome, n, drive)))
     return played
@@ -601,12 +607,18 @@ def _finite(limits: tuple[float, ...]) -> dict[str, float | None]:
     return {name: value if np.isfinite(value) else None for name, value in pairs}
 
 
-def _streamed(drive: Drive, plan: Plan, recorder: Recorder, writer: RecordWriter | None) -> Played:
+def _streamed(
+    drive: Drive,
+    plan: Plan,
+    recorder: Recorder,
+    writer: RecordWriter | None,
+    cancel: threading.Event | None,
+) -> Played:
     """Stream, close the file whatever happens, and give what came."""
     # of this run, not of one before it
     drive.outcome = None
     try:
-        outcome = drive.stream(plan, recorder)
+        outcome = drive.stream(plan, recorder, **cancelled_by(cancel))
     except BaseException as error:
         ended = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
         _closed(recorder, ended, drive.outcome, error)

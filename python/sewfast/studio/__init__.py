@@ -1,11 +1,13 @@
-"""Studio: look, identify, validate and tune on a local page; its files are the command line's.
+"""Studio: from a recording to a driven machine on a local page; its files are the command line's.
 
-`project` says what the steps are, each a call of the public API; `tuning` what a controller's
-numbers do; `server` shows both to a browser on this machine and to nobody else; `page` holds what
-the browser loads.
+`project`, `commissioning` and `driving` say what the steps are, each a call of the public API;
+`tuning` what a controller's numbers do; `messages` what a page may ask for; `server` shows all of
+it to a browser on this machine and to nobody else; `line` is its end of `bench`, the process that
+owns a drive's port; `page` holds what the browser loads.
 """
 
-from .project import Commission, Project, Step, make_demo
+from .commissioning import Commission
+from .project import Project, Step, make_demo
 from .server import Studio
 from .tuning import Tuning
 

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from ..errors import DataError, SettingError
+from .commissioning import COMMISSIONED, Commission, carry_out, envelope, require
 
 if TYPE_CHECKING:
-    from ..dataset import Dataset, FloatArray
+    from ..dataset import Dataset
     from .tuning import Tuning
 
 RECORDINGS = (".csv", ".npz", ".mat", ".parquet", ".mcap")
@@ -26,11 +27,9 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 LARGEST = 512 * 2**20
 """Bytes of a recording that the page opens."""
 
-COLUMNS = 1200
-"""Pairs of lowest and highest value in a drawn curve: about two a pixel of a wide window."""
+_ARTEFACTS = ("controllers", "models")
+"""Where the documents are in the folder of a commissioning."""
 
-COMMISSIONED, _ARTEFACTS = "commissioned", ("controllers", "models")
-"""Folder that a commissioning fills, and where in it the documents are."""
 DEMO_MEMBERS, DEMO_SAMPLES = 4, 8000
 
 MODEL_FORMAT, CONTROLLER_FORMAT = "sewfast.model", "sewfast.controller"
@@ -75,74 +74,17 @@ class Step:
         """
         inputs, output = asked.get("inputs", []), asked.get("output")
         resample, model, seed = asked.get("resample"), asked.get("model", "auto"), asked.get("seed")
-        _require(isinstance(asked.get("file"), str), "file", "a name", asked.get("file"))
+        require(isinstance(asked.get("file"), str), "file", "a name", asked.get("file"))
         named = isinstance(inputs, list) and all(isinstance(name, str) for name in inputs)
-        _require(named, "inputs", "a list of column names", inputs)
-        _require(output is None or isinstance(output, str), "output", "a column or null", output)
+        require(named, "inputs", "a list of column names", inputs)
+        require(output is None or isinstance(output, str), "output", "a column or null", output)
         number = isinstance(resample, (int, float)) and not isinstance(resample, bool)
-        _require(resample is None or number, "resample", "seconds or null", resample)
-        _require(model in KINDS, "model", f"one of {', '.join(KINDS)}", model)
+        require(resample is None or number, "resample", "seconds or null", resample)
+        require(model in KINDS, "model", f"one of {', '.join(KINDS)}", model)
         seed = 0 if seed is None else seed
         whole = isinstance(seed, int) and not isinstance(seed, bool) and 0 <= seed < 2**32
-        _require(whole, "seed", "a whole number from 0", seed)
+        require(whole, "seed", "a whole number from 0", seed)
         return cls(asked["file"], tuple(inputs), output or None, resample, model, seed)
-
-
-@dataclass(frozen=True)
-class Commission:
-    """Which virtual machine to commission, and with what effort.
-
-    Parameters
-    ----------
-    machine : str
-        ``virtual`` or ``virtual:SEED``.
-    seed, members, evaluations : int
-        As for `sewfast.commission`.
-    """
-
-    machine: str = "virtual"
-    seed: int = 0
-    members: int = 4
-    evaluations: int = 3000
-
-    @classmethod
-    def parse(cls, asked: dict[str, Any]) -> Commission:
-        """From a message; what is out of range is refused.
-
-        Raises
-        ------
-        SettingError
-        """
-        machine = asked.get("machine", "virtual")
-        named = isinstance(machine, str) and re.fullmatch(r"virtual(:\d{1,9})?", machine)
-        _require(bool(named), "machine", "virtual or virtual:SEED", machine)
-        numbers = {}
-        for name, low, high in (
-            ("seed", 0, 2**32 - 1), ("members", 1, 16), ("evaluations", 10, 20_000)
-        ):  # fmt: skip
-            value = asked.get(name, getattr(cls, name))
-            whole = isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
-            _require(whole, name, f"a whole number from {low} to {high}", value)
-            numbers[name] = value
-        return cls(str(machine), **numbers)
-
-    def python(self) -> str:
-        """A script that does it again, run in the project folder."""
-        call = f"machine, seed={self.seed}, members={self.members}, evaluations={self.evaluations}"
-        return (
-            f"import sewfast\n\nmachine = sewfast.VirtualMachine.from_name({self.machine!r})\n"
-            f"found = sewfast.commission({call})\nfound.save({COMMISSIONED!r})\nprint(found)\n"
-        )
-
-    def commands(self) -> str:
-        """The same for a shell in the project folder."""
-        effort = f"--members {self.members} --evaluations {self.evaluations} --seed {self.seed}"
-        return f"sewfast commission --on {self.machine} {effort} --out {COMMISSIONED}\n"
-
-
-def _require(ok: bool, name: str, expected: str, received: object) -> None:
-    if not ok:
-        raise SettingError(f"{name}: expected {expected}, received {str(received)[:80]!r}")
 
 
 def make_demo(folder: str | os.PathLike[str]) -> None:
@@ -269,6 +211,8 @@ class Project:
         return path
 
     def state(self) -> dict[str, Any]:
+        from .. import signals
+
         return {
             "folder": self.folder.name or str(self.folder),
             "recordings": self.recordings(),
@@ -276,6 +220,8 @@ class Project:
             "demo": self.demo,
             "models": self.documents(MODEL_FORMAT),
             "controllers": self.documents(CONTROLLER_FORMAT),
+            "excitations": list(signals.EXCITATIONS),
+            "references": list(signals.REFERENCES),
         }
 
     # --- Tuning -----------------------------------------------------------------------------------
@@ -332,39 +278,9 @@ class Project:
         SettingError
             For a folder of that name with files of somebody else's.
         """
-        from ..commissioning import commission
-        from ..commissioning.result import require_own
         from ..machine import VirtualMachine
 
-        place = self.folder / COMMISSIONED
-        if place.is_symlink():
-            raise SettingError(f"{COMMISSIONED}: expected a folder, received a link; remove it")
-        require_own(place, overwrite=False)
-        found = commission(
-            VirtualMachine.from_name(asked.machine), seed=asked.seed, members=asked.members,
-            evaluations=asked.evaluations, progress=progress,
-        )  # fmt: skip
-        found.save(place)
-        loops = [(c.reference, c.predicted, c.measured) for c in found.comparisons]
-        return {
-            "verdict": found.verdict,
-            "text": str(found),
-            "predicted_cost": found.predicted_cost,
-            "measured_cost": found.measured_cost,
-            "references": [
-                {
-                    "name": name,
-                    "curves": [
-                        {"name": title, "unit": run.units["y"], **envelope(run.r - run.y, run.Ts)}
-                        for title, run in (("measured", measured), ("predicted", predicted))
-                    ],
-                }
-                for name, predicted, measured in loops
-                if measured is not None
-            ],
-            "python": asked.python(),
-            "commands": asked.commands(),
-        }
+        return carry_out(asked, VirtualMachine.from_name(asked.machine), self.folder, progress)
 
     # --- Steps ------------------------------------------------------------------------------------
 
@@ -512,30 +428,5 @@ def checked_name(file: Any) -> str:
     SettingError
     """
     fits = isinstance(file, str) and re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,60}\.json", file)
-    _require(bool(fits), "file", "a name such as controller.json", file)
+    require(bool(fits), "file", "a name such as controller.json", file)
     return str(file)
-
-
-def envelope(values: FloatArray, Ts: float, columns: int = COLUMNS) -> dict[str, Any]:
-    """A curve to draw: every sample, or the lowest and the highest of each of `columns` pieces.
-
-    Parameters
-    ----------
-    values : (N,) array
-        NaN is a gap.
-    Ts : float
-        Sample time [s].
-    columns : int
-
-    Returns
-    -------
-    dict
-        ``Ts``, ``n`` and ``low``, ``high``: lists of equal length over the whole time.
-    """
-    n = len(values)
-    if n <= 2 * columns:
-        low = high = values
-    else:
-        starts = np.linspace(0, n, columns, endpoint=False).astype(np.intp)
-        low, high = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
-    return {"Ts": Ts, "n": n, "low": low.tolist(), "high": high.tolist()}

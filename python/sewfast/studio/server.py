@@ -8,6 +8,7 @@ import hmac
 import json
 import logging
 import math
+import queue
 import secrets
 import struct
 import threading
@@ -19,8 +20,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import Interrupted, SettingError, SewfastError
-from .project import Commission, Project, Step, checked_name
+from ..errors import Interrupted, SettingError
+from .bench import said
+from .commissioning import Commission
+from .driving import checked_recording
+from .line import Line
+from .messages import checked
+from .project import CONTROLLER_FORMAT, Project, Step, checked_name
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response
@@ -38,8 +44,21 @@ FAREWELL = 1.0
 
 BETWEEN_REPORTS = 0.05
 """Seconds between two messages of a job's progress."""
-WRITES = ("identify", "commission", "cancel", "tune_search", "tune_save")
-"""What only the page that holds the control can ask for."""
+WRITES = (
+    "identify", "commission", "cancel", "tune_search", "tune_save", "drive_connect",
+    "drive_disconnect", "drive_limits", "drive_arm", "drive_disarm", "drive_clear", "drive_go",
+    "drive_record", "drive_run", "drive_commission",
+)  # fmt: skip
+"""What only the page that holds the control can ask for; a stop may come from any."""
+
+BEAT = 0.1
+"""Seconds between two questions whether the page that holds the control is there."""
+
+PROMPT, ROW = 0.15, 10
+"""A drive is armed for a page that has answered so many times in a row within so many seconds."""
+
+MOST_UNANSWERED = 20
+"""Questions to a page that does not answer, which are then no longer put."""
 
 PAGE = {
     "/": ("index.html", "text/html; charset=utf-8"),
@@ -48,6 +67,7 @@ PAGE = {
     "/commission.js": ("commission.js", "text/javascript; charset=utf-8"),
     "/copies.js": ("copies.js", "text/javascript; charset=utf-8"),
     "/tune.js": ("tune.js", "text/javascript; charset=utf-8"),
+    "/drive.js": ("drive.js", "text/javascript; charset=utf-8"),
     "/server.js": ("server.js", "text/javascript; charset=utf-8"),
     "/studio.css": ("studio.css", "text/css; charset=utf-8"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
@@ -68,6 +88,71 @@ HEADERS = {
 
 class _Cancelled(KeyboardInterrupt):
     """Raised out of a job's progress; a search then hands over its best so far."""
+
+
+class _Page:
+    """A page that has given its token.
+
+    What is said to it and what it asks for each have a thread of their own, so that a page that
+    takes nothing more holds up nobody, and a long question of a page not its STOP.
+    """
+
+    def __init__(
+        self, connection: ServerConnection, answer: Callable[[_Page, str | bytes], object]
+    ) -> None:
+        self.connection = connection
+        self._says: queue.SimpleQueue[str | bytes | None] = queue.SimpleQueue()
+        self._asks: queue.SimpleQueue[str | bytes | None] = queue.SimpleQueue()
+        self._answer = answer
+        self._beats: dict[int, float] = {}
+        self._beat = 0
+        #: Questions in a row that it has answered promptly.
+        self.prompt = 0
+        for run in (self._speak, self._work):
+            threading.Thread(target=run, daemon=True).start()
+
+    def say(self, message: str | bytes) -> None:
+        self._says.put(message)
+
+    def ask(self, message: str | bytes) -> None:
+        self._asks.put(message)
+
+    def end(self) -> None:
+        self._says.put(None)
+        self._asks.put(None)
+
+    def _speak(self) -> None:
+        from websockets.exceptions import ConnectionClosed
+
+        with contextlib.suppress(ConnectionClosed):
+            while (message := self._says.get()) is not None:
+                self.connection.send(message)
+
+    def _work(self) -> None:
+        while (message := self._asks.get()) is not None:
+            self._answer(self, message)
+
+    def beat(self) -> None:
+        """Ask whether it is there."""
+        now = time.monotonic()
+        if len(self._beats) >= MOST_UNANSWERED:
+            self.prompt = 0
+            oldest = min(self._beats)
+            if now - self._beats[oldest] > 10.0:  # it may have lost them, for all that is known
+                self._beats.clear()
+            return
+        self._beat += 1
+        self._beats[self._beat] = now
+        self.say(_text({"event": "beat", "n": self._beat, "prompt": self.prompt}))
+
+    def answered(self, n: int) -> float | None:
+        """Seconds that the answer to a beat took; None where that was not asked."""
+        sent = self._beats.pop(n, None)
+        if sent is None:
+            return None
+        took = time.monotonic() - sent
+        self.prompt = self.prompt + 1 if took <= PROMPT else 0
+        return took
 
 
 class Studio:
@@ -101,8 +186,10 @@ class Studio:
         silent.addHandler(logging.NullHandler())
         self.project = project
         self.token = secrets.token_urlsafe(32)
-        self._pages: set[ServerConnection] = set()
-        self._writer: ServerConnection | None = None
+        self._pages: set[_Page] = set()
+        self._writer: _Page | None = None
+        self._line = Line(project.folder, self._tell)
+        self._ended = threading.Event()
         self._lock = threading.RLock()
         self._job: threading.Thread | None = None
         self._cancel = threading.Event()
@@ -118,6 +205,7 @@ class Studio:
                 f"port {port}: expected a free port, received {e.strerror!r}; choose another "
                 "with --port, or leave --port out"
             ) from e
+        threading.Thread(target=self._beat, daemon=True).start()
         self.port: int = self._server.socket.getsockname()[1]
         self._hosts = {f"{name}:{self.port}" for name in (ADDRESS, "localhost")}
 
@@ -132,10 +220,12 @@ class Studio:
     def close(self) -> None:
         """End a running job and every socket, also those of pages that no longer answer."""
         self._cancel.set()
+        self._ended.set()
+        self._line.close()
         with self._lock:
             pages = list(self._pages)
         for page in pages:
-            page.close(1001, "the studio has ended")
+            page.connection.close(1001, "the studio has ended")
         self._server.shutdown()
         if self._job is not None:
             self._job.join()
@@ -180,17 +270,24 @@ class Studio:
             if not self._is_known(connection):
                 connection.close(1008, "wrong token")
                 return
+            page = _Page(connection, self._answer)
             with self._lock:
-                self._pages.add(connection)
-                self._writer = self._writer or connection
+                self._pages.add(page)
+                self._writer = self._writer or page
             try:
                 self._tell_all()
+                page.say(_text(self._line.state))
                 for message in connection:
-                    connection.send(self._answer(connection, message))
+                    if not self._is_done_at_once(page, message):
+                        page.ask(message)
             finally:
                 with self._lock:
-                    self._pages.discard(connection)
-                    self._writer = None if self._writer is connection else self._writer
+                    self._pages.discard(page)
+                    was_writer = self._writer is page
+                    self._writer = None if was_writer else self._writer
+                if was_writer and self._line.may_move:
+                    self._line.stop("the page that held the control was closed")
+                page.end()
                 self._tell_all()
 
     def _is_known(self, connection: ServerConnection) -> bool:
@@ -203,33 +300,75 @@ class Studio:
 
     # --- What a page asks for ---------------------------------------------------------------------
 
-    def _answer(self, connection: ServerConnection, message: str | bytes) -> str | bytes:
+    def _is_done_at_once(self, page: _Page, message: str | bytes) -> bool:
+        """Do what must not wait behind anything else; False for what may."""
+        # a stop is heard of every page, also where the rest of its message is nonsense
+        try:
+            asked = json.loads(message)
+            name = asked.get("do") if isinstance(asked, dict) else None
+        except (ValueError, RecursionError):
+            return False
+        if name == "stop":
+            self._line.stop("STOP on the page")
+        elif name not in ("alive", "live"):
+            return False
+        number = asked.get("id") if isinstance(asked.get("id"), int) else None
+        try:
+            fields = checked(asked)
+            if name == "alive":
+                took = page.answered(fields["n"])
+                if took is not None and page is self._writer:
+                    self._line.alive(took)
+                return True
+            found = self._line.live(**fields) if name == "live" else (None, {})
+            page.say(packed({"id": number, "found": found[0]}, found[1]))
+        except Exception as e:
+            page.say(_text({"id": number, "error": said(e)}))
+        return True
+
+    def _beat(self) -> None:
+        """Ask the page that holds the control whether it is there, as long as there is a drive."""
+        while not self._ended.wait(BEAT):
+            page = self._writer
+            if page is not None and self._line.is_connected:
+                page.beat()
+
+    def _answer(self, page: _Page, message: str | bytes) -> None:
         number: Any = None
         try:
             asked = json.loads(message)
             if not isinstance(asked, dict):
                 raise SettingError("expected an object")
             number = asked.get("id") if isinstance(asked.get("id"), int) else None
-            found = self._do(connection, asked)
+            found = self._do(page, asked)
             if isinstance(found, tuple):
-                return _packed({"id": number, "found": found[0]}, found[1])
-            return _text({"id": number, "found": found})
+                page.say(packed({"id": number, "found": found[0]}, found[1]))
+            else:
+                page.say(_text({"id": number, "found": found}))
         except Exception as e:
-            return _text({"id": number, "error": _said(e)})
+            page.say(_text({"id": number, "error": said(e)}))
 
-    def _do(self, connection: ServerConnection, asked: dict[str, Any]) -> Any:
+    def _do(self, page: _Page, asked: dict[str, Any]) -> Any:
         name = asked.get("do")
+        if name in WRITES and self._writer is not page:
+            raise SettingError("this page looks on; press 'take control' first")
+        fields = checked(asked)
+        name = str(name)
         if name == "take":
             with self._lock:
-                self._writer = connection
+                before, self._writer = self._writer, page
+            if before is not page and self._line.may_move:
+                self._line.stop("another page has taken the control")
             self._tell_all()
             return None
-        if name in WRITES and self._writer is not connection:
-            raise SettingError("this page looks on; press 'take control' first")
         if name == "cancel":
             self._cancel.set()
             return None
-        if isinstance(name, str) and name.startswith("tune"):
+        if name == "ports":
+            return _ports()
+        if name.startswith("drive_"):
+            return self._drive(page, name.removeprefix("drive_"), fields)
+        if name.startswith("tune"):
             return self._tune(name, asked)
         if name == "commission":
             wanted = Commission.parse(asked)
@@ -247,6 +386,28 @@ class Studio:
             )
             return None
         raise SettingError(f"expected a known step, received {str(name)[:40]!r}")
+
+    def _drive(self, page: _Page, name: str, fields: dict[str, Any]) -> Any:
+        line = self._line
+        if name == "arm" and page.prompt < ROW:
+            raise SettingError(
+                f"expected {ROW} answers of this page in a row within {PROMPT * 1e3:.0f} ms, "
+                f"received {page.prompt}: page or computer are too busy to watch over a motor; "
+                "close what is not needed, then arm again"
+            )
+        if name in ("record", "run", "commission"):
+            if "file" in fields:
+                place = self.project.folder / checked_recording(fields["file"])
+                if place.exists() or place.is_symlink():
+                    raise SettingError(
+                        f"{fields['file']}: expected a new name, there is such a file; a recording "
+                        "of a drive is not replaced"
+                    )
+            if name == "run":
+                self.project.document(fields["controller"], CONTROLLER_FORMAT)
+            line.work(name, **fields)
+            return None
+        return getattr(line, name)(**fields)
 
     def _tune(self, name: str, asked: dict[str, Any]) -> Any:
         tuning = self.project.tuning(asked.get("model"), asked.get("controller"))
@@ -288,15 +449,15 @@ class Studio:
             self._job.start()
 
     def _work(self, event: str, work: Callable[[Any], dict[str, Any]]) -> None:
-        told, stage = -math.inf, ""
+        heard, stage = -math.inf, ""
 
         def progress(done: int, total: int, best: float | str) -> None:
-            nonlocal told, stage
+            nonlocal heard, stage
             if self._cancel.is_set():
                 raise _Cancelled
             before, stage = stage, str(best).split(" ")[0] if isinstance(best, str) else ""
-            if stage != before or time.monotonic() - told > BETWEEN_REPORTS:
-                told = time.monotonic()
+            if stage != before or time.monotonic() - heard > BETWEEN_REPORTS:
+                heard = time.monotonic()
                 self._tell(
                     {"event": "progress", "of": event, "done": done, "total": total, "best": best}
                 )
@@ -307,7 +468,7 @@ class Studio:
         except (KeyboardInterrupt, Interrupted):  # whoever passes it on makes one of the two of it
             found = {"error": "cancelled; nothing was written"}
         except Exception as e:
-            found = {"error": _said(e)}
+            found = {"error": said(e)}
         self._tell({"event": event, **found})
         self._tell_all()
 
@@ -317,13 +478,27 @@ class Studio:
         with self._lock:
             pages, writer = list(self._pages), self._writer
         for page in pages:
-            _send(page, {"event": "state", **state, "writes": page is writer, "pages": len(pages)})
+            told = {**state, "writes": page is writer, "pages": len(pages)}
+            page.say(_text({"event": "state", **told}))
 
     def _tell(self, event: dict[str, Any]) -> None:
         with self._lock:
             pages = list(self._pages)
+        text = _text(event)
         for page in pages:
-            _send(page, event)
+            page.say(text)
+        if event["event"] == "driven":
+            self._tell_all()  # there may be another file
+
+
+def _ports() -> list[dict[str, str]]:
+    """The serial ports of this computer; without pyserial none are known."""
+    from ..link.ports import list_ports
+
+    try:
+        return [{"path": p.path, "text": p.problem or p.description} for p in list_ports()]
+    except SettingError:
+        return []
 
 
 def _answer(
@@ -339,14 +514,7 @@ def _answer(
     return response
 
 
-def _said(error: Exception) -> str:
-    """What the page is told: a refusal in its own words, a fault with its kind."""
-    if isinstance(error, (ValueError, RecursionError, SewfastError, OSError)):
-        return str(error)
-    return f"a fault in sewfast: {type(error).__name__}: {error}"
-
-
-def _packed(head: dict[str, Any], curves: Mapping[str, FloatArray]) -> bytes:
+def packed(head: dict[str, Any], curves: Mapping[str, FloatArray]) -> bytes:
     """A message with curves: length of the head, head as JSON, then every curve in float32.
 
     The head's `curves` are names and lengths in order; it is padded so that a browser can lay an
@@ -357,13 +525,6 @@ def _packed(head: dict[str, Any], curves: Mapping[str, FloatArray]) -> bytes:
     text += b" " * (-len(text) % 4)
     rows = [np.asarray(values, dtype="<f4").tobytes() for values in curves.values()]
     return b"".join([struct.pack("<I", len(text)), text, *rows])
-
-
-def _send(page: ServerConnection, event: dict[str, Any]) -> None:
-    from websockets.exceptions import ConnectionClosed
-
-    with contextlib.suppress(ConnectionClosed):
-        page.send(_text(event))
 
 
 def _text(value: Any) -> str:

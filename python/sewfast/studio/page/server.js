@@ -11,8 +11,10 @@ let number = 0;
 /** Calls `heard(message)` at every event of that name. */
 export function on(event, heard) { (listeners[event] ??= []).push(heard); }
 
-/** A step of the server; resolves to what it found, rejects with its refusal. */
-export function ask(name, asked = {}) {
+/** A step of the server; resolves to what it found, rejects with its refusal. One that is not `answered` is only sent. */
+export function ask(name, asked = {}, answered = true) {
+  if (socket.readyState !== WebSocket.OPEN) return Promise.reject(new Error("no connection to the studio"));
+  if (!answered) return socket.send(JSON.stringify({ do: name, ...asked }));
   const id = ++number;
   socket.send(JSON.stringify({ id, do: name, ...asked }));
   return new Promise((done, failed) => waiting.set(id, [done, failed]));

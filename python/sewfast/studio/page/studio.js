@@ -4,8 +4,9 @@ import { draw } from "/curves.js";
 import { show } from "/tune.js";
 import { copies } from "/copies.js";
 import "/commission.js";
+import { look } from "/drive.js";
 
-const $ = id => document.getElementById(id);
+const $ = id => document.getElementById(id), VIEWS = ["data", "tune", "drive", "commission"];
 let writes = false, busy = false, files = null;
 
 on("closed", () => { $("control").textContent = "not connected: start sewfast studio again, or open its whole address"; });
@@ -20,8 +21,9 @@ function ask(name) {
 }
 
 function view(name) {
-  for (const v of ["data", "tune", "commission"]) { $(v).hidden = v !== name; $(`view-${v}`).setAttribute("aria-pressed", v === name); }
+  for (const v of VIEWS) { $(v).hidden = v !== name; $(`view-${v}`).setAttribute("aria-pressed", v === name); }
   if (name === "tune") show();
+  if (name === "drive") look();
 }
 
 function tell(error) { $("error").textContent = error ? error.message : ""; $("error").hidden = !error; }
@@ -102,7 +104,7 @@ function candidates(rows) {
 $("file").onchange = choose;
 $("what").onsubmit = event => event.preventDefault();
 $("take").onclick = () => send("take");
-for (const v of ["data", "tune", "commission"]) $(`view-${v}`).onclick = () => view(v);
+for (const v of VIEWS) $(`view-${v}`).onclick = () => view(v);
 $("cancel").onclick = () => send("cancel").catch(tell);
 $("look").onclick = () => act("look", f => {
   curves($("signals"), f.curves.map(c => [c]));

@@ -1,0 +1,300 @@
+"""The server's end of the bench process: what the page asks of a drive, and what it sees of it."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NoAnswer
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import LinkError, SettingError
+from ..live import Feed
+from .driving import LIMITS, Place, copies
+
+if TYPE_CHECKING:
+    from ..dataset import FloatArray
+    from ..link import VirtualDevice
+
+PATIENCE = 15.0
+"""Seconds for an answer of the bench; it waits up to 10 s for a motor to rest."""
+
+CLOSING = 3.0
+"""Seconds for the bench to end by itself."""
+
+_PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast.studio.bench import main; main()"
+
+
+class Line:
+    """A drive, by way of the process that owns its port.
+
+    Parameters
+    ----------
+    folder : Path
+        Where recordings go.
+    tell : callable(event)
+        Takes what the bench says; called in a thread of its own.
+    """
+
+    def __init__(self, folder: Path, tell: Callable[[dict[str, Any]], None]) -> None:
+        self.folder, self._tell = folder, tell
+        self.state: dict[str, Any] = {"event": "drive", "connected": False, "armed": False}
+        self._program: subprocess.Popen[bytes] | None = None
+        self._ear: threading.Thread | None = None
+        self._device: VirtualDevice | None = None
+        self._place = Place("")
+        self._work: tuple[str, dict[str, Any]] | None = None
+        self._writing, self._lock = threading.Lock(), threading.RLock()
+        self._numbers = itertools.count()
+        self._waiting: dict[int, Future[dict[str, Any]]] = {}
+        self._feed: Feed | None = None
+        self._run = 0
+
+    @property
+    def is_connected(self) -> bool:
+        return bool(self.state["connected"])
+
+    @property
+    def may_move(self) -> bool:
+        """Whether the motor turns or may be made to."""
+        return bool(self.state["armed"]) or self._work is not None
+
+    # --- The process ------------------------------------------------------------------------------
+
+    def _started(self) -> subprocess.Popen[bytes]:
+        with self._lock:
+            if self._program is None or self._program.poll() is not None:
+                self._program = subprocess.Popen(
+                    [sys.executable, "-c", _PROGRAM.format(path=sys.path)],
+                    stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                    # Ctrl-C is for the server; its end stops the motor
+                    start_new_session=True,
+                )  # fmt: skip
+                self._ear = threading.Thread(target=self._hear, args=(self._program,), daemon=True)
+                self._ear.start()
+            return self._program
+
+    def _write(self, message: dict[str, Any]) -> None:
+        program = self._program
+        if program is None or program.stdin is None:
+            return
+        with self._writing, suppress(OSError, ValueError):
+            program.stdin.write(json.dumps(message).encode() + b"\n")
+            program.stdin.flush()
+
+    def _ask(self, name: str, **asked: Any) -> Any:
+        self._started()
+        number = next(self._numbers)
+        future = self._waiting[number] = Future()
+        self._write({"do": name, "id": number, **asked})
+        try:
+            answer = future.result(PATIENCE)
+        except NoAnswer:
+            raise LinkError(
+                f"expected an answer about the drive within {PATIENCE:g} s, received none; press "
+                "STOP, see to cable and supply, then connect again"
+            ) from None
+        finally:
+            self._waiting.pop(number, None)
+        if "error" in answer:
+            raise SettingError(answer["error"])
+        return answer["found"]
+
+    def _hear(self, program: subprocess.Popen[bytes]) -> None:
+        assert program.stdout is not None
+        with program.stdout as pipe:
+            while len(head := pipe.read(4)) == 4:
+                self._take(pipe.read(struct.unpack("<I", head)[0]))
+        program.wait()
+        with suppress(OSError):
+            assert program.stdin is not None
+            program.stdin.close()
+        self._lost()
+
+    def _take(self, body: bytes) -> None:
+        if not body:
+            return
+        length = struct.unpack_from("<I", body)[0]
+        said = json.loads(body[4 : 4 + length])
+        if "answer" in said:
+            waiting = self._waiting.get(said["answer"])
+            if waiting is not None:
+                waiting.set_result(said)
+            return
+        event = said["event"]
+        if event == "samples":
+            self._put(said, np.frombuffer(body, "<f4", offset=4 + length))
+            return
+        del said["curves"]
+        if event == "begin":
+            columns = {k: v for k, v in said["columns"].items() if k != "counts"}
+            speed = {"speed": "RPM"} if said["counts_per_rev"] else {}
+            feed = Feed({**columns, **speed}, said["Ts"], said["n"], said["title"])
+            self._feed, self._run = feed, said["run"]
+            return
+        if event == "drive":
+            self.state = said
+            # in single precision on the wire; none is infinite, which JSON does not know
+            given = {
+                name: math.inf if value is None else float(f"{value:.7g}")
+                for name, value in zip(LIMITS, said.get("limits", ()), strict=False)
+            }
+            self._place = replace(self._place, limits=given)
+        if event == "stopped":
+            self.state = {**self.state, "armed": False}
+        if event == "driven":
+            said |= self._copies() if "found" in said else {}
+            self._work = None
+        self._tell(said)
+
+    def _put(self, said: dict[str, Any], values: FloatArray) -> None:
+        feed = self._feed
+        if feed is None:
+            return
+        lengths = [n for _, n in said["curves"]]
+        parts = np.split(values, np.cumsum(lengths)[:-1])
+        names = (name for name, _ in said["curves"])
+        feed.put(said["first"], dict(zip(names, parts, strict=True)))
+
+    def _copies(self) -> dict[str, str]:
+        return {} if self._work is None else copies(self._work[0], self._place, self._work[1])
+
+    def _lost(self) -> None:
+        """The bench has ended; the watchdog of a drive that it ran stops the motor."""
+        self.state = {"event": "drive", "connected": False, "armed": False}
+        self._work = None
+        error = {"error": "the process at the port has ended; connect again"}
+        for waiting in list(self._waiting.values()):
+            with suppress(Exception):  # answered meanwhile
+                waiting.set_result(error)
+        self._tell({**self.state, **error})
+
+    def close(self) -> None:
+        """Stop the motor, end the process."""
+        program = self._program
+        if program is not None:
+            self.stop("the studio has ended")
+            with self._writing, suppress(OSError):
+                assert program.stdin is not None
+                program.stdin.close()
+            try:
+                program.wait(CLOSING)
+            except subprocess.TimeoutExpired:
+                program.kill()
+                program.wait()
+            if self._ear is not None:
+                self._ear.join(CLOSING)
+        if self._device is not None:
+            self._device.stop()
+
+    # --- What the page asks for -------------------------------------------------------------------
+
+    def stop(self, why: str) -> None:
+        """Command 0 and drive disabled, ahead of everything else."""
+        self._write({"do": "stop", "why": why})
+
+    def alive(self, age: float) -> None:
+        """The page that has armed the drive has answered."""
+        self._write({"do": "alive", "age": age})
+
+    def go(self) -> None:
+        """Have a commissioning that waits go on."""
+        self._write({"do": "go"})
+
+    def connect(self, port: str, baud: int = 115_200, watchdog: float | None = None) -> None:
+        """Open a port; ``virtual[:SEED]`` is a computed drive of this process."""
+        from ..link import VirtualDevice
+
+        with self._lock:
+            if self.is_connected:
+                raise SettingError("expected no drive, one is connected; disconnect it first")
+            place = Place(port, baud, watchdog)
+            if self._device is not None:
+                self._device.stop()
+                self._device = None
+            if place.is_virtual:
+                self._device = VirtualDevice(port)
+            self._place = place
+            url = port if self._device is None else self._device.port
+            self._ask("connect", port=url, baud=baud, watchdog=watchdog)
+
+    def disconnect(self) -> None:
+        """Stop the motor and give the port back."""
+        if self._program is not None:
+            self._ask("disconnect")
+
+    def limits(self, **limits: float | None) -> None:
+        """Set what the drive may do; None is its own ceiling."""
+        self._ask("limits", **limits)
+
+    def arm(self) -> None:
+        """Allow runs for as long as the page answers."""
+        self._ask("arm")
+
+    def disarm(self) -> None:
+        """Allow no further run."""
+        self._ask("disarm")
+
+    def clear(self) -> None:
+        """Take a trip back."""
+        self._ask("clear")
+
+    def work(self, kind: str, **asked: Any) -> None:
+        """Begin a record, run or commissioning; its end is the event ``driven``.
+
+        Raises
+        ------
+        SettingError
+            Where the drive is not armed, or at work.
+        """
+        with self._lock:
+            if not self.is_connected:
+                raise SettingError("expected a drive, none is connected; connect one first")
+            if not self.state["armed"]:
+                raise SettingError("expected an armed drive, it is not; press Arm first")
+            if self._work is not None:
+                raise SettingError("the drive is at work; stop it or wait for its end")
+            self._work = (kind, asked)
+        place = {"kind": kind, "folder": str(self.folder)}
+        self._write({"do": "work", "id": next(self._numbers), **place, **asked})
+
+    def live(self, seconds: float, columns: int) -> tuple[dict[str, Any], dict[str, FloatArray]]:
+        """The newest samples to draw: lowest and highest of each of `columns` pieces.
+
+        Returns
+        -------
+        head, curves
+            By column ``NAME_low`` and ``NAME_high`` beside the times ``t`` [s].
+        """
+        feed = self._feed
+        if feed is None:
+            return {"run": 0}, {}
+        end = feed.end
+        n = min(math.ceil(seconds / feed.Ts), feed.window)
+        # pieces begin at multiples of their length, so that a curve does not shimmer as it moves
+        step = max(1, math.ceil(n / columns))
+        start = max(0, end - n) // step * step
+        head = {
+            "run": self._run, "title": feed.title, "n": feed.n, "end": end, "gaps": feed.gaps,
+            "missing": feed.missing, "columns": feed.columns, "received": feed.received,
+        }  # fmt: skip
+        if end <= start:
+            return head, {}
+        values = feed.read(start, end)
+        starts = np.arange(0, end - start, step)
+        curves: dict[str, FloatArray] = {"t": np.asarray((start + starts) * feed.Ts)}
+        for name, column in values.items():
+            curves[f"{name}_low"] = np.fmin.reduceat(column, starts)
+            curves[f"{name}_high"] = np.fmax.reduceat(column, starts)
+        return head, curves

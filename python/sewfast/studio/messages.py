@@ -1,0 +1,164 @@
+"""What a page may ask for: a JSON schema for every message, and the check of one."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from ..errors import SettingError
+
+SEED = {"type": "integer", "minimum": 0, "maximum": 2**32 - 1}
+NAME = {"type": "string", "maxLength": 200}
+WORDS = {"type": "array", "items": NAME, "maxItems": 100}
+LIMIT = {"type": ["number", "null"], "exclusiveMinimum": 0}
+VALUES = {"type": "object", "additionalProperties": {"type": "number"}, "maxProperties": 20}
+
+_STEP = {
+    "file": NAME,
+    "inputs": WORDS,
+    "output": {**NAME, "type": ["string", "null"]},
+    "resample": {"type": ["number", "null"]},
+    "model": NAME,
+    "seed": {**SEED, "type": ["integer", "null"]},
+}
+_TUNE = {"model": NAME, "controller": {**NAME, "type": ["string", "null"]}, "values": VALUES}
+_EFFORT = {
+    "seed": SEED,
+    "members": {"type": "integer", "minimum": 1, "maximum": 16},
+    "evaluations": {"type": "integer", "minimum": 10, "maximum": 20_000},
+}
+_SIGNAL = {
+    "seed": SEED,
+    "scale": {"type": "number", "exclusiveMinimum": 0, "maximum": 10},
+    "file": NAME,
+}
+
+# name: (fields, of which these must be there)
+_MESSAGES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+    "take": ({}, ()),
+    "cancel": ({}, ()),
+    **dict.fromkeys(("columns", "look", "validate", "identify"), (_STEP, ("file",))),
+    "commission": ({"machine": NAME, **_EFFORT}, ()),
+    "tune_open": (_TUNE, ("model",)),
+    "tune_move": (_TUNE, ("model", "values")),
+    "tune_costs": (_TUNE, ("model", "values")),
+    "tune_search": (
+        {
+            **_TUNE,
+            "evaluations": {"type": "integer", "minimum": 10, "maximum": 20_000},
+            "seed": SEED,
+        },
+        ("model", "values", "evaluations", "seed"),
+    ),
+    "tune_save": ({**_TUNE, "file": NAME}, ("model", "values", "file")),
+    "tune_copy": ({**_TUNE, "file": NAME}, ("model", "values", "file")),
+    "ports": ({}, ()),
+    "drive_connect": (
+        {
+            "port": NAME,
+            "baud": {"type": "integer", "minimum": 300, "maximum": 100_000_000},
+            "watchdog": {"type": ["number", "null"], "minimum": 0.001, "maximum": 10},
+        },
+        ("port",),
+    ),
+    "drive_disconnect": ({}, ()),
+    "drive_limits": (
+        dict.fromkeys(("volt", "speed_rpm", "acceleration", "current"), LIMIT),
+        ("volt", "speed_rpm", "acceleration", "current"),
+    ),
+    "drive_arm": ({}, ()),
+    "drive_disarm": ({}, ()),
+    "drive_clear": ({}, ()),
+    "drive_go": ({}, ()),
+    "drive_record": ({"signal": NAME, **_SIGNAL}, ("signal", "seed", "scale", "file")),
+    "drive_run": (
+        {"controller": NAME, "reference": NAME, **_SIGNAL},
+        ("controller", "reference", "seed", "scale", "file"),
+    ),
+    "drive_commission": (
+        {**_EFFORT, "go_on": {"type": "boolean"}},
+        ("seed", "members", "evaluations", "go_on"),
+    ),
+    "stop": ({}, ()),
+    "alive": ({"n": {"type": "integer", "minimum": 0}}, ("n",)),
+    "live": (
+        {
+            "seconds": {"type": "number", "exclusiveMinimum": 0, "maximum": 30},
+            "columns": {"type": "integer", "minimum": 2, "maximum": 4000},
+        },
+        ("seconds", "columns"),
+    ),
+}
+
+SCHEMAS: dict[str, dict[str, Any]] = {
+    name: {
+        "type": "object",
+        "properties": {"do": {"const": name}, "id": {"type": "integer"}, **fields},
+        "required": ["do", *required],
+        "additionalProperties": False,
+    }
+    for name, (fields, required) in _MESSAGES.items()
+}
+"""A JSON schema for every message of a page, by its name."""
+
+_KINDS: dict[str, type | tuple[type, ...]] = {
+    "string": str, "object": dict, "array": list, "boolean": bool, "null": type(None),
+    "integer": int, "number": (int, float),
+}  # fmt: skip
+
+
+def checked(asked: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a message that keeps to its schema.
+
+    Raises
+    ------
+    SettingError
+        It names the field, what was expected and what came.
+    """
+    name = asked.get("do")
+    schema = SCHEMAS.get(name) if isinstance(name, str) else None
+    if schema is None:
+        raise SettingError(f"expected a known step, received {str(name)[:40]!r}")
+    fields = schema["properties"]
+    for field in schema["required"]:
+        if field not in asked:
+            raise SettingError(f"{field}: expected a value, received none")
+    for field, value in asked.items():
+        if field not in fields:
+            raise SettingError(f"{field[:40]}: expected no such field in {name}; leave it out")
+        if field not in ("do", "id"):
+            _check(field, value, fields[field])
+    return {field: value for field, value in asked.items() if field not in ("do", "id")}
+
+
+def _check(field: str, value: Any, rule: dict[str, Any]) -> None:
+    kinds = [rule["type"]] if isinstance(rule["type"], str) else rule["type"]
+    if not any(_is(value, kind) for kind in kinds):
+        raise _refusal(field, " or ".join(kinds), value)
+    if isinstance(value, str) and len(value) > rule.get("maxLength", math.inf):
+        raise _refusal(field, f"at most {rule['maxLength']} letters", value)
+    if isinstance(value, list):
+        if len(value) > rule["maxItems"]:
+            raise _refusal(field, f"at most {rule['maxItems']} entries", value)
+        for entry in value:
+            _check(field, entry, rule["items"])
+    if isinstance(value, dict):
+        if len(value) > rule["maxProperties"]:
+            raise _refusal(field, f"at most {rule['maxProperties']} entries", value)
+        for key, entry in value.items():
+            _check(key, entry, rule["additionalProperties"])
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        low, high = rule.get("minimum", -math.inf), rule.get("maximum", math.inf)
+        above = rule.get("exclusiveMinimum", -math.inf)
+        if not (math.isfinite(value) and low <= value <= high and value > above):
+            raise _refusal(field, f"a number from {max(low, above):g} to {high:g}", value)
+
+
+def _is(value: Any, kind: str) -> bool:
+    if isinstance(value, bool) and kind != "boolean":
+        return False
+    return isinstance(value, _KINDS[kind])
+
+
+def _refusal(field: str, expected: str, value: object) -> SettingError:
+    return SettingError(f"{field[:40]}: expected {expected}, received {str(value)[:80]!r}")

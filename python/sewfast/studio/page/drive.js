@@ -1,0 +1,159 @@
+// The Drive view: connect, limits, arming, live curves, and a STOP that goes ahead of everything else.
+import { ask, on } from "/server.js";
+import { Chart } from "/curves.js";
+import { copies } from "/copies.js";
+
+const $ = id => document.getElementById(id);
+const LIMITS = ["volt", "speed_rpm", "acceleration", "current"], MOST_COLUMNS = 1200;
+let writes = false, drive = { connected: false, armed: false }, prompt = 0, paused = false, looping = false, charts = new Map(), run = -1, asking = false;
+
+function tell(error) { $("drive-error").textContent = error ? error.message : ""; $("drive-error").hidden = !error; }
+const seconds = value => Math.min(30, Math.max(.5, value || 5));
+
+// --- STOP: no question, no confirmation, from every view and every page ---
+
+function stop() {
+  $("drive-state").textContent = "stopping";
+  ask("stop").catch(error => { $("drive-state").textContent = "STOP not sent: use the emergency stop"; tell(error); });
+}
+$("stop").onclick = stop;
+addEventListener("keydown", event => { if (event.key === "Escape") { event.preventDefault(); stop(); } }, { capture: true });
+on("beat", m => { prompt = m.prompt; ask("alive", { n: m.n }, false); state(); });
+on("closed", () => { $("drive-state").textContent = "no connection to the studio: it has stopped the drive; else use the emergency stop"; });
+on("stopped", m => {
+  drive = { ...drive, armed: false }; state(); enable();
+  if (!m.moving) return;
+  $("stopped").textContent = m.error || `${m.why}: output off, confirmed after ${m.off_ms.toFixed(0)} ms; at rest after ${(m.rest_ms / 1000).toFixed(2)} s. Arm to go on.`;
+});
+
+// --- what there is ---
+
+on("state", s => {
+  writes = s.writes;
+  fill($("run-controller"), s.controllers); fill($("signal"), s.excitations); fill($("reference"), s.references);
+  for (const [field, word] of [["record-file", "record"], ["run-file", "run"]]) if (s.recordings.includes($(field).value)) $(field).value = free(s.recordings, word);
+  enable();
+});
+on("drive", m => {
+  drive = m;
+  if (m.error) tell(new Error(m.error));
+  if (m.connected) for (const [k, name] of LIMITS.entries()) {
+    const ceiling = m.ceilings[k];
+    $(`limit-${name}`).placeholder = ceiling === null ? "none" : `at most ${Number(ceiling.toPrecision(4))}`;
+  }
+  state(); enable(); table();
+});
+
+function state() {
+  const d = drive, speed = d.connected ? `, ${d.speed.toFixed(0)} RPM` : "";
+  document.querySelector("header").classList.toggle("armed", !!d.armed);
+  const said = !d.connected ? "no drive" : `${d.name}: ${d.job ? "running" : d.state}${d.state === "tripped" ? ` (${d.reason})` : ""}, ${d.armed ? "ARMED" : "not armed"}${d.job ? `, ${d.job}` : ""}`;
+  if ($("drive-state").textContent !== said) $("drive-state").textContent = said;
+  $("prompt").textContent = d.connected && writes && !d.armed ? (prompt < 10 ? `this page has answered ${prompt} of 10 times in a row` : "this page answers in time") : "";
+  $("speed").classList.toggle("old", !d.job);
+  if (d.connected && !d.job && run < 1) $("speed").textContent = `at rest${speed}`;
+}
+
+function table() {
+  const d = drive, rows = !d.connected ? [] : [
+    ["state", d.state + (d.reason && d.state === "tripped" ? `: ${d.reason}` : "")], ["sample time", `${d.Ts * 1000} ms`], ["watchdog", `${d.watchdog * 1000} ms`],
+    ["limits", LIMITS.map((name, k) => `${name} ${d.limits[k] === null ? "none" : Number(d.limits[k].toPrecision(4))}`).join(", ")],
+    ["frames received, dropped", `${d.received}, ${d.dropped}`],
+  ];
+  $("drive-table").replaceChildren(...rows.map(([title, value]) => {
+    const row = document.createElement("tr"), th = document.createElement("th"); th.scope = "row"; th.textContent = title; row.append(th);
+    row.insertCell().textContent = value; return row;
+  }));
+}
+
+function enable() {
+  const d = drive, idle = d.connected && writes && !d.job;
+  $("connect").disabled = d.connected || !writes; $("disconnect").disabled = !idle; $("limits").disabled = !idle;
+  $("arm").disabled = !idle || d.armed; $("disarm").disabled = !idle || !d.armed; $("clear").disabled = !idle || d.state !== "tripped";
+  $("record").disabled = !idle || !d.armed; $("run").disabled = !idle || !d.armed || !$("run-controller").value;
+}
+
+async function act(name, asked = {}) {
+  tell(null);
+  try { await ask(name, asked); return true; } catch (error) { tell(error); return false; }
+}
+
+$("connect").onclick = async () => {
+  $("connect").disabled = true;
+  await act("drive_connect", { port: $("port").value.trim(), baud: $("baud").valueAsNumber || 115200, watchdog: $("watchdog").valueAsNumber / 1000 || null }); enable();
+};
+$("disconnect").onclick = () => act("drive_disconnect");
+$("limits").onclick = async () => {
+  const asked = Object.fromEntries(LIMITS.map(name => [name, $(`limit-${name}`).valueAsNumber || null]));
+  $("limits-set").textContent = await act("drive_limits", asked) ? "set; an empty field is the drive's own ceiling" : "";
+};
+$("arm").onclick = async () => { $("stopped").textContent = ""; await act("drive_arm"); };
+$("disarm").onclick = () => act("drive_disarm");
+$("clear").onclick = () => act("drive_clear");
+$("record").onclick = () => begin("drive_record", { signal: $("signal").value, seed: $("record-seed").valueAsNumber || 0, scale: $("record-scale").valueAsNumber, file: $("record-file").value });
+$("run").onclick = () => begin("drive_run", { controller: $("run-controller").value, reference: $("reference").value, seed: $("run-seed").valueAsNumber || 0, scale: $("run-scale").valueAsNumber, file: $("run-file").value });
+
+async function begin(name, asked) {
+  $("driven").textContent = ""; $("driven-copy").replaceChildren(); $("stopped").textContent = "";
+  if (await act(name, asked)) $("driven").textContent = "under way";
+}
+on("driven", m => {
+  if (m.kind === "commission") return;
+  $("driven").textContent = m.found ? m.found.text : "";
+  if (m.error) tell(new Error(m.error)); else copies($("driven-copy"), m);
+});
+
+// --- what is seen: one question under way, so that a slow page misses frames and nothing queues up ---
+
+async function loop() {
+  if ($("drive").hidden) { looping = false; return; }
+  if (drive.connected && !paused && !asking) {
+    asking = true;
+    try { paint(await ask("live", { seconds: seconds($("live-seconds").valueAsNumber), columns: Math.min(MOST_COLUMNS, Math.max(100, $("live").clientWidth - 74)) })); } catch (error) { tell(error); }
+    asking = false;
+  }
+  requestAnimationFrame(loop);
+}
+
+function paint(f) {
+  if (!f.columns || !f.curves.t) return;
+  if (f.run !== run) { run = f.run; charts.clear(); $("live").replaceChildren(); }
+  const panels = new Map(), t = f.curves.t, n = t.length, step = n > 1 ? t[1] - t[0] : 0;
+  for (const [name, unit] of Object.entries(f.columns)) panels.set(unit, [...(panels.get(unit) || []), name]);
+  for (const [unit, names] of panels) {
+    if (!charts.has(unit)) charts.set(unit, new Chart($("live"), { y: `[${unit || "1"}]` }));
+    const series = names.map(name => {
+      const low = f.curves[`${name}_low`], high = f.curves[`${name}_high`], x = new Float32Array(2 * n), y = new Float32Array(2 * n);
+      for (let k = 0; k < n; k++) { x[2 * k] = t[k]; x[2 * k + 1] = t[k] + .5 * step; y[2 * k] = low[k]; y[2 * k + 1] = high[k]; }
+      return { name, x, y };
+    });
+    charts.get(unit).draw(series, `${names.join(" and ")} over the last ${seconds($("live-seconds").valueAsNumber)} seconds`);
+  }
+  const speed = f.curves.speed_high || f.curves.speed_true_high;
+  if (speed) $("speed").textContent = Number.isNaN(speed[n - 1]) ? "speed unknown" : `${speed[n - 1].toFixed(0)} RPM`;
+  $("live-state").textContent = `${f.title}: ${f.end}${f.n ? ` of ${f.n}` : ""} samples` + (f.missing ? `, ${f.missing} missing` : "") + (drive.job ? "" : " (ended)");
+  document.dispatchEvent(new CustomEvent("frame", { detail: f.end }));
+}
+
+function pause() { paused = !paused; $("pause").setAttribute("aria-pressed", paused); $("pause").textContent = paused ? "Go on (Space)" : "Pause (Space)"; }
+$("pause").onclick = pause;
+document.addEventListener("keydown", event => {
+  if (event.key !== " " || $("drive").hidden || ["INPUT", "BUTTON", "SELECT", "SUMMARY"].includes(event.target.tagName)) return;
+  event.preventDefault(); pause();
+});
+
+function free(names, word) { let k = 1; while (names.includes(`${word}-${k}.mcap`)) k++; return `${word}-${k}.mcap`; }
+function fill(select, names) {
+  const kept = select.value;
+  select.replaceChildren(...names.map(name => new Option(name, name)));
+  if (names.includes(kept)) select.value = kept;
+}
+
+/** Opens the view. */
+export async function look() {
+  if (!looping) { looping = true; requestAnimationFrame(loop); }
+  try {
+    const found = await ask("ports");
+    $("ports").replaceChildren(...[{ path: "virtual", text: "a computed drive" }, ...found].map(({ path, text }) => new Option(text, path)));
+  } catch (error) { tell(error); }
+}
