@@ -23,10 +23,10 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors fleet fuzz-logs studio bits bode notches physics killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors fleet fuzz-logs studio bits bode notches physics aarch64 licences killed laws bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
+	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
 
 demo: $(REPORT) ## the whole experiment on the virtual machine; the report goes to demo/report.html
 	$(BIN)/sewfast demo --out $(OUT)
@@ -59,8 +59,9 @@ rust-test: $(DEV) ## unit, property and documentation tests of the crates (SEED=
 fleet: $(DEV) ## 2,000 recordings on one worker and on two, and with a worker killed every 10 s
 	$(BIN)/python benches/fleet.py
 
-studio: $(DEV) ## the studio in a real browser: from a slider's event to painted plots
+studio: $(DEV) ## the studio in a real browser: from a slider's event to painted plots, from Esc to output off
 	$(BIN)/python benches/studio.py
+	$(BIN)/python benches/studio_stops.py
 
 fuzz-logs: $(DEV) ## damaged logs of every format, refused or read (COUNT=100000; a tenth of it where a library reads)
 	SEWFAST_DAMAGED=$(or $(COUNT),100000) $(BIN)/python -m pytest tests/readers/test_logs.py -k damaged_log
@@ -96,19 +97,34 @@ ifeq ($(shell uname),Linux)
 	! nm target/bare/device_test | grep panicking
 endif
 
+ARM64 = aarch64-unknown-linux-gnu
+aarch64: ## unit and property tests on an emulated 64-bit ARM (Debian: rustc-web rust-web-src gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user; CASES=16)
+	RUSTC=/usr/bin/rustc RUSTDOC=/usr/bin/rustdoc RUSTC_BOOTSTRAP=1 PROPTEST_RNG_SEED=$(SEED) PROPTEST_CASES=$(or $(CASES),16) \
+	  CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc \
+	  CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER='qemu-aarch64 -L /usr/aarch64-linux-gnu' \
+	  cargo test --package sewfast-control --package sewfast-core --lib --profile checked --quiet -Zbuild-std --target $(ARM64)
+
+licences: ## LICENSE-THIRD-PARTY, from what the crates of a wheel say
+	$(PYTHON) tests/support/licences.py
+
 killed: firmware ## kills the host of the emulated board 100 times; its output goes off in time
 	SEWFAST_TRIALS=100 $(BIN)/python -m pytest tests/system/test_emulated.py -k killed
 
+# the library is the M4's: an M7 runs it as it is, and its external memory lies elsewhere
 M4 = thumbv7em-none-eabihf
-firmware: ## the example firmware for an emulated Cortex-M4 (Debian: rustc-web rust-web-src gcc-arm-none-eabi libnewlib-arm-none-eabi)
+firmware: ## the example firmware for emulated boards, Cortex-M4 and M7 (Debian: rustc-web rust-web-src gcc-arm-none-eabi libnewlib-arm-none-eabi)
 	RUSTC=/usr/bin/rustc RUSTC_BOOTSTRAP=1 cargo rustc --package sewfast-capi --profile firmware --crate-type staticlib \
 	  --quiet -Zbuild-std=core --target $(M4)
 	mkdir -p target/bare
-	arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16 -O2 -std=c99 -Wall -Wextra -Werror \
-	  -nostartfiles -Wl,--gc-sections -T examples/firmware/mps2/board.ld -I rust/capi/include -I examples/firmware \
-	  -o target/bare/mps2.elf examples/firmware/mps2/board.c examples/firmware/firmware.c \
-	  $(or $(CARGO_TARGET_DIR),target)/$(M4)/firmware/libsewfast_capi.a -lm
-	arm-none-eabi-size target/bare/mps2.elf
+	set -e; for board in mps2-an386:cortex-m4:fpv4-sp-d16:0x21000000 mps2-an500:cortex-m7:fpv5-sp-d16:0x60000000; do \
+	  set -- $$(echo $$board | tr : ' '); \
+	  arm-none-eabi-gcc -mcpu=$$2 -mthumb -mfloat-abi=hard -mfpu=$$3 -O2 -std=c99 -Wall -Wextra -Werror \
+	    -nostartfiles -Wl,--gc-sections,-z,noexecstack,--defsym=EXTERNAL=$$4 -T examples/firmware/mps2/board.ld \
+	    -I rust/capi/include -I examples/firmware -o target/bare/$$1.elf \
+	    examples/firmware/mps2/board.c examples/firmware/firmware.c \
+	    $(or $(CARGO_TARGET_DIR),target)/$(M4)/firmware/libsewfast_capi.a -lm; \
+	  arm-none-eabi-size target/bare/$$1.elf; \
+	done
 
 python-test: $(DEV) ## pytest, with every snippet of the documentation and every example
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not alone'
@@ -126,7 +142,7 @@ package: $(DEV) ## source archive -> wheel -> import in a clean environment
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir target/package/wheels target/package/sewfast-*/
 	$(PYTHON) -m venv target/package/venv
 	target/package/venv/bin/pip install --quiet target/package/wheels/sewfast-*.whl
-	cd target/package/venv && bin/python -I $(CURDIR)/tests/clean_import.py
+	cd target/package/venv && bin/python -I $(CURDIR)/tests/support/clean_import.py
 
 bench: $(VENV)/bench.stamp ## sewfast and its rivals in one run; writes docs/PERFORMANCE.md (QUICK=1, ONLY=word)
 	$(BIN)/python benches/performance.py $(if $(QUICK),--quick) $(if $(ONLY),--only $(ONLY))

@@ -487,6 +487,9 @@ class SingleController:
     """The controller's arithmetic in single precision, as a microcontroller has it."""
 
     def step(self, r: float, y: float, feedforward: float = 0.0) -> float: ...
+    def set_design(self, other: SingleController) -> None:
+        """As ``Controller.set_design``."""
+
     def set_manual(self, u: float) -> None: ...
     def set_automatic(self) -> None: ...
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -295,6 +296,31 @@ def test_any_bytes_are_settings_or_refused(
 
 def test_without_a_file_there_are_no_settings(tmp_path: Path) -> None:
     assert find(tmp_path).path is None
+
+
+def test_a_file_of_somebody_else_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A file in /tmp by another user must not set the limits of a drive."""
+    if not hasattr(os, "getuid"):
+        pytest.skip("needs users with numbers")
+    toml(tmp_path, 'port = "COM9"')
+    owner = (tmp_path / NAME).stat().st_uid
+    monkeypatch.setattr(os, "getuid", lambda: owner + 1)
+    if owner == 0:
+        os.chown(tmp_path / NAME, 4711, -1)
+    assert find(tmp_path).port is None
+    assert "belongs to another user" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_gone_has_no_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone() -> Path:
+        raise FileNotFoundError
+
+    monkeypatch.setattr(Path, "cwd", gone)
+    assert find().path is None
 
 
 @pytest.mark.skipif(sys.version_info >= (3, 11), reason="tomllib is there")

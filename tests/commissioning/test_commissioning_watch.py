@@ -38,6 +38,17 @@ def test_a_run_that_does_as_predicted_ends_by_itself() -> None:
     assert len(found.r) == len(R)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("samples", [1, 2, 30, 2000])
+def test_short_references_and_what_a_link_has_lost_end_nothing(samples: int) -> None:
+    watch = Watching(run(QUIET, VirtualMachine(), np.zeros(samples)), QUIET, 1572.0)
+    for first in range(0, samples + 40, 7):
+        watch(first, np.full(7, np.nan), np.full(7, np.nan))
+    watch = Watching(run(QUIET, VirtualMachine(), R), QUIET, 1572.0)
+    watch(0, np.zeros(20), np.zeros(20))
+    watch(600, np.zeros(20), np.zeros(20))
+
+
 def on_virtual(watch: Watch) -> None:
     MachineBench(VirtualMachine()).follow(FIERCE, R, "hold", watch=watch)
 

@@ -107,6 +107,8 @@ def test_python_control_gets_the_same_loop() -> None:
     for k, one in enumerate(z):
         np.testing.assert_allclose(system(one), plain(one) * filters[k], rtol=1e-8)
     assert control.ss(system).nstates == 2 * 2 * len(ALL) + plain.nstates
+    with pytest.raises(SettingError, match="without biquads"):
+        forms.to_matlab(c)
     with pytest.raises(SettingError, match="poles of a PID"):
         forms.from_control(system)
 

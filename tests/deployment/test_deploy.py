@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -88,20 +89,7 @@ def test_hostile_inputs_and_changes_of_mode_keep_the_bits(
     name: str, precision: str, tmp_path: Path
 ) -> None:
     controller = deployed.CONTROLLERS[name]
-    deploy(controller, tmp_path, precision=precision, name="code")
-    flags = ["-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared"]
-    library = tmp_path / "code.so"
-    subprocess.run(
-        [deployed.compilers()[0], *flags, str(tmp_path / "code.c"), "-o", str(library)], check=True
-    )
-    code, real = (
-        ctypes.CDLL(str(library)),
-        ctypes.c_float if precision == "f32" else ctypes.c_double,
-    )
-    code.code_step_with.argtypes = [ctypes.c_void_p, real, real, real]
-    code.code_step_with.restype = real
-    code.code_set_manual.argtypes = [ctypes.c_void_p, real]
-    code.code_set_automatic.argtypes = code.code_init.argtypes = [ctypes.c_void_p]
+    code = _library(controller, tmp_path, precision)
     memory = ctypes.create_string_buffer(4096)
     code.code_init(memory)
     core: Any = controller.core()
@@ -126,6 +114,129 @@ def test_hostile_inputs_and_changes_of_mode_keep_the_bits(
         found, expected = code.code_step_with(memory, r, y, extra), core.step(r, y, extra)
         assert found == expected, (k, r, y, extra)
         assert np.isfinite(found)
+
+
+CHANGING = ("pi", "paper", "p alone", "lag", "tracking", "slew", "biquads")
+
+
+@needs_compiler
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("name", CHANGING)
+def test_gains_and_limits_change_as_the_core_changes_its_design(
+    name: str, precision: str, tmp_path: Path
+) -> None:
+    """At any moment, to anything: in manual, before the first sample, among hostile inputs."""
+    controller = deployed.CONTROLLERS[name]
+    code = _library(controller, tmp_path, precision, changeable=True)
+    memory = ctypes.create_string_buffer(4096)
+    code.code_init(memory)
+    core: Any = controller.core()
+    core = core.single() if precision == "f32" else core
+    rng = np.random.default_rng(11)
+    bumps = []
+    for k in range(4000):
+        r, y = 500.0 + 1000.0 * (k // 700 % 2), rng.normal(450.0, 30.0)
+        if rng.uniform() < 0.02:
+            y = float(rng.choice([np.nan, np.inf, -np.inf, 3e4]))
+        if rng.uniform() < 0.02:
+            u = rng.uniform(-12.0, 12.0)
+            code.code_set_manual(memory, u)
+            core.set_manual(u)
+        if rng.uniform() < 0.05:
+            code.code_set_automatic(memory)
+            core.set_automatic()
+        if k == 0 or rng.uniform() < 0.05:
+            gains = (rng.uniform(-0.05, 0.05), *rng.uniform(0.01, 1.0, 2) * (1.0, 0.05))
+            gains = (gains[0], math.inf if rng.uniform() < 0.3 else gains[1], gains[2])
+            gains = (*gains[:2], 0.0) if rng.uniform() < 0.3 else gains
+            controller = replace(controller, gains=Gains.standard(*gains))
+            assert code.code_set_gains(memory, *gains) == 1
+            core.set_design(_core_of(controller, precision))
+        if k == 0 or rng.uniform() < 0.02:
+            low, high = np.sort(rng.uniform(-20.0, 20.0, 2))
+            controller = replace(controller, u_min=low, u_max=high)
+            assert code.code_set_limits(memory, low, high) == 1
+            core.set_design(_core_of(controller, precision))
+        for wrong in ((math.nan, 1, 0), (math.inf, 1, 0), (1, 0, 0), (1, -1, 0), (1, math.nan, 0),
+                      (1, 1, -1), (1, 1, math.inf), (1, 1, math.nan)):  # fmt: skip
+            assert code.code_set_gains(memory, *wrong) == 0
+        for wrong in ((1, 1), (2, 1), (math.nan, 1), (0, math.nan), (math.inf, math.inf)):
+            assert code.code_set_limits(memory, *wrong) == 0
+        found, expected = code.code_step(memory, r, y), core.step(r, y)
+        assert found == expected, (k, r, y)
+        bumps.append(found)
+    assert len(set(bumps)) > 300
+
+
+@needs_compiler
+def test_a_change_of_gains_is_bumpless(tmp_path: Path) -> None:
+    controller = Controller(Gains.standard(0.02, 0.1, 0.004), N=10.0, u_min=-24, u_max=24)
+    code = _library(controller, tmp_path, "f64", changeable=True)
+    memory = ctypes.create_string_buffer(4096)
+    code.code_init(memory)
+    y, u = 0.0, 0.0
+    for _ in range(3000):
+        u = code.code_step(memory, 1000.0, y)
+        y += 0.001 / 0.15 * (300.0 * u - y)
+    code.code_set_gains(memory, 0.001, 2.0, 0.0)
+    changed = code.code_step(memory, 1000.0, y)
+    assert abs(changed - u) < 1e-6 * abs(u)
+    # and it is the new gains that act: 100 RPM more are 0.1 V at once
+    moved = code.code_step(memory, 1100.0, y) - changed
+    assert abs(moved - 0.1) < 1e-3
+
+
+@needs_compiler
+def test_what_has_no_gains_to_change_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for what, to in (
+        (CASES["pi"], "st"),
+        (kinds.model_of("oe"), "c99"),
+        (CASES["everything"], "c99"),
+    ):
+        with pytest.raises(SettingError, match="changeable: expected"):
+            deploy(what, tmp_path / "out", to=to, changeable=True)
+    assert not (tmp_path / "out").exists()
+    CASES["pi"].save(tmp_path / "pi.json")
+    assert main(["deploy", str(tmp_path / "pi.json"), str(tmp_path / "out"), "--changeable"]) == 0
+    assert "controller_set_gains" in capsys.readouterr().out
+    sources = [str(tmp_path / "out" / f"controller{end}.c") for end in ("", "_test")]
+    for compiler in deployed.compilers():
+        built = [compiler, *deployed.WARNINGS, "-ffp-contract=off", *sources, "-o"]
+        subprocess.run([*built, str(tmp_path / "test")], check=True)
+        done = subprocess.run([tmp_path / "test"], capture_output=True, text=True, check=True)
+        assert done.stdout == "0 of 200 samples differ\n"
+
+
+def _core_of(controller: Controller, precision: str) -> Any:
+    core = controller.core()
+    return core.single() if precision == "f32" else core
+
+
+def _library(
+    controller: Controller, folder: Path, precision: str, *, changeable: bool = False
+) -> ctypes.CDLL:
+    """The deployed controller as a shared library."""
+    deploy(controller, folder, precision=precision, name="code", changeable=changeable)
+    flags = [*deployed.WARNINGS, "-O2", "-ffp-contract=off", "-fPIC", "-shared"]
+    library = folder / "code.so"
+    subprocess.run(
+        [deployed.compilers()[0], *flags, str(folder / "code.c"), "-o", str(library)], check=True
+    )
+    code = ctypes.CDLL(str(library))
+    real: Any = ctypes.c_float if precision == "f32" else ctypes.c_double
+    of = ctypes.c_void_p
+    code.code_step.argtypes, code.code_step.restype = [of, real, real], real
+    code.code_step_with.argtypes, code.code_step_with.restype = [of, real, real, real], real
+    code.code_set_manual.argtypes = [of, real]
+    code.code_set_automatic.argtypes = code.code_init.argtypes = [of]
+    if changeable:
+        code.code_set_gains.argtypes, code.code_set_limits.argtypes = (
+            [of, *3 * [real]],
+            [of, real, real],
+        )
+    return code
 
 
 def test_the_sum_of_bits_sees_every_bit_and_the_order() -> None:

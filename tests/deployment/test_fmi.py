@@ -1,14 +1,17 @@
 """FMUs both ways: models and controllers for other tools, and plants of other tools as machines.
 
-FMPy drives what the package writes; what the package drives was written by PythonFMU.
+FMPy and Ecos drive what the package writes; what the package drives was written by PythonFMU.
 """
 
 from __future__ import annotations
 
+import json
 import shutil
+import subprocess
 import sys
 import zipfile
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +109,91 @@ def test_a_controller_is_stepped_alike(slave: Any) -> None:
         fmu.set(r=r, y=y, feedforward=0.1)
         fmu.step(k)
         assert fmu.get("u") == core.step(r, y, 0.1)
+
+
+ECOS = """
+import ctypes, json, sys
+from pathlib import Path
+
+ctypes.CDLL(str(Path(sys.prefix, "lib", "libtbb.so.12")), mode=ctypes.RTLD_GLOBAL)
+from ecospy import EcosSimulation, EcosSimulationStructure
+
+given = json.load(sys.stdin)
+structure = EcosSimulationStructure()
+for name, file in given["models"].items():
+    structure.add_model(name, file)
+for source, sink in given["connections"]:
+    structure.make_real_connection(source, sink)
+run = EcosSimulation(structure=structure, step_size=given["Ts"])
+run.init()
+found = []
+for row in given["inputs"]:
+    for name, value in row.items():
+        run.set_real(name, value)
+    run.step(1)
+    found.append([run.get_real(name) for name in given["outputs"]])
+run.terminate()
+Path(given["file"]).write_text(json.dumps(found))
+"""
+
+
+def _in_ecos(folder: Path, **given: Any) -> np.ndarray[Any, Any]:
+    """Outputs after each step of Ecos, a co-simulation engine in C++ with an importer of its own.
+
+    In a process of its own: what it logs and how it ends is no part of the test.
+    """
+    if find_spec("ecospy") is None or not Path(sys.prefix, "lib", "libtbb.so.12").exists():
+        pytest.skip("needs ecospy and tbb")
+    file = folder / "found.json"
+    given["file"] = str(file)
+    done = subprocess.run(
+        [sys.executable, "-c", ECOS], input=json.dumps(given), capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return np.array(json.loads(file.read_text()))
+
+
+@pytest.mark.parametrize("name", ["oe", "neural_oe", "neural_ss, nk 0"])
+def test_a_second_importer_has_the_same_free_run(name: str, tmp_path: Path) -> None:
+    model = kinds.model_of(name)
+    deploy(model, tmp_path, to="fmi")
+    u = kinds.levels(300, 5, 1)[:, 0]
+    u[0] = 0.0
+    found = _in_ecos(
+        tmp_path, models={"m": str(tmp_path / "model.fmu")}, connections=[], Ts=model.Ts,
+        inputs=[{"m::u": float(v)} for v in u], outputs=[f"m::{model.output_name}"],
+    )  # fmt: skip
+    # after a step the input is still that of the sample before
+    held = np.append(u, u[-1])
+    for k in (0, 1, 150, 299):
+        expected = model.core.simulate(
+            np.append(u[: k + 1], u[k])[:, None], model.core.rest_state()
+        )
+        assert abs(found[k, 0] - expected[-1]) <= 1e-12 * np.ptp(found), k
+    if "nk 0" not in name:
+        expected = model.core.simulate(held[:, None], model.core.rest_state())[1:]
+        assert np.abs(found[:, 0] - expected).max() <= 1e-12 * np.ptp(expected)
+
+
+def test_a_second_importer_closes_the_loop(tmp_path: Path) -> None:
+    """Controller and plant, connected there: each takes what the other gave in the last step."""
+    model = kinds.model_of("oe")
+    controller = sewfast.Controller(sewfast.Gains.standard(0.01, 0.1), Ts=model.Ts)
+    deploy(model, tmp_path, to="fmi", name="plant")
+    deploy(controller, tmp_path, to="fmi", name="loop")
+    found = _in_ecos(
+        tmp_path, Ts=model.Ts,
+        models={n: str(tmp_path / f"{n}.fmu") for n in ("plant", "loop")},
+        connections=[["loop::u", "plant::u"], [f"plant::{model.output_name}", "loop::y"]],
+        inputs=[{"loop::r": 500.0, "loop::feedforward": 0.0}] * 300,
+        outputs=["loop::u", f"plant::{model.output_name}"],
+    )  # fmt: skip
+    u, y = found.T
+    core = controller.core()
+    rest = float(model.core.simulate(np.zeros((1, 1)), model.core.rest_state())[0])
+    expected = [core.step(500.0, v, 0.0) for v in (rest, *y[:-1])]
+    assert np.array_equal(u, expected)
+    assert 300.0 < y[-1] < 500.0
 
 
 def test_several_samples_are_one_step_and_parts_are_none(slave: Any) -> None:

@@ -24,7 +24,14 @@ from sewfast.identification.folds import (
     free_runs,
 )
 from sewfast.identification.orders import LinearTable, raised
-from sewfast.identification.search import Candidate, Search, counting
+from sewfast.identification.search import (
+    HALVING_ITERATIONS,
+    STILL_NEAR,
+    Candidate,
+    Search,
+    best_of_each_size,
+    counting,
+)
 from sewfast.identification.task import Task
 from sewfast.identification.training import Start, Structure
 
@@ -207,6 +214,53 @@ def test_direct_feedthrough_has_to_be_worth_it() -> None:
     better = candidate(0, 0.4)
     search.candidates[better.structure] = better
     assert search.best is better
+
+
+@pytest.mark.parametrize("nk", [0, 1])
+def test_feedthrough_is_found_before_further_states_make_up_for_it(nk: int) -> None:
+    # a bent oscillator under a slow input, whose next sample can be told from the last ones
+    rng = np.random.default_rng(5)
+    t = np.arange(1500)
+    waves = [np.sin(2 * np.pi * f * t + rng.uniform(0, 7)) for f in np.linspace(0.01, 0.2, 40)]
+    u = np.sum(waves, axis=0) / 5.0
+    y = np.zeros(len(u))
+    for k in range(2, len(u)):
+        y[k] = 1.6 * y[k - 1] - 0.8 * y[k - 2] - 0.02 * y[k - 1] ** 3 + 0.2 * u[k - nk]
+    y += 0.002 * rng.normal(size=len(u))
+    data = Dataset.from_arrays(u, y, 0.01)
+    search = Search(task(data), folds(data), pool())
+    search.linear.search(None)
+    kept = search.screen()
+    assert search.feeds_through == (nk == 0)
+    assert any(c.structure.nk == 0 for c in kept) == (nk == 0)
+    assert search.best is not None
+    assert search.best.structure.nk == nk
+
+
+def test_a_model_without_a_delay_says_that_no_loop_can_be_closed_around_it() -> None:
+    rng = np.random.default_rng(1)
+    u = rng.uniform(-2.0, 2.0, 600)
+    y = np.tanh(2.0 * u) + 0.01 * rng.normal(size=len(u))
+    y[1:] += 0.3 * np.tanh(2.0 * u[:-1])
+    settings: dict[str, Any] = {"nx": 1, "hidden": 4, "starts": 2, "iterations": 30}
+    model = identify(Dataset.from_arrays(u, y, 0.01), **settings)
+    assert {m.orders["nk"] for m in model.members or (model,)} == {0}
+    assert any("identify with nk = 1" in note for note in model.training["notes"])
+    asked = identify(Dataset.from_arrays(u, y, 0.01), nk=0, **settings)
+    assert not any("nk = 1" in note for note in asked.training.get("notes", []))
+
+
+def test_the_best_of_every_number_of_states_is_trained_beyond_the_screening() -> None:
+    data = bent_data(1000, noise=0.1)
+    search = Search(task(data, starts=1), folds(data), pool())
+    search.linear.search(None)
+    alive = search.screen()
+    assert len({c.structure.nx for c in alive}) > 1
+    near = {c.structure.size for c in alive if c.error <= STILL_NEAR * alive[0].error}
+    kept = search.halve(alive, HALVING_ITERATIONS[0])
+    assert near <= {c.structure.size for c in kept}
+    firsts = best_of_each_size(sorted(alive, key=lambda c: c.error))
+    assert len({c.structure.size for c in firsts}) == len(firsts)
 
 
 def test_a_repeated_trajectory_is_seen_and_a_random_one_is_not() -> None:

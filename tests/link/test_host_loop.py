@@ -132,6 +132,12 @@ def test_runs_the_reference_and_gives_the_session_back(
     assert run_on_host(drive, CONTROLLER, r).outcome == "completed", "the session goes on"
 
 
+def test_a_motor_that_creeps_is_waited_for(drive: Drive, device: ScriptedDevice) -> None:
+    device.creeping = 2
+    assert run_on_host(drive, CONTROLLER, np.full(20, 100.0)).outcome == "completed"
+    assert sum(kind == ARM for kind, _ in device.executed) == 3
+
+
 def test_an_error_of_progress_leaves_a_session_that_can_stop(
     drive: Drive, device: ScriptedDevice
 ) -> None:

@@ -156,6 +156,17 @@ def test_heartbeats_go_on_while_a_run_lasts_and_no_longer(device, drive):
     assert device.heartbeats == beats
 
 
+def test_whether_the_motor_rests_is_for_the_device_to_say(device, drive):
+    """It sees counts that no STATUS brings: a motor that creeps is waited for, not refused."""
+    device.creeping = 3
+    assert drive.stream(Plan("commands", U), Kept()).is_complete
+    assert sum(kind == script.ARM for kind, _ in device.executed) == 4
+    device.creeping = 10**9
+    with pytest.raises(LinkError, match="refused: the motor is moving"):
+        drive.stream(Plan("commands", U), Kept())
+    assert len(starts(device)) == 1
+
+
 # --- what is refused ----------------------------------------------------------------------------
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import os
 import struct
 from collections.abc import Callable
@@ -15,6 +16,7 @@ import pytest
 import sewfast
 from sewfast.errors import DataError, SettingError
 from sewfast.readers import Table, logs, read_table
+from sewfast.readers import blackbox as blackbox_module
 
 RNG = np.random.default_rng(0)
 T = 10.0 + np.arange(200) * 0.002
@@ -301,6 +303,17 @@ def test_a_black_box_goes_on_behind_what_is_damaged(tmp_path: Path) -> None:
     rows = {int(k): v for k, v in zip(found["loopIteration"], found["y"], strict=True)}
     wrong = sum(rows[k] != written[k][13] for k in kept & written.keys())
     assert wrong <= 1, "a frame that ends where another begins cannot be told from a sound one"
+
+
+def test_loops_that_are_not_logged_are_counted_as_the_flight_controller_does() -> None:
+    """A frame is due at every `interval`th loop, and in between `part` of every `whole` loops."""
+    for interval, part, whole in ((32, 1, 2), (32, 1, 4), (30, 2, 3), (256, 1, 16), (7, 3, 5)):
+        due = [
+            k for k in range(3 * interval)
+            if k % interval == 0 or (k % interval + part - 1) % whole < part
+        ]  # fmt: skip
+        for now, following in itertools.pairwise(due):
+            assert blackbox_module._skipped(now, interval, part, whole) == following - now - 1
 
 
 def test_of_several_flights_the_longest_is_read(tmp_path: Path) -> None:

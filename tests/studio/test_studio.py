@@ -664,7 +664,7 @@ def test_no_view_keeps_anybody_out(tuned: Studio, browser: Any) -> None:
     browser.get(tuned.address)
     _until(lambda: browser.execute_script(NUMBER, "Ms"))
     axe.inject()
-    for view in ("tune", "data", "commission"):
+    for view in ("tune", "data", "drive", "commission"):
         browser.find_element("id", f"view-{view}").click()
         assert axe.run()["violations"] == [], view
 

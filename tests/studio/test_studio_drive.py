@@ -108,6 +108,14 @@ def test_a_drive_by_clicks(studio: Studio, device: VirtualDevice, browser: Any) 
             "const r = arguments[0].getBoundingClientRect(); return [r.x, r.y]", stop
         )
         assert browser.execute_script(inside, stop, box[0] + 60, box[1] + 22)
+    if "STUDIO_PICTURES" in os.environ:
+        browser.set_window_size(1400, 1000)
+        browser.execute_script("scrollTo(0, 0)")
+        browser.save_screenshot(str(Path(os.environ["STUDIO_PICTURES"]) / "drive.png"))
+    for width in (1600, 1000, 600):  # 600: what 200 % zoom leaves of a window of 1200
+        browser.set_window_size(width, 900)
+        wide = "return document.documentElement.scrollWidth - innerWidth"
+        assert browser.execute_script(wide) <= 0
     # Esc in a field, as anywhere
     at("record-file").send_keys(Keys.ESCAPE)
     until(lambda: not _is_on(device))

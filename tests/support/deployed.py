@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from sewfast import Controller, Gains, Model, deploy
+from sewfast import Biquad, Controller, Gains, Model, deploy
 from sewfast.deployment.c99 import combined_run, embedded_members
 
 EMULATED = Path(__file__).parent / "emulated"
@@ -179,6 +179,8 @@ def _size(controller: Controller) -> float:
     return 8000.0 if controller.schedule else 4000.0
 
 
+SECTIONS = (Biquad.notch(60.0), Biquad.low_pass(200.0), Biquad.lead_lag(40.0, 160.0))
+
 CONTROLLERS = {
     "pi": Controller(Gains.standard(0.02, 0.25)),
     "paper": Controller(
@@ -191,10 +193,13 @@ CONTROLLERS = {
     "tracking": Controller(Gains.standard(0.02, 0.05), Tt=0.02, u_min=-8.0, u_max=8.0),
     "slew": Controller(Gains.standard(0.02, 0.05), slew=900.0, u_min=-8.0, u_max=8.0, alpha=-0.1),
     "ramp": Controller(Gains.standard(0.01, 0.2), r_rate=30000.0, u_min=2.0, u_max=20.0),
+    "biquads": Controller(
+        Gains.standard(0.02, 0.05, 0.002), N=10.0, u_min=-8.0, u_max=8.0, biquads=SECTIONS
+    ),
     "everything": Controller(
         Gains.standard(0.02, 0.25, 0.004), alpha=0.4, beta=0.2, N=8.0, Tt=0.05, u_min=-20.0,
         u_max=20.0, slew=4000.0, filter_samples=8, filter_time=0.002, observer_time=0.003,
-        r_rate=20000.0,
+        r_rate=20000.0, biquads=SECTIONS,
         schedule=(
             (300.0, Gains.standard(0.01, 0.3, 0.002)),
             (1000.0, Gains.standard(0.02, 0.2, 0.004)),

@@ -147,6 +147,8 @@ class ScriptedDevice(threading.Thread):
         self.executed: list[tuple[int, bytes]] = []
         self.arrived: list[tuple[float, int]] = []
         self.heartbeats = self.foreign = 0
+        self.creeping = 0
+        """So many ARMs find the motor moving, whatever STATUS says."""
         self.limits = (0.0,) * 4
         self.state, self.reason, self.run_number = IDLE, 0, 0
         self.problem: BaseException | None = None
@@ -370,6 +372,9 @@ class ScriptedDevice(threading.Thread):
         watchdog, key = struct.unpack("<II", body)
         if key != KEY:
             return b"\x0d" + bytes(4)
+        if self.creeping:
+            self.creeping -= 1
+            return b"\x0b" + bytes(4)
         self._watchdog = watchdog * 1e-6
         self._fed = self._monotonic()
         self.state = ARMED

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import ast
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import licences
 import sewfast
 
 
@@ -49,3 +52,11 @@ def test_work_loads_no_extra() -> None:
 def test_help_loads_no_arithmetic() -> None:
     loaded = _loaded_by("from sewfast.cli.parser import build_parser\nbuild_parser()")
     assert not loaded & {"numpy", "scipy", "matplotlib", "sewfast._core"}
+
+
+@pytest.mark.skipif(shutil.which("cargo") is None, reason="needs cargo")
+def test_the_licences_of_what_is_linked_are_shipped() -> None:
+    """Written anew where a crate came, went or changed: `make licences`."""
+    assert licences.FILE.read_text(encoding="utf-8") == licences.written()
+    text = (licences.ROOT / "pyproject.toml").read_text()
+    assert f'"{licences.FILE.name}"' in re.search(r"license-files = .*", text)[0]  # type: ignore[index]

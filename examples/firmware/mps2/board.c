@@ -1,5 +1,5 @@
-/* A board that is an emulated Cortex-M4: QEMU's mps2-an386, with UART0 as port and a computed motor with dry friction as drive
- * (built by `make firmware`, started by `sewfast pil`).
+/* A board that is an emulated Cortex-M4 or Cortex-M7: QEMU's mps2-an386 or mps2-an500, with UART0 as port and a computed motor
+ * with dry friction as drive (built by `make firmware`, started by `sewfast pil`).
  *
  * It runs on credit unless told otherwise: once a host has opened a session, its time stands still but for what the host grants,
  * so that a busy computer changes no recording. A serial line does not tell that the host has gone: time then stands until the

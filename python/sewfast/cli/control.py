@@ -46,7 +46,7 @@ Columns: t [s], r, u, y (the plant's true output; of a real drive the speed esti
 counts), feedback (y after encoder and filter).
 
 On a drive the controller runs on the device; the run is written as MCAP while it lasts, and
-another ending of -o is made from it afterwards. Ctrl-C stops the motor and keeps the file.
+a file with another ending is made from it afterwards. Ctrl-C stops the motor and keeps the file.
 """
 
 RUN_EXAMPLES = """\

@@ -225,7 +225,7 @@ def add_preparation(parser: argparse.ArgumentParser, *, detrend: bool = True) ->
 def add_hold(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--hold-inputs", action="store_true",
-        help="take an input that is missing to be the last known one, held",
+        help="replace a missing input by the last known one",
     )  # fmt: skip
 
 
@@ -292,10 +292,10 @@ def _detrended(data: Dataset, order: str | None, like: Dataset | None) -> Datase
 
 
 LOOK_TEXT = """\
-Say what one should know of recordings before identifying from them: samples, gaps, range, trend,
-quantisation, time at limits, noise, the band that is excited, and what to do about each finding.
+Show what you should know about recordings before you identify a model from them: samples, gaps,
+range, trend, quantisation, time at limits, noise, the excited band, and what to do about each.
 
-Without --input and --output every column of a file is listed, so that the two can be chosen.
+Without --input and --output it lists every column of a file, so that you can choose the two.
 """
 
 LOOK_EXAMPLES = """\

@@ -18,6 +18,7 @@ for.
 EXAMPLES = """\
 examples:
   sewfast deploy controller.json firmware             controller.c, controller.h and their test
+  sewfast deploy controller.json firmware --changeable  with set_gains, set_limits
   sewfast deploy drive.json firmware --name plant     the model: plant.c, plant.h
   sewfast deploy controller.json simulation --precision f64
   sewfast deploy controller.json plc --to st          a function block for a PLC
@@ -49,6 +50,10 @@ def add(commands: Commands) -> None:
         "--name", dest="prefix", metavar="NAME",
         help="with which all names in the code begin; default: controller or model",
     )  # fmt: skip
+    parser.add_argument(
+        "--changeable", action="store_true",
+        help="gains and limits of the controller can be changed while it runs (C99 only)",
+    )  # fmt: skip
 
 
 def deploy_command(args: argparse.Namespace) -> None:
@@ -60,7 +65,10 @@ def deploy_command(args: argparse.Namespace) -> None:
 
     controller = storage.format_of(args.file) == FORMAT
     what = load_controller(args.file) if controller else load_model(args.file)
-    done = deploy(what, args.folder, to=args.to, precision=args.precision, name=args.prefix)
+    done = deploy(
+        what, args.folder, to=args.to, precision=args.precision, name=args.prefix,
+        changeable=args.changeable,
+    )  # fmt: skip
     if args.json:
         files = [str(done.folder / name) for name in done.files]
         print_json({"folder": str(done.folder), "files": files, "notes": list(done.notes)})

@@ -138,7 +138,7 @@ Make a drive's output safe: command 0, drive disabled. A tripped drive stays tri
 """
 
 CLEAR = """\
-Take back the trip of a drive once its cause is known. The drive is idle then; nothing moves.
+Clear the trip of a drive once you know its cause. The drive is then idle; nothing moves.
 """
 
 
@@ -146,7 +146,7 @@ def add(commands: Commands) -> None:
     for name, command, text in (("stop", stop_command, STOP), ("clear", clear_command, CLEAR)):
         parser = add_command(
             commands, name, command,
-            summary={"stop": "stop a drive", "clear": "take back a drive's trip"}[name], text=text,
+            summary={"stop": "stop a drive", "clear": "clear a drive's trip"}[name], text=text,
             examples=f"example:\n  sewfast {name} /dev/ttyUSB0",
         )  # fmt: skip
         parser.add_argument("port", metavar="PORT", help=PORT_HELP)

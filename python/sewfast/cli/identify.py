@@ -108,9 +108,10 @@ several files are several experiments of one drive.
 FILE:IN:OUT names the columns of one file, IN1+IN2 several inputs.
 
 The default, auto, fits linear output error of several orders, then networks that start from it, and
-keeps a network only where it does credibly better in free run on samples that it was not fitted to.
-What was tried is printed with its errors; the last lines say whether the model is good enough to
-tune a controller on, and what to do next.
+keeps a network only if it does credibly better in free run on samples that it was not fitted to.
+Every candidate is printed with its error; the last lines say whether the model is good enough to
+tune a controller on, and what to do next. Without --input and --output both are recognised by
+their names and units, if there is no doubt.
 """
 
 EXAMPLES = """\
@@ -330,9 +331,9 @@ def _show(
 VALIDATE = """\
 Score a model on a recording that it was not trained on, in free run and one step ahead.
 
-Free run is the headline: the model starts once and lives with its own outputs, as it does when a
+Free run is what counts: the model starts once and depends on its own outputs, as it does when a
 controller is tuned on it. One step ahead starts from the measured output at every sample: that
-looks good for models that are of no use alone, and bad where the outputs are noisy.
+looks good for models that are useless on their own, and bad if the outputs are noisy.
 """
 
 VALIDATE_EXAMPLES = """\

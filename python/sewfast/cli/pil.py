@@ -16,9 +16,9 @@ from .arguments import Commands, add_command, add_overwrite
 from .output import print_json
 
 PIL = """\
-Processor in the loop: compile the example firmware for a Cortex-M4, start it in the emulator QEMU,
-connect to its serial port and do what one does with a drive: examine it, record a chirp, run a
-controller, commission it. The motor is computed on the emulated processor too.
+Processor in the loop: compile the example firmware for a Cortex-M4 or M7, start it in the emulator
+QEMU, connect to its serial port and do what one does with a drive: examine it, record a chirp, run
+a controller, commission it. The motor is computed on the emulated processor too.
 
 At the end it says how many instructions a control period takes, how deep the stack was used and
 how large the code is. QEMU counts instructions, not cycles.
@@ -33,7 +33,8 @@ examples:
   sewfast pil                                 in a source checkout; results go to pil/
   sewfast pil --no-commission                 in a quarter of the time
   sewfast pil --clock real --watchdog 500     the board's time is the computer's
-  sewfast pil --firmware target/bare/mps2.elf
+  sewfast pil --board mps2-an500              a Cortex-M7
+  sewfast pil --firmware target/bare/mps2-an386.elf
 """
 
 LIMITS = "volt=10,speed=8000,acceleration=90000,current=inf"
@@ -50,7 +51,14 @@ def add(commands: Commands) -> None:
         "--source", type=Path, default=Path(), metavar="DIR",
         help="a source checkout of sewfast (the current folder)",
     )  # fmt: skip
-    place.add_argument("--firmware", type=Path, metavar="FILE.elf", help="built already")
+    place.add_argument(
+        "--firmware", type=Path, metavar="FILE.elf",
+        help="built already, for either board; it says which",
+    )  # fmt: skip
+    parser.add_argument(
+        "--board", choices=("mps2-an386", "mps2-an500"),
+        help="what to build for: a Cortex-M4 or a Cortex-M7 (mps2-an386)",
+    )  # fmt: skip
     parser.add_argument(
         "--out", type=Path, default=Path("pil"), metavar="DIR", help="folder for what it did (pil)"
     )
@@ -82,7 +90,9 @@ def command(args: argparse.Namespace) -> int:
     firmware = args.firmware
     if firmware is None:
         _say("compiling the firmware")
-        firmware = build_firmware(args.source)
+        firmware = build_firmware(args.source, board=args.board or "mps2-an386")
+    elif args.board is not None:
+        raise SettingError("--board: leave it out beside --firmware, which says for which it is")
     with EmulatedBoard(firmware, clock=args.clock, boot_id=args.seed + 1) as board:
         args.out.mkdir(parents=True, exist_ok=True)
         first = Controller(

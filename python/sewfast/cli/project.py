@@ -10,13 +10,14 @@ import argparse
 import difflib
 import importlib
 import math
+import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import SettingError
+from ..errors import SettingError, printable
 from .arguments import Commands, add_command
 from .drive import LIMITS, is_port
 from .output import print_json
@@ -89,7 +90,7 @@ class Project:
             for name, value in self.command.items():
                 self._take(args, taken, name, value)
         if taken:
-            shown = ", ".join(f"{name} = {value}" for name, value in taken.items())
+            shown = printable(", ".join(f"{name} = {value}" for name, value in taken.items()))
             print(f"from {self.path}: {shown}", file=sys.stderr)
 
     def _fill_port(self, args: argparse.Namespace, taken: dict[str, Any]) -> None:
@@ -121,12 +122,30 @@ def find(folder: Path | None = None) -> Project:
     SettingError
         Where the file cannot be read or says something that is not understood.
     """
-    folder = Path.cwd() if folder is None else folder
+    try:
+        folder = Path.cwd() if folder is None else folder
+        found = next((p for p in _places(folder) if p.is_file()), None)
+        if found is None:
+            return Project()
+        if not _is_trusted(found):
+            print(f"{found} belongs to another user and is left out; copy it", file=sys.stderr)
+            return Project()
+    except OSError:
+        # a folder that is gone, or one above that may not be looked into
+        return Project()
+    return load(found)
+
+
+def _places(folder: Path) -> Iterator[Path]:
     for place in (folder, *folder.parents):
-        path = place / NAME
-        if path.is_file():
-            return load(path)
-    return Project()
+        yield place / NAME
+
+
+def _is_trusted(path: Path) -> bool:
+    """Whether a file is the user's own or the system's: limits of a drive are nobody else's."""
+    if not hasattr(os, "getuid"):
+        return True
+    return path.stat().st_uid in (os.getuid(), 0)
 
 
 def load(path: Path) -> Project:

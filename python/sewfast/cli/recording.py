@@ -39,11 +39,11 @@ A signal is a named one (`sewfast signals`), made for the sewing machine, or a f
 t [s], u [V] at the machine's sample time. --scale 0.2 makes any of them gentle.
 
 Columns: t [s], u [V], counts, y [RPM] (the speed estimated from the counts) and, of a virtual
-machine, speed_true [RPM], which no experiment could see; it is there for scores.
+machine, speed_true [RPM], which no experiment could measure; it is there for scoring.
 virtual:SEED is another machine of the same type.
 
-On a drive the recording is written as MCAP while it runs, so that whatever happens what came is
-kept; another ending of -o is made from it afterwards. Ctrl-C stops the motor and keeps the file.
+On a drive the recording is written as MCAP while it runs, so nothing that arrived is lost; a file
+with another ending is made from it afterwards. Ctrl-C stops the motor and keeps the file.
 """
 
 RECORD_EXAMPLES = """\

@@ -41,8 +41,8 @@ models are plants that one controller has to serve; of an ensemble every member 
 Nothing but the model is needed. References cover the range that the drive was recorded over, at
 the pace of its step response; the command's limits are the recorded range of the input, with 0;
 the feedback is filtered over 8 ms, at most a tenth of the time constant; an encoder is in the
-loop where the model's speed comes from counts. What the drive can do beyond its record is yours
-to say: --u-min, --u-max.
+loop if the model's speed comes from counts. If the drive can do more than it was recorded with,
+say so with --u-min and --u-max.
 
 A reference is a named one (`sewfast signals`) or a CSV with columns t [s], r [output unit].
 Named ones are signals in RPM at 1 ms; on any other drive the same shapes over its own range.

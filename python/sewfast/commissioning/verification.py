@@ -244,19 +244,23 @@ class Watching:
         Aborted
         """
         end = min(first + len(u), len(self._u))
+        if end <= first:
+            return
         self._u[first:end], self._counts[first:end] = u[: end - first], counts[: end - first]
         self._chatters(end)
         self._parts(end)
 
     def _chatter_predicted(self) -> float:
         """The largest of any window, from sample to sample of the machine [V]."""
-        changes = np.diff(self._predicted.u) / math.sqrt(self._k)
+        changes = np.diff(self._predicted.u, append=self._predicted.u[-1]) / math.sqrt(self._k)
         span = min(len(changes), max(5, self._window // self._k))
         return float(np.sqrt(np.convolve(changes**2, np.ones(span) / span, "valid").max()))
 
     def _chatters(self, end: int) -> None:
         recent = self._u[max(0, end - self._window) : end]
-        chatter = float(np.sqrt(np.nanmean(np.diff(recent) ** 2))) if len(recent) > 9 else 0.0
+        changes = np.diff(recent)
+        # what a link has lost says nothing
+        chatter = _rms(changes[np.isfinite(changes)]) if np.isfinite(changes).any() else 0.0
         if len(recent) == self._window and chatter > self._most:
             self._end(
                 end, f"expected a command that moves by up to {self._most:.3g} V rms a sample, it "

@@ -235,13 +235,18 @@ def to_matlab(controller: Controller, form: Object = "pid2") -> dict[str, Any]:
     Raises
     ------
     SettingError
-        For another form, weights that it cannot hold, or a gain schedule.
+        For another form, weights that it cannot hold, a gain schedule, or biquads.
     """
     require_controller(controller, None, "to_matlab(controller, form)")
     _require_form(form)
     if controller.schedule:
         raise SettingError(
             "expected constant gains, received a gain schedule; convert its points one by one"
+        )
+    if controller.biquads:
+        raise SettingError(
+            "expected a controller without biquads, which MATLAB's PID objects have no place for, "
+            f"got {len(controller.biquads)}; take them out and put them in series: Biquad.to_tf(Ts)"
         )
     if not form.endswith("2") and (controller.alpha or controller.beta):
         raise SettingError(

@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from ..control import Controller
@@ -60,6 +61,7 @@ def deploy(
     to: str = "c99",
     precision: str | None = None,
     name: str | None = None,
+    changeable: bool = False,
 ) -> Deployment:
     """Write a model or a controller as code.
 
@@ -79,6 +81,9 @@ def deploy(
         only single precision in hardware takes some fifty times as long for `f64`.
     name : str, optional
         With which every name in the code begins; `controller` or `model` where there is none.
+    changeable : bool
+        Whether gains and limits of a controller in C can be changed while it runs (`set_gains`,
+        `set_limits`), without a bump. They lie in memory then, not among the constants.
 
     Returns
     -------
@@ -87,7 +92,8 @@ def deploy(
     Raises
     ------
     SettingError
-        For another target, precision or name, and for a model that single precision would change.
+        For another target, precision or name, for a model that single precision would change, and
+        for changeable gains of what has none.
     ModelFileError
         Where a file cannot be written.
     """
@@ -95,11 +101,6 @@ def deploy(
         raise SettingError(
             f"expected a model or a controller, got {type(what).__name__}; load it with "
             "sewfast.load_model or sewfast.load_controller"
-        )
-    if isinstance(what, Controller) and what.biquads:
-        raise SettingError(
-            "expected a controller without biquads, which deployed code does not hold yet, got "
-            f"{len(what.biquads)}; leave them out, or run it by sewfast.h"
         )
     if to not in TARGETS:
         raise SettingError(f"to: expected one of {', '.join(TARGETS)}, received {to!r}")
@@ -116,18 +117,39 @@ def deploy(
             f"language and no name of another file (_test, fmi3), received {name!r}; for example "
             "drive"
         )
-    texts, notes = _WRITERS[to](what, name, precision)
+    writer = _WRITERS[to]
+    if changeable:
+        _require_changeable(what, to)
+        writer = partial(c99.files, changeable=True)
+    texts, notes = writer(what, name, precision)
     target = Path(folder)
     if target.exists() and not target.is_dir():
         raise SettingError(f"expected a folder, got the file {target}; name another one")
-    for path, content in texts.items():
-        place = target / path
+    # all folders before any file: nothing is left half written
+    for folder in dict.fromkeys((target / path).parent for path in texts):
         try:
-            place.parent.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise SettingError(
-                f"expected a folder that can be made, got {place.parent} ({error.strerror}); name "
+                f"expected a folder that can be made, got {folder} ({error.strerror}); name "
                 "one that can be written to"
             ) from error
-        replace(place, content)
+    for path, content in texts.items():
+        replace(target / path, content)
     return Deployment(target, tuple(texts), tuple(notes))
+
+
+def _require_changeable(what: Model | Controller, to: str) -> None:
+    """Raises a SettingError for what has no gains that C could change."""
+    refused = partial(SettingError, name="changeable", remedy="leave it out")
+    if to != "c99":
+        raise refused(expected="c99", received=to)
+    if not isinstance(what, Controller):
+        raise refused(expected="a controller", received="a model")
+    if what.schedule:
+        raise SettingError(
+            name="changeable",
+            expected="a controller with constant gains",
+            received=f"a schedule of {len(what.schedule)} points",
+            remedy="leave it out, or deploy the controller without its schedule",
+        )

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files as resources
 from typing import Any
 
@@ -21,6 +21,7 @@ from .. import __version__, _core
 from ..control import Controller
 from ..dataset import FloatArray
 from ..errors import FitError, SettingError
+from ..gains import Gains
 from ..models import Ensemble, Model
 from . import manifests
 
@@ -45,11 +46,13 @@ _MOST_MEMBERS = 64
 _LICENCE = "The code in this file may be used under MIT, Apache-2.0 or 0BSD, as you like."
 
 
-def files(what: Model | Controller, name: str, precision: str) -> tuple[dict[str, str], list[str]]:
+def files(
+    what: Model | Controller, name: str, precision: str, *, changeable: bool = False
+) -> tuple[dict[str, str], list[str]]:
     """The texts of all files by their names, and what is to be said of them."""
     code = Code(name, precision)
     if isinstance(what, Controller):
-        header, source, vectors, notes = _controller(what, code)
+        header, source, vectors, notes = _controller(what, code, changeable)
     else:
         header, source, vectors, notes = _model(what, code)
     texts = {
@@ -424,13 +427,13 @@ def _model_test(
     return _test(code, "test_model.c", {"u": u.ravel(), "y": y})
 
 
-def _test(code: Code, file: str, vectors: Mapping[str, FloatArray]) -> str:
+def _test(code: Code, file: str, vectors: Mapping[str, FloatArray], **places: str) -> str:
     opening = code.opening(
         f"A test of {code.name}: its results are compared with those of sewfast, to the last bit.",
         ["Returns 0 where all are equal."],
     )
     tables = "\n".join(code.table(name, values) for name, values in vectors.items())
-    body, count = code.template(file, COUNT=str(_VECTORS)), str(_VECTORS)
+    body, count = code.template(file, COUNT=str(_VECTORS), **places), str(_VECTORS)
     values = {"OPENING": opening, "NAME": code.name, "TABLES": tables, "BODY": body}
     return code.template("test.c", COUNT=count, **values)
 
@@ -438,7 +441,9 @@ def _test(code: Code, file: str, vectors: Mapping[str, FloatArray]) -> str:
 # --- The controller -------------------------------------------------------------------------------
 
 
-def _controller(controller: Controller, code: Code) -> tuple[str, str, str, list[str]]:
+def _controller(
+    controller: Controller, code: Code, changeable: bool
+) -> tuple[str, str, str, list[str]]:
     core: Any = controller.core()
     core = core.single() if code.single else core
     numbers: dict[str, Any] = core.numbers
@@ -452,32 +457,63 @@ def _controller(controller: Controller, code: Code) -> tuple[str, str, str, list
         "No heap, no C library, no global state.",
     ]
     size = 4 if code.single else 8
-    memory = (numbers["samples"] + 10) * size + 10
-    functions = f"{code.name}_init, {code.name}_step"
-    notes = [f"PID as C99 in {code.real}: {functions}; about {memory} bytes of memory"]
+    kept = numbers["samples"] + 10 + 6 * len(numbers["biquads"]) + 7 * changeable
+    functions = [f"{code.name}_init", f"{code.name}_step"]
+    if changeable:
+        functions += [f"{code.name}_set_gains", f"{code.name}_set_limits"]
+    notes = [
+        f"PID as C99 in {code.real}: {', '.join(functions)}; about {kept * size + 10} bytes of "
+        "memory"
+    ]
     return (
-        _controller_header(controller, code, numbers, about),
-        _controller_source(code, numbers, about),
-        _controller_test(controller, code, core),
+        _controller_header(controller, code, numbers, about, changeable),
+        _controller_source(controller, code, numbers, about, changeable),
+        _controller_test(controller, code, core, changeable),
         notes,
     )
 
 
 def _controller_header(
-    controller: Controller, code: Code, numbers: Mapping[str, Any], about: list[str]
+    controller: Controller,
+    code: Code,
+    numbers: Mapping[str, Any],
+    about: list[str],
+    changeable: bool,
 ) -> str:
+    units = {
+        "UNIT_U": _safe(controller.gains.u_unit or "u"),
+        "UNIT_Y": _safe(controller.gains.y_unit or "y"),
+    }
+    members, flags, biquads = "", "", ""
+    if sections := len(numbers["biquads"]):
+        biquads = code.template("biquads.h", SECTIONS=str(sections))
+        members += "    @_biquad of_y[@@_BIQUADS], of_r[@@_BIQUADS]; /* of y and r */\n"
+        flags += ", y_begun, r_begun"
+    if changeable:
+        members += "    @_terms terms;\n    @_real u_min, u_max;\n"
+        flags += ", held"
     body = code.template(
         "pid.h",
         TS=Code(code.name, "f64").literal(controller.Ts),
         SAMPLES=str(numbers["samples"]),
-        UNIT_U=_safe(controller.gains.u_unit or "u"),
-        UNIT_Y=_safe(controller.gains.y_unit or "y"),
+        BIQUADS_TYPE=biquads,
+        TERMS_TYPE=code.template("terms.h", RATE=", rate") if changeable else "",
+        MEMBERS=members,
+        FLAGS=flags,
+        CHANGES=code.template("changes.h", **units) if changeable else "",
+        **units,
     )
     opening = code.opening(f"{code.name}: a two-degree-of-freedom PID controller", about)
     return code.framed("frame.h", opening, body)
 
 
-def _controller_source(code: Code, numbers: Mapping[str, Any], about: list[str]) -> str:
+def _controller_source(
+    controller: Controller,
+    code: Code,
+    numbers: Mapping[str, Any],
+    about: list[str],
+    changeable: bool,
+) -> str:
     def number(name: str) -> str:
         return _signed(code.literal(numbers[name]))
 
@@ -492,16 +528,54 @@ def _controller_source(code: Code, numbers: Mapping[str, Any], about: list[str])
             "        kept = (integral - c->integral) * excess < R(0.0) ? c->integral : integral;"
         )
     names = ("ALPHA", "BETA", "LAG", "RAMP", "CHANGE", "U_MIN", "U_MAX")
+    places = {name: number(name.lower()) for name in names}
+    terms = code.template("terms.h", RATE=", rate" if changeable else "")
+    places |= dict.fromkeys(("BIQUADS", "OF_Y", "OF_R", "INIT", "HELD", "CHANGES"), "")
+    places |= {"TERMS_TYPE": terms, "GAINS_NOW": "@_gains(filtered)"}
+    if numbers["biquads"]:
+        rows = [f"{{{', '.join(map(code.literal, row))}}}" for row in numbers["biquads"]]
+        places |= {
+            "BIQUADS": code.template("biquads.c", SECTIONS=",\n    ".join(rows)),
+            "OF_Y": code.template("biquads_y.c"),
+            "OF_R": code.template("biquads_r.c"),
+            "INIT": "    c->y_begun = 0;\n    c->r_begun = 0;\n",
+        }
+    if changeable:
+        step = {"FILTER": _derivative_lag(code, numbers), "STEP": code.literal(numbers["ts"])}
+        own = ", ".join(
+            code.literal(v)
+            for v in (numbers["kp"], numbers["ki"], controller.gains.to("standard").Td)
+        )
+        places["INIT"] += f"    c->terms = @_terms_of({own});\n"
+        places["INIT"] += f"    c->u_min = {number('u_min')};\n    c->u_max = {number('u_max')};\n"
+        places["INIT"] += "    c->held = 0;\n"
+        places |= {
+            "HELD": "    c->held = 1;\n",
+            "TERMS_TYPE": "",  # it stands in the header
+            "GAINS_OF": code.template("terms.c", **step),
+            "GAINS_NOW": "c->terms",
+            "CHANGES": code.template(
+                "changes.c", ALPHA=number("alpha"), LARGEST=code.literal(math.inf), **step
+            ),
+            "U_MIN": "c->u_min",
+            "U_MAX": "c->u_max",
+        }
+    else:
+        places["GAINS_OF"] = code.template("gains.c", GAINS=_gains(code, numbers).rstrip()) + "\n"
     body = code.template(
         "pid.c",
         OBSERVER=observer,
         WINDUP=windup,
-        GAINS=_gains(code, numbers).rstrip(),
         FILTER_WORDS=", then an observer" if numbers["observes"] else "",
-        **{name: number(name.lower()) for name in names},
+        **places,
     )
     opening = code.opening(f"{code.name}: a two-degree-of-freedom PID controller", about)
     return code.framed("frame.c", opening, body)
+
+
+def _derivative_lag(code: Code, numbers: Mapping[str, Any]) -> str:
+    """`Td/N`, of which an infinite N leaves 0."""
+    return "R(0.0)" if math.isinf(numbers["n"]) else f"td / {code.literal(numbers['n'])}"
 
 
 def _gains(code: Code, numbers: Mapping[str, Any]) -> str:
@@ -517,16 +591,33 @@ def _gains(code: Code, numbers: Mapping[str, Any]) -> str:
         "schedule.c",
         ROWS=str(len(used)),
         TABLE=(",\n" + " " * 8).join(lines),
-        # Td/N, of which infinity leaves 0
-        FILTER="R(0.0)" if math.isinf(numbers["n"]) else f"td / {code.literal(numbers['n'])}",
+        FILTER=_derivative_lag(code, numbers),
         STEP=code.literal(numbers["ts"]),
     )
 
 
-def _controller_test(controller: Controller, code: Code, core: Any) -> str:
+def _controller_test(controller: Controller, code: Code, core: Any, changeable: bool) -> str:
     r, y = _signals(controller, _VECTORS, code)
-    u = np.array([core.step(float(a), float(b)) for a, b in zip(r, y, strict=True)])
-    return _test(code, "test_pid.c", {"r": r, "y": y, "u": u})
+    u, switch = [], ""
+    middle = _VECTORS // 2
+    if changeable:
+        other = _other_gains(controller.gains.to("standard"))
+        given = ", ".join(code.literal(v) for v in (other.Kp, other.Ti, other.Td))
+        switch = f"        wrong += k == {middle} && !@_set_gains(&c, {given});\n"
+    for k, (a, b) in enumerate(zip(r, y, strict=True)):
+        if changeable and k == middle:
+            changed: Any = replace(controller, gains=other).core()
+            core.set_design(changed.single() if code.single else changed)
+        u.append(core.step(float(a), float(b)))
+    vectors = {"r": r, "y": y, "u": np.array(u)}
+    return _test(code, "test_pid.c", vectors, SWITCH=switch)
+
+
+def _other_gains(gains: Gains) -> Gains:
+    """Gains to change to: weaker, with another derivative."""
+    return Gains.standard(
+        0.5 * gains.Kp, 2.0 * gains.Ti, 1.5 * gains.Td, u_unit=gains.u_unit, y_unit=gains.y_unit
+    )
 
 
 def _signals(controller: Controller, count: int, code: Code) -> tuple[FloatArray, FloatArray]:

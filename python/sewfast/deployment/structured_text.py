@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -67,6 +67,7 @@ def _block(controller: Controller, name: str, number: _Type, n: Mapping[str, Any
   observing := TRUE;
   y_filtered := speed;
 """
+    declared, of_y, of_r, forgotten = _biquads(number, n["biquads"])
     if n["tracks"]:
         windup = f"        kept := integral_now + {value['tracking']} * excess;"
     else:
@@ -97,11 +98,11 @@ VAR
   samples : ARRAY[0..{samples - 1}] OF {real};
   next_sample, i : INT;
   averaging, lagging, observing, ramping, started : BOOL;
-  lag, speed, innovation, ramped, integral, derivative, r_last, e_last : {real};
+  lag, speed, innovation, ramped, referred, integral, derivative, r_last, e_last : {real};
   sum, previous, e, rate_input, change, derivative_now, integral_now, proportional : {real};
   kp, ki, kd, pole, wanted, excess, kept, low, high, distance, share, weight, td, lag_of_d : {real};
   usable : BOOL;
-END_VAR
+{declared}END_VAR
 
 IF restart THEN
   averaging := FALSE;
@@ -109,7 +110,7 @@ IF restart THEN
   lagging := FALSE;
   observing := FALSE;
   ramping := FALSE;
-  started := FALSE;
+{forgotten}  started := FALSE;
   integral := {zero};
   derivative := {zero};
   r_last := {zero};
@@ -152,7 +153,7 @@ IF usable THEN
     observing := FALSE;
   END_IF;
 END_IF;
-
+{of_y}
 IF usable THEN
   IF NOT ramping THEN
     ramped := y_filtered;
@@ -167,16 +168,17 @@ IF usable THEN
   IF ramped > high THEN
     ramped := high;
   END_IF;
-{_gains(number, n)}
-  e := ramped - y_filtered;
-  rate_input := e - {value["beta"]} * ramped;
+  referred := ramped;
+{of_r}{_gains(number, n)}
+  e := referred - y_filtered;
+  rate_input := e - {value["beta"]} * referred;
   change := {zero};
   IF started THEN
     change := rate_input - (e_last - {value["beta"]} * r_last);
   END_IF;
   derivative_now := pole * derivative + kd * change;
   integral_now := integral + ki * e;
-  proportional := kp * (e - {value["alpha"]} * ramped);
+  proportional := kp * (e - {value["alpha"]} * referred);
   wanted := proportional + integral_now + derivative_now + feedforward;
   usable := wanted - wanted = {zero};
 END_IF;
@@ -217,7 +219,7 @@ IF usable OR manual THEN
       integral := kept;
     END_IF;
     derivative := derivative_now;
-    r_last := ramped;
+    r_last := referred;
     e_last := e;
     started := TRUE;
   ELSE
@@ -232,6 +234,45 @@ _NUMBERS = (
     "kp", "ki", "kd", "pole", "tracking", "lag", "keep", "gain", "ramp", "change", "alpha", "beta",
     "u_min", "u_max", "ts",
 )  # fmt: skip
+
+
+def _biquads(number: _Type, sections: Sequence[Sequence[float]]) -> tuple[str, str, str, str]:
+    """Declarations, feedback and reference through the sections, and how both are forgotten."""
+    if not sections:
+        return "", "", "", ""
+    zero, count = number(0.0), len(sections)
+    memory = ", ".join(f"{name}_{of}" for of in "yr" for name in ("x", "s1", "s2"))
+    declared = (
+        f"  {memory} : ARRAY[0..{count - 1}] OF {number.name};\n"
+        f"  delta, d : {number.name};\n  y_begun, r_begun : BOOL;\n"
+    )
+
+    def through(signal: str, of: str) -> list[str]:
+        lines = [
+            f"  IF NOT {of}_begun THEN",
+            f"    FOR i := 0 TO {count - 1} DO",
+            f"      x_{of}[i] := y_filtered;",
+            f"      s1_{of}[i] := {zero};",
+            f"      s2_{of}[i] := {zero};",
+            "    END_FOR;",
+            "  END_IF;",
+        ]
+        for k, (c0, c1, a1, a2) in enumerate(sections):
+            lines += [
+                f"  delta := {signal} - x_{of}[{k}];",
+                f"  d := {number(c0)} * delta + s1_{of}[{k}];",
+                f"  x_{of}[{k}] := {signal};",
+                f"  s1_{of}[{k}] := {number(c1)} * delta - {number(a1)} * d + s2_{of}[{k}];",
+                f"  s2_{of}[{k}] := -({number(a2)} * d);",
+                f"  {signal} := {signal} + d;",
+            ]
+        return [*lines, f"  {of}_begun := {signal} - {signal} = {zero};"]
+
+    of_y = ["IF usable THEN", *through("y_filtered", "y"), "  usable := y_begun;", "END_IF;"]
+    within = [f"  {line}" for line in through("referred", "r")]
+    of_r = [f"  IF referred - referred = {zero} THEN", *within, "  END_IF;"]
+    forgotten = "  y_begun := FALSE;\n  r_begun := FALSE;\n"
+    return declared, "\n".join([*of_y, ""]), "\n".join([*of_r, ""]), forgotten
 
 
 def _gains(number: _Type, n: Mapping[str, Any]) -> str:

@@ -21,8 +21,18 @@ from ..models import Ensemble, LinearOE, Model, NeuralOE, NeuralSS
 from .effort import Look, Pool, Stopped
 from .folds import LEAST_HELD_OUT, SHARE, Split, compared, errors_of, folds, free_runs
 from .linear import linear_model
-from .orders import LinearCandidate, LinearTable
-from .search import BY_FAR, Candidate, Search, counting, decayed, median_of
+from .orders import LEAST_GAIN, LinearCandidate, LinearTable
+from .search import (
+    BY_FAR,
+    STILL_NEAR,
+    STILL_WORTH_A_FEEDTHROUGH,
+    Candidate,
+    Search,
+    best_of_each_size,
+    counting,
+    decayed,
+    median_of,
+)
 from .task import Provenance, Task, arrays, documented, finite, with_provenance, wrap
 from .training import Network, Request, Start, Structure, train
 from .verdict import verdict
@@ -48,6 +58,8 @@ MOST_STARTS_LARGE = 2
 """Starts of a finalist that are trained to the end on much data."""
 ALONE = 0.98
 """A single start must bring the error of the median below this part: a median errs less often."""
+ABOUT_EQUAL = 0.02
+"""Up to this larger an error on little data counts as none: fewer parameters are the safer bet."""
 MOST_MEMBERS = 15
 """Of an ensemble: a controller is tuned on every one, and a median of more is hardly better."""
 MOST_ALTERNATIVES = 2
@@ -170,10 +182,7 @@ class Choice:
         earlier fifth, so that a win by luck, of the start or of the part, is none.
         """
         search = self.search
-        best_of: dict[tuple[int, bool, str], Candidate] = {}
-        for c in ranked:
-            best_of.setdefault((c.structure.nx, c.structure.integrator, c.structure.kind), c)
-        asked = list(best_of.values())[:VERIFIED]
+        asked = best_of_each_size(ranked)[:VERIFIED]
         newest = search.trials[0]
         winning = [c for c in asked if self._usual(c, newest) < WORTH_IT * linear.rmse]
         passed, parts = [(c.error, c) for c in winning], 1
@@ -204,10 +213,10 @@ class Choice:
         if len(passed) < LEAST_PASSING * len(asked):
             # one of four sizes passes by luck now and then; what the data show, most sizes can see
             return []
-        sizes = {(c.structure.nx, c.structure.integrator, c.structure.kind): c for _, c in passed}
+        sizes = {c.structure.size: c for _, c in passed}
         kept = []
         for c in ranked:
-            size = sizes.get((c.structure.nx, c.structure.integrator, c.structure.kind))
+            size = sizes.get(c.structure.size)
             if size is not None and c.structure.hidden <= size.structure.hidden:
                 kept.append(c)
         order = [id(c) for _, c in passed]
@@ -241,12 +250,15 @@ class Choice:
     # --- training to the end --------------------------------------------------------------------
 
     def _finalists(self, ranked: Sequence[Candidate]) -> list[Candidate]:
-        """Up to three of different structure, about as good as the best."""
+        """Up to three of different structure, about as good as the best; of different size first.
+
+        A search that has led to the wrong size has led there with all its neighbours.
+        """
         within = WITHIN_LARGE if len(self.task.data) >= 20_000 else WITHIN
         first = ranked[0]
         found: list[Candidate] = []
         seen: set[tuple[object, ...]] = set()
-        for c in ranked:
+        for c in (*best_of_each_size(ranked), *ranked):
             s = c.structure
             key = (s.kind, s.nx, s.hidden, s.nk, s.integrator, s.output.name)
             close = c.error <= within * first.error or (
@@ -258,7 +270,7 @@ class Choice:
                 found.append(c)
         if all(c.structure.integrator for c in found):
             plain = next((c for c in ranked if not c.structure.integrator), None)
-            if plain is not None:
+            if plain is not None and plain.error <= STILL_NEAR * first.error:
                 found[FINALISTS - 1 :] = [plain]
         if self.search.is_released and not first.structure.integrator:
             released = replace(first, structure=decayed(first.structure, RELEASED))
@@ -378,12 +390,15 @@ class Choice:
         integrates = bool(able) and able[0].structure.integrator
         if integrates and plain and able[0].error > WORTH_AN_INTEGRATOR * plain[0].error:
             able = plain
+        delayed = [c for c in able if c.structure.nk > 0]
+        if delayed and able[0].error > STILL_WORTH_A_FEEDTHROUGH * delayed[0].error:
+            able = delayed
         if not able:
             return []
         best = able[0]
         for c in sorted(able, key=lambda c: c.structure.parameters(self.search.inputs)):
             ratio, deviation = compared(c.errors, best.errors)
-            if ratio <= min(deviation, 0.02):
+            if ratio <= min(deviation, ABOUT_EQUAL if self.search.is_small else LEAST_GAIN):
                 best = c
                 break
         return [best, *self._joining(best, able)]
@@ -564,6 +579,11 @@ class Choice:
             notes.append(
                 f"free-run error on data not trained on: {100 * error / linear.rmse:.1f} % of the "
                 "best linear model's; consider model oe"
+            )
+        if self.task.nk is None and any(m.orders["nk"] == 0 for m in model.members or (model,)):
+            notes.append(
+                "the output depends on the input of the same sample (nk = 0), so that no loop can "
+                "be closed around the model; for a controller identify with nk = 1"
             )
         extra: Provenance = {"notes": notes} if notes else {}
         extra["verdict"] = verdict(self, error)

@@ -21,7 +21,7 @@ from ..errors import FitError
 from ..models.base import EnsembleCore
 from .effort import Look, Pool
 from .folds import RUNAWAY, Errors, Split, compared, errors_of, free_runs
-from .orders import LinearTable, slowest_pole
+from .orders import MISLED, LinearTable, slowest_pole
 from .outputs import ABS, LINEAR, Output, named, rectified_start, rms_error, suggested
 from .task import Provenance, Task, arrays, finite
 from .training import Network, Request, Start, Structure, train
@@ -47,12 +47,19 @@ WORTH_A_STEP = 0.97
 """A step of the climb must bring the error below this part."""
 LEAST_STEP = 0.01
 """Relative gain of a step that is taken where the gain is known to be one."""
-WORTH_A_FEEDTHROUGH = 0.5
-"""nk = 0 is no plant for a loop, and a smoothed speed leans ahead a little: it must be worth it."""
+WORTH_A_FEEDTHROUGH, STILL_WORTH_A_FEEDTHROUGH = 0.5, 0.9
+"""nk = 0 is no plant for a loop, and a smoothed speed leans ahead a little: it must be worth it, at
+equal size, and beside the best with a delay, whose further states may have made up for it."""
 WORTH_A_RECTIFIER = 0.8
 FAR_BEHIND = 2.0
 """A kind of network whose best is this many times worse than the other's climbs no further."""
+STILL_NEAR = 3.0
+"""How many times larger than the best one's a size's error may be after the screening."""
+SECOND_ROUTE = 0.25
+"""Part of its operations below which a search still has the means to climb a second route."""
 ROUNDS = 6
+SCREENED_STARTS, SHARE_OF_SCREEN = 8, 0.1
+"""Starts of a screened structure, at most, and the part of the operations that they may take."""
 SCREEN_ITERATIONS, HALVING_ITERATIONS, CLIMB_ITERATIONS = 20, (25, 40), 40
 INTEGRATING_POLE = 0.9995
 """A slower real pole of the linear models asks for an integrator."""
@@ -105,6 +112,14 @@ def counting(starts: Iterable[Start]) -> list[Start]:
     return [s for s in able if s.cost <= WORST * able[0].cost]
 
 
+def best_of_each_size(ranked: Iterable[Candidate]) -> list[Candidate]:
+    """The first one of each kind and number of states."""
+    found: dict[tuple[object, ...], Candidate] = {}
+    for c in ranked:
+        found.setdefault(c.structure.size, c)
+    return list(found.values())
+
+
 def median_of(models: Sequence[Network]) -> Any:
     """One model as it is, several as their median."""
     return models[0] if len(models) == 1 else EnsembleCore(tuple(models), "median")
@@ -142,6 +157,8 @@ class Search:
         self.budget, self.rate = self.most, 0.0
         # part of a time budget at which the present stage has to be done; 0 for the search's own
         self.share = 0.0
+        # whether the screening has found that the output depends on the input of the same sample
+        self.feeds_through = False
         self._starts: dict[tuple[int, int, str, int], _core.LinearModel | None] = {}
         self._guarded = arrays(self.task.data)
 
@@ -185,7 +202,7 @@ class Search:
     @property
     def is_released(self) -> bool:
         """Whether a finalist is asked with less weight decay: the climb has not asked for it."""
-        return self.samples >= DECAY_MATTERS and not self.is_large
+        return self.samples >= DECAY_MATTERS
 
     # --- the steps ------------------------------------------------------------------------------
 
@@ -207,26 +224,73 @@ class Search:
 
     def screen(self) -> list[Candidate]:
         """A short training of every likely structure; the best first."""
-        wanted = [(s, SCREEN_ITERATIONS, 4 if self.is_small else 3) for s in self._likely()]
+        likely = self._likely()
+        starts = self._screened_starts(likely)
+        at_once = self._at_once(likely)
+        wanted = [(s, SCREEN_ITERATIONS, starts) for s in (*likely, *at_once)]
         if self.task.hidden is None or self.task.nx is None:
             wanted += [(s, INTEGRATING_ITERATIONS, INTEGRATING_STARTS) for s in self._integrating()]
         wanted += [(s, SCREEN_ITERATIONS, 2) for s in self._lagged()]
         found = self.tried([(s, i, self._limited(n)) for s, i, n in wanted], share=0.25)
+        self.feeds_through = bool(at_once) and all(self._is_halved(s) for s in at_once)
+        if not self.feeds_through:
+            found = [c for c in found if c.structure not in at_once]
         return sorted(found, key=lambda c: c.error)
 
+    def _at_once(self, likely: Sequence[Structure]) -> list[Structure]:
+        """Networks without any delay, of the smallest order whose linear model is not far behind.
+
+        Further states make up for the missing sample of an input that changes slowly, at great
+        expense: among large networks the question comes too late.
+        """
+        if self.task.nk is not None or self.task.data.counts is not None or self.nk != 1:
+            return []
+        linear = self.linear
+        most = MISLED * linear.best.rmse if linear.eligible else math.inf
+        able = [s.nx for s in likely if linear.error(s.nx, linear.nk) <= most]
+        order = min(able, default=min((s.nx for s in likely), default=1))
+        return [replace(s, nk=0) for s in likely if s.nx == order and s.output == LINEAR]
+
+    def _is_halved(self, s: Structure) -> bool:
+        """Whether the median of the starts and the best one do by far better without a delay."""
+        one, other = self.candidates[s], self.candidates[replace(s, nk=1)]
+        if not (one.is_sound and other.starts):
+            return False
+        costs = [min(start.cost for start in c.starts) for c in (one, other)]
+        worth = WORTH_A_FEEDTHROUGH
+        return one.error < worth * other.error and costs[0] < worth**2 * costs[1]
+
+    def _screened_starts(self, likely: Sequence[Structure]) -> int:
+        """Starts of each: many where they are cheap, for a size is judged by the luckiest ones."""
+        samples = len(self.trials[0].fitted)
+        round_ = SCREEN_ITERATIONS * sum(s.operations(self.inputs, samples) for s in likely)
+        able = int(SHARE_OF_SCREEN * self.most / max(round_, 1.0))
+        return min(SCREENED_STARTS, max(4 if self.is_small else 3, able))
+
     def halve(self, alive: Sequence[Candidate], iterations: int) -> list[Candidate]:
-        """The better half is trained further, with fresh starts for some luck."""
-        kept = list(alive[: max(2, len(alive) // 2)])
+        """The better half is trained further, with fresh starts for some luck.
+
+        The first time the best of every number of states is among it, unless it is far behind: few
+        iterations say little of how good a size will be.
+        """
+        half = list(alive[: max(2, len(alive) // 2)])
+        near = [c for c in alive if c.error <= STILL_NEAR * alive[0].error]
+        firsts = best_of_each_size(near) if iterations == HALVING_ITERATIONS[0] else []
+        kept = half + [c for c in firsts if c not in half]
         fresh = [0 if c.structure.integrator else 2 if self.is_small else 1 for c in kept]
         return sorted(self.continued(kept, iterations, fresh), key=lambda c: c.error)
 
     def climb(self) -> None:
         """Larger networks, other decays and delays, from the best so far while each step gains.
 
-        State-space and lagged networks climb side by side, as long as neither is far behind.
+        State-space and lagged networks climb side by side, as long as neither is far behind; where
+        the search has been cheap so far, so does the best state-space network of another order:
+        which of the two leads by now is often luck.
         """
         asked: set[tuple[str, Structure]] = set()
         climbing = [c for c in (self.best_of("neural_ss"), self.best_of("neural_oe")) if c]
+        if self.operations < SECOND_ROUTE * self.budget:
+            climbing += [c for c in self._ranked("neural_ss")[1:2] if c not in climbing]
         for round_ in range(ROUNDS):
             if not climbing or self.is_over:
                 return
@@ -260,6 +324,11 @@ class Search:
         """The lowest held-out error of one kind, a sound candidate first."""
         return self._lowest(c for c in self.eligible if c.structure.kind == kind)
 
+    def _ranked(self, kind: str) -> list[Candidate]:
+        """The best sound candidate of each size of one kind, the best first."""
+        sound = [c for c in self.eligible if c.structure.kind == kind and c.is_sound]
+        return best_of_each_size(sorted(sound, key=lambda c: c.error))
+
     @property
     def best(self) -> Candidate | None:
         """The lowest held-out error, a sound candidate first."""
@@ -270,7 +339,8 @@ class Search:
         """Candidates that may be chosen: with direct feedthrough only where it is worth it."""
         found = [c for c in self.candidates.values() if math.isfinite(c.error) and c.starts]
         delayed = min((c.error for c in found if c.structure.nk > 0), default=math.inf)
-        most = delayed if self.task.nk == 0 else WORTH_A_FEEDTHROUGH * delayed
+        worth = STILL_WORTH_A_FEEDTHROUGH if self.feeds_through else WORTH_A_FEEDTHROUGH
+        most = delayed if self.task.nk == 0 else worth * delayed
         return [c for c in found if c.structure.nk > 0 or c.error < most]
 
     @staticmethod
@@ -458,11 +528,12 @@ class Search:
             worth *= WORTH_A_FEEDTHROUGH
         if best.is_sound and not found.is_sound:
             return False
+        ratio, deviation = compared(found.errors, best.errors)
         if found.error < worth * best.error:
-            return True
+            # of many steps on few held-out samples some gain by luck, and lead to large networks
+            return not self.is_small or ratio < -deviation
         # below the noise a step gains little of the error, and still gains; on much data that would
         # go on for long
-        ratio, deviation = compared(found.errors, best.errors)
         is_small_step = worth == WORTH_A_STEP and not self.is_large
         return is_small_step and ratio < -max(2.0 * deviation, LEAST_STEP)
 

@@ -59,6 +59,11 @@ class Structure:
     integrator: bool = False
     kind: str = "neural_ss"
 
+    @property
+    def size(self) -> tuple[int, bool, str]:
+        """What networks of one size share: their hidden units and all else may differ."""
+        return self.nx, self.integrator, self.kind
+
     def parameters(self, inputs: int) -> int:
         """Length of theta."""
         nx, h = self.nx, self.hidden

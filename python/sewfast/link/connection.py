@@ -491,6 +491,15 @@ class Connection(Unique):
         """Let the time of a device on credit advance to `until` [us]; a heartbeat too."""
         self._beat(Kind.CREDIT, wire.credit(self.watchdog_us, until))
 
+    def let_pass(self, us: int) -> None:
+        """Grant time to a device on credit; take turns for as long with another."""
+        if self.identity.on_credit:
+            self.grant(self.newest + us)
+            return
+        until = time.monotonic() + us * 1e-6
+        while (rest := until - time.monotonic()) > 0.0:
+            self.turn(rest)
+
     def _beat(self, kind: Kind, body: bytes) -> None:
         self._beats = (self._beats + 1) & 0xFFFFFFFF
         self._send(self._frame(kind, self._beats, body))

@@ -27,7 +27,7 @@ from . import wire
 from .connection import ClockBounds, Connection, DeviceReset, Loan
 from .plan import Layout, Outcome, Plan, Sink, excite, follow, layout, require_capable
 from .ports import Unique, open_port
-from .run import Run
+from .run import REST_US, STEP_US, Run
 from .wire import Channel, Identity, Kind, Limits, Status
 
 # --- Terms of host and device: its channels, limits within its ceilings, controllers in its units -
@@ -125,9 +125,6 @@ def _require_units(given: str, device: str, what: str) -> None:
 # --- Rest: time that passes on the device until its motor stands still or it has measured well ----
 
 
-REST_US = 120_000
-"""Device's time without a count after which a motor is at rest; ARM wants 100 ms."""
-STEP_US = 20_000
 MEASURED_WITHIN = 1.0
 
 
@@ -143,7 +140,7 @@ def wait_for_rest(link: Connection, timeout: float) -> None:
                 f"expected the motor at rest within {timeout:g} s, it turns at "
                 f"{status.speed_rpm:.0f} RPM; brake it or wait longer"
             )
-        let_pass(link, STEP_US)
+        link.let_pass(STEP_US)
         before, status = status, link.status()
         if status.counts != before.counts:
             since = status.time_us
@@ -153,17 +150,7 @@ def await_measurement(link: Connection) -> None:
     """Boot ends by itself after some good samples; a device on credit needs time for them."""
     deadline = time.monotonic() + MEASURED_WITHIN
     while link.status().state == "boot" and time.monotonic() < deadline:
-        let_pass(link, STEP_US)
-
-
-def let_pass(link: Connection, us: int) -> None:
-    """Grant time to a device on credit; take turns for as long with another."""
-    if link.identity.on_credit:
-        link.grant(link.newest + us)
-        return
-    until = time.monotonic() + us * 1e-6
-    while (rest := until - time.monotonic()) > 0.0:
-        link.turn(rest)
+        link.let_pass(STEP_US)
 
 
 # --- `Drive`: a motor drive behind a port; `connect` opens it -------------------------------------

@@ -1,4 +1,4 @@
-"""An emulated Cortex-M4 that runs the example firmware: QEMU as a drive behind a port."""
+"""An emulated Cortex-M4 or M7 that runs the example firmware: QEMU as a drive behind a port."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from typing import Literal
 
 from ..errors import LinkError, SettingError
 
-BOARD = "mps2-an386"
+BOARDS = {"mps2-an386": 0x21000000, "mps2-an500": 0x60000000}
+"""QEMU's boards, a Cortex-M4 and a Cortex-M7, and where the memory lies that they share with us."""
 EMULATOR = "qemu-system-arm"
 PACKAGES = "gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm rustc-web rust-web-src"
 """What Debian calls all that is needed to build and to run the firmware."""
@@ -77,13 +78,15 @@ class BoardFigures:
         )
 
 
-def build_firmware(source: str | os.PathLike[str] = ".") -> Path:
-    """Compile the example firmware for the emulated board.
+def build_firmware(source: str | os.PathLike[str] = ".", *, board: str = "mps2-an386") -> Path:
+    """Compile the example firmware for the emulated boards.
 
     Parameters
     ----------
     source : path
         A source checkout of sewfast, or a folder in it.
+    board : {"mps2-an386", "mps2-an500"}
+        Whose firmware to return: a Cortex-M4, or a Cortex-M7.
 
     Returns
     -------
@@ -93,8 +96,10 @@ def build_firmware(source: str | os.PathLike[str] = ".") -> Path:
     Raises
     ------
     SettingError
-        No source checkout; a compiler is missing; it does not compile.
+        Another board; no source checkout; a compiler is missing; it does not compile.
     """
+    if board not in BOARDS:
+        raise SettingError(f"board: expected {' or '.join(BOARDS)}, got {board!r}")
     start = Path(source).resolve()
     places = (start, *start.parents)
     root = next((p for p in places if (p / "examples/firmware/mps2/board.c").is_file()), None)
@@ -118,16 +123,16 @@ def build_firmware(source: str | os.PathLike[str] = ".") -> Path:
     if made.returncode != 0:
         last = (made.stderr or made.stdout).strip().splitlines()[-8:]
         raise SettingError("firmware: it does not compile; make says:\n  " + "\n  ".join(last))
-    return root / "target" / "bare" / "mps2.elf"
+    return root / "target" / "bare" / f"{board}.elf"
 
 
 class EmulatedBoard:
-    """A Cortex-M4 with floating-point unit in QEMU (`mps2-an386`), its UART a TCP port.
+    """A Cortex-M4 or M7 with floating-point unit in QEMU, its UART a TCP port.
 
     Parameters
     ----------
     firmware : path
-        ELF file, as of `build_firmware`.
+        ELF file, as of `build_firmware`, which says by its addresses for which board it was linked.
     clock : {"credit", "real"}
         On credit the board's time stands still but for what the host grants: a busy computer
         changes no recording, and instructions are counted. In real time its clock is the
@@ -139,7 +144,7 @@ class EmulatedBoard:
     Raises
     ------
     SettingError
-        No emulator; a file that is no firmware for ARM.
+        No emulator; a file that is no firmware for one of the boards.
     LinkError
         The emulator ends, or opens no port.
 
@@ -158,7 +163,8 @@ class EmulatedBoard:
     ) -> None:
         if clock not in ("credit", "real"):
             raise SettingError(f"clock: expected 'credit' or 'real', got {clock!r}")
-        self._code, self._static = _sizes(Path(firmware))
+        #: QEMU's name of the board.
+        self.board, self._code, self._static = _examined(Path(firmware))
         if shutil.which(EMULATOR) is None:
             raise SettingError(
                 f"expected the emulator {EMULATOR}, which is missing; on Debian: apt-get install "
@@ -191,7 +197,7 @@ class EmulatedBoard:
     def _command(self, firmware: Path, memory: Path, number: int) -> list[str]:
         # QEMU takes a comma in a value where it is doubled
         place = str(memory).replace(",", ",,")
-        command = [EMULATOR, "-M", f"{BOARD},memory-backend=shared", "-display", "none"]
+        command = [EMULATOR, "-M", f"{self.board},memory-backend=shared", "-display", "none"]
         command += ["-monitor", "none", "-kernel", str(firmware)]
         command += ["-object", f"memory-backend-file,id=shared,mem-path={place},size=16M,share=on"]
         command += ["-serial", f"tcp:127.0.0.1:{number},server=on,wait=off,nodelay=on"]
@@ -264,25 +270,26 @@ def _memory(path: Path) -> mmap.mmap:
         return mmap.mmap(file.fileno(), _STACK_TOP)
 
 
-def _sizes(firmware: Path) -> tuple[int, int]:
-    """Bytes of code and constants, and of static memory, from an ELF file's program headers.
+def _examined(firmware: Path) -> tuple[str, int, int]:
+    """The board, and bytes of code and constants and of static memory, from an ELF file's headers.
 
     Raises
     ------
     SettingError
-        No 32-bit little-endian ELF file for ARM.
+        No 32-bit little-endian ELF file for ARM, or one for another board.
     """
+    remedy = "build one by `make firmware` in a source checkout"
     try:
         raw = firmware.read_bytes()
     except OSError as e:
         raise SettingError(f"{firmware}: expected a firmware, got {e.strerror!r}") from e
     if len(raw) < 52 or raw[:6] != b"\x7fELF\x01\x01" or raw[18:20] != b"\x28\x00":
         raise SettingError(
-            f"{firmware}: expected a firmware for ARM (ELF), got another file; build one by "
-            "`make firmware` in a source checkout"
+            f"{firmware}: expected a firmware for ARM (ELF), got another file; {remedy}"
         )
     start, size, count = struct.unpack_from("<I10xHH", raw, 28)
     code = static = 0
+    board = None
     for k in range(count):
         header = raw[start + k * size : start + k * size + 32]
         if len(header) < 32:
@@ -293,4 +300,10 @@ def _sizes(firmware: Path) -> tuple[int, int]:
         code += in_file
         if 0x20000000 <= address < 0x21000000:
             static += in_memory
-    return code, static
+        board = next((name for name, place in BOARDS.items() if place == address), board)
+    if board is None:
+        raise SettingError(
+            f"{firmware}: expected a firmware for {' or '.join(BOARDS)}, got one for another "
+            f"board; {remedy}"
+        )
+    return board, code, static

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -25,6 +26,7 @@ from ..writers import write_table
 from . import wire
 from .drive import Drive
 from .plan import Layout, Plan
+from .run import ARMS_WITHIN, MOVING
 from .wire import Identity, refusal
 
 if TYPE_CHECKING:
@@ -534,17 +536,23 @@ def run_on_host(
     plan = Plan("direct", r, columns=columns, batch=batch or _batch(ratio))
     streamed = drive.prepare_direct(plan, controller)
     wait = max(drive.watchdog, WATCHDOG_PERIODS * controller.Ts) if watchdog is None else watchdog
-    with drive.lent() as session, _scheduling(real_time) as scheduling:
-        found = _core.host_loop(
-            session.descriptor, controller.core(), r, tag=drive.identity.tag,
-            session=session.session, key=drive.identity.key, command=session.command,
-            heartbeat=session.heartbeat, device_period=drive.identity.period_us,
-            ratio=ratio, watchdog=round(1e6 * wait),
-            batch=streamed.batch, mask=streamed.mask,
-            channels=[(c.encoding, c.steps_per_unit) for c in streamed.channels],
-            counts_per_unit=_scale(drive, controller), lock_memory=real_time, progress=progress,
-        )  # fmt: skip
-        session.command, session.heartbeat = found["sequences"]
+    until = time.monotonic() + ARMS_WITHIN
+    while True:
+        with drive.lent() as session, _scheduling(real_time) as scheduling:
+            found = _core.host_loop(
+                session.descriptor, controller.core(), r, tag=drive.identity.tag,
+                session=session.session, key=drive.identity.key, command=session.command,
+                heartbeat=session.heartbeat, device_period=drive.identity.period_us,
+                ratio=ratio, watchdog=round(1e6 * wait),
+                batch=streamed.batch, mask=streamed.mask,
+                channels=[(c.encoding, c.steps_per_unit) for c in streamed.channels],
+                counts_per_unit=_scale(drive, controller), lock_memory=real_time, progress=progress,
+            )  # fmt: skip
+            session.command, session.heartbeat = found["sequences"]
+        # the device alone decides whether its motor rests, as in `arm_at_rest`
+        if found["outcome"].get("result") != MOVING or time.monotonic() > until:
+            break
+        drive.wait_for_rest()
     _raise_where_it_never_ran(found["outcome"])
     label = name or (reference if isinstance(reference, str) else "reference")
     run = _run(found, drive, controller, r, streamed, scheduling, label)

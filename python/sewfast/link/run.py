@@ -119,7 +119,35 @@ the second. A device that is slow to read would otherwise drown in grants, with 
 them."""
 ARMED_SILENCE = 0.25
 """Time within which an armed device says something: every .2 s [s]."""
+REST_US = 120_000
+"""Device's time without a count after which a motor is taken to be at rest; ARM wants 100 ms."""
+STEP_US = 20_000
+ARMS_WITHIN = 10.0
+"""Longest wait for a motor that the device finds still moving [s]."""
+HALTED = "expected a run to start, it was stopped from elsewhere before"
+MOVING = 11
+"""Result of ARM where the motor moves."""
 _ENDS = ("finished", "stopped", "tripped")
+
+
+def arm_at_rest(link: Connection) -> None:
+    """ARM, once the device finds its motor at rest.
+
+    The device sees every count, and decides. Rest as the host sees it is what STATUS brings every
+    20 ms: a motor that creeps, or swings about an edge of the encoder, may move just before ARM.
+
+    Raises
+    ------
+    LinkError
+        Where it still moves after 10 s, and where the device refuses for another reason.
+    """
+    body = wire.arm(link.watchdog_us, link.identity.key)
+    until = time.monotonic() + ARMS_WITHIN
+    while (reply := link.request(Kind.ARM, body)).result == MOVING and time.monotonic() < until:
+        link.let_pass(STEP_US)
+        if link.halted:
+            raise LinkError(HALTED)
+    reply.checked()
 
 
 class Run:
@@ -186,13 +214,13 @@ class Run:
         """Arm and start; the motor moves from here on."""
         link, layout = self.link, self.layout
         if link.halted:
-            raise LinkError("expected a run to start, it was stopped from elsewhere before")
+            raise LinkError(HALTED)
         link.receiver.expect([(c.encoding, c.steps_per_unit) for c in layout.channels], self.period)
         link.receiver.take()
         link.events.clear()
         link.resumable = True
         link.each_turn = self._each_turn
-        link.ask(Kind.ARM, wire.arm(link.watchdog_us, link.identity.key))
+        arm_at_rest(link)
         mode = wire.MODES[self.plan.mode]
         body = wire.start(mode, link.watchdog_us, 0, self.length, layout.mask, layout.batch)
         self.run, start_us = wire.started(link.ask(Kind.START, body))

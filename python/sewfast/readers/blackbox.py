@@ -329,11 +329,10 @@ def _skipped(iteration: int, interval: int, part: int, whole: int) -> int:
     """Loops after an iteration that the flight controller was not to log."""
     if part >= whole:
         return 0
-    for count in range(1, whole + interval + 1):
-        k = iteration + count
-        if k % interval == 0 or (k % interval + part - 1) % whole < part:
-            return count - 1
-    return 0
+    place = (iteration + 1) % interval
+    to_whole = (interval - place) % interval
+    phase = (place + part - 1) % whole
+    return min(to_whole, 0 if phase < part else whole - phase)
 
 
 def _predicted(

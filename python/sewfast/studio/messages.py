@@ -47,23 +47,11 @@ _MESSAGES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
             **_TUNE,
             "evaluations": {"type": "integer", "minimum": 10, "maximum": 20_000},
             "seed": SEED,
-            "seconds": {"type": ["number", "null"], "exclusiveMinimum": 0, "maximum": 3600},
-            "weights": VALUES,
-            "constraints": VALUES,
         },
         ("model", "values", "evaluations", "seed"),
     ),
     "tune_save": ({**_TUNE, "file": NAME}, ("model", "values", "file")),
     "tune_copy": ({**_TUNE, "file": NAME}, ("model", "values", "file")),
-    "upload": (
-        {
-            "file": NAME,
-            "first": {"type": "boolean"},
-            "last": {"type": "boolean"},
-            "data": {"type": "string", "maxLength": 60_000},
-        },
-        ("file", "first", "last", "data"),
-    ),
     "ports": ({}, ()),
     "drive_connect": (
         {

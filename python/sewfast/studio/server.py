@@ -45,7 +45,7 @@ FAREWELL = 1.0
 BETWEEN_REPORTS = 0.05
 """Seconds between two messages of a job's progress."""
 WRITES = (
-    "identify", "commission", "cancel", "tune_search", "tune_save", "upload", "drive_connect",
+    "identify", "commission", "cancel", "tune_search", "tune_save", "drive_connect",
     "drive_disconnect", "drive_limits", "drive_arm", "drive_disarm", "drive_clear", "drive_go",
     "drive_record", "drive_run", "drive_commission",
 )  # fmt: skip

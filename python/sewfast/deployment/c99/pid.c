@@ -1,8 +1,4 @@
-typedef struct @_terms {
-    @_real kp, ki, kd, pole;
-} @_terms;
-
-static int @_is_finite(@_real x)
+@TERMS_TYPEstatic int @_is_finite(@_real x)
 {
     return x - x == R(0.0);
 }
@@ -14,12 +10,7 @@ static @_real @_limit(@_real x, @_real low, @_real high)
     return raised > high ? high : raised;
 }
 
-/* The gains where the filtered output is y; Kp, Kp/Ti and Kp Td are linear between points of a schedule. */
-static @_terms @_gains(@_real y)
-{
-@GAINS
-}
-
+@GAINS_OF
 /* Mean of the last samples, then a lag@FILTER_WORDS. */
 static @_real @_filter(@_pid *c, @_real y)
 {
@@ -44,7 +35,7 @@ static @_real @_filter(@_pid *c, @_real y)
 @OBSERVER    return y;
 }
 
-static void @_reset_filter(@_pid *c)
+@BIQUADSstatic void @_reset_filter(@_pid *c)
 {
     c->averaging = 0;
     c->next = 0;
@@ -74,7 +65,7 @@ static @_real @_limited(const @_pid *c, @_real wanted)
 /* A sample without measurement: command and memory stay; in manual the command is still the operator's. */
 static @_real @_hold(@_pid *c)
 {
-    if (c->manual) {
+@HELD    if (c->manual) {
         const @_real u = @_limited(c, c->operator_u);
         c->integral = c->integral + (u - c->u);
         c->u = u;
@@ -84,7 +75,7 @@ static @_real @_hold(@_pid *c)
 
 void @_init(@_pid *c)
 {
-    @_reset_filter(c);
+@INIT    @_reset_filter(c);
     c->ramping = 0;
     c->integral = R(0.0);
     c->derivative = R(0.0);
@@ -114,9 +105,9 @@ void @_init(@_pid *c)
         @_reset_filter(c);
         return @_hold(c);
     }
-    c->filtered = filtered;
+@OF_Y    c->filtered = filtered;
     r = @_ramp(c, r, filtered);
-    g = @_gains(filtered);
+@OF_R    g = @GAINS_NOW;
     e = r - filtered;
     rate_input = e - @BETA * r;
     change = rate_input - (c->e - @BETA * c->r);
@@ -166,3 +157,4 @@ void @_set_automatic(@_pid *c)
 {
     c->manual = 0;
 }
+@CHANGES

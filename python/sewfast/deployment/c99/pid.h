@@ -1,7 +1,7 @@
 #define @@_TS @TS /* s */
 #define @@_SAMPLES @SAMPLES /* of the moving average */
 
-typedef struct @_pid {
+@BIQUADS_TYPE@TERMS_TYPEtypedef struct @_pid {
     @_real samples[@@_SAMPLES];
     @_real lag, speed, innovation; /* of the feedback filter */
     @_real ramped; /* the reference after its ramp */
@@ -9,8 +9,8 @@ typedef struct @_pid {
     @_real r, e; /* of the last sample */
     @_real u, operator_u;
     @_real filtered; /* the measurement after its filter */
-    int next;
-    unsigned char averaging, lagging, observing, ramping, manual, started;
+@MEMBERS    int next;
+    unsigned char averaging, lagging, observing, ramping, manual, started@FLAGS;
 } @_pid;
 
 /* At rest, in automatic. */
@@ -29,3 +29,4 @@ int @_set_manual(@_pid *c, @_real u);
 
 /* The controller's command again, beginning where the operator's was. */
 void @_set_automatic(@_pid *c);
+@CHANGES

@@ -2,5 +2,5 @@
     int k, wrong = 0;
     @_init(&c);
     for (k = 0; k < @COUNT; k++) {
-        wrong += @_step(&c, r[k], y[k]) != u[k];
+@SWITCH        wrong += @_step(&c, r[k], y[k]) != u[k];
     }

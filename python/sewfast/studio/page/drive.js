@@ -50,7 +50,7 @@ function state() {
   const said = !d.connected ? "no drive" : `${d.name}: ${d.job ? "running" : d.state}${d.state === "tripped" ? ` (${d.reason})` : ""}, ${d.armed ? "ARMED" : "not armed"}${d.job ? `, ${d.job}` : ""}`;
   if ($("drive-state").textContent !== said) $("drive-state").textContent = said;
   $("prompt").textContent = d.connected && writes && !d.armed ? (prompt < 10 ? `this page has answered ${prompt} of 10 times in a row` : "this page answers in time") : "";
-  $("speed").classList.toggle("old", !d.job);
+  $("speed").classList.toggle("stale", !d.job);
   if (d.connected && !d.job && run < 1) $("speed").textContent = `at rest${speed}`;
 }
 

@@ -115,6 +115,16 @@ macro_rules! controller_methods {
                 self.core.step_with(r, y, feedforward)
             }
 
+            fn set_design(&mut self, py: Python<'_>, other: &Bound<'_, Self>) -> PyResult<()> {
+                // a controller takes its own design as well, which a second borrow would not allow
+                let design = match other.try_borrow() {
+                    Ok(other) => *other.core.design(),
+                    Err(_) => *self.core.design(),
+                };
+                let done = self.core.set_design(design);
+                done.map_err(|refused| raise(py, Error::from(refused)))
+            }
+
             fn set_manual(&mut self, py: Python<'_>, u: $float) -> PyResult<()> {
                 let done = self.core.set_manual(u);
                 done.map_err(|refused| raise(py, Error::from(refused)))
@@ -247,16 +257,6 @@ controller_methods!(Controller, f64 {
         let made = single(self.core.design()).and_then(Core::new);
         let core = made.map_err(|refused| raise(py, Error::from(refused)))?;
         Ok(SingleController { core })
-    }
-
-    fn set_design(&mut self, py: Python<'_>, other: &Bound<'_, Self>) -> PyResult<()> {
-        // a controller takes its own design as well, which a second borrow would not allow
-        let design = match other.try_borrow() {
-            Ok(other) => *other.core.design(),
-            Err(_) => *self.core.design(),
-        };
-        let done = self.core.set_design(design);
-        done.map_err(|refused| raise(py, Error::from(refused)))
     }
 });
 
