@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_link_drive import Kept
 
 import sewfast
 from link_kept import Kept

@@ -104,7 +104,7 @@ impl Peer {
             kind::STATUS => {
                 reply.u8(1).u8(0).u8(2).u16(1).u32(1).u64(0).u32(self.taken);
                 reply.u32(self.length).u32(0).f32(0.0).i32(0);
-                reply.u32(1).u32(2).u32(3).u32(4).u32(5);
+                reply.u32(1).u32(2).u32(3).u32(4).u32(5).u32(6);
             }
             _ => {}
         }
