@@ -2,7 +2,7 @@
 
 use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
-use sewfast_core::closed_loop::{Known, LaggedPlant, Plant, StatePlant};
+use sewfast_core::closed_loop::{KernelPlant, LaggedPlant, Plant, StatePlant};
 use sewfast_core::encoder::Encoder;
 use sewfast_core::machine::{self, SAMPLE_TIME};
 use sewfast_core::{Error, Result, linear, neural, neural_ss};
@@ -102,7 +102,7 @@ impl Plant for AnyPlant<'_> {
         }
     }
 
-    fn known(&self) -> Option<Known<'_>> {
+    fn known(&self) -> Option<KernelPlant<'_>> {
         each!(self, plant => plant.known())
     }
 }
