@@ -262,6 +262,44 @@ class NeuralSS(Model):
     def jacobian(self, u: _F, state: _F) -> tuple[_F, _F]: ...
 
 @final
+class HammersteinWiener(Model):
+    """A linear difference equation between static curves; theta = [a, b, offset, bends of f, log slopes of g]."""
+
+    def __new__(
+        cls, *, na: int, nb: int, nk: int, input_low: _F, input_high: _F, input_pieces: int,
+        x_low: float, x_high: float, output_pieces: int, theta: _F,
+    ) -> HammersteinWiener:
+        """Ranges of the curves: of each input (n_inputs,), and of the linear part's output."""
+    @property
+    def settings(self) -> dict[str, object]:
+        """Every constructor argument but theta."""
+    def input_curve(self, input: int, u: _F) -> _F:
+        """f of one input at values of it, (N,)."""
+    def output_curve(self, x: _F) -> _F:
+        """g at values of the linear part's output, (N,)."""
+
+@final
+class HammersteinWienerFit:
+    """A fitted Hammerstein-Wiener model and how the fit went."""
+
+    @property
+    def model(self) -> HammersteinWiener: ...
+    @property
+    def cost(self) -> float:
+        """1/(2N) sum e^2 in free run, in the output's unit squared."""
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def termination(self) -> str: ...
+    @property
+    def remedy(self) -> str: ...
+    @property
+    def trace(self) -> _F: ...
+    @property
+    def initial_states(self) -> _F:
+        """Past outputs of each experiment, newest first, (n_experiments, na)."""
+
+@final
 class LinearFit:
     """A fitted linear model with the story of its fit."""
 
@@ -387,6 +425,10 @@ class NeuralSSFit:
     def initial_states(self) -> _F:
         """State of each training experiment, (n_experiments, nx)."""
 
+def fit_hammerstein_wiener(
+    experiments: _Experiments, *, na: int, nb: int, nk: int, input_pieces: int, output_pieces: int,
+    max_iterations: int = 100, progress: _Progress = None,
+) -> HammersteinWienerFit: ...
 def fit_oe(
     experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool = True,
     max_iterations: int = 100, initial: LinearModel | None = None, progress: _Progress = None,

@@ -9,6 +9,8 @@ Kind: TypeAlias = Literal[
     "arx",
     "iv",
     "oe",
+    "hammerstein_wiener",
+    "hammerstein-wiener",
     "neural_oe",
     "neural-oe",
     "neural_ss",
@@ -19,6 +21,7 @@ TEXTS: dict[str, str] = {
     "arx": "least squares one step ahead",
     "iv": "refined instrumental variables",
     "oe": "linear output error",
+    "hammerstein_wiener": "linear output error between static characteristics",
     "neural_oe": "lagged network output error",
     "neural_ss": "neural state space",
 }

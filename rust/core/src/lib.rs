@@ -15,6 +15,7 @@ pub mod fopdt;
 mod gram;
 pub mod greybox;
 pub mod guard;
+pub mod hammerstein;
 pub mod iv;
 pub mod lagged;
 #[cfg(test)]

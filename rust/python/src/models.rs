@@ -71,6 +71,7 @@ macro_rules! started_fit_methods {
 
 pub mod embedded;
 mod guard;
+mod hammerstein;
 pub mod linear;
 pub mod neural;
 pub mod neural_ss;
@@ -91,6 +92,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Model>()?;
     embedded::register(module)?;
     guard::register(module)?;
+    hammerstein::register(module)?;
     linear::register(module)?;
     neural::register(module)?;
     neural_ss::register(module)
