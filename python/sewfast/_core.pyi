@@ -163,9 +163,32 @@ class EmbeddedModel:
 def tanh_quotients() -> dict[str, tuple[list[float], list[float], float]]:
     """tanh(x) = x P(x^2)/Q(x^2): P, Q and the largest |x| of ``near``, ``far`` and ``single``."""
 
+class Model:
+    """A compiled model of any kind, which adds its own parameters. States are past outputs, newest first, or the model's own."""
+
+    @property
+    def theta(self) -> _F:
+        """All parameters (docs/CONVENTIONS.md, Models)."""
+    def rest_state(self) -> _F:
+        """Of a drive at rest."""
+    def simulate(self, u: _F, state: _F) -> _F: ...
+    def predict(self, u: _F, y: _F, state: _F, horizon: int) -> _F: ...
+    def estimate_initial_state(self, u: _F, y: _F) -> _F:
+        """NaN in y does not count."""
+    def jacobian(self, u: _F, state: _F) -> tuple[_F, _F]:
+        """Free run (N,) in the data's units and its sensitivities (N, n_theta + n_state): theta, then the state."""
+    def linearise(self, u: _F, state: _F) -> tuple[_F, _F, _F, _F]:
+        """A (n, n), B (n, nu), C (ny, n), D (ny, nu) of one step about inputs (nu,) and a state (n,), in the data's units.
+
+        x+ = A x + B v, y = C x + D v with v(k) = u(k - nk). The state of a lagged model is [y(k-1) .. y(k-na)], then of one
+        input after the other [v(k-1) .. v(k-nb+1)]: n = na + nu (nb - 1). That of a state-space model is its own.
+        """
+    def embedded(self, *, scaled: bool = False) -> EmbeddedModel:
+        """For a microcontroller: in the data's units where ``simulate`` is, or ``scaled``."""
+
 @final
-class LinearModel:
-    """y(k) = -sum_i a[i] y(k-1-i) + sum_j sum_i b[j, i] u_j(k-nk-i) + offset, in the data's units."""
+class LinearModel(Model):
+    """y(k) = -sum_i a[i] y(k-1-i) + sum_j sum_i b[j, i] u_j(k-nk-i) + offset, in the data's units; theta = [a, b, offset]."""
 
     def __new__(cls, a: _F, b: _F, nk: int, offset: float) -> LinearModel: ...
     @property
@@ -184,25 +207,9 @@ class LinearModel:
         """Real and imaginary parts, (na, 2)."""
     def dc_gain(self) -> _F:
         """Steady gain from each input, (n_inputs,)."""
-    def embedded(self) -> EmbeddedModel:
-        """For a microcontroller."""
-
-    def rest_state(self) -> _F:
-        """Zeros, (na,): past outputs of a drive at rest."""
-    def simulate(self, u: _F, y_past: _F) -> _F: ...
-    def predict(self, u: _F, y: _F, y_past: _F, horizon: int) -> _F: ...
-    def estimate_initial_state(self, u: _F, y: _F) -> _F: ...
-    def jacobian(self, u: _F, y_past: _F) -> tuple[_F, _F]:
-        """Free run (N,) and its sensitivities (N, n_theta + na): [a, b input by input, offset], then y_past."""
-    def linearise(self, u: _F, state: _F) -> tuple[_F, _F, _F, _F]:
-        """A (n, n), B (n, nu), C (1, n), D (1, nu) of one step about inputs (nu,) and a state (n,), in the data's units.
-
-        x+ = A x + B v, y = C x + D v with v(k) = u(k - nk). The state is [y(k-1) .. y(k-na)], then of one input after the
-        other [v(k-1) .. v(k-nb+1)]: n = na + nu (nb - 1).
-        """
 
 @final
-class NeuralOE:
+class NeuralOE(Model):
     """Network output-error model; theta = [W1 (H, n_phi) row by row, b1 (H), w2 (H), b2, linear (n_phi)]."""
 
     def __new__(
@@ -211,31 +218,13 @@ class NeuralOE:
         output_low: float | None, output_high: float | None,
     ) -> NeuralOE: ...
     @property
-    def theta(self) -> _F: ...
-    @property
     def settings(self) -> dict[str, object]:
         """Every constructor argument but theta."""
     @property
     def na(self) -> int: ...
-    def embedded(self, *, scaled: bool = False) -> EmbeddedModel:
-        """For a microcontroller: in the data's units where ``simulate`` is, or ``scaled``."""
-
-    def rest_state(self) -> _F:
-        """Zeros, (na,): past outputs of a drive at rest."""
-    def simulate(self, u: _F, y_past: _F) -> _F: ...
-    def predict(self, u: _F, y: _F, y_past: _F, horizon: int) -> _F: ...
-    def estimate_initial_state(self, u: _F, y: _F) -> _F: ...
-    def jacobian(self, u: _F, y_past: _F) -> tuple[_F, _F]:
-        """Free run (N,) in the data's units and its sensitivities (N, n_theta + na): theta, then y_past."""
-    def linearise(self, u: _F, state: _F) -> tuple[_F, _F, _F, _F]:
-        """A (n, n), B (n, nu), C (1, n), D (1, nu) of one step about inputs (nu,) and a state (n,), in the data's units.
-
-        x+ = A x + B v, y = C x + D v with v(k) = u(k - nk). The state is [y(k-1) .. y(k-na)], then of one input after the
-        other [v(k-1) .. v(k-nb+1)]: n = na + nu (nb - 1).
-        """
 
 @final
-class NeuralSS:
+class NeuralSS(Model):
     """Neural state-space model (docs/CONVENTIONS.md); theta = [A, B, E, Wx, Wu, bh, C, D, c, G], row by row.
 
     States are in scaled units. With one output, runs are (N,) and rows (N, n); with ny outputs (N, ny) and (N, ny, n).
@@ -248,8 +237,6 @@ class NeuralSS:
         process_noise: float,
     ) -> NeuralSS:
         """``output_parameters``: (), (low, high, w) or (w,), in scaled units; ``state_covariance`` (nx, nx)."""
-    @property
-    def theta(self) -> _F: ...
     @property
     def settings(self) -> dict[str, object]:
         """Every constructor argument but theta."""
@@ -265,25 +252,52 @@ class NeuralSS:
         It keeps all weights; what is new acts on the rest with weights of about 1e-3, so that the free run hardly
         changes. New states come after the old ones, before an integrated one. Smaller sizes are a SettingError.
         """
-    def embedded(self) -> EmbeddedModel:
-        """For a microcontroller."""
-
-    def rest_state(self) -> _F:
-        """State that minimises |x+ - x|^2 + |y|^2 at input zero, (nx,)."""
-    def simulate(self, u: _F, state: _F) -> _F: ...
     def states(self, u: _F, state: _F) -> _F:
         """States of the free run, (N, nx)."""
+    def simulate(self, u: _F, state: _F) -> _F: ...
     def predict(self, u: _F, y: _F, state: _F, horizon: int) -> _F:
         """Extended Kalman filter up to sample k - horizon, then free run; NaN in y is not used."""
     def estimate_initial_state(self, u: _F, y: _F) -> _F:
         """Maximum a posteriori, (nx,); NaN in y does not count."""
-    def jacobian(self, u: _F, state: _F) -> tuple[_F, _F]:
-        """Free run and its sensitivities in the data's units: theta, then the state."""
-    def linearise(self, u: _F, state: _F) -> tuple[_F, _F, _F, _F]:
-        """A (nx, nx), B (nx, nu), C (ny, nx), D (ny, nu) of one step about inputs (nu,) and a state (nx,).
+    def jacobian(self, u: _F, state: _F) -> tuple[_F, _F]: ...
 
-        x+ = A x + B v, y = C x + D v with v(k) = u(k - nk); inputs and outputs in the data's units, states in their own.
-        """
+@final
+class HammersteinWiener(Model):
+    """A linear difference equation between static curves; theta = [a, b, offset, bends of f, log slopes of g]."""
+
+    def __new__(
+        cls, *, na: int, nb: int, nk: int, input_low: _F, input_high: _F, input_pieces: int,
+        x_low: float, x_high: float, output_pieces: int, theta: _F,
+    ) -> HammersteinWiener:
+        """Ranges of the curves: of each input (n_inputs,), and of the linear part's output."""
+    @property
+    def settings(self) -> dict[str, object]:
+        """Every constructor argument but theta."""
+    def input_curve(self, input: int, u: _F) -> _F:
+        """f of one input at values of it, (N,)."""
+    def output_curve(self, x: _F) -> _F:
+        """g at values of the linear part's output, (N,)."""
+
+@final
+class HammersteinWienerFit:
+    """A fitted Hammerstein-Wiener model and how the fit went."""
+
+    @property
+    def model(self) -> HammersteinWiener: ...
+    @property
+    def cost(self) -> float:
+        """1/(2N) sum e^2 in free run, in the output's unit squared."""
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def termination(self) -> str: ...
+    @property
+    def remedy(self) -> str: ...
+    @property
+    def trace(self) -> _F: ...
+    @property
+    def initial_states(self) -> _F:
+        """Past outputs of each experiment, newest first, (n_experiments, na)."""
 
 @final
 class LinearFit:
@@ -411,6 +425,10 @@ class NeuralSSFit:
     def initial_states(self) -> _F:
         """State of each training experiment, (n_experiments, nx)."""
 
+def fit_hammerstein_wiener(
+    experiments: _Experiments, *, na: int, nb: int, nk: int, input_pieces: int, output_pieces: int,
+    max_iterations: int = 100, progress: _Progress = None,
+) -> HammersteinWienerFit: ...
 def fit_oe(
     experiments: _Experiments, *, na: int, nb: int, nk: int, offset: bool = True,
     max_iterations: int = 100, initial: LinearModel | None = None, progress: _Progress = None,

@@ -28,7 +28,7 @@ from .dataset import Dataset
 from .errors import SettingError, SewfastError
 from .evidence import Residuals, estimate
 from .identification import identify
-from .identification.entry import Kind
+from .kinds import Kind
 from .models import Model
 from .readers import read
 from .validation import validate

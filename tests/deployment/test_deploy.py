@@ -278,7 +278,7 @@ def test_double_precision_is_the_baselines_free_run() -> None:
     program = """
 import kinds, numpy as np
 from sewfast.deployment import c99
-for name in kinds.CASES:
+for name in kinds.DEPLOYED:
     model = kinds.model_of(name)
     u = kinds.levels(3000, 4, len(model.input_names))
     u[0] = 0.0

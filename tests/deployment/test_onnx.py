@@ -28,7 +28,7 @@ def session(path: Path) -> Any:
     return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
-@pytest.mark.parametrize("name", kinds.CASES)
+@pytest.mark.parametrize("name", kinds.DEPLOYED)
 def test_the_free_run_is_that_of_the_package(name: str, tmp_path: Path) -> None:
     model = kinds.model_of(name)
     deploy(model, tmp_path, to="onnx", name="drive")

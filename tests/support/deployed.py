@@ -319,7 +319,7 @@ def cases() -> Iterator[tuple[str, Model | Controller]]:
     """Every kind of model, and controllers with everything that one may have."""
     import kinds
 
-    for name in kinds.CASES:
+    for name in kinds.DEPLOYED:
         yield name, kinds.model_of(name)
     yield from CONTROLLERS.items()
 

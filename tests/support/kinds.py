@@ -11,6 +11,7 @@ import numpy as np
 
 from sewfast import ARX, IV, Dataset, Ensemble, LinearOE, Model, NeuralOE, NeuralSS, _core
 from sewfast.evidence import remembered
+from sewfast.models.hammerstein import HammersteinWiener
 
 TS = 0.01
 
@@ -25,10 +26,13 @@ class Case:
         The model as its kind's trainer would give it, with the range of the inputs.
     evidence : bool
         Whether it stores what `identify` adds (region, uncertainty, information).
+    deploys : bool
+        Whether there is a form of it for a microcontroller.
     """
 
     make: Callable[[], Model]
     evidence: bool = True
+    deploys: bool = True
 
 
 def levels(n: int, seed: int, inputs: int) -> Any:
@@ -66,6 +70,20 @@ def _linear(cls: Any, nk: int = 1, inputs: int = 1, pole: float = 0.8, na: int =
     a = np.poly([pole, 0.3][:na])[1:]
     b = np.array([[0.4, 0.3], [1.0, -0.2], [0.2, 0.2]])[:inputs]
     return _wrapped(cls, _core.LinearModel(a, b, nk, 0.5), inputs)
+
+
+def _hammerstein_wiener(
+    nk: int = 1, inputs: int = 1, pieces: tuple[int, int] = (4, 3), na: int = 2
+) -> Any:
+    a, b = np.poly([0.8, 0.3][:na])[1:], np.tile([0.4, 0.3], inputs)
+    bends = np.tile([-0.1, 0.05, 0.12, 0.0, 0.03][: pieces[0] - 1], inputs)
+    slopes = np.array([0.6, -0.5, 0.3])[: pieces[1] - 1]
+    core = _core.HammersteinWiener(
+        na=na, nb=2, nk=nk, input_low=np.full(inputs, -3.0), input_high=np.full(inputs, 5.0),
+        input_pieces=pieces[0], x_low=-20.0, x_high=40.0, output_pieces=pieces[1],
+        theta=np.concatenate([a, b, [0.5], bends, slopes]),
+    )  # fmt: skip
+    return _wrapped(HammersteinWiener, core, inputs)
 
 
 def _neural_oe(nk: int = 1, inputs: int = 1, bypass: bool = True, saturates: bool = False) -> Any:
@@ -140,6 +158,14 @@ CASES: dict[str, Case] = {
     "oe, three inputs": Case(lambda: _linear(LinearOE, inputs=3)),
     "oe, integrator": Case(lambda: _linear(LinearOE, pole=1.0)),
     "oe without evidence": Case(lambda: _linear(LinearOE), evidence=False),
+    "hammerstein_wiener": Case(_hammerstein_wiener, deploys=False),
+    "hammerstein_wiener, nk 0": Case(
+        lambda: _hammerstein_wiener(nk=0, pieces=(4, 1)), deploys=False
+    ),
+    "hammerstein_wiener, two inputs": Case(
+        lambda: _hammerstein_wiener(nk=2, inputs=2), deploys=False
+    ),
+    "wiener, na 1": Case(lambda: _hammerstein_wiener(pieces=(1, 4), na=1), deploys=False),
     "neural_oe": Case(_neural_oe),
     "neural_oe, nk 0": Case(lambda: _neural_oe(nk=0)),
     "neural_oe, nk 2, no bypass": Case(lambda: _neural_oe(nk=2, bypass=False)),
@@ -177,3 +203,5 @@ CASES: dict[str, Case] = {
     ),
     "ensemble, no delay": Case(lambda: _ensemble(_neural_ss(nk=0), _linear(LinearOE, nk=0))),
 }
+
+DEPLOYED = tuple(name for name, case in CASES.items() if case.deploys)

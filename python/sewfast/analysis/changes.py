@@ -15,6 +15,7 @@ from ..errors import SettingError
 from ..gains import real, whole
 from ..machine import VirtualMachine
 from ..models import Model, NeuralSS
+from ..models.base import SingleModel
 from ..models.files import from_dict
 from ..models.linear import LinearDifference
 
@@ -146,12 +147,9 @@ def _changed(model: Model, **parameters: Any) -> Model:
 
 def with_gain(model: Model, factor: float) -> Model:
     """The same model whose output is a factor as large."""
-    p = model.parameters()
-    if isinstance(model, LinearDifference):
-        b = (factor * np.asarray(p["b"])).tolist()
-        return _changed(model, b=b, offset=factor * p["offset"])
-    scaled = {k: (factor * np.asarray(p[k])).tolist() for k in ("y_mean", "y_scale")}
-    return _changed(model, **scaled)
+    if not isinstance(model, SingleModel):
+        raise SettingError("gain: expected a single model, received an ensemble; take its members")
+    return _changed(model, **model.with_output_scaled(factor))
 
 
 def with_delay(model: Model, samples: int) -> Model:

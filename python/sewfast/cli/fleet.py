@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 from pathlib import Path
 
+from ..kinds import KINDS
 from .arguments import Commands, add_command
 from .output import Progress, print_json
 
@@ -45,7 +46,7 @@ def add(commands: Commands) -> None:
         "--ts", "--Ts", type=float, metavar="S", help="sample time [s]; default: the time column's"
     )
     parser.add_argument(
-        "--model", default="oe", choices=("auto", "arx", "iv", "oe", "neural_oe", "neural_ss"),
+        "--model", default="oe", choices=KINDS,
         help="kind of model (oe)",
     )  # fmt: skip
     parser.add_argument(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import Interrupted, SettingError
+from ..kinds import KINDS, TEXTS, spelled
 from .arguments import (
     TABLES,
     Commands,
@@ -180,10 +181,9 @@ def add(commands: Commands) -> None:
 
 def _add_model(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--model", choices=("auto", "arx", "iv", "oe", "neural-oe", "neural-ss"), default="auto",
-        help="arx: least squares one step ahead; iv: refined instrumental variables; oe: linear "
-        "output error; neural-oe: lagged network output error; neural-ss: neural state space; auto "
-        "(default): oe or a network, whichever does better",
+        "--model", choices=[spelled(kind) for kind in KINDS], default="auto",
+        help="; ".join(f"{spelled(kind)}: {text}" for kind, text in TEXTS.items())
+        + "; auto (default): oe or a network, whichever does better",
     )  # fmt: skip
     parser.add_argument(
         "--preset", choices=("paper",),

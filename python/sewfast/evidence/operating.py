@@ -107,16 +107,18 @@ def _network(core: Any, s: dict[str, Any], u: FloatArray, state: FloatArray | No
         return value, C[0, :na], np.hstack([D.T, C[0, na:].reshape(len(u), nb - 1)])
 
     y = _steady(core, u, np.zeros(na) if state is None else state)
+    # of a model without scales, the size of the output there
+    scale = s.get("y_scale", max(abs(y), 1e-6))
     settled = False
     for _ in range(_NEWTON):
         value, to_y, _ = slopes(y)
         step = (value - y) / (1.0 - to_y.sum()) if abs(1.0 - to_y.sum()) > 1e-12 else np.inf
-        settled = bool(abs(step) <= 1e-9 * s["y_scale"])
-        if settled or not np.isfinite(step) or abs(step) > 100.0 * s["y_scale"]:
+        settled = bool(abs(step) <= 1e-9 * scale)
+        if settled or not np.isfinite(step) or abs(step) > 100.0 * scale:
             break
         y += step
     _, to_y, to_u = slopes(y)
-    limited = s["output_low"] is not None or s["output_high"] is not None
+    limited = any(s.get(name) is not None for name in ("output_low", "output_high"))
     # on a limit nothing moves the output
     saturated = limited and not (to_y.any() or to_u.any())
     return _difference(to_y, to_u, s["nk"], y, settled, saturated, np.full(na, y))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Literal, TypeAlias
+from typing import Literal
 
 from ..dataset import Dataset, require_dataset
 from ..dataset.experiment import in_effect
@@ -12,18 +12,16 @@ from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, Interrupted, SettingError
 from ..evidence import remembered
+from ..kinds import KINDS, Kind, spelled
 from ..models import Model
+from ..models.files import STRUCTURED
 from ..threads import Workers, available, require_workers
-from . import choice, further, lagged, linear
+from . import choice, further, lagged, linear, structured
 from .effort import Clock, Progress
 from .folds import thinned
 from .outputs import OUTPUTS
 from .task import Task, with_provenance
 from .training import Structure
-
-Kind: TypeAlias = Literal[
-    "auto", "arx", "iv", "oe", "neural_oe", "neural-oe", "neural_ss", "neural-ss"
-]
 
 _KINDS: dict[str, Callable[[Task], Model]] = {
     "auto": choice.auto,
@@ -33,6 +31,7 @@ _KINDS: dict[str, Callable[[Task], Model]] = {
     "neural_oe": lagged.neural_oe,
     "neural_ss": choice.neural_ss,
     "paper": lagged.paper,
+    **{cls.kind: structured.identified_as(cls) for cls in STRUCTURED},
 }
 SHARE_OF_FIT = 0.9
 """Of a time budget; the rest is for the evidence that is kept with the model."""
@@ -158,8 +157,8 @@ def identify(
         kind = str(model).replace("-", "_")
         if kind not in _KINDS or kind == "paper":
             raise SettingError(
-                "model: expected auto, arx, iv, oe, neural-oe, neural-ss or a model to train "
-                f"further, received {model!r}"
+                f"model: expected {', '.join(map(spelled, KINDS))} or a model to train further, "
+                f"received {model!r}"
             )
     if preset is not None:
         kind = _preset(preset, kind, {"na": na, "nb": nb, "nk": nk, "hidden": hidden})

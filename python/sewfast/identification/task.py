@@ -7,10 +7,10 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
-from .. import _core
 from ..dataset import Dataset, FloatArray
 from ..errors import FitError
 from ..models import Model
+from ..models.base import Fitted
 from ..threads import Workers
 from ..validation import validate
 from .effort import Clock, Progress
@@ -98,9 +98,7 @@ def documented(model: Model, task: Task, began: float, extra: Provenance) -> Mod
     return with_provenance(model, common | extra)
 
 
-def fit_provenance(
-    fit: _core.LinearFit | _core.NeuralFit | _core.NeuralSSFit,
-) -> Provenance:
+def fit_provenance(fit: Fitted) -> Provenance:
     """How a fit went."""
     return {
         "cost": fit.cost,

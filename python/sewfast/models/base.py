@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +14,7 @@ from ..dataset import Dataset, FloatArray
 from ..dynamic_model import INIT, Core, DynamicModel, FreeRunJacobian
 from ..errors import FitError, SettingError
 from ..evidence import Bands, OperatingPoint, ReportCard, bands, check, operating_range
+from ..storage import Fields
 from ..validation import Validation, validate
 
 _OF_LINEAR_MODELS = (
@@ -120,6 +122,48 @@ class Model(DynamicModel):
         from .files import restored
 
         return restored, (self.to_dict(), self.alternatives)
+
+
+class SingleModel(Model):
+    """A model of one kind: what its file and its variations need, beside what every model has."""
+
+    @staticmethod
+    @abstractmethod
+    def core_from(fields: Fields) -> Any:
+        """The compiled model from the parameters of a file."""
+
+    @abstractmethod
+    def with_output_scaled(self, factor: float) -> dict[str, Any]:
+        """The parameters that change where the output is a factor as large."""
+
+
+class Fitted(Protocol):
+    """A compiled fit: the model and how it went."""
+
+    @property
+    def model(self) -> Any: ...
+    @property
+    def cost(self) -> float: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def termination(self) -> str: ...
+    @property
+    def trace(self) -> FloatArray: ...
+
+
+class StructuredModel(SingleModel):
+    """A lagged model that is fitted in free run in one of several structures."""
+
+    @staticmethod
+    @abstractmethod
+    def structures(size: int | None) -> tuple[Mapping[str, int], ...]:
+        """What is tried, the plainest first; of one size where it is given."""
+
+    @staticmethod
+    @abstractmethod
+    def fitted(experiments: Any, **settings: Any) -> Fitted:
+        """A fit of one structure: `na`, `nb`, `nk`, `max_iterations`, `progress`, its numbers."""
 
 
 # --- Ensemble: several models of one plant as one -------------------------------------------------

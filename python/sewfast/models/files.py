@@ -7,19 +7,25 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from importlib.resources import files
-from typing import Any, TypeAlias
+from typing import Any
 
 from .. import storage
 from ..dynamic_model import FORMAT, VERSION
 from ..errors import ModelFileError, SewfastError
 from ..storage import Fields
-from .base import COMBINATIONS, MOST_MEMBERS, Ensemble, Model
+from .base import COMBINATIONS, MOST_MEMBERS, Ensemble, Model, SingleModel, StructuredModel
+from .hammerstein import HammersteinWiener
 from .linear import ARX, IV, LinearOE
 from .neural import NeuralOE, NeuralSS
 
 SCHEMA = f"model-{VERSION}.json"
-_Kind: TypeAlias = type[ARX] | type[IV] | type[LinearOE] | type[NeuralOE] | type[NeuralSS]
-_KINDS: dict[str, _Kind] = {c.kind: c for c in (ARX, IV, LinearOE, NeuralOE, NeuralSS)}
+SINGLE: tuple[type[SingleModel], ...] = (
+    ARX, IV, LinearOE, HammersteinWiener, NeuralOE, NeuralSS,
+)  # fmt: skip
+"""Every kind of model but the ensemble."""
+STRUCTURED = tuple(c for c in SINGLE if issubclass(c, StructuredModel))
+"""Kinds that are fitted in one of several structures, which held-out data choose."""
+_KINDS = {c.kind: c for c in SINGLE}
 _FIELDS = ("version", "kind", "Ts", "inputs", "output", "counts", "parameters", "training")
 
 
@@ -119,7 +125,7 @@ def _training(training: Fields, inputs: int) -> Mapping[str, Any]:
     return known
 
 
-def _core(parameters: Fields, cls: _Kind) -> object:
+def _core(parameters: Fields, cls: type[SingleModel]) -> object:
     try:
         return cls.core_from(parameters)
     except ModelFileError:

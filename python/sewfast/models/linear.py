@@ -14,7 +14,7 @@ from .. import _core
 from ..dataset import FloatArray, labelled
 from ..errors import SettingError
 from ..storage import Fields
-from .base import Model
+from .base import SingleModel
 from .conversion import (
     ContinuousModel,
     StateSpace,
@@ -32,7 +32,7 @@ from .conversion import (
 )
 
 
-class LinearDifference(Model):
+class LinearDifference(SingleModel):
     """y(k) = -sum a_i y(k-i) + sum_j sum_i b_ji u_j(k-nk-i+1) + offset (docs/CONVENTIONS.md)."""
 
     core: _core.LinearModel
@@ -69,6 +69,9 @@ class LinearDifference(Model):
     def parameters(self) -> dict[str, Any]:
         core = self.core
         return {"a": core.a.tolist(), "b": core.b.tolist(), "nk": core.nk, "offset": core.offset}
+
+    def with_output_scaled(self, factor: float) -> dict[str, Any]:
+        return {"b": (factor * self.core.b).tolist(), "offset": factor * self.core.offset}
 
     @staticmethod
     def core_from(fields: Fields) -> _core.LinearModel:

@@ -10,26 +10,37 @@ from .. import _core
 from ..dataset import Dataset, FloatArray
 from ..dynamic_model import INIT
 from ..storage import Fields, entries
-from .base import Model
+from .base import SingleModel
+
+
+class _Network(SingleModel):
+    """What both have in common: settings, parameters and scales in the compiled model."""
+
+    core: _core.NeuralOE | _core.NeuralSS
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Sizes, scaling and whatever else makes the model beside `theta`, as JSON values."""
+        raw = self.core.settings
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in raw.items()}
+
+    def parameters(self) -> dict[str, Any]:
+        return {**self.settings, "theta": self.core.theta.tolist()}
+
+    def with_output_scaled(self, factor: float) -> dict[str, Any]:
+        scales = self.settings
+        return {k: (factor * np.asarray(scales[k])).tolist() for k in ("y_mean", "y_scale")}
+
 
 # --- The network output-error model ---------------------------------------------------------------
 
 
-class NeuralOE(Model):
+class NeuralOE(_Network):
     """One hidden layer of tanh on the lagged regressor, trained in free run (paper Eq. 2 to 4)."""
 
     kind: ClassVar[str] = "neural_oe"
     title: ClassVar[str] = "Network output error"
     core: _core.NeuralOE
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Orders, scaling and output limits, as JSON values."""
-        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in self._raw.items()}
-
-    @property
-    def _raw(self) -> dict[str, object]:
-        return self.core.settings
 
     @property
     def orders(self) -> dict[str, int]:
@@ -48,9 +59,6 @@ class NeuralOE(Model):
         hidden, width = s["hidden"], s["na"] + s["nb"] * s["n_inputs"]
         shapes = {"W1": (hidden, width), "b1": (hidden,), "w2": (hidden,), "b2": ()}
         return entries(shapes | ({"linear": (width,)} if s["bypass"] else {}))
-
-    def parameters(self) -> dict[str, Any]:
-        return {**self.settings, "theta": self.core.theta.tolist()}
 
     @staticmethod
     def core_from(fields: Fields) -> _core.NeuralOE:
@@ -89,7 +97,7 @@ class NeuralOE(Model):
 OUTPUTS = ("linear", "saturation", "abs")
 
 
-class NeuralSS(Model):
+class NeuralSS(_Network):
     """Linear state equations beside one hidden layer of tanh, trained in free run.
 
     Its states have no unit of their own: they are scaled to be of size 1 on the training data.
@@ -103,12 +111,6 @@ class NeuralSS(Model):
     kind: ClassVar[str] = "neural_ss"
     title: ClassVar[str] = "Neural state space"
     core: _core.NeuralSS
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Sizes, output function, scaling and statistics, as JSON values."""
-        raw = self.core.settings
-        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in raw.items()}
 
     @property
     def orders(self) -> dict[str, int]:
@@ -155,9 +157,6 @@ class NeuralSS(Model):
         self._require_match(data)
         data.require_inputs()
         return [self.core.states(e.u, self.initial_state(e, init)) for e in data.experiments]
-
-    def parameters(self) -> dict[str, Any]:
-        return {**self.settings, "theta": self.core.theta.tolist()}
 
     @staticmethod
     def core_from(fields: Fields) -> _core.NeuralSS:

@@ -9,11 +9,12 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import DataError, SettingError
+from ..kinds import KINDS, Kind
 from .commissioning import COMMISSIONED, Commission, carry_out, envelope, require
 
 if TYPE_CHECKING:
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
 
 RECORDINGS = (".csv", ".npz", ".mat", ".parquet", ".mcap")
 MODEL = "model.json"
-Kind: TypeAlias = Literal["auto", "arx", "iv", "oe", "neural_oe", "neural_ss"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
 LARGEST = 512 * 2**20
 """Bytes of a recording that the page opens."""
 

@@ -1,23 +1,21 @@
 //! A controller and a plant in closed loop, with encoder, feedback filter and limits inside the loop.
 
-mod alone;
-mod known;
-pub(crate) mod lanes;
+pub(crate) mod batch;
+mod kernel_plant;
 mod plants;
+mod scalar;
 mod signals;
 
-pub use known::Known;
+pub use kernel_plant::KernelPlant;
 pub use plants::{LaggedPlant, StatePlant, Varied};
 pub use signals::Signals;
 
 use sewfast_control::{Controller, Refused};
 
 use crate::encoder::Encoder;
-use crate::simd::{self, Eight, Kernel};
+use crate::simd;
 use crate::{Error, Monitor, Result};
-use alone::{Constant, Decides};
-use known::{Any, Second};
-use lanes::Lanes;
+use scalar::{LoopController, ScalarLoop};
 
 /// What a controller can be closed around: one input, one output, stepped sample by sample.
 pub trait Plant {
@@ -34,7 +32,7 @@ pub trait Plant {
         None
     }
     /// The plant as kernels know it; `None` for one that only steps itself.
-    fn known(&self) -> Option<Known<'_>> {
+    fn known(&self) -> Option<KernelPlant<'_>> {
         None
     }
 }
@@ -132,29 +130,14 @@ impl Run {
         encoder: Option<&Encoder>,
         monitor: &Monitor,
     ) {
-        self.record_by(plant, controller, signals, encoder, monitor, false);
-    }
-
-    /// [`record_with`](Self::record_with); where `as_lane`, to the bit what one of several controllers gives that run side by
-    /// side. Around a network this takes longer, and differs in last digits.
-    pub(crate) fn record_by(
-        &mut self,
-        plant: &mut (impl Plant + ?Sized),
-        controller: &mut Controller<f64>,
-        signals: Signals<'_>,
-        encoder: Option<&Encoder>,
-        monitor: &Monitor,
-        as_lane: bool,
-    ) {
         match plant.known() {
-            Some(known) => simd::run(Alone {
+            Some(known) => simd::run(ScalarLoop {
                 run: self,
                 known,
                 controller,
                 signals,
                 encoder,
                 monitor,
-                as_lane,
             }),
             None => self.fill(plant, controller, signals, encoder, monitor),
         }
@@ -164,7 +147,7 @@ impl Run {
     fn fill(
         &mut self,
         plant: &mut (impl Plant + ?Sized),
-        controller: &mut impl Decides,
+        controller: &mut impl LoopController,
         signals: Signals<'_>,
         encoder: Option<&Encoder>,
         monitor: &Monitor,
@@ -186,7 +169,7 @@ impl Run {
     fn through(
         &mut self,
         plant: &mut (impl Plant + ?Sized),
-        controller: &mut impl Decides,
+        controller: &mut impl LoopController,
         signals: Signals<'_>,
         encoder: Option<&Encoder>,
         monitor: &Monitor,
@@ -225,49 +208,6 @@ impl Run {
     /// The largest `|u|`; 0 of an empty record.
     pub fn largest_command(&self) -> f64 {
         self.u.iter().fold(0.0, |most, u| f64::max(most, u.abs()))
-    }
-}
-
-/// A loop around a plant that kernels know: all of it is compiled for one processor.
-struct Alone<'a> {
-    run: &'a mut Run,
-    known: Known<'a>,
-    controller: &'a Controller<f64>,
-    signals: Signals<'a>,
-    encoder: Option<&'a Encoder>,
-    monitor: &'a Monitor,
-    /// Whether the bits are those of a lane.
-    as_lane: bool,
-}
-
-impl Kernel for Alone<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn run<V: Eight>(self) {
-        let controller = self.controller;
-        if !Lanes::take(controller) {
-            let plant = known::Alone::<V, Any, true>::new(self.known);
-            self.around(plant, &mut controller.clone());
-        } else if Second::takes(&self.known) && self.as_lane {
-            let plant = known::Alone::<V, Second, true>::new(self.known);
-            self.around(plant, &mut Constant::new(controller));
-        } else if Second::takes(&self.known) {
-            let plant = known::Alone::<V, Second, false>::new(self.known);
-            self.around(plant, &mut Constant::new(controller));
-        } else {
-            let plant = known::Alone::<V, Any, true>::new(self.known);
-            self.around(plant, &mut Constant::new(controller));
-        }
-    }
-}
-
-impl Alone<'_> {
-    #[inline(always)]
-    fn around(self, mut plant: impl Plant, controller: &mut impl Decides) {
-        let (signals, encoder) = (self.signals, self.encoder);
-        self.run
-            .fill(&mut plant, controller, signals, encoder, self.monitor);
     }
 }
 

@@ -1,6 +1,6 @@
 //! Records as the core sees them: borrowed slices with their shape.
 
-use crate::simd::{self, Eight, Kernel, LANES};
+use crate::simd::{self, F64x8, Kernel, LANES};
 use crate::{Error, Result};
 
 /// One experiment of which only the shape has been checked.
@@ -139,7 +139,7 @@ impl Kernel for Finite<'_> {
     type Output = bool;
 
     #[inline(always)]
-    fn run<V: Eight>(self) -> bool {
+    fn run<V: F64x8>(self) -> bool {
         let (groups, rest) = self.0.as_chunks::<LANES>();
         let (pairs, single) = groups.as_chunks::<2>();
         let zero = V::splat(0.0);

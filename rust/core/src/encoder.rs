@@ -1,6 +1,6 @@
 //! An incremental encoder: position to counts.
 
-use crate::simd::Eight;
+use crate::simd::F64x8;
 
 /// An encoder whose counter stands at zero, `phase` of a count past the last edge, where the position is zero.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -43,7 +43,7 @@ impl Encoder {
 
     /// The counters at eight positions.
     #[inline(always)]
-    pub(crate) fn counts<V: Eight>(&self, positions: V) -> V {
+    pub(crate) fn counts<V: F64x8>(&self, positions: V) -> V {
         let scaled = positions.mul(V::splat(self.counts_per_unit));
         let exact = scaled.add(V::splat(self.phase));
         if self.quantised { exact.floor() } else { exact }

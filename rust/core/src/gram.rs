@@ -31,7 +31,7 @@
 //! 1 % with 155. Panels and blocks of 128 rows save loads: `J'J` of 155 parameters 330 -> 290 ns a sample on an Intel Xeon
 //! (docs/PERFORMANCE.md); a Zen 4 works its wide registers in halves, has loads to spare and shows nothing (-0.4 to 0 %).
 
-use crate::simd::{self, Eight, Kernel, LANES};
+use crate::simd::{self, F64x8, Kernel, LANES};
 
 /// Rows per block: with 64 parameters a block is 32 kB and stays in the first-level cache.
 pub(crate) const BLOCK: usize = 64;
@@ -249,7 +249,7 @@ impl Kernel for Fold<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<V: Eight>(mut self) {
+    fn run<V: F64x8>(mut self) {
         match V::TILE {
             (8, _) => self.wide::<V>(),
             (4, _) => self.narrow::<V, 6>(),
@@ -262,7 +262,7 @@ impl Fold<'_> {
     /// Panels of three groups of columns, which stay in the first-level cache while the rows of `X'` pass by; then the
     /// rows that fill no group.
     #[inline(always)]
-    fn wide<V: Eight>(&mut self) {
+    fn wide<V: F64x8>(&mut self) {
         let whole = self.columns / LANES;
         for first in (0..whole).step_by(3) {
             let below = match whole - first {
@@ -287,7 +287,7 @@ impl Fold<'_> {
 
     /// Rows on their own, with as many groups at once as registers hold; the row behind them.
     #[inline(always)]
-    fn strip<V: Eight, const ROWS: usize, const MOST: usize>(&mut self, row: usize) -> usize {
+    fn strip<V: F64x8, const ROWS: usize, const MOST: usize>(&mut self, row: usize) -> usize {
         if (self.columns - row) & ROWS == 0 {
             return row;
         }
@@ -309,7 +309,7 @@ impl Fold<'_> {
 
     /// One group of columns after the other.
     #[inline(always)]
-    fn narrow<V: Eight, const ROWS: usize>(&mut self) {
+    fn narrow<V: F64x8, const ROWS: usize>(&mut self) {
         for column in (0..self.columns).step_by(LANES) {
             let mut row = column;
             while row + ROWS <= self.columns {
@@ -332,7 +332,7 @@ impl Fold<'_> {
 
     /// Sixteen rows from the diagonal on: one group for the upper eight, two for the lower.
     #[inline(always)]
-    fn corner<V: Eight>(&mut self, at: usize) {
+    fn corner<V: F64x8>(&mut self, at: usize) {
         let mut upper = [[V::splat(0.0)]; LANES];
         let mut lower = [[V::splat(0.0); 2]; LANES];
         for row in self.block.chunks_exact(self.width) {
@@ -354,7 +354,7 @@ impl Fold<'_> {
 
     /// `ROWS` times `GROUPS` groups of sums, which stay in registers.
     #[inline(always)]
-    fn tile<V: Eight, const ROWS: usize, const GROUPS: usize>(&mut self, i: usize, j: usize) {
+    fn tile<V: F64x8, const ROWS: usize, const GROUPS: usize>(&mut self, i: usize, j: usize) {
         let mut sums = [[V::splat(0.0); GROUPS]; ROWS];
         for row in self.block.chunks_exact(self.width) {
             let right = &row[j..j + GROUPS * LANES];
@@ -375,7 +375,7 @@ impl Fold<'_> {
 
     /// Adds a tile to the sums whose first row is `i` and whose first column `j`.
     #[inline(always)]
-    fn add<V: Eight, const ROWS: usize, const GROUPS: usize>(
+    fn add<V: F64x8, const ROWS: usize, const GROUPS: usize>(
         &mut self,
         i: usize,
         j: usize,

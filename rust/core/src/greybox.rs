@@ -16,7 +16,7 @@
 //! `k_a = J R/K`, `k_b = B R/K`, `k_s = T R/K`. Derivatives are carried along with the values, as dual numbers
 //! (Griewank and Walther 2008, chapter 3): one more parameter costs one more column and no more code.
 
-use crate::simd::{self, Eight, Kernel};
+use crate::simd::{self, F64x8, Kernel};
 use crate::{Error, Monitor, Result};
 
 /// Names of the parameters, in their order.
@@ -425,7 +425,7 @@ impl<const N: usize> Kernel for Carried<'_, N> {
     type Output = Found;
 
     #[inline(always)]
-    fn run<V: Eight>(self) -> Found {
+    fn run<V: F64x8>(self) -> Found {
         let Self(task, u, monitor) = self;
         let (n, m) = (u.len(), task.free.len());
         let step = task.sample_time / task.steps as f64;

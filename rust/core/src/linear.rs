@@ -3,7 +3,7 @@
 use nalgebra::{Complex, DMatrix};
 
 use crate::lagged::{Form, Lagged, Lags, push_past};
-use crate::simd::{Eight, Group};
+use crate::simd::{F64x8, Lanes};
 use crate::{Error, Result};
 
 /// `y(k) = -sum_i a[i] y(k-1-i) + sum_j sum_i b[j nb + i] u_j(k-nk-i) + offset`, in the data's units.
@@ -143,7 +143,7 @@ impl LinearModel {
 
     /// The outputs for eight regressors, lane by lane; each to the bit what [`Lagged::output`] gives for it.
     #[inline(always)]
-    pub(crate) fn beside<V: Eight>(&self, phi: &[Group]) -> V {
+    pub(crate) fn beside<V: F64x8>(&self, phi: &[Lanes]) -> V {
         let (past, inputs) = phi.split_at(self.lags.na);
         let (a, b) = (&self.a[..past.len()], &self.b[..inputs.len()]);
         let mut sum = V::splat(self.offset);

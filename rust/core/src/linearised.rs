@@ -2,9 +2,8 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use crate::lagged::{Lagged, Lags};
-use crate::linear::LinearModel;
-use crate::neural::NeuralOE;
+use crate::lagged::Lags;
+use crate::model::Differentiable;
 use crate::neural_ss::NeuralSS;
 use crate::{Error, Result};
 
@@ -95,29 +94,15 @@ fn check(u: &[f64], state: &[f64], inputs: usize, states: usize) -> Result<()> {
     ))
 }
 
-impl LinearModel {
-    /// The same wherever it is asked.
-    ///
-    /// # Errors
-    /// `ErrorKind::Data` for wrong numbers of inputs or states, or values that are not finite.
-    pub fn linearise(&self, u: &[f64], state: &[f64]) -> Result<Linearised> {
-        regressor(self.lags(), u, state)?;
-        let past = self.a().iter().map(|a| -a);
-        let slopes: Vec<f64> = past.chain(self.b().iter().copied()).collect();
-        Ok(Linearised::lagged(self.lags(), &slopes))
-    }
-}
-
-impl NeuralOE {
-    /// About the input `u`, which has been held for `nk` samples, and a state; on a limit nothing moves the output.
-    ///
-    /// # Errors
-    /// `ErrorKind::Data` for wrong numbers of inputs or states, or values that are not finite.
-    pub fn linearise(&self, u: &[f64], state: &[f64]) -> Result<Linearised> {
-        let lags = self.shape().lags;
-        let phi = regressor(lags, u, state)?;
-        Ok(Linearised::lagged(lags, &self.slopes(&phi)))
-    }
+/// Of a lagged model about the input `u`, which has been held for `nk` samples, and a state. Where its output is limited
+/// nothing moves it.
+pub(crate) fn of_lagged(
+    model: &impl Differentiable,
+    u: &[f64],
+    state: &[f64],
+) -> Result<Linearised> {
+    let phi = regressor(model.lags(), u, state)?;
+    Ok(Linearised::lagged(model.lags(), &model.slopes(&phi)))
 }
 
 impl NeuralSS {
@@ -169,7 +154,10 @@ impl NeuralSS {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::neural;
+    use crate::lagged::Lagged;
+    use crate::linear::LinearModel;
+    use crate::model::Model;
+    use crate::neural::{self, NeuralOE};
     use crate::neural_ss::{OutputFunction, Scaling, Shape, Statistics};
     use crate::random::Random;
 

@@ -7,7 +7,7 @@
 use crate::Monitor;
 use crate::descent::{Method, Proposal, Verdict, descend};
 pub use crate::descent::{Outcome, Termination};
-use crate::simd::{self, Eight, Kernel};
+use crate::simd::{self, F64x8, Kernel};
 
 /// What is minimised. `normal_equations` is only called at the parameters of the last successful `cost`, whose
 /// simulation it may reuse.
@@ -323,7 +323,7 @@ impl Kernel for Cholesky<'_> {
     type Output = bool;
 
     #[inline(always)]
-    fn run<V: Eight>(self) -> bool {
+    fn run<V: F64x8>(self) -> bool {
         let Self { a, n } = self;
         for i in 0..n {
             let (above, row) = a.split_at_mut(i * n);
@@ -344,7 +344,7 @@ impl Kernel for Cholesky<'_> {
 
 /// The sum of products, eight at a time.
 #[inline(always)]
-fn dot<V: Eight>(a: &[f64], b: &[f64]) -> f64 {
+fn dot<V: F64x8>(a: &[f64], b: &[f64]) -> f64 {
     let ((a, a_rest), (b, b_rest)) = (a.as_chunks(), b.as_chunks());
     let sum = a.iter().zip(b).fold(V::splat(0.0), |sum, (a, b)| {
         sum.add_product(V::load(a), V::load(b))

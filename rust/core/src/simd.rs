@@ -3,7 +3,7 @@
 //! Eight doubles are one cache line, one AVX-512 register, two of AVX2, four of the baseline:
 //!
 //! ```text
-//!   Group (memory, 64 bytes, aligned)    | 0 | 1 | 2 | 3 | 4 | 5 | 6 | 7 |
+//!   Lanes (memory, 64 bytes, aligned)    | 0 | 1 | 2 | 3 | 4 | 5 | 6 | 7 |
 //!   AVX-512  x86::Wide                   |             zmm               |
 //!   AVX2     x86::Halves                 |      ymm      |      ymm      |
 //!   baseline plain::Plain                |  the compiler's, as xmm pairs |
@@ -17,7 +17,7 @@
 //! take 177 ms with AVX-512, 285 with AVX2, 619 on the baseline; 1,000 closed loops 37.5, 68.4 and 158 ms; a state-space
 //! training 401, 627 and 1,625 ms. A free run gains 5 % from AVX-512 and 92 % from AVX2: it is one chain, not throughput.
 //!
-//! A [`Kernel`] is written once over [`Eight`] and compiled for AVX-512, for AVX2 with fused multiply-add and for the
+//! A [`Kernel`] is written once over [`F64x8`] and compiled for AVX-512, for AVX2 with fused multiply-add and for the
 //! baseline; [`run`] takes the best one at run time, or the one that `SEWFAST_CPU` names. All do the same operations in
 //! the same order and differ only in the rounding of products that are added at once: on one level a kernel has one answer.
 
@@ -36,9 +36,9 @@ pub(crate) const LANES: usize = 8;
 /// Eight numbers in memory, on a cache line of their own.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[repr(C, align(64))]
-pub(crate) struct Group(pub [f64; LANES]);
+pub(crate) struct Lanes(pub [f64; LANES]);
 
-impl Group {
+impl Lanes {
     /// Eight zeros.
     pub const ZERO: Self = Self([0.0; LANES]);
 }
@@ -70,7 +70,7 @@ pub(crate) trait Choice: Arithmetic {
     /// The larger of `self` and `limits`, one by one; NaN in `self` stays NaN.
     fn at_least_each(self, limits: Self) -> Self;
     /// `|self|`.
-    fn size(self) -> Self;
+    fn abs(self) -> Self;
     /// The largest integers that are not above `self`.
     fn floor(self) -> Self;
     /// `yes` where `self < other`, else `no`.
@@ -82,7 +82,7 @@ pub(crate) trait Choice: Arithmetic {
 }
 
 /// Eight numbers in registers.
-pub(crate) trait Eight: Choice {
+pub(crate) trait F64x8: Choice {
     /// Sums that stay in registers: rows of a tile, and groups of columns, of which there are at most three.
     ///
     /// A tile of r x c needs r c registers for sums, c for the row and one for the broadcast: 8 x 3 of the 32 of AVX-512, 4 x 1
@@ -93,7 +93,7 @@ pub(crate) trait Eight: Choice {
     /// The sum of all eight, in halves.
     fn sum(self) -> f64;
     /// `|self|`, but `limit` where that is larger; NaN stays NaN.
-    fn size_up_to(self, limit: f64) -> Self;
+    fn abs_up_to(self, limit: f64) -> Self;
     /// `2^n` for numbers that hold the integer `n` in their low bits.
     fn power_of_two(self) -> Self;
 
@@ -152,7 +152,7 @@ pub(crate) trait Kernel {
     type Output;
 
     /// Does the work; `#[inline(always)]`, as everything it calls that uses `V`.
-    fn run<V: Eight>(self) -> Self::Output;
+    fn run<V: F64x8>(self) -> Self::Output;
 }
 
 /// Does the work on the level in use.
@@ -196,7 +196,7 @@ mod tests {
         type Output = Vec<[f64; LANES]>;
 
         #[inline(always)]
-        fn run<V: Eight>(self) -> Self::Output {
+        fn run<V: F64x8>(self) -> Self::Output {
             let (a, b) = (V::load(&self.0), V::load(&self.1));
             let all = [
                 a.add(b),
@@ -205,12 +205,12 @@ mod tests {
                 a.div(b),
                 a.add_product(a, b),
                 V::splat(a.sum()),
-                a.size_up_to(2.5),
+                a.abs_up_to(2.5),
                 a.at_most(2.5).at_least(-1.5),
                 V::splat(f64::from_bits(3)).power_of_two(),
                 a.at_most_each(b),
                 a.at_least_each(b),
-                a.size(),
+                a.abs(),
                 a.floor(),
                 a.if_less(b, a, b),
                 a.if_equal(V::splat(0.5), b, a),

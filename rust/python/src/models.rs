@@ -71,24 +71,136 @@ macro_rules! started_fit_methods {
 
 pub mod embedded;
 mod guard;
+mod hammerstein;
 pub mod linear;
 pub mod neural;
 pub mod neural_ss;
 
+use std::sync::Arc;
+
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::PyClass;
 use pyo3::prelude::*;
 use sewfast_core::Result;
-use sewfast_core::lagged::Lagged;
 use sewfast_core::linearised::Linearised;
+use sewfast_core::model;
 
-use crate::arrays::{array2, raise, rows, slice};
+use crate::arrays::{array1, array2, raise, rows, slice};
+use embedded::EmbeddedModel;
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<Model>()?;
     embedded::register(module)?;
     guard::register(module)?;
+    hammerstein::register(module)?;
     linear::register(module)?;
     neural::register(module)?;
     neural_ss::register(module)
+}
+
+/// A model of any kind: the class below which each kind adds its parameters.
+#[pyclass(frozen, subclass, module = "sewfast._core")]
+pub struct Model {
+    /// The model itself, as whoever needs no more than a model knows it.
+    pub inner: Arc<dyn model::Model>,
+}
+
+/// A kind of model in Python: its own value beside the one in [`Model`].
+pub trait Kind: PyClass<BaseType = Model> + Sized {
+    type Inner: model::Model + 'static;
+
+    fn of(inner: Arc<Self::Inner>) -> Self;
+
+    /// Both classes around one value.
+    fn wrapped(inner: Self::Inner) -> PyClassInitializer<Self> {
+        let inner = Arc::new(inner);
+        let base = Model {
+            inner: inner.clone(),
+        };
+        PyClassInitializer::from(base).add_subclass(Self::of(inner))
+    }
+
+    /// A new object of Python's.
+    fn object(py: Python<'_>, inner: Self::Inner) -> PyResult<Py<Self>> {
+        Py::new(py, Self::wrapped(inner))
+    }
+}
+
+#[pymethods]
+impl Model {
+    #[getter]
+    fn theta<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array1(py, self.inner.theta())
+    }
+
+    fn rest_state<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        array1(py, py.detach(|| self.inner.rest_state()))
+    }
+
+    fn simulate<'py>(
+        &self,
+        py: Python<'py>,
+        u: Rows<'py>,
+        state: Values<'py>,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        let ((u, channels), state) = (rows(&u, "u")?, slice(&state, "state")?);
+        let run = released(py, || self.inner.simulate(u, channels, state))?;
+        Ok(array1(py, run))
+    }
+
+    fn predict<'py>(
+        &self,
+        py: Python<'py>,
+        u: Rows<'py>,
+        y: Values<'py>,
+        state: Values<'py>,
+        horizon: usize,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        let ((u, channels), y, state) = (rows(&u, "u")?, slice(&y, "y")?, slice(&state, "state")?);
+        let run = released(py, || self.inner.predict(u, channels, y, state, horizon))?;
+        Ok(array1(py, run))
+    }
+
+    fn estimate_initial_state<'py>(
+        &self,
+        py: Python<'py>,
+        u: Rows<'py>,
+        y: Values<'py>,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        let ((u, channels), y) = (rows(&u, "u")?, slice(&y, "y")?);
+        let state = released(py, || self.inner.estimate_state(u, channels, y))?;
+        Ok(array1(py, state))
+    }
+
+    fn linearise<'py>(
+        &self,
+        py: Python<'py>,
+        u: Values<'py>,
+        state: Values<'py>,
+    ) -> PyResult<Matrices<'py>> {
+        let found = self
+            .inner
+            .linearise(slice(&u, "u")?, slice(&state, "state")?);
+        matrices(py, found)
+    }
+
+    fn jacobian<'py>(
+        &self,
+        py: Python<'py>,
+        u: Rows<'py>,
+        state: Values<'py>,
+    ) -> PyResult<RunAndJacobian<'py>> {
+        let ((u, channels), state) = (rows(&u, "u")?, slice(&state, "state")?);
+        let (run, found) = released(py, || self.inner.jacobian(u, channels, state))?;
+        let columns = found.len().checked_div(run.len()).unwrap_or(0);
+        Ok((array1(py, run), array2(py, found, columns)?))
+    }
+
+    #[pyo3(signature = (*, scaled=false))]
+    fn embedded(&self, py: Python<'_>, scaled: bool) -> PyResult<EmbeddedModel> {
+        let made = self.inner.embedded(scaled);
+        made.map(EmbeddedModel::of).map_err(|e| raise(py, e))
+    }
 }
 
 /// A, B, C, D.
@@ -122,36 +234,4 @@ type Values<'py> = PyReadonlyArray1<'py, f64>;
 
 fn released<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send) -> PyResult<T> {
     py.detach(work).map_err(|e| raise(py, e))
-}
-
-fn simulate(
-    py: Python<'_>,
-    model: &(impl Lagged + Sync),
-    u: &Rows<'_>,
-    y_past: &Values<'_>,
-) -> PyResult<Vec<f64>> {
-    let ((u, channels), y_past) = (rows(u, "u")?, slice(y_past, "y_past")?);
-    released(py, || model.simulate(u, channels, y_past))
-}
-
-fn predict(
-    py: Python<'_>,
-    model: &(impl Lagged + Sync),
-    u: &Rows<'_>,
-    y: &Values<'_>,
-    y_past: &Values<'_>,
-    horizon: usize,
-) -> PyResult<Vec<f64>> {
-    let ((u, channels), y, y_past) = (rows(u, "u")?, slice(y, "y")?, slice(y_past, "y_past")?);
-    released(py, || model.predict(u, channels, y, y_past, horizon))
-}
-
-fn initial_state(
-    py: Python<'_>,
-    model: &(impl Lagged + Sync),
-    u: &Rows<'_>,
-    y: &Values<'_>,
-) -> PyResult<Vec<f64>> {
-    let ((u, channels), y) = (rows(u, "u")?, slice(y, "y")?);
-    released(py, || model.estimate_initial_state(u, channels, y))
 }

@@ -8,7 +8,7 @@ use nalgebra::DMatrix;
 
 use crate::Record;
 use crate::lagged::Lags;
-use crate::simd::{self, Eight, Kernel, LANES};
+use crate::simd::{self, F64x8, Kernel, LANES};
 
 /// Samples of a block, of which two signals and the ones stay in the first-level cache.
 const BLOCK: usize = 1024;
@@ -197,7 +197,7 @@ impl Kernel for Middle<'_> {
     type Output = Vec<Vec<f64>>;
 
     #[inline(always)]
-    fn run<V: Eight>(mut self) -> Self::Output {
+    fn run<V: F64x8>(mut self) -> Self::Output {
         let end = self.record.len();
         for begin in (self.shifts.lags.first_whole()..end).step_by(BLOCK) {
             self.separate(begin);
@@ -241,7 +241,7 @@ impl Middle<'_> {
 
     /// The products of one signal with all its partners, for the rows from `begin` to `end`.
     #[inline(always)]
-    fn block<V: Eight>(&mut self, p: usize, begin: usize, end: usize) {
+    fn block<V: F64x8>(&mut self, p: usize, begin: usize, end: usize) {
         let signal = &self.shifts.signals[p];
         let end = end.min(self.record.len() - (signal.last - signal.first));
         if end <= begin {
@@ -271,7 +271,7 @@ impl Middle<'_> {
 
     /// The products with `COUNT` partners; of each, `WAYS` sums grow side by side: one alone would wait for itself.
     #[inline(always)]
-    fn tile<V: Eight, const COUNT: usize, const WAYS: usize>(
+    fn tile<V: F64x8, const COUNT: usize, const WAYS: usize>(
         &mut self,
         (p, first, begin, end): (usize, usize, usize, usize),
     ) {
@@ -293,7 +293,7 @@ impl Middle<'_> {
 
 /// `sum_t own(t) other(t)` for each of the others.
 #[inline(always)]
-fn products<V: Eight, const COUNT: usize, const WAYS: usize>(
+fn products<V: F64x8, const COUNT: usize, const WAYS: usize>(
     own: &[f64],
     others: [&[f64]; COUNT],
 ) -> [f64; COUNT] {
@@ -319,7 +319,7 @@ fn products<V: Eight, const COUNT: usize, const WAYS: usize>(
 
 /// Adds the products of one group of samples.
 #[inline(always)]
-fn add<V: Eight, const COUNT: usize>(
+fn add<V: F64x8, const COUNT: usize>(
     g: usize,
     own: &[[f64; LANES]],
     others: &[&[[f64; LANES]]; COUNT],

@@ -1,6 +1,6 @@
 //! Plants to close a loop around: identified models, variations for robust tuning.
 
-use super::{Known, Plant};
+use super::{KernelPlant, Plant};
 use crate::encoder::Encoder;
 use crate::lagged::{Form, Lagged, Lags};
 use crate::neural_ss::{NeuralSS, Shape, Stepper};
@@ -84,8 +84,8 @@ impl<M: Lagged> Plant for LaggedPlant<'_, M> {
         push(&mut self.phi[..na], y);
     }
 
-    fn known(&self) -> Option<Known<'_>> {
-        Some(Known {
+    fn known(&self) -> Option<KernelPlant<'_>> {
+        Some(KernelPlant {
             form: self.form.as_ref()?,
             lags: self.lags,
             ts: self.ts,
@@ -226,9 +226,9 @@ impl<P: Plant> Plant for Varied<P> {
     }
 
     /// Of a plant that is itself varied or held back, the product of the gains and the sum of the delays.
-    fn known(&self) -> Option<Known<'_>> {
+    fn known(&self) -> Option<KernelPlant<'_>> {
         let known = self.plant.known()?;
-        Some(Known {
+        Some(KernelPlant {
             gain: self.gain * known.gain,
             delay: self.delay + known.delay,
             ..known

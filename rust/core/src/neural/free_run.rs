@@ -8,7 +8,7 @@ use super::regressor;
 use crate::Monitor;
 use crate::data::weighted_squares;
 use crate::limit::Limit;
-use crate::simd::{self, Eight, Group, Kernel, LANES};
+use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
 
 /// Samples whose inputs are prepared at once.
 const BLOCK: usize = 64;
@@ -23,7 +23,7 @@ pub(super) struct Run<'a> {
     /// Outputs, one for each sample simulated.
     pub outputs: &'a mut [f64],
     /// Room for the hidden outputs of all samples, or of none.
-    pub hidden: &'a mut [Group],
+    pub hidden: &'a mut [Lanes],
     /// None where it has already failed elsewhere.
     pub limit: Option<Limit>,
 }
@@ -57,7 +57,7 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
     type Output = [Option<f64>; RUNS];
 
     #[inline(always)]
-    fn run<V: Eight>(self) -> Self::Output {
+    fn run<V: F64x8>(self) -> Self::Output {
         let Self {
             runs,
             u,
@@ -98,7 +98,7 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
 
 /// One block of all runs that have not ended.
 #[inline(always)]
-fn advance<V: Eight, const RUNS: usize>(chains: &mut [Chain; RUNS], start: usize, count: usize) {
+fn advance<V: F64x8, const RUNS: usize>(chains: &mut [Chain; RUNS], start: usize, count: usize) {
     let shape = chains[0].run.network.shape;
     let na = if shape.groups() == 1 {
         shape.lags.na
@@ -130,11 +130,11 @@ fn advance<V: Eight, const RUNS: usize>(chains: &mut [Chain; RUNS], start: usize
 struct Chain<'a> {
     run: Run<'a>,
     /// The inputs' share of each group's arguments, and last of the direct way to the output.
-    driven: Vec<[Group; BLOCK]>,
+    driven: Vec<[Lanes; BLOCK]>,
     /// The last outputs, the oldest first, and behind them those of the block.
     outputs: Vec<f64>,
     /// Squared errors, every eighth.
-    sums: Group,
+    sums: Lanes,
     sum: f64,
     limit: Limit,
     runs: bool,
@@ -144,9 +144,9 @@ impl<'a> Chain<'a> {
     fn new(run: Run<'a>) -> Self {
         let past = run.state.iter().rev().copied();
         Self {
-            driven: vec![[Group::ZERO; BLOCK]; run.network.shape.groups() + 1],
+            driven: vec![[Lanes::ZERO; BLOCK]; run.network.shape.groups() + 1],
             outputs: past.chain([0.0; BLOCK]).collect(),
-            sums: Group::ZERO,
+            sums: Lanes::ZERO,
             sum: 0.0,
             limit: run.limit.unwrap_or(Limit::NONE),
             runs: run.limit.is_some(),
@@ -156,7 +156,7 @@ impl<'a> Chain<'a> {
 
     /// The inputs' share of a block.
     #[inline(always)]
-    fn drive<V: Eight>(&mut self, inputs: &[[f64; BLOCK]], count: usize) {
+    fn drive<V: F64x8>(&mut self, inputs: &[[f64; BLOCK]], count: usize) {
         let network = self.run.network;
         let n_phi = network.shape.lags.regressors();
         for (group, driven) in self.driven.iter_mut().enumerate() {
@@ -175,7 +175,7 @@ impl<'a> Chain<'a> {
 
     /// A block of a network of any shape.
     #[inline(always)]
-    fn alone<V: Eight>(&mut self, start: usize, count: usize) {
+    fn alone<V: F64x8>(&mut self, start: usize, count: usize) {
         let network = self.run.network;
         let (shape, na) = (network.shape, network.shape.lags.na);
         let (groups, n_phi) = (shape.groups(), shape.lags.regressors());
@@ -203,7 +203,7 @@ impl<'a> Chain<'a> {
 
     /// Hands the block's outputs on and measures them.
     #[inline(always)]
-    fn conclude<V: Eight>(
+    fn conclude<V: F64x8>(
         &mut self,
         start: usize,
         (measured, weights): (&[f64], &[f64]),
@@ -231,7 +231,7 @@ impl<'a> Chain<'a> {
 /// The argument of a group: the inputs' share, then the outputs', the newest last as everything else is ready before it
 /// is known. `older` has the oldest first.
 #[inline(always)]
-fn argument<V: Eight>(driven: V, weights: &[Group], older: &[f64], newest: V) -> V {
+fn argument<V: F64x8>(driven: V, weights: &[Lanes], older: &[f64], newest: V) -> V {
     let mut sum = driven;
     for (w, y) in weights[1..].iter().rev().zip(older) {
         sum = sum.add_product(V::load(&w.0), V::splat(*y));
@@ -241,7 +241,7 @@ fn argument<V: Eight>(driven: V, weights: &[Group], older: &[f64], newest: V) ->
 
 /// A block of networks of one group of hidden units and `NA` past outputs, side by side.
 #[inline(always)]
-fn together<V: Eight, const NA: usize, const RUNS: usize>(
+fn together<V: F64x8, const NA: usize, const RUNS: usize>(
     chains: [&mut Chain; RUNS],
     start: usize,
     count: usize,
@@ -299,7 +299,7 @@ fn together<V: Eight, const NA: usize, const RUNS: usize>(
 
 /// Adds to the inputs' share of arguments that of all outputs but the newest; `past` begins with the one before it.
 #[inline(always)]
-fn older<V: Eight, const NA: usize>(driven: V, weights: &[V; NA], past: &[V]) -> V {
+fn older<V: F64x8, const NA: usize>(driven: V, weights: &[V; NA], past: &[V]) -> V {
     let mut sum = driven;
     for m in (1..NA).rev() {
         sum = sum.add_product(weights[m], past[m - 1]);
@@ -309,7 +309,7 @@ fn older<V: Eight, const NA: usize>(driven: V, weights: &[V; NA], past: &[V]) ->
 
 /// Adds the squared errors of the samples that were measured; the sum of all so far.
 #[inline(always)]
-fn squared_errors_on<V: Eight>(sums: &mut Group, y: &[f64], run: &[f64]) -> f64 {
+fn squared_errors_on<V: F64x8>(sums: &mut Lanes, y: &[f64], run: &[f64]) -> f64 {
     let mut sum = V::load(&sums.0);
     let ((y, y_rest), (run, run_rest)) = (y.as_chunks(), run.as_chunks());
     for (y, run) in y.iter().zip(run) {
@@ -328,7 +328,7 @@ fn squared_errors_on<V: Eight>(sums: &mut Group, y: &[f64], run: &[f64]) -> f64 
 
 /// Adds squares; what was not measured is NaN and adds nothing.
 #[inline(always)]
-fn square<V: Eight>(sum: V, error: V) -> V {
+fn square<V: F64x8>(sum: V, error: V) -> V {
     let error = error.if_equal(error, error, V::splat(0.0));
     sum.add_product(error, error)
 }

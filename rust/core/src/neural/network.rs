@@ -7,7 +7,7 @@ pub(crate) use beside::{Meanwhile, Nothing};
 use crate::gram::Gram;
 use crate::lagged::{Lagged, Lags};
 use crate::simd::tanh::{rise, tanh};
-use crate::simd::{self, Eight, Group, Kernel, LANES};
+use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
 use crate::{Error, Result};
 
 /// What fixes the length and the order of the parameter vector.
@@ -117,9 +117,9 @@ pub struct Network {
     saturates: bool,
     /// For each group its weights for the regressor; behind the last one, in the first lane, those of the direct way to
     /// the output, whose bias is the constant.
-    pub(super) first: Vec<Group>,
-    pub(super) bias: Vec<Group>,
-    pub(super) second: Vec<Group>,
+    pub(super) first: Vec<Lanes>,
+    pub(super) bias: Vec<Lanes>,
+    pub(super) second: Vec<Lanes>,
     pub(super) linear: Vec<f64>,
 }
 
@@ -131,9 +131,9 @@ impl Network {
             shape,
             limits,
             saturates: limits.0 > f64::NEG_INFINITY || limits.1 < f64::INFINITY,
-            first: vec![Group::ZERO; (groups + 1) * n_phi],
-            bias: vec![Group::ZERO; groups + 1],
-            second: vec![Group::ZERO; groups],
+            first: vec![Lanes::ZERO; (groups + 1) * n_phi],
+            bias: vec![Lanes::ZERO; groups + 1],
+            second: vec![Lanes::ZERO; groups],
             linear: vec![0.0; n_phi],
         }
     }
@@ -166,11 +166,11 @@ impl Network {
     ///
     /// The newest output comes last: everything else is ready before it is known.
     #[inline(always)]
-    fn argument<V: Eight>(&self, group: usize, newest: f64, phi: &[f64]) -> V {
+    fn argument<V: F64x8>(&self, group: usize, newest: f64, phi: &[f64]) -> V {
         let weights = &self.first[group * phi.len()..][..phi.len()];
         let older = weights.iter().zip(phi).skip(1).rev();
         let sum =
-            |sum: V, (w, value): (&Group, &f64)| sum.add_product(V::load(&w.0), V::splat(*value));
+            |sum: V, (w, value): (&Lanes, &f64)| sum.add_product(V::load(&w.0), V::splat(*value));
         let z = older.fold(V::load(&self.bias[group].0), sum);
         sum(z, (&weights[0], &newest))
     }
@@ -178,7 +178,7 @@ impl Network {
     /// The output for the regressor whose first entry is `newest`, the others those of `phi`; `hidden` receives the
     /// outputs of each group of hidden units.
     #[inline(always)]
-    pub(crate) fn step<V: Eight>(
+    pub(crate) fn step<V: F64x8>(
         &self,
         newest: f64,
         phi: &[f64],
@@ -216,13 +216,13 @@ impl Network {
 
     /// A group's outputs `h` and `1 - h^2` to its last digits.
     #[inline(always)]
-    pub(super) fn unit<V: Eight>(&self, group: usize, phi: &[f64]) -> (V, V) {
+    pub(super) fn unit<V: F64x8>(&self, group: usize, phi: &[f64]) -> (V, V) {
         let argument = self.argument::<V>(group, phi[0], phi);
         (tanh(argument), rise(argument))
     }
 
     /// The outputs of all hidden units for the regressor `phi`.
-    pub(super) fn hidden(&self, phi: &[f64], hidden: &mut [Group]) {
+    pub(super) fn hidden(&self, phi: &[f64], hidden: &mut [Lanes]) {
         simd::run(Once {
             network: self,
             phi,
@@ -236,7 +236,7 @@ impl Network {
 struct Once<'a> {
     network: &'a Network,
     phi: &'a [f64],
-    hidden: &'a mut [Group],
+    hidden: &'a mut [Lanes],
     slope: &'a mut [f64],
 }
 
@@ -244,7 +244,7 @@ impl Kernel for Once<'_> {
     type Output = f64;
 
     #[inline(always)]
-    fn run<V: Eight>(self) -> f64 {
+    fn run<V: F64x8>(self) -> f64 {
         let Self {
             network,
             phi,

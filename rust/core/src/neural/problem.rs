@@ -9,7 +9,7 @@ use crate::data::{total_weight, weighted_squares};
 use crate::gram::Gram;
 use crate::limit::Limit;
 use crate::lm::Problem;
-use crate::simd::{self, Group, LANES};
+use crate::simd::{self, LANES, Lanes};
 use crate::{Monitor, Record};
 
 /// A free run beyond this many scales has diverged.
@@ -142,7 +142,7 @@ struct Attempt {
     network: Network,
     /// Outputs and hidden outputs, experiment by experiment.
     runs: Vec<Vec<f64>>,
-    hidden: Vec<Vec<Group>>,
+    hidden: Vec<Vec<Lanes>>,
 }
 
 impl Attempt {
@@ -154,7 +154,7 @@ impl Attempt {
             network,
             runs: all().map(|samples| vec![0.0; samples]).collect(),
             hidden: all()
-                .map(|samples| vec![Group::ZERO; samples * groups])
+                .map(|samples| vec![Lanes::ZERO; samples * groups])
                 .collect(),
         }
     }

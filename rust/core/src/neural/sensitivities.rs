@@ -23,14 +23,13 @@
 //! A `Column` is a group of eight with its source (r, h or tail) and its scale (an entry of phi, or ones). Within a block the
 //! sources and gains are known, so one group at a time passes over all 64 samples with its last `na` values in registers: the rows
 //! are written once and never read back. Known numbers of past outputs keep these values in registers and not in an array: `na` = 2
-//! instead of any number saves 9 % of a training, `na` = 3 as much (12 hidden units 6 %); `na` = 1 saves 3 %. The one-pass
-//! way of the usual shape saves 2 to 6 % (Zen 4, processor time).
+//! instead of any number saves 9 % of a training, `na` = 3 as much (12 hidden units 6 %); `na` = 1 saved 3 % and is not there.
 
 use super::network::{Network, Shape};
 use super::regressor;
 use crate::Monitor;
 use crate::gram::{BLOCK, Gram};
-use crate::simd::{self, Eight, Group, Kernel, LANES};
+use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
 
 /// What takes the rows and holds the ones before.
 pub(super) trait Rows {
@@ -61,7 +60,7 @@ pub(super) struct Recursion<'a, R> {
     pub state: &'a [f64],
     /// What the free run left behind; without hidden outputs the slopes are computed to their last digits.
     pub run: &'a [f64],
-    pub hidden: Option<&'a [Group]>,
+    pub hidden: Option<&'a [Lanes]>,
     /// Measured outputs of the simulated samples, and their weights; none where all count alike.
     pub y: &'a [f64],
     pub weights: &'a [f64],
@@ -118,7 +117,7 @@ struct Block {
     scales: Vec<[f64; BLOCK]>,
     /// Slopes of the output by each hidden unit's argument, hidden outputs, and
     /// `[1, linear's regressor, 0 ..]`: the rows' own part behind the hidden units.
-    sources: Vec<[Group; BLOCK]>,
+    sources: Vec<[Lanes; BLOCK]>,
     /// Slopes of the output by each past output.
     gains: Vec<[f64; BLOCK]>,
     errors: [f64; BLOCK],
@@ -140,7 +139,7 @@ impl Block {
             groups,
             columns: units.chain(tail).map(column).collect(),
             scales: vec![[1.0; BLOCK]; n_phi + 1],
-            sources: vec![[Group::ZERO; BLOCK]; 2 * groups + shape.tail_groups()],
+            sources: vec![[Lanes::ZERO; BLOCK]; 2 * groups + shape.tail_groups()],
             gains: vec![[0.0; BLOCK]; shape.lags.na],
             errors: [0.0; BLOCK],
         }
@@ -173,7 +172,7 @@ impl Block {
 struct Step<'a> {
     network: &'a Network,
     run: &'a [f64],
-    hidden: Option<&'a [Group]>,
+    hidden: Option<&'a [Lanes]>,
 }
 
 /// One block of the recursion.
@@ -188,12 +187,8 @@ impl Kernel for Advance<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<V: Eight>(mut self) {
-        if V::TILE.0 == 8 && self.is_usual() {
-            return self.usual::<V>();
-        }
+    fn run<V: F64x8>(mut self) {
         match self.block.shape.lags.na {
-            1 => self.advance::<V, 1>(),
             2 => self.advance::<V, 2>(),
             3 => self.advance::<V, 3>(),
             _ => self.advance::<V, 0>(),
@@ -210,7 +205,7 @@ impl Kernel for Advance<'_> {
 impl Advance<'_> {
     /// `NA` past outputs; 0 stands for any number.
     #[inline(always)]
-    fn advance<V: Eight, const NA: usize>(&mut self) {
+    fn advance<V: F64x8, const NA: usize>(&mut self) {
         for group in 0..self.block.groups {
             self.slopes::<V>(group);
         }
@@ -219,8 +214,7 @@ impl Advance<'_> {
         let mut next = 0;
         while next < self.block.columns.len() {
             next += match (V::TILE.0, self.block.columns.len() - next) {
-                (8, 1) | (2, _) => self.columns::<V, NA, 1>(next),
-                (4, 1) => self.columns::<V, NA, 1>(next),
+                (2, _) | (_, 1) => self.columns::<V, NA, 1>(next),
                 (4, _) | (_, 2) => self.columns::<V, NA, 2>(next),
                 (_, 3 | 6) => self.columns::<V, NA, 3>(next),
                 _ => self.columns::<V, NA, 4>(next),
@@ -232,7 +226,7 @@ impl Advance<'_> {
     ///
     /// What `1 - h^2` loses where a unit saturates is far below what a sum of squares shows.
     #[inline(always)]
-    fn slopes<V: Eight>(&mut self, group: usize) {
+    fn slopes<V: F64x8>(&mut self, group: usize) {
         let network = self.recursion.network;
         let (groups, block) = (self.block.groups, &mut *self.block);
         let second = V::load(&network.second[group].0);
@@ -260,7 +254,7 @@ impl Advance<'_> {
 
     /// The slopes of the output by each past output.
     #[inline(always)]
-    fn gains<V: Eight>(&mut self) {
+    fn gains<V: F64x8>(&mut self) {
         let (network, groups) = (self.recursion.network, self.block.groups);
         let n_phi = self.block.shape.lags.regressors();
         let count = self.recursion.run.len().min(BLOCK);
@@ -290,13 +284,13 @@ impl Advance<'_> {
         {
             block.gains.iter_mut().for_each(|gains| gains[k] = 0.0);
             let sources = block.sources.iter_mut();
-            sources.for_each(|source| source[k] = Group::ZERO);
+            sources.for_each(|source| source[k] = Lanes::ZERO);
         }
     }
 
     /// `COUNT` groups of columns from the plan's `next` on, through the block; how many they were.
     #[inline(always)]
-    fn columns<V: Eight, const NA: usize, const COUNT: usize>(&mut self, next: usize) -> usize {
+    fn columns<V: F64x8, const NA: usize, const COUNT: usize>(&mut self, next: usize) -> usize {
         let (block, count) = (&*self.block, self.recursion.run.len());
         let na = block.shape.lags.na;
         let width = self.rows.len() / (na + count);
@@ -338,68 +332,6 @@ impl Advance<'_> {
 
 /// `w2 (1 - h^2)`.
 #[inline(always)]
-fn steep<V: Eight>(second: V, h: V) -> V {
+fn steep<V: F64x8>(second: V, h: V) -> V {
     second.mul(V::splat(1.0).sub(h.mul(h)))
-}
-
-/// Past outputs, regressors and hidden units of the usual shape.
-const PAST: usize = 2;
-const REGRESSORS: usize = 4;
-/// Its groups of columns: for each regressor, `b1`, `w2`, and what is behind.
-const GROUPS: usize = REGRESSORS + 3;
-
-impl Advance<'_> {
-    /// Whether all past rows of the block's shape fit into registers.
-    fn is_usual(&self) -> bool {
-        let shape = self.block.shape;
-        (shape.lags.na, shape.lags.regressors()) == (PAST, REGRESSORS)
-            && (shape.hidden, shape.tail_groups()) == (LANES, 1)
-            && self.recursion.hidden.is_some()
-            && !self.recursion.network.saturates()
-    }
-
-    /// A block of the usual shape: slopes, gains and rows in one pass.
-    #[inline(always)]
-    fn usual<V: Eight>(&mut self) {
-        let (network, block) = (self.recursion.network, &*self.block);
-        let width = self.rows.len() / (PAST + self.recursion.run.len());
-        let second = V::load(&network.second[0].0);
-        let weights = [V::load(&network.first[0].0), V::load(&network.first[1].0)];
-        let linear = [network.linear[0], network.linear[1]];
-        let mut old = [[V::splat(0.0); GROUPS]; PAST];
-        for (m, old) in old.iter_mut().enumerate() {
-            let row = &self.rows[(PAST - 1 - m) * width..];
-            for (old, row) in old.iter_mut().zip(row.as_chunks().0) {
-                *old = V::load(row);
-            }
-        }
-        let (tail, error) = (&block.sources[2], block.shape.error_column());
-        let scales: [&[f64; BLOCK]; REGRESSORS] = std::array::from_fn(|c| &block.scales[c]);
-        let hidden = self.recursion.hidden.unwrap_or_default();
-        let count = self.recursion.run.len().min(hidden.len()).min(BLOCK);
-        let rows = &mut self.rows[PAST * width..];
-        for k in 0..count {
-            let Some(row) = rows[k * width..].first_chunk_mut::<{ GROUPS * LANES }>() else {
-                return;
-            };
-            let h = V::load(&hidden[k].0);
-            let slope = steep(second, h);
-            let newest = V::splat(linear[0] + slope.mul(weights[0]).sum());
-            let older = V::splat(linear[1] + slope.mul(weights[1]).sum());
-            let mut own = [slope; GROUPS];
-            for c in 0..REGRESSORS {
-                own[c] = slope.mul(V::splat(scales[c][k]));
-            }
-            own[GROUPS - 2] = h;
-            own[GROUPS - 1] = V::load(&tail[k].0);
-            for c in 0..GROUPS {
-                let value = own[c].add_product(older, old[1][c]);
-                let value = value.add_product(newest, old[0][c]);
-                old[1][c] = old[0][c];
-                old[0][c] = value;
-                value.write(&mut row[c * LANES..]);
-            }
-            row[error] = block.errors[k];
-        }
-    }
 }

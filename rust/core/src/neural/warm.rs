@@ -4,7 +4,7 @@
 use super::network::Network;
 use super::problem::Experiment;
 use crate::lm::{cholesky, substitute};
-use crate::simd::{Group, LANES};
+use crate::simd::{LANES, Lanes};
 
 /// Added to the diagonal, relative to its mean: hidden outputs of small weights are nearly collinear.
 const RIDGE: f64 = 1e-9;
@@ -18,7 +18,7 @@ pub(super) fn output_layer(network: &Network, experiments: &[Experiment]) -> Opt
     let n = hidden + 1;
     let (mut left, mut right) = (vec![0.0; n * n], vec![0.0; n]);
     let (mut phi, mut row) = (vec![0.0; lags.regressors()], vec![1.0; n]);
-    let mut groups = vec![Group::ZERO; network.shape.groups()];
+    let mut groups = vec![Lanes::ZERO; network.shape.groups()];
     for experiment in experiments {
         let measured = |k: &usize| experiment.y[k - lags.na..=*k].iter().all(|y| !y.is_nan());
         for k in (lags.na..experiment.y.len()).filter(measured) {

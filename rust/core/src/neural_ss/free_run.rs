@@ -5,7 +5,7 @@ use super::network::{Network, Scratch, copy, unrolled};
 use super::shape::Shape;
 use crate::Monitor;
 use crate::limit::Limit;
-use crate::simd::{self, Eight, Group, Kernel};
+use crate::simd::{self, F64x8, Kernel, Lanes};
 
 /// Samples between two looks at bound and limit.
 const BLOCK: usize = 64;
@@ -16,7 +16,7 @@ const LOOK: usize = 64 * BLOCK;
 #[derive(Clone, Debug)]
 pub(super) struct Trajectory {
     pub states: Vec<f64>,
-    pub hidden: Vec<Group>,
+    pub hidden: Vec<Lanes>,
     /// Sums before the output function.
     pub sums: Vec<f64>,
 }
@@ -26,7 +26,7 @@ impl Trajectory {
         let Shape { nx, outputs, .. } = network.shape;
         Self {
             states: vec![0.0; samples * nx],
-            hidden: vec![Group::ZERO; samples * network.groups()],
+            hidden: vec![Lanes::ZERO; samples * network.groups()],
             sums: vec![0.0; samples * outputs],
         }
     }
@@ -95,7 +95,7 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
     type Output = [Option<f64>; RUNS];
 
     #[inline(always)]
-    fn run<V: Eight>(self) -> Self::Output {
+    fn run<V: F64x8>(self) -> Self::Output {
         unrolled!(self.runs[0].network.shape.nx, self.samples::<V>)
     }
 }
@@ -103,7 +103,7 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
 impl<const RUNS: usize> FreeRuns<'_, RUNS> {
     /// `NX` states; 0 stands for any number.
     #[inline(always)]
-    fn samples<V: Eight, const NX: usize>(mut self) -> [Option<f64>; RUNS] {
+    fn samples<V: F64x8, const NX: usize>(mut self) -> [Option<f64>; RUNS] {
         let inputs = self.runs[0].network.shape.inputs;
         let samples = self.v.len() / inputs;
         let mut sums = [0.0; RUNS];
@@ -137,7 +137,7 @@ impl<const RUNS: usize> FreeRuns<'_, RUNS> {
 
 /// A block of all runs.
 #[inline(always)]
-fn advance<V: Eight, const NX: usize, const RUNS: usize>(
+fn advance<V: F64x8, const NX: usize, const RUNS: usize>(
     runs: &mut [Run; RUNS],
     start: usize,
     v: &[f64],
@@ -159,7 +159,7 @@ fn advance<V: Eight, const NX: usize, const RUNS: usize>(
 
 /// A block of models of one output, `NX` states and `GROUPS` groups of hidden units, side by side.
 #[inline(always)]
-fn together<V: Eight, const NX: usize, const GROUPS: usize, const RUNS: usize>(
+fn together<V: F64x8, const NX: usize, const GROUPS: usize, const RUNS: usize>(
     runs: &mut [Run; RUNS],
     start: usize,
     v: &[f64],
@@ -187,7 +187,7 @@ fn together<V: Eight, const NX: usize, const GROUPS: usize, const RUNS: usize>(
 impl Run<'_> {
     /// Sample `k`.
     #[inline(always)]
-    fn step<V: Eight, const NX: usize>(&mut self, k: usize, v: &[f64]) {
+    fn step<V: F64x8, const NX: usize>(&mut self, k: usize, v: &[f64]) {
         let Shape { nx, outputs, .. } = self.network.shape;
         let nx = if NX == 0 { nx } else { NX };
         let (groups, scratch) = (self.network.groups(), &mut *self.scratch);

@@ -5,7 +5,7 @@ use super::problem::Experiment;
 use super::shape::Shape;
 use super::state::{Statistics, step_with_slopes};
 use crate::Monitor;
-use crate::simd::{self, Eight, Kernel};
+use crate::simd::{self, F64x8, Kernel};
 
 /// Powers of ten that the process noise is chosen from.
 const EXPONENTS: std::ops::RangeInclusive<i32> = -8..=2;
@@ -32,7 +32,7 @@ impl<F: FnMut(usize, &[f64], &[f64])> Kernel for Filter<'_, F> {
     type Output = ();
 
     #[inline(always)]
-    fn run<V: Eight>(self) {
+    fn run<V: F64x8>(self) {
         let Self {
             network,
             prior,

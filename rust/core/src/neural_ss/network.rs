@@ -3,7 +3,7 @@
 use super::output::OutputFunction;
 use super::shape::Shape;
 use crate::simd::tanh::{rise, tanh};
-use crate::simd::{Eight, Group, LANES};
+use crate::simd::{F64x8, LANES, Lanes};
 
 /// The weights laid out for the kernels: hidden units in groups of eight, missing ones with weights of zero.
 #[derive(Clone, Debug)]
@@ -11,19 +11,19 @@ pub(super) struct Network {
     pub shape: Shape,
     pub output: OutputFunction,
     /// For each group its weights for states and inputs, and the bias.
-    first: Vec<Group>,
+    first: Vec<Lanes>,
     /// For each state and each output its weights for the groups: `[E; G]`.
-    pub second: Vec<Group>,
+    pub second: Vec<Lanes>,
     /// `[A B; C D]` row by row.
     linear: Vec<f64>,
     /// `c`.
     constant: Vec<f64>,
     /// For each group of slopes, the products of each hidden unit's weights that stand beside its `1 - h^2`.
-    products: Vec<Group>,
+    products: Vec<Lanes>,
     /// The linear part of the slopes: `[A; C]` in the order of `products`.
-    base: Vec<Group>,
+    base: Vec<Lanes>,
     /// For each argument its column of `[A B 0; C D c]`, where that has no more rows than a group.
-    columns: Vec<Group>,
+    columns: Vec<Lanes>,
 }
 
 /// What a step needs room for, and leaves behind.
@@ -32,15 +32,15 @@ pub(super) struct Scratch {
     /// States and inputs of the step, then 1.
     pub arguments: Vec<f64>,
     /// Hidden outputs.
-    pub hidden: Vec<Group>,
+    pub hidden: Vec<Lanes>,
     /// The next state.
     pub next: Vec<f64>,
     /// The sums `s`, before the output function.
     pub sums: Vec<f64>,
     /// `1 - h^2`.
-    pub rises: Vec<Group>,
+    pub rises: Vec<Lanes>,
     /// `dx+/dx`, then `ds/dx`, row by row.
-    pub slopes: Vec<Group>,
+    pub slopes: Vec<Lanes>,
 }
 
 impl Scratch {
@@ -51,11 +51,11 @@ impl Scratch {
         arguments[shape.arguments()] = 1.0;
         Self {
             arguments,
-            hidden: vec![Group::ZERO; groups],
+            hidden: vec![Lanes::ZERO; groups],
             next: vec![0.0; shape.nx],
             sums: vec![0.0; shape.outputs],
-            rises: vec![Group::ZERO; groups],
-            slopes: vec![Group::ZERO; slopes],
+            rises: vec![Lanes::ZERO; groups],
+            slopes: vec![Lanes::ZERO; slopes],
         }
     }
 
@@ -95,7 +95,7 @@ pub(super) fn copy(to: &mut [f64], from: &[f64]) {
 
 /// `1 - h^2` from hidden outputs: fast, and exact to 1e-16.
 #[inline(always)]
-pub(super) fn rises_of<V: Eight>(hidden: &[Group], rises: &mut [Group]) {
+pub(super) fn rises_of<V: F64x8>(hidden: &[Lanes], rises: &mut [Lanes]) {
     for (rise, hidden) in rises.iter_mut().zip(hidden) {
         let h = V::load(&hidden.0);
         V::splat(1.0).sub(h.mul(h)).store(&mut rise.0);
@@ -125,13 +125,13 @@ impl Network {
         let mut network = Self {
             shape,
             output,
-            first: vec![Group::ZERO; groups * (width + 1)],
-            second: vec![Group::ZERO; rows * groups],
+            first: vec![Lanes::ZERO; groups * (width + 1)],
+            second: vec![Lanes::ZERO; rows * groups],
             linear: vec![0.0; rows * width],
             constant: vec![0.0; shape.outputs],
-            products: vec![Group::ZERO; slopes * groups * LANES],
-            base: vec![Group::ZERO; slopes],
-            columns: vec![Group::ZERO; width + 1],
+            products: vec![Lanes::ZERO; slopes * groups * LANES],
+            base: vec![Lanes::ZERO; slopes],
+            columns: vec![Lanes::ZERO; width + 1],
         };
         network.load(theta);
         network
@@ -209,7 +209,7 @@ impl Network {
 
     /// The argument of a group of hidden units for `[x, v, 1]`.
     #[inline(always)]
-    fn argument<V: Eight>(&self, group: usize, states: &[f64], inputs: &[f64]) -> V {
+    fn argument<V: F64x8>(&self, group: usize, states: &[f64], inputs: &[f64]) -> V {
         let width = states.len() + inputs.len();
         // The states come last: everything else is ready before they are known.
         let (of_states, of_inputs) = self.first[group * width..][..width].split_at(states.len());
@@ -225,7 +225,7 @@ impl Network {
 
     /// `1 - h^2` to its last digits, for `[x, v, 1]`; [`rises_of`] is faster, and less exact in saturation.
     #[inline(always)]
-    pub fn rises<V: Eight>(&self, arguments: &[f64], rises: &mut [Group]) {
+    pub fn rises<V: F64x8>(&self, arguments: &[f64], rises: &mut [Lanes]) {
         let (states, inputs) = arguments.split_at(self.shape.nx);
         for (g, rises) in rises.iter_mut().enumerate() {
             rise(self.argument::<V>(g, states, inputs)).store(&mut rises.0);
@@ -234,10 +234,10 @@ impl Network {
 
     /// `h = tanh(Wx x + Wu v + bh)`, `x+ = A x + B v + E h`, `s = C x + D v + c + G h` for `[x, v, 1]`.
     #[inline(always)]
-    pub fn step<V: Eight, const NX: usize>(
+    pub fn step<V: F64x8, const NX: usize>(
         &self,
         arguments: &[f64],
-        hidden: &mut [Group],
+        hidden: &mut [Lanes],
         next: &mut [f64],
         sums: &mut [f64],
     ) {
@@ -257,11 +257,11 @@ impl Network {
     /// [`Network::step`] of one output, a number of states and a number of groups: takes `x` a step on, with
     /// everything in registers. Gives the sum `s`.
     #[inline(always)]
-    pub fn step_small<V: Eight, const NX: usize, const GROUPS: usize>(
+    pub fn step_small<V: F64x8, const NX: usize, const GROUPS: usize>(
         &self,
         x: &mut [f64; NX],
         v: &[f64],
-        hidden: &mut [Group; GROUPS],
+        hidden: &mut [Lanes; GROUPS],
     ) -> f64 {
         let width = NX + v.len();
         let mut units = [V::splat(0.0); GROUPS];
@@ -272,7 +272,7 @@ impl Network {
             *unit = tanh(*unit);
             unit.store(&mut hidden[g].0);
         }
-        let mut linear = Group::ZERO;
+        let mut linear = Lanes::ZERO;
         affine::<V, NX>(&self.columns[..width + 1], x, v).store(&mut linear.0);
         let mut sum = 0.0;
         for q in 0..=NX {
@@ -291,7 +291,7 @@ impl Network {
 
     /// A row of `[A B; C D] [x; v] + [E; G] h`.
     #[inline(always)]
-    fn row<V: Eight>(&self, q: usize, x: &[f64], v: &[f64], hidden: &[Group]) -> f64 {
+    fn row<V: F64x8>(&self, q: usize, x: &[f64], v: &[f64], hidden: &[Lanes]) -> f64 {
         let width = self.shape.arguments();
         let weights = &self.second[q * hidden.len()..][..hidden.len()];
         let mut sum = V::splat(0.0);
@@ -306,7 +306,7 @@ impl Network {
 
     /// `dx+/dx = A + E diag(1 - h^2) Wx` and `ds/dx = C + G diag(1 - h^2) Wx` from `rises`, `1 - h^2`.
     #[inline(always)]
-    pub fn slopes<V: Eight>(&self, rises: &[Group], slopes: &mut [Group]) {
+    pub fn slopes<V: F64x8>(&self, rises: &[Lanes], slopes: &mut [Lanes]) {
         for (at, slope) in slopes.iter_mut().enumerate() {
             let [sum] = self.slope::<V, 1>(at, rises);
             sum.store(&mut slope.0);
@@ -315,10 +315,10 @@ impl Network {
 
     /// [`Network::slopes`] of several samples, in the first `used` of the groups of each.
     #[inline(always)]
-    pub fn slopes_of<V: Eight, const ROOM: usize>(
+    pub fn slopes_of<V: F64x8, const ROOM: usize>(
         &self,
-        rises: &[Group],
-        slopes: &mut [[Group; ROOM]],
+        rises: &[Lanes],
+        slopes: &mut [[Lanes; ROOM]],
         used: usize,
     ) {
         let groups = self.groups();
@@ -337,9 +337,9 @@ impl Network {
         }
     }
 
-    /// Group `at` of the slopes of some samples side by side.
+    /// Lanes `at` of the slopes of some samples side by side.
     #[inline(always)]
-    fn slope<V: Eight, const SAMPLES: usize>(&self, at: usize, rises: &[Group]) -> [V; SAMPLES] {
+    fn slope<V: F64x8, const SAMPLES: usize>(&self, at: usize, rises: &[Lanes]) -> [V; SAMPLES] {
         let groups = self.groups();
         let (products, _) = self.products[at * groups * LANES..].as_chunks::<LANES>();
         // Two sums side by side: one alone would wait for each product.
@@ -364,7 +364,7 @@ impl Network {
 
 /// The sum of the columns times `[x, v, 1]`, the states last.
 #[inline(always)]
-fn affine<V: Eight, const NX: usize>(columns: &[Group], x: &[f64; NX], v: &[f64]) -> V {
+fn affine<V: F64x8, const NX: usize>(columns: &[Lanes], x: &[f64; NX], v: &[f64]) -> V {
     let (of_states, rest) = columns.split_at(NX);
     let (of_inputs, constant) = rest.split_at(v.len());
     let mut sum = V::load(&constant[0].0);

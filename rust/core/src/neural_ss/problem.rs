@@ -12,7 +12,7 @@ use crate::data::total_weight;
 use crate::gram::Gram;
 use crate::limit::Limit;
 use crate::lm::Problem;
-use crate::simd::{self, Group};
+use crate::simd::{self, Lanes};
 
 /// A state beyond this many of its standard deviations has diverged.
 const DIVERGED: f64 = 1e3;
@@ -85,7 +85,7 @@ const MOST_GROUPS: usize = 2;
 fn pays(network: &Network, experiments: &[Experiment]) -> bool {
     let Shape { nx, outputs, .. } = network.shape;
     let samples: usize = experiments.iter().map(|e| e.y.len()).sum();
-    let bytes = size_of::<f64>() * (nx + 1) + size_of::<Group>() * network.groups();
+    let bytes = size_of::<f64>() * (nx + 1) + size_of::<Lanes>() * network.groups();
     let small = outputs == 1 && nx <= MOST_STATES && network.groups() <= MOST_GROUPS;
     small && samples * bytes <= MOST_TOGETHER && simd::level() == Ok(simd::Level::Avx512)
 }
@@ -108,7 +108,7 @@ pub(super) struct Training<'a> {
     monitor: &'a Monitor,
     pub network: Network,
     pub decay: Decay,
-    /// Known outputs, each by its weight.
+    /// KernelPlant outputs, each by its weight.
     samples: f64,
     attempts: &'a Attempts,
     gram: Gram,

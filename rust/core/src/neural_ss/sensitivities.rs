@@ -25,7 +25,7 @@ use super::shape::Shape;
 use super::single::Block;
 use crate::Monitor;
 use crate::gram::{Gram, forget};
-use crate::simd::{Eight, Group, Kernel, LANES};
+use crate::simd::{F64x8, Kernel, LANES, Lanes};
 
 /// Samples between two looks at the monitor, and at sensitivities that have all but decayed.
 const LOOK: usize = 64;
@@ -126,15 +126,15 @@ impl Rows for Gram {
 pub(super) struct Sensitivities {
     pub(super) columns: Columns,
     /// `X` in groups of columns: for each group the rows of all states.
-    pub(super) states: Vec<Group>,
+    pub(super) states: Vec<Lanes>,
     /// `dx+/d[A B x0]`, in groups as `states`.
-    pub(super) linear: Vec<Group>,
+    pub(super) linear: Vec<Lanes>,
     /// `[E; f' G] diag(1 - h^2)`.
-    pub(super) weighted: Vec<Group>,
+    pub(super) weighted: Vec<Lanes>,
     /// `f' ds/dx` of the outputs that are known.
     pub(super) outward: Vec<f64>,
     /// Room for one group of columns of the states.
-    moved: Vec<Group>,
+    moved: Vec<Lanes>,
     pub(super) scratch: Scratch,
     pub(super) block: Block,
     /// Outputs of a sample that are known: which, slope of the output function, error.
@@ -148,11 +148,11 @@ impl Sensitivities {
         let hidden = (shape.arguments() + 1 + nx) * groups;
         Self {
             columns: Columns::new(shape),
-            states: vec![Group::ZERO; (hidden + small) * nx],
-            linear: vec![Group::ZERO; small * nx],
-            weighted: vec![Group::ZERO; (nx + shape.outputs) * groups],
+            states: vec![Lanes::ZERO; (hidden + small) * nx],
+            linear: vec![Lanes::ZERO; small * nx],
+            weighted: vec![Lanes::ZERO; (nx + shape.outputs) * groups],
             outward: vec![0.0; nx * shape.outputs],
-            moved: vec![Group::ZERO; nx],
+            moved: vec![Lanes::ZERO; nx],
             scratch: Scratch::new(shape),
             block: Block::new(shape),
             known: Vec::with_capacity(shape.outputs),
@@ -163,7 +163,7 @@ impl Sensitivities {
     fn reset(&mut self) {
         let Shape { nx, .. } = self.columns.shape;
         let first = self.states.len() - self.linear.len();
-        self.states.fill(Group::ZERO);
+        self.states.fill(Lanes::ZERO);
         for q in 0..nx {
             let column = self.columns.state - self.columns.linear + q;
             self.states[first + column / LANES * nx + q].0[column % LANES] = 1.0;
@@ -191,7 +191,7 @@ impl Kernel for Recursion<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<V: Eight>(self) {
+    fn run<V: F64x8>(self) {
         self.buffers.reset();
         let Shape { nx, outputs, .. } = self.network.shape;
         match (outputs, nx) {
@@ -207,7 +207,7 @@ impl Kernel for Recursion<'_> {
 impl Recursion<'_> {
     /// `NX` states; 0 stands for any number.
     #[inline(always)]
-    fn samples<V: Eight, const NX: usize>(self) {
+    fn samples<V: F64x8, const NX: usize>(self) {
         let Self {
             network,
             run,
@@ -273,10 +273,10 @@ impl Sensitivities {
 
     /// All that the columns have in common.
     #[inline(always)]
-    fn prepare<V: Eight>(
+    fn prepare<V: F64x8>(
         &mut self,
         network: &Network,
-        h: &[Group],
+        h: &[Lanes],
         (s, y): (&[f64], &[f64]),
         exact: bool,
     ) {
@@ -329,10 +329,10 @@ impl Sensitivities {
 
     /// Writes the sample's rows and takes `X` to the next sample.
     #[inline(always)]
-    fn advance<V: Eight, const NX: usize>(
+    fn advance<V: F64x8, const NX: usize>(
         &mut self,
         network: &Network,
-        h: &[Group],
+        h: &[Lanes],
         rows: &mut [f64],
         stride: usize,
     ) {
@@ -409,14 +409,14 @@ struct Slopes<'a, V, const NX: usize> {
     known: &'a [(usize, f64, f64)],
 }
 
-impl<V: Eight, const NX: usize> Slopes<'_, V, NX> {
+impl<V: F64x8, const NX: usize> Slopes<'_, V, NX> {
     /// One group of columns: its part of the rows, from `start` on, and `X` one step on. `direct(p)` and `next(q)` are
     /// `f' ds/dtheta` and `dx+/dtheta`.
     #[inline(always)]
     fn advance(
         &self,
-        x: &mut [Group],
-        moved: &mut [Group],
+        x: &mut [Lanes],
+        moved: &mut [Lanes],
         rows: &mut [f64],
         (start, stride): (usize, usize),
         direct: impl Fn(usize) -> V,
@@ -458,7 +458,7 @@ impl<V: Eight, const NX: usize> Slopes<'_, V, NX> {
     #[inline(always)]
     fn write_direct(
         &self,
-        h: &[Group],
+        h: &[Lanes],
         rows: &mut [f64],
         stride: usize,
         first: usize,

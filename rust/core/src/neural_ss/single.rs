@@ -32,7 +32,7 @@
 use super::network::{Network, rises_of};
 use super::sensitivities::{Recursion, Sensitivities, weigh};
 use super::shape::Shape;
-use crate::simd::{Eight, Group, LANES};
+use crate::simd::{F64x8, LANES, Lanes};
 
 /// Samples of a block: what all groups of columns read stays in the first-level cache.
 pub(super) const BLOCK: usize = 32;
@@ -45,15 +45,15 @@ const SLOPES: usize = ((MOST_STATES + 1) * MOST_STATES).div_ceil(LANES);
 #[derive(Clone, Debug)]
 pub(super) struct Block {
     /// `dx+/dx`, then `f' ds/dx`, row by row.
-    slopes: Box<[[Group; SLOPES]; BLOCK]>,
+    slopes: Box<[[Lanes; SLOPES]; BLOCK]>,
     /// `1 - h^2`.
-    rises: Vec<Group>,
+    rises: Vec<Lanes>,
     /// States, inputs and 1, one after the other.
     arguments: Vec<[f64; BLOCK]>,
     /// `E diag(1 - h^2)`: for each group and sample the rows of all states.
-    weighted: Vec<Group>,
+    weighted: Vec<Lanes>,
     /// `f' G diag(1 - h^2)` for each group.
-    direct: Vec<[Group; BLOCK]>,
+    direct: Vec<[Lanes; BLOCK]>,
     /// `f'` and the error.
     outputs: [(f64, f64); BLOCK],
     /// Where the sample's row begins, or that of the next one that has one.
@@ -69,11 +69,11 @@ impl Block {
         let groups = shape.hidden.div_ceil(LANES);
         let space = (shape.nx + 1) * shape.arguments() + LANES;
         Self {
-            slopes: Box::new([[Group::ZERO; SLOPES]; BLOCK]),
-            rises: vec![Group::ZERO; BLOCK * groups],
+            slopes: Box::new([[Lanes::ZERO; SLOPES]; BLOCK]),
+            rises: vec![Lanes::ZERO; BLOCK * groups],
             arguments: vec![[1.0; BLOCK]; shape.arguments() + 1],
-            weighted: vec![Group::ZERO; groups * BLOCK * shape.nx],
-            direct: vec![[Group::ZERO; BLOCK]; groups],
+            weighted: vec![Lanes::ZERO; groups * BLOCK * shape.nx],
+            direct: vec![[Lanes::ZERO; BLOCK]; groups],
             outputs: [(0.0, 0.0); BLOCK],
             places: [0; BLOCK],
             spaced: vec![0.0; (BLOCK + 1) * space],
@@ -102,20 +102,20 @@ struct Gains<V, const NX: usize> {
 
 /// A kind of columns.
 trait Source<const NX: usize>: Copy {
-    fn gains<V: Eight>(&self, k: usize) -> Gains<V, NX>;
+    fn gains<V: F64x8>(&self, k: usize) -> Gains<V, NX>;
 }
 
 /// Weights of one argument of a group of hidden units.
 #[derive(Clone, Copy)]
 struct OfArgument<'a, const NX: usize> {
     argument: &'a [f64; BLOCK],
-    weighted: &'a [[Group; NX]; BLOCK],
-    direct: &'a [Group; BLOCK],
+    weighted: &'a [[Lanes; NX]; BLOCK],
+    direct: &'a [Lanes; BLOCK],
 }
 
 impl<const NX: usize> Source<NX> for OfArgument<'_, NX> {
     #[inline(always)]
-    fn gains<V: Eight>(&self, k: usize) -> Gains<V, NX> {
+    fn gains<V: F64x8>(&self, k: usize) -> Gains<V, NX> {
         let argument = V::splat(self.argument[k]);
         let mut next = [None; NX];
         for (next, weighted) in next.iter_mut().zip(&self.weighted[k]) {
@@ -130,13 +130,13 @@ impl<const NX: usize> Source<NX> for OfArgument<'_, NX> {
 #[derive(Clone, Copy)]
 struct OfUnits<'a, const Q: usize> {
     /// Hidden outputs from this group on, and groups.
-    hidden: &'a [Group],
+    hidden: &'a [Lanes],
     groups: usize,
 }
 
 impl<const NX: usize, const Q: usize> Source<NX> for OfUnits<'_, Q> {
     #[inline(always)]
-    fn gains<V: Eight>(&self, k: usize) -> Gains<V, NX> {
+    fn gains<V: F64x8>(&self, k: usize) -> Gains<V, NX> {
         let mut next = [None; NX];
         if let Some(next) = next.get_mut(Q) {
             *next = Some(V::load(&self.hidden[k * self.groups].0));
@@ -156,7 +156,7 @@ struct OfStates<'a> {
 
 impl<const NX: usize> Source<NX> for OfStates<'_> {
     #[inline(always)]
-    fn gains<V: Eight>(&self, k: usize) -> Gains<V, NX> {
+    fn gains<V: F64x8>(&self, k: usize) -> Gains<V, NX> {
         let mut next = [None; NX];
         for (q, next) in next.iter_mut().rev().enumerate() {
             let start = k * self.space + q * self.width;
@@ -169,7 +169,7 @@ impl<const NX: usize> Source<NX> for OfStates<'_> {
 impl Block {
     /// `E diag(1 - h^2)` and `f' G diag(1 - h^2)` of all samples.
     #[inline(always)]
-    fn weigh<V: Eight, const NX: usize>(&mut self, network: &Network, count: usize) {
+    fn weigh<V: F64x8, const NX: usize>(&mut self, network: &Network, count: usize) {
         let groups = self.direct.len();
         let (weighted, _) = self.weighted.as_chunks_mut::<NX>();
         let (weighted, _) = weighted.as_chunks_mut::<BLOCK>();
@@ -192,7 +192,7 @@ impl Block {
 
     /// `dx+/dx` and `f' ds/dx` of all samples.
     #[inline(always)]
-    fn incline<V: Eight, const NX: usize>(&mut self, network: &Network, count: usize) {
+    fn incline<V: F64x8, const NX: usize>(&mut self, network: &Network, count: usize) {
         let used = (NX * (NX + 1)).div_ceil(LANES);
         network.slopes_of::<V, SLOPES>(&self.rises, &mut self.slopes[..count], used);
         for (slopes, (steepness, _)) in self.slopes.iter_mut().zip(self.outputs).take(count) {
@@ -206,10 +206,10 @@ impl Block {
 
     /// Takes all groups of a kind over the block, as many at a time as there are registers for.
     #[inline(always)]
-    fn pass_all<V: Eight, const NX: usize, S: Source<NX>>(
+    fn pass_all<V: F64x8, const NX: usize, S: Source<NX>>(
         &self,
         count: usize,
-        states: &mut [[Group; NX]],
+        states: &mut [[Lanes; NX]],
         source: impl Fn(usize) -> S,
         start: impl Fn(usize) -> usize,
         rows: &mut [f64],
@@ -231,10 +231,10 @@ impl Block {
 
     /// The columns of row `Q` of E, the first of which is `first`.
     #[inline(always)]
-    fn pass_row<V: Eight, const NX: usize, const Q: usize>(
+    fn pass_row<V: F64x8, const NX: usize, const Q: usize>(
         &self,
         part: &Part,
-        states: &mut [[Group; NX]],
+        states: &mut [[Lanes; NX]],
         first: usize,
         rows: &mut [f64],
     ) {
@@ -252,10 +252,10 @@ impl Block {
 
     /// Takes `GROUPS` groups of columns over the block; their parts of the rows begin at `starts`.
     #[inline(always)]
-    fn pass<V: Eight, const NX: usize, const GROUPS: usize>(
+    fn pass<V: F64x8, const NX: usize, const GROUPS: usize>(
         &self,
         count: usize,
-        states: &mut [[Group; NX]],
+        states: &mut [[Lanes; NX]],
         sources: [impl Source<NX>; GROUPS],
         starts: [usize; GROUPS],
         rows: &mut [f64],
@@ -306,7 +306,7 @@ impl Block {
 
 /// `sum + slope x`, where there is a sum.
 #[inline(always)]
-fn plus<V: Eight>(sum: Option<V>, slope: V, x: V) -> V {
+fn plus<V: F64x8>(sum: Option<V>, slope: V, x: V) -> V {
     match sum {
         Some(sum) => sum.add_product(slope, x),
         None => slope.mul(x),
@@ -316,7 +316,7 @@ fn plus<V: Eight>(sum: Option<V>, slope: V, x: V) -> V {
 impl Recursion<'_> {
     /// The whole run, block by block.
     #[inline(always)]
-    pub(super) fn blocks<V: Eight, const NX: usize>(self) {
+    pub(super) fn blocks<V: F64x8, const NX: usize>(self) {
         let Self {
             network,
             run,
@@ -360,7 +360,7 @@ impl Recursion<'_> {
 /// What the simulation left behind of a block, and its inputs and measured outputs.
 struct Part<'a> {
     states: &'a [f64],
-    hidden: &'a [Group],
+    hidden: &'a [Lanes],
     sums: &'a [f64],
     v: &'a [f64],
     y: &'a [f64],
@@ -369,7 +369,7 @@ struct Part<'a> {
 impl Sensitivities {
     /// All that the columns have in common; how many samples have a row.
     #[inline(always)]
-    fn prepare_block<V: Eight, const NX: usize>(
+    fn prepare_block<V: F64x8, const NX: usize>(
         &mut self,
         network: &Network,
         part: &Part,
@@ -404,7 +404,7 @@ impl Sensitivities {
 
     /// The columns of the hidden units' weights for states and inputs, and of their biases.
     #[inline(always)]
-    fn pass_arguments<V: Eight, const NX: usize>(&mut self, count: usize, rows: &mut [f64]) {
+    fn pass_arguments<V: F64x8, const NX: usize>(&mut self, count: usize, rows: &mut [f64]) {
         let (block, hidden) = (&self.block, self.columns.shape.hidden);
         let groups = block.direct.len();
         let (weighted, _) = block.weighted.as_chunks::<NX>();
@@ -422,7 +422,7 @@ impl Sensitivities {
 
     /// The columns of E.
     #[inline(always)]
-    fn pass_units<V: Eight, const NX: usize>(&mut self, part: &Part, rows: &mut [f64]) {
+    fn pass_units<V: F64x8, const NX: usize>(&mut self, part: &Part, rows: &mut [f64]) {
         let (states, _) = self.states.as_chunks_mut::<NX>();
         let groups = self.block.direct.len();
         let states = &mut states[self.block.arguments.len() * groups..];
@@ -439,7 +439,7 @@ impl Sensitivities {
 
     /// The columns of G, of `[A B x0]` and of `[C D c]`, and the error.
     #[inline(always)]
-    fn pass_rest<V: Eight, const NX: usize>(&mut self, part: &Part, rows: &mut [f64]) {
+    fn pass_rest<V: F64x8, const NX: usize>(&mut self, part: &Part, rows: &mut [f64]) {
         let (columns, block) = (self.columns, &self.block);
         let groups = block.direct.len();
         for (k, h) in part.hidden.chunks_exact(groups).enumerate().take(BLOCK) {

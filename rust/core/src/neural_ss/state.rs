@@ -3,7 +3,7 @@
 use super::network::{Network, Scratch, rises_of};
 use super::shape::Shape;
 use crate::lm::{cholesky, substitute};
-use crate::simd::{self, Eight, Kernel};
+use crate::simd::{self, F64x8, Kernel};
 use crate::{Error, Result};
 
 /// Steps of one descent, which almost always ends earlier.
@@ -263,7 +263,7 @@ impl Kernel for Evaluation<'_, '_> {
     type Output = f64;
 
     #[inline(always)]
-    fn run<V: Eight>(self) -> f64 {
+    fn run<V: F64x8>(self) -> f64 {
         let Self {
             posterior,
             x,
@@ -330,7 +330,7 @@ impl Kernel for Evaluation<'_, '_> {
 
 /// A step from `scratch.next`, and its slopes.
 #[inline(always)]
-pub(super) fn step_with_slopes<V: Eight>(network: &Network, scratch: &mut Scratch, v: &[f64]) {
+pub(super) fn step_with_slopes<V: F64x8>(network: &Network, scratch: &mut Scratch, v: &[f64]) {
     scratch.go_on(v);
     let Scratch {
         arguments,
@@ -397,7 +397,7 @@ impl Kernel for Step<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<V: Eight>(self) {
+    fn run<V: F64x8>(self) {
         step_with_slopes::<V>(self.network, self.scratch, self.v);
     }
 }
@@ -413,7 +413,7 @@ impl Kernel for Next<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<V: Eight>(self) {
+    fn run<V: F64x8>(self) {
         self.scratch.go_on(self.v);
         let Scratch {
             arguments,

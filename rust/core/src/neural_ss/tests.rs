@@ -337,7 +337,7 @@ impl simd::Kernel for Whole<'_> {
     type Output = (Trajectory, Vec<Vec<f64>>);
 
     #[inline(always)]
-    fn run<V: simd::Eight>(self) -> Self::Output {
+    fn run<V: simd::F64x8>(self) -> Self::Output {
         let shape = self.network.shape;
         let monitor = Monitor::default();
         let mut run = Trajectory::new(self.network, self.v.len() / shape.inputs);

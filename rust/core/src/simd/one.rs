@@ -64,7 +64,7 @@ impl Choice for f64 {
     }
 
     #[inline(always)]
-    fn size(self) -> Self {
+    fn abs(self) -> Self {
         self.abs()
     }
 

@@ -1,6 +1,6 @@
 //! Eight numbers as the baseline of any processor has them.
 
-use super::{Arithmetic, Choice, Eight, LANES};
+use super::{Arithmetic, Choice, F64x8, LANES};
 
 #[derive(Clone, Copy)]
 pub(super) struct Plain([f64; LANES]);
@@ -77,7 +77,7 @@ impl Choice for Plain {
     }
 
     #[inline(always)]
-    fn size(self) -> Self {
+    fn abs(self) -> Self {
         Self(self.0.map(f64::abs))
     }
 
@@ -116,7 +116,7 @@ impl Choice for Plain {
     }
 }
 
-impl Eight for Plain {
+impl F64x8 for Plain {
     const TILE: (usize, usize) = (2, 1);
 
     #[inline(always)]
@@ -131,7 +131,7 @@ impl Eight for Plain {
     }
 
     #[inline(always)]
-    fn size_up_to(self, limit: f64) -> Self {
+    fn abs_up_to(self, limit: f64) -> Self {
         // A comparison rather than `min`, which would turn NaN into a number.
         Self(
             self.0

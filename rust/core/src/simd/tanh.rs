@@ -21,7 +21,7 @@
 //! | `pieces` | AVX-512 | free runs: each waits for the last | chain of 36 cycles |
 //! | `sums` | AVX-512 | lanes: none waits, throughput counts | 20 operations, half a division |
 //!
-//! Measured end to end: `sums` took a candidate's step from 34.5 to 28.5 cycles (docs/PERFORMANCE.md, Zen 5). `pieces` depends on
+//! Measured end to end: `sums` takes a candidate's step from 34.5 to 28.5 cycles (docs/PERFORMANCE.md, Zen 5). `pieces` depends on
 //! the processor: counted, it saves 10 of 86 cycles of a free run's sample where a permutation of two registers takes 3 cycles; on a
 //! Zen 4, whose registers are half as wide inside, it saves nothing (`free_run` of the kernels' example, least of 300 calls: 22.17 ns with,
 //! 21.86 without). It may go when that is so on the processors that the figures are kept for.
@@ -35,7 +35,7 @@ use sewfast_control::model::tanh::{
     self, DENOMINATOR, NEAR_DENOMINATOR, NEAR_NUMERATOR, NUMERATOR,
 };
 
-use crate::simd::Eight;
+use crate::simd::F64x8;
 
 /// From here on `tanh` is 1 to the last bit.
 const SATURATED: f64 = tanh::FAR.end;
@@ -46,8 +46,8 @@ const NEAR: f64 = tanh::NEAR.end;
 ///
 /// A branch that is nearly always foretold keeps what large arguments need off the chain of dependent operations.
 #[inline(always)]
-pub(crate) fn tanh<V: Eight>(x: V) -> V {
-    let (size, limit) = (x.size(), V::splat(NEAR));
+pub(crate) fn tanh<V: F64x8>(x: V) -> V {
+    let (size, limit) = (x.abs(), V::splat(NEAR));
     let near = near(x);
     if size.are_less(limit) == u8::MAX {
         return near;
@@ -57,7 +57,7 @@ pub(crate) fn tanh<V: Eight>(x: V) -> V {
 
 /// `tanh(x)` below [`NEAR`], where the quotient stays below 1.
 #[inline(always)]
-fn near<V: Eight>(x: V) -> V {
+fn near<V: F64x8>(x: V) -> V {
     let s = x.mul(x);
     let s2 = s.mul(s);
     let s4 = s2.mul(s2);
@@ -79,7 +79,7 @@ fn near<V: Eight>(x: V) -> V {
 
 /// A polynomial of degree 7 in Estrin's form, its even and its odd coefficients apart.
 #[inline(always)]
-fn eight<V: Eight>(even: [V; 4], odd: [V; 4], s: V, s2: V, s4: V) -> V {
+fn eight<V: F64x8>(even: [V; 4], odd: [V; 4], s: V, s2: V, s4: V) -> V {
     let pair = |i: usize| even[i].add_product(odd[i], s);
     let low = pair(0).add_product(pair(1), s2);
     low.add_product(pair(2).add_product(pair(3), s2), s4)
@@ -89,7 +89,7 @@ fn eight<V: Eight>(even: [V; 4], odd: [V; 4], s: V, s2: V, s4: V) -> V {
 ///
 /// Beyond [`SATURATED`] the quotient is held and exceeds 1 with `x`, so that the last step gives +-1.
 #[inline(always)]
-fn far<V: Eight>(x: V) -> V {
+fn far<V: F64x8>(x: V) -> V {
     let s = x.mul(x).at_most(SATURATED * SATURATED);
     let s2 = s.mul(s);
     let s4 = s2.mul(s2);
@@ -109,7 +109,7 @@ struct Parts<V> {
     high: V,
 }
 
-impl<V: Eight> Parts<V> {
+impl<V: F64x8> Parts<V> {
     #[inline(always)]
     fn of(c: &[f64; 11], s: V, s2: V, s4: V) -> Self {
         let pair = |i: usize| V::splat(c[i]).add_product(V::splat(c[i + 1]), s);
@@ -147,7 +147,7 @@ const TAYLOR: [f64; 12] = [
 /// `1 - tanh(x)^2 = q (2 - q)` with `q = 1 - |tanh(x)| = 2/(exp(2|x|) + 1)`: near saturation the difference itself has
 /// lost its digits.
 #[inline(always)]
-pub(crate) fn rise<V: Eight>(x: V) -> V {
+pub(crate) fn rise<V: F64x8>(x: V) -> V {
     let two = V::splat(2.0);
     let q = two.div(growth(x).add(two));
     q.mul(two.sub(q))
@@ -155,9 +155,9 @@ pub(crate) fn rise<V: Eight>(x: V) -> V {
 
 /// `exp(2|x|) - 1`.
 #[inline(always)]
-fn growth<V: Eight>(x: V) -> V {
+fn growth<V: F64x8>(x: V) -> V {
     let one = V::splat(1.0);
-    let size = x.size_up_to(FLAT);
+    let size = x.abs_up_to(FLAT);
     let twice = size.add(size);
     let shifted = V::splat(ROUND).add_product(twice, V::splat(std::f64::consts::LOG2_E));
     let n = shifted.sub(V::splat(ROUND));
@@ -171,7 +171,7 @@ fn growth<V: Eight>(x: V) -> V {
 
 /// The Taylor sum in Estrin's form: short chains, so that a processor can do several things at once.
 #[inline(always)]
-fn series<V: Eight>(r: V) -> V {
+fn series<V: F64x8>(r: V) -> V {
     let r2 = r.mul(r);
     let r4 = r2.mul(r2);
     let pair = |i: usize| V::splat(TAYLOR[i]).add_product(V::splat(TAYLOR[i + 1]), r);
@@ -193,7 +193,7 @@ mod tests {
         type Output = [f64; LANES];
 
         #[inline(always)]
-        fn run<V: Eight>(self) -> Self::Output {
+        fn run<V: F64x8>(self) -> Self::Output {
             let mut values = self.0;
             rise(V::load(&values)).store(&mut values);
             values
@@ -206,7 +206,7 @@ mod tests {
         type Output = [f64; LANES];
 
         #[inline(always)]
-        fn run<V: Eight>(self) -> Self::Output {
+        fn run<V: F64x8>(self) -> Self::Output {
             let mut values = self.0;
             V::load(&values).tanh_in_chain().store(&mut values);
             values
@@ -220,7 +220,7 @@ mod tests {
         type Output = [f64; LANES];
 
         #[inline(always)]
-        fn run<V: Eight>(self) -> Self::Output {
+        fn run<V: F64x8>(self) -> Self::Output {
             let mut values = self.0;
             let own = V::load(&values);
             let other = own.mul(V::splat(0.3));
@@ -237,7 +237,7 @@ mod tests {
         type Output = ([f64; LANES], [f64; LANES]);
 
         #[inline(always)]
-        fn run<V: Eight>(self) -> Self::Output {
+        fn run<V: F64x8>(self) -> Self::Output {
             let (mut alone, mut four) = (self.0, self.0);
             V::load(&self.0).tanh_as_of_four().store(&mut alone);
             for half in [0, 4] {
@@ -277,7 +277,7 @@ mod tests {
         type Output = [f64; LANES];
 
         #[inline(always)]
-        fn run<V: Eight>(self) -> Self::Output {
+        fn run<V: F64x8>(self) -> Self::Output {
             let mut values = self.0;
             tanh(V::load(&values)).store(&mut values);
             values

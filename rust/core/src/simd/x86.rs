@@ -4,7 +4,7 @@
 
 use std::arch::x86_64::*;
 
-use super::{Arithmetic, Choice, Eight, Group, Kernel, LANES, tanh};
+use super::{Arithmetic, Choice, F64x8, Kernel, LANES, Lanes, tanh};
 
 /// What is beyond the nearest quarter; half way between two of them, beyond the even one.
 const BEYOND_QUARTERS: i32 = 2 << 4 | _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
@@ -30,7 +30,7 @@ pub(super) struct Wide(__m512d);
 impl Wide {
     /// Entries of a table, by the low four bits.
     #[inline(always)]
-    pub(super) fn pick(self, table: &[Group; 2]) -> Self {
+    pub(super) fn pick(self, table: &[Lanes; 2]) -> Self {
         let (low, high) = (Self::load(&table[0].0), Self::load(&table[1].0));
         // SAFETY: as `splat`.
         unsafe {
@@ -148,7 +148,7 @@ impl Choice for Wide {
     }
 
     #[inline(always)]
-    fn size(self) -> Self {
+    fn abs(self) -> Self {
         // SAFETY: as `splat`.
         unsafe { Self(_mm512_abs_pd(self.0)) }
     }
@@ -184,7 +184,7 @@ impl Choice for Wide {
     }
 }
 
-impl Eight for Wide {
+impl F64x8 for Wide {
     const TILE: (usize, usize) = (8, 3);
 
     #[inline(always)]
@@ -203,7 +203,7 @@ impl Eight for Wide {
     }
 
     #[inline(always)]
-    fn size_up_to(self, limit: f64) -> Self {
+    fn abs_up_to(self, limit: f64) -> Self {
         // SAFETY: as `splat`.
         unsafe {
             let (size, limit) = (_mm512_abs_pd(self.0), _mm512_set1_pd(limit));
@@ -369,7 +369,7 @@ impl Choice for Halves {
     }
 
     #[inline(always)]
-    fn size(self) -> Self {
+    fn abs(self) -> Self {
         // SAFETY: as `splat`.
         let one = |v: __m256d| unsafe { _mm256_andnot_pd(_mm256_set1_pd(-0.0), v) };
         Self(one(self.0), one(self.1))
@@ -414,7 +414,7 @@ impl Choice for Halves {
     }
 }
 
-impl Eight for Halves {
+impl F64x8 for Halves {
     const TILE: (usize, usize) = (4, 1);
 
     #[inline(always)]
@@ -434,7 +434,7 @@ impl Eight for Halves {
     }
 
     #[inline(always)]
-    fn size_up_to(self, limit: f64) -> Self {
+    fn abs_up_to(self, limit: f64) -> Self {
         // SAFETY: as `splat`.
         let one = |v: __m256d| unsafe {
             let size = _mm256_andnot_pd(_mm256_set1_pd(-0.0), v);

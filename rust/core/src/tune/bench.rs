@@ -5,7 +5,7 @@ use sewfast_control::{Controller, Design, Settings};
 use super::beside::{Beside, Runs};
 use super::cost::{Measure, Terms, Weights};
 use super::{Aggregate, LoadLimit, Task};
-use crate::closed_loop::lanes::MOST;
+use crate::closed_loop::batch::MOST;
 use crate::closed_loop::{Outcome, Plant, Run};
 use crate::search::Judgement;
 use crate::{Monitor, Result};
@@ -222,7 +222,7 @@ impl<P: Plant + Clone> Bench<P> {
         let signals = task.signals(run);
         let (plant, encoder) = (&mut self.plants[plant], task.encoder.as_ref());
         self.run
-            .record_by(plant, controller, signals, encoder, monitor, true);
+            .record_with(plant, controller, signals, encoder, monitor);
         if self.run.outcome != Outcome::Completed || monitor.stopped() {
             return None;
         }

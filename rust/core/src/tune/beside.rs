@@ -5,15 +5,15 @@ use sewfast_control::Controller;
 use super::LoadStep;
 use super::cost::{Course, Measure, SMOOTHING, Terms};
 use crate::Monitor;
-use crate::closed_loop::lanes::{Lanes, MOST, Sums, Tally};
-use crate::closed_loop::{Known, Outcome, Signals};
+use crate::closed_loop::batch::{BatchLoop, MOST, Sums, Tally};
+use crate::closed_loop::{KernelPlant, Outcome, Signals};
 use crate::encoder::Encoder;
 use crate::metrics::Edge;
-use crate::simd::{self, Eight, Group, Kernel, LANES};
+use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
 
 /// What several controllers are run on.
 pub(super) struct Runs<'a> {
-    pub known: Known<'a>,
+    pub known: KernelPlant<'a>,
     pub signals: Signals<'a>,
     pub encoder: Option<&'a Encoder>,
     /// The load step that the runs are about, else ...
@@ -34,7 +34,7 @@ impl Beside {
     /// Whether controllers can be run side by side, and had better be.
     pub fn take(controllers: &[&Controller<f64>]) -> bool {
         let ts = controllers.first().map(|c| c.settings().ts);
-        let alike = |c: &&Controller<f64>| Some(c.settings().ts) == ts && Lanes::take(c);
+        let alike = |c: &&Controller<f64>| Some(c.settings().ts) == ts && BatchLoop::takes(c);
         controllers.len() > 1 && controllers.iter().all(alike)
     }
 
@@ -66,7 +66,7 @@ impl Beside {
         for (tally, group) in self.tallies.iter_mut().zip(groups) {
             tally.begin(group, kept);
         }
-        let lanes = Lanes {
+        let lanes = BatchLoop {
             known: runs.known,
             controllers,
             signals: runs.signals,
@@ -88,7 +88,7 @@ impl Beside {
     }
 
     /// The terms of the run in lane `i`.
-    fn lane(&mut self, runs: &Runs<'_>, i: usize, ts: f64, overshoots: &[Group]) -> Terms {
+    fn lane(&mut self, runs: &Runs<'_>, i: usize, ts: f64, overshoots: &[Lanes]) -> Terms {
         let (tally, reference) = (&self.tallies[i / LANES], runs.signals.reference);
         let sums = tally.sums(i % LANES);
         if let Some(load) = runs.load {
@@ -110,7 +110,7 @@ impl Beside {
     }
 
     /// Overshoots of all lanes, where nothing else of the outputs' course is asked for.
-    fn overshoots(&self, runs: &Runs<'_>, ts: f64, used: usize) -> Vec<Group> {
+    fn overshoots(&self, runs: &Runs<'_>, ts: f64, used: usize) -> Vec<Lanes> {
         let Some(Course::Overshoot(edge)) = runs.measure.map(|m| m.course()) else {
             return Vec::new();
         };
@@ -141,16 +141,16 @@ fn summed(sums: &Sums, samples: usize) -> Terms {
 
 /// [`Edge::overshoot_percent`] after [`smooth`](crate::metrics::smooth), of eight outputs.
 struct Overshoots<'a> {
-    y: &'a [Group],
+    y: &'a [Lanes],
     edge: Edge,
     half: usize,
 }
 
 impl Kernel for Overshoots<'_> {
-    type Output = Group;
+    type Output = Lanes;
 
     #[inline(always)]
-    fn run<V: Eight>(self) -> Group {
+    fn run<V: F64x8>(self) -> Lanes {
         let Self { y, edge, half } = self;
         let falls = edge.high < edge.low;
         let whole = 2 * half + 1;
@@ -176,7 +176,7 @@ impl Kernel for Overshoots<'_> {
             highest = highest.at_least_each(share(&edge, extreme, whole));
         }
         let excess = highest.sub(V::splat(1.0)).at_least(0.0);
-        let mut percent = Group::ZERO;
+        let mut percent = Lanes::ZERO;
         V::splat(100.0).mul(excess).store(&mut percent.0);
         percent
     }
@@ -184,7 +184,7 @@ impl Kernel for Overshoots<'_> {
 
 /// Where the mean of a window lies between the edge's levels.
 #[inline(always)]
-fn share<V: Eight>(edge: &Edge, sum: V, samples: usize) -> V {
+fn share<V: F64x8>(edge: &Edge, sum: V, samples: usize) -> V {
     let mean = sum.div(V::splat(samples as f64));
     mean.sub(V::splat(edge.low))
         .div(V::splat(edge.high - edge.low))

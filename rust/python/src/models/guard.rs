@@ -23,15 +23,16 @@ fn guard(
     linear: Vec<PyRef<'_, LinearModel>>,
 ) -> PyResult<&'static str> {
     let experiments = recordings(py, &experiments)?;
-    let linear: Vec<linear::LinearModel> = linear.iter().map(|m| m.inner.clone()).collect();
+    let linear: Vec<linear::LinearModel> =
+        linear.iter().map(|m| m.inner.as_ref().clone()).collect();
     let found = if let Ok(model) = model.cast::<LinearModel>() {
-        let model = &model.get().inner;
+        let model = model.get().inner.as_ref();
         watched(py, None, |m| verdict(model, &experiments, &linear, m))
     } else if let Ok(model) = model.cast::<NeuralOE>() {
-        let model = &model.get().inner;
+        let model = model.get().inner.as_ref();
         watched(py, None, |m| verdict(model, &experiments, &linear, m))
     } else if let Ok(model) = model.cast::<NeuralSS>() {
-        let model = &model.get().inner;
+        let model = model.get().inner.as_ref();
         watched(py, None, |m| verdict(model, &experiments, &linear, m))
     } else {
         Err(PyTypeError::new_err(format!(

@@ -1,12 +1,13 @@
 //! Bindings of the linear model and its fits.
 
+use std::sync::Arc;
+
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use sewfast_core::lagged::Lagged;
 use sewfast_core::{Error, arx, iv, linear, linear_fit, oe};
 
-use super::embedded::EmbeddedModel;
-use super::{Matrices, Rows, RunAndJacobian, Values};
+use super::{Kind, Model, Rows, Values};
 use crate::arrays::{Experiments, array1, array2, raise, records, rows, samples, slice};
 use crate::watch::watched;
 
@@ -19,20 +20,34 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
 }
 
 /// A linear difference equation with offset.
-#[pyclass(frozen, module = "sewfast._core")]
+#[pyclass(frozen, extends = Model, module = "sewfast._core")]
 pub struct LinearModel {
     /// The model itself.
-    pub inner: linear::LinearModel,
+    pub inner: Arc<linear::LinearModel>,
+}
+
+impl Kind for LinearModel {
+    type Inner = linear::LinearModel;
+
+    fn of(inner: Arc<Self::Inner>) -> Self {
+        Self { inner }
+    }
 }
 
 #[pymethods]
 impl LinearModel {
     #[new]
-    fn new(py: Python<'_>, a: Values<'_>, b: Rows<'_>, nk: usize, offset: f64) -> PyResult<Self> {
+    fn new(
+        py: Python<'_>,
+        a: Values<'_>,
+        b: Rows<'_>,
+        nk: usize,
+        offset: f64,
+    ) -> PyResult<PyClassInitializer<Self>> {
         let channels = b.as_array().nrows();
         let (b, _) = rows(&b, "b")?;
         linear::LinearModel::new(slice(&a, "a")?.to_vec(), b.to_vec(), channels, nk, offset)
-            .map(|inner| Self { inner })
+            .map(Self::wrapped)
             .map_err(|e| raise(py, e))
     }
 
@@ -61,10 +76,6 @@ impl LinearModel {
         self.inner.lags().na
     }
 
-    fn embedded(&self) -> EmbeddedModel {
-        EmbeddedModel::of(self.inner.embedded())
-    }
-
     #[getter]
     fn is_stable(&self) -> bool {
         self.inner.is_stable()
@@ -83,64 +94,6 @@ impl LinearModel {
     fn dc_gain<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         array1(py, self.inner.dc_gain())
     }
-
-    fn rest_state<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        array1(py, vec![0.0; self.inner.lags().na])
-    }
-
-    fn simulate<'py>(
-        &self,
-        py: Python<'py>,
-        u: Rows<'py>,
-        y_past: Values<'py>,
-    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
-        Ok(array1(py, super::simulate(py, &self.inner, &u, &y_past)?))
-    }
-
-    fn predict<'py>(
-        &self,
-        py: Python<'py>,
-        u: Rows<'py>,
-        y: Values<'py>,
-        y_past: Values<'py>,
-        horizon: usize,
-    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
-        let run = super::predict(py, &self.inner, &u, &y, &y_past, horizon)?;
-        Ok(array1(py, run))
-    }
-
-    fn estimate_initial_state<'py>(
-        &self,
-        py: Python<'py>,
-        u: Rows<'py>,
-        y: Values<'py>,
-    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
-        Ok(array1(py, super::initial_state(py, &self.inner, &u, &y)?))
-    }
-
-    fn linearise<'py>(
-        &self,
-        py: Python<'py>,
-        u: Values<'py>,
-        state: Values<'py>,
-    ) -> PyResult<Matrices<'py>> {
-        let found = self
-            .inner
-            .linearise(slice(&u, "u")?, slice(&state, "state")?);
-        super::matrices(py, found)
-    }
-
-    fn jacobian<'py>(
-        &self,
-        py: Python<'py>,
-        u: Rows<'py>,
-        y_past: Values<'py>,
-    ) -> PyResult<RunAndJacobian<'py>> {
-        let ((u, channels), y_past) = (rows(&u, "u")?, slice(&y_past, "y_past")?);
-        let (run, jacobian) = super::released(py, || self.inner.jacobian(u, channels, y_past))?;
-        let columns = self.inner.parameters() + self.inner.lags().na;
-        Ok((array1(py, run), array2(py, jacobian, columns)?))
-    }
 }
 
 /// A fitted linear model with the story of its fit.
@@ -151,10 +104,8 @@ pub struct LinearFit {
 
 fit_methods!(LinearFit {
     #[getter]
-    fn model(&self) -> LinearModel {
-        LinearModel {
-            inner: self.inner.model.clone(),
-        }
+    fn model(&self, py: Python<'_>) -> PyResult<Py<LinearModel>> {
+        LinearModel::object(py, self.inner.model.clone())
     }
 
     #[getter]
@@ -184,10 +135,10 @@ fn fit_arx(
     nb: usize,
     nk: usize,
     offset: bool,
-) -> PyResult<LinearModel> {
+) -> PyResult<Py<LinearModel>> {
     let samples = samples(py, &experiments)?;
     let inner = super::released(py, || arx::fit_samples(&samples, na, nb, nk, offset))?;
-    Ok(LinearModel { inner })
+    LinearModel::object(py, inner)
 }
 
 #[pyfunction]
@@ -208,7 +159,7 @@ fn fit_oe(
 ) -> PyResult<LinearFit> {
     let records = records(py, &experiments)?;
     let initial = initial.map(|m| m.inner.clone());
-    if let Some(lags) = initial.as_ref().map(Lagged::lags)
+    if let Some(lags) = initial.as_ref().map(|m| m.lags())
         && (lags.na, lags.nb, lags.nk) != (na, nb, nk)
     {
         return Err(raise(

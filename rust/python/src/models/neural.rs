@@ -1,5 +1,7 @@
 //! Bindings of the network output-error model and its training.
 
+use std::sync::Arc;
+
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -7,9 +9,8 @@ use sewfast_core::lagged::{Lagged, Lags};
 use sewfast_core::neural::{self, InitialState, Scaling, Settings, Shape};
 use sewfast_core::{Error, Result};
 
-use super::embedded::EmbeddedModel;
 use super::linear::LinearModel;
-use super::{Matrices, Rows, RunAndJacobian, Values};
+use super::{Kind, Model, Rows, Values};
 use crate::arrays::{Experiments, array1, array2, raise, records, rows, slice};
 use crate::watch::watched;
 
@@ -20,10 +21,18 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
 }
 
 /// Network output-error model.
-#[pyclass(frozen, module = "sewfast._core")]
+#[pyclass(frozen, extends = Model, module = "sewfast._core")]
 pub struct NeuralOE {
     /// The model itself.
-    pub inner: neural::NeuralOE,
+    pub inner: Arc<neural::NeuralOE>,
+}
+
+impl Kind for NeuralOE {
+    type Inner = neural::NeuralOE;
+
+    fn of(inner: Arc<Self::Inner>) -> Self {
+        Self { inner }
+    }
 }
 
 #[pymethods]
@@ -46,7 +55,7 @@ impl NeuralOE {
         y_scale: f64,
         output_low: Option<f64>,
         output_high: Option<f64>,
-    ) -> PyResult<Self> {
+    ) -> PyResult<PyClassInitializer<Self>> {
         let scaling = Scaling {
             u_mean: slice(&u_mean, "u_mean")?.to_vec(),
             u_scale: slice(&u_scale, "u_scale")?.to_vec(),
@@ -61,13 +70,8 @@ impl NeuralOE {
         Lags::new(na, nb, nk, n_inputs)
             .and_then(|lags| Shape::new(lags, hidden, bypass))
             .and_then(|shape| neural::NeuralOE::new(shape, theta, scaling, limits))
-            .map(|inner| Self { inner })
+            .map(Self::wrapped)
             .map_err(|e| raise(py, e))
-    }
-
-    #[getter]
-    fn theta<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        array1(py, self.inner.theta().to_vec())
     }
 
     #[getter]
@@ -90,72 +94,9 @@ impl NeuralOE {
         Ok(settings)
     }
 
-    #[pyo3(signature = (*, scaled=false))]
-    fn embedded(&self, scaled: bool) -> EmbeddedModel {
-        EmbeddedModel::of(self.inner.embedded(scaled))
-    }
-
     #[getter]
     fn na(&self) -> usize {
         self.inner.lags().na
-    }
-
-    fn rest_state<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        array1(py, vec![0.0; self.inner.lags().na])
-    }
-
-    fn simulate<'py>(
-        &self,
-        py: Python<'py>,
-        u: Rows<'py>,
-        y_past: Values<'py>,
-    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
-        Ok(array1(py, super::simulate(py, &self.inner, &u, &y_past)?))
-    }
-
-    fn predict<'py>(
-        &self,
-        py: Python<'py>,
-        u: Rows<'py>,
-        y: Values<'py>,
-        y_past: Values<'py>,
-        horizon: usize,
-    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
-        let run = super::predict(py, &self.inner, &u, &y, &y_past, horizon)?;
-        Ok(array1(py, run))
-    }
-
-    fn estimate_initial_state<'py>(
-        &self,
-        py: Python<'py>,
-        u: Rows<'py>,
-        y: Values<'py>,
-    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
-        Ok(array1(py, super::initial_state(py, &self.inner, &u, &y)?))
-    }
-
-    fn linearise<'py>(
-        &self,
-        py: Python<'py>,
-        u: Values<'py>,
-        state: Values<'py>,
-    ) -> PyResult<Matrices<'py>> {
-        let found = self
-            .inner
-            .linearise(slice(&u, "u")?, slice(&state, "state")?);
-        super::matrices(py, found)
-    }
-
-    fn jacobian<'py>(
-        &self,
-        py: Python<'py>,
-        u: Rows<'py>,
-        y_past: Values<'py>,
-    ) -> PyResult<RunAndJacobian<'py>> {
-        let ((u, channels), y_past) = (rows(&u, "u")?, slice(&y_past, "y_past")?);
-        let (run, jacobian) = super::released(py, || self.inner.jacobian(u, channels, y_past))?;
-        let columns = self.inner.theta().len() + self.inner.lags().na;
-        Ok((array1(py, run), array2(py, jacobian, columns)?))
     }
 }
 
@@ -167,18 +108,14 @@ pub struct NeuralFit {
 
 started_fit_methods!(NeuralFit {
     #[getter]
-    fn model(&self) -> NeuralOE {
-        NeuralOE {
-            inner: self.inner.model.clone(),
-        }
+    fn model(&self, py: Python<'_>) -> PyResult<Py<NeuralOE>> {
+        NeuralOE::object(py, self.inner.model.clone())
     }
 
     #[getter]
-    fn models(&self) -> Vec<NeuralOE> {
-        let model = |inner: &neural::NeuralOE| NeuralOE {
-            inner: inner.clone(),
-        };
-        self.inner.models.iter().map(model).collect()
+    fn models(&self, py: Python<'_>) -> PyResult<Vec<Py<NeuralOE>>> {
+        let models = self.inner.models.iter();
+        models.map(|m| NeuralOE::object(py, m.clone())).collect()
     }
 
     #[getter]
@@ -238,7 +175,7 @@ fn fit_neural_oe(
         nb,
         nk,
         hidden,
-        linear: linear.map(|l| l.inner.clone()),
+        linear: linear.map(|l| l.inner.as_ref().clone()),
         scaling,
         saturate,
         initial_state: parsed(initial_state).map_err(|e| raise(py, e))?,

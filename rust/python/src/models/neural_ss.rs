@@ -1,5 +1,7 @@
 //! Bindings of the neural state-space model and its training.
 
+use std::sync::Arc;
+
 use numpy::{PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -8,9 +10,8 @@ use sewfast_core::neural_ss::{
 };
 use sewfast_core::{Error, Result};
 
-use super::embedded::EmbeddedModel;
 use super::linear::LinearModel;
-use super::{Matrices, Rows, Values};
+use super::{Kind, Model, Rows, Values};
 use crate::arrays::{Experiment, array1, array2, raise, rows, slice};
 use crate::watch::watched;
 
@@ -27,10 +28,18 @@ pub(super) type Experiments<'py> = Vec<Experiment<'py, Outputs<'py>>>;
 type Array<'py> = Bound<'py, PyArrayDyn<f64>>;
 
 /// Neural state-space model.
-#[pyclass(frozen, module = "sewfast._core")]
+#[pyclass(frozen, extends = Model, module = "sewfast._core")]
 pub struct NeuralSS {
     /// The model itself.
-    pub inner: neural_ss::NeuralSS,
+    pub inner: Arc<neural_ss::NeuralSS>,
+}
+
+impl Kind for NeuralSS {
+    type Inner = neural_ss::NeuralSS;
+
+    fn of(inner: Arc<Self::Inner>) -> Self {
+        Self { inner }
+    }
 }
 
 #[pymethods]
@@ -60,7 +69,7 @@ impl NeuralSS {
         state_covariance: Rows<'_>,
         residual_variance: Values<'_>,
         process_noise: f64,
-    ) -> PyResult<Self> {
+    ) -> PyResult<PyClassInitializer<Self>> {
         let shape = Shape {
             nx,
             nk,
@@ -84,18 +93,8 @@ impl NeuralSS {
         let theta = slice(&theta, "theta")?.to_vec();
         OutputFunction::new(output, slice(&output_parameters, "output_parameters")?)
             .and_then(|output| neural_ss::NeuralSS::new(shape, output, theta, scaling, statistics))
-            .map(|inner| Self { inner })
+            .map(Self::wrapped)
             .map_err(|e| raise(py, e))
-    }
-
-    #[getter]
-    fn theta<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        array1(py, self.inner.theta().to_vec())
-    }
-
-    fn embedded(&self, py: Python<'_>) -> PyResult<EmbeddedModel> {
-        let made = self.inner.embedded();
-        made.map(EmbeddedModel::of).map_err(|e| raise(py, e))
     }
 
     #[getter]
@@ -134,18 +133,14 @@ impl NeuralSS {
         Ok(settings)
     }
 
-    fn slowed(&self, py: Python<'_>, factor: f64) -> PyResult<Self> {
+    fn slowed(&self, py: Python<'_>, factor: f64) -> PyResult<Py<Self>> {
         let slowed = self.inner.slowed(factor);
-        slowed.map(|inner| Self { inner }).map_err(|e| raise(py, e))
+        Self::object(py, slowed.map_err(|e| raise(py, e))?)
     }
 
-    fn grown(&self, py: Python<'_>, nx: usize, hidden: usize, seed: u64) -> PyResult<Self> {
+    fn grown(&self, py: Python<'_>, nx: usize, hidden: usize, seed: u64) -> PyResult<Py<Self>> {
         let grown = self.inner.grown(nx, hidden, seed);
-        grown.map(|inner| Self { inner }).map_err(|e| raise(py, e))
-    }
-
-    fn rest_state<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        array1(py, py.detach(|| self.inner.rest_state()))
+        Self::object(py, grown.map_err(|e| raise(py, e))?)
     }
 
     fn simulate<'py>(
@@ -193,18 +188,6 @@ impl NeuralSS {
         let ((u, channels), (y, _)) = (rows(&u, "u")?, outputs(py, &y)?);
         let state = super::released(py, || self.inner.estimate_initial_state(u, channels, y))?;
         Ok(array1(py, state))
-    }
-
-    fn linearise<'py>(
-        &self,
-        py: Python<'py>,
-        u: Values<'py>,
-        state: Values<'py>,
-    ) -> PyResult<Matrices<'py>> {
-        let found = self
-            .inner
-            .linearise(slice(&u, "u")?, slice(&state, "state")?);
-        super::matrices(py, found)
     }
 
     fn jacobian<'py>(
@@ -286,27 +269,23 @@ pub struct NeuralSSFit {
     inner: neural_ss::NeuralSSFit,
 }
 
-fn wrapped(inner: &neural_ss::NeuralSS) -> NeuralSS {
-    NeuralSS {
-        inner: inner.clone(),
-    }
-}
-
 started_fit_methods!(NeuralSSFit {
     #[getter]
-    fn model(&self) -> NeuralSS {
-        wrapped(&self.inner.model)
+    fn model(&self, py: Python<'_>) -> PyResult<Py<NeuralSS>> {
+        NeuralSS::object(py, self.inner.model.clone())
     }
 
     #[getter]
-    fn models(&self) -> Vec<NeuralSS> {
-        self.inner.models.iter().map(wrapped).collect()
+    fn models(&self, py: Python<'_>) -> PyResult<Vec<Py<NeuralSS>>> {
+        let models = self.inner.models.iter();
+        models.map(|m| NeuralSS::object(py, m.clone())).collect()
     }
 
     #[getter]
-    fn start_models(&self) -> Vec<Option<NeuralSS>> {
+    fn start_models(&self, py: Python<'_>) -> PyResult<Vec<Option<Py<NeuralSS>>>> {
+        let object = |m: &neural_ss::NeuralSS| NeuralSS::object(py, m.clone());
         let models = self.inner.start_models.iter();
-        models.map(|model| model.as_ref().map(wrapped)).collect()
+        models.map(|m| m.as_ref().map(object).transpose()).collect()
     }
 
     #[getter]
@@ -356,8 +335,8 @@ fn fit_neural_ss(
         nx,
         nk,
         hidden,
-        linear: linear.map(|l| l.inner.clone()),
-        initial: initial.iter().map(|m| m.inner.clone()).collect(),
+        linear: linear.map(|l| l.inner.as_ref().clone()),
+        initial: initial.iter().map(|m| m.inner.as_ref().clone()).collect(),
         output: output.map_err(|e| raise(py, e))?,
         integrator,
         weight_decay,

@@ -26,9 +26,9 @@ fn side_by_side<const RUNS: usize>(
     u: &[f64],
     y: &[f64],
     limit: f64,
-) -> [(Option<f64>, Vec<f64>, Vec<Group>); RUNS] {
+) -> [(Option<f64>, Vec<f64>, Vec<Lanes>); RUNS] {
     let groups = networks[0].shape.groups();
-    let mut kept = networks.map(|_| (vec![0.0; SAMPLES], vec![Group::ZERO; SAMPLES * groups]));
+    let mut kept = networks.map(|_| (vec![0.0; SAMPLES], vec![Lanes::ZERO; SAMPLES * groups]));
     let mut left = networks.into_iter();
     let limit = Limit {
         limit,

@@ -3,16 +3,16 @@
 //! Loops count by hand: the calls of an iterator that the compiler leaves would empty the wide registers.
 
 use super::Network;
-use crate::simd::{Eight, Group, LANES};
+use crate::simd::{F64x8, LANES, Lanes};
 
 impl Network {
-    /// The outputs for eight regressors, lane by lane; each to the bit what [`next`](Self::next) gives for it with `BITS`.
+    /// The outputs for eight regressors, lane by lane; each to the bit what [`next`](Self::next) gives for it.
     ///
     /// `N` is the number of regressors, 0 for any. Some of other work is done after each hidden unit.
     #[inline(always)]
-    pub(crate) fn beside<V: Eight, const N: usize>(
+    pub(crate) fn beside<V: F64x8, const N: usize>(
         &self,
-        phi: &[Group],
+        phi: &[Lanes],
         meanwhile: &mut impl Meanwhile,
     ) -> V {
         let n = if N == 0 { phi.len() } else { N };
@@ -36,42 +36,30 @@ impl Network {
         }
     }
 
-    /// The output for the regressor `phi` alone.
-    ///
-    /// `N` is the number of regressors, 0 for any. `BITS` asks for the bits of [`beside`](Self::beside), else the result is
-    /// there sooner after the newest command, which is at the place `past` of `phi`.
+    /// The output for the regressor `phi` alone; `N` is the number of regressors, 0 for any.
     #[inline(always)]
-    pub(crate) fn next<V: Eight, const N: usize, const BITS: bool>(
-        &self,
-        phi: &[f64],
-        past: usize,
-    ) -> f64 {
+    pub(crate) fn next<V: F64x8, const N: usize>(&self, phi: &[f64]) -> f64 {
         let n = if N == 0 { phi.len() } else { N };
-        let last = if BITS { 0 } else { past };
         let (phi, groups) = (&phi[..n], self.second.len());
         let mut sum = V::load(&self.bias[groups].0);
         if self.shape.bypass {
-            sum = together::<V>(sum, &self.first[groups * n..][..n], phi, last);
+            sum = together::<V>(sum, &self.first[groups * n..][..n], phi);
         }
         for group in 0..groups {
             let z = V::load(&self.bias[group].0);
-            let z = together::<V>(z, &self.first[group * n..][..n], phi, last);
-            let h = if BITS {
-                z.tanh_as_of_four()
-            } else {
-                z.tanh_in_chain()
-            };
-            sum = sum.add_product(V::load(&self.second[group].0), h);
+            let z = together::<V>(z, &self.first[group * n..][..n], phi);
+            let second = V::load(&self.second[group].0);
+            sum = sum.add_product(second, z.tanh_as_of_four());
         }
         self.limited(sum.sum())
     }
 
     /// Adds what the hidden units from `FIRST` on give, four of one group.
     #[inline(always)]
-    fn four<V: Eight, const FIRST: usize>(
+    fn four<V: F64x8, const FIRST: usize>(
         &self,
         group: usize,
-        phi: &[Group],
+        phi: &[Lanes],
         sums: &mut [V; LANES],
     ) {
         let weights = &self.first[group * phi.len()..][..phi.len()];
@@ -92,7 +80,7 @@ impl Network {
 
     /// What reaches the output past the hidden units.
     #[inline(always)]
-    fn direct<V: Eight>(&self, phi: &[Group]) -> V {
+    fn direct<V: F64x8>(&self, phi: &[Lanes]) -> V {
         let groups = self.second.len();
         if !self.shape.bypass {
             return V::splat(self.bias[groups].0[0]);
@@ -120,7 +108,7 @@ impl Meanwhile for Nothing {
 
 /// The argument of one hidden unit for eight regressors, the newest output last.
 #[inline(always)]
-fn argument<V: Eight>(bias: f64, weights: &[Group], unit: usize, phi: &[Group]) -> V {
+fn argument<V: F64x8>(bias: f64, weights: &[Lanes], unit: usize, phi: &[Lanes]) -> V {
     let (mut z, mut c) = (V::splat(bias), phi.len());
     while c > 0 {
         c -= 1;
@@ -129,22 +117,20 @@ fn argument<V: Eight>(bias: f64, weights: &[Group], unit: usize, phi: &[Group]) 
     z
 }
 
-/// The arguments of eight hidden units for one regressor, the entry at `last` as the last.
+/// The arguments of eight hidden units for one regressor, the newest output last.
 #[inline(always)]
-fn together<V: Eight>(bias: V, weights: &[Group], phi: &[f64], last: usize) -> V {
+fn together<V: F64x8>(bias: V, weights: &[Lanes], phi: &[f64]) -> V {
     let (mut z, mut c) = (bias, phi.len());
     while c > 0 {
         c -= 1;
-        if c != last {
-            z = z.add_product(V::load(&weights[c].0), V::splat(phi[c]));
-        }
+        z = z.add_product(V::load(&weights[c].0), V::splat(phi[c]));
     }
-    z.add_product(V::load(&weights[last].0), V::splat(phi[last]))
+    z
 }
 
-/// The sums of [`Eight::sum`], in its order.
+/// The sums of [`F64x8::sum`], in its order.
 #[inline(always)]
-fn in_halves<V: Eight>(v: [V; LANES]) -> V {
+fn in_halves<V: F64x8>(v: [V; LANES]) -> V {
     let even = v[0].add(v[4]).add(v[2].add(v[6]));
     even.add(v[1].add(v[5]).add(v[3].add(v[7])))
 }

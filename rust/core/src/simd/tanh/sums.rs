@@ -11,7 +11,7 @@
 //! rounded argument. Because p has degree 4 only, the whole is 20 operations; the division is shared by two results,
 //! `1/(d1 d2)` giving `d2/(d1 d2)` and `d1/(d1 d2)`, since a division takes as long as 8 products and there is one unit for it.
 
-use crate::simd::Group;
+use crate::simd::Lanes;
 use crate::simd::x86::Wide;
 use crate::simd::{Arithmetic, Choice};
 
@@ -30,12 +30,12 @@ const BEYOND: [f64; 5] = [
 
 /// `tanh` of 0, 1/4, 1/2 ... 15/4.
 #[rustfmt::skip]
-static OF_QUARTERS: [Group; 2] = [
-    Group([
+static OF_QUARTERS: [Lanes; 2] = [
+    Lanes([
         0.0, 0.24491866240370913, 0.46211715726000974, 0.6351489523872873,
         0.7615941559557649, 0.8482836399575129, 0.9051482536448664, 0.9413755384972874,
     ]),
-    Group([
+    Lanes([
         0.9640275800758169, 0.9780261147388136, 0.9866142981514303, 0.9918597245682077,
         0.9950547536867305, 0.996997635486526, 0.9981778976111987, 0.9988944427261528,
     ]),
@@ -92,7 +92,7 @@ struct Parts {
 impl Parts {
     #[inline(always)]
     fn of(x: Wide) -> Self {
-        let size = x.size();
+        let size = x.abs();
         let quarters = size.add(Wide::splat(QUARTERS)).pick(&OF_QUARTERS);
         let t = size.beyond_quarters();
         let t2 = t.mul(t);

@@ -2,7 +2,6 @@
 
 use sewfast_control::{Controller, Numbers};
 
-use super::average::Averages;
 use crate::simd::{Choice, LANES};
 
 /// A derivative term below this is nothing: in a loop at rest it would fade on for ever among numbers so small that processors
@@ -166,13 +165,13 @@ impl<V: Choice> Controllers<V> {
         if let Some(change) = self.change {
             u = limited(u, self.u.sub(change), self.u.add(change));
         }
-        let fading = derivative.size().if_less(V::splat(FADED), zero, derivative);
+        let fading = derivative.abs().if_less(V::splat(FADED), zero, derivative);
         let new = [u, self.kept(integral, u.sub(wanted)), fading, input];
         // 0 where both are finite, else NaN
         let sound = wanted.mul(zero).add(input.mul(zero));
         let old = [self.u, self.integral, self.derivative, self.input];
         [self.u, self.integral, self.derivative, self.input] =
-            if sound.size().are_less(V::splat(1.0)) == V::ALL {
+            if sound.abs().are_less(V::splat(1.0)) == V::ALL {
                 new
             } else {
                 [
@@ -202,4 +201,79 @@ impl<V: Choice> Controllers<V> {
 #[inline(always)]
 fn limited<V: Choice>(value: V, low: V, high: V) -> V {
     value.at_least_each(low).at_most_each(high)
+}
+
+/// Eight of [`sewfast_control::filter::MovingAverage`].
+struct Averages<V> {
+    /// Room for the longest; beyond a lane's own length there are zeros, which a sum does not feel.
+    slots: Vec<V>,
+    lengths: V,
+    /// The length of all, where it is the same.
+    common: bool,
+    /// Where the next sample goes.
+    next: usize,
+    /// The same by lane, where lengths differ.
+    nexts: V,
+}
+
+impl<V: Choice> Averages<V> {
+    #[inline(always)]
+    fn new(lengths: [usize; LANES]) -> Self {
+        let longest = lengths.into_iter().max().unwrap_or(1);
+        Self {
+            slots: vec![V::splat(0.0); longest],
+            lengths: V::load(&lengths.map(|n| n as f64)),
+            common: lengths == [longest; LANES],
+            next: 0,
+            nexts: V::splat(0.0),
+        }
+    }
+
+    /// Takes samples, gives the averages; the first fill the memory.
+    #[inline(always)]
+    fn step(&mut self, first: bool, x: V) -> V {
+        if self.common && self.slots.len() == 1 {
+            // the lag that follows makes the same of -0 and of 0
+            return x;
+        }
+        if first {
+            for j in 0..self.slots.len() {
+                let place = V::splat(j as f64);
+                self.slots[j] = place.if_less(self.lengths, x, V::splat(0.0));
+            }
+        }
+        let sum = if self.common {
+            self.alike(x)
+        } else {
+            self.apart(x)
+        };
+        sum.div(self.lengths)
+    }
+
+    /// The sum where all have one length.
+    #[inline(always)]
+    fn alike(&mut self, x: V) -> V {
+        self.slots[self.next] = x;
+        let next = self.next + 1;
+        self.next = if next < self.slots.len() { next } else { 0 };
+        let mut sum = V::splat(0.0);
+        for j in 0..self.slots.len() {
+            sum = sum.add(self.slots[j]);
+        }
+        sum
+    }
+
+    /// The sum where lengths differ.
+    #[inline(always)]
+    fn apart(&mut self, x: V) -> V {
+        let mut sum = V::splat(0.0);
+        for j in 0..self.slots.len() {
+            let kept = self.nexts.if_equal(V::splat(j as f64), x, self.slots[j]);
+            self.slots[j] = kept;
+            sum = sum.add(kept);
+        }
+        let next = self.nexts.add(V::splat(1.0));
+        self.nexts = next.if_less(self.lengths, next, V::splat(0.0));
+        sum
+    }
 }

@@ -1,24 +1,23 @@
 //! Plants that kernels know, and their steps in registers.
 //!
-//! A lagged model in a loop is its regressor and its position. One loop alone ([`Alone`]) holds them as numbers, the lanes of a
-//! network being its hidden units; eight loops ([`Beside`]) hold them as [`Group`], a lane being a loop. Asked for
-//! the bits of a lane, one loop does the operations of eight in the same order, so that a controller is worth the same wherever it is judged.
+//! A lagged model in a loop is its regressor and its position. One loop alone ([`ScalarPlant`]) holds them as numbers, the lanes of a
+//! network being its hidden units; eight loops ([`BatchPlant`]) hold them as [`Lanes`], a lane being a loop. Both do the same operations
+//! in the same order, so that a controller is worth the same wherever it is judged.
 //!
 //! Why a plant is known to a kernel at all: through [`Plant`] alone, one call a sample that the compiler cannot see through, a loop takes
-//! 61 to 64 ns a sample instead of 43 (`closed_loop` of the kernels' example, Zen 4). [`Second`], two outputs and two inputs in
-//! registers, takes 43 where [`Any`] takes 46 (6.7 %); the bits of a lane cost a
-//! loop of its own 1 to 2 %.
+//! 61 to 64 ns a sample instead of 43 (`closed_loop` of the kernels' example, Zen 4). [`SecondOrder`], two outputs and two inputs in
+//! registers, takes 43 where [`AnyOrder`] takes 46 (6.7 %).
 
 use std::marker::PhantomData;
 
 use super::Plant;
 use crate::lagged::{Form, Lags};
 use crate::neural::Meanwhile;
-use crate::simd::{Eight, Group};
+use crate::simd::{F64x8, Lanes};
 
 /// A plant whose equations kernels know: a lagged model, its output multiplied, its input held back.
 #[derive(Clone, Copy, Debug)]
-pub struct Known<'a> {
+pub struct KernelPlant<'a> {
     pub(super) form: &'a Form,
     pub(super) lags: Lags,
     pub(super) ts: f64,
@@ -27,7 +26,7 @@ pub struct Known<'a> {
     pub(super) delay: usize,
 }
 
-impl Known<'_> {
+impl KernelPlant<'_> {
     /// Samples between a command and its first appearance in the regressor.
     fn lead(&self) -> usize {
         self.delay + self.lags.nk - 1
@@ -35,17 +34,17 @@ impl Known<'_> {
 }
 
 /// One plant inside a kernel, where the whole loop is compiled for one processor; `R` holds its regressor. `BITS` asks for
-/// those of a lane, else a network's output is there sooner (where its [`Second`] is taken).
-pub(super) struct Alone<'a, V, R, const BITS: bool> {
-    known: Known<'a>,
+/// those of a lane, else a network's output is there sooner (where its [`SecondOrder`] is taken).
+pub(super) struct ScalarPlant<'a, V, R> {
+    known: KernelPlant<'a>,
     regressor: R,
     position: f64,
     level: PhantomData<V>,
 }
 
-impl<'a, V: Eight, R: Regressor, const BITS: bool> Alone<'a, V, R, BITS> {
+impl<'a, V: F64x8, R: Regressor> ScalarPlant<'a, V, R> {
     #[inline(always)]
-    pub fn new(known: Known<'a>) -> Self {
+    pub fn new(known: KernelPlant<'a>) -> Self {
         Self {
             known,
             regressor: R::at_rest(&known),
@@ -55,7 +54,7 @@ impl<'a, V: Eight, R: Regressor, const BITS: bool> Alone<'a, V, R, BITS> {
     }
 }
 
-impl<V: Eight, R: Regressor, const BITS: bool> Plant for Alone<'_, V, R, BITS> {
+impl<V: F64x8, R: Regressor> Plant for ScalarPlant<'_, V, R> {
     #[inline(always)]
     fn reset(&mut self) {
         self.regressor = R::at_rest(&self.known);
@@ -76,7 +75,7 @@ impl<V: Eight, R: Regressor, const BITS: bool> Plant for Alone<'_, V, R, BITS> {
     fn advance(&mut self, u: f64) {
         let before = self.regressor.newest();
         self.regressor.take(u);
-        let y = self.regressor.output::<V, BITS>(self.known.form);
+        let y = self.regressor.output::<V>(self.known.form);
         self.position += self.known.ts * (before + y) / 2.0;
         self.regressor.put(y);
     }
@@ -84,19 +83,19 @@ impl<V: Eight, R: Regressor, const BITS: bool> Plant for Alone<'_, V, R, BITS> {
 
 /// What the next output of one plant depends on.
 pub(super) trait Regressor {
-    fn at_rest(known: &Known<'_>) -> Self;
+    fn at_rest(known: &KernelPlant<'_>) -> Self;
     /// The newest output.
     fn newest(&self) -> f64;
     /// Takes a command in.
     fn take(&mut self, u: f64);
     /// The next output.
-    fn output<V: Eight, const BITS: bool>(&self, form: &Form) -> f64;
+    fn output<V: F64x8>(&self, form: &Form) -> f64;
     /// Takes that output in.
     fn put(&mut self, y: f64);
 }
 
 /// Any number of outputs and inputs.
-pub(super) struct Any {
+pub(super) struct AnyOrder {
     /// Past outputs, newest first, then the inputs of the regressor.
     phi: Vec<f64>,
     /// Past inputs, newest first.
@@ -105,9 +104,9 @@ pub(super) struct Any {
     lead: usize,
 }
 
-impl Regressor for Any {
+impl Regressor for AnyOrder {
     #[inline(always)]
-    fn at_rest(known: &Known<'_>) -> Self {
+    fn at_rest(known: &KernelPlant<'_>) -> Self {
         let (lags, lead) = (known.lags, known.lead());
         Self {
             phi: vec![0.0; lags.regressors()],
@@ -135,10 +134,10 @@ impl Regressor for Any {
     }
 
     #[inline(always)]
-    fn output<V: Eight, const BITS: bool>(&self, form: &Form) -> f64 {
+    fn output<V: F64x8>(&self, form: &Form) -> f64 {
         match form {
             Form::Linear(model) => model.next(&self.phi),
-            Form::Network(network) => network.next::<V, 0, BITS>(&self.phi, self.past),
+            Form::Network(network) => network.next::<V, 0>(&self.phi),
         }
     }
 
@@ -149,18 +148,18 @@ impl Regressor for Any {
 }
 
 /// Two outputs and two inputs, the newest of them the last command: they stay in registers.
-pub(super) struct Second([f64; 4]);
+pub(super) struct SecondOrder([f64; 4]);
 
-impl Second {
+impl SecondOrder {
     /// Whether a plant has that many, and no more delay.
-    pub fn takes(known: &Known<'_>) -> bool {
+    pub fn takes(known: &KernelPlant<'_>) -> bool {
         (known.lags.na, known.lags.regressors(), known.lead()) == (2, 4, 0)
     }
 }
 
-impl Regressor for Second {
+impl Regressor for SecondOrder {
     #[inline(always)]
-    fn at_rest(_known: &Known<'_>) -> Self {
+    fn at_rest(_known: &KernelPlant<'_>) -> Self {
         Self([0.0; 4])
     }
 
@@ -175,10 +174,10 @@ impl Regressor for Second {
     }
 
     #[inline(always)]
-    fn output<V: Eight, const BITS: bool>(&self, form: &Form) -> f64 {
+    fn output<V: F64x8>(&self, form: &Form) -> f64 {
         match form {
             Form::Linear(model) => model.next(&self.0),
-            Form::Network(network) => network.next::<V, 4, BITS>(&self.0, 2),
+            Form::Network(network) => network.next::<V, 4>(&self.0),
         }
     }
 
@@ -200,42 +199,42 @@ fn shift(newest_first: &mut [f64], value: f64) {
 }
 
 /// Eight runs of one plant, side by side.
-pub(super) struct Beside<'a> {
-    pub known: Known<'a>,
+pub(super) struct BatchPlant<'a> {
+    pub known: KernelPlant<'a>,
     /// Past outputs, newest first, then the inputs of the regressor.
-    phi: Vec<Group>,
+    phi: Vec<Lanes>,
     /// Inputs that are still to reach the regressor, the next one at `next`.
-    waiting: Vec<Group>,
+    waiting: Vec<Lanes>,
     next: usize,
-    position: Group,
+    position: Lanes,
 }
 
-impl<'a> Beside<'a> {
+impl<'a> BatchPlant<'a> {
     /// At rest.
-    pub fn new(known: Known<'a>) -> Self {
+    pub fn new(known: KernelPlant<'a>) -> Self {
         Self {
             known,
-            phi: vec![Group::ZERO; known.lags.regressors()],
-            waiting: vec![Group::ZERO; known.lead()],
+            phi: vec![Lanes::ZERO; known.lags.regressors()],
+            waiting: vec![Lanes::ZERO; known.lead()],
             next: 0,
-            position: Group::ZERO,
+            position: Lanes::ZERO,
         }
     }
 
     #[inline(always)]
-    pub fn output<V: Eight>(&self) -> V {
+    pub fn output<V: F64x8>(&self) -> V {
         V::splat(self.known.gain).mul(V::load(&self.phi[0].0))
     }
 
     #[inline(always)]
-    pub fn position<V: Eight>(&self) -> V {
+    pub fn position<V: F64x8>(&self) -> V {
         V::splat(self.known.gain).mul(V::load(&self.position.0))
     }
 
     /// Holds a command in each lane for one sample time; `N` is 4 for two outputs and two inputs in the regressor, 0 for any.
     /// Other work may be done meanwhile.
     #[inline(always)]
-    pub fn advance<V: Eight, const N: usize>(&mut self, u: V, meanwhile: &mut impl Meanwhile) {
+    pub fn advance<V: F64x8, const N: usize>(&mut self, u: V, meanwhile: &mut impl Meanwhile) {
         let due = self.delayed(u);
         let (na, n) = if N == 4 {
             (2, 4)
@@ -259,7 +258,7 @@ impl<'a> Beside<'a> {
     }
 
     #[inline(always)]
-    fn delayed<V: Eight>(&mut self, u: V) -> V {
+    fn delayed<V: F64x8>(&mut self, u: V) -> V {
         let Some(place) = self.waiting.get_mut(self.next) else {
             return u;
         };
@@ -274,7 +273,7 @@ impl<'a> Beside<'a> {
 }
 
 #[inline(always)]
-fn push_eight<V: Eight>(newest_first: &mut [Group], value: V) {
+fn push_eight<V: F64x8>(newest_first: &mut [Lanes], value: V) {
     let mut i = newest_first.len();
     while i > 1 {
         i -= 1;

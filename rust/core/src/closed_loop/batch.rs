@@ -3,9 +3,9 @@
 //! A search asks what each of many controllers does on the same plant and reference. Their loops never meet: a lane is a loop.
 //!
 //! ```text
-//!   lane        0    1    2  ..  7      one `Eight`: u, y, integral, .. of eight loops
+//!   lane        0    1    2  ..  7      one F64x8: u, y, integral, .. of eight loops
 //!   group g     controllers 8g .. 8g+7  Loops: plants (phi, position), controllers (gains, states), counters
-//!   Lanes       up to 4 groups          one pass over the reference, sample by sample
+//!   BatchLoop   up to 4 groups          one pass over the reference, sample by sample
 //! ```
 //!
 //! One group alone would mostly wait: a sample is a chain of some 230 cycles (encoder, filter, controller, network), in which the
@@ -21,30 +21,27 @@
 //! out): taking turns 11 to 14 % with encoder and filter, 0 % without; a regressor of known length (`N` = 4) 14 to 17 %; averages of one
 //! length 4 to 6 %.
 //!
-//! Ownership: `Lanes` borrows plant, controllers and signals; a group owns the states of its eight loops for the run; notes are
+//! Ownership: `BatchLoop` borrows plant, controllers and signals; a group owns the states of its eight loops for the run; notes are
 //! the caller's, one for a group.
 //!
 //! A lane does the operations of a loop that runs alone, in the same order: on one level it gives the bits of
 //! [`Run::record_by`](super::Run::record_by) as a lane. A loop that runs alone for its own sake takes a
 //! shorter way around a network of two past outputs and two inputs without delay.
 
-mod average;
 mod controllers;
-mod tally;
 
 #[cfg(test)]
 mod tests;
 
 use sewfast_control::Controller;
 
-use super::known::{Beside, Known};
+use super::kernel_plant::{BatchPlant, KernelPlant};
 use super::{Outcome, RUNAWAY, Signals, WATCHED};
 use crate::Monitor;
 use crate::encoder::Encoder;
 use crate::neural::{Meanwhile, Nothing};
-use crate::simd::{self, Eight, Kernel, LANES};
+use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
 pub(super) use controllers::Controllers;
-pub(crate) use tally::{Sums, Tally};
 
 /// Loops that run side by side at most: four groups, of which one computes while others wait for their results.
 pub(crate) const MOST: usize = 4 * LANES;
@@ -52,12 +49,12 @@ pub(crate) const MOST: usize = 4 * LANES;
 /// What takes note of the samples of a group of lanes.
 pub(crate) trait Notes {
     /// Reference, command after the limits, true output and filtered feedback of a sample.
-    fn put<V: Eight>(&mut self, k: usize, r: f64, u: V, y: V, feedback: V);
+    fn put<V: F64x8>(&mut self, k: usize, r: f64, u: V, y: V, feedback: V);
 }
 
 /// The loops of some controllers around one plant, from rest.
-pub(crate) struct Lanes<'a> {
-    pub known: Known<'a>,
+pub(crate) struct BatchLoop<'a> {
+    pub known: KernelPlant<'a>,
     /// At least one, with constant gains and one sample time; at most [`MOST`].
     pub controllers: &'a [&'a Controller<f64>],
     pub signals: Signals<'a>,
@@ -66,9 +63,9 @@ pub(crate) struct Lanes<'a> {
     pub monitor: &'a Monitor,
 }
 
-impl Lanes<'_> {
+impl BatchLoop<'_> {
     /// Whether a controller can be run in a lane.
-    pub fn take(controller: &Controller<f64>) -> bool {
+    pub fn takes(controller: &Controller<f64>) -> bool {
         controller.numbers().is_some()
     }
 
@@ -85,13 +82,13 @@ impl Lanes<'_> {
 }
 
 /// Groups of loops around a plant; `N` is 4 for two outputs and two inputs in its regressor, 0 for any.
-struct Grouped<'a, 'b, S, const N: usize>(Lanes<'a>, &'b mut [S]);
+struct Grouped<'a, 'b, S, const N: usize>(BatchLoop<'a>, &'b mut [S]);
 
 impl<S: Notes, const N: usize> Kernel for Grouped<'_, '_, S, N> {
     type Output = [Outcome; MOST];
 
     #[inline(always)]
-    fn run<V: Eight>(self) -> Self::Output {
+    fn run<V: F64x8>(self) -> Self::Output {
         let Self(lanes, notes) = self;
         // on the heap, so that one pointer finds all of a group
         let mut groups = Vec::with_capacity(notes.len());
@@ -129,7 +126,7 @@ struct Now<'a> {
 /// A group decides, while the plants of the group that decided half a round ago take their step: both have time until what
 /// comes out is asked for. A group alone does one after the other.
 #[inline(always)]
-fn turn<V: Eight, S: Notes, const N: usize>(
+fn turn<V: F64x8, S: Notes, const N: usize>(
     groups: &mut [Loops<'_, V>],
     notes: &mut S,
     ends: &mut Ends,
@@ -185,7 +182,7 @@ impl Ends {
 
 /// Eight loops.
 struct Loops<'a, V> {
-    plants: Beside<'a>,
+    plants: BatchPlant<'a>,
     controllers: Controllers<V>,
     /// With counts per sample and unit of speed.
     encoder: Option<(&'a Encoder, f64)>,
@@ -196,16 +193,16 @@ struct Loops<'a, V> {
     applied: V,
 }
 
-impl<'a, V: Eight> Loops<'a, V> {
+impl<'a, V: F64x8> Loops<'a, V> {
     #[inline(always)]
-    fn new(lanes: &Lanes<'a>, group: usize) -> Self {
+    fn new(lanes: &BatchLoop<'a>, group: usize) -> Self {
         let own = &lanes.controllers[LANES * group..];
         let ts = own[0].settings().ts;
         let per_speed = |encoder: &Encoder| ts * encoder.counts_per_unit();
         let encoder = lanes.encoder.map(|encoder| (encoder, per_speed(encoder)));
         let zero = V::splat(0.0);
         Self {
-            plants: Beside::new(lanes.known),
+            plants: BatchPlant::new(lanes.known),
             controllers: Controllers::new(own),
             encoder,
             before: encoder.map_or(zero, |(encoder, _)| encoder.counts(zero)),
@@ -218,18 +215,18 @@ impl<'a, V: Eight> Loops<'a, V> {
     #[inline(always)]
     fn measure(&mut self) -> u64 {
         let y: V = self.plants.output();
-        let mut sound = y.size().are_less(V::splat(RUNAWAY));
+        let mut sound = y.abs().are_less(V::splat(RUNAWAY));
         self.measured = y;
         if let Some((encoder, per_speed)) = self.encoder {
             let now = encoder.counts(self.plants.position::<V>());
             self.measured = now.sub(self.before).div(V::splat(per_speed));
             self.before = now;
-            sound &= self.measured.size().are_less(V::splat(f64::INFINITY));
+            sound &= self.measured.abs().are_less(V::splat(f64::INFINITY));
         }
         u64::from(!sound)
     }
 
-    /// Decides on the commands.
+    /// LoopController on the commands.
     #[inline(always)]
     fn decide(&mut self, signals: &Signals<'_>, k: usize, r: f64, notes: &mut impl Notes) {
         let y = self.plants.output();
@@ -254,7 +251,7 @@ struct Decision<'a, 'b, V, S> {
     stage: usize,
 }
 
-impl<'a, 'b, V: Eight, S: Notes> Decision<'a, 'b, V, S> {
+impl<'a, 'b, V: F64x8, S: Notes> Decision<'a, 'b, V, S> {
     #[inline(always)]
     fn new(
         loops: &'a mut Loops<'b, V>,
@@ -283,7 +280,7 @@ impl<'a, 'b, V: Eight, S: Notes> Decision<'a, 'b, V, S> {
 /// Stages of a [`Decision`].
 const STAGES: usize = 3;
 
-impl<V: Eight, S: Notes> Meanwhile for Decision<'_, '_, V, S> {
+impl<V: F64x8, S: Notes> Meanwhile for Decision<'_, '_, V, S> {
     #[inline(always)]
     fn go(&mut self) {
         let Now { k, r, g, signals } = self.now;
@@ -298,4 +295,114 @@ impl<V: Eight, S: Notes> Meanwhile for Decision<'_, '_, V, S> {
         }
         self.stage += 1;
     }
+}
+
+/// Sums over one run, in the order of its samples.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Sums {
+    /// Of `(r - y)^2`.
+    pub error: f64,
+    /// Of `u^2`.
+    pub command: f64,
+    /// Of the squared change of `u` from sample to sample.
+    pub change: f64,
+    /// Samples between the limits.
+    pub inside: f64,
+    /// Largest `|u|`.
+    pub largest: f64,
+}
+
+/// Sums over eight runs, and their outputs where they are kept.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Tally {
+    low: Lanes,
+    high: Lanes,
+    error: Lanes,
+    command: Lanes,
+    change: Lanes,
+    inside: Lanes,
+    largest: Lanes,
+    last: Lanes,
+    /// Outputs of all samples, or of none.
+    pub y: Vec<Lanes>,
+}
+
+impl Default for Tally {
+    /// Nothing yet.
+    fn default() -> Self {
+        let zero = Lanes::ZERO;
+        Self {
+            low: zero,
+            high: zero,
+            error: zero,
+            command: zero,
+            change: zero,
+            inside: zero,
+            largest: zero,
+            last: zero,
+            y: Vec::new(),
+        }
+    }
+}
+
+impl Tally {
+    /// Begins anew, for runs of these controllers whose outputs of so many samples are kept.
+    pub fn begin(&mut self, controllers: &[&Controller<f64>], kept: usize) {
+        let mut y = std::mem::take(&mut self.y);
+        y.resize(kept, Lanes::ZERO);
+        *self = Self {
+            y,
+            ..Self::default()
+        };
+        for (i, controller) in controllers.iter().take(LANES).enumerate() {
+            let settings = controller.settings();
+            (self.low.0[i], self.high.0[i]) = (settings.u_min, settings.u_max);
+        }
+    }
+
+    /// The outputs of a lane, where they were kept.
+    pub fn copy_outputs(&self, lane: usize, y: &mut Vec<f64>) {
+        y.clear();
+        y.extend(self.y.iter().map(|group| group.0[lane]));
+    }
+
+    /// The sums of a lane.
+    pub fn sums(&self, lane: usize) -> Sums {
+        Sums {
+            error: self.error.0[lane],
+            command: self.command.0[lane],
+            change: self.change.0[lane],
+            inside: self.inside.0[lane],
+            largest: self.largest.0[lane],
+        }
+    }
+}
+
+impl Notes for Tally {
+    #[inline(always)]
+    fn put<V: F64x8>(&mut self, k: usize, r: f64, u: V, y: V, _feedback: V) {
+        let zero = V::splat(0.0);
+        let last = if k == 0 { u } else { V::load(&self.last.0) };
+        let change = u.sub(last);
+        let off = V::splat(r).sub(y);
+        add(&mut self.error, off.mul(off));
+        add(&mut self.command, u.mul(u));
+        add(&mut self.change, change.mul(change));
+        let below = u.if_less(V::load(&self.high.0), V::splat(1.0), zero);
+        add(
+            &mut self.inside,
+            V::load(&self.low.0).if_less(u, below, zero),
+        );
+        let largest = V::load(&self.largest.0).at_least_each(u.abs());
+        largest.store(&mut self.largest.0);
+        u.store(&mut self.last.0);
+        if let Some(place) = self.y.get_mut(k) {
+            y.store(&mut place.0);
+        }
+    }
+}
+
+#[inline(always)]
+fn add<V: F64x8>(sum: &mut Lanes, value: V) {
+    V::load(&sum.0).add(value).store(&mut sum.0);
 }

@@ -7,10 +7,15 @@
 
 use sewfast_control::Controller;
 
-use super::lanes::Controllers;
+use super::batch::{BatchLoop, Controllers};
+use super::kernel_plant::{AnyOrder, KernelPlant, ScalarPlant, SecondOrder};
+use super::{Plant, Run, Signals};
+use crate::Monitor;
+use crate::encoder::Encoder;
+use crate::simd::{F64x8, Kernel};
 
 /// What a loop asks of its controller.
-pub(super) trait Decides {
+pub(super) trait LoopController {
     /// Back to the state before the first sample.
     fn reset(&mut self);
     /// Sample time \[s\].
@@ -21,7 +26,7 @@ pub(super) trait Decides {
     fn filtered(&self) -> f64;
 }
 
-impl Decides for Controller<f64> {
+impl LoopController for Controller<f64> {
     fn reset(&mut self) {
         self.reset();
     }
@@ -59,7 +64,7 @@ impl<'a> Constant<'a> {
     }
 }
 
-impl Decides for Constant<'_> {
+impl LoopController for Constant<'_> {
     #[inline(always)]
     fn reset(&mut self) {
         self.numbers = Controllers::new(&[self.controller]);
@@ -78,5 +83,43 @@ impl Decides for Constant<'_> {
     #[inline(always)]
     fn filtered(&self) -> f64 {
         self.numbers.filtered
+    }
+}
+
+/// A loop around a plant that kernels know: all of it is compiled for one processor.
+pub(super) struct ScalarLoop<'a> {
+    pub run: &'a mut Run,
+    pub known: KernelPlant<'a>,
+    pub controller: &'a Controller<f64>,
+    pub signals: Signals<'a>,
+    pub encoder: Option<&'a Encoder>,
+    pub monitor: &'a Monitor,
+}
+
+impl Kernel for ScalarLoop<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<V: F64x8>(self) {
+        let controller = self.controller;
+        if !BatchLoop::takes(controller) {
+            let plant = ScalarPlant::<V, AnyOrder>::new(self.known);
+            self.around(plant, &mut controller.clone());
+        } else if SecondOrder::takes(&self.known) {
+            let plant = ScalarPlant::<V, SecondOrder>::new(self.known);
+            self.around(plant, &mut Constant::new(controller));
+        } else {
+            let plant = ScalarPlant::<V, AnyOrder>::new(self.known);
+            self.around(plant, &mut Constant::new(controller));
+        }
+    }
+}
+
+impl ScalarLoop<'_> {
+    #[inline(always)]
+    fn around(self, mut plant: impl Plant, controller: &mut impl LoopController) {
+        let (signals, encoder) = (self.signals, self.encoder);
+        self.run
+            .fill(&mut plant, controller, signals, encoder, self.monitor);
     }
 }

@@ -1,0 +1,33 @@
+"""Kinds of model by name: what `identify`, the command line and the studio offer."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias, get_args
+
+Kind: TypeAlias = Literal[
+    "auto",
+    "arx",
+    "iv",
+    "oe",
+    "hammerstein_wiener",
+    "hammerstein-wiener",
+    "neural_oe",
+    "neural-oe",
+    "neural_ss",
+    "neural-ss",
+]
+KINDS: tuple[Kind, ...] = tuple(kind for kind in get_args(Kind) if "-" not in kind)
+TEXTS: dict[str, str] = {
+    "arx": "least squares one step ahead",
+    "iv": "refined instrumental variables",
+    "oe": "linear output error",
+    "hammerstein_wiener": "linear output error between static characteristics",
+    "neural_oe": "lagged network output error",
+    "neural_ss": "neural state space",
+}
+"""What each kind is, in a few words."""
+
+
+def spelled(kind: str) -> str:
+    """As the command line spells it: with hyphens."""
+    return kind.replace("_", "-")

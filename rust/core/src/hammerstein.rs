@@ -1,0 +1,641 @@
+//! The Hammerstein-Wiener model: a linear difference equation between two static characteristics.
+//!
+//! ```text
+//!   u_j --> [ f_j ] --> w_j --> [ B_j / A ] --> x --> [ g ] --> y
+//!
+//!   x(k) = -sum_i a_i x(k-i) + sum_j sum_i b_ji w_j(k-nk-i+1) + offset
+//! ```
+//!
+//! A dead band, a saturation or a servo valve's curve is an `f`; a sensor that is not straight is a `g`. Both are piecewise
+//! linear over evenly spaced knots of the training range and go straight on beyond it. `g` rises strictly, so that
+//! `x(k-i) = g^-1(y(k-i))` and the model is a [`Lagged`] one: past *outputs* are its state, as of every other kind.
+//!
+//! A factor may be moved from `f` to `b` and on to `g` without a change of `y`. It is fixed by what the two curves do at the
+//! ends of their ranges: there `f(u) = u` and `g(x) = x`.
+
+use std::ops::Range;
+
+use crate::lagged::{Lagged, Lags};
+use crate::linear::is_stable;
+use crate::output_error::{self, Fit, Parametric};
+use crate::{Error, Monitor, Record, Result, oe};
+
+/// Nearest that a reflection coefficient may come to the unit circle in a fit.
+const MARGIN: f64 = 1e-9;
+/// Share of the mean slope that every piece of `g` has at least: below, one step of the output's noise would be a jump of x.
+const LEAST_SLOPE: f64 = 0.02;
+/// More pieces than this describe noise.
+const MOST_PIECES: usize = 100;
+/// Weight of the ridge: a curve on which the data say nothing stays straight. A curve off by a tenth of its range at ten
+/// knots costs a rms error of 0.1 % of the output's.
+const RIDGE: f64 = 1e-5;
+
+/// Where a curve has its knots.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Knots {
+    /// First knot.
+    pub low: f64,
+    /// Last knot.
+    pub high: f64,
+    /// Pieces between them; 1 is a straight line.
+    pub pieces: usize,
+}
+
+impl Knots {
+    fn check(&self, name: &str) -> Result<()> {
+        let ordered = self.low < self.high && self.low.is_finite() && self.high.is_finite();
+        if ordered && (1..=MOST_PIECES).contains(&self.pieces) {
+            return Ok(());
+        }
+        Err(Error::setting(format!(
+            "expected 1 to {MOST_PIECES} pieces between two different levels for the {name} characteristic, got {} from {} \
+             to {}; record an {name} that moves",
+            self.pieces, self.low, self.high
+        )))
+    }
+
+    fn width(&self) -> f64 {
+        (self.high - self.low) / self.pieces as f64
+    }
+
+    /// The knot `i`.
+    pub fn at(&self, i: usize) -> f64 {
+        self.low + (self.high - self.low) * i as f64 / self.pieces as f64
+    }
+
+    /// The piece that `x` is on, and how far along it; below 0 or above 1 beyond the ends.
+    fn place(&self, x: f64) -> (usize, f64) {
+        let along = (x - self.low) / self.width();
+        // NaN and what is below the first knot become piece 0
+        let piece = (along.max(0.0) as usize).min(self.pieces - 1);
+        (piece, along - piece as f64)
+    }
+}
+
+/// `f(u) = u + (high - low) c(u)`; `c` is 0 at both ends and a free number at each knot between them.
+#[derive(Clone, Debug)]
+struct Bent {
+    knots: Knots,
+    c: Vec<f64>,
+}
+
+impl Bent {
+    /// With the ends put back.
+    fn new(knots: Knots, inner: &[f64]) -> Self {
+        Self {
+            knots,
+            c: [&[0.0], inner, &[0.0]].concat(),
+        }
+    }
+
+    fn value_and_slope(&self, u: f64) -> (f64, f64) {
+        let (i, t) = self.knots.place(u);
+        let range = self.knots.high - self.knots.low;
+        let (left, rise) = (self.c[i], self.c[i + 1] - self.c[i]);
+        (
+            u + range * (left + t * rise),
+            1.0 + self.knots.pieces as f64 * rise,
+        )
+    }
+
+    /// Adds `factor df/dc` to `by_c`.
+    fn add_gradient(&self, u: f64, factor: f64, by_c: &mut [f64]) {
+        let (i, t) = self.knots.place(u);
+        let range = self.knots.high - self.knots.low;
+        for (knot, share) in [(i, 1.0 - t), (i + 1, t)] {
+            if let Some(place) = knot.checked_sub(1).and_then(|inner| by_c.get_mut(inner)) {
+                *place += factor * range * share;
+            }
+        }
+    }
+}
+
+/// `g` from the logarithms `d` of its pieces' slopes over the first one's: with `s = softmax(0, d)` piece `i` rises by
+/// `(high - low) (LEAST_SLOPE/n + (1 - LEAST_SLOPE) s_i)`. It rises strictly for every `d`, and no constraint is needed.
+#[derive(Clone, Debug)]
+struct Rising {
+    knots: Knots,
+    /// `g` at the knots.
+    values: Vec<f64>,
+    shares: Vec<f64>,
+}
+
+impl Rising {
+    fn new(knots: Knots, d: &[f64]) -> Self {
+        let n = knots.pieces;
+        let largest = d.iter().fold(0.0, |most: f64, d| most.max(*d));
+        let mut shares: Vec<f64> = std::iter::once(&0.0)
+            .chain(d)
+            .map(|d| (d - largest).exp())
+            .collect();
+        let sum: f64 = shares.iter().sum();
+        shares.iter_mut().for_each(|share| *share /= sum);
+        let range = knots.high - knots.low;
+        let mut values = vec![knots.low];
+        for share in &shares {
+            let rise = range * (LEAST_SLOPE / n as f64 + (1.0 - LEAST_SLOPE) * share);
+            values.push(values[values.len() - 1] + rise);
+        }
+        Self {
+            knots,
+            values,
+            shares,
+        }
+    }
+
+    fn rise(&self, i: usize) -> f64 {
+        self.values[i + 1] - self.values[i]
+    }
+
+    fn value_and_slope(&self, x: f64) -> (f64, f64) {
+        if self.knots.pieces == 1 {
+            return (x, 1.0);
+        }
+        let (i, t) = self.knots.place(x);
+        let rise = self.rise(i);
+        (self.values[i] + t * rise, rise / self.knots.width())
+    }
+
+    /// `g^-1(y)` and the slope of `g` there.
+    fn inverse(&self, y: f64) -> (f64, f64) {
+        if self.knots.pieces == 1 {
+            return (y, 1.0);
+        }
+        let inner = &self.values[1..self.knots.pieces];
+        let i = inner.partition_point(|value| *value <= y);
+        let (rise, width) = (self.rise(i), self.knots.width());
+        let t = (y - self.values[i]) / rise;
+        (self.knots.at(i) + t * width, rise / width)
+    }
+
+    /// Adds `factor dg/dd` at `x`: with `C_i = s_0 + .. + s_(i-1)`,
+    /// `dg/dd_m = R (1 - LEAST_SLOPE) s_m ([m < i] - C_i + t ([m = i] - s_i))`.
+    fn add_gradient(&self, x: f64, factor: f64, by_d: &mut [f64]) {
+        let (i, t) = self.knots.place(x);
+        let before: f64 = self.shares[..i].iter().sum();
+        let range = (self.knots.high - self.knots.low) * (1.0 - LEAST_SLOPE);
+        for (m, (place, share)) in (1..).zip(by_d.iter_mut().zip(&self.shares[1..])) {
+            let whole = f64::from(u8::from(m < i)) - before;
+            let part = f64::from(u8::from(m == i)) - self.shares[i];
+            *place += factor * range * share * (whole + t * part);
+        }
+    }
+}
+
+/// A Hammerstein-Wiener model in the data's units.
+///
+/// `theta = [a, b input by input, offset, c input by input, d]`: bends of `f` at the inner knots in parts of the input's
+/// range, logarithms of the slopes of `g` over that of its first piece.
+#[derive(Clone, Debug)]
+pub struct HammersteinWiener {
+    theta: Vec<f64>,
+    lags: Lags,
+    inputs: Vec<Bent>,
+    output: Rising,
+}
+
+/// Where the parts of theta are.
+struct Parts {
+    offset: usize,
+    bends: usize,
+    slopes: usize,
+    end: usize,
+}
+
+impl Parts {
+    fn of(lags: Lags, inputs: &[Knots], output: Knots) -> Self {
+        let offset = lags.regressors();
+        let bends = offset + 1;
+        let slopes = bends + inputs.iter().map(|k| k.pieces - 1).sum::<usize>();
+        Self {
+            offset,
+            bends,
+            slopes,
+            end: slopes + output.pieces - 1,
+        }
+    }
+}
+
+impl HammersteinWiener {
+    /// A model from its parameters.
+    ///
+    /// # Errors
+    /// `ErrorKind::Setting` for knots that are no range, a wrong number of parameters, or values that are not finite.
+    pub fn new(lags: Lags, inputs: &[Knots], output: Knots, theta: Vec<f64>) -> Result<Self> {
+        if inputs.len() != lags.channels {
+            return Err(Error::setting(format!(
+                "expected a characteristic for each of {} inputs, got {}; give one range an input",
+                lags.channels,
+                inputs.len()
+            )));
+        }
+        inputs.iter().try_for_each(|knots| knots.check("input"))?;
+        output.check("output")?;
+        let parts = Parts::of(lags, inputs, output);
+        if theta.len() != parts.end {
+            return Err(Error::setting(format!(
+                "expected {} parameters for this structure, got {}; theta is a, b input by input, offset, bends of the \
+                 inputs' curves, slopes of the output's",
+                parts.end,
+                theta.len()
+            )));
+        }
+        if theta.iter().any(|value| !value.is_finite()) {
+            return Err(Error::setting(
+                "expected finite parameters, got NaN or infinity; identify the model again",
+            ));
+        }
+        Ok(Self::made(lags, inputs, output, theta))
+    }
+
+    fn made(lags: Lags, inputs: &[Knots], output: Knots, theta: Vec<f64>) -> Self {
+        let parts = Parts::of(lags, inputs, output);
+        let mut next = parts.bends;
+        let bent = |knots: &Knots| {
+            let first = next;
+            next += knots.pieces - 1;
+            Bent::new(*knots, &theta[first..next])
+        };
+        Self {
+            lags,
+            inputs: inputs.iter().map(bent).collect(),
+            output: Rising::new(output, &theta[parts.slopes..]),
+            theta,
+        }
+    }
+
+    /// Parameters.
+    pub fn theta(&self) -> &[f64] {
+        &self.theta
+    }
+
+    /// Knots of each input's curve.
+    pub fn input_knots(&self) -> Vec<Knots> {
+        self.inputs.iter().map(|bent| bent.knots).collect()
+    }
+
+    /// Knots of the output's curve.
+    pub fn output_knots(&self) -> Knots {
+        self.output.knots
+    }
+
+    /// `f_j` at values of input `j`.
+    pub fn input_curve(&self, j: usize, u: &[f64]) -> Vec<f64> {
+        let bent = &self.inputs[j];
+        u.iter().map(|u| bent.value_and_slope(*u).0).collect()
+    }
+
+    /// `g` at values of the linear part's output.
+    pub fn output_curve(&self, x: &[f64]) -> Vec<f64> {
+        x.iter()
+            .map(|x| self.output.value_and_slope(*x).0)
+            .collect()
+    }
+
+    fn parts(&self) -> Parts {
+        Parts::of(self.lags, &self.input_knots(), self.output.knots)
+    }
+
+    /// `x`, the linear part's output, and in `each` what is called with every term: its place, coefficient, value, slope.
+    fn linear_part(&self, phi: &[f64], mut each: impl FnMut(usize, f64, f64, f64)) -> f64 {
+        let Lags { na, nb, .. } = self.lags;
+        let mut x = self.theta[phi.len()];
+        for (i, value) in phi.iter().enumerate() {
+            let coefficient = self.theta[i];
+            let (value, slope) = if i < na {
+                let (past, slope) = self.output.inverse(*value);
+                (-past, -1.0 / slope)
+            } else {
+                self.inputs[(i - na) / nb].value_and_slope(*value)
+            };
+            x += coefficient * value;
+            each(i, coefficient, value, slope);
+        }
+        x
+    }
+}
+
+impl Lagged for HammersteinWiener {
+    fn lags(&self) -> Lags {
+        self.lags
+    }
+
+    fn output(&self, phi: &[f64]) -> f64 {
+        let x = self.linear_part(phi, |_, _, _, _| ());
+        self.output.value_and_slope(x).0
+    }
+
+    fn output_and_slope(&self, phi: &[f64], slope: &mut [f64]) -> f64 {
+        let x = self.linear_part(phi, |i, coefficient, _, steep| {
+            if let Some(slope) = slope.get_mut(i) {
+                *slope = coefficient * steep;
+            }
+        });
+        let (y, steep) = self.output.value_and_slope(x);
+        slope.iter_mut().for_each(|slope| *slope *= steep);
+        y
+    }
+}
+
+impl Parametric for HammersteinWiener {
+    fn theta(&self) -> Vec<f64> {
+        self.theta.clone()
+    }
+
+    fn with_theta(&self, theta: &[f64]) -> Option<Self> {
+        let finite = theta.iter().all(|value| value.is_finite());
+        (finite && is_stable(&theta[..self.lags.na], MARGIN)).then(|| {
+            Self::made(
+                self.lags,
+                &self.input_knots(),
+                self.output.knots,
+                theta.to_vec(),
+            )
+        })
+    }
+
+    /// With `x` as above, `dy = g'(x) dx + (dg/dd)(x)`, where a past `x = g^-1(y)` gives `dx/dy = 1/g'` and
+    /// `dx/dd = -(dg/dd)/g'`.
+    fn gradient(&self, phi: &[f64], by_theta: &mut [f64], by_phi: &mut [f64]) -> f64 {
+        let (Lags { na, nb, .. }, parts) = (self.lags, self.parts());
+        by_theta[parts.offset..].fill(0.0);
+        by_theta[parts.offset] = 1.0;
+        let (linear, curves) = by_theta.split_at_mut(parts.bends);
+        let (bends, slopes) = curves.split_at_mut(parts.slopes - parts.bends);
+        let mut first = 0;
+        let x = self.linear_part(phi, |i, coefficient, value, steep| {
+            linear[i] = value;
+            by_phi[i] = coefficient * steep;
+            if i < na {
+                // value is -x, steep is -1/g'
+                self.output
+                    .add_gradient(-value, -coefficient * steep, slopes);
+                return;
+            }
+            let (j, of_input) = ((i - na) / nb, (i - na) % nb);
+            if of_input == 0 && j > 0 {
+                first += self.inputs[j - 1].knots.pieces - 1;
+            }
+            let inner = self.inputs[j].knots.pieces - 1;
+            let own = &mut bends[first..first + inner];
+            self.inputs[j].add_gradient(phi[i], coefficient, own);
+        });
+        let (y, steep) = self.output.value_and_slope(x);
+        by_theta.iter_mut().for_each(|value| *value *= steep);
+        by_phi.iter_mut().for_each(|value| *value *= steep);
+        self.output
+            .add_gradient(x, 1.0, &mut by_theta[parts.slopes..]);
+        y
+    }
+
+    fn shrunk(&self) -> Range<usize> {
+        let parts = self.parts();
+        parts.bends..parts.end
+    }
+}
+
+/// Fits a Hammerstein-Wiener model in free run over all experiments, with an initial state per experiment.
+///
+/// It begins as the linear output-error model of the same orders, with straight curves over the ranges of the data.
+/// `pieces` are those of every input's curve and of the output's.
+///
+/// ```
+/// use sewfast_core::{Monitor, Record, hammerstein};
+///
+/// // a dead band in front of a lag
+/// let band = |u: f64| u - u.clamp(-0.5, 0.5);
+/// let u: Vec<f64> = (0..600).map(|k| f64::from(k / 7 * 13 % 9) / 4.0 - 1.0).collect();
+/// let mut y = vec![0.0; 600];
+/// for k in 1..600 {
+///     y[k] = 0.8 * y[k - 1] + 0.4 * band(u[k - 1]);
+/// }
+/// let records = [Record::new(&u, 1, &y)?];
+/// let fit = hammerstein::fit(&records, 1, 1, 1, (8, 1), 100, &Monitor::default())?;
+/// assert!(fit.cost < 1e-6);
+/// # Ok::<(), sewfast_core::Error>(())
+/// ```
+///
+/// # Errors
+/// As [`oe::fit`]; `ErrorKind::Setting` for pieces out of range.
+pub fn fit(
+    records: &[Record],
+    na: usize,
+    nb: usize,
+    nk: usize,
+    pieces: (usize, usize),
+    max_iterations: usize,
+    monitor: &Monitor,
+) -> Result<Fit<HammersteinWiener>> {
+    let linear = oe::fit(records, na, nb, nk, true, max_iterations, monitor)?;
+    let (lags, channels) = (linear.model.lags(), linear.model.lags().channels);
+    let inputs: Vec<Knots> = (0..channels)
+        .map(|j| {
+            let values = records
+                .iter()
+                .flat_map(|r| r.u.iter().skip(j).step_by(channels));
+            knots(values, pieces.0)
+        })
+        .collect();
+    let output = knots(records.iter().flat_map(|r| r.y), pieces.1);
+    output.check("output")?;
+    inputs.iter().try_for_each(|knots| knots.check("input"))?;
+    let straight = Parts::of(lags, &inputs, output);
+    let mut theta = [linear.model.a(), linear.model.b(), &[linear.model.offset()]].concat();
+    theta.resize(straight.end, 0.0);
+    let start = HammersteinWiener::new(lags, &inputs, output, theta)?;
+    let states = &linear.initial_states;
+    monitor.set_total(max_iterations as u64);
+    output_error::fit(&start, states, records, RIDGE, max_iterations, monitor)
+}
+
+/// Knots over the range of the values that are there.
+fn knots<'a>(values: impl Iterator<Item = &'a f64>, pieces: usize) -> Knots {
+    let empty = (f64::INFINITY, f64::NEG_INFINITY);
+    let (low, high) = values.fold(empty, |(low, high), v| (low.min(*v), high.max(*v)));
+    Knots { low, high, pieces }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{Differentiable, Model};
+    use crate::random::Random;
+    use proptest::prelude::*;
+
+    /// A stable model with bent curves.
+    fn bent(seed: u64, channels: usize, nk: usize) -> HammersteinWiener {
+        let mut random = Random::new(seed);
+        let lags = Lags::new(2, 2, nk, channels).unwrap();
+        let inputs: Vec<Knots> = (0..channels)
+            .map(|j| Knots {
+                low: -1.0,
+                high: 2.0 + j as f64,
+                pieces: 4 + j,
+            })
+            .collect();
+        let output = Knots {
+            low: -3.0,
+            high: 5.0,
+            pieces: 5,
+        };
+        let parts = Parts::of(lags, &inputs, output);
+        let mut theta: Vec<f64> = (0..parts.end).map(|_| random.between(-0.3, 0.3)).collect();
+        theta[..2].copy_from_slice(&[-1.2, 0.4]);
+        for d in &mut theta[parts.slopes..] {
+            *d *= 5.0;
+        }
+        HammersteinWiener::new(lags, &inputs, output, theta).unwrap()
+    }
+
+    fn inputs(seed: u64, channels: usize, samples: usize) -> Vec<f64> {
+        let mut random = Random::new(seed);
+        (0..samples * channels)
+            .map(|_| random.between(-1.5, 3.5))
+            .collect()
+    }
+
+    proptest! {
+        #![proptest_config(crate::laws::cases(60))]
+        #[test]
+        fn the_output_curve_rises_and_is_inverted(seed in any::<u64>(), y in -20.0f64..20.0) {
+            let g = bent(seed, 1, 1).output;
+            let (x, slope) = g.inverse(y);
+            let (back, same) = g.value_and_slope(x);
+            prop_assert!((back - y).abs() <= 1e-12 * (1.0 + y.abs()), "{back} {y}");
+            prop_assert!(slope >= 0.99 * LEAST_SLOPE && (slope - same).abs() < 1e-9 * slope || (x / g.knots.width()).fract().abs() < 1e-9);
+            for end in [g.knots.low, g.knots.high] {
+                prop_assert!((g.value_and_slope(end).0 - end).abs() < 1e-12);
+            }
+        }
+
+        #[test]
+        fn sensitivities_agree_with_differences(seed in any::<u64>(), channels in 1usize..3, nk in 0usize..3) {
+            let model = bent(seed, channels, nk);
+            let (u, past) = (inputs(seed ^ 1, channels, 25), [0.7, -0.4]);
+            let (run, rows) = Differentiable::jacobian(&model, &u, channels, &past).unwrap();
+            prop_assert_eq!(&run, &Lagged::simulate(&model, &u, channels, &past).unwrap());
+            let shared = model.theta.len();
+            let moved = |i: usize, by: f64| {
+                let (mut theta, mut state) = (model.theta.clone(), past);
+                match i.checked_sub(shared) {
+                    None => theta[i] += by,
+                    Some(m) => state[m] += by,
+                }
+                let other = model.with_theta(&theta).unwrap();
+                Lagged::simulate(&other, &u, channels, &state).unwrap()
+            };
+            let columns = shared + 2;
+            for i in 0..columns {
+                let (ahead, behind) = (moved(i, 1e-6), moved(i, -1e-6));
+                for k in 0..run.len() {
+                    // a run that passes a knot within the step has two slopes there, and others after it
+                    let forward = (ahead[k] - run[k]) / 1e-6;
+                    let backward = (run[k] - behind[k]) / 1e-6;
+                    if (forward - backward).abs() > 1e-3 * (1.0 + forward.abs()) {
+                        break;
+                    }
+                    let difference = (forward + backward) / 2.0;
+                    let found = rows[k * columns + i];
+                    prop_assert!((found - difference).abs() < 1e-3 * (1.0 + difference.abs()), "{i} {k}: {found} {difference}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn small_signals_are_those_of_the_pieces() {
+        let model = bent(3, 1, 1);
+        let (u, state) = ([0.4], [1.1, 0.9, 0.3]);
+        let found = Model::linearise(&model, &u, &state).unwrap();
+        let step = |u: f64, x: [f64; 3]| model.output(&[x[0], x[1], u, x[2]]);
+        let difference = (step(0.4 + 1e-6, state) - step(0.4 - 1e-6, state)) / 2e-6;
+        assert!((found.d[0] - difference).abs() < 1e-6);
+        for i in 0..3 {
+            let moved = |by: f64| {
+                let mut x = state;
+                x[i] += by;
+                step(u[0], x)
+            };
+            let difference = (moved(1e-6) - moved(-1e-6)) / 2e-6;
+            assert!((found.c[i] - difference).abs() < 1e-6, "{i}");
+        }
+    }
+
+    #[test]
+    fn finds_the_curves_that_made_the_data() {
+        for (seed, pieces) in [(1, (4, 5)), (2, (4, 5)), (3, (4, 5))] {
+            let truth = bent(seed, 1, 1);
+            let u: Vec<f64> = inputs(seed, 1, 300).iter().flat_map(|u| [*u; 5]).collect();
+            let mut random = Random::new(9);
+            let clean = Lagged::simulate(&truth, &u, 1, &[0.0, 0.0]).unwrap();
+            let y: Vec<f64> = clean.iter().map(|y| y + 0.01 * random.normal()).collect();
+            let records = [Record::new(&u, 1, &y).unwrap()];
+            let monitor = Monitor::default();
+            let linear = oe::fit(&records, 2, 2, 1, true, 100, &monitor).unwrap();
+            let found = fit(&records, 2, 2, 1, pieces, 200, &monitor).unwrap();
+            // knots lie elsewhere than those of the truth: what is left is what pieces make of other pieces
+            assert!(
+                found.cost < 0.1 * linear.cost,
+                "{seed}: {} {}",
+                found.cost,
+                linear.cost
+            );
+            let new = inputs(seed + 100, 1, 300);
+            let (truth, own) = (
+                Lagged::simulate(&truth, &new, 1, &[0.0, 0.0]).unwrap(),
+                Lagged::simulate(&found.model, &new, 1, &[0.0, 0.0]).unwrap(),
+            );
+            let error: f64 = truth.iter().zip(&own).map(|(a, b)| (a - b).powi(2)).sum();
+            let size: f64 = truth.iter().map(|a| a * a).sum();
+            assert!(error < 0.02 * size, "{seed}: {}", error / size);
+        }
+    }
+
+    #[test]
+    fn puts_gaps_weights_and_several_records_into_one_cost() {
+        let truth = bent(5, 1, 1);
+        let u: Vec<f64> = inputs(5, 1, 60).iter().flat_map(|u| [*u; 5]).collect();
+        let mut y = Lagged::simulate(&truth, &u, 1, &[0.2, 0.1]).unwrap();
+        let mut random = Random::new(3);
+        y.iter_mut().for_each(|y| *y += 0.05 * random.normal());
+        y[40..60].fill(f64::NAN);
+        let w = crate::laws::weights(300, 1);
+        let records = [Record::with_gaps(&u, 1, &y).unwrap(); 2];
+        let records = [records[0].with_weights(&w).unwrap(), records[1]];
+        let monitor = Monitor::default();
+        let found = fit(&records, 2, 2, 1, (4, 5), 30, &monitor).unwrap();
+        assert_eq!(found.initial_states.len(), 2);
+        assert!(found.trace.windows(2).all(|pair| pair[1] < pair[0]));
+        assert!(found.cost < 5e-3 && found.cost > 0.0, "{}", found.cost);
+    }
+
+    #[test]
+    fn refuses_what_is_no_model() {
+        let model = bent(1, 1, 1);
+        let (lags, inputs, output) = (model.lags, model.input_knots(), model.output_knots());
+        let flat = Knots {
+            low: 1.0,
+            high: 1.0,
+            pieces: 3,
+        };
+        let none = Knots {
+            pieces: 0,
+            ..output
+        };
+        let theta = model.theta.clone();
+        let refused = |inputs: &[Knots], output, theta| {
+            HammersteinWiener::new(lags, inputs, output, theta)
+                .unwrap_err()
+                .message
+        };
+        assert!(refused(&[flat], output, theta.clone()).contains("input"));
+        assert!(refused(&inputs, none, theta.clone()).contains("0 from"));
+        assert!(refused(&[], output, theta.clone()).contains("each of 1 inputs"));
+        assert!(refused(&inputs, output, theta[1..].to_vec()).contains("parameters"));
+        let mut wild = theta;
+        wild[4] = f64::NAN;
+        assert!(refused(&inputs, output, wild).contains("finite"));
+        let unstable = [vec![-2.5, 1.0], model.theta[2..].to_vec()].concat();
+        assert!(model.with_theta(&unstable).is_none());
+    }
+}

@@ -1,0 +1,300 @@
+//! The free run of any lagged model fitted by Levenberg-Marquardt, from the derivatives of one step.
+//!
+//! A model `y(k) = f(phi(k); theta)` that knows its gradient ([`Parametric`]) gets its sensitivities and its fit from here.
+//! With `S(k) = dy(k)/d(theta, y_past)` the rule of the chain along the free run is
+//!
+//! ```text
+//! S(k) = [df/dtheta  0](k) + sum_m (df/dy(k-m)) S(k-m),    S(-m) = [0  e_m]
+//! ```
+//!
+//! Row by row this is a recursion with gains that change from sample to sample, as [`Gram`] has it. The parameters of a
+//! fit are theta, then the past outputs of each experiment, so that `J'J` is full for theta and block-diagonal for those.
+
+use std::ops::Range;
+
+use crate::data::weighted_squares;
+use crate::gram::Gram;
+use crate::lagged::{Lagged, push_past};
+use crate::lm::{self, Damping, Outcome, Problem};
+use crate::model::{Differentiable, RunAndRows};
+use crate::monitor::look;
+use crate::{Error, Monitor, Record, Result};
+
+/// A lagged model that is a function of its parameters.
+pub trait Parametric: Lagged + Clone + Send + Sync {
+    /// The parameters.
+    fn theta(&self) -> Vec<f64>;
+
+    /// The same structure with other parameters; `None` where these make no stable model.
+    fn with_theta(&self, theta: &[f64]) -> Option<Self>;
+
+    /// The output, and its derivatives by the parameters and by the regressor, into room of their lengths.
+    fn gradient(&self, phi: &[f64], by_theta: &mut [f64], by_phi: &mut [f64]) -> f64;
+
+    /// The parameters that a fit holds near 0 where the data say nothing about them; each is of size 1.
+    fn shrunk(&self) -> Range<usize>;
+}
+
+impl<M: Parametric> Differentiable for M {
+    fn theta(&self) -> Vec<f64> {
+        Parametric::theta(self)
+    }
+
+    fn slopes(&self, phi: &[f64]) -> Vec<f64> {
+        let (mut by_theta, mut by_phi) = (vec![0.0; self.theta().len()], vec![0.0; phi.len()]);
+        self.gradient(phi, &mut by_theta, &mut by_phi);
+        by_phi
+    }
+
+    fn jacobian(&self, u: &[f64], channels: usize, y_past: &[f64]) -> Result<RunAndRows> {
+        let run = Lagged::simulate(self, u, channels, y_past)?;
+        let (lags, parameters) = (self.lags(), Parametric::theta(self).len());
+        let (na, columns) = (lags.na, parameters + lags.na);
+        // the rows of the past outputs themselves come first, the oldest one on top
+        let mut rows = vec![0.0; (na + run.len()) * columns];
+        for i in 0..na {
+            rows[(na - 1 - i) * columns + parameters + i] = 1.0;
+        }
+        let mut phi = vec![0.0; lags.regressors()];
+        let mut by_phi = phi.clone();
+        phi[..na].copy_from_slice(y_past);
+        for (k, &y) in run.iter().enumerate() {
+            lags.write_inputs(u, k, &mut phi[na..]);
+            let (before, rest) = rows.split_at_mut((na + k) * columns);
+            let row = &mut rest[..columns];
+            self.gradient(&phi, &mut row[..parameters], &mut by_phi);
+            for (gain, old) in by_phi[..na].iter().zip(before.rchunks_exact(columns)) {
+                for (value, old) in row.iter_mut().zip(old) {
+                    *value += gain * old;
+                }
+            }
+            push_past(&mut phi[..na], y);
+        }
+        rows.drain(..na * columns);
+        Ok((run, rows))
+    }
+}
+
+/// A model fitted in free run.
+#[derive(Clone, Debug)]
+pub struct Fit<M> {
+    /// The model.
+    pub model: M,
+    /// `1/(2N) sum e^2` in free run, in the output's unit squared, without what holds parameters near 0.
+    pub cost: f64,
+    /// Iterations.
+    pub iterations: usize,
+    /// How the iteration ended.
+    pub termination: lm::Termination,
+    /// What was minimised, at the start and after each accepted step.
+    pub trace: Vec<f64>,
+    /// Past outputs of each experiment, newest first, as estimated with the model.
+    pub initial_states: Vec<Vec<f64>>,
+}
+
+/// Fits the free run of `start`'s structure to all experiments, from its parameters and from past outputs.
+///
+/// `ridge` times half the sum of the squares of the shrunk parameters, in units of the output's variance, is added to the
+/// cost: a parameter on which the data say nothing stays at 0, and one on which they do is moved by about `ridge`.
+///
+/// # Errors
+/// `ErrorKind::Data` for fewer samples than unknowns, `ErrorKind::Fit` where the start has no finite free run.
+pub fn fit<M: Parametric>(
+    start: &M,
+    initial_states: &[Vec<f64>],
+    records: &[Record],
+    ridge: f64,
+    max_iterations: usize,
+    monitor: &Monitor,
+) -> Result<Fit<M>> {
+    let theta = [Parametric::theta(start), initial_states.concat()].concat();
+    let mut problem = FreeRun::new(start.clone(), records, ridge, monitor)?;
+    let settings = lm::Settings {
+        max_iterations,
+        damping: Damping::Diagonal,
+        ..lm::Settings::default()
+    };
+    let found: Outcome = lm::minimize(&mut problem, theta, &settings, monitor, |_, _| ());
+    if !found.cost.is_finite() {
+        return Err(Error::fit(
+            "expected a start with a finite free run, found none; scale the data, or identify a linear model first",
+        ));
+    }
+    let shared = problem.shared;
+    let model = start.with_theta(&found.theta[..shared]).ok_or_else(|| {
+        Error::fit("expected a stable model, the fit found none; lower the orders")
+    })?;
+    Ok(Fit {
+        cost: found.cost - problem.ridged(&found.theta),
+        model,
+        iterations: found.iterations,
+        termination: found.termination,
+        trace: found.trace,
+        initial_states: found.theta[shared..]
+            .chunks_exact(start.lags().na)
+            .map(<[f64]>::to_vec)
+            .collect(),
+    })
+}
+
+/// The free runs over all experiments as a least-squares problem.
+struct FreeRun<'a, M> {
+    model: M,
+    records: &'a [Record<'a>],
+    monitor: &'a Monitor,
+    /// Parameters that all experiments share.
+    shared: usize,
+    weight: f64,
+    ridge: f64,
+    /// Free runs from each record's first measured sample on: a state before a gap would leave no trace.
+    runs: Vec<Vec<f64>>,
+    gram: Gram,
+}
+
+impl<'a, M: Parametric> FreeRun<'a, M> {
+    fn new(model: M, records: &'a [Record<'a>], ridge: f64, monitor: &'a Monitor) -> Result<Self> {
+        let (shared, na) = (Parametric::theta(&model).len(), model.lags().na);
+        let samples: usize = records.iter().map(Record::counting).sum();
+        let unknowns = shared + na * records.len();
+        if samples <= unknowns {
+            return Err(Error::data(format!(
+                "expected more than {unknowns} samples for as many parameters and initial states, got {samples} measured; record longer or lower na and nb"
+            )));
+        }
+        let weight: f64 = records.iter().map(Record::total_weight).sum();
+        Ok(Self {
+            shared,
+            monitor,
+            weight,
+            ridge: ridge * variance(records, weight),
+            runs: records
+                .iter()
+                .map(|r| vec![0.0; r.len() - r.first_measured()])
+                .collect(),
+            gram: Gram::new(shared + na + 1, na),
+            records,
+            model,
+        })
+    }
+
+    /// What holds the shrunk parameters near 0.
+    fn ridged(&self, theta: &[f64]) -> f64 {
+        let shrunk = &theta[self.model.shrunk()];
+        0.5 * self.ridge * shrunk.iter().map(|value| value * value).sum::<f64>()
+    }
+
+    fn state<'t>(&self, theta: &'t [f64], experiment: usize) -> &'t [f64] {
+        let na = self.model.lags().na;
+        &theta[self.shared + experiment * na..][..na]
+    }
+
+    fn run(&mut self, model: &M, theta: &[f64], experiment: usize) -> Option<f64> {
+        let (lags, record) = (model.lags(), &self.records[experiment]);
+        let (first, look) = (record.first_measured(), look(8 * lags.regressors()));
+        let mut phi = vec![0.0; lags.regressors()];
+        phi[..lags.na].copy_from_slice(self.state(theta, experiment));
+        let mut sum = 0.0;
+        for (k, out) in (first..record.len()).zip(&mut self.runs[experiment]) {
+            if k & (look - 1) == 0 && self.monitor.stopped() {
+                return None;
+            }
+            lags.write_inputs(record.u, k, &mut phi[lags.na..]);
+            *out = model.output(&phi);
+            push_past(&mut phi[..lags.na], *out);
+            let error = record.y[k] - *out;
+            sum += if record.y[k].is_nan() {
+                0.0
+            } else {
+                error * error
+            };
+        }
+        Some(match record.weights {
+            None => sum,
+            Some(w) => weighted_squares(&w[first..], &record.y[first..], &self.runs[experiment]),
+        })
+    }
+
+    /// The rows of one experiment, into the Gram matrix.
+    fn sensitivities(&mut self, model: &M, theta: &[f64], experiment: usize) {
+        let (lags, record, shared) = (model.lags(), &self.records[experiment], self.shared);
+        let (first, na) = (record.first_measured(), lags.na);
+        let mut phi = vec![0.0; lags.regressors()];
+        let mut by_phi = phi.clone();
+        phi[..na].copy_from_slice(self.state(theta, experiment));
+        let (gram, mut by_theta) = (&mut self.gram, vec![0.0; shared]);
+        gram.clear();
+        for i in 0..na {
+            gram.past_mut(i + 1)[shared + i] = 1.0;
+        }
+        let look = look((shared + na).pow(2));
+        for (k, &y) in (first..).zip(&self.runs[experiment]) {
+            if k & (look - 1) == 0 && self.monitor.stopped() {
+                return;
+            }
+            lags.write_inputs(record.u, k, &mut phi[na..]);
+            model.gradient(&phi, &mut by_theta, &mut by_phi);
+            let weight = record.weights.map_or(1.0, |w| w[k]);
+            let error = (record.y[k] - y, weight);
+            gram.push(&by_phi[..na], shared + na, error, |row| {
+                row[..shared].copy_from_slice(&by_theta);
+                row[shared..].fill(0.0);
+            });
+            push_past(&mut phi[..na], y);
+        }
+    }
+}
+
+/// The weighted variance of the measured outputs.
+fn variance(records: &[Record], weight: f64) -> f64 {
+    let measured = || {
+        records.iter().flat_map(|r| {
+            let known = (0..r.len()).filter(|&k| !r.y[k].is_nan());
+            known.map(|k| (r.weight(k), r.y[k]))
+        })
+    };
+    let mean = measured().map(|(w, y)| w * y).sum::<f64>() / weight;
+    measured().map(|(w, y)| w * (y - mean).powi(2)).sum::<f64>() / weight
+}
+
+impl<M: Parametric> Problem for FreeRun<'_, M> {
+    fn parameters(&self) -> usize {
+        self.shared + self.model.lags().na * self.records.len()
+    }
+
+    fn cost(&mut self, theta: &[f64]) -> Option<f64> {
+        let model = self.model.with_theta(&theta[..self.shared])?;
+        let mut sum = 0.0;
+        for experiment in 0..self.records.len() {
+            sum += self.run(&model, theta, experiment)?;
+        }
+        Some(0.5 * sum / self.weight + self.ridged(theta)).filter(|c| c.is_finite())
+    }
+
+    fn normal_equations(&mut self, theta: &[f64], jtj: &mut [f64], jte: &mut [f64]) {
+        jtj.fill(0.0);
+        jte.fill(0.0);
+        let Some(model) = self.model.with_theta(&theta[..self.shared]) else {
+            return;
+        };
+        let (shared, na, n) = (self.shared, model.lags().na, self.parameters());
+        for experiment in 0..self.records.len() {
+            self.sensitivities(&model, theta, experiment);
+            let place = |i: usize| if i < shared { i } else { i + experiment * na };
+            let (sums, width) = self.gram.finish();
+            for i in 0..shared + na {
+                jte[place(i)] += sums[(shared + na) * width + i] / self.weight;
+                for j in 0..=i {
+                    jtj[place(i) * n + place(j)] += sums[i * width + j] / self.weight;
+                }
+            }
+        }
+        for i in model.shrunk() {
+            jtj[i * n + i] += self.ridge;
+            jte[i] -= self.ridge * theta[i];
+        }
+        // a state that has decayed before the first measured sample leaves no trace
+        for i in shared..n {
+            jtj[i * n + i] += f64::MIN_POSITIVE;
+        }
+    }
+}
