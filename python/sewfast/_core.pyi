@@ -6,6 +6,7 @@ from typing import Any, Literal, TypeAlias, TypedDict, final
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import disjoint_base
 
 __version__: str
 cpu: Literal["baseline", "avx2", "avx512"]  # what the kernels run on; SEWFAST_CPU forces one
@@ -163,6 +164,7 @@ class EmbeddedModel:
 def tanh_quotients() -> dict[str, tuple[list[float], list[float], float]]:
     """tanh(x) = x P(x^2)/Q(x^2): P, Q and the largest |x| of ``near``, ``far`` and ``single``."""
 
+@disjoint_base
 class Model:
     """A compiled model of any kind, which adds its own parameters. States are past outputs, newest first, or the model's own."""
 
