@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import sewfast
 from link_kept import Kept
 from sewfast import (
     Biquad,
@@ -256,11 +255,6 @@ def test_a_response_alone_or_a_variable_of_no_notch_is_refused() -> None:
             model, r, start=start, constraints=Constraints(Ms=1.6, plant=[model, slower]),
             evaluations=2,
         )  # fmt: skip
-
-
-def test_code_for_other_processors_refuses_them_by_name(tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match="without biquads"):
-        sewfast.deploy(controller(), tmp_path / "code")
 
 
 def test_a_notch_is_proposed_where_the_shaft_swings() -> None:

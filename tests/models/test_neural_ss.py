@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import state_space
+import neural_ss_equations
 from sewfast import _core
 from sewfast.control import paper_controller
 from sewfast.dataset import Dataset
@@ -75,8 +75,8 @@ def test_run_and_derivatives_agree_with_complex_steps() -> None:
     rng = np.random.default_rng(20040)
     worst = 0.0
     for _ in range(CASES):
-        case = state_space.random_case(rng)
-        expected, derivatives = state_space.jacobian(
+        case = neural_ss_equations.random_case(rng)
+        expected, derivatives = neural_ss_equations.jacobian(
             case["theta"], case["state"], case["u"], case["settings"]
         )
         run, rows = made(case).jacobian(case["u"], case["state"])
@@ -97,7 +97,7 @@ def test_shapes_are_those_of_the_number_of_outputs() -> None:
     for outputs, columns in ((1, ()), (2, (2,))):
         case = next(
             c
-            for c in iter(lambda: state_space.random_case(rng), None)
+            for c in iter(lambda: neural_ss_equations.random_case(rng), None)
             if c["settings"]["n_outputs"] == outputs
         )
         core, u, state = made(case), case["u"], case["state"]
@@ -112,7 +112,7 @@ def test_shapes_are_those_of_the_number_of_outputs() -> None:
 def test_a_clean_record_gives_its_state_back() -> None:
     rng = np.random.default_rng(2)
     for _ in range(30):
-        case = state_space.random_case(rng, samples=60)
+        case = neural_ss_equations.random_case(rng, samples=60)
         if case["settings"]["output"] == "abs":
             continue  # which sign it was cannot always be told
         case["settings"]["residual_variance"][:] = 1e-12
@@ -125,7 +125,7 @@ def test_a_clean_record_gives_its_state_back() -> None:
 
 
 def test_without_outputs_the_state_is_the_prior_and_a_gap_changes_little() -> None:
-    case = state_space.random_case(np.random.default_rng(3), samples=60)
+    case = neural_ss_equations.random_case(np.random.default_rng(3), samples=60)
     case["settings"] |= {"output": "linear", "output_parameters": np.zeros(0)}
     case["settings"]["state_mean"] = np.full(case["settings"]["nx"], 0.25)
     core = made(case)
@@ -138,7 +138,7 @@ def test_without_outputs_the_state_is_the_prior_and_a_gap_changes_little() -> No
 
 
 def test_a_record_without_number_is_refused() -> None:
-    case = state_space.random_case(np.random.default_rng(4))
+    case = neural_ss_equations.random_case(np.random.default_rng(4))
     core = made(case)
     u = case["u"].copy()
     u[3] = np.nan
@@ -151,8 +151,8 @@ def test_a_record_without_number_is_refused() -> None:
 
 
 def test_a_model_that_runs_away_says_so() -> None:
-    case = state_space.random_case(np.random.default_rng(5), samples=400)
-    where, shape = state_space.parts(case["settings"])["A"]
+    case = neural_ss_equations.random_case(np.random.default_rng(5), samples=400)
+    where, shape = neural_ss_equations.parts(case["settings"])["A"]
     case["theta"][where] = (1e3 * np.eye(shape[0])).ravel()
     with pytest.raises(FitError, match="unstable"):
         made(case).simulate(case["u"], case["state"])
@@ -442,9 +442,11 @@ def test_a_twin_has_every_bit() -> None:
 
 
 def test_a_loop_is_closed_around_it() -> None:
-    case = state_space.random_case(np.random.default_rng(16))
+    case = neural_ss_equations.random_case(np.random.default_rng(16))
     while case["settings"]["n_inputs"] != 1 or case["settings"]["n_outputs"] != 1:
-        case = state_space.random_case(np.random.default_rng(int(1e6 * case["theta"][0] ** 2)))
+        case = neural_ss_equations.random_case(
+            np.random.default_rng(int(1e6 * case["theta"][0] ** 2))
+        )
     case["settings"]["nk"] = 1
     core = made(case)
     controller = paper_controller().core()
