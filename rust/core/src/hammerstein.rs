@@ -563,7 +563,7 @@ mod tests {
 
     #[test]
     fn finds_the_curves_that_made_the_data() {
-        for (seed, pieces) in [(1, (4, 5)), (2, (4, 5)), (3, (4, 5))] {
+        for seed in 1..=3 {
             let truth = bent(seed, 1, 1);
             let u: Vec<f64> = inputs(seed, 1, 300).iter().flat_map(|u| [*u; 5]).collect();
             let mut random = Random::new(9);
@@ -572,10 +572,10 @@ mod tests {
             let records = [Record::new(&u, 1, &y).unwrap()];
             let monitor = Monitor::default();
             let linear = oe::fit(&records, 2, 2, 1, true, 100, &monitor).unwrap();
-            let found = fit(&records, 2, 2, 1, pieces, 200, &monitor).unwrap();
-            // knots lie elsewhere than those of the truth: what is left is what pieces make of other pieces
+            // knots lie elsewhere than those of the truth: many pieces come close to a few, a few do not
+            let found = fit(&records, 2, 2, 1, (16, 16), 200, &monitor).unwrap();
             assert!(
-                found.cost < 0.1 * linear.cost,
+                found.cost < 0.25 * linear.cost,
                 "{seed}: {} {}",
                 found.cost,
                 linear.cost
@@ -603,7 +603,7 @@ mod tests {
         let records = [Record::with_gaps(&u, 1, &y).unwrap(); 2];
         let records = [records[0].with_weights(&w).unwrap(), records[1]];
         let monitor = Monitor::default();
-        let found = fit(&records, 2, 2, 1, (4, 5), 30, &monitor).unwrap();
+        let found = fit(&records, 2, 2, 1, (16, 16), 60, &monitor).unwrap();
         assert_eq!(found.initial_states.len(), 2);
         assert!(found.trace.windows(2).all(|pair| pair[1] < pair[0]));
         assert!(found.cost < 5e-3 && found.cost > 0.0, "{}", found.cost);
