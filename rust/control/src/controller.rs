@@ -70,6 +70,23 @@ impl<T: Real> Controller<T> {
         })
     }
 
+    /// What [`new`](Self::new) would refuse, without the controller, which fills most of a small processor's stack.
+    ///
+    /// # Errors
+    /// The first setting that is outside its range.
+    pub fn check(design: &Design<T>) -> Result<(), Refused> {
+        let ts = design.pid.ts;
+        Pid::new(design.pid)?;
+        Feedback::new(
+            design.filter_samples,
+            design.filter_time,
+            design.observer_time,
+            ts,
+        )?;
+        Ramp::new(design.r_rate, ts)?;
+        Ok(())
+    }
+
     /// Back to the state before the first sample, in automatic.
     pub fn reset(&mut self) {
         self.filter.reset();

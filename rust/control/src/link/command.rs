@@ -98,6 +98,10 @@ impl Gains {
     /// # Errors
     /// The first setting that is outside its range.
     pub(super) fn controller(&self, volt: f32, ts: f32) -> Result<Controller<f32>, Refused> {
+        Controller::new(self.clipped(volt, ts))
+    }
+
+    fn clipped(&self, volt: f32, ts: f32) -> Design<f32> {
         let Settings { u_min, u_max, .. } = self.design.pid;
         // not f32::max and f32::min, which would hide a NaN
         let clipped = Settings {
@@ -106,10 +110,10 @@ impl Gains {
             ts,
             ..self.design.pid
         };
-        Controller::new(Design {
+        Design {
             pid: clipped,
             ..self.design
-        })
+        }
     }
 
     /// Biquads from the next start on; GAINS come without any.
@@ -132,10 +136,10 @@ impl Gains {
         refused(volt).map_or(Ok(()), |field| Err(Refusal::limit(field)))
     }
 
-    /// What keeps a controller from being made; in a frame of its own, as a controller fills most of a stack.
+    /// What keeps a controller from being made; in a frame of its own, as its parts fill much of a stack.
     #[inline(never)]
     pub(super) fn refused(&self, volt: f32, ts: f32) -> Option<Refused> {
-        self.controller(volt, ts).err()
+        Controller::check(&self.clipped(volt, ts)).err()
     }
 }
 
