@@ -53,7 +53,7 @@ WITHIN, WITHIN_LARGE = 2.0, 1.3
 """How much larger than the best one's a finalist's error may be."""
 WORTH_AN_INTEGRATOR = 0.7
 ENOUGH_TO_CHOOSE_BY = 1_500
-"""Held-out samples from which on a single start may be taken instead of the median."""
+"""Held-out samples from which on a single start, or structure, may be taken instead of a median."""
 MOST_STARTS_LARGE = 2
 """Starts of a finalist that are trained to the end on much data."""
 ALONE = 0.98
@@ -404,8 +404,13 @@ class Choice:
         return [best, *self._joining(best, able)]
 
     def _joining(self, best: Candidate, able: Sequence[Candidate]) -> list[Candidate]:
-        """Others whose runs bring the median's error down, on little data all about as good."""
+        """Others whose runs bring the median's error down, on little data all about as good.
+
+        Where little is held out, a structure that leads there by a hair may do far worse elsewhere,
+        and others do their worst at other places: any gain will do.
+        """
         group = [best]
+        worth = 1.0 if self.split.scored < ENOUGH_TO_CHOOSE_BY else ALONE
         if best.structure.integrator and self.search.repeats:
             # what is held out repeats what was learned and cannot tell them: all that are small
             return [c for c in able if c is not best and c.structure.integrator]
@@ -414,7 +419,7 @@ class Choice:
                 continue
             before = self._error_of(group)
             after = self._error_of([*group, c])
-            if after < 0.98 * before or (self.search.is_small and c.error < TOGETHER * best.error):
+            if after < worth * before or (self.search.is_small and c.error < TOGETHER * best.error):
                 group.append(c)
         return group[1:]
 

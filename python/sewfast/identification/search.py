@@ -58,8 +58,8 @@ STILL_NEAR = 3.0
 SECOND_ROUTE = 0.25
 """Part of its operations below which a search still has the means to climb a second route."""
 ROUNDS = 6
-SCREENED_STARTS, SHARE_OF_SCREEN = 8, 0.1
-"""Starts of a screened structure, at most, and the part of the operations that they may take."""
+SCREENED_STARTS, SHARE_OF_SCREEN, SHARE_OF_HALVING = 8, 0.1, 0.1
+"""Fresh starts of a structure at a time, at most, and the parts of the operations they may take."""
 SCREEN_ITERATIONS, HALVING_ITERATIONS, CLIMB_ITERATIONS = 20, (25, 40), 40
 INTEGRATING_POLE = 0.9995
 """A slower real pole of the linear models asks for an integrator."""
@@ -277,8 +277,15 @@ class Search:
         near = [c for c in alive if c.error <= STILL_NEAR * alive[0].error]
         firsts = best_of_each_size(near) if iterations == HALVING_ITERATIONS[0] else []
         kept = half + [c for c in firsts if c not in half]
-        fresh = [0 if c.structure.integrator else 2 if self.is_small else 1 for c in kept]
+        fresh = [self._cheap_starts(c, iterations, len(kept)) for c in kept]
         return sorted(self.continued(kept, iterations, fresh), key=lambda c: c.error)
+
+    def _cheap_starts(self, c: Candidate, iterations: int, candidates: int) -> int:
+        """Fresh starts of one of so many candidates: luck, so that cheap ones get many."""
+        samples = len(self.trials[0].fitted)
+        each = (c.iterations + iterations) * c.structure.operations(self.inputs, samples)
+        able = int(SHARE_OF_HALVING * self.budget / (candidates * max(each, 1.0)))
+        return min(SCREENED_STARTS, max(2 if self.is_small else 1, able))
 
     def climb(self) -> None:
         """Larger networks, other decays and delays, from the best so far while each step gains.

@@ -1,6 +1,6 @@
 //! Start parameters: a linear model with a hidden layer that hardly reaches it yet.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, RowDVector};
 
 use super::problem::Experiment;
 use super::realisation::Realisation;
@@ -14,8 +14,16 @@ const POLES: (f64, f64) = (0.5, 0.99);
 /// Added to the normal equations of the outputs, relative to their mean.
 const RIDGE: f64 = 1e-9;
 
+/// Half of the starts of an integrator have a unit that switches with the sign of the speed.
+const SWITCHING: f64 = 0.5;
+/// Slopes of such a unit at rest, in deviations of the speed: friction switches within a small part of them.
+const SLOPES: (f64, f64) = (2.0, 30.0);
+
 /// The realisation beside hidden units: weights normal with standard deviation `scale/sqrt(nx + nu)`, biases uniform
 /// from -1 to 1, `E` and `G` small.
+///
+/// A position is the sum of a speed, and what resists a motion is friction: dry friction jumps where the speed changes
+/// its sign, and training hardly ever finds that jump from smooth random units.
 pub(super) fn beside(
     linear: &Realisation,
     shape: Shape,
@@ -26,9 +34,19 @@ pub(super) fn beside(
     let mut theta = linear.theta(shape);
     let width = scale / (shape.arguments() as f64).sqrt();
     theta[parts.wx.start..parts.wu.end].fill_with(|| width * random.normal());
-    theta[parts.bh].fill_with(|| random.between(-1.0, 1.0));
+    theta[parts.bh.clone()].fill_with(|| random.between(-1.0, 1.0));
     theta[parts.e].fill_with(|| REACH * random.normal());
     theta[parts.g].fill_with(|| REACH * random.normal());
+    if shape.integrator && random.between(0.0, 1.0) < SWITCHING {
+        let slope = random.between(SLOPES.0.ln(), SLOPES.1.ln()).exp();
+        let speed = linear.speed();
+        let deviation = speed.norm();
+        if deviation > 0.0 {
+            (0..shape.nx).for_each(|j| theta[parts.wx.start + j] = slope * speed[j] / deviation);
+            theta[parts.wu.start..parts.wu.start + shape.inputs].fill(0.0);
+            theta[parts.bh.start] = 0.0;
+        }
+    }
     for (i, value) in shape.held() {
         theta[i] = value;
     }
@@ -62,6 +80,11 @@ pub(super) fn small(
 }
 
 impl Realisation {
+    /// What the states add to the first output from one sample to the next, beside the input's part.
+    fn speed(&self) -> RowDVector<f64> {
+        self.c.row(0) * &self.a - self.c.row(0)
+    }
+
     /// With `C`, `D` and `c` by least squares over the states.
     fn with_outputs(mut self, shape: Shape, experiments: &[Experiment]) -> Option<Self> {
         let (nx, width) = (shape.nx, shape.arguments() + 1);
