@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from sewfast import Biquad, Controller, Gains, Model, deploy
-from sewfast.deployment.c99 import combined_run, embedded_members
+from sewfast.deployment.precision import combined_run, embedded_members
 
 EMULATED = Path(__file__).parent / "emulated"
 WARNINGS = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]

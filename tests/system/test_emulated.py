@@ -128,6 +128,10 @@ def test_the_command_goes_from_doctor_to_run(
     assert {p.name for p in out.iterdir()} >= {"chirp.mcap", "first.json", "first.mcap"}
     assert main(words) == 2
     assert "--overwrite" in capsys.readouterr().err
+    (tmp_path / "file").touch()
+    for wrong in (tmp_path / "file" / "below", tmp_path / ("x" * 300)):
+        assert main(["pil", "--firmware", str(FIRMWARE), "--out", str(wrong)]) == 2
+        assert "expected a folder that can be made" in capsys.readouterr().err
 
 
 def test_what_is_no_firmware_is_refused(tmp_path: Path) -> None:
