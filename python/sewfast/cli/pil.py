@@ -23,7 +23,7 @@ a controller, commission it. The motor is computed on the emulated processor too
 At the end it says how many instructions a control period takes, how deep the stack was used and
 how large the code is. QEMU counts instructions, not cycles.
 
-It needs a source checkout and, on Debian, make, cargo and
+It needs a source checkout and, on Debian, make, cargo-web and
   gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm rustc-web rust-web-src
 or a firmware that is built already, and qemu-system-arm alone.
 """
