@@ -34,15 +34,15 @@ class Dataset:
     counts : tuple (column, counts_per_rev) or None
         Set where the output is a speed [RPM] computed from an encoder's counts.
     notes : tuple of str
-        What was left out when the data set was made.
+        Notes on samples and columns omitted when the data set was made.
     looks_ahead : bool
-        The output was computed with samples after it as well, by a smoother or a filter without
-        delay: it begins to move before the input does.
+        Whether the output was computed from later samples as well, by a smoother or a filter
+        without delay, so that it begins to move before the input does.
 
     Raises
     ------
     DataError
-        Where experiments, names and units disagree in number, or Ts is not a positive number.
+        If experiments, names and units disagree in number, or Ts is not a positive number.
     """
 
     experiments: tuple[Experiment, ...]
@@ -103,9 +103,9 @@ class Dataset:
         Ts : float
             Sample time [s].
         weights : array_like, shape (N,), or None
-            How much the squared error of each sample counts: finite, 0 or more, not all 0. What is
-            trusted less gets less, what is not to count 0; only their ratios matter. None: all
-            alike.
+            How much the squared error of each sample counts: finite, 0 or more, not all 0. Give
+            less weight to samples that you trust less and 0 to those that must not count; only
+            ratios matter. None: all equal.
 
         Raises
         ------
@@ -134,7 +134,7 @@ class Dataset:
         Raises
         ------
         DataError
-            Where there is none, or sample times (1 %), numbers of inputs or units differ.
+            If there is none, or sample times (1 %), numbers of inputs or units differ.
         """
         parts = tuple(datasets)
         if not parts:

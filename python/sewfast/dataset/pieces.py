@@ -183,9 +183,9 @@ def take(data: Dataset, text: str) -> Dataset:
     Raises
     ------
     SettingError
-        Where the text is not a range.
+        If the text is not a range.
     DataError
-        Where the range leaves an experiment or is empty.
+        If the range leaves an experiment or is empty.
     """
     pieces = (e.cut(*range_of_text(text, e)) for e in data.experiments)
     return replace(data, experiments=tuple(pieces))
@@ -228,10 +228,10 @@ def split(
     Raises
     ------
     SettingError
-        Where a fraction is not between 0 and 1, they leave no rest, times do not increase, or both
+        If a fraction is not between 0 and 1, they leave no rest, times do not increase, or both
         or none are given.
     DataError
-        Where an experiment is too short to leave samples in every part, or there are fewer
+        If an experiment is too short to leave samples in every part, or there are fewer
         experiments than parts.
     """
     if by not in ("samples", "experiments"):
@@ -311,9 +311,9 @@ def split_at_gaps(
     Raises
     ------
     SettingError
-        Where `shortest` is no whole number above 0, or `of` is neither of the two.
+        If `shortest` is no whole number above 0, or `of` is neither of the two.
     DataError
-        Where no piece is left.
+        If no piece is left.
     """
     if isinstance(shortest, bool) or not isinstance(shortest, int) or shortest < 1:
         raise SettingError(f"shortest: expected a number of samples above 0, got {shortest!r}")
@@ -348,9 +348,9 @@ Where: TypeAlias = "str | Sequence[BoolArray] | BoolArray | Callable[[Experiment
 
 
 def mask(data: Dataset, where: Where, *, why: str = "masked") -> Dataset:
-    """The data with NaN in the output where `where` says so: these samples lose their weight.
+    """The data with NaN in the output wherever `where` selects a sample: it then has no weight.
 
-    Inputs and channels stay: a model still runs through such samples, it is not scored there.
+    Inputs and channels stay: a model still runs through such samples but is not scored there.
 
     Parameters
     ----------
@@ -364,10 +364,10 @@ def mask(data: Dataset, where: Where, *, why: str = "masked") -> Dataset:
     Raises
     ------
     DataError
-        Where a mask has not the experiment's length or is not of bool, or a range leaves an
+        If a mask has not the experiment's length or is not of bool, or a range leaves an
         experiment.
     SettingError
-        Where the text is not a range.
+        If the text is not a range.
     """
     masks = _masks(data, where)
     experiments, notes = [], []
@@ -427,7 +427,7 @@ def fill_inputs(data: Dataset, method: str = "hold", *, longest: int | None = No
     SettingError
         For another method, or a length that is no whole number above 0.
     DataError
-        Where an experiment begins with an unknown input: nothing is known to hold.
+        If an experiment begins with an unknown input: nothing is known to hold.
     """
     if method != "hold":
         raise SettingError(f"fill_inputs: expected the method 'hold', received {method!r}")
