@@ -202,7 +202,7 @@ def fleet(
     Parameters
     ----------
     recordings : path or sequence of paths
-        A folder (with its subfolders), a manifest (CSV with a column `file` and, where they differ,
+        A folder (with its subfolders), a manifest (CSV with a column `file` and, if they differ,
         `inputs` (several apart by `;`), `output`, `Ts`), or files.
     inputs, output, Ts
         As of `sewfast.read`.

@@ -58,7 +58,7 @@ class Recording:
         return len(self.u)
 
     def columns(self) -> dict[str, FloatArray]:
-        """t, u, counts, y and, where known, speed_true by name, as in a recording file."""
+        """t, u, counts, y and, if known, speed_true by name, as in a recording file."""
         t = np.arange(len(self), dtype=np.float64) * self.Ts
         known = {} if self.speed_true is None else {"speed_true": self.speed_true}
         return {"t": t, "u": self.u, "counts": self.counts, "y": self.y, **known}

@@ -85,10 +85,10 @@ def commission(
     First motion, step response, a small random command that shows delays and resonances, first
     gains by rule, pulses up to the command's limit, a closed loop under the first gains, an
     ensemble of networks from all of these, gains by search on all members with encoder, feedback
-    filter, gain spread and delay in the loop, and the machine under these beside what was
-    predicted. New gains are applied to the machine in steps, and a loop that oscillates is ended at
-    once. Every stage begins and ends at rest, and stops with a reason if the evidence is not good
-    enough (docs/commissioning.md).
+    filter, gain spread and delay in the loop, and finally the machine with these gains, compared
+    with the prediction. New gains are applied to the machine in steps, and a loop that oscillates
+    is ended at once. Every stage begins and ends at rest, and stops with a reason if the evidence
+    is not good enough (docs/commissioning.md).
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def commission(
         such requirement.
     Ms : float or None
         Largest sensitivity, on every member linearised at three quarters of the top speed; that of
-        Eq. 12's gains where it is larger and a load is required.
+        Eq. 12's gains if it is larger and a load is required.
     time_budget : float, optional
         Time of the search [s], after which the best gains so far are taken. A seed then no longer
         gives the same gains again.
@@ -153,7 +153,7 @@ def commission(
     Returns
     -------
     Commissioning
-        Its `verdict` is ``verified``, or ``verified, prediction poor`` where the measured cost is
+        Its `verdict` is ``verified``, or ``verified, prediction poor`` if the measured cost is
         more than twice the predicted one.
 
     Raises

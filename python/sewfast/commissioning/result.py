@@ -182,7 +182,7 @@ class Commissioning:
         Returns
         -------
         Path
-            The page, or `commissioning.json` where the report's packages are missing.
+            The page, or `commissioning.json` if the report's packages are missing.
 
         Raises
         ------

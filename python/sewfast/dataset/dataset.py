@@ -20,7 +20,8 @@ class Dataset:
     """Recordings of one plant: the same columns, units and sample time in every experiment.
 
     Immutable. An output may be NaN, which means that it was not measured: models run through it and
-    it has no weight. An input that is NaN is refused where a model needs it, with its sample.
+    it has no weight. An input that is NaN is refused if a model needs it; the message names the
+    sample.
 
     Parameters
     ----------
@@ -32,7 +33,7 @@ class Dataset:
     input_units, output_unit
         Units as text, empty where unknown.
     counts : tuple (column, counts_per_rev) or None
-        Set where the output is a speed [RPM] computed from an encoder's counts.
+        Set if the output is a speed [RPM] computed from an encoder's counts.
     notes : tuple of str
         Notes on samples and columns omitted when the data set was made.
     looks_ahead : bool
@@ -99,7 +100,7 @@ class Dataset:
         ----------
         u : array_like, shape (N,) or (N, n_inputs)
         y : array_like, shape (N,), or None
-            None where nothing was measured: enough to simulate from rest.
+            None if nothing was measured: enough to simulate from rest.
         Ts : float
             Sample time [s].
         weights : array_like, shape (N,), or None
@@ -166,7 +167,7 @@ class Dataset:
 
     @property
     def output_range(self) -> tuple[float, float]:
-        """Smallest and largest measured output over all experiments; NaN where there is none."""
+        """Smallest and largest measured output over all experiments; NaN if there is none."""
         return range_of(np.concatenate([e.y for e in self.experiments]))
 
     def __len__(self) -> int:

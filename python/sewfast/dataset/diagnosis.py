@@ -90,7 +90,7 @@ class Diagnosis:
     findings: tuple[Finding, ...]
 
     def find(self, kind: str) -> Finding | None:
-        """The first finding of that kind; None where there is none."""
+        """The first finding of that kind; None if there is none."""
         return next((f for f in self.findings if f.kind == kind), None)
 
     def to_json(self) -> dict[str, Any]:

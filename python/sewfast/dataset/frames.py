@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def to_pandas(data: Dataset, *, units: bool = False) -> Any:
     """The samples as a pandas DataFrame.
 
-    Columns: `t` [s], inputs, output, channels, `weights` where there are any, and with several
+    Columns: `t` [s], inputs, output, channels, `weights` if there are any, and with several
     experiments their number, `experiment`, first. NaN means not measured.
 
     Parameters

@@ -42,7 +42,7 @@ def white_noise(column: FloatArray) -> float:
 
 
 def quantum(column: FloatArray) -> float | None:
-    """The step of a grid on which all values lie; None where there is none.
+    """The step of a grid on which all values lie; None if there is none.
 
     Only where at least three values occur twice or more on average: a few values of any kind lie on
     some grid.

@@ -123,7 +123,7 @@ def require_sane(data: Dataset, largest: float = LARGEST) -> None:
 
 
 def require_excited(data: Dataset) -> None:
-    """Raise `DataError` where an input or the output never moves: nothing to identify from."""
+    """Raise `DataError` if an input or the output never moves: there is nothing to identify."""
     for i, name in enumerate(data.input_names):
         if all(np.min(e.u[:, i]) == np.max(e.u[:, i]) for e in data.experiments):
             raise DataError(
@@ -296,7 +296,7 @@ def _whole_experiments(data: Dataset, ends: list[float]) -> tuple[Dataset, ...]:
 def split_at_gaps(
     data: Dataset, shortest: int = SHORTEST_PIECE, *, of: Literal["any", "inputs"] = "any"
 ) -> Dataset:
-    """The pieces without NaN between the gaps, each as an experiment of its own.
+    """The pieces without NaN between the gaps, each as a separate experiment.
 
     Only a gap in an input needs this: models run through gaps in the output, which have no weight.
 
@@ -356,8 +356,8 @@ def mask(data: Dataset, where: Where, *, why: str = "masked") -> Dataset:
     ----------
     where : str, array of bool, sequence of arrays of bool, or callable
         A range `"A:B"` of every experiment (0-based, end excluded); a mask of shape (N,), one per
-        experiment where there are several, True where the output is to be forgotten; or a function
-        from an experiment to its mask.
+        experiment if there are several, True where the output is to be ignored; or a function from
+        an experiment to its mask.
     why : str
         What the note says.
 

@@ -81,7 +81,7 @@ def deploy(
         Of the arithmetic: f32 by default, f64 for FMI and ONNX. A microcontroller that computes
         only single precision in hardware takes some fifty times as long for `f64`.
     name : str, optional
-        With which every name in the code begins; `controller` or `model` where there is none.
+        Prefix of every name in the code; by default `controller` or `model`.
     changeable : bool
         Whether gains and limits of a controller in C can be changed while it runs (`set_gains`,
         `set_limits`), without a bump. They lie in memory then, not among the constants.

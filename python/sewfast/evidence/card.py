@@ -253,7 +253,7 @@ class ReportCard(Judged):
     criteria : Criteria or None
         Where the training data are known.
     outside : float
-        Share of the samples outside the training region; NaN where it is not known.
+        Share of the samples outside the training region; NaN if it is not known.
     distances : tuple of array, shape (N,)
         Distance to the nearest known point over the region's radius, per experiment.
     runs : tuple of Run

@@ -47,7 +47,7 @@ class FrequencyResponse:
     value : array of complex, shape (n,)
         Output over input [y/u].
     variance : array, shape (n,)
-        Of `value`: the expected square of its error's magnitude, from noise and, where different
+        Of `value`: the expected square of its error's magnitude, from noise and, if different
         excitations were averaged, from nonlinear distortion.
     noise : array, shape (n,), or None
         The part of it seen when the same excitation is repeated: noise alone.

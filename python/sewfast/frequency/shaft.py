@@ -68,8 +68,8 @@ class ShaftFit:
     Attributes
     ----------
     parameters : mapping of Parameter by name
-        `gain` [y/u], `delay` [s] beyond the hold, `lag_1`, `lag_2` [s] where the lags are real,
-        else `swing_hertz`, `swing_damping`; with a shaft also `resonance_hertz` and
+        `gain` [y/u], `delay` [s] beyond the hold, `lag_1`, `lag_2` [s] if the lags are real,
+        otherwise `swing_hertz`, `swing_damping`; with a shaft also `resonance_hertz` and
         `resonance_damping`, to which the motor's back-EMF adds, `antiresonance_hertz`,
         `antiresonance_damping`, `inertia_ratio` (load over motor).
     misfit : float
@@ -165,7 +165,7 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
     DataError
         For fewer than 20 usable frequencies.
     FitError
-        If nothing converges, or a resonance is asked for and none is found.
+        If nothing converges, or a resonance is requested and none is found.
     """
     usable = response.coherence > 0.5
     if usable.sum() < LEAST:

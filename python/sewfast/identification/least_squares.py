@@ -25,7 +25,7 @@ _ERRORS = {"2-point": 2.0**-24, "3-point": 2.0**-33, "cs": 0.0}
 class LeastSquaresResult:
     """A solution, how the iteration reached it and how well the data determine it.
 
-    ``success`` is True only where a test for a minimum held and was confirmed: the Jacobian has
+    ``success`` is True only if a test for a minimum held and was confirmed: the Jacobian has
     full rank, and further undamped steps became shorter and ended below the tolerances.
 
     Attributes
@@ -142,7 +142,7 @@ def least_squares(
         Relative reduction of the cost at which the solver tries to confirm a minimum, and cosine
         (see ``gtol``) that is small enough then. None switches a test off.
     xtol
-        Change of each parameter relative to its value (or standard error, where that is larger)
+        Change of each parameter relative to its value (or standard error, if that is larger)
         below which steps are small enough.
     gtol
         Cosine between the residuals and the range of the Jacobian that counts as zero.

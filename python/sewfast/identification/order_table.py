@@ -80,7 +80,7 @@ class OrderTable:
     choice : Structure
     reason : str
     delay : DelayEstimate or None
-        None where the delays to try were given.
+        None if the delays to try were given.
     output : str
         Name and unit of the output.
     """
@@ -107,7 +107,7 @@ class OrderTable:
         return least
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values; None where a number is not defined."""
+        """As JSON values; None if a number is not defined."""
         rows = [
             {k: v if math.isfinite(v) else None for k, v in asdict(r).items()} for r in self.rows
         ]
@@ -240,7 +240,7 @@ def orders(
     Returns
     -------
     OrderTable
-        `identify(data, **table.choice.orders)` goes on with it.
+        `identify(data, **table.choice.orders)` uses it.
 
     Raises
     ------

@@ -43,7 +43,7 @@ class Model(DynamicModel):
     input_names, input_units, output_name, output_unit
         As in the data set.
     counts : tuple (column, counts_per_rev) or None
-        Set where the output is a speed computed from encoder counts.
+        Set if the output is a speed computed from encoder counts.
     training : mapping
         Provenance: data, settings, cost with its horizon, termination. JSON values only.
     alternatives : tuple of Model

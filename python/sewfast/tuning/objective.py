@@ -36,7 +36,7 @@ class Cost:
     effort : float
         Of rms(u) [u].
     overshoot : float or None
-        Of the overshoot above its limit [%], where the reference is a step or trapezoid; R/100.
+        Of the overshoot above its limit [%], if the reference is a step or trapezoid; R/100.
     overshoot_limit : float
         Overshoot that costs nothing [%].
     rise : float

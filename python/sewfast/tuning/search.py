@@ -215,7 +215,7 @@ def tune(
     filter_samples : int, optional
         Moving average in the feedback. By default 8 ms, at most a tenth of the time constant.
     output_unit : str, optional
-        Unit of the output where the model states none: an encoder needs it.
+        Unit of the output if the model states none: an encoder needs it.
     start : Controller, optional
         Start of the search; settings that are not searched are kept, and the five settings above
         are ignored. By default Table 1 on the first model's own step response.
@@ -223,7 +223,7 @@ def tune(
         What to search, by name or with its bounds: ``Kp``, ``Ti``, ``Td``, ``alpha``, ``beta``,
         ``N``, ``Tt``, ``filter_samples``, ``filter_time``, ``observer_time``, ``r_rate``;
         ``Kp[0]``, ``Ti[0]``, ``Td[0]`` and so on of a gain schedule's points, ``schedule`` for all
-        of them. By default the gains, alpha, beta, and N where the start has a derivative filter.
+        of them. By default the gains, alpha, beta, and N if the start has a derivative filter.
     cost : Cost, optional
         What counts how much.
     aggregate : "mean" or "worst"
@@ -241,11 +241,11 @@ def tune(
         One for each reference: a command that is added behind the limits, unseen by the controller
         [u]. For instance, a load over the turn that no model contains.
     rival : model, optional
-        A model of another kind of the same drive, a linear one beside networks: its own gains are
-        searched for briefly (a fifth of the evaluations). Where either gains cost more than three
-        times as much on the other's model as that one's own, `TuningResult.warning` says so, and
-        of these two, and of gains tuned on both, those are taken whose largest cost, relative to
-        the least on the same model, is smallest.
+        A model of another kind of the same drive, such as a linear one next to networks: its own
+        gains are searched for briefly (a fifth of the evaluations). If either set of gains costs
+        more than three times as much on the other's model as that model's own gains,
+        `TuningResult.warning` says so. The result is then that one of the two, and of gains tuned
+        on both, whose largest cost relative to the least on the same model is smallest.
     method : "genetic" or "cma-es"
         A genetic algorithm with local refinement, or CMA-ES with restarts.
     evaluations : int
