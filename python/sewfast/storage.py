@@ -82,7 +82,7 @@ LARGEST_FILE = 16 * 1024 * 1024
 def write(
     path: str | os.PathLike[str], format: str, version: int, payload: Mapping[str, Any]
 ) -> None:
-    """Write ``payload`` under its format and version; the file appears whole or not at all.
+    """Write ``payload`` under its format and version; the file is either complete or absent.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ class FmuMachine:
         Units of those where the FMU states none: `RPM`, `rad/s`, `deg/s`, `rev/s`; `rad`, `deg`,
         `rev`.
     counts_per_rev : float
-        Encoder counts of one turn.
+        Encoder counts per turn.
     start : mapping, optional
         Values of further variables at the beginning.
     timeout : float

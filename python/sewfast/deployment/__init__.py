@@ -42,7 +42,7 @@ class Deployment:
     files : tuple of str
         Their paths within the folder.
     notes : tuple of str
-        What the code does and costs, one line each.
+        Properties and cost of the code, one line each.
     """
 
     folder: Path
@@ -72,7 +72,7 @@ def deploy(
         Linear models, networks, neural state-space models of one output and ensembles of them; a
         PID in all its forms.
     folder : path
-        Made if it is not there. Files of the same names are replaced, all of them or none.
+        Created if it does not exist. Files of the same names are replaced, all of them or none.
     to : {"c99", "st", "fmi", "onnx"}
         C99 without heap, libm, recursion or global state; IEC 61131-3 structured text, of a
         controller only; a co-simulation FMU of FMI 3.0, for which a C compiler is needed; ONNX, of
@@ -81,7 +81,7 @@ def deploy(
         Of the arithmetic: f32 by default, f64 for FMI and ONNX. A microcontroller that computes
         only single precision in hardware takes some fifty times as long for `f64`.
     name : str, optional
-        With which every name in the code begins; `controller` or `model` where there is none.
+        Prefix of every name in the code; by default `controller` or `model`.
     changeable : bool
         Whether gains and limits of a controller in C can be changed while it runs (`set_gains`,
         `set_limits`), without a bump. They lie in memory then, not among the constants.
@@ -96,7 +96,7 @@ def deploy(
         For another target, precision or name, for a model that single precision would change, and
         for changeable gains of what has none.
     ModelFileError
-        Where a file cannot be written; none is then.
+        If a file cannot be written; none is then.
     """
     if not isinstance(what, Model | Controller):
         raise SettingError(

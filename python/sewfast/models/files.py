@@ -44,7 +44,7 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     Raises
     ------
     ModelFileError
-        Where the file is missing, damaged, of another format, or of an unknown version or kind;
+        If the file is missing, damaged, of another format, or of an unknown version or kind;
         the message names the file and the field.
     """
     return _read(Fields(os.fspath(path), storage.read(path, FORMAT, (VERSION,))))
