@@ -28,11 +28,11 @@ class Comparison:
     names : tuple of str
         Of the models, in the order in which they were given.
     parameters : tuple of int
-        How many numbers each model was fitted with; of an ensemble those of all members.
+        Number of fitted parameters of each model; for an ensemble the sum over its members.
     validations : tuple of Validation or None
-        What `validate` says of each; None where the model runs away on these inputs.
+        The result of `validate` for each; None if the model diverges on these inputs.
     failures : tuple of str
-        Why it does; empty where it does not.
+        The reason if it diverges; otherwise empty.
     unit : str
         Of errors and output.
     """
@@ -65,12 +65,12 @@ class Comparison:
 
     @property
     def best(self) -> str:
-        """The model with the smallest free-run error; empty where all run away."""
+        """The model with the smallest free-run error; empty if all diverge."""
         errors = {name: self[name].simulation.rmse for name in self._scored}
         return min(errors, key=errors.__getitem__, default="")
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values; null for the scores of a model that runs away."""
+        """As JSON values; null for the scores of a model that diverges."""
         return {
             "unit": self.unit,
             "best": self.best or None,
@@ -105,7 +105,7 @@ class Comparison:
         Raises
         ------
         SettingError
-            Where matplotlib is not installed, the file cannot be written, or all models run away.
+            If matplotlib is not installed, the file cannot be written, or all models diverge.
         """
         if not self._scored:
             raise SettingError("expected a model that stays bounded on these data; all run away")
@@ -183,9 +183,9 @@ def compare(
     Parameters
     ----------
     *models : Model, or one mapping of name to Model
-        Without names they are called by their kind. The data may be the last of them.
+        Without names they are called by their kind. The last argument can be the data.
     data : Dataset
-        Best one that none of the models was trained on.
+        Preferably data that none of the models was trained on.
     init, against
         As for `sewfast.validate`.
 
@@ -196,9 +196,9 @@ def compare(
     Raises
     ------
     SettingError
-        Where there is no model or no data.
+        If there is no model or no data.
     DataError
-        Where a model does not fit the data; the message names the model.
+        If a model does not fit the data; the message names the model.
     """
     given: list[Any] = list(models)
     if data is None and given and isinstance(given[-1], Dataset):

@@ -78,17 +78,17 @@ class DynamicModel(ABC):
     Parameters
     ----------
     core : compiled model
-        Its arithmetic; takes part in `sewfast.run` and `sewfast.tune` as a plant.
+        The compiled arithmetic; `sewfast.run` and `sewfast.tune` use it as a plant.
     Ts : float
         Sample time [s].
     input_names, input_units, output_name, output_unit
         As in the data set.
     counts : tuple (column, counts_per_rev) or None
-        Set where the output is a speed computed from encoder counts.
+        Set if the output is a speed computed from encoder counts.
     training : mapping
-        How it came about: data, settings, cost with its horizon, termination. JSON values only.
+        Provenance: data, settings, cost with its horizon, termination. JSON values only.
     alternatives : tuple of Model
-        What `identify` would have chosen next, the best first; not written to the model's file.
+        The next choices of `identify`, best first; not written to the model's file.
     """
 
     core: Any

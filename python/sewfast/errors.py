@@ -7,16 +7,16 @@ from typing import Any
 
 
 class SewfastError(Exception):
-    """Anything that sewfast refuses; the message says what was expected, what came, what to do.
+    """Base class of all errors; the message says what was expected, what came, what to do.
 
-    It is given by its fields, and the message is made of them: ``name: expected ..., received ...;
-    remedy``. Or it is given whole, and the fields are read from it where it has this shape; so are
-    those of the compiled core.
+    It can be raised with its fields, from which the message is made:
+    ``name: expected ..., received ...; remedy``. It can also be raised with a whole message of this
+    form, from which the fields are read, as for errors of the compiled core.
 
     Attributes
     ----------
     name : str or None
-        Of what is refused: an argument, a column, a file, a port.
+        Name of the refused item: an argument, a column, a file, a port.
     expected, received, remedy : str or None
         What was expected, what came instead, what to do.
 
@@ -83,7 +83,7 @@ class SettingError(SewfastError, ValueError):
 
 
 class FitError(SewfastError, RuntimeError):
-    """An identification or a tuning found no usable answer."""
+    """An identification or a tuning found no usable result."""
 
 
 class ModelFileError(SewfastError, ValueError):
@@ -96,7 +96,7 @@ class LinkError(SewfastError, OSError):
     Attributes
     ----------
     recording
-        What a run had brought until then, where there was one: a `Recording` or a `ClosedLoopRun`.
+        The data of the run up to then, if there was one: a `Recording` or a `ClosedLoopRun`.
     """
 
     recording: Any = None
@@ -108,7 +108,7 @@ class Interrupted(KeyboardInterrupt):
     Parameters
     ----------
     best
-        What the work had reached: a model or a controller, usable as it is.
+        The best result so far: a model or a controller, usable as it is.
     """
 
     def __init__(self, best: Any) -> None:

@@ -138,7 +138,7 @@ class Fleet:
     ----------
     rows : tuple of Row
     drifts : tuple of Drift
-        Against an earlier run, where one was given.
+        Compared with an earlier run, if one was given.
     """
 
     rows: tuple[Row, ...]
@@ -150,14 +150,14 @@ class Fleet:
         return tuple(row for row in self.rows if row.status != "ok")
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the rows as `.csv`, `.json` or `.parquet`; the file appears whole or not at all.
+        """Write the rows as `.csv`, `.json` or `.parquet`; the file is either complete or absent.
 
         Raises
         ------
         SettingError
             For another ending, or `.parquet` without pyarrow.
         ModelFileError
-            Where the file cannot be written.
+            If the file cannot be written.
         """
         place = Path(path)
         _require_ending(place)
@@ -202,7 +202,7 @@ def fleet(
     Parameters
     ----------
     recordings : path or sequence of paths
-        A folder (with its subfolders), a manifest (CSV with a column `file` and, where they differ,
+        A folder (with its subfolders), a manifest (CSV with a column `file` and, if they differ,
         `inputs` (several apart by `;`), `output`, `Ts`), or files.
     inputs, output, Ts
         As of `sewfast.read`.
@@ -212,20 +212,21 @@ def fleet(
     controller : Controller, optional
         Tuned anew for every model, from these settings.
     before : path or Fleet, optional
-        An earlier result (`.csv`, `.json`, `.parquet`): what has moved beyond its bands is in
-        `drifts`.
+        An earlier result (`.csv`, `.json`, `.parquet`): `drifts` lists what has moved beyond its
+        bands.
     out : path, optional
-        Where to write the table (`.csv`, `.json`, `.parquet`). Beside it lies a journal until all
-        is done; the same call goes on from it, and works only on what is new or changed.
+        Where to write the table (`.csv`, `.json`, `.parquet`). A journal is kept next to it until
+        everything is done; the same call continues from it and processes only what is new or
+        changed.
     client : dask.distributed.Client, optional
-        A cluster of yours.
+        Your own cluster.
     scheduler : str, optional
         Address of one, such as `tcp://host:8786`.
     workers : int, optional
-        Processes on this computer where there is neither; as many as cores by default. 0 works in
-        this process, without Dask.
+        Processes on this computer if there is neither; by default as many as cores. 0 works in this
+        process, without Dask.
     memory : str
-        Of each worker of this computer; one that takes more is begun anew.
+        Limit for each worker on this computer; a worker that uses more is restarted.
     seed : int
         As of `identify`; the same seed gives the same bits on any number of workers.
     progress : callable, optional
@@ -238,7 +239,7 @@ def fleet(
     Raises
     ------
     SettingError
-        For no recordings, an ending that is not known, and without Dask where it is needed.
+        For no recordings, an unknown file extension, or if Dask is needed and not installed.
     """
     jobs = _jobs(recordings, inputs, output, Ts)
     settings: dict[str, Any] = {"model": model, "seed": seed, "controller": None}

@@ -87,8 +87,8 @@ class Gains:
     Raises
     ------
     SettingError
-        For gains that are not numbers, of different signs, or with `Kp = 0` beside another gain,
-        which the standard form cannot express.
+        For gains that are not numbers, of different signs, or with `Kp = 0` and another gain, which
+        the standard form cannot express.
     """
 
     form: Form
@@ -153,7 +153,7 @@ class Gains:
         ----------
         form : "standard", "parallel" or "per_sample"
         Ts : float, optional
-            Sample time of per-sample gains [s]; that of these gains where they have one.
+            Sample time of per-sample gains [s]; by default that of these gains, if they have one.
 
         Raises
         ------
@@ -207,7 +207,7 @@ class Gains:
 
     @property
     def units(self) -> dict[str, str]:
-        """The unit of each number by name; u and y stand for units that nobody stated."""
+        """The unit of each number by name; u and y stand for unknown units."""
         u, y = self.u_unit or "u", self.y_unit or "y"
         ratio = f"{u}/{y}"
         if self.form == "standard":

@@ -42,7 +42,7 @@ class VirtualMachine:
     Parameters
     ----------
     seed
-        None is the nominal machine; a whole number is another machine of the same type.
+        None is the nominal machine; a whole number gives another machine of the same type.
     u_limit
         Largest command to either side [V].
     angle_dependence
@@ -51,12 +51,12 @@ class VirtualMachine:
         Whether the encoder gives whole counts. Without it counts are the exact position.
     load_inertia
         Inertia of a second mass behind an elastic shaft [kg m^2]; 0 is a rigid machine. The
-        encoder stays on the first. The masses swing against each other at
+        encoder stays on the first. The masses oscillate against each other at
         ``sqrt(stiffness (1 / inertia + 1 / load_inertia))`` [rad/s]; the first stands still at
         ``sqrt(stiffness / load_inertia)``.
     stiffness, damping, backlash
-        Of the shaft [N m/rad, N m s/rad, rad]; they matter with a second mass only. None leaves
-        what `parameters` say.
+        Of the shaft [N m/rad, N m s/rad, rad]; they matter only with a second mass. None keeps the
+        values of `parameters`.
     parameters
         Values by name that replace those of the machine chosen so far.
 
@@ -120,7 +120,7 @@ class VirtualMachine:
 
     @property
     def core(self) -> Machine:
-        """Its arithmetic; takes part in `sewfast.control.loop` as a plant."""
+        """The compiled arithmetic; `sewfast.control.loop` uses it as a plant."""
         return self._core
 
     @property
@@ -159,18 +159,18 @@ class VirtualMachine:
         return self._core.current
 
     def reset(self) -> None:
-        """Back to rest at the initial crank angle, counter at zero."""
+        """Return to rest at the initial crank angle, with the counter at zero."""
         self._core.reset()
 
     def set_load(self, torque: float) -> None:
         """Load the shaft with a constant torque [N m] from now on, through resets as well.
 
-        It brakes where it has the sign of the speed; 0 takes it off.
+        It brakes if it has the sign of the speed; 0 removes it.
 
         Raises
         ------
         SettingError
-            Where the torque is not finite.
+            If the torque is not finite.
         """
         self._core.set_load(torque)
 
@@ -180,12 +180,12 @@ class VirtualMachine:
         Raises
         ------
         DataError
-            Where ``u`` is not finite.
+            If ``u`` is not finite.
         """
         return self._core.step(u)
 
     def run(self, u: ArrayLike) -> MachineRun:
-        """Hold each command in turn for one sample, going on from the present state.
+        """Hold each command in turn for one sample, starting from the present state.
 
         Parameters
         ----------
@@ -195,7 +195,7 @@ class VirtualMachine:
         Raises
         ------
         DataError
-            Where ``u`` is not a one-dimensional array of finite numbers.
+            If ``u`` is not a one-dimensional array of finite numbers.
         """
         counts, speed = self._core.run(_commands(u))
         return MachineRun(counts, speed)

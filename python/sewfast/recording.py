@@ -35,7 +35,7 @@ class Recording:
     y : array, shape (N,)
         Speed [RPM] estimated from the counts.
     speed_true : array, shape (N,), or None
-        The virtual machine's true speed [RPM], for scores only; None where there is no such thing.
+        The virtual machine's true speed [RPM], for scores only; None if there is no such speed.
     Ts, counts_per_rev : float
         Sample time [s], counts of one turn.
     name : str
@@ -43,7 +43,7 @@ class Recording:
 
     Notes
     -----
-    Samples that the link to a drive lost are NaN in every column.
+    Samples lost on the link to a drive are NaN in every column.
     """
 
     u: FloatArray
@@ -58,7 +58,7 @@ class Recording:
         return len(self.u)
 
     def columns(self) -> dict[str, FloatArray]:
-        """t, u, counts, y and, where known, speed_true by name, as in a recording file."""
+        """t, u, counts, y and, if known, speed_true by name, as in a recording file."""
         t = np.arange(len(self), dtype=np.float64) * self.Ts
         known = {} if self.speed_true is None else {"speed_true": self.speed_true}
         return {"t": t, "u": self.u, "counts": self.counts, "y": self.y, **known}
@@ -68,7 +68,7 @@ class Recording:
         return speed_from_counts(self.counts, self.Ts, self.counts_per_rev, method=method)
 
     def dataset(self, y: ArrayLike | None = None) -> Dataset:
-        """Command and speed for `identify`; a true speed rides along as channel `speed_true`.
+        """Command and speed for `identify`; a true speed is added as the channel `speed_true`.
 
         Parameters
         ----------
@@ -87,7 +87,7 @@ class Recording:
         return replace(data, looks_ahead=y is None)
 
     def header(self, *, device: Mapping[str, Any] | None = None, **settings: Any) -> Header:
-        """What its file says of it.
+        """The header of its file.
 
         Parameters
         ----------
@@ -112,9 +112,9 @@ class Recording:
         Parameters
         ----------
         path : path
-            A file that exists is replaced in one step, save a recording of a drive.
+            An existing file is replaced in one step, except a recording of a drive.
         overwrite : bool
-            Whether that may be replaced as well.
+            Whether to replace such a recording as well.
 
         Raises
         ------

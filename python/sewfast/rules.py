@@ -123,21 +123,21 @@ def fit_fopdt(
     Least squares over K, T, L and the level before the step. The record is used from its start to
     the second step of the input; the first may be anywhere after some samples. Samples on a limit
     of the output have no weight, and a machine that was not at rest is fitted with its free
-    response where that is three of its standard errors. Standard errors hold for residuals of any
-    colour, which are whitened by an autoregression (Andrews, Monahan 1992). An overshoot beyond
-    what the noise explains is told (`Fopdt.warning`): the response is then of no first order.
+    response if that exceeds three of its standard errors. Standard errors hold for coloured
+    residuals, which are whitened by an autoregression (Andrews, Monahan 1992). `Fopdt.warning`
+    reports an overshoot beyond what the noise explains: the response is then not of first order.
 
     Parameters
     ----------
     u, y : array, shape (N,)
-        Input and output; a raw speed with its quantisation will do.
+        Input and output; a raw, quantised speed is fine.
     Ts : float
         Sample time [s].
 
     Raises
     ------
     DataError
-        Without a step, or where the response does not settle or drowns in noise.
+        Without a step, or if the response does not settle or is hidden by noise.
     SettingError
         For a sample time that is not above 0.
     """
@@ -182,13 +182,13 @@ def table_1(fopdt: Fopdt, *, outside: Literal["error", "nearest"] = "error") -> 
     ----------
     fopdt : Fopdt
     outside : "error" or "nearest"
-        What to do where L/T is not in .1 to 1. The nearest row below .1 is the row for `L = .1 T`,
+        What to do if L/T is not in .1 to 1. The nearest row below .1 is the row for `L = .1 T`,
         a longer dead time than the plant's: conservative. Above 1 it is not.
 
     Raises
     ------
     SettingError
-        Where L/T is outside the table and no row is to be taken instead, or for K = 0 or T <= 0.
+        If L/T is outside the table and `outside` is "error", or for K = 0 or T <= 0.
     """
     if outside not in ("error", "nearest"):
         raise SettingError(f"expected outside='error' or 'nearest', got {outside!r}")
@@ -212,7 +212,7 @@ def eq_12(fopdt: Fopdt, *, Ms: float = math.inf) -> Rule:
     Raises
     ------
     SettingError
-        Where L/T is outside .01 to 2, for K = 0 or T <= 0, or an Ms of 1.1 or less.
+        If L/T is outside .01 to 2, for K = 0 or T <= 0, or an Ms of 1.1 or less.
     """
     _require(fopdt)
     found = _core.eq_12(fopdt.K, fopdt.T, fopdt.L, Ms=real("Ms", Ms))

@@ -52,11 +52,11 @@ def speed_from_counts(
     window, order
         Of ``savgol``: odd number of samples, order of the polynomial.
     process_noise
-        Of ``kalman``: intensity of the jerk [unit^2/s^3]; found by maximum likelihood where None.
+        Of ``kalman``: intensity of the jerk [unit^2/s^3]; None: found by maximum likelihood.
         Whole counts are taken as exact to 1/12 count^2; for others that variance is found too.
     ripple_orders
         Of ``kalman``: multiples of the shaft's turn at which the load may repeat, 6 at most, as
-        cranks and torque ripple do [4]_; used where the counts make it likelier. () leaves it out.
+        cranks and torque ripple do [4]_; used if it makes the counts more likely. () disables it.
     unwrap_bits
         Width of a counter that wraps, for example 16.
 

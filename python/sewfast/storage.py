@@ -8,6 +8,7 @@ import math
 import os
 import secrets
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -27,22 +28,48 @@ def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
     ------
     OSError
         Where the folder does not exist or cannot be written to, or what is there is no file but a
-        device or a pipe, which must not be replaced; nothing is left behind.
+        folder, a device or a pipe, which must not be replaced; nothing is left behind.
     """
+    replace_files({path: content})
+
+
+def replace_files(contents: Mapping[Any, bytes]) -> None:
+    """Put several files in place together: none is renamed before the last one is written.
+
+    Raises
+    ------
+    OSError
+        As `replace_file`, with the name of the file that it failed on; none is changed then.
+    """
+    staged: list[tuple[Path, Path]] = []
+    try:
+        for path, content in contents.items():
+            try:
+                staged.append(_names(path))
+                with staged[-1][0].open("xb") as file:
+                    file.write(content)
+                    file.flush()
+                    os.fsync(file.fileno())
+            except OSError as error:
+                raise OSError(error.errno, error.strerror, os.fspath(path)) from error
+        for temporary, target in staged:
+            temporary.replace(target)
+    finally:
+        for temporary, _ in staged:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+
+
+def _names(path: str | os.PathLike[str]) -> tuple[Path, Path]:
+    """A free temporary name beside a file, and where it goes."""
     if "\0" in os.fspath(path):
         raise OSError(errno.EINVAL, "a name cannot hold the character 0")
     target = Path(path).resolve()
-    if target.exists() and not (target.is_file() or target.is_dir()):
+    if target.is_dir():
+        raise OSError(errno.EISDIR, os.strerror(errno.EISDIR))
+    if target.exists() and not target.is_file():
         raise OSError(errno.EINVAL, "what has that name is no file")
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        with temporary.open("xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
+    return target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp"), target
 
 
 # --- JSON files of the package: whole or not at all when written, strict when read ----------------
@@ -55,7 +82,7 @@ LARGEST_FILE = 16 * 1024 * 1024
 def write(
     path: str | os.PathLike[str], format: str, version: int, payload: Mapping[str, Any]
 ) -> None:
-    """Write ``payload`` under its format and version; the file appears whole or not at all.
+    """Write ``payload`` under its format and version; the file is either complete or absent.
 
     Parameters
     ----------

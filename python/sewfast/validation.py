@@ -127,7 +127,7 @@ class ExperimentErrors:
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """How well a model does on data, in free run (the headline) and one step ahead.
+    """Errors of a model on data, in free run (the main score) and one step ahead.
 
     Attributes
     ----------
@@ -166,12 +166,12 @@ class Validation:
 
     @property
     def noise(self) -> float:
-        """White measurement noise of what is scored against [unit]; NaN where unknown."""
+        """White measurement noise of the scored output [unit]; NaN if unknown."""
         return noise_of([e.y for e in self.experiments])
 
     @property
     def grade(self) -> str:
-        """`good`, `fair`, `poor` or `useless` by the free run; empty where y is constant."""
+        """`good`, `fair`, `poor` or `useless` by the free run; empty if y is constant."""
         return grade_of(self.simulation.fit_percent, self.simulation.rmse, self.noise)
 
     @property
@@ -237,7 +237,7 @@ class Validation:
         Raises
         ------
         SettingError
-            Where matplotlib is not installed or the file cannot be written.
+            If matplotlib is not installed or the file cannot be written.
         """
         from .plotting import fit_panels, significant, stacked
 
@@ -349,10 +349,10 @@ def validate(
     data : Dataset
         Complete inputs. Samples whose output is NaN are not scored, and counted in `unmeasured`.
         With weights, errors and fits are weighted (`Scores`), and a sample of weight 0 counts as
-        not measured; the measurement noise does not look at them.
+        not measured; the measurement noise ignores them.
     init : int
-        The first `init` measured outputs of each experiment set the initial state; what comes up
-        to the last of them is not scored. 0 starts from rest and scores every sample.
+        The first `init` measured outputs of each experiment set the initial state; samples up to
+        the last of them are not scored. 0 starts from rest and scores every sample.
     against : str or None
         Name of a channel to score against instead of the measured output (a virtual machine's
         true speed).
@@ -360,9 +360,9 @@ def validate(
     Raises
     ------
     DataError
-        Where data do not fit the model, an input is NaN, or nothing is left to score.
+        If data do not fit the model, an input is NaN, or nothing is left to score.
     FitError
-        Where the model is unstable on this input.
+        If the model is unstable on this input.
     """
     require_dataset(data, "data")
     require_init(init)

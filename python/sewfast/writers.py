@@ -26,9 +26,9 @@ def write_table(
     *,
     units: Mapping[str, str] | None = None,
 ) -> None:
-    """Write columns of one length to a file, in the format that its extension says.
+    """Write columns of one length to a file, in the format given by its extension.
 
-    Every float is written so that reading gives the same bits. A column `t` comes first.
+    Every float is written so that reading returns the same bits. A column `t` comes first.
 
     Parameters
     ----------
@@ -41,9 +41,9 @@ def write_table(
     Raises
     ------
     DataError
-        Where columns differ in length or shape, or the file cannot be written.
+        If columns differ in length or shape, or the file cannot be written.
     SettingError
-        Where the extension is unknown or its package is not installed.
+        If the extension is unknown or its package is not installed.
     """
     path = Path(path)
     encode = _ENCODERS.get(path.suffix.lower())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import json
 import math
 import os
@@ -21,8 +22,8 @@ import deployed
 import kinds
 from sewfast import Controller, Ensemble, Gains, LinearOE, Model, _core, deploy
 from sewfast.cli import main
-from sewfast.deployment import c99
-from sewfast.errors import FitError, SettingError
+from sewfast.deployment.precision import combined_run, embedded_members
+from sewfast.errors import FitError, ModelFileError, SettingError
 
 needs_compiler = pytest.mark.skipif(not deployed.compilers(), reason="needs gcc or clang")
 PRECISIONS = ("f64", "f32")
@@ -277,13 +278,13 @@ def test_double_precision_is_the_baselines_free_run() -> None:
     """In a process of its own: the level of the kernels is chosen as the package is loaded."""
     program = """
 import kinds, numpy as np
-from sewfast.deployment import c99
+from sewfast.deployment.precision import combined_run, embedded_members
 for name in kinds.DEPLOYED:
     model = kinds.model_of(name)
     u = kinds.levels(3000, 4, len(model.input_names))
     u[0] = 0.0
     free = model.core.simulate(u, model.core.rest_state())
-    step = c99.combined_run(*c99.embedded_members(model, "f64"), u, "f64")
+    step = combined_run(*embedded_members(model, "f64"), u, "f64")
     exact = all(
         m.kind != "neural_ss" or (m.orders["nx"] <= 4 and m.settings["output"] == "linear")
         for m in model.members or (model,)
@@ -442,13 +443,52 @@ def test_a_model_that_runs_away_is_refused_in_single_precision(tmp_path: Path) -
         deploy(_linear([-1.5], [1.0]), tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("changed", "received"),
+    [
+        ({"gains": Gains.standard(1e39, 0.25)}, "inf"),
+        ({"gains": Gains.standard(1e-60, 0.25)}, "kp 1e-60"),
+        ({"gains": Gains.standard(0.02, 0.25), "slew": 1e-60}, "0"),
+        # of 2^24 steps of the integral at its limit an error of 1 % moves none
+        ({"gains": Gains.standard(0.02, 1000.0), "u_max": 10.0}, "Ti 1000 s at a sample time of"),
+    ],
+)
+@pytest.mark.parametrize("to", ["c99", "st"])
+def test_controllers_that_single_precision_cannot_keep_are_refused(
+    changed: dict[str, Any], received: str, to: str, tmp_path: Path
+) -> None:
+    controller = Controller(**changed)
+    with pytest.raises(SettingError) as found:
+        deploy(controller, tmp_path / "out", to=to)
+    assert found.value.name == "precision"
+    assert str(found.value.received).startswith(received)
+    assert "f64" in str(found.value.remedy)
+    assert not (tmp_path / "out").exists()
+    deploy(controller, tmp_path / "out", to=to, precision="f64")
+
+
+def test_the_error_at_which_an_integral_rests_is_said_and_true(tmp_path: Path) -> None:
+    controller = Controller(
+        Gains.standard(0.02, 20.0, u_unit="V", y_unit="RPM"), u_min=-16.5, u_max=16.5
+    )
+    note = deploy(controller, tmp_path).notes[1]
+    rests = float(re.search(r"errors below ([\d.e-]+) RPM", note)[1])  # type: ignore[index]
+    for error, moves in ((0.9 * rests, False), (1.1 * rests, True)):
+        core: Any = controller.core().single()
+        core.set_manual(16.25)
+        core.step(0.0, 0.0)
+        core.set_automatic()
+        commands = [core.step(error, 0.0) for _ in range(2000)]
+        assert (commands[-1] > commands[0]) == moves
+
+
 def test_what_single_precision_costs_is_said_and_true(tmp_path: Path) -> None:
     model = kinds.model_of("neural_oe")
     note = deploy(model, tmp_path).notes[1]
     said = float(re.search(r"by ([\d.e-]+) of its span", note)[1])  # type: ignore[index]
     u = kinds.levels(4000, 9, 1)
-    double = c99.combined_run(*c99.embedded_members(model, "f64"), u, "f64")
-    single = c99.combined_run(*c99.embedded_members(model, "f32"), u, "f32")
+    double = combined_run(*embedded_members(model, "f64"), u, "f64")
+    single = combined_run(*embedded_members(model, "f32"), u, "f32")
     loss = np.abs(double - single).max() / np.ptp(double)
     assert 0.1 * said < loss < 10 * said
 
@@ -465,6 +505,43 @@ def test_texts_of_a_user_stay_in_their_comments(tmp_path: Path) -> None:
         deploy(controller, tmp_path / "st", to="st", name="c").folder.joinpath("c.st").read_text()
     )
     assert Block(text).step(r=np.float32(1.0), y=np.float32(0.0)) != 0.0
+
+
+def test_all_files_are_written_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A header beside the source of another controller would compile."""
+
+    def refused(folder: Path, name: str, received: str) -> None:
+        before = {p: p.is_dir() or p.read_bytes() for p in tmp_path.rglob("*")}
+        with pytest.raises(ModelFileError) as found:
+            deploy(CASES["paper"], folder)
+        assert str(found.value.name).endswith(name)
+        assert received in str(found.value.received)
+        assert {p: p.is_dir() or p.read_bytes() for p in tmp_path.rglob("*")} == before
+
+    there = deploy(CASES["pi"], tmp_path / "there").folder
+    (there / "controller_test.c").unlink()
+    (there / "controller_test.c").mkdir()
+    refused(there, "controller_test.c", "directory")
+    (tmp_path / "file").touch()
+    refused(tmp_path / "file" / "below", "below", "directory")
+    refused(tmp_path / ("x" * 300), "x", "too long")
+    refused(tmp_path / "new" / ("x" * 300), "x", "too long")
+    refused(tmp_path / "a\0b", "b", "null byte")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    refused(there.parent / "new" / "folder", "controller.h", "No space left")
+    refused(there, "controller.h", "No space left")
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        deploy(CASES["paper"], tmp_path / "new" / "folder")
+    assert not (tmp_path / "new").exists()
 
 
 def test_an_ensemble_for_no_processor_is_refused(tmp_path: Path) -> None:
@@ -506,5 +583,8 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "plant.c" in capsys.readouterr().out
     assert main(["deploy", str(tmp_path / "nix.json"), str(folder)]) == 2
     (tmp_path / "other.json").write_text('{"format": "something", "version": 1}')
+    capsys.readouterr()
     assert main(["deploy", str(tmp_path / "other.json"), str(folder)]) == 2
-    assert "other.json" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "other.json: expected a model or a controller" in said
+    assert "'something'" in said

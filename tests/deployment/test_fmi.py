@@ -5,8 +5,10 @@ FMPy and Ecos drive what the package writes; what the package drives was written
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
+import signal
 import subprocess
 import sys
 import zipfile
@@ -325,6 +327,8 @@ def test_its_own_fmu_is_a_machine_as_well(tmp_path: Path) -> None:
         ({"speed_unit": None}, "give speed_unit="),
         ({"angle_unit": "mile"}, "give angle_unit="),
         ({"Ts": 0.0}, "Ts: expected"),
+        ({"timeout": float("nan")}, "timeout: expected"),
+        ({"input": "speed"}, "an input as input=, got 'speed'"),
     ],
 )
 def test_variables_that_do_not_fit_are_refused(
@@ -386,6 +390,100 @@ def test_what_is_no_fmu_or_would_do_harm_is_refused(tmp_path: Path, motor: Path)
             if entry.filename not in binaries:
                 new.writestr(entry, old.read(entry))
     refused(bare, "a binary for")
+
+
+def _faulty(folder: Path, fault: str) -> Path:
+    """An FMU of a model whose step does something else after a while."""
+    deploy(kinds.model_of("oe"), folder, to="fmi")
+    unpacked, broken = folder / "unpacked", folder / "faulty.fmu"
+    with zipfile.ZipFile(folder / "model.fmu") as archive:
+        archive.extractall(unpacked)
+    source = unpacked / "sources" / "model.c"
+    opening = "model_real model_step(model_model *model, const model_real *u)\n{\n"
+    text = source.read_text()
+    assert opening in text
+    worse = f"static int calls;\n{opening}    if (++calls > 80) {{ {fault} }}\n"
+    source.write_text(f"#include <stdio.h>\n#include <stdlib.h>\n{text.replace(opening, worse)}")
+    binary = next((unpacked / "binaries").rglob("model.so"))
+    files = [str(source), str(source.with_name("fmi3.c"))]
+    subprocess.run(["cc", "-w", "-fPIC", "-shared", *files, "-o", str(binary)], check=True)
+    with zipfile.ZipFile(broken, "w") as archive:
+        for file in unpacked.rglob("*"):
+            archive.write(file, file.relative_to(unpacked))
+    return broken
+
+
+OF_FAULTY: dict[str, Any] = {"volt": 5.0, "Ts": kinds.TS, "counts_per_rev": 1000.0}
+
+
+@pytest.mark.parametrize(
+    ("fault", "options", "received"),
+    [
+        ("abort();", {}, "a process that ended (SIGABRT)"),
+        ("*(volatile int *)0 = 1;", {}, "a process that ended (SIGSEGV)"),
+        ("exit(0);", {}, "a process that ended (code 0)"),
+        ("for (;;) ;", {"timeout": 3.0}, "no answer within 3 s"),
+        ("return 0.0 / 0.0;", {}, "nan at"),
+    ],
+)
+def test_a_faulty_binary_is_an_error_and_not_the_end(
+    fault: str, options: dict[str, float], received: str, tmp_path: Path
+) -> None:
+    bench = fmu_bench(_faulty(tmp_path, fault), **OF_FAULTY, **options)
+    for _ in range(2):  # it stays ended, and says why
+        with pytest.raises(SettingError) as found:
+            sewfast.record(bench, np.ones(100))
+        assert received in str(found.value.received)
+        assert found.value.remedy
+        if "nan" in received:
+            break
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs POSIX timers")
+def test_ctrl_c_ends_a_step_without_end(tmp_path: Path) -> None:
+    bench = fmu_bench(_faulty(tmp_path, "for (;;) ;"), **OF_FAULTY)
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 2.0)
+        with pytest.raises(KeyboardInterrupt):
+            sewfast.record(bench, np.ones(100))
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    process = bench.machine._process._process  # type: ignore[attr-defined]
+    assert process.wait(10.0) < 0
+
+
+def test_what_an_fmu_prints_is_no_answer(tmp_path: Path) -> None:
+    bench = fmu_bench(_faulty(tmp_path, 'puts("mine"); fflush(0);'), **OF_FAULTY)
+    assert len(sewfast.record(bench, np.ones(100)).counts) == 100
+    folder = bench.machine._folder  # type: ignore[attr-defined]
+    bench.machine.close()  # type: ignore[attr-defined]
+    assert bench.machine._process._process.poll() == 0  # type: ignore[attr-defined]
+    del bench
+    gc.collect()
+    assert not Path(folder).exists()
+
+
+def test_hostile_descriptions_are_refused(tmp_path: Path, motor: Path) -> None:
+    with zipfile.ZipFile(motor) as archive:
+        xml = archive.read("modelDescription.xml")
+
+    def refused(content: bytes, message: str) -> None:
+        path = _altered(motor, tmp_path / "altered.fmu", modelDescription_dot_xml=content)
+        with pytest.raises(ModelFileError, match=message):
+            fmu_bench(path, **OF_MOTOR)
+
+    # entities that a search for bytes does not see
+    laughs = '<?xml version="1.0" encoding="UTF-16"?><!DOCTYPE x [<!ENTITY a "b">]>'
+    refused((laughs + xml.decode().partition("?>")[2]).encode("utf-16"), "version 1.0, 2.0 or 3.0")
+    refused(xml.replace(b'fmiVersion="2.0"', b'fmiVersion="4.0"'), "3.0, got 4.0")
+    refused(xml.replace(b'fmiVersion="2.0"', b""), "3.0, got none")
+    refused(xml.replace(b'modelIdentifier="Motor"', b'modelIdentifier="../x"'), r"got '\.\./x'")
+    refused(b" " * (65 * 1024**2), "at most 67108864 bytes")
 
 
 def test_without_fmpy_its_name_is_said(motor: Path, monkeypatch: pytest.MonkeyPatch) -> None:

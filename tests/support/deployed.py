@@ -14,16 +14,21 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sewfast import Biquad, Controller, Gains, Model, deploy
-from sewfast.deployment.c99 import combined_run, embedded_members
+from sewfast.deployment.precision import combined_run, embedded_members
 
 EMULATED = Path(__file__).parent / "emulated"
 WARNINGS = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
+CORTEX_M4 = [
+    "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-std=gnu99", "-O2",
+    "-ffp-contract=off",
+]  # fmt: skip
 HOLD = 16
 """Samples for which an input stays."""
 
@@ -288,10 +293,9 @@ def instructions(what: Model | Controller, folder: Path, precision: str) -> floa
 def cortex_m4(folder: Path, name: str, *options: str) -> str:
     """The same on the emulated Cortex-M4."""
     program = folder / f"{name}.elf"
-    target = ["-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"]
     sources = [str(folder / f"{name}.c"), str(folder / "main.c"), str(EMULATED / "start.c")]
     subprocess.run(
-        ["arm-none-eabi-gcc", *target, "-std=gnu99", "-O2", "-ffp-contract=off", "-nostartfiles",
+        ["arm-none-eabi-gcc", *CORTEX_M4, "-nostartfiles",
          "-T", str(EMULATED / "mps2.ld"), *sources, "-o", str(program)],
         check=True,
     )  # fmt: skip
@@ -324,11 +328,67 @@ def cases() -> Iterator[tuple[str, Model | Controller]]:
     yield from CONTROLLERS.items()
 
 
+def costs() -> Iterator[tuple[str, Model | Controller]]:
+    """What the table of docs/deploy.md is about."""
+    import kinds
+    from sewfast import NeuralOE, _core
+
+    yield "PI controller", CONTROLLERS["pi"]
+    yield "mean of 8 samples and derivative", CONTROLLERS["filter"]
+    everything = CONTROLLERS["everything"]
+    yield "everything: schedule, observer, ramp, slew", replace(everything, biquads=())
+    four = (*SECTIONS, Biquad.notch(90.0))
+    yield "everything and four biquads", replace(everything, biquads=four)
+    yield "linear model, second order", kinds.model_of("oe")
+    rng, width, hidden = np.random.default_rng(4), 4, 8
+    core = _core.NeuralOE(
+        na=2, nb=2, nk=1, n_inputs=1, hidden=hidden, bypass=True,
+        theta=np.append(0.3 * rng.normal(size=hidden * (width + 2) + 1), [0.9, -0.2, 0.2, 0.1]),
+        u_mean=np.array([1.0]), u_scale=np.array([2.3]), y_mean=4.0, y_scale=8.0,
+        output_low=None, output_high=None,
+    )  # fmt: skip
+    known = {"input_range": [[-3.0, 5.0]]}
+    network = NeuralOE(core, 0.001, ("u",), "y", ("V",), "RPM", None, known)
+    yield "network, 8 tanh, 2 past outputs and inputs", network
+    yield "neural state space, 2 states, 3 tanh", kinds.model_of("neural_ss")
+
+
+def sizes(folder: Path, kind: str) -> tuple[int, int]:
+    """Bytes of code and tables for the Cortex-M4, and of a controller's or model's memory."""
+    (folder / "memory.c").write_text(f'#include "code.h"\ncode_{kind} memory;\n')
+    found = []
+    for name in ("code", "memory"):
+        built = str(folder / f"{name}.o")
+        source = str(folder / f"{name}.c")
+        subprocess.run(["arm-none-eabi-gcc", *CORTEX_M4, "-c", source, "-o", built], check=True)
+        size = subprocess.run(
+            ["arm-none-eabi-size", built], capture_output=True, text=True, check=True
+        )
+        found.append([int(v) for v in size.stdout.splitlines()[1].split()[:3]])
+    return sum(found[0][:2]), sum(found[1])
+
+
+def print_costs() -> int:
+    """The table of docs/deploy.md."""
+    print("| | instructions a step, f32 | f64 | bytes of code and tables, f32 | of memory, f32 |")
+    print("|---|---|---|---|---|")
+    for name, what in costs():
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place)
+            double, single = (instructions(what, folder, p) for p in ("f64", "f32"))
+            code, memory = sizes(folder, "pid" if isinstance(what, Controller) else "model")
+        print(f"| {name} | {single:.0f} | {double:,.0f} | {code:,} | {memory} |", flush=True)
+    return 0
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--costs", action="store_true", help="instructions and sizes instead")
     parser.add_argument("--samples", type=int, default=10_000_000)
-    parser.add_argument("--emulated", type=int, default=100_000)
+    parser.add_argument("--emulated", type=int, default=1_000_000, help="a tenth of it in f64")
     args = parser.parse_args()
+    if args.costs:
+        return print_costs()
     wrong = total = 0
     for name, what in cases():
         for precision in ("f64", "f32"):

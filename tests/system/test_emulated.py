@@ -8,6 +8,7 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -54,6 +55,28 @@ def test_the_doctor_finds_nothing_wrong(name: str, clock: str) -> None:
     # a busy computer may be slow, which is the computer's
     worse = [f.name for f in found.findings if f.verdict != "ok"]
     assert set(worse) <= {"round trip", "throughput"}, found
+
+
+@needs_board
+def test_a_computer_that_pauses_the_emulator_does_not_bend_its_clock() -> None:
+    """What the board makes up for after a pause must not be seen as a clock that runs back."""
+    with EmulatedBoard(FIRMWARE, clock="real") as board:
+        over = threading.Event()
+
+        def pause() -> None:
+            while not over.wait(0.05):
+                board.process.send_signal(signal.SIGSTOP)
+                time.sleep(0.015)
+                board.process.send_signal(signal.SIGCONT)
+
+        busy = threading.Thread(target=pause)
+        busy.start()
+        try:
+            found = examine(board.port)
+        finally:
+            over.set()
+            busy.join()
+    assert found["clock"].verdict == "ok", found
 
 
 @needs_board
@@ -128,6 +151,10 @@ def test_the_command_goes_from_doctor_to_run(
     assert {p.name for p in out.iterdir()} >= {"chirp.mcap", "first.json", "first.mcap"}
     assert main(words) == 2
     assert "--overwrite" in capsys.readouterr().err
+    (tmp_path / "file").touch()
+    for wrong in (tmp_path / "file" / "below", tmp_path / ("x" * 300)):
+        assert main(["pil", "--firmware", str(FIRMWARE), "--out", str(wrong)]) == 2
+        assert "expected a folder that can be made" in capsys.readouterr().err
 
 
 def test_what_is_no_firmware_is_refused(tmp_path: Path) -> None:

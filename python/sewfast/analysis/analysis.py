@@ -53,25 +53,25 @@ MOST = 8
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Analysis:
-    """What a controller does on plants, and what it would do if things were a little different.
+    """A controller's behaviour on plants, and its sensitivity to small changes.
 
     Attributes
     ----------
     controller : Controller
     plants, references : tuple of str
-        What it was analysed on.
+        The names of the plants and references.
     loops : tuple of LoopBode
         L, S, T and margins, per operating point.
     main : int
-        Which of them the steps and the sensitivities are taken at.
+        Index of the loop used for the steps and the sensitivities.
     responses : tuple of Responses
-        Reference step and disturbance step; empty where the loop runs away.
+        Reference step and disturbance step; empty if the loop is unstable.
     score : Score
         Cost on the references, worst error and overshoot, Ms.
     sensitivity : tuple of GainSensitivity
     what_if : tuple of WhatIf
     judgement : Judgement
-        What speaks against the loops (`sewfast.trust`); a refusal is a line that fails.
+        Objections to the loops (`sewfast.trust`); a refusal is a line that fails.
     """
 
     controller: Controller
@@ -98,7 +98,7 @@ class Analysis:
         Raises
         ------
         SettingError
-            For a point or a plant that is not there.
+            For an unknown point or plant.
         """
         point = self.main if point is None else point
         if not 0 <= point < len(self.loops):
@@ -116,7 +116,7 @@ class Analysis:
         Raises
         ------
         SettingError
-            Where matplotlib is not installed.
+            If matplotlib is not installed.
         """
         from .figures import figures
 
@@ -134,7 +134,7 @@ class Analysis:
         Parameters
         ----------
         ax : Axes or sequence of Axes, optional
-            One takes the figure's first panel, several as many panels, in reading order: output
+            One gets the figure's first panel; several get as many panels, in reading order: output
             and command after both steps; |L|, |S|, phase of L and |T|; cost and Ms.
         figure : str, optional
             `responses`, `bode`, `sensitivity` or `what_if`.
@@ -149,7 +149,7 @@ class Analysis:
         Raises
         ------
         SettingError
-            For another figure, where matplotlib is not installed, or the file cannot be written.
+            For another figure, if matplotlib is not installed, or the file cannot be written.
         """
         from .figures import drawing
 
@@ -158,25 +158,25 @@ class Analysis:
     def save(self, folder: str | os.PathLike[str], *, png: bool = True) -> list[Path]:
         """Write `analysis.json` and every figure as SVG, and as PNG, into a folder.
 
-        `sewfast report` shows them where the folder is that of a demo or a commissioning.
+        `sewfast report` shows them if the folder is that of a demo or a commissioning.
 
         Parameters
         ----------
         folder : path
-            Is made where it does not exist.
+            Created if it does not exist.
         png : bool
             Whether to write PNGs as well.
 
         Raises
         ------
         SettingError
-            Where matplotlib is not installed or the folder cannot be written to.
+            If matplotlib is not installed or the folder cannot be written to.
         """
 
         return save(self, folder, png=png)
 
     def to_json(self) -> dict[str, Any]:
-        """Every number as JSON values; what is not finite is None."""
+        """Every number as JSON values; non-finite numbers are None."""
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -237,19 +237,19 @@ def analyse(
     on : Model, VirtualMachine or sequence of them
         With one input each; every member of an ensemble is a plant.
     speeds : sequence of float, optional
-        Steady outputs about which the plants are linearised [y]; by default three over what the
-        first model's training data came near.
+        Steady outputs about which the plants are linearised [y]; by default three within the range
+        covered by the first model's training data.
     level, step : float, optional
         Output before the steps and size of the reference step [y]; by default the middle of
         `speeds` and a tenth of it.
     disturbance : float, optional
-        Of the disturbance step, at the plant's input [u]; by default what would move the output by
-        `step` without control. On a virtual machine it is the load torque that costs as much.
+        Of the disturbance step, at the plant's input [u]; by default one that would move the output
+        by `step` without control. On a virtual machine it is the load torque with the same effect.
     seconds : float, optional
-        How long the steps are looked at; by default five times the slowest closed-loop pole's time
+        Duration of the steps; by default five times the slowest closed-loop pole's time
         constant.
     references : str, array of shape (N,), or sequence of them, optional
-        What the cost is taken over; `REFERENCES` by default where these suit the first plant (RPM
+        References for the cost; by default `REFERENCES` if these suit the first plant (RPM
         at 1 ms, its recorded range), else the reference step.
     cost : Cost, optional
         As for `sewfast.tune`.

@@ -59,12 +59,20 @@ def add(commands: Commands) -> None:
 def deploy_command(args: argparse.Namespace) -> None:
     from .. import storage
     from ..control import load_controller
-    from ..control.controller import FORMAT
+    from ..control.controller import FORMAT as CONTROLLER
     from ..deployment import deploy
+    from ..dynamic_model import FORMAT as MODEL
+    from ..errors import ModelFileError
     from ..models import load_model
 
-    controller = storage.format_of(args.file) == FORMAT
-    what = load_controller(args.file) if controller else load_model(args.file)
+    found = storage.format_of(args.file)
+    if found not in ("", CONTROLLER, MODEL):
+        raise ModelFileError(
+            name=args.file, expected="a model or a controller",
+            received=f"a file of format {found!r}",
+            remedy="`sewfast identify` and `sewfast tune` write those",
+        )  # fmt: skip
+    what = load_controller(args.file) if found == CONTROLLER else load_model(args.file)
     done = deploy(
         what, args.folder, to=args.to, precision=args.precision, name=args.prefix,
         changeable=args.changeable,

@@ -23,7 +23,7 @@ a controller, commission it. The motor is computed on the emulated processor too
 At the end it says how many instructions a control period takes, how deep the stack was used and
 how large the code is. QEMU counts instructions, not cycles.
 
-It needs a source checkout and, on Debian, make, cargo and
+It needs a source checkout and, on Debian, make, cargo-web and
   gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm rustc-web rust-web-src
 or a firmware that is built already, and qemu-system-arm alone.
 """
@@ -82,11 +82,7 @@ def command(args: argparse.Namespace) -> int:
     from ..gains import Gains
     from ..link.emulated import EmulatedBoard, build_firmware
 
-    if args.out.exists() and not args.overwrite:
-        raise SettingError(
-            f"--out {args.out}: expected a new folder, got one that is there; name another, or "
-            "--overwrite"
-        )
+    _prepare(args.out, args.overwrite, make=False)
     firmware = args.firmware
     if firmware is None:
         _say("compiling the firmware")
@@ -94,7 +90,7 @@ def command(args: argparse.Namespace) -> int:
     elif args.board is not None:
         raise SettingError("--board: leave it out beside --firmware, which says for which it is")
     with EmulatedBoard(firmware, clock=args.clock, boot_id=args.seed + 1) as board:
-        args.out.mkdir(parents=True, exist_ok=True)
+        _prepare(args.out, args.overwrite, make=True)
         first = Controller(
             Gains.standard(Kp=0.02, Ti=0.1, Td=0.002),
             Ts=0.001, alpha=0.4, N=10, u_min=-10, u_max=10, filter_samples=8,
@@ -113,6 +109,25 @@ def command(args: argparse.Namespace) -> int:
         print(figures)
         print(f"written to {args.out}")
     return 0
+
+
+def _prepare(folder: Path, overwrite: bool, *, make: bool) -> None:
+    """The folder for the results: looked at before a compiler runs, made when a board does."""
+    try:
+        if folder.exists() and not overwrite:
+            raise SettingError(
+                f"--out {folder}: expected a new folder, got one that is there; name another, or "
+                "--overwrite"
+            )
+        if make:
+            folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, UnicodeError) as error:
+        raise SettingError(
+            name=f"--out {folder}",
+            expected="a folder that can be made",
+            received=getattr(error, "strerror", None) or str(error),
+            remedy="name another one",
+        ) from error
 
 
 def _stages(args: argparse.Namespace, port: str) -> Iterator[tuple[str, list[str]]]:

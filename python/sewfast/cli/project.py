@@ -42,7 +42,7 @@ class Project:
     Attributes
     ----------
     path : Path or None
-        The file; None where there is none.
+        The file; None if there is none.
     port : str or None
         Serial port or socket of the drive.
     columns : mapping

@@ -1,12 +1,13 @@
 """A co-simulation FMU as a machine: a plant from Modelica, Simulink or any other tool.
 
-FMPy loads it. An FMU is a program: what is loaded runs on this computer with the user's rights.
+FMPy loads it, in a process of its own. An FMU is a program: it runs with the user's rights.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import re
 import shutil
 import tempfile
 import weakref
@@ -17,6 +18,7 @@ from typing import Any
 
 from ..control.machine import SteppedBench
 from ..errors import ModelFileError, SettingError
+from .fmu_process import FmuProcess
 
 MOST_BYTES = 2 * 1024**3
 """Of all files of an FMU, unpacked."""
@@ -48,9 +50,11 @@ class FmuMachine:
         Units of those where the FMU states none: `RPM`, `rad/s`, `deg/s`, `rev/s`; `rad`, `deg`,
         `rev`.
     counts_per_rev : float
-        Encoder counts of one turn.
+        Encoder counts per turn.
     start : mapping, optional
         Values of further variables at the beginning.
+    timeout : float
+        Longest time that the FMU may take to begin, or for a step [s].
 
     Raises
     ------
@@ -73,11 +77,16 @@ class FmuMachine:
         speed_unit: str | None = None,
         angle_unit: str | None = None,
         start: Mapping[str, float] | None = None,
+        timeout: float = 60.0,
     ) -> None:
-        self.path = Path(path)
+        self.path, self.timeout = Path(path), float(timeout)
         self.Ts, self.counts_per_rev = float(Ts), float(counts_per_rev)
         if not (self.Ts > 0.0 and math.isfinite(self.Ts)):
             raise SettingError(f"Ts: expected a time above 0 s, received {Ts!r}; 0.001 is usual")
+        if not self.timeout > 0.0:
+            raise SettingError(
+                f"timeout: expected a time above 0 s, received {timeout!r}; 60 is usual"
+            )
         _require_fmu(self.path)
         self._fmpy = _library()
         self._folder = tempfile.mkdtemp(prefix="sewfast-fmu-")
@@ -86,17 +95,28 @@ class FmuMachine:
         self._variables = {v.name: v for v in self._description.modelVariables}
         if speed is None and angle is None and counts is None:
             speed = self._only("output", "speed=, angle= or counts=")
-        self._input = self._reference(input or self._only("input", "input="))
+        input = input or self._only("input", "input=")
+        self._input = self._reference(input)
+        if self._variables[input].causality != "input":
+            raise SettingError(
+                f"{self.path}: expected an input as input=, got {input!r}; it has inputs "
+                f"{self._names('input')}"
+            )
         self._counts = None if counts is None else self._reference(counts)
         self._angle = None if angle is None else self._reference(angle)
         self._speed = None if speed is None else self._reference(speed)
         self._turns = self._factor(angle, angle_unit, _TURNS, "angle_unit")
         self._rpm = self._factor(speed, speed_unit, _RPM, "speed_unit")
         self._start = {self._reference(n): float(v) for n, v in (start or {}).items()}
-        self._fmu: Any = None
+        self._read = (self._counts, self._angle, self._speed)
+        self._process = FmuProcess(
+            self.path, self._folder, input=self._input, measured=self._read, start=self._start,
+            Ts=self.Ts,
+            timeout=self.timeout,
+        )  # fmt: skip
+        self._end = weakref.finalize(self, self._process.close)  # before its folder goes
         self._sample = 0
         self._turned = 0.0
-        self._before = 0.0
         self.reset()
 
     def _described(self) -> Any:
@@ -108,12 +128,18 @@ class FmuMachine:
             said = str(error).strip().splitlines()
             raise ModelFileError(
                 f"{self.path}: expected an FMU whose model description is valid, got "
-                f"{said[0][:200] if said else type(error).__name__}; export it again"
+                f"{' '.join(said[:2])[:300] or type(error).__name__}; export it again"
             ) from error
         if found.coSimulation is None:
             raise ModelFileError(
                 f"{self.path}: expected an FMU for co-simulation, got one for model exchange only; "
                 "export it for co-simulation, with its solver"
+            )
+        name = found.coSimulation.modelIdentifier
+        if not re.fullmatch(r"\w+", name):
+            raise ModelFileError(
+                f"{self.path}: expected a name of letters, digits and _ as modelIdentifier, got "
+                f"{name[:80]!r}; do not use it"
             )
         own, present = self._fmpy.platform, self._fmpy.supported_platforms(self._folder)
         tuple_name = getattr(self._fmpy, "platform_tuple", own)
@@ -163,22 +189,16 @@ class FmuMachine:
         return known[unit]
 
     def reset(self) -> None:
-        """A new run: the FMU is begun again."""
-        self.close()
-        version = self._description.fmiVersion
-        fmu = self._fmpy.instantiate_fmu(self._folder, self._description, "CoSimulation")
-        for reference, value in self._start.items():
-            self._set(fmu, reference, value)
-        if version.startswith("1."):
-            fmu.initialize()
-        else:
-            if version.startswith("2."):
-                fmu.setupExperiment(startTime=0.0)
-            fmu.enterInitializationMode()
-            self._set(fmu, self._input, 0.0)
-            fmu.exitInitializationMode()
-        self._fmu, self._sample, self._turned = fmu, 0, 0.0
-        self._before = self.speed_rpm if self._speed is not None else 0.0
+        """A new run: the FMU is begun again.
+
+        Raises
+        ------
+        SettingError
+            Where the FMU refuses, crashes, or does not answer in time.
+        """
+        self._measured = self._process.begin()
+        self._sample, self._turned = 0, 0.0
+        self._require_finite()
 
     def step(self, u: float) -> None:
         """Hold a command for one sample.
@@ -186,50 +206,43 @@ class FmuMachine:
         Raises
         ------
         SettingError
-            Where the FMU refuses the step.
+            Where the FMU refuses the step, crashes, or does not answer in time.
         """
-        self._set(self._fmu, self._input, u)
-        try:
-            self._fmu.doStep(self._sample * self.Ts, self.Ts)
-        except Exception as error:
-            raise SettingError(
-                f"{self.path}: expected a step of {self.Ts:g} s from {self._sample * self.Ts:g} s, "
-                f"got {error}; give a Ts that its solver can do"
-            ) from error
+        before = self.speed_rpm
+        self._measured = self._process.step(u, self._sample)
         self._sample += 1
+        self._require_finite()
         if self._speed is not None:
-            now = self.speed_rpm
-            self._turned += 0.5 * (self._before + now) * self.Ts / 60.0
-            self._before = now
+            self._turned += 0.5 * (before + self.speed_rpm) * self.Ts / 60.0
+
+    def _require_finite(self) -> None:
+        for reference, value in zip(self._read, self._measured, strict=True):
+            if reference is not None and not math.isfinite(value):
+                name = next(n for n, v in self._variables.items() if v.valueReference == reference)
+                raise SettingError(
+                    name=str(self.path), expected=f"a finite value of {name}",
+                    received=f"{value} at {self._sample * self.Ts:g} s",
+                    remedy="its model has run away: give smaller commands, a shorter Ts or other "
+                    "start values",
+                )  # fmt: skip
 
     @property
     def counts(self) -> float:
         """What the encoder shows."""
+        counts, angle, _ = self._measured
         if self._counts is not None:
-            return self._get(self._counts)
-        turned = self._turned if self._angle is None else self._get(self._angle) * self._turns
+            return counts
+        turned = self._turned if self._angle is None else angle * self._turns
         return math.floor(turned * self.counts_per_rev)
 
     @property
     def speed_rpm(self) -> float:
         """True speed [RPM]; not a number where the FMU does not show it."""
-        return math.nan if self._speed is None else self._get(self._speed) * self._rpm
+        return self._measured[2] * self._rpm
 
     def close(self) -> None:
-        """Free the FMU; the next `reset` begins it again."""
-        if self._fmu is not None:
-            fmu, self._fmu = self._fmu, None
-            fmu.terminate()
-            fmu.freeInstance()
-
-    def _get(self, reference: int) -> float:
-        three = self._description.fmiVersion.startswith("3.")
-        values = (self._fmu.getFloat64 if three else self._fmu.getReal)([reference])
-        return float(values[0])
-
-    def _set(self, fmu: Any, reference: int, value: float) -> None:
-        three = self._description.fmiVersion.startswith("3.")
-        (fmu.setFloat64 if three else fmu.setReal)([reference], [value])
+        """End the FMU."""
+        self._end()
 
 
 def fmu_bench(
@@ -252,7 +265,8 @@ def fmu_bench(
     limit : float
         Speed beyond which it stops by itself [RPM].
     **variables
-        Further arguments of `FmuMachine`: `input`, `speed`, `angle`, `counts`, units, `start`.
+        Further arguments of `FmuMachine`: `input`, `speed`, `angle`, `counts`, units, `start`,
+        `timeout`.
 
     Returns
     -------
@@ -267,7 +281,7 @@ def fmu_bench(
     return SteppedBench(machine, Ts, counts_per_rev, volt, Path(path).stem, limit)
 
 
-_NUMBERS = ("volt", "Ts", "counts_per_rev", "limit")
+_NUMBERS = ("volt", "Ts", "counts_per_rev", "limit", "timeout")
 _NAMES = ("input", "speed", "angle", "counts", "speed_unit", "angle_unit")
 
 
@@ -320,10 +334,15 @@ def _require_fmu(path: Path) -> None:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
             described = [e for e in entries if e.filename == "modelDescription.xml"]
-            if len(described) != 1 or described[0].file_size > MOST_XML:
+            if len(described) != 1:
                 raise ModelFileError(
                     f"{path}: expected an FMU with one modelDescription.xml, got {len(described)}; "
                     "export it again"
+                )
+            if described[0].file_size > MOST_XML:
+                raise ModelFileError(
+                    f"{path}: expected a modelDescription.xml of at most {MOST_XML} bytes, got "
+                    f"{described[0].file_size}; export it without what is not needed"
                 )
             with archive.open(described[0]) as file:
                 text = file.read(MOST_XML)
@@ -340,6 +359,14 @@ def _require_fmu(path: Path) -> None:
     if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
         raise ModelFileError(
             f"{path}: expected a model description without entities, got some; an FMU needs none"
+        )
+    # FMI asks for UTF-8: in another encoding, which could hide entities, no version is found
+    version = re.search(rb"""\bfmiVersion\s*=\s*["']([^"']{0,20})""", text)
+    if version is None or not re.fullmatch(rb"[12]\.0|3\..*", version[1]):
+        raise ModelFileError(
+            f"{path}: expected an FMU of version 1.0, 2.0 or 3.0, got "
+            f"{'none' if version is None else version[1].decode(errors='replace')}; export it as "
+            "2.0 or 3.0"
         )
     size = sum(e.file_size for e in entries)
     if size > MOST_BYTES or len(entries) > MOST_FILES:

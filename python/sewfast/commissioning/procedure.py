@@ -80,32 +80,34 @@ def commission(
     cancel: threading.Event | None = None,
     between: Between | None = None,
 ) -> Commissioning:
-    """From a machine at rest to a controller that was verified on it.
+    """Take a machine from rest to a controller that has been verified on it.
 
     First motion, step response, a small random command that shows delays and resonances, first
     gains by rule, pulses up to the command's limit, a closed loop under the first gains, an
     ensemble of networks from all of these, gains by search on all members with encoder, feedback
-    filter, gain spread and delay in the loop, and the machine under these beside what was
-    predicted. New gains meet the machine in steps, and a loop that swings is left at once. Every
-    stage begins and ends at rest, and stops with a reason where the evidence is not good enough
-    (docs/commissioning.md).
+    filter, gain spread and delay in the loop, and finally the machine with these gains, compared
+    with the prediction. New gains are applied to the machine in steps, and a loop that oscillates
+    is ended at once. Every stage begins and ends at rest, and stops with a reason if the evidence
+    is not good enough (docs/commissioning.md).
 
     Parameters
     ----------
     on : VirtualMachine, Drive or another Machine
-        The machine; of a drive the limits must have been set. It turns forward only, but for what
-        a controller does at the end of a reference.
+        The machine; a drive's limits must have been set. It turns forward only, except for what a
+        controller does at the end of a reference.
     u_max : float, optional
         Largest command to either side [V]; the machine's own limit by default.
     speed : float, optional
-        Top of the working range [RPM]: the largest reference, or 2,000. A quarter more is planned.
+        Top of the working range [RPM]: by default the largest reference, or 2,000. Plan for a
+        quarter more.
     references : mapping of name to array, or sequence of names, optional
         What to verify on [RPM] at the machine's sample time; names are those of `sewfast.signals`.
         By default `sewfast.commissioning.excitations.standard`.
     practice : mapping of name to array, or sequence of names, optional
-        What to tune on. By default the references; of the standard ones shorter kin.
+        References for tuning. By default the references above, or shorter versions of the standard
+        ones.
     cost : Cost, optional
-        What counts how much; by default 1 per RPM of tracking error, 5 per volt of chatter and
+        Weights; by default 1 per RPM of tracking error, 5 per volt of chatter and
         3 per percent of overshoot beyond 1 of references with an edge, to the scale of speed and
         u_max.
     members : int
@@ -118,7 +120,7 @@ def commission(
         such requirement.
     Ms : float or None
         Largest sensitivity, on every member linearised at three quarters of the top speed; that of
-        Eq. 12's gains where it is larger and a load is required.
+        Eq. 12's gains if it is larger and a load is required.
     time_budget : float, optional
         Time of the search [s], after which the best gains so far are taken. A seed then no longer
         gives the same gains again.
@@ -129,15 +131,16 @@ def commission(
     progress : callable(done, total, stage), optional
         Called as each stage begins, within long ones, and at the end.
     folder : path, optional
-        Where every recording is written as soon as it is there, as `unfinished/NAME.mcap`, so that
-        a process that is killed does not lose it; `Commissioning.save` into the same folder puts
-        tables in their place. One that cannot be written is warned of.
+        Folder in which every recording is written as soon as it is taken, as
+        `unfinished/NAME.mcap`, so that a process that is killed does not lose it;
+        `Commissioning.save` into the same folder replaces them by tables. If one cannot be
+        written, there is a warning.
     overwrite : bool
         See `Commissioning.save`.
     resume : bool
-        Go on from what an earlier attempt has left in `folder`: what it has recorded of the very
-        same commands and references is not recorded again. With the same settings the controller
-        is, bit by bit, that of an attempt without interruption on the same recordings.
+        Continue from the recordings that an earlier attempt left in `folder`: those of exactly the
+        same commands and references are not taken again. With the same settings the controller is,
+        bit by bit, that of an attempt without interruption on the same recordings.
     cancel : threading.Event, optional
         Set in another thread, it ends the commissioning as Ctrl-C does: a drive that runs is
         stopped at once, everything else at its next step.
@@ -150,18 +153,18 @@ def commission(
     Returns
     -------
     Commissioning
-        Its `verdict` is ``verified``, or ``verified, prediction poor`` where the measured cost is
+        Its `verdict` is ``verified``, or ``verified, prediction poor`` if the measured cost is
         more than twice the predicted one.
 
     Raises
     ------
     Refusal
-        Where the evidence is not good enough; `so_far` holds it.
+        If the evidence is not good enough; `so_far` holds it.
     SettingError
-        For demands that contradict the machine's limits, or a folder with files of somebody
-        else's, before anything moves.
+        For demands that contradict the machine's limits, or a folder with files from another
+        source, before anything moves.
     LinkError
-        Where port or drive failed or tripped; the motor is stopped.
+        If port or drive failed or tripped; the motor is stopped.
     Interrupted
         On Ctrl-C or `cancel`; the motor is stopped, `best` is the `Commissioning` so far.
     """

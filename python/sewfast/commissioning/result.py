@@ -57,11 +57,11 @@ class Commissioning:
     ----------
     machine : str
     verdict : str
-        ``verified``: run on the machine, where it did as predicted; ``verified, prediction poor``:
-        it kept to the speeds predicted, at more than twice the cost. ``refused``, ``interrupted``:
-        ended at `stage`; what there is until then is here, the rest is None or empty.
+        ``verified``: run on the machine, which behaved as predicted; ``verified, prediction poor``:
+        the speeds agree with the prediction, but the cost is more than twice as high. ``refused``,
+        ``interrupted``: ended at `stage`; results up to then are here, the rest is None or empty.
     stage, reason : str
-        The last stage; why it ended there.
+        The last stage, and why it ended there.
     seconds : mapping of stage to float
     recordings : mapping of name to Recording
         Of the machine, for `identify`.
@@ -69,43 +69,43 @@ class Commissioning:
     fopdt : Fopdt or None
         From the step response.
     small_signal : SmallSignal or None
-        The machine about a working speed, with its resonance where it has one.
+        Linear model about a working speed, including the resonance if there is one.
     acceleration : float or None
-        What the machine has shown at the limit of its command [RPM/s].
+        Measured at the limit of the command [RPM/s].
     turn_load : TurnLoad or None
-        The load over the turn, as a command; None where none was seen.
+        The load over the turn, as a command; None if none was seen.
     first : Controller or None
         The gains by rule, under which the closed loop was recorded.
     models : Ensemble or None
-        What was tuned on: networks, or the linear rival alone where these failed.
+        The models used for tuning: networks, or the linear rival alone if these failed.
     rival : Rival or None
-        The linear model beside the networks.
+        The linear model that competes with the networks.
     rmse : tuple of float
-        Of each member on the recording `levels`, which none was trained on [RPM].
+        Of each member on the recording `levels`, not used for training [RPM].
     controller : Controller or None
-        The best there is: tuned, or else the first.
+        The best so far: the tuned one, or else the first.
     tuning : TuningResult or None
     cost : Cost or None
         What counted how much.
     met : mapping or None
-        What the gains do of what was required beside the cost: `Ms` of the members linearised,
+        How the gains meet the requirements besides the cost: `Ms` of the members linearised,
         `recovery_ms` of each member under the load step, tuned and with the rule's gains.
     card : ReportCard or None
         How far the best member can be trusted, on the recording `levels`.
     judgement : Judgement or None
-        What speaks against the loops as predicted.
+        Objections to the predicted loops.
     comparisons : tuple of Comparison
-        Predicted and measured, per reference.
+        Prediction compared with measurement, per reference.
     margins : mapping or None
         Of a machine with a resonance: `predicted` by its small signals and `measured` on it, at
         `speed` [RPM]: `Ms`, `phase_margin_deg`, `gain_margin`.
     sample_time : float or None
         Of what is simulated [s]: for a slow drive a multiple of the machine's.
     notes : tuple of str
-        What went otherwise than usual: networks that failed, models that contradict each other,
-        gains that were lowered.
+        Anything unusual: networks that failed, models that contradict each other, gains that were
+        lowered.
     taken_in : Path or None
-        The folder in which each recording was written as it came.
+        The folder in which each recording was written as it was taken.
     """
 
     machine: str
@@ -137,7 +137,7 @@ class Commissioning:
 
     @property
     def is_verified(self) -> bool:
-        """Whether the machine did as predicted."""
+        """Whether the machine behaved as predicted."""
         return self.verdict in (VERIFIED, VERIFIED_POORLY)
 
     @property
@@ -175,21 +175,21 @@ class Commissioning:
         Parameters
         ----------
         folder : path
-            Made where it is not there; see docs/CONVENTIONS.md for the layout.
+            Created if it does not exist; see docs/CONVENTIONS.md for the layout.
         overwrite : bool
-            Whether files of these names may be replaced that no commissioning has left.
+            Whether to replace files of these names that were not written by a commissioning.
 
         Returns
         -------
         Path
-            The page, or `commissioning.json` where the report's packages are missing.
+            The page, or `commissioning.json` if the report's packages are missing.
 
         Raises
         ------
         SettingError
-            For a folder with files of somebody else's.
+            For a folder with files from another source.
         DataError
-            Where it cannot be made.
+            If it cannot be made.
         """
 
         return write(self, Path(folder), overwrite=overwrite)
@@ -201,7 +201,7 @@ class Commissioning:
         reference: str | None = None,
         file: str | os.PathLike[str] | None = None,
     ) -> Any:
-        """Draw the loop as predicted beside that of the machine: output, error, command.
+        """Draw the predicted and the measured loop: output, error, command.
 
         Parameters
         ----------
@@ -220,7 +220,7 @@ class Commissioning:
         Raises
         ------
         SettingError
-            For another reference, or where it ended before any loop was predicted; where matplotlib
+            For another reference, or if it ended before any loop was predicted; if matplotlib
             is not installed or the file cannot be written.
         """
         found = {c.reference: c for c in self.comparisons}

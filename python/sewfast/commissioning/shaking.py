@@ -66,16 +66,17 @@ def bode(
     Parameters
     ----------
     on : machine, Recording or Dataset
-        A machine (`VirtualMachine`, drive, `SteppedBench`) is shaken about a working speed. Of a
-        recording or a data set averaged spectra are taken; their other parameters are `reference`
-        and `segment`.
+        A machine (`VirtualMachine`, drive, `SteppedBench`) is excited about a working speed. For a
+        recording or a data set, spectra are averaged; `reference` and `segment` apply to these
+        only.
     speed : float, optional
-        Working speed [RPM], which a machine needs. It turns at it, and a little faster and slower.
+        Working speed [RPM], required for a machine. It turns at this speed, and a little faster and
+        slower.
     amplitude : float, optional
         Peak of the multisine [V]; six tenths of what the command has left at that speed. Under a
         controller the peak of the reference's [RPM], a twentieth of the speed.
     controller : Controller, optional
-        Shake the reference of this loop instead of the command. The response is still that of the
+        Excite the reference of this loop instead of the command. The response is still that of the
         plant, not disturbed by the feedback; `response.margins(controller)` are those of the loop.
     period : float
         Of the multisine [s]; its lines lie two over it apart.
@@ -104,10 +105,10 @@ def bode(
         For a machine without a speed, a speed or an amplitude out of reach, parameters that do not
         belong together.
     DataError
-        Where the machine comes near to standstill, a command is clipped, nothing of the multisine
+        If the machine comes near to standstill, a command is clipped, nothing of the multisine
         is seen in the counts, or a record cannot be used.
     LinkError
-        Where a drive fails or trips.
+        If a drive fails or trips.
 
     Notes
     -----

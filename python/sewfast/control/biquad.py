@@ -42,7 +42,7 @@ class Biquad:
     kind : str
         ``notch``, ``low_pass``, ``lead_lag`` or ``resonance``.
     numbers : tuple of float
-        What the constructor was given, in its order.
+        The arguments of the constructor, in its order.
 
     Examples
     --------
@@ -67,9 +67,9 @@ class Biquad:
 
     @classmethod
     def notch(cls, frequency: float, depth: float = 0.1, width: float = 0.5) -> Biquad:
-        """Take out what swings at `frequency` [Hz].
+        """Remove an oscillation at `frequency` [Hz].
 
-        The gain there is `depth`, 0 to 1; the band that a deep notch weakens by 3 dB and more is
+        The gain there is `depth`, 0 to 1; the band that a deep notch attenuates by 3 dB or more is
         `width` times as wide as the frequency:
         H(s) = (s^2 + depth width w s + w^2)/(s^2 + width w s + w^2).
         """
@@ -82,14 +82,14 @@ class Biquad:
 
     @classmethod
     def lead_lag(cls, zero: float, pole: float) -> Biquad:
-        """H(s) = (1 + s/w_zero)/(1 + s/w_pole), both [Hz]: a lead where the zero comes first."""
+        """H(s) = (1 + s/w_zero)/(1 + s/w_pole), both [Hz]: a lead if the zero comes first."""
         return cls("lead_lag", (zero, pole))
 
     @classmethod
     def resonance(
         cls, zero_frequency: float, zero_damping: float, pole_frequency: float, pole_damping: float
     ) -> Biquad:
-        """Zeros and poles with frequencies [Hz] and damping ratios of their own.
+        """Zeros and poles, each with its own frequency [Hz] and damping ratio.
 
         With the zeros on a shaft's resonance and the poles on its antiresonance it is the inverse
         of the shaft.

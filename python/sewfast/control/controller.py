@@ -46,7 +46,7 @@ class Controller:
     Ts : float
         Sample time [s].
     alpha, beta : float
-        Shares of the reference taken out of the proportional and of the derivative term; negative
+        Shares of the reference subtracted in the proportional and the derivative term; negative
         values feed the reference forward.
     N : float
         The derivative is filtered with time constant `Td/N`; inf for no filter.
@@ -63,11 +63,11 @@ class Controller:
     observer_time : float
         Time constant of the alpha-beta observer in the feedback after that [s]; 0 for none.
     r_rate : float
-        Largest change of the reference that is controlled to [y/s]; inf for none.
+        Largest change of the reference used by the controller [y/s]; inf for none.
     schedule : sequence of (float, Gains)
-        Gains over the size of the filtered output [y]: up to 8 points with growing speeds of 0 or
-        more. Kp, Kp/Ti and Kp Td are linear between them and held outside. Where it is not empty,
-        `gains` has no part in the command.
+        Gains over the magnitude of the filtered output [y]: up to 8 points with increasing speeds
+        of 0 or more. Kp, Kp/Ti and Kp Td are linear between them and held outside. If it is not
+        empty, `gains` is not used.
     biquads : sequence of Biquad
         Up to 4 filters, one after the other, on the reference and on the filtered output:
         `Biquad.notch(60.0)` and the like.
@@ -144,7 +144,7 @@ class Controller:
         """The arithmetic itself, at rest: `step(r, y, feedforward)` gives the command of a sample.
 
         `set_design(other.core())` changes its settings and `set_manual(u)`, `set_automatic()` its
-        mode while it runs, without a bump. `core().single()` is the same in single precision, bit
+        mode during a run, without a bump. `core().single()` is the same in single precision, bit
         by bit what a microcontroller computes.
         """
         gains = self.gains.to("standard")
@@ -168,17 +168,17 @@ class Controller:
         return [biquad.coefficients(self.Ts) for biquad in self.biquads]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write it as JSON (docs/CONVENTIONS.md, Files); the file appears whole or not at all.
+        """Write it as JSON (docs/CONVENTIONS.md, Files); the file is either complete or absent.
 
         Raises
         ------
         ModelFileError
-            Where the file cannot be written.
+            If the file cannot be written.
         """
         storage.write(path, FORMAT, VERSION, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as JSON values; null stands for a limit or filter that is not there."""
+        """Everything as JSON values; null means no such limit or filter."""
         values = {name: _bounded(getattr(self, name)) for name in _REALS}
         return {
             "gains": _gains_to_dict(self.gains),
@@ -227,7 +227,7 @@ def load_controller(path: str | os.PathLike[str]) -> Controller:
     Raises
     ------
     ModelFileError
-        Where the file is missing, damaged, of another format or of an unknown version, or holds a
+        If the file is missing, damaged, of another format or of an unknown version, or holds a
         setting outside its range; the message names the file and the field.
     """
     fields = Fields(os.fspath(path), storage.read(path, FORMAT, (1, 2, VERSION)))
@@ -329,7 +329,7 @@ def paper_controller() -> Controller:
     """The paper's controller: Kp .02, Ki .02, Kd .5 per sample of 1 ms, alpha .4, beta .2.
 
     The paper leaves the form open; only as per-sample gains in V/RPM within +-10 V do they track on
-    its own plant, and they lean on that limit: without it the loop is unstable. Raw feedback.
+    its own plant, and they depend on that limit: without it the loop is unstable. Raw feedback.
     """
     return Controller(
         gains=Gains.per_sample(0.02, 0.02, 0.5, Ts=0.001),

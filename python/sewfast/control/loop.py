@@ -34,7 +34,7 @@ SMOOTHING = 0.005
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoopRun:
-    """What a controller did on a plant; entry k is measured and decided at `t[k]`.
+    """A run of a controller on a plant; entry k is measured and computed at `t[k]`.
 
     Attributes
     ----------
@@ -74,13 +74,13 @@ class ClosedLoopRun:
         return {name: getattr(self, name) for name in self.units}
 
     def metrics(self) -> dict[str, float | None]:
-        """How well it tracked and what that took.
+        """Tracking errors and the effort behind them.
 
         Returns
         -------
         dict
             `rmse` and `max_abs` of r - y [y]; `rise_time_ms`, `reference_rise_time_ms` (10 to 90 %
-            of the first edge) and `overshoot_percent`, None where the reference is no step or
+            of the first edge) and `overshoot_percent`, None if the reference is no step or
             trapezoid or the level is not reached; `u_rms`, `du_rms` (change from sample to sample)
             [u]; `saturated`, the share of samples at a limit. Samples that a link lost (NaN) do not
             count; with any of them there is no rise time and no overshoot.
@@ -112,14 +112,14 @@ class ClosedLoopRun:
         beside: Sequence[ClosedLoopRun] = (),
         file: str | os.PathLike[str] | None = None,
     ) -> Any:
-        """Draw output over reference, error and command, below each other.
+        """Draw output and reference, the error and the command in three panels.
 
         Parameters
         ----------
         ax : Axes or sequence of Axes, optional
             One shows the output, further ones the error and the command.
         beside : sequence of ClosedLoopRun
-            Other runs over the same reference, such as the one that a model predicted.
+            Other runs over the same reference, such as one predicted by a model.
         file : path, optional
             Where to write the figure: PNG, SVG or PDF by its ending.
 
@@ -131,7 +131,7 @@ class ClosedLoopRun:
         Raises
         ------
         SettingError
-            Where matplotlib is not installed or the file cannot be written.
+            If matplotlib is not installed or the file cannot be written.
         """
         from ..plotting import Trace, loop_drawing
 
@@ -224,15 +224,15 @@ def run(
     ----------
     controller : Controller
     on : Model, VirtualMachine, Drive or another Machine
-        The plant. A model needs one input and is not changed; so is a virtual machine. A drive
-        (`sewfast.link`) runs the controller itself, in single precision; its limits must have been
-        set. A `sewfast.Machine` of your own does what its `follow` does.
+        The plant. A model needs one input. Neither a model nor a virtual machine is changed. A
+        drive (`sewfast.link`) runs the controller itself, in single precision; its limits must have
+        been set. For your own `sewfast.Machine`, its `follow` is called.
     reference : str or array, shape (N,), optional
         Name of a reference (`sewfast.signals`) or its samples at the controller's sample time [y].
         On a model that is not in RPM at 1 ms a name is the same shape over the model's recorded
-        range. By default a trapezoid that suits the plant; a drive has to be given one.
+        range. By default a trapezoid that suits the plant; a drive needs an explicit one.
     feedforward : array, shape (N,), optional
-        A command that is added before the limits [u]; a drive takes none.
+        A command that is added before the limits [u]; not for a drive.
     disturbance : array, shape (N,), optional
         Of a model: a command that is added behind the limits, unseen by the controller [u]. A
         virtual machine has `set_load`.
@@ -245,27 +245,26 @@ def run(
     live : str
         Of a drive: see `sewfast.live.open_view`.
     overwrite : bool
-        Whether `file` may replace a recording of a drive, which cannot be had again.
+        Whether `file` may replace a recording of a drive, which cannot be repeated exactly.
     cancel : threading.Event, optional
         Of a drive: set in another thread, it ends the run as Ctrl-C does.
 
     Returns
     -------
     ClosedLoopRun
-        Of a drive, `y` is the speed estimated from its counts, or its true speed where it is a
-        virtual one.
+        For a drive, `y` is the speed estimated from its counts, or the true speed of a virtual one.
 
     Raises
     ------
     SettingError
-        Where sample times or units of controller, plant and reference disagree, or for signals that
+        If sample times or units of controller, plant and reference disagree, or for signals that
         the plant cannot take.
     DataError
         For signals that are empty, not finite or of different lengths.
     FitError
-        Where the loop diverges.
+        If the loop diverges.
     LinkError
-        Where the port or the drive failed or tripped; the motor is stopped, `recording` holds what
+        If the port or the drive failed or tripped; the motor is stopped, `recording` holds what
         came.
     Interrupted
         On Ctrl-C or `cancel`, of a drive; the motor is stopped, `best` is the run up to there.

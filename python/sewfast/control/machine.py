@@ -71,11 +71,10 @@ WATCHED = 20
 class Machine(Protocol):
     """A motor with an encoder that can be excited and run, each time from rest.
 
-    Whatever has these members can be recorded (`record`), run (`run`), commissioned (`commission`)
-    and shaken (`bode`): a drive behind a port, an FMU, a model of MuJoCo, a rig of your own. A
-    `VirtualMachine` is taken as it is. Every run ends without command on the motor, also one that
-    is broken off. Where its `follow` takes a `watch` as well (`Watch`), a run that goes wrong is
-    ended while it does.
+    Any object with these members works with `record`, `run`, `commission` and `bode`: a drive
+    behind a port, an FMU, a model of MuJoCo, your own test rig. A `VirtualMachine` has them all.
+    Every run, even an interrupted one, ends with no command on the motor. If its `follow` also
+    accepts a `watch` (`Watch`), a run that goes wrong is ended early.
     """
 
     @property
@@ -88,18 +87,18 @@ class Machine(Protocol):
 
     @property
     def counts_per_rev(self) -> float:
-        """Encoder counts of one turn."""
+        """Encoder counts per turn."""
 
     @property
     def volt(self) -> float:
-        """Largest command that it takes to either side [V]."""
+        """Largest command that it accepts in either direction [V]."""
 
     @property
     def speed(self) -> float:
-        """Speed beyond which it stops by itself [RPM]; inf where there is none."""
+        """Speed beyond which it stops on its own [RPM]; inf if there is none."""
 
     def excite(self, u: FloatArray, name: str) -> Recording:
-        """Play commands [V], shape (N,), one each sample."""
+        """Apply commands [V], shape (N,), one per sample."""
 
     def follow(self, controller: Controller, r: FloatArray, name: str) -> RecordedRun:
         """Run a controller along a reference [RPM], shape (N,)."""
@@ -174,9 +173,9 @@ def record(
     Parameters
     ----------
     machine : VirtualMachine, Drive or a machine of your own
-        A virtual machine is reset first, and left where the run ends. A drive (`sewfast.link`)
-        waits for rest, is armed and started; its limits must have been set. One of your own is a
-        `Machine`; a simulator stands in a `sewfast.commissioning.SteppedBench`.
+        A virtual machine is reset first and stays in the state at the end of the run. A drive
+        (`sewfast.link`) waits for rest, is armed and started; its limits must have been set. Your
+        own is a `Machine`; wrap a simulator in a `sewfast.commissioning.SteppedBench`.
     u : array, shape (N,)
         Command [V] at the machine's sample time; see `sewfast.signals.excitation`.
     name : str
@@ -189,27 +188,27 @@ def record(
     live : str
         Of a drive: see `sewfast.live.open_view`.
     settings : mapping, optional
-        What else the file says of the recording.
+        Further entries for the header of the file.
     overwrite : bool
-        Whether `file` may replace a recording of a drive, which cannot be had again; one of a
-        virtual machine is replaced anyway.
+        Whether `file` may replace a recording of a drive, which cannot be repeated exactly; one of
+        a virtual machine is always replaced.
     cancel : threading.Event, optional
         Of a drive: set in another thread, it ends the run as Ctrl-C does.
 
     Returns
     -------
     Recording
-        Of a virtual machine the command as given: beyond its limit the machine clips it. Of a
-        drive the command as applied.
+        For a virtual machine, `u` is the command as given, which the machine clips at its limit;
+        for a drive, the command as applied.
 
     Raises
     ------
     DataError
-        Where `u` is not one-dimensional and finite, or too short for a speed.
+        If `u` is not one-dimensional and finite, or too short for a speed.
     SettingError
-        Where `file` has an unknown ending or is a recording that is kept, before anything moves.
+        If `file` has an unknown ending or is a recording that is kept, before anything moves.
     LinkError
-        Where the port or the drive failed or tripped; the motor is stopped, `recording` holds what
+        If the port or the drive failed or tripped; the motor is stopped, `recording` holds what
         came.
     Interrupted
         On Ctrl-C or `cancel`, of a drive; the motor is stopped, `best` is the recording up to
@@ -345,7 +344,7 @@ class SteppedBench:
     Ts : float
         Sample time [s].
     counts_per_rev : float
-        Encoder counts of one turn.
+        Encoder counts per turn.
     volt : float
         Largest command that it takes to either side [V]; larger ones are clipped.
     name : str

@@ -76,13 +76,13 @@ def _of_model(model: Any, Ts: float, speed: float | None) -> tuple[FloatArray, F
 def operating_point(model: Any, speed: float) -> OperatingPoint:
     """The linear model of a nonlinear one about the steady state whose output is `speed`.
 
-    `margins(controller, point, speed=speed)` is then what `margins(controller, model, speed=speed)`
-    is, to the bit, without the search for the steady state: for whoever tries many controllers.
+    `margins(controller, point, speed=speed)` then equals `margins(controller, model, speed=speed)`
+    to the bit, without the search for the steady state: useful if you try many controllers.
 
     Parameters
     ----------
     model : Model
-        With one input; of an ensemble take one of its `members`.
+        With one input; for an ensemble, use one of its `members`.
     speed : float
         Steady output [y].
 
@@ -211,7 +211,7 @@ def _require(inputs: int, of: float, Ts: float) -> None:
 class Margins:
     """Margins of the sampled loop, broken at the plant's input (docs/CONVENTIONS.md, Control).
 
-    Of an unstable loop the peaks and the noise gain are infinite and the other margins NaN.
+    For an unstable loop the peaks and the noise gain are infinite and the other margins NaN.
 
     Attributes
     ----------
@@ -222,19 +222,19 @@ class Margins:
     Ms_omega, Mt_omega : float
         Where [rad/s].
     gain_margin : float
-        The factor above 1 on the loop's gain that makes it unstable; inf where none does.
+        The factor above 1 on the loop's gain that makes the loop unstable; inf if none does.
     gain_reduction : float
-        The factor below 1 that does; 0 where none does.
+        The factor below 1 that makes it unstable; 0 if none does.
     phase_margin_deg : float
-        The least turn of L, to either side, that does [deg].
+        The smallest phase change of L, in either direction, that makes it unstable [deg].
     delay_margin_s : float
-        The additional delay that does [s].
+        The additional delay that makes it unstable [s].
     gain_crossovers, phase_crossovers : tuple of float
         Where |L| is 1, and where L is real and negative [rad/s].
     noise_gain : float
         rms of the command over rms of white noise on the measured output [u/y].
     largest_pole : float
-        Largest size of a closed-loop pole; NaN with a memory of more than 250 samples.
+        Largest magnitude of a closed-loop pole; NaN with a memory of more than 250 samples.
     u_unit, y_unit : str
     """
 
@@ -261,8 +261,8 @@ class Margins:
     def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
         """Draw the margins in the plane of the loop transfer L.
 
-        L stays outside the circle of radius 1/Ms about -1. Arrows lead from -1 to where L may come
-        to on the real axis (gain) and on the unit circle (phase) before the loop is unstable.
+        L stays outside the circle of radius 1/Ms about -1. Arrows show how far L can move on the
+        real axis (gain) and on the unit circle (phase) before the loop is unstable.
 
         Parameters
         ----------
@@ -279,7 +279,7 @@ class Margins:
         Raises
         ------
         SettingError
-            Where the loop is unstable, matplotlib is not installed, or the file cannot be written.
+            If the loop is unstable, matplotlib is not installed, or the file cannot be written.
         """
         if not self.stable:
             raise SettingError(
@@ -336,9 +336,9 @@ class Margins:
 def margins(controller: Controller, plant: Any, *, speed: float | None = None) -> Margins:
     """Margins of a controller on a linear plant at the controller's sample time.
 
-    What is in the loop: the gains, the derivative's filter, the feedback filters, the encoder's
-    mean over a sample where the controller has one, the zero-order hold, every delay. What is
-    not: limits, the reference's weights and ramp, the encoder's rounding.
+    The loop includes the gains, the derivative's filter, the feedback filters, the encoder's mean
+    over a sample if the controller has an encoder, the zero-order hold and every delay. It excludes
+    limits, the reference's weights and ramp, and the encoder's rounding.
 
     Parameters
     ----------
@@ -348,13 +348,13 @@ def margins(controller: Controller, plant: Any, *, speed: float | None = None) -
         model is linearised at the steady state with output `speed`; `operating_range(model)` gives
         operating points. One input.
     speed : float, optional
-        Output at which the gains of a schedule, and a nonlinear model, are taken [y].
+        Output at which a gain schedule and a nonlinear model are evaluated [y].
 
     Raises
     ------
     SettingError
         Without a speed where one is needed, for several inputs, another sample time, other units,
-        or a plant that answers within the same sample.
+        or a plant that responds within the same sample.
     """
     require_controller(controller, plant, "margins(controller, plant)")
     _require_units(controller.gains, plant)

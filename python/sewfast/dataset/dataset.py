@@ -20,7 +20,8 @@ class Dataset:
     """Recordings of one plant: the same columns, units and sample time in every experiment.
 
     Immutable. An output may be NaN, which means that it was not measured: models run through it and
-    it has no weight. An input that is NaN is refused where a model needs it, with its sample.
+    it has no weight. An input that is NaN is refused if a model needs it; the message names the
+    sample.
 
     Parameters
     ----------
@@ -32,17 +33,17 @@ class Dataset:
     input_units, output_unit
         Units as text, empty where unknown.
     counts : tuple (column, counts_per_rev) or None
-        Set where the output is a speed [RPM] computed from an encoder's counts.
+        Set if the output is a speed [RPM] computed from an encoder's counts.
     notes : tuple of str
-        What was left out when the data set was made.
+        Notes on samples and columns omitted when the data set was made.
     looks_ahead : bool
-        The output was computed with samples after it as well, by a smoother or a filter without
-        delay: it begins to move before the input does.
+        Whether the output was computed from later samples as well, by a smoother or a filter
+        without delay, so that it begins to move before the input does.
 
     Raises
     ------
     DataError
-        Where experiments, names and units disagree in number, or Ts is not a positive number.
+        If experiments, names and units disagree in number, or Ts is not a positive number.
     """
 
     experiments: tuple[Experiment, ...]
@@ -99,13 +100,13 @@ class Dataset:
         ----------
         u : array_like, shape (N,) or (N, n_inputs)
         y : array_like, shape (N,), or None
-            None where nothing was measured: enough to simulate from rest.
+            None if nothing was measured: enough to simulate from rest.
         Ts : float
             Sample time [s].
         weights : array_like, shape (N,), or None
-            How much the squared error of each sample counts: finite, 0 or more, not all 0. What is
-            trusted less gets less, what is not to count 0; only their ratios matter. None: all
-            alike.
+            How much the squared error of each sample counts: finite, 0 or more, not all 0. Give
+            less weight to samples that you trust less and 0 to those that must not count; only
+            ratios matter. None: all equal.
 
         Raises
         ------
@@ -134,7 +135,7 @@ class Dataset:
         Raises
         ------
         DataError
-            Where there is none, or sample times (1 %), numbers of inputs or units differ.
+            If there is none, or sample times (1 %), numbers of inputs or units differ.
         """
         parts = tuple(datasets)
         if not parts:
@@ -166,7 +167,7 @@ class Dataset:
 
     @property
     def output_range(self) -> tuple[float, float]:
-        """Smallest and largest measured output over all experiments; NaN where there is none."""
+        """Smallest and largest measured output over all experiments; NaN if there is none."""
         return range_of(np.concatenate([e.y for e in self.experiments]))
 
     def __len__(self) -> int:

@@ -84,13 +84,13 @@ class Diagnosis:
     Attributes
     ----------
     findings : tuple of Finding
-        What decides most comes first.
+        The most decisive one comes first.
     """
 
     findings: tuple[Finding, ...]
 
     def find(self, kind: str) -> Finding | None:
-        """The first finding of that kind; None where there is none."""
+        """The first finding of that kind; None if there is none."""
         return next((f for f in self.findings if f.kind == kind), None)
 
     def to_json(self) -> dict[str, Any]:
@@ -107,14 +107,14 @@ class Diagnosis:
 
 
 def diagnose(data: Dataset) -> Diagnosis:
-    """Say what a record is, where that decides what can be identified from it.
+    """Report the properties of a record that decide what can be identified from it.
 
     ==================  ======================================================================
     `integrator`        the output is a position: it integrates what an input drives
     `wraps`             the output is an angle that jumps back by a turn
     `closed_loop`       an input was computed from the output, or a reference was recorded
-    `repeats`           one trajectory over and over: a held-out part holds nothing new
-    `two_level_input`   no nonlinearity can be told from an input with two levels
+    `repeats`           one trajectory over and over: a held-out part contains nothing new
+    `two_level_input`   an input with two levels shows no nonlinearity
     `rests`             the ends, a fifth of the record or more, at rest
     `short_record`      shorter than three of its slowest time constants
     `limited_input`     an input that often stays at its limit
@@ -136,12 +136,12 @@ def diagnose(data: Dataset) -> Diagnosis:
     Raises
     ------
     DataError
-        Where it is no data set.
+        If it is not a data set.
 
     Notes
     -----
-    The tests for an integrator and for feedback are statistical: `sewfast.dataset.feedback` and
-    `sewfast.dataset.feedback` say what they rest on.
+    The tests for an integrator and for feedback are statistical: `sewfast.dataset.feedback`
+    describes their assumptions.
 
     Examples
     --------

@@ -116,18 +116,18 @@ class Experiment:
     start : int
         Index of its first sample in the recording that it was cut from.
     removed : Trend or None
-        What `Dataset.detrend` has taken off; `Dataset.restore` puts it back on.
+        What `Dataset.detrend` has removed; `Dataset.restore` adds it again.
     weights : array, shape (N,), or None
         How much the squared error of each sample counts in `identify` and `validate`: finite, 0 or
         more, not all 0. A sample of weight 0 counts as not measured wherever a model is fitted,
-        scored or checked, or starts from. None: all alike. Statistics, pictures and preparation do
-        not look at weights; only `resample` and `differentiate`, which mix neighbours, leave what
-        has weight 0 out.
+        scored or checked, or starts from. None: all equal. Statistics, pictures and preparation
+        ignore weights; only `resample` and `differentiate`, which mix neighbours, omit samples of
+        weight 0.
 
     Raises
     ------
     DataError
-        Where shapes disagree, nothing is left, or the values are not real numbers.
+        If shapes disagree, nothing is left, or the values are not real numbers.
     """
 
     u: FloatArray
@@ -189,12 +189,12 @@ class Experiment:
         return int(np.isnan(self.y).sum())
 
     def initial_samples(self, init: int) -> int:
-        """How many of its first samples hold `init` measured outputs; `init` where none is missing.
+        """Number of first samples that contain `init` measured outputs; `init` if none is missing.
 
         Raises
         ------
         DataError
-            Where fewer than `init` were measured.
+            If fewer than `init` were measured.
         """
         known = np.flatnonzero(~np.isnan(self.y[:init]))
         if len(known) < init:
@@ -213,7 +213,7 @@ class Experiment:
         Raises
         ------
         DataError
-            Where the range leaves the experiment or is empty.
+            If the range leaves the experiment or is empty.
         """
         if not 0 <= start < stop <= len(self):
             raise DataError(

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 def to_pandas(data: Dataset, *, units: bool = False) -> Any:
     """The samples as a pandas DataFrame.
 
-    Columns: `t` [s], inputs, output, channels, `weights` where there are any, and with several
-    experiments their number, `experiment`, first. NaN is what was not measured.
+    Columns: `t` [s], inputs, output, channels, `weights` if there are any, and with several
+    experiments their number, `experiment`, first. NaN means not measured.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def to_pandas(data: Dataset, *, units: bool = False) -> Any:
     Raises
     ------
     SettingError
-        Where pandas is not installed.
+        If pandas is not installed.
     """
     columns, known = _columns(data)
     frame = _package("pandas", "to_pandas").DataFrame(_headed(columns, known, units))
@@ -37,7 +37,7 @@ def to_pandas(data: Dataset, *, units: bool = False) -> Any:
 
 
 def to_polars(data: Dataset, *, units: bool = False) -> Any:
-    """The samples as a polars DataFrame, with the columns of `to_pandas`; null is not measured.
+    """The samples as a polars DataFrame, with the columns of `to_pandas`; null means not measured.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def to_polars(data: Dataset, *, units: bool = False) -> Any:
     Raises
     ------
     SettingError
-        Where polars is not installed.
+        If polars is not installed.
     """
     columns, known = _columns(data)
     return _package("polars", "to_polars").DataFrame(
@@ -56,7 +56,7 @@ def to_polars(data: Dataset, *, units: bool = False) -> Any:
 
 
 def to_arrow(data: Dataset, *, units: bool = False) -> Any:
-    """The samples as a pyarrow Table, with the columns of `to_pandas`; null is not measured.
+    """The samples as a pyarrow Table, with the columns of `to_pandas`; null means not measured.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def to_arrow(data: Dataset, *, units: bool = False) -> Any:
     Raises
     ------
     SettingError
-        Where pyarrow is not installed.
+        If pyarrow is not installed.
     """
     columns, known = _columns(data)
     pa = _package("pyarrow", "to_arrow")
@@ -83,12 +83,12 @@ def to_xarray(data: Dataset) -> Any:
     """The samples as an xarray Dataset over the coordinate `t` [s]; `attrs["units"]` per variable.
 
     Several experiments follow one another along `sample`, with the coordinates `t` and
-    `experiment`. NaN is what was not measured.
+    `experiment`. NaN means not measured.
 
     Raises
     ------
     SettingError
-        Where xarray is not installed.
+        If xarray is not installed.
     """
     columns, known = _columns(data)
     several = "experiment" in columns and len(data.experiments) > 1

@@ -42,7 +42,7 @@ def white_noise(column: FloatArray) -> float:
 
 
 def quantum(column: FloatArray) -> float | None:
-    """The step of a grid on which all values lie; None where there is none.
+    """The step of a grid on which all values lie; None if there is none.
 
     Only where at least three values occur twice or more on average: a few values of any kind lie on
     some grid.
@@ -206,7 +206,7 @@ def mark_outliers(
     window: int = 7,
     model: Simulates | None = None,
 ) -> Outliers:
-    """Marks of outputs that stand out of their neighbours; nothing is changed.
+    """Mark outputs that differ strongly from their neighbours; the data stay unchanged.
 
     An output is marked where its distance to the median of `window` samples around it is over
     `threshold` robust standard deviations (Hampel 1974), of the window without its slope or of the
@@ -220,20 +220,20 @@ def mark_outliers(
     window : int
         Odd, from 3 on.
     model : Model or None
-        Looks at what this model's free run leaves of the output, so that fast motion of the plant
-        is not mistaken for an outlier.
+        Examine the residual of this model's free run instead of the output, so that fast motion of
+        the plant is not mistaken for an outlier.
 
     Returns
     -------
     Outliers
-        `data.mask(data.mark_outliers())` takes the marked outputs out.
+        `data.mask(data.mark_outliers())` removes the marked outputs.
 
     Raises
     ------
     SettingError
-        For a threshold or window that is none.
+        For an invalid threshold or window.
     DataError, FitError
-        Where the model cannot run on the data.
+        If the model cannot run on the data.
     """
     if threshold is None:
         threshold = usual_threshold(data)

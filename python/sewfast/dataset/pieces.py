@@ -123,7 +123,7 @@ def require_sane(data: Dataset, largest: float = LARGEST) -> None:
 
 
 def require_excited(data: Dataset) -> None:
-    """Raise `DataError` where an input or the output never moves: nothing to identify from."""
+    """Raise `DataError` if an input or the output never moves: there is nothing to identify."""
     for i, name in enumerate(data.input_names):
         if all(np.min(e.u[:, i]) == np.max(e.u[:, i]) for e in data.experiments):
             raise DataError(
@@ -183,9 +183,9 @@ def take(data: Dataset, text: str) -> Dataset:
     Raises
     ------
     SettingError
-        Where the text is not a range.
+        If the text is not a range.
     DataError
-        Where the range leaves an experiment or is empty.
+        If the range leaves an experiment or is empty.
     """
     pieces = (e.cut(*range_of_text(text, e)) for e in data.experiments)
     return replace(data, experiments=tuple(pieces))
@@ -228,10 +228,10 @@ def split(
     Raises
     ------
     SettingError
-        Where a fraction is not between 0 and 1, they leave no rest, times do not increase, or both
+        If a fraction is not between 0 and 1, they leave no rest, times do not increase, or both
         or none are given.
     DataError
-        Where an experiment is too short to leave samples in every part, or there are fewer
+        If an experiment is too short to leave samples in every part, or there are fewer
         experiments than parts.
     """
     if by not in ("samples", "experiments"):
@@ -296,7 +296,7 @@ def _whole_experiments(data: Dataset, ends: list[float]) -> tuple[Dataset, ...]:
 def split_at_gaps(
     data: Dataset, shortest: int = SHORTEST_PIECE, *, of: Literal["any", "inputs"] = "any"
 ) -> Dataset:
-    """The pieces without NaN between the gaps, each as an experiment of its own.
+    """The pieces without NaN between the gaps, each as a separate experiment.
 
     Only a gap in an input needs this: models run through gaps in the output, which have no weight.
 
@@ -311,9 +311,9 @@ def split_at_gaps(
     Raises
     ------
     SettingError
-        Where `shortest` is no whole number above 0, or `of` is neither of the two.
+        If `shortest` is no whole number above 0, or `of` is neither of the two.
     DataError
-        Where no piece is left.
+        If no piece is left.
     """
     if isinstance(shortest, bool) or not isinstance(shortest, int) or shortest < 1:
         raise SettingError(f"shortest: expected a number of samples above 0, got {shortest!r}")
@@ -348,26 +348,26 @@ Where: TypeAlias = "str | Sequence[BoolArray] | BoolArray | Callable[[Experiment
 
 
 def mask(data: Dataset, where: Where, *, why: str = "masked") -> Dataset:
-    """The data with NaN in the output where `where` says so: these samples lose their weight.
+    """The data with NaN in the output wherever `where` selects a sample: it then has no weight.
 
-    Inputs and channels stay: a model still runs through such samples, it is not scored there.
+    Inputs and channels stay: a model still runs through such samples but is not scored there.
 
     Parameters
     ----------
     where : str, array of bool, sequence of arrays of bool, or callable
         A range `"A:B"` of every experiment (0-based, end excluded); a mask of shape (N,), one per
-        experiment where there are several, True where the output is to be forgotten; or a function
-        from an experiment to its mask.
+        experiment if there are several, True where the output is to be ignored; or a function from
+        an experiment to its mask.
     why : str
         What the note says.
 
     Raises
     ------
     DataError
-        Where a mask has not the experiment's length or is not of bool, or a range leaves an
+        If a mask has not the experiment's length or is not of bool, or a range leaves an
         experiment.
     SettingError
-        Where the text is not a range.
+        If the text is not a range.
     """
     masks = _masks(data, where)
     experiments, notes = [], []
@@ -427,7 +427,7 @@ def fill_inputs(data: Dataset, method: str = "hold", *, longest: int | None = No
     SettingError
         For another method, or a length that is no whole number above 0.
     DataError
-        Where an experiment begins with an unknown input: nothing is known to hold.
+        If an experiment begins with an unknown input: nothing is known to hold.
     """
     if method != "hold":
         raise SettingError(f"fill_inputs: expected the method 'hold', received {method!r}")

@@ -43,9 +43,10 @@ def resample(
 ) -> Dataset:
     """The data at another sample time, slower or faster, by any ratio.
 
-    New sample j is at `t = j Ts` from the first sample of its experiment. The output there comes
-    out of a zero-phase low-pass filter (a sinc under a Kaiser window) at the Nyquist frequency of
-    the slower of both rates: what a slower rate cannot show does not come back as something else.
+    New sample j is at `t = j Ts` from the first sample of its experiment. The output there is the
+    result of a zero-phase low-pass filter (a sinc under a Kaiser window) at the Nyquist frequency
+    of the slower of both rates: frequencies that a slower rate cannot show are removed instead of
+    aliased.
 
     Parameters
     ----------
@@ -72,7 +73,7 @@ def resample(
         For a sample time that is no positive number or makes over 100 million samples, or another
         `inputs`.
     DataError
-        Where an experiment is shorter than one new period.
+        If an experiment is shorter than one new period.
     """
     if isinstance(Ts, bool) or not isinstance(Ts, (int, float, np.number)):
         raise SettingError(f"resample: expected a sample time in seconds, received {Ts!r}")
@@ -280,7 +281,7 @@ def differentiate(data: Dataset, *, method: Method = "kalman") -> Dataset:
     SettingError
         For another method.
     DataError
-        Where no piece is long enough, or the output jumps as a counter that wraps.
+        If no piece is long enough, or the output jumps as a counter that wraps.
 
     Examples
     --------

@@ -165,7 +165,7 @@ class Summary:
 def summary(data: Dataset) -> Summary:
     """Range, gaps, quantisation, limits, trend, noise and band of every column, and what to do.
 
-    Looks at anything: values that no model could use are counted and not refused.
+    Accepts any data: values that no model could use are counted, not refused.
 
     Returns
     -------
@@ -444,8 +444,7 @@ _MOST_GAPS = 1000
 def plot(data: Dataset, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
     """Draw every column over time and its spectrum.
 
-    What is missing is shaded, outputs that stand out of their neighbours are circled; experiments
-    follow one another.
+    Missing samples are shaded, outliers are circled; experiments follow one another.
 
     Parameters
     ----------
@@ -462,7 +461,7 @@ def plot(data: Dataset, ax: Any = None, *, file: str | os.PathLike[str] | None =
     Raises
     ------
     SettingError
-        Where matplotlib is not installed or the file cannot be written.
+        If matplotlib is not installed or the file cannot be written.
     """
     return drawing(data).plot(ax, file)
 

@@ -55,10 +55,10 @@ class Trend:
 def detrend(
     data: Dataset, order: Literal[0, 1, "steady"] = 1, *, like: Dataset | None = None
 ) -> Dataset:
-    """The data without offset or drift; what is taken off is remembered for `restore`.
+    """The data without offset or drift; what is removed is kept for `restore`.
 
-    Models of this package have an offset of their own, so a constant need not come off for them.
-    Take it off for a model of deviations from an operating point, and a line where a sensor drifts.
+    Models of this package have their own offset, so a constant need not be removed for them. Remove
+    it for a model of deviations from an operating point, and a line if a sensor drifts.
 
     Parameters
     ----------
@@ -67,8 +67,8 @@ def detrend(
         through each column of each experiment, by least squares. "steady": in each experiment the
         level at rest, before an input first moves.
     like : Dataset or None
-        A data set that `detrend` made with one and the same offset for all its experiments: take
-        off what was taken off there, as for data to validate on. `order` is then not looked at.
+        A data set that `detrend` made with one and the same offset for all its experiments: remove
+        what was removed there, as for validation data. `order` is then ignored.
 
     Returns
     -------
@@ -80,7 +80,7 @@ def detrend(
     SettingError
         For another order, or a `like` whose offset is not one and the same constant.
     DataError
-        Where a column has no value, or an experiment does not begin at rest.
+        If a column has no value, or an experiment does not begin at rest.
     """
     require_sane(data)
     if like is not None:
@@ -100,7 +100,7 @@ def detrend(
 
 
 def restore(data: Dataset, outputs: Sequence[ArrayLike]) -> list[FloatArray]:
-    """Outputs of a model of detrended data, with what was taken off the output put back on.
+    """Outputs of a model of detrended data, with the removed offset or line added again.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def restore(data: Dataset, outputs: Sequence[ArrayLike]) -> list[FloatArray]:
     Raises
     ------
     DataError
-        Where their number or a length is not that of the experiments.
+        If their number or a length is not that of the experiments.
     """
     if len(outputs) != len(data.experiments):
         raise DataError(

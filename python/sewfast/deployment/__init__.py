@@ -9,14 +9,15 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from ..control import Controller
-from ..errors import SettingError
+from ..errors import ModelFileError, SettingError
 from ..models import Model
-from ..storage import replace
+from ..storage import replace_files
 from . import c99, fmi, onnx, structured_text
 
 TARGETS = ("c99", "st", "fmi", "onnx")
@@ -41,7 +42,7 @@ class Deployment:
     files : tuple of str
         Their paths within the folder.
     notes : tuple of str
-        What the code does and costs, one line each.
+        Properties and cost of the code, one line each.
     """
 
     folder: Path
@@ -71,7 +72,7 @@ def deploy(
         Linear models, networks, neural state-space models of one output and ensembles of them; a
         PID in all its forms.
     folder : path
-        Made if it is not there. Files of the same names are replaced, each as a whole.
+        Created if it does not exist. Files of the same names are replaced, all of them or none.
     to : {"c99", "st", "fmi", "onnx"}
         C99 without heap, libm, recursion or global state; IEC 61131-3 structured text, of a
         controller only; a co-simulation FMU of FMI 3.0, for which a C compiler is needed; ONNX, of
@@ -80,7 +81,7 @@ def deploy(
         Of the arithmetic: f32 by default, f64 for FMI and ONNX. A microcontroller that computes
         only single precision in hardware takes some fifty times as long for `f64`.
     name : str, optional
-        With which every name in the code begins; `controller` or `model` where there is none.
+        Prefix of every name in the code; by default `controller` or `model`.
     changeable : bool
         Whether gains and limits of a controller in C can be changed while it runs (`set_gains`,
         `set_limits`), without a bump. They lie in memory then, not among the constants.
@@ -95,7 +96,7 @@ def deploy(
         For another target, precision or name, for a model that single precision would change, and
         for changeable gains of what has none.
     ModelFileError
-        Where a file cannot be written.
+        If a file cannot be written; none is then.
     """
     if not isinstance(what, Model | Controller):
         raise SettingError(
@@ -123,20 +124,37 @@ def deploy(
         writer = partial(c99.files, changeable=True)
     texts, notes = writer(what, name, precision)
     target = Path(folder)
-    if target.exists() and not target.is_dir():
-        raise SettingError(f"expected a folder, got the file {target}; name another one")
-    # all folders before any file: nothing is left half written
-    for folder in dict.fromkeys((target / path).parent for path in texts):
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise SettingError(
-                f"expected a folder that can be made, got {folder} ({error.strerror}); name "
-                "one that can be written to"
-            ) from error
-    for path, content in texts.items():
-        replace(target / path, content)
+    _write(target, {target / path: _bytes(content) for path, content in texts.items()})
     return Deployment(target, tuple(texts), tuple(notes))
+
+
+def _bytes(content: str | bytes) -> bytes:
+    return content.encode() if isinstance(content, str) else content
+
+
+def _write(target: Path, contents: Mapping[Path, bytes]) -> None:
+    """All files or none: a header beside the source of another controller would compile."""
+    made: list[Path] = []
+    try:
+        if target.exists() and not target.is_dir():
+            raise SettingError(f"expected a folder, got the file {target}; name another one")
+        for folder in dict.fromkeys(path.parent for path in contents):
+            made += [place for place in (folder, *folder.parents) if not place.exists()]
+            folder.mkdir(parents=True, exist_ok=True)
+        replace_files(contents)
+    except BaseException as error:
+        for folder in sorted(made, reverse=True):  # what is inside comes first
+            with suppress(OSError, ValueError):
+                folder.rmdir()
+        # a name with the character 0 is a ValueError
+        if isinstance(error, SettingError) or not isinstance(error, OSError | ValueError):
+            raise
+        raise ModelFileError(
+            name=str(getattr(error, "filename", None) or target),
+            expected="a folder that can be written to",
+            received=getattr(error, "strerror", None) or str(error),
+            remedy="name another one; nothing was written",
+        ) from error
 
 
 def _require_changeable(what: Model | Controller, to: str) -> None:

@@ -20,10 +20,18 @@ import numpy as np
 from .. import __version__, _core
 from ..control import Controller
 from ..dataset import FloatArray
-from ..errors import FitError, SettingError
+from ..errors import SettingError
 from ..gains import Gains
-from ..models import Ensemble, Model
+from ..models import Model
 from . import manifests
+from .precision import (
+    combined_run,
+    controller_step,
+    embedded_members,
+    excitation,
+    model_loss,
+    signals,
+)
 
 KEYWORDS = frozenset(
     keyword
@@ -36,13 +44,8 @@ KEYWORDS = frozenset(
     for keyword in line.split()
 )
 """Words of C and C++ that no name may be."""
-MOST_LOSS = 0.01
-"""Of the output's span: a model that single precision changes by more is refused."""
-_SAMPLES = 5000
-"""Over which the loss of single precision is measured."""
 _VECTORS = 200
 """Samples of the test that stands beside the code."""
-_MOST_MEMBERS = 64
 _LICENCE = "The code in this file may be used under MIT, Apache-2.0 or 0BSD, as you like."
 
 
@@ -156,7 +159,7 @@ def _model(model: Model, code: Code) -> tuple[str, str, str, list[str]]:
     functions = ", ".join(f"{code.name}_{f}" for f in ("init", "begin", "step"))
     notes = [f"{model.title} as C99 in {code.real}: {functions}"]
     if code.single:
-        notes.append(_require_single(model, members, embedded, combined))
+        notes.append(model_loss(model, members, embedded, combined))
     numbers = sum(len(v) for e in embedded for v in e.parts.values())
     size = 4 if code.single else 8
     rooms = [_room(e) for e in embedded]
@@ -194,98 +197,12 @@ def _digest(model: Model) -> str:
     return f"SHA-256 {hashlib.sha256(model.theta.tobytes()).hexdigest()[:16]}"
 
 
-def embedded_members(
-    model: Model, precision: str
-) -> tuple[list[Model], list[_core.EmbeddedModel], str]:
-    """A model's members, their steps, and how their outputs are combined.
-
-    In single precision a network keeps its scaled units, which lose fewer digits.
-    """
-    members = list(model.members) if isinstance(model, Ensemble) else [model]
-    if len(members) > _MOST_MEMBERS:
-        raise SettingError(
-            f"expected at most {_MOST_MEMBERS} members for a processor, got {len(members)}; deploy "
-            "some of them with Ensemble.of(model.members[:3])"
-        )
-    scaled = {"scaled": precision == "f32"}
-    embedded = [m.core.embedded(**(scaled if m.kind == "neural_oe" else {})) for m in members]
-    return members, embedded, model.combine if isinstance(model, Ensemble) else "median"
-
-
 def _kept(embedded: _core.EmbeddedModel) -> int:
     return embedded.orders["nk"] + embedded.orders["nb"]
 
 
 def _room(embedded: _core.EmbeddedModel) -> int:
     return embedded.orders["na"] + embedded.orders["inputs"] * _kept(embedded)
-
-
-def _excitation(model: Model, samples: int) -> FloatArray:
-    """Steps over the range that the model was trained on, held for 1 to 80 samples, (N, inputs)."""
-    rng = np.random.default_rng(0)
-    ranges = model.training.get("input_range") or [[-1.0, 1.0]] * len(model.input_names)
-    columns = [
-        np.repeat(rng.uniform(low, high, samples), rng.integers(1, 81, samples))[:samples]
-        for low, high in ranges
-    ]
-    return np.ascontiguousarray(np.stack(columns, axis=1))
-
-
-def combined_run(
-    members: list[Model],
-    embedded: list[_core.EmbeddedModel],
-    combined: str,
-    u: FloatArray,
-    precision: str,
-) -> FloatArray:
-    """The free run from rest, as the C computes it."""
-    held = np.zeros(u.shape[1])
-    runs = [
-        e.run(u, m.core.rest_state(), held, precision=precision)
-        for m, e in zip(members, embedded, strict=True)
-    ]
-    if precision == "f64":
-        stacked = np.array(runs)
-        return np.asarray(
-            np.median(stacked, axis=0) if combined == "median" else np.mean(stacked, axis=0)
-        )
-    single = np.array(runs, dtype=np.float32)
-    ordered = np.sort(single, axis=0)
-    n, half = len(runs), np.float32(0.5)
-    if combined == "median":
-        middle = half * (ordered[(n - 1) // 2] + ordered[n // 2])
-        return np.asarray(ordered[n // 2] if n % 2 else middle, dtype=np.float64)
-    total = np.zeros(single.shape[1], dtype=np.float32)
-    for run in single:
-        total = total + run
-    return np.asarray(total / np.float32(n), dtype=np.float64)
-
-
-def _require_single(
-    model: Model, members: list[Model], embedded: list[_core.EmbeddedModel], combined: str
-) -> str:
-    """Refuses a model that single precision would change; else what it costs."""
-    _, exact, _ = embedded_members(model, "f64")
-    u = _excitation(model, _SAMPLES)
-    with np.errstate(all="ignore"):
-        double = combined_run(members, exact, combined, u, "f64")
-        single = combined_run(members, embedded, combined, u, "f32")
-        span = float(np.ptp(double))
-        loss = float(np.max(np.abs(single - double))) / span if span > 0 else math.nan
-    if not np.isfinite(double).all():
-        raise FitError(
-            "expected a model whose free run stays finite over its own input range, got one that "
-            "leaves it; identify a stable model"
-        )
-    if not loss <= MOST_LOSS:
-        poles = [abs(p) for m in members if m.kind in ("arx", "oe", "iv") for p in m.poles]  # type: ignore[attr-defined]
-        slow = f" (its slowest pole is {max(poles):.9g})" if poles else ""
-        raise SettingError(
-            f"expected a model that single precision changes by at most {MOST_LOSS:.0%} of its "
-            f"span, got {loss:.3%}{slow}; deploy it with precision f64, or identify it at a longer "
-            "sample time"
-        )
-    return f"single precision changes a free run of {_SAMPLES} samples by {loss:.1e} of its span"
 
 
 def _model_header(
@@ -420,7 +337,7 @@ def _model_test(
     embedded: list[_core.EmbeddedModel],
     combined: str,
 ) -> str:
-    u = _excitation(model, _VECTORS)
+    u = excitation(model, _VECTORS)
     if code.single:
         u = u.astype(np.float32).astype(np.float64)
     y = combined_run(members, embedded, combined, u, code.precision)
@@ -444,8 +361,7 @@ def _test(code: Code, file: str, vectors: Mapping[str, FloatArray], **places: st
 def _controller(
     controller: Controller, code: Code, changeable: bool
 ) -> tuple[str, str, str, list[str]]:
-    core: Any = controller.core()
-    core = core.single() if code.single else core
+    core, loss = controller_step(controller, code.precision)
     numbers: dict[str, Any] = core.numbers
     u, y = controller.gains.u_unit or "u", controller.gains.y_unit or "y"
     about = [
@@ -463,7 +379,8 @@ def _controller(
         functions += [f"{code.name}_set_gains", f"{code.name}_set_limits"]
     notes = [
         f"PID as C99 in {code.real}: {', '.join(functions)}; about {kept * size + 10} bytes of "
-        "memory"
+        "memory",
+        *loss,
     ]
     return (
         _controller_header(controller, code, numbers, about, changeable),
@@ -597,7 +514,7 @@ def _gains(code: Code, numbers: Mapping[str, Any]) -> str:
 
 
 def _controller_test(controller: Controller, code: Code, core: Any, changeable: bool) -> str:
-    r, y = _signals(controller, _VECTORS, code)
+    r, y = signals(controller, _VECTORS, code.precision)
     u, switch = [], ""
     middle = _VECTORS // 2
     if changeable:
@@ -618,20 +535,3 @@ def _other_gains(gains: Gains) -> Gains:
     return Gains.standard(
         0.5 * gains.Kp, 2.0 * gains.Ti, 1.5 * gains.Td, u_unit=gains.u_unit, y_unit=gains.y_unit
     )
-
-
-def _signals(controller: Controller, count: int, code: Code) -> tuple[FloatArray, FloatArray]:
-    """Reference and measurement about the size at which the proportional term spans the limits."""
-    rng = np.random.default_rng(0)
-    gains = controller.gains.to("standard")
-    limit = max(
-        (abs(v) for v in (controller.u_min, controller.u_max) if math.isfinite(v)), default=1.0
-    )
-    size = limit / abs(gains.Kp) if gains.Kp else 1.0
-    if controller.schedule:
-        size = max(size, 1.5 * controller.schedule[-1][0])
-    r = np.repeat(rng.uniform(-size, size, count), 20)[:count]
-    y = 0.7 * r + rng.normal(0.0, 0.2 * size, count)
-    if code.single:
-        r, y = (v.astype(np.float32).astype(np.float64) for v in (r, y))
-    return r, y

@@ -23,6 +23,7 @@ from ..control import Controller
 from ..errors import SettingError
 from ..models import Model
 from . import c99
+from .precision import embedded_members
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Of all files within: the same model gives the same bytes."""
@@ -97,7 +98,7 @@ def _of(what: Model | Controller, name: str) -> _System:
             f"expected names of inputs and output that differ and are not time, got "
             f"{', '.join(names[:-1])}; rename the columns and identify again"
         )
-    direct = any(e.orders["nk"] == 0 for e in c99.embedded_members(what, "f64")[1])
+    direct = any(e.orders["nk"] == 0 for e in embedded_members(what, "f64")[1])
     return _System(
         name, what.title, what.Ts, inputs, (what.output_name, what.output_unit), direct,
         f"{name}_model", f"return {name}_step(system, u);",

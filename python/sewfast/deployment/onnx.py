@@ -17,7 +17,7 @@ from ..control import Controller
 from ..dataset import FloatArray
 from ..errors import SettingError
 from ..models import Model
-from .c99 import embedded_members
+from .precision import embedded_members
 
 OPSET = 17
 IR = 9

@@ -13,6 +13,7 @@ from .. import __version__
 from ..control import Controller
 from ..errors import SettingError
 from ..models import Model
+from .precision import controller_step
 
 
 def files(what: Model | Controller, name: str, precision: str) -> tuple[dict[str, str], list[str]]:
@@ -21,11 +22,10 @@ def files(what: Model | Controller, name: str, precision: str) -> tuple[dict[str
         raise SettingError(
             "to: expected a controller for structured text, received a model; deploy models to c99"
         )
-    core: Any = what.core()
-    core = core.single() if precision == "f32" else core
+    core, loss = controller_step(what, precision)
     block = _block(what, name, _Type("REAL" if precision == "f32" else "LREAL"), core.numbers)
     note = f"PID as structured text: FUNCTION_BLOCK {name.upper()}, call it every {what.Ts:g} s"
-    return {f"{name}.st": block}, [note]
+    return {f"{name}.st": block}, [note, *loss]
 
 
 class _Type:

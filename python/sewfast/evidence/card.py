@@ -241,7 +241,7 @@ class ReportCard(Judged):
     ----------
     lines : tuple of Line
     model, data : str
-        What was checked on what.
+        The names of the model and the data.
     on_training : bool
         Whether the data are those that the model was identified from.
     scores : HorizonScores
@@ -253,7 +253,7 @@ class ReportCard(Judged):
     criteria : Criteria or None
         Where the training data are known.
     outside : float
-        Share of the samples outside the training region; NaN where it is not known.
+        Share of the samples outside the training region; NaN if it is not known.
     distances : tuple of array, shape (N,)
         Distance to the nearest known point over the region's radius, per experiment.
     runs : tuple of Run
@@ -299,7 +299,7 @@ class ReportCard(Judged):
 
     @property
     def summary(self) -> str:
-        """Whether the model is good enough to tune on, what speaks against it, what to do first."""
+        """Whether the model is good enough for tuning, the objections, and what to do first."""
         return summary(self.lines)
 
     @property
@@ -320,9 +320,9 @@ class ReportCard(Judged):
         Parameters
         ----------
         ax : Axes or sequence of Axes, optional
-            One takes the figure's first panel, several as many panels, in reading order.
+            One gets the figure's first panel; several get as many panels, in reading order.
         figure : str, optional
-            `bands`, `residuals`, `bode`, `poles` or `region`: what the card has evidence for.
+            `bands`, `residuals`, `bode`, `poles` or `region`: whichever the card has data for.
         file : path, optional
             Where to write the figure: PNG, SVG or PDF by its ending.
 
@@ -334,7 +334,7 @@ class ReportCard(Judged):
         Raises
         ------
         SettingError
-            For another figure, where matplotlib is not installed, or the file cannot be written.
+            For another figure, if matplotlib is not installed, or the file cannot be written.
         """
         from .figures import drawing
 

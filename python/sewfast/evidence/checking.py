@@ -41,14 +41,14 @@ def check(
     init: int = INIT,
     level: float = LEVEL,
 ) -> ReportCard:
-    """What is known of a model's trustworthiness on these data.
+    """Assess how far a model can be trusted on these data.
 
     Parameters
     ----------
     model : Model
     data : Dataset
         Best not the training data. Outputs after the first `init` samples may be NaN; those of
-        weight 0 count as such, other weights are not looked at.
+        weight 0 count as such, other weights are ignored.
     training : Dataset or None
         What the model was identified from: adds information criteria and the comparison of errors,
         and replaces what `identify` stored with the model (bands, region).
@@ -64,9 +64,9 @@ def check(
     Raises
     ------
     DataError
-        Where the data do not fit the model or leave nothing to judge.
+        If the data do not fit the model or leave nothing to judge.
     FitError
-        Where the model runs away on these inputs.
+        If the model runs away on these inputs.
     """
     require_dataset(data, "data")
     weighed = in_effect(data)

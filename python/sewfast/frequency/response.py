@@ -43,14 +43,14 @@ class FrequencyResponse:
     Attributes
     ----------
     hertz : array, shape (n,)
-        Frequencies [Hz], rising, up to half the sample rate.
+        Frequencies [Hz], increasing, up to half the sample rate.
     value : array of complex, shape (n,)
         Output over input [y/u].
     variance : array, shape (n,)
-        Of `value`: the expected square of its error's magnitude, from noise and, where different
+        Of `value`: the expected square of its error's magnitude, from noise and, if different
         excitations were averaged, from nonlinear distortion.
     noise : array, shape (n,), or None
-        The part of it that repeating the same excitation shows: noise alone.
+        The part of it seen when the same excitation is repeated: noise alone.
     coherence : array, shape (n,)
         Share of the output's power that the response explains, 0 to 1.
     blocks : float
@@ -61,7 +61,7 @@ class FrequencyResponse:
     from_counts : bool
         Whether the output is a difference of encoder counts: the mean speed over the sample before.
     provenance : mapping
-        How it came about: machine, speed, method.
+        Machine, speed, method.
     """
 
     hertz: FloatArray
@@ -88,9 +88,9 @@ class FrequencyResponse:
 
     @property
     def distortion(self) -> FloatArray | None:
-        """Standard deviation of what is not noise but differs from excitation to excitation [y/u].
+        """Standard deviation between excitations beyond the noise [y/u].
 
-        Of one such excitation, shape (n,); None where it was not measured.
+        For one excitation, shape (n,); None if it was not measured.
         """
         if self.noise is None:
             return None
@@ -115,7 +115,7 @@ class FrequencyResponse:
         Raises
         ------
         SettingError
-            Outside of what was measured.
+            For a frequency outside the measured range.
         """
         if not self.hertz[0] <= hertz <= self.hertz[-1]:
             raise SettingError(
@@ -189,7 +189,7 @@ class FrequencyResponse:
     def margins(self, controller: Controller, *, speed: float | None = None) -> LoopMargins:
         """Margins of the loop where the coherence is above a half.
 
-        That it is stable is taken for granted: a response alone does not tell.
+        Assumes that the loop is stable, because a response alone cannot show it.
         """
         feedback, seen = self._feedback(controller, speed), self.coherence > 0.5
         L, radius = self.value * feedback, self.radius() * np.abs(feedback)

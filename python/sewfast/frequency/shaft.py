@@ -68,12 +68,12 @@ class ShaftFit:
     Attributes
     ----------
     parameters : mapping of Parameter by name
-        `gain` [y/u], `delay` [s] beyond the hold, `lag_1`, `lag_2` [s] where the lags are real,
-        else `swing_hertz`, `swing_damping`; with a shaft also `resonance_hertz` and
+        `gain` [y/u], `delay` [s] beyond the hold, `lag_1`, `lag_2` [s] if the lags are real,
+        otherwise `swing_hertz`, `swing_damping`; with a shaft also `resonance_hertz` and
         `resonance_damping`, to which the motor's back-EMF adds, `antiresonance_hertz`,
         `antiresonance_damping`, `inertia_ratio` (load over motor).
     misfit : float
-        Root of the mean squared error over its standard deviation: 1 where noise explains all.
+        Root of the mean squared error over its standard deviation: 1 if noise explains everything.
     response : FrequencyResponse
         What was fitted.
     """
@@ -89,7 +89,7 @@ class ShaftFit:
         return len(self._theta) == 8
 
     def at(self, hertz: Any) -> Complex:
-        """The fitted response of what was measured, at `hertz`."""
+        """The fitted response of the measured quantity, at `hertz`."""
         f = np.atleast_1d(np.asarray(hertz, dtype=np.float64))
         return _sampled(self._theta, f, self.response.Ts, self.response.from_counts)
 
@@ -99,7 +99,7 @@ class ShaftFit:
         return sampled_model(self._theta, of.Ts, of.u_unit, of.y_unit)
 
     def notch(self) -> Biquad:
-        """The notch that levels the resonance: its zeros are the swing's poles.
+        """The notch that cancels the resonance: its zeros are the poles of the oscillation.
 
         At w_r the shaft lifts the gain by g = (w_r/w_a)^2 |A/R|; a depth of 1/g takes that back,
         and with a width of 2 z_r g the notch's zeros are damped as the resonance is.
@@ -154,10 +154,10 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
     Parameters
     ----------
     response : FrequencyResponse
-        From command to speed, as `sewfast.bode` measures it; lines of a coherence below a half are
-        left out.
+        From command to speed, as `sewfast.bode` measures it; lines with a coherence below a half
+        are omitted.
     resonance : bool, optional
-        Whether there is a shaft. None finds out: it is believed where it explains 100 times the
+        Whether there is a shaft. None finds out: a shaft is accepted if it explains 100 times the
         mean squared error of a frequency, is damped below .5 and lies within what was measured.
 
     Raises
@@ -165,7 +165,7 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
     DataError
         For fewer than 20 usable frequencies.
     FitError
-        Where nothing converges, or a resonance is asked for and none is found.
+        If nothing converges, or a resonance is requested and none is found.
     """
     usable = response.coherence > 0.5
     if usable.sum() < LEAST:

@@ -87,10 +87,10 @@ def physics(
 ) -> Motor:
     """Friction, inertia and electrical constants of a motor from one record, with 95 % intervals.
 
-    From command and speed alone come the command per speed `k_v`, per acceleration `k_a`, dry
-    friction `k_s`, lag, delay and what varies over the turn, all in units of the command. R, Ke
-    and J each scale with what nobody measured then, and are not printed. A measured `current` adds
-    the resistance [command/A] and parts k_v into back-EMF and viscous friction; with `volts` as
+    Command and speed alone determine the command per speed `k_v` and per acceleration `k_a`, dry
+    friction `k_s`, lag, delay and variations over the turn, all in units of the command. R, Ke and
+    J then each scale with an unmeasured quantity and are not printed. A measured `current` adds the
+    resistance [command/A] and separates k_v into back-EMF and viscous friction; with `volts` as
     well, all are in SI units.
 
     Parameters
@@ -101,28 +101,28 @@ def physics(
     structure : "dcmotor" or sequence of str
         Terms that may be in it, of `lag`, `delay`, `coulomb`, `offset`, `drop`, `stribeck`,
         `load_1`, `load_2`, `inertia_2` (varying once, twice per turn) and `limit`. "dcmotor" tries
-        all; a term that the record does not show is left out.
+        all; a term that the record does not show is omitted.
     current : str or array, shape (N,), optional
         Motor current [A]: a channel of the data set, or its samples.
     volts : float, optional
-        Volts on the winding per unit of command; 1 where the command is that voltage.
+        Volts on the winding per unit of command; 1 if the command is that voltage.
     speed_unit : str, optional
-        rpm, rad/s, rev/s or deg/s where the data set does not say.
+        rpm, rad/s, rev/s or deg/s, if the data set does not say.
 
     Returns
     -------
     Motor
-        Parameters with intervals, and by name what the record cannot tell.
+        Parameters with intervals, and the names of those that the record does not determine.
 
     Raises
     ------
     DataError
-        Where speed or command do not change, the speed falls as the command rises (a sign is
+        If speed or command do not change, the speed falls as the command rises (a sign is
         wrong), or too few samples are left.
     SettingError
         For an unknown term or unit.
     FitError
-        Where nothing converges to a motor.
+        If nothing converges to a motor.
 
     Notes
     -----

@@ -60,25 +60,26 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Motor:
-    """A motor as a record shows it.
+    """The parameters of a motor, identified from a record.
 
     Attributes
     ----------
     parameters : mapping of Parameter by name
         Value, 95 % interval and unit. `k_v`, `k_a`, `k_s`: command per speed, per acceleration and
-        against dry friction; `time_constant`; of the terms that are shown `electrical_lag`,
+        against dry friction; `time_constant`; of the detectable terms `electrical_lag`,
         `delay` beyond the hold, `offset`, `drop` (dead zone of the inverter), `stribeck` and
         `stribeck_speed`, `load_1`, `load_2` (amplitude once, twice per turn), `inertia_2`
         (relative), `limit`. With a current also `k_e`, `k_b` (back-EMF, viscous) and `resistance`
         per unit of command; with volts R, Ke, J, friction and inductance in SI units.
     untold : mapping of str by name
-        Parameters that the record cannot tell, and why.
+        Parameters that the record does not determine, and why.
     terms : tuple of str
-        What the record shows beside back-EMF and inertia.
+        Terms that the record shows besides back-EMF and inertia.
     fit_percent, rmse : float
         Of the free run on the record, after its start; rmse in `speed_unit`.
     converged : bool
-        Whether the least squares were confirmed, or have less to gain than noise would give.
+        Whether the least-squares minimum was confirmed, or any further gain is below what noise
+        would give.
     """
 
     parameters: Mapping[str, Parameter]
@@ -106,7 +107,7 @@ class Motor:
         Raises
         ------
         DataError
-            Where the record does not tell it, with the reason.
+            If the record does not determine it; the message gives the reason.
         """
         if name in self.parameters:
             return self.parameters[name].value
@@ -123,7 +124,7 @@ class Motor:
         Raises
         ------
         DataError
-            Where the commands are not finite, one-dimensional numbers.
+            If the commands are not finite, one-dimensional numbers.
         """
         step = self.Ts if Ts is None else float(Ts)
         factor = rad_per_second(self.speed_unit)
@@ -148,21 +149,21 @@ class Motor:
         return sampled_model(theta, self.Ts, self.u_unit, self.speed_unit)
 
     def machine(self, *, u_limit: float | None = None) -> VirtualMachine:
-        """A virtual machine that behaves so under commands: a twin to tune and rehearse on.
+        """A virtual machine with this behaviour: a twin to tune and rehearse on.
 
-        Where R, Ke and J are not known each for itself, it has some that make the same speed; its
-        current is then in no unit. It has no dead time beyond the hold.
+        If R, Ke and J are not known individually, it has values that give the same speed; its
+        current then has no unit. It has no dead time beyond the hold.
 
         Parameters
         ----------
         u_limit : float, optional
-            Where the drive clips the command, which a record does not tell; by default it hardly
-            does.
+            The command at which the drive clips, which a record does not show; the default is so
+            large that it hardly clips.
 
         Raises
         ------
         SettingError
-            Where the parameters lie outside those of virtual machines.
+            If the parameters lie outside those of virtual machines.
         """
         refused: SettingError | None = None
         known = None if self.volts is None else self.resistance
@@ -228,7 +229,7 @@ class Motor:
         SettingError
             For another target.
         DataError
-            Where the record does not tell what the target needs.
+            If the record does not determine what the target needs.
         """
         if target not in get_args(Target):
             raise SettingError(
@@ -262,7 +263,7 @@ class Motor:
         Raises
         ------
         ModelFileError
-            Where the file cannot be written.
+            If the file cannot be written.
         """
         storage.write(path, FORMAT, VERSION, self.to_dict())
 
@@ -281,7 +282,7 @@ class Motor:
         }
 
     def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
-        """Measured speed and free run, and what it takes to hold a speed.
+        """Measured speed and free run, and the command needed to hold a speed.
 
         Arguments and result are those of `Dataset.plot`.
         """

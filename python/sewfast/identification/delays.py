@@ -183,7 +183,7 @@ class DelayEstimate:
     Attributes
     ----------
     nk : int
-        Delay that a model with one delay for all inputs should have: the smallest of theirs.
+        Delay for a model that has one delay for all inputs: the smallest of them.
     inputs : tuple of InputDelay
     Ts : float
         Sample time [s].
@@ -218,7 +218,7 @@ class DelayEstimate:
         Raises
         ------
         SettingError
-            Where matplotlib is not installed, or the file cannot be written.
+            If matplotlib is not installed, or the file cannot be written.
         """
         panels: list[Any] = []
         for found in self.inputs:
@@ -263,11 +263,11 @@ def delay(
     Free run: models with two past outputs and two past inputs from `nk` on are fitted by
     instrumental variables for every `nk`, the other inputs at their own best delays. The likelihood
     of a delay relative to the best one is `(cost_best / cost)^(N/2)`, with `N` the number of
-    samples over the sum of the squared residual autocorrelations: a drive that is not linear leaves
-    a smooth residual, which says less than its length.
+    samples over the sum of the squared residual autocorrelations: a nonlinear drive leaves a smooth
+    residual, which carries less information than its length suggests.
 
     One step: the same for ARX models of order 4, which cost next to nothing; at a high sampling
-    rate noise makes them late, so they are the start only.
+    rate noise makes them late, so they are only the start.
 
     Correlation: an autoregression of order 20 is fitted to the input, and input and output are
     filtered by it; the input is then white, and independent series correlate within `z / sqrt(N)`
@@ -276,12 +276,11 @@ def delay(
     Parameters
     ----------
     data : Dataset
-        Samples that were not measured, or have weight 0, are left out; other weights are not looked
-        at.
+        Samples that were not measured, or have weight 0, are omitted; other weights are ignored.
     longest : int
-        Largest delay looked at [samples].
+        Largest delay considered [samples].
     least : int
-        Smallest one; 0 admits inputs that act at once, which feedback in the recording can feign.
+        Smallest one; 0 admits inputs that act at once, which feedback in the recording can mimic.
     confidence : float
         Of the range of plausible delays, and of the bound on the correlations together.
 
@@ -292,14 +291,14 @@ def delay(
     Raises
     ------
     DataError
-        Where the data are too short or never move.
+        If the data are too short or never move.
     SettingError
-        Where a setting is out of its range.
+        If a setting is out of its range.
 
     Notes
     -----
-    A drive answers through its inertia: the first coefficients can be too small to be seen, so that
-    the estimate may be late by a sample or two. A model may then still begin at 1.
+    A drive responds through its inertia: the first coefficients can be too small to be seen, so the
+    estimate can be late by a sample or two. The model can then still start at 1.
     """
     _require(data, longest, least, confidence)
     data = in_effect(data)

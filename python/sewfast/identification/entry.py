@@ -71,24 +71,24 @@ def identify(
 
     Without further settings many structures are tried (docs/choosing-a-model.md), and the model
     says why it was chosen and whether it is good enough: `print(model)`, `model.training["choice"]`
-    and `["verdict"]`. What would have been chosen next is in `model.alternatives`.
+    and `["verdict"]`. `model.alternatives` has the next choices.
 
     Parameters
     ----------
     data : Dataset
         Training data: inputs complete; outputs that are NaN were not measured and have no weight.
         With weights, the costs that are minimised and the errors on what is held out are weighted
-        (a sample of weight 0 counts as not measured); starts, scalings, output functions, the
-        guard and the evidence that is kept with the model do not look at them. `iv` takes no
-        weights between 0 and the largest.
+        (a sample of weight 0 counts as not measured); starts, scalings, output functions, the guard
+        and the evidence stored with the model ignore them. `iv` takes no weights between 0 and the
+        largest.
     model : {"auto", "arx", "iv", "oe", "neural_oe", "neural_ss"} or Model
         `arx`: least squares of the one-step error. `iv`: refined instrumental variables, which
         measurement noise does not bias. `oe`: linear output error. `neural_oe`: the
         lagged network, trained in free run from the linear output-error model. `neural_ss`: the
         state-space network. `auto`: one of `oe`, `neural_ss` and `neural_oe`, by the free-run error
-        on data not trained on; on little data the median of several networks, an `Ensemble`.
-        A kind that is asked for by name is what comes back. A model is trained further on these
-        data, in its own structure.
+        on held-out data; on little data the median of several networks, an `Ensemble`. A kind
+        requested by name is always returned. A model is trained further on these data, in its own
+        structure.
     preset : "paper" or None
         The paper's network (docs/CONVENTIONS.md): no linear start, fixed scaling and orders.
     na, nb : int or None
@@ -101,18 +101,18 @@ def identify(
     hidden : int or None
         Hidden units of a network; None: found, 8 for `neural_oe`.
     output : {"linear", "saturation", "abs"} or None
-        Output function of `neural_ss`; None: `linear`, or another where the data suggest it and it
-        does better.
+        Output function of `neural_ss`; None: `linear`, or another if the data suggest it and it is
+        better.
     starts : int or None
         Random starts of a network's training. None: by the amount of data; 4 for `neural_oe`, 8
         for the preset `paper`, which has no linear model to start from.
     seed : int
         Of the starts. A seed gives the same model at any number of threads and with any workers,
-        as long as a time budget does not bite.
+        unless a time budget ends the work.
     iterations : int or None
         At most this many per start; None: by the amount of data, 100 for a lagged model.
     validation : Dataset or None
-        Data to select on, from which nothing is learned. None holds out the last fifth of every
+        Data for selection only, not for fitting. None holds out the last fifth of every
         experiment (two of eight blocks for `neural_oe`).
     threads : int or None
         None uses every core, or as many as the environment variable SEWFAST_THREADS allows.
@@ -121,12 +121,12 @@ def identify(
         Dask client, or anything with `map(function, jobs)`. None: threads of this process.
     time_budget : float or None
         Seconds for everything, linear fits and evidence included; the best so far is returned, and
-        the model says where the budget has cut the work short.
+        the model says what the budget has cut short.
     select : bool
         Whether data are held out to stop the training of `neural_oe` and to choose its weight
         decay. False trains on all data to the last iteration, for comparisons of methods.
     progress : callable(done, total, best_cost) or None
-        Called from the calling thread now and then, once through for each stage.
+        Called from the calling thread from time to time, counting each stage from its start.
 
     Returns
     -------
@@ -136,11 +136,11 @@ def identify(
     Raises
     ------
     DataError
-        Where an input is NaN, data never move, or are too short for the orders.
+        If an input is NaN, data never move, or are too short for the orders.
     SettingError
-        Where a setting is out of its range or contradicts another.
+        If a setting is out of its range or contradicts another.
     FitError
-        Where no usable model was found.
+        If no usable model was found.
     Interrupted
         On Ctrl-C; `best` is the best model so far.
 

@@ -23,9 +23,9 @@ _ERRORS = {"2-point": 2.0**-24, "3-point": 2.0**-33, "cs": 0.0}
 
 @dataclass(frozen=True)
 class LeastSquaresResult:
-    """A point, how the iteration got there and how well the data fix it.
+    """A solution, how the iteration reached it and how well the data determine it.
 
-    ``success`` is True only where a test for a minimum held and was confirmed: the Jacobian has
+    ``success`` is True only if a test for a minimum held and was confirmed: the Jacobian has
     full rank, and further undamped steps became shorter and ended below the tolerances.
 
     Attributes
@@ -50,7 +50,7 @@ class LeastSquaresResult:
         Evaluations of ``fun`` and of the Jacobian; as in SciPy's ``trf``, evaluations that a
         numerical Jacobian makes are not counted.
     optimality
-        Largest component of the gradient ``jac.T @ fun`` that no bound holds.
+        Largest component of the gradient ``jac.T @ fun`` among parameters not on a bound.
     relative_offset
         Cosine between the residuals and the range of the Jacobian [1]_; 0 at a minimum whose
         residuals are not zero.
@@ -58,14 +58,14 @@ class LeastSquaresResult:
         -1 where the lower bound holds a parameter, 1 where the upper one does, else 0; shape (n,).
     covariance
         ``s^2 inv(jac.T @ jac)`` with ``s^2 = 2 cost / (m - n)``, shape (n, n): zero for
-        parameters on a bound, which count as known; infinite variances for parameters that the
-        data do not fix; NaN where m = n.
+        parameters on a bound, which count as known; infinite variances for parameters that the data
+        do not determine; NaN if m = n.
     standard_errors
         Square roots of its diagonal, shape (n,).
     condition
         Condition number of the Jacobian with its columns scaled to length 1.
     rank
-        Its rank, parameters on a bound left out.
+        Its rank, without parameters on a bound.
     trace
         Cost at the start and after each accepted step.
 
@@ -121,9 +121,9 @@ def least_squares(
 ) -> LeastSquaresResult:
     """Minimise ``0.5 * sum(fun(x)**2)``, by Levenberg-Marquardt in a trust region [1]_.
 
-    The arguments are those of ``scipy.optimize.least_squares``. What differs is the end: where a
-    test for a minimum holds, undamped steps from there must contract before ``success`` is True,
-    and they give the last digits that the cost cannot show.
+    The arguments are those of ``scipy.optimize.least_squares``. The difference is the end: if a
+    test for a minimum holds, undamped steps from there must contract before ``success`` is True;
+    they provide the last digits, which the cost cannot show.
 
     Parameters
     ----------
@@ -139,10 +139,10 @@ def least_squares(
     bounds
         Lower and upper bounds, numbers or shape (n,), infinite for none. ``x0`` lies within.
     ftol
-        Relative reduction of the cost at which a minimum is tried to be confirmed, and cosine
+        Relative reduction of the cost at which the solver tries to confirm a minimum, and cosine
         (see ``gtol``) that is small enough then. None switches a test off.
     xtol
-        Change of each parameter relative to its value (or standard error, where that is larger)
+        Change of each parameter relative to its value (or standard error, if that is larger)
         below which steps are small enough.
     gtol
         Cosine between the residuals and the range of the Jacobian that counts as zero.
@@ -150,14 +150,14 @@ def least_squares(
         Typical sizes of the parameters, a number or shape (n,); ``jac``: the Jacobian's columns
         scale them, so that units play no part.
     max_nfev
-        Evaluations of ``fun`` at most; the larger of 1000 and 200 (n + 1) where None.
+        Evaluations of ``fun`` at most; None: the larger of 1000 and 200 (n + 1).
     args, kwargs
         Passed on to ``fun`` and ``jac``.
 
     Returns
     -------
     LeastSquaresResult
-        With covariance, rank and the reason of the end. The end of an iteration is no exception.
+        With covariance, rank and the reason for stopping. Stopping never raises an exception.
 
     Raises
     ------

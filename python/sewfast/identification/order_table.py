@@ -80,7 +80,7 @@ class OrderTable:
     choice : Structure
     reason : str
     delay : DelayEstimate or None
-        None where the delays to try were given.
+        None if the delays to try were given.
     output : str
         Name and unit of the output.
     """
@@ -107,7 +107,7 @@ class OrderTable:
         return least
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON values; None where a number is not defined."""
+        """As JSON values; None if a number is not defined."""
         rows = [
             {k: v if math.isfinite(v) else None for k, v in asdict(r).items()} for r in self.rows
         ]
@@ -139,7 +139,7 @@ class OrderTable:
         Raises
         ------
         SettingError
-            Where matplotlib is not installed, or the file cannot be written.
+            If matplotlib is not installed, or the file cannot be written.
         """
         return stacked([self._draw], (2.8,)).plot(ax, file)
 
@@ -225,11 +225,12 @@ def orders(
     Parameters
     ----------
     data : Dataset
-        Samples of weight 0 are left out; other weights are not looked at.
+        Samples of weight 0 are omitted; other weights are ignored.
     na, nb : int or iterable of int
-        Orders to try; a number stands for 1 up to it.
+        Orders to try; a number n means 1 to n.
     nk : int, iterable of int, or None
-        Delays to try; a number stands for itself. None: 1 and what `sewfast.delay` finds plausible.
+        Delays to try; a number means that one delay. None: 1 and what `sewfast.delay` finds
+        plausible.
     validation : Dataset or None
         Data for the errors; None: the last part of each experiment.
     held_out : float
@@ -239,23 +240,23 @@ def orders(
     Returns
     -------
     OrderTable
-        `identify(data, **table.choice.orders)` goes on with it.
+        `identify(data, **table.choice.orders)` uses it.
 
     Raises
     ------
     DataError
-        Where the data are too short or never move.
+        If the data are too short or never move.
     SettingError
-        Where a setting is out of its range.
+        If a setting is out of its range.
     FitError
-        Where no structure has a finite free run.
+        If no structure has a finite free run.
 
     Notes
     -----
     The choice is the structure with the fewest parameters whose free-run error on later data is
     within 0.5 % of the lowest, or above it by no more than two standard errors of the difference
     over ten blocks (compare the one-standard-error rule: Hastie, Tibshirani, Friedman 2009, 7.10).
-    Errors below 0.1 % of the output's standard deviation count as none.
+    Errors below 0.1 % of the output's standard deviation count as zero.
     Information criteria judge one-step errors, which at a high sampling rate hardly depend on the
     model; they are there to compare.
     """

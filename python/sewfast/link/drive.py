@@ -249,7 +249,7 @@ class Drive(Unique):
 
     @property
     def counts_per_rev(self) -> float:
-        """Encoder counts of one turn."""
+        """Encoder counts per turn."""
         return self.identity.counts_per_rev
 
     @property

@@ -114,7 +114,7 @@ def build_firmware(source: str | os.PathLike[str] = ".", *, board: str = "mps2-a
     if missing:
         raise SettingError(
             f"firmware: expected {', '.join(missing)}, which is missing; on Debian: apt-get "
-            f"install make cargo {PACKAGES}"
+            f"install make cargo-web {PACKAGES}"
         )
     made = subprocess.run(
         ["make", "--no-print-directory", "-C", str(root), "firmware"],

@@ -382,9 +382,9 @@ class HostLoopRun:
         Parameters
         ----------
         path : path
-            A file that exists is replaced in one step, save a recording of a drive.
+            An existing file is replaced in one step, except a recording of a drive.
         overwrite : bool
-            Whether that may be replaced as well.
+            Whether to replace such a recording as well.
 
         Raises
         ------

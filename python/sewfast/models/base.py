@@ -37,17 +37,17 @@ class Model(DynamicModel):
     Parameters
     ----------
     core : compiled model
-        Its arithmetic; takes part in `sewfast.run` and `sewfast.tune` as a plant.
+        The compiled arithmetic; `sewfast.run` and `sewfast.tune` use it as a plant.
     Ts : float
         Sample time [s].
     input_names, input_units, output_name, output_unit
         As in the data set.
     counts : tuple (column, counts_per_rev) or None
-        Set where the output is a speed computed from encoder counts.
+        Set if the output is a speed computed from encoder counts.
     training : mapping
-        How it came about: data, settings, cost with its horizon, termination. JSON values only.
+        Provenance: data, settings, cost with its horizon, termination. JSON values only.
     alternatives : tuple of Model
-        What `identify` would have chosen next, the best first; not written to the model's file.
+        The next choices of `identify`, best first; not written to the model's file.
     """
 
     alternatives: tuple[Model, ...] = ()
@@ -74,9 +74,9 @@ class Model(DynamicModel):
         Raises
         ------
         SettingError
-            For an ensemble, whose members are linear models of their own.
+            For an ensemble; linearise its members instead.
         DataError
-            Where `u` has not one finite value per input, or is not given and the model does not
+            If `u` has not one finite value per input, or is not given and the model does not
             store the range of its training inputs.
         """
         if self.members:
@@ -103,7 +103,7 @@ class Model(DynamicModel):
         return check(self, data, training=training, init=init)
 
     def bands(self, data: Dataset, level: float = 0.95, *, init: int = INIT) -> Bands:
-        """Where measured samples are to be expected; see `sewfast.evidence.bands`."""
+        """Bands in which measured samples are expected; see `sewfast.evidence.bands`."""
         return bands(self, data, level, init=init)
 
     if not TYPE_CHECKING:
@@ -277,15 +277,15 @@ class Ensemble(Model):
         members : sequence of Model
             With the same inputs, output and sample time; none of them an ensemble.
         combine : {"median", "mean"}
-            Taken over the members' runs, sample by sample. A median does not heed the few members
-            that go astray on a new input.
+            Taken over the members' runs, sample by sample. A median ignores a few members that go
+            astray on a new input.
         training : mapping, optional
-            How it came about.
+            Its provenance.
 
         Raises
         ------
         SettingError
-            Where there is no member, or the members are of different plants.
+            If there is no member, or the members are of different plants.
         """
         _require_members(members)
         if combine not in COMBINATIONS:
@@ -307,7 +307,7 @@ class Ensemble(Model):
 
     @property
     def orders(self) -> dict[str, int]:
-        """What all members have in common, and their number."""
+        """The orders that all members share, and the number of members."""
         first, *others = (m.orders for m in self.members)
         common = {k: v for k, v in first.items() if all(o.get(k) == v for o in others)}
         return {"members": len(self.members), **common}

@@ -44,7 +44,7 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     Raises
     ------
     ModelFileError
-        Where the file is missing, damaged, of another format, or of an unknown version or kind;
+        If the file is missing, damaged, of another format, or of an unknown version or kind;
         the message names the file and the field.
     """
     return _read(Fields(os.fspath(path), storage.read(path, FORMAT, (VERSION,))))
@@ -115,8 +115,11 @@ def _single(fields: Fields, own: Fields) -> Model:
 def _training(training: Fields, inputs: int) -> Mapping[str, Any]:
     """What is read back later must have its form; the rest is the trainer's own record."""
     known = training.values
-    if "input_range" in known and training.matrix("input_range").shape != (inputs, 2):
-        raise training.refuse("input_range", f"{inputs} pairs of numbers", known["input_range"])
+    if "input_range" in known:
+        ranges = training.matrix("input_range")
+        if ranges.shape != (inputs, 2) or (ranges[:, 0] > ranges[:, 1]).any():
+            expected = f"{inputs} pairs of numbers, the lower one first"
+            raise training.refuse("input_range", expected, known["input_range"])
     if "data" in known:
         for source in training.objects("data"):
             source.text("name")

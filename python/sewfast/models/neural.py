@@ -98,9 +98,9 @@ OUTPUTS = ("linear", "saturation", "abs")
 
 
 class NeuralSS(_Network):
-    """Linear state equations beside one hidden layer of tanh, trained in free run.
+    """Linear state equations plus one hidden layer of tanh, trained in free run.
 
-    Its states have no unit of their own: they are scaled to be of size 1 on the training data.
+    Its states have no units: they are scaled to unit size on the training data.
 
     References
     ----------

@@ -79,7 +79,7 @@ def read_table(path: Any) -> Table:
     Parameters
     ----------
     path : path or table
-        The format is told by the file's first bytes, where they tell, else by its extension. A
+        The file's first bytes decide the format if they can, otherwise its extension. A
         table is one of pandas, polars, pyarrow (or anything with `__arrow_c_stream__`), an xarray
         Dataset or a mapping of name to array; null, NA and NaT are NaN, moments become seconds from
         the first one. Logs are MDF, TDMS, PX4 ULog, WPILib's data log and ROS bags (`.bag`,
@@ -93,9 +93,9 @@ def read_table(path: Any) -> Table:
     Raises
     ------
     DataError
-        Where the file is missing, empty, damaged or of an unknown kind; the message names it.
+        If the file is missing, empty, damaged or of an unknown kind; the message names it.
     SettingError
-        Where the format needs a package that is not installed, or for what is neither path nor
+        If the format needs a package that is not installed, or for what is neither path nor
         table.
     """
     if not isinstance(path, (str, os.PathLike)):
@@ -176,19 +176,19 @@ def read(
         than 3.5 periods are gaps, NaN in all columns. Notes say what was done.
     counts, counts_per_rev : str and float, or None
         Column of encoder counts. The output is then the speed [RPM] computed from it by a Kalman
-        smoother, each piece between gaps (NaN) for itself, and `output` only names it (`speed` by
+        smoother, each piece between gaps (NaN) separately, and `output` only names it (`speed` by
         default). A recording (MCAP) states the counts of one turn itself.
     time : str or None
-        Name of the time column where it is none of t, time, timestamp, seconds, alone or with a
+        Name of the time column if it is none of t, time, timestamp, seconds, alone or with a
         unit (`t [ms]`, `time_us`). Without any, a file's variable Ts or fs is used.
     channels : sequence of str
         Further columns to carry along.
     name : str or None
-        Of the experiment, for messages; the file's name where None.
+        Name of the experiment, for messages; None: the file's name.
     weights : str or None
         Column of weights: how much the squared error of each sample counts (`Experiment.weights`).
-        Rows of weight 0 leave no trace in an `output` that is resampled; in a speed that is
-        computed from counts they do.
+        Rows of weight 0 do not affect a resampled `output`; they do affect a speed computed from
+        counts.
 
     Returns
     -------
@@ -198,9 +198,9 @@ def read(
     Raises
     ------
     DataError
-        Where the file or a column cannot be used.
+        If the file or a column cannot be used.
     SettingError
-        Where the sample time is missing or settings contradict each other.
+        If the sample time is missing or settings contradict each other.
     """
     table = path if isinstance(path, Table) else read_table(path)
     names = (inputs,) if isinstance(inputs, str) else tuple(inputs)

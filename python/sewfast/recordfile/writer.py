@@ -333,7 +333,7 @@ def _index(what: str, value: object) -> int:
 def save_columns(
     path: str | os.PathLike[str], header: Header, columns: Mapping[str, ArrayLike]
 ) -> None:
-    """Write a recording that is already there; the file appears whole or not at all.
+    """Write a recording that is already there; the file is either complete or absent.
 
     Parameters
     ----------
@@ -454,10 +454,10 @@ def export(
         The recording.
     out : path
         `.csv`, `.parquet`, `.mat`, `.npz`, or `.mcap`: one message a sample, for programs that
-        plot; also the repair of a file that lacks its end. A file that exists is replaced in one
-        step, save a recording of a drive.
+        plot; also the repair of a file that lacks its end. An existing file is replaced in one
+        step, except a recording of a drive.
     overwrite : bool
-        Whether that may be replaced as well.
+        Whether to replace such a recording as well.
 
     Returns
     -------

@@ -220,7 +220,7 @@ class Tuning:
         return {**numbers, "diverges": False}, curves
 
     def costs(self, several: list[Mapping[str, Any]]) -> list[float]:
-        """What controllers cost on the model, as `sewfast.tune` counts it; inf where one diverges.
+        """What controllers cost on the model, as `sewfast.tune` counts it; inf if one diverges.
 
         Parameters
         ----------

@@ -35,14 +35,14 @@ _TUNED = 0.25
 
 @dataclass(frozen=True, eq=False)
 class ParetoFront:
-    """Controllers of which none is better than another in everything.
+    """Controllers of which none is better than another in every objective.
 
     Attributes
     ----------
     controllers : tuple of Controller
-        By their first objective.
+        Sorted by the first objective.
     objectives : tuple of str
-        What was to be small.
+        The quantities to be minimised.
     units : dict
         The unit of each objective.
     values : array, shape (controllers, objectives)
@@ -73,12 +73,12 @@ class ParetoFront:
         return self.controllers[self.pick]
 
     def best(self, objective: str) -> Controller:
-        """The controller with the least value of one objective.
+        """The controller with the lowest value of one objective.
 
         Raises
         ------
         SettingError
-            For what was no objective.
+            For a name that is not an objective.
         """
         if objective not in self.objectives:
             raise SettingError(f"expected one of {', '.join(self.objectives)}, got {objective!r}")
@@ -107,7 +107,7 @@ class ParetoFront:
         Raises
         ------
         SettingError, DataError
-            For an ending that stands for no format, or a file that cannot be written.
+            For an unknown file extension, or a file that cannot be written.
         """
         gains = self.picked.gains
         units = {**self.units, "Kp": f"{gains.u_unit}/{gains.y_unit}", "Ti": "s", "Td": "s"}
@@ -131,7 +131,7 @@ class ParetoFront:
         Raises
         ------
         SettingError
-            Where matplotlib is not installed or the file cannot be written.
+            If matplotlib is not installed or the file cannot be written.
         """
         return drawing(self).plot(ax, file)
 
@@ -174,10 +174,10 @@ def pareto(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> ParetoFront:
-    """The front of what can be had in several objectives at once (NSGA-II, Deb et al. 2002).
+    """Find the best trade-offs between several objectives (NSGA-II, Deb et al. 2002).
 
-    A quarter of the evaluations tunes one controller for `cost`, with which the population begins;
-    the rest spreads it along the front.
+    A quarter of the evaluations is spent on tuning one controller for `cost`, the start of the
+    population; the rest spreads the population along the front.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def pareto(
         Two or more of tracking, chatter, effort, overshoot, rise, lag, saturation, recovery, load,
         cost, Ms.
     cost : Cost, optional
-        What the objective ``cost`` is, and what the first controller is tuned for.
+        Defines the objective ``cost``, for which the first controller is tuned.
     size : int
         Controllers on the front, at most.
     evaluations : int
@@ -204,9 +204,9 @@ def pareto(
     SettingError, DataError
         For plants, references or settings that cannot be used.
     FitError
-        Where no candidate stays bounded within the constraints.
+        If no candidate stays bounded within the constraints.
     Interrupted
-        After Ctrl-C; its `best` is the front so far, or the best controller where there is none.
+        After Ctrl-C; its `best` is the front so far, or the best controller if there is none.
     """
     total, names = whole("evaluations", evaluations), _checked(objectives)
     if total < 2:

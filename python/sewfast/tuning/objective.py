@@ -24,8 +24,8 @@ SHARES = ("chatter", "overshoot", "saturation")
 class Cost:
     """Weights of the terms of a run (docs/CONVENTIONS.md, Tuning); the sum is in the output's unit.
 
-    A weight is per unit of its term. None is the default in shares of the references' span R (the
-    largest minus the smallest value).
+    A weight is per unit of its term. None is the default, given below in terms of the references'
+    span R (the largest minus the smallest value).
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class Cost:
     effort : float
         Of rms(u) [u].
     overshoot : float or None
-        Of the overshoot above its limit [%], where the reference is a step or trapezoid; R/100.
+        Of the overshoot above its limit [%], if the reference is a step or trapezoid; R/100.
     overshoot_limit : float
         Overshoot that costs nothing [%].
     rise : float
@@ -46,7 +46,7 @@ class Cost:
     saturation : float or None
         Of the share of samples at a limit; .02 R.
     recovery : float
-        Of the time until a load step is fought down [ms] (`LoadStep`), the mean over these.
+        Of the recovery time from a load step [ms] (`LoadStep`), the mean over these.
     load : float
         Of the rms deviation under a load step [y].
 
@@ -96,14 +96,14 @@ class Cost:
         return Cost(**(shares | self.named()))
 
     def of(self, runs: ClosedLoopRun | Sequence[ClosedLoopRun]) -> float:
-        """What runs cost: the mean over them, as in `sewfast.tune` over references.
+        """The cost of runs: the mean over them, as in `sewfast.tune` over references.
 
-        Runs along references are meant: recovery and load do not count.
+        For runs along references: recovery and load do not count.
 
         Raises
         ------
         DataError
-            Where there is no run, or what is none, or one has samples missing.
+            If there is no run, or what is none, or one has samples missing.
         """
         several = list(runs) if isinstance(runs, Sequence) else [runs]
         for one in several:
@@ -150,8 +150,8 @@ def terms(run: ClosedLoopRun) -> dict[str, float]:
 class Constraints:
     """Limits that come before the cost (docs/CONVENTIONS.md, Tuning).
 
-    Of two controllers the one within all limits is better; of two beyond them, that with the
-    smaller sum of relative violations.
+    A controller within all limits is better than one that violates any; of two that violate limits,
+    the one with the smaller sum of relative violations is better.
 
     Parameters
     ----------
@@ -163,15 +163,16 @@ class Constraints:
     u : float, optional
         Largest \\|u\\| in every run [u].
     recovery : float or Controller, optional
-        Longest recovery from any load step, on every plant in every variation [ms]. Of a
-        controller what it takes on each plant itself, at least one sample: no plant may recover
-        later than under it, as it is, or in every variation where none leaves it as it is.
+        Longest recovery from any load step, on every plant in every variation [ms]. A controller
+        stands for its own recovery on each plant, at least one sample: no plant may recover later
+        than with it. This is judged on the unchanged plant, or in every variation if none leaves it
+        unchanged.
     load : float or Controller, optional
         Largest rms deviation under any load step [y], likewise.
     plant : linear plant or list of them, optional
-        Where Ms is taken: whatever `sewfast.margins` takes. A `FrequencyResponse` beside one of
-        these counts with its bands: Ms is the largest that they allow. By default the linear models
-        among the plants that are tuned on.
+        The plants for Ms: anything that `sewfast.margins` accepts. A `FrequencyResponse` next to
+        one of these counts with its bands: Ms is the largest that they allow. By default the linear
+        models among the plants used for tuning.
     speed : float, optional
         Where a nonlinear `plant` is linearised [y].
 
@@ -235,26 +236,26 @@ BAND = 0.01
 
 @dataclass(frozen=True)
 class LoadStep:
-    """A level is approached and held; then a command that the controller does not see comes on.
+    """A level is approached and held; then a command unknown to the controller is added.
 
-    It acts as a load on the shaft does: a torque of a motor takes as many volts as it makes current
-    times resistance (docs/tuning.md). The run's recovery [ms] is the last time after it that the
-    true output, in the mean of the last `mean` seconds, is farther than `band` from the level; its
-    load the rms of that deviation from then on [y].
+    It acts like a load on the shaft: a motor's torque corresponds to the voltage given by its
+    current times resistance (docs/tuning.md). The run's recovery [ms] is the last time after it
+    that the true output, in the mean of the last `mean` seconds, is farther than `band` from the
+    level; its load is the rms of that deviation from then on [y].
 
     Parameters
     ----------
     level : float
         What is held [y].
     disturbance : float
-        Added to the command behind its limits [u]; one that brakes has the other sign.
+        Added to the command behind its limits [u]; a braking one has the opposite sign.
     band : float, optional
         [y]; a hundredth of the level by default.
     ramp, settle, look : float
-        Time of the way to the level, from there to the load, and of the load [s].
+        Duration of the rise to the level, of the hold before the load, and of the load [s].
     mean : float
-        Time of the moving mean of the deviation [s]; that of a turn where a load varies over it, 0
-        for none.
+        Duration of the moving mean of the deviation [s]: one turn if a load varies over it, 0 for
+        none.
 
     Raises
     ------

@@ -38,32 +38,32 @@ EVALUATIONS = 1500
 
 @dataclass(frozen=True, eq=False)
 class TuningResult:
-    """The tuned controller and the story of its search.
+    """The tuned controller and a record of its search.
 
     Attributes
     ----------
     controller : Controller
         Ready to run.
     start : Controller
-        What the search began with; moved to the bounds that were given where it lay outside.
+        The start of the search, moved to the given bounds if it lay outside.
     cost, start_cost : float
-        Cost of both in the output's unit, over plants and references; inf where one diverges.
+        Cost of both in the output's unit, over plants and references; inf if one diverges.
     variables : tuple of Variable
-        What was searched, between which bounds, and what was found.
+        The searched variables, their bounds and the values found.
     trace : array, shape (evaluations,)
         The cost of the best controller so far after each evaluation, the start's first.
     termination : str
         ``evaluations``, ``time`` or ``interrupted``.
     weights : Cost
-        What counted how much, every weight a number.
+        The weights, each a number.
     aggregate : str
         ``mean`` or ``worst``, over the plants.
     constraints : Constraints
-        What had to be kept.
+        The constraints that applied.
     method : str
         ``genetic`` or ``cma-es``.
     opinion : SecondOpinion or None
-        What a rival says of the gains; None without one, or where no gains suit it.
+        The comparison with a rival; None without one, or if no gains suit it.
     """
 
     controller: Controller
@@ -81,7 +81,7 @@ class TuningResult:
 
     @property
     def warning(self) -> str | None:
-        """What speaks against the gains, and what to do; None where nothing does.
+        """An objection to the gains, and what to do; None if there is none.
 
         Models of two kinds that contradict each other on which gains are good.
         """
@@ -120,9 +120,9 @@ class TuningResult:
         Raises
         ------
         SettingError
-            Where matplotlib is not installed, the file cannot be written, or as `sewfast.run`.
+            If matplotlib is not installed, the file cannot be written, or as `sewfast.run`.
         FitError
-            Where the tuned loop diverges on this plant; a start that does is left out.
+            If the tuned loop diverges on this plant; a start that does is left out.
         """
         from ..plotting import Trace, loop_drawing
 
@@ -189,7 +189,7 @@ def tune(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> TuningResult:
-    """Search a controller's numbers for the least cost of simulated loops.
+    """Search for the controller settings with the lowest cost in simulated loops.
 
     Every candidate runs on every plant in every variation over every reference, with encoder,
     feedback filter and limits in the loop. A run's cost is a weighted sum of terms (`Cost`). A seed
@@ -207,44 +207,45 @@ def tune(
         defaults wherever the catalogue does not suit the drive.
     u_min, u_max : float, optional
         Limits of the command [u]. By default the range of the input that the first model was
-        identified on, with 0: a controller may not do what nobody has seen the drive stand.
+        identified on, with 0: a controller must not demand more than the drive has been seen to
+        withstand.
     counts_per_rev : float, None or "model"
         Encoder in the loop of the models; None for ideal feedback, "model" for that of the counts
         that the first model's output was computed from, if it was.
     filter_samples : int, optional
         Moving average in the feedback. By default 8 ms, at most a tenth of the time constant.
     output_unit : str, optional
-        Unit of the output where the model states none: an encoder needs it.
+        Unit of the output if the model states none: an encoder needs it.
     start : Controller, optional
-        What to begin with; what is not searched is kept, and the five settings above are not used.
-        By default Table 1 on the first model's own step response.
+        Start of the search; settings that are not searched are kept, and the five settings above
+        are ignored. By default Table 1 on the first model's own step response.
     variables : sequence of str or (str, float, float), optional
         What to search, by name or with its bounds: ``Kp``, ``Ti``, ``Td``, ``alpha``, ``beta``,
         ``N``, ``Tt``, ``filter_samples``, ``filter_time``, ``observer_time``, ``r_rate``;
         ``Kp[0]``, ``Ti[0]``, ``Td[0]`` and so on of a gain schedule's points, ``schedule`` for all
-        of them. By default the gains, alpha, beta, and N where the start has a derivative filter.
+        of them. By default the gains, alpha, beta, and N if the start has a derivative filter.
     cost : Cost, optional
         What counts how much.
     aggregate : "mean" or "worst"
         Over the plants in their variations; over the references it is the mean.
     constraints : Constraints, optional
-        What must be kept whatever it costs.
+        Requirements that come before the cost.
     variations : sequence of (gain, delay), optional
         Output gain and extra input delay in samples, applied to every plant. By default the plant
-        as it is, and with the gains .8 and 1.25 and a delay of a quarter of the moving average, at
+        unchanged, and with the gains .8 and 1.25 and a delay of a quarter of the moving average, at
         least one sample: dynamics that identification missed must not upset the loop.
     loads : sequence of LoadStep
-        Load steps that every candidate has to bear as well; what recovery and load of `cost` and
-        `constraints` are taken on. Their runs count for nothing else.
+        Load steps simulated for every candidate, from which recovery and load of `cost` and
+        `constraints` are computed. These runs count for nothing else.
     disturbances : sequence of array, shape (N,), optional
         One for each reference: a command that is added behind the limits, unseen by the controller
-        [u]. A load over the turn that no model holds, for instance.
+        [u]. For instance, a load over the turn that no model contains.
     rival : model, optional
-        A model of another kind of the same drive, a linear one beside networks: its own gains are
-        searched for briefly (a fifth of the evaluations). Where either gains cost more than three
-        times as much on the other's model as that one's own, `TuningResult.warning` says so, and
-        of these two, and of gains tuned on both, those are taken whose largest cost, relative to
-        the least on the same model, is smallest.
+        A model of another kind of the same drive, such as a linear one next to networks: its own
+        gains are searched for briefly (a fifth of the evaluations). If either set of gains costs
+        more than three times as much on the other's model as that model's own gains,
+        `TuningResult.warning` says so. The result is then that one of the two, and of gains tuned
+        on both, whose largest cost relative to the least on the same model is smallest.
     method : "genetic" or "cma-es"
         A genetic algorithm with local refinement, or CMA-ES with restarts.
     evaluations : int
@@ -264,7 +265,7 @@ def tune(
     SettingError, DataError
         For plants, references or settings that cannot be used.
     FitError
-        Where every candidate diverges or breaks a constraint.
+        If every candidate diverges or breaks a constraint.
     Interrupted
         After Ctrl-C; its `best` is the best controller so far.
     """

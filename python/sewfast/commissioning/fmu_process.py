@@ -1,0 +1,233 @@
+"""The process in which an FMU runs: a crash there, or a step without end, is an error here.
+
+Requests and answers are structs over the process's standard input and output.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import select
+import signal
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from ..errors import SettingError
+
+_REQUEST = struct.Struct("<cd")
+"""`r`, begin again, or `s`, a step, and the command."""
+_ANSWER = struct.Struct("<?3d")
+"""Whether it succeeded, and the measured variables; where it did not, first a message's size."""
+_FAREWELL = 5.0
+"""Time for an FMU to end by itself [s]."""
+
+
+class FmuProcess:
+    """An FMU in a process of its own, advanced by requests.
+
+    Parameters
+    ----------
+    path : path
+        The FMU, for messages.
+    folder : path
+        Where it is unpacked.
+    input : int
+        Reference of the variable that takes the command.
+    measured : sequence of int or None
+        References of three variables to read after every step; not a number where there is none.
+    start : mapping
+        First values of further variables, by reference.
+    Ts : float
+        Sample time [s].
+    timeout : float
+        Longest time that a call may take [s].
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        folder: str,
+        *,
+        input: int,
+        measured: Sequence[int | None],
+        start: Mapping[int, float],
+        Ts: float,
+        timeout: float,
+    ) -> None:
+        self.path, self.Ts, self.timeout = path, Ts, timeout
+        given = json.dumps([folder, input, list(measured), list(start.items()), Ts])
+        program = f"from {__name__} import serve; serve()"
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", program, given],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0,
+            start_new_session=True,  # Ctrl-C is the caller's
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        )  # fmt: skip
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._requests, self._answers = self._process.stdin, self._process.stdout
+        self._ended: BaseException | None = None
+
+    def begin(self) -> tuple[float, ...]:
+        """Begin a run; the variables at its beginning.
+
+        Raises
+        ------
+        SettingError
+            Where the FMU refuses, crashes, or does not answer in time.
+        """
+        return self._ask(b"r", 0.0, "an instance that begins")
+
+    def step(self, u: float, sample: int) -> tuple[float, ...]:
+        """Hold a command for a sample; the variables after it. Raises as `begin`."""
+        return self._ask(b"s", u, f"a step of {self.Ts:g} s from {sample * self.Ts:g} s")
+
+    def close(self) -> None:
+        """End the process."""
+        with contextlib.suppress(OSError):
+            self._requests.close()
+        try:
+            self._process.wait(0.0 if self._ended else _FAREWELL)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._answers.close()
+
+    def _ask(self, kind: bytes, u: float, what: str) -> tuple[float, ...]:
+        if self._ended is not None:
+            raise self._ended  # a bench that stops its machine meets the reason again
+        try:
+            self._requests.write(_REQUEST.pack(kind, u))
+            until = time.monotonic() + self.timeout
+            good, *values = _ANSWER.unpack(self._read(_ANSWER.size, until))
+            if good:
+                return tuple(values)
+            said = self._read(int(values[0]), until).decode(errors="replace")
+        except TimeoutError:
+            self._fail(what, f"no answer within {self.timeout:g} s", "give a longer timeout=")
+        except (BrokenPipeError, EOFError):
+            code = self._process.wait()
+            how = f"code {code}"
+            if code < 0:
+                with contextlib.suppress(ValueError):
+                    how = signal.Signals(-code).name
+            self._fail(what, f"a process that ended ({how})", "its binary is faulty")
+        except BaseException as error:
+            self._ended = error
+            self._process.kill()
+            raise
+        remedy = (
+            "give a Ts that its solver can do"
+            if kind == b"s"
+            else "export it again, with its binary for this system"
+        )
+        self._fail(what, said.strip() or "an error without words", remedy)
+
+    def _fail(self, what: str, received: str, remedy: str) -> NoReturn:
+        self._process.kill()
+        self._ended = SettingError(
+            name=str(self.path),
+            expected=what,
+            received=received[:400],
+            remedy=f"{remedy}; or try the FMU in the tool that it comes from",
+        )
+        raise self._ended
+
+    def _read(self, size: int, until: float) -> bytes:
+        whole = b""
+        while len(whole) < size:
+            # only POSIX waits for pipes; elsewhere there is no end to an FMU without one
+            if os.name == "posix":
+                left = until - time.monotonic()
+                if not select.select([self._answers], [], [], max(left, 0.0))[0]:
+                    raise TimeoutError
+            part = self._answers.read(size - len(whole))
+            if not part:
+                raise EOFError
+            whole += part
+        return whole
+
+
+# --- In the process -------------------------------------------------------------------------------
+
+
+def serve() -> None:
+    """Answer requests until there are no more; `sys.argv[1]` has what `FmuProcess` was given."""
+    answers = os.fdopen(os.dup(1), "wb", buffering=0)
+    os.dup2(2, 1)  # what an FMU prints is for the user
+    _end_with_the_caller()
+    folder, taken, measured, start, Ts = json.loads(sys.argv[1])
+    slave, sample = _Slave(folder), 0
+    while len(request := os.read(0, _REQUEST.size)) == _REQUEST.size:
+        kind, u = _REQUEST.unpack(request)
+        try:
+            if kind == b"r":
+                sample = 0
+                slave.begin([*start, (taken, 0.0)])
+            else:
+                slave.set(taken, u)
+                slave.fmu.doStep(sample * Ts, Ts)
+                sample += 1
+            values = [math.nan if v is None else slave.get(v) for v in measured]
+            answers.write(_ANSWER.pack(True, *values))
+        except Exception as error:
+            said = str(error).encode()[:2000]
+            answers.write(_ANSWER.pack(False, len(said), 0.0, 0.0) + said)
+    slave.end()
+
+
+def _end_with_the_caller() -> None:
+    """A caller that is killed takes an FMU without end along."""
+    if sys.platform == "linux":
+        import ctypes
+
+        set_parent_death_signal = 1
+        ctypes.CDLL(None).prctl(set_parent_death_signal, int(signal.SIGKILL))
+
+
+class _Slave:
+    """An instance in FMPy, whatever the version."""
+
+    def __init__(self, folder: str) -> None:
+        import fmpy
+
+        self._fmpy, self._folder = fmpy, folder
+        self._description = fmpy.read_model_description(folder)
+        self._three = self._description.fmiVersion.startswith("3.")
+        self.fmu: Any = None
+
+    def begin(self, values: Sequence[tuple[int, float]]) -> None:
+        self.end()
+        fmu = self._fmpy.instantiate_fmu(self._folder, self._description, "CoSimulation")
+        self.fmu = fmu
+        *start, taken = values
+        for reference, value in start:
+            self.set(reference, value)
+        if self._description.fmiVersion.startswith("1."):
+            fmu.initialize()
+            return
+        if self._description.fmiVersion.startswith("2."):
+            fmu.setupExperiment(startTime=0.0)
+        fmu.enterInitializationMode()
+        self.set(*taken)
+        fmu.exitInitializationMode()
+
+    def get(self, reference: int) -> float:
+        read = self.fmu.getFloat64 if self._three else self.fmu.getReal
+        return float(read([reference])[0])
+
+    def set(self, reference: int, value: float) -> None:
+        (self.fmu.setFloat64 if self._three else self.fmu.setReal)([reference], [value])
+
+    def end(self) -> None:
+        if self.fmu is not None:
+            fmu, self.fmu = self.fmu, None
+            fmu.terminate()
+            fmu.freeInstance()

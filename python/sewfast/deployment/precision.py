@@ -1,0 +1,197 @@
+"""The steps that deployed code has to compute, and what single precision costs them.
+
+A model or controller that single precision would change is refused here, before anything is
+written.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from .. import _core
+from ..control import Controller
+from ..dataset import FloatArray
+from ..errors import FitError, SettingError
+from ..models import Ensemble, Model
+
+MOST_LOSS = 0.01
+"""Of the output's span: a model that single precision changes by more is refused."""
+_SAMPLES = 5000
+"""Over which the loss of single precision is measured."""
+_MOST_MEMBERS = 64
+
+
+# --- Models ---------------------------------------------------------------------------------------
+
+
+def embedded_members(
+    model: Model, precision: str
+) -> tuple[list[Model], list[_core.EmbeddedModel], str]:
+    """A model's members, their steps, and how their outputs are combined.
+
+    In single precision a network keeps its scaled units, which lose fewer digits.
+    """
+    members = list(model.members) if isinstance(model, Ensemble) else [model]
+    if len(members) > _MOST_MEMBERS:
+        raise SettingError(
+            f"expected at most {_MOST_MEMBERS} members for a processor, got {len(members)}; deploy "
+            "some of them with Ensemble.of(model.members[:3])"
+        )
+    scaled = {"scaled": precision == "f32"}
+    embedded = [m.core.embedded(**(scaled if m.kind == "neural_oe" else {})) for m in members]
+    return members, embedded, model.combine if isinstance(model, Ensemble) else "median"
+
+
+def excitation(model: Model, samples: int) -> FloatArray:
+    """Steps over the range that the model was trained on, held for 1 to 80 samples, (N, inputs)."""
+    rng = np.random.default_rng(0)
+    ranges = model.training.get("input_range") or [[-1.0, 1.0]] * len(model.input_names)
+    columns = [
+        np.repeat(rng.uniform(low, high, samples), rng.integers(1, 81, samples))[:samples]
+        for low, high in ranges
+    ]
+    return np.ascontiguousarray(np.stack(columns, axis=1))
+
+
+def combined_run(
+    members: list[Model],
+    embedded: list[_core.EmbeddedModel],
+    combined: str,
+    u: FloatArray,
+    precision: str,
+) -> FloatArray:
+    """The free run from rest, as the C computes it."""
+    held = np.zeros(u.shape[1])
+    runs = [
+        e.run(u, m.core.rest_state(), held, precision=precision)
+        for m, e in zip(members, embedded, strict=True)
+    ]
+    if precision == "f64":
+        stacked = np.array(runs)
+        return np.asarray(
+            np.median(stacked, axis=0) if combined == "median" else np.mean(stacked, axis=0)
+        )
+    single = np.array(runs, dtype=np.float32)
+    ordered = np.sort(single, axis=0)
+    n, half = len(runs), np.float32(0.5)
+    if combined == "median":
+        middle = half * (ordered[(n - 1) // 2] + ordered[n // 2])
+        return np.asarray(ordered[n // 2] if n % 2 else middle, dtype=np.float64)
+    total = np.zeros(single.shape[1], dtype=np.float32)
+    for run in single:
+        total = total + run
+    return np.asarray(total / np.float32(n), dtype=np.float64)
+
+
+def model_loss(
+    model: Model, members: list[Model], embedded: list[_core.EmbeddedModel], combined: str
+) -> str:
+    """Refuses a model that single precision would change; else what it costs."""
+    _, exact, _ = embedded_members(model, "f64")
+    u = excitation(model, _SAMPLES)
+    with np.errstate(all="ignore"):
+        double = combined_run(members, exact, combined, u, "f64")
+        single = combined_run(members, embedded, combined, u, "f32")
+        span = float(np.ptp(double)) or float(np.max(np.abs(double))) or 1.0
+        loss = float(np.max(np.abs(single - double))) / span
+    if not np.isfinite(double).all():
+        raise FitError(
+            "expected a model whose free run stays finite over its own input range, got one that "
+            "leaves it; identify a stable model"
+        )
+    if not loss <= MOST_LOSS:
+        poles = [abs(p) for m in members if m.kind in ("arx", "oe", "iv") for p in m.poles]  # type: ignore[attr-defined]
+        slow = f" (its slowest pole is {max(poles):.9g})" if poles else ""
+        got = f"{loss:.3%}" if math.isfinite(loss) else "an overflow"
+        raise SettingError(
+            f"expected a model that single precision changes by at most {MOST_LOSS:.0%} of its "
+            f"span, got {got}{slow}; deploy it with precision f64, or identify it at a longer "
+            "sample time"
+        )
+    return f"single precision changes a free run of {_SAMPLES} samples by {loss:.1e} of its span"
+
+
+# --- The controller -------------------------------------------------------------------------------
+
+
+def controller_step(controller: Controller, precision: str) -> tuple[Any, list[str]]:
+    """A controller's step in a precision, and what is to be said of its loss."""
+    core: Any = controller.core()
+    if precision == "f64":
+        return core, []
+    try:
+        single = core.single()
+    except SettingError as error:
+        raise SettingError(
+            name="precision",
+            expected=f"settings that single precision holds ({error.expected})",
+            received=error.received,
+            remedy="deploy it with precision f64",
+        ) from error
+    return single, [_controller_loss(controller, core.numbers, single.numbers)]
+
+
+def _controller_loss(controller: Controller, double: Any, single: Any) -> str:
+    """Refuses a controller that single precision would change; else what it costs.
+
+    A gain that becomes 0 is lost. An integral of the size of the limits is a multiple of 2^-24 of
+    them, and an error whose share of a sample is less than half of that does not move it any more:
+    there the loop stays, however long it waits.
+    """
+    lost = [k for k in ("kp", "ki", "kd") if double[k] and not single[k]]
+    if lost:
+        raise SettingError(
+            name="precision",
+            expected="gains that single precision holds",
+            received=", ".join(f"{k} {double[k]:.3g} a sample" for k in lost),
+            remedy="deploy it with precision f64",
+        )
+    limit, still = min(_limit(controller), float(np.finfo(np.float32).max)), 0.0
+    for gains in (
+        g.to("standard") for g in (controller.gains, *(g for _, g in controller.schedule))
+    ):
+        if not (gains.Kp and math.isfinite(gains.Ti)):
+            continue
+        step = abs(gains.Kp) * controller.Ts / gains.Ti
+        rests = 0.5 * float(np.spacing(np.float32(limit))) / step
+        if rests * abs(gains.Kp) > MOST_LOSS * limit:
+            raise SettingError(
+                name="precision",
+                expected=f"an integral that errors of {MOST_LOSS:.0%} of the working range move in "
+                "single precision",
+                received=f"Ti {gains.Ti:g} s at a sample time of {controller.Ts:g} s",
+                remedy="deploy it with precision f64, or tune it for a longer sample time",
+            )
+        still = max(still, rests)
+    unit = f" {controller.gains.y_unit}" if controller.gains.y_unit else ""
+    return (
+        f"single precision: errors below {still:.2g}{unit} no longer move an integral as large as "
+        "the limits"
+        if still
+        else "single precision: all gains are held"
+    )
+
+
+def _limit(controller: Controller) -> float:
+    """The larger limit of the command; 1 where there is none."""
+    return max(
+        (abs(v) for v in (controller.u_min, controller.u_max) if math.isfinite(v)), default=1.0
+    )
+
+
+def signals(controller: Controller, count: int, precision: str) -> tuple[FloatArray, FloatArray]:
+    """Reference and measurement about the size at which the proportional term spans the limits."""
+    rng = np.random.default_rng(0)
+    gains = controller.gains.to("standard")
+    size = _limit(controller) / abs(gains.Kp) if gains.Kp else 1.0
+    if controller.schedule:
+        size = max(size, 1.5 * controller.schedule[-1][0])
+    size = min(size, 1e30 if precision == "f32" else 1e300)
+    r = np.repeat(rng.uniform(-size, size, count), 20)[:count]
+    y = 0.7 * r + rng.normal(0.0, 0.2 * size, count)
+    if precision == "f32":
+        r, y = (v.astype(np.float32).astype(np.float64) for v in (r, y))
+    return r, y
