@@ -21,9 +21,6 @@ const SLOPES: (f64, f64) = (2.0, 30.0);
 
 /// The realisation beside hidden units: weights normal with standard deviation `scale/sqrt(nx + nu)`, biases uniform
 /// from -1 to 1, `E` and `G` small.
-///
-/// A position is the sum of a speed, and what resists a motion is friction: dry friction jumps where the speed changes
-/// its sign, and training hardly ever finds that jump from smooth random units.
 pub(super) fn beside(
     linear: &Realisation,
     shape: Shape,
@@ -34,23 +31,32 @@ pub(super) fn beside(
     let mut theta = linear.theta(shape);
     let width = scale / (shape.arguments() as f64).sqrt();
     theta[parts.wx.start..parts.wu.end].fill_with(|| width * random.normal());
-    theta[parts.bh.clone()].fill_with(|| random.between(-1.0, 1.0));
+    theta[parts.bh].fill_with(|| random.between(-1.0, 1.0));
     theta[parts.e].fill_with(|| REACH * random.normal());
     theta[parts.g].fill_with(|| REACH * random.normal());
     if shape.integrator && random.between(0.0, 1.0) < SWITCHING {
-        let slope = random.between(SLOPES.0.ln(), SLOPES.1.ln()).exp();
-        let speed = linear.speed();
-        let deviation = speed.norm();
-        if deviation > 0.0 {
-            (0..shape.nx).for_each(|j| theta[parts.wx.start + j] = slope * speed[j] / deviation);
-            theta[parts.wu.start..parts.wu.start + shape.inputs].fill(0.0);
-            theta[parts.bh.start] = 0.0;
-        }
+        switch(&mut theta, linear, shape, random);
     }
     for (i, value) in shape.held() {
         theta[i] = value;
     }
     theta
+}
+
+/// The first hidden unit becomes a smooth sign of the speed.
+///
+/// A position is the sum of a speed, and what resists a motion is friction: dry friction jumps where the speed changes
+/// its sign, and training hardly ever finds that jump from smooth random units.
+fn switch(theta: &mut [f64], linear: &Realisation, shape: Shape, random: &mut Random) {
+    let parts = shape.parts();
+    let slope = random.between(SLOPES.0.ln(), SLOPES.1.ln()).exp();
+    let speed = linear.speed();
+    let deviation = speed.norm();
+    if deviation > 0.0 {
+        (0..shape.nx).for_each(|j| theta[parts.wx.start + j] = slope * speed[j] / deviation);
+        theta[parts.wu.start..][..shape.inputs].fill(0.0);
+        theta[parts.bh.start] = 0.0;
+    }
 }
 
 /// Random states that decay at different rates, with the outputs that come nearest to the data; none where these are
