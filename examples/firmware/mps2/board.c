@@ -130,8 +130,9 @@ static void count_the_step(void) {
 }
 
 void board_apply(sewfast_output output) {
+    /* a sample's output holds from the sample on, also where the sample is made up for late */
+    if (shared.enabled && !output.enabled) shared.safe = pending ? sampled : board_time();
     if (pending) count_the_step();
-    if (shared.enabled && !output.enabled) shared.safe = board_time();
     shared.enabled = output.enabled;
     applied = output.enabled ? output.u : 0.0f;
 }
