@@ -9,8 +9,8 @@ Rules of the search may be made on the families of RULES. Those of HELD are only
 nothing is decided on them. Each half has a motor with friction, an integrator (a position), a chain
 of blocks, a linear truth, small records and large ones.
 
-    RULES  first_order_encoder, prbs_drift, dead_time, motor_friction, drive_limit,
-           angle, position_periodic, hammerstein, wiener_hammerstein, tanks, duffing, backlash, two_inputs
+    RULES  first_order_encoder, prbs_drift, dead_time, motor_friction, drive_limit, angle,
+           position_periodic, hammerstein, wiener_hammerstein, tanks, duffing, backlash, two_inputs
     HELD   second_order_encoder, two_mass, three_inputs, motor_loop, slow_drive, position, wiener,
            hammerstein_wiener, bouc_wen, bilinear, gain_scheduled
 """
