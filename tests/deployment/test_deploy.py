@@ -472,7 +472,9 @@ def test_the_error_at_which_an_integral_rests_is_said_and_true(tmp_path: Path) -
         Gains.standard(0.02, 20.0, u_unit="V", y_unit="RPM"), u_min=-16.5, u_max=16.5
     )
     note = deploy(controller, tmp_path).notes[1]
-    rests = float(re.search(r"errors below ([\d.e-]+) RPM", note)[1])  # type: ignore[index]
+    said = re.search(r"errors below ([\d.e-]+) RPM", note)
+    assert said is not None
+    rests = float(said[1])
     for error, moves in ((0.9 * rests, False), (1.1 * rests, True)):
         core: Any = controller.core().single()
         core.set_manual(16.25)

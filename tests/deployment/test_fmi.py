@@ -453,16 +453,17 @@ def test_ctrl_c_ends_a_step_without_end(tmp_path: Path) -> None:
             sewfast.record(bench, np.ones(100))
     finally:
         signal.signal(signal.SIGALRM, before)
-    process = bench.machine._process._process  # type: ignore[attr-defined]
-    assert process.wait(10.0) < 0
+    assert isinstance(bench.machine, FmuMachine)
+    assert bench.machine._process._process.wait(10.0) < 0
 
 
 def test_what_an_fmu_prints_is_no_answer(tmp_path: Path) -> None:
     bench = fmu_bench(_faulty(tmp_path, 'puts("mine"); fflush(0);'), **OF_FAULTY)
     assert len(sewfast.record(bench, np.ones(100)).counts) == 100
-    folder = bench.machine._folder  # type: ignore[attr-defined]
-    bench.machine.close()  # type: ignore[attr-defined]
-    assert bench.machine._process._process.poll() == 0  # type: ignore[attr-defined]
+    assert isinstance(bench.machine, FmuMachine)
+    folder = bench.machine._folder
+    bench.machine.close()
+    assert bench.machine._process._process.poll() == 0
     del bench
     gc.collect()
     assert not Path(folder).exists()

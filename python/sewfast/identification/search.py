@@ -58,8 +58,8 @@ STILL_NEAR = 3.0
 SECOND_ROUTE = 0.25
 """Part of its operations below which a search still has the means to climb a second route."""
 ROUNDS = 6
-SCREENED_STARTS, SHARE_OF_SCREEN, SHARE_OF_HALVING = 8, 0.1, 0.1
-"""Fresh starts of a structure at a time, at most, and the parts of the operations they may take."""
+MOST_STARTS, SHARE_OF_STARTS = 8, 0.1
+"""Fresh starts of a structure at a time, and the part of the operations that those of all take."""
 SCREEN_ITERATIONS, HALVING_ITERATIONS, CLIMB_ITERATIONS = 20, (25, 40), 40
 INTEGRATING_POLE = 0.9995
 """A slower real pole of the linear models asks for an integrator."""
@@ -261,11 +261,15 @@ class Search:
         return one.error < worth * other.error and costs[0] < worth**2 * costs[1]
 
     def _screened_starts(self, likely: Sequence[Structure]) -> int:
-        """Starts of each: many where they are cheap, for a size is judged by the luckiest ones."""
+        """Starts of each structure."""
         samples = len(self.trials[0].fitted)
         round_ = SCREEN_ITERATIONS * sum(s.operations(self.inputs, samples) for s in likely)
-        able = int(SHARE_OF_SCREEN * self.most / max(round_, 1.0))
-        return min(SCREENED_STARTS, max(4 if self.is_small else 3, able))
+        return self._cheap_starts(round_, 4 if self.is_small else 3)
+
+    def _cheap_starts(self, operations: float, least: int) -> int:
+        """As many starts as are cheap at so much for one: a size is judged by the luckiest."""
+        able = int(SHARE_OF_STARTS * self.budget / max(operations, 1.0))
+        return min(MOST_STARTS, max(least, able))
 
     def halve(self, alive: Sequence[Candidate], iterations: int) -> list[Candidate]:
         """The better half is trained further, with fresh starts for some luck.
@@ -277,15 +281,12 @@ class Search:
         near = [c for c in alive if c.error <= STILL_NEAR * alive[0].error]
         firsts = best_of_each_size(near) if iterations == HALVING_ITERATIONS[0] else []
         kept = half + [c for c in firsts if c not in half]
-        fresh = [self._cheap_starts(c, iterations, len(kept)) for c in kept]
+        samples, least = len(self.trials[0].fitted), 2 if self.is_small else 1
+        costs = [
+            (c.iterations + iterations) * c.structure.operations(self.inputs, samples) for c in kept
+        ]
+        fresh = [self._cheap_starts(len(kept) * cost, least) for cost in costs]
         return sorted(self.continued(kept, iterations, fresh), key=lambda c: c.error)
-
-    def _cheap_starts(self, c: Candidate, iterations: int, candidates: int) -> int:
-        """Fresh starts of one of so many candidates: luck, so that cheap ones get many."""
-        samples = len(self.trials[0].fitted)
-        each = (c.iterations + iterations) * c.structure.operations(self.inputs, samples)
-        able = int(SHARE_OF_HALVING * self.budget / (candidates * max(each, 1.0)))
-        return min(SCREENED_STARTS, max(2 if self.is_small else 1, able))
 
     def climb(self) -> None:
         """Larger networks, other decays and delays, from the best so far while each step gains.
