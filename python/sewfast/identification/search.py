@@ -65,7 +65,9 @@ INTEGRATING_POLE = 0.9995
 """A slower real pole of the linear models asks for an integrator."""
 ENDLESS_GAIN = 5.0
 """Steady gain times the input's range, in widths of the output's range, of what never settles."""
-INTEGRATING_ITERATIONS, INTEGRATING_STARTS = 40, 6
+SAYS_LITTLE = 0.5
+"""Error of the best linear model, in deviations of the output, above which it tells no poles."""
+INTEGRATING_ITERATIONS, INTEGRATING_STARTS = 60, 8
 
 
 @dataclass(frozen=True)
@@ -423,16 +425,28 @@ class Search:
         """Small networks behind an integrator, where a linear pole is nearly 1."""
         if self.task.nx is not None or self.task.output not in (None, "linear"):
             return []
-        if not self.linear.eligible or not self._integrates():
+        if not self.linear.eligible:
             return []
-        likely = (1, 2) if self.repeats else (1, 2, 4, 8)
+        orders: tuple[int, ...] = (2, 3)
+        likely: tuple[int, ...] = (1, 2) if self.repeats else (1, 2, 4, 8)
+        if not self._integrates():
+            # a drive that friction holds still most of the time hides its integrator from them
+            if self.linear.best.rmse < SAYS_LITTLE * self._deviation:
+                return []
+            orders, likely = (2,), (4,)
         sizes = likely if self.task.hidden is None else (self.task.hidden,)
         structures = (
             Structure(nx, self.linear.nk, h, self.decay, integrator=True)
-            for nx in (2, 3)
+            for nx in orders
             for h in sizes
         )
         return [s for s in structures if self.is_affordable(s)]
+
+    @property
+    def _deviation(self) -> float:
+        """Of the held-out output from its mean."""
+        held = [e.y for e in self.trials[0].held.experiments]
+        return float(np.nanstd(np.concatenate(held)))
 
     @cached_property
     def diagnosis(self) -> Diagnosis:

@@ -284,6 +284,8 @@ def _spread(workers: Workers, jobs: Sequence[Job]) -> list[tuple[Network, float]
 
 def _jobs(request: Request, seed: int, until: float | None) -> list[Job]:
     s, linear = request.structure, request.linear
+    if s.integrator and linear is not None and not _has_slow_mode(linear):
+        linear = None  # starts begin at random states
     settings: dict[str, Any] = {"nk": s.nk, "hidden": s.hidden, "weight_decay": s.decay}
     settings["max_iterations"] = request.iterations
     if s.kind == "neural_oe":
@@ -306,6 +308,12 @@ def _jobs(request: Request, seed: int, until: float | None) -> list[Job]:
             for i, model in enumerate(request.initial)
         ]
     return [Job(**common, number=request.first + i, initial=None) for i in range(request.starts)]
+
+
+def _has_slow_mode(linear: _core.LinearModel) -> bool:
+    """Whether a real mode could become an integrator."""
+    poles = linear.poles()
+    return bool(((abs(poles[:, 1]) <= 1e-9 * abs(poles[:, 0])) & (poles[:, 0] > 0.0)).any())
 
 
 def _output_parameters(request: Request) -> Any:

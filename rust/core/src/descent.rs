@@ -156,6 +156,11 @@ pub(crate) trait Method {
     /// Linearises at the present point; false where that is not finite.
     fn linearise(&mut self, theta: &[f64]) -> bool;
 
+    /// Whether the derivatives at the present point are of no use; those of the point before it are then present again.
+    fn takes_back(&mut self) -> bool {
+        false
+    }
+
     /// The tests that end the iteration; they may refine the outcome.
     fn finished(&mut self, outcome: &mut Outcome) -> Option<Termination>;
 
@@ -210,8 +215,16 @@ fn iterate(
     accepted: &mut impl FnMut(&[f64], f64),
 ) -> Termination {
     let mut trial = vec![0.0; method.parameters()];
+    let (mut last, mut last_cost) = (outcome.theta.clone(), outcome.cost);
     for _ in 0..max_iterations {
         let finite = method.linearise(&outcome.theta);
+        if finite && method.takes_back() {
+            outcome.theta.copy_from_slice(&last);
+            outcome.cost = last_cost;
+        } else {
+            last.copy_from_slice(&outcome.theta);
+            last_cost = outcome.cost;
+        }
         if monitor.stopped() {
             return Termination::Interrupted;
         }

@@ -62,6 +62,11 @@ pub struct Settings {
     pub step_tolerance: f64,
     /// Relative reduction of the cost that counts as none, five times in a row.
     pub reduction_tolerance: f64,
+    /// A step after which the trace of `J'J` is larger by more than this factor is taken back.
+    ///
+    /// Where a model has become unstable between kinks that hold it (a friction that overshoots the standstill), its run
+    /// is still finite, and the sensitivities grow without end: they say nothing of the cost any more.
+    pub most_growth: f64,
 }
 
 impl Default for Settings {
@@ -73,6 +78,7 @@ impl Default for Settings {
             gradient_tolerance: 1e-10,
             step_tolerance: 1e-12,
             reduction_tolerance: 1e-10,
+            most_growth: f64::INFINITY,
         }
     }
 }
@@ -83,6 +89,8 @@ const PATIENCE: usize = 5;
 const MOST_REJECTIONS: usize = 30;
 /// What a rejected trial multiplies the damping by.
 const RAISE: f64 = 4.0;
+/// What an accepted trial divides it by.
+const GAIN: f64 = 5.0;
 /// Damping never falls below this, so that a singular system stays solvable.
 const LEAST_MU: f64 = 1e-14;
 
@@ -178,6 +186,15 @@ impl<P: Problem> Method for Marquardt<'_, P> {
         true
     }
 
+    fn takes_back(&mut self) -> bool {
+        let exploded = self.system.exploded(self.settings.most_growth);
+        if exploded {
+            // the step was accepted by its cost: its damping is raised as if it had not been
+            self.mu *= GAIN * RAISE;
+        }
+        exploded
+    }
+
     fn finished(&mut self, outcome: &mut Outcome) -> Option<Termination> {
         let cosine = self.system.largest_cosine(outcome.cost);
         (cosine <= self.settings.gradient_tolerance).then_some(Termination::SmallGradient)
@@ -209,7 +226,7 @@ impl<P: Problem> Method for Marquardt<'_, P> {
 
     fn judge(&mut self, before: f64, after: Option<f64>) -> Verdict {
         if after.is_some_and(|cost| cost < before) {
-            self.mu = (self.mu / 5.0).max(LEAST_MU);
+            self.mu = (self.mu / GAIN).max(LEAST_MU);
             return Verdict::Accepted;
         }
         self.reject()
@@ -261,6 +278,8 @@ struct System {
     size: usize,
     jtj: Vec<f64>,
     jte: Vec<f64>,
+    /// `J'J` and `J'e` of the last point whose sensitivities had not exploded, where that is asked.
+    last: (Vec<f64>, Vec<f64>),
     factor: Vec<f64>,
     step: Vec<f64>,
 }
@@ -271,9 +290,28 @@ impl System {
             size,
             jtj: vec![0.0; size * size],
             jte: vec![0.0; size],
+            last: (Vec::new(), Vec::new()),
             factor: vec![0.0; size * size],
             step: vec![0.0; size],
         }
+    }
+
+    /// Whether `J'J` is larger than the last one by more than this factor, which is then put back in its place.
+    fn exploded(&mut self, most_growth: f64) -> bool {
+        if most_growth.is_infinite() {
+            return false;
+        }
+        let trace = |jtj: &[f64]| jtj.iter().step_by(self.size + 1).sum::<f64>();
+        let exploded =
+            !self.last.0.is_empty() && !(trace(&self.jtj) <= most_growth * trace(&self.last.0));
+        if exploded {
+            self.jtj.copy_from_slice(&self.last.0);
+            self.jte.copy_from_slice(&self.last.1);
+        } else {
+            self.last.0.clone_from(&self.jtj);
+            self.last.1.clone_from(&self.jte);
+        }
+        exploded
     }
 
     fn largest_cosine(&self, cost: f64) -> f64 {

@@ -2,8 +2,10 @@
 
 mod draw;
 mod free_run;
+mod friction;
 mod growth;
 mod kalman;
+mod leak;
 mod network;
 mod output;
 mod problem;

@@ -10,7 +10,7 @@ use crate::random::Random;
 /// Standard deviation of E and G: enough to tell the hidden units apart.
 const REACH: f64 = 1e-3;
 /// Poles of a start without a linear model: fast and slow ones.
-const POLES: (f64, f64) = (0.5, 0.99);
+pub(super) const POLES: (f64, f64) = (0.5, 0.99);
 /// Added to the normal equations of the outputs, relative to their mean.
 const RIDGE: f64 = 1e-9;
 
@@ -27,20 +27,30 @@ pub(super) fn beside(
     scale: f64,
     random: &mut Random,
 ) -> Vec<f64> {
-    let parts = shape.parts();
     let mut theta = linear.theta(shape);
+    hide(&mut theta, shape, scale, random);
+    if shape.integrator && random.between(0.0, 1.0) < SWITCHING {
+        switch(&mut theta, linear, shape, random);
+    }
+    hold(&mut theta, shape);
+    theta
+}
+
+/// Draws the hidden units.
+pub(super) fn hide(theta: &mut [f64], shape: Shape, scale: f64, random: &mut Random) {
+    let parts = shape.parts();
     let width = scale / (shape.arguments() as f64).sqrt();
     theta[parts.wx.start..parts.wu.end].fill_with(|| width * random.normal());
     theta[parts.bh].fill_with(|| random.between(-1.0, 1.0));
     theta[parts.e].fill_with(|| REACH * random.normal());
     theta[parts.g].fill_with(|| REACH * random.normal());
-    if shape.integrator && random.between(0.0, 1.0) < SWITCHING {
-        switch(&mut theta, linear, shape, random);
-    }
+}
+
+/// Sets the parameters that an integrator holds.
+pub(super) fn hold(theta: &mut [f64], shape: Shape) {
     for (i, value) in shape.held() {
         theta[i] = value;
     }
-    theta
 }
 
 /// The first hidden unit becomes a smooth sign of the speed.

@@ -94,6 +94,11 @@ impl Shape {
         }
     }
 
+    /// Where the last state's own pole stands.
+    pub(super) fn pole(&self) -> usize {
+        self.parts().a.end - 1
+    }
+
     /// Parameters that an integrator holds, and their values.
     pub(super) fn held(&self) -> Vec<(usize, f64)> {
         if !self.integrator {
@@ -102,10 +107,7 @@ impl Shape {
         let (nx, last, parts) = (self.nx, self.nx - 1, self.parts());
         let column = (0..last).map(|q| (parts.a.start + q * nx + last, 0.0));
         let units = (0..self.hidden).map(|i| (parts.wx.start + i * nx + last, 0.0));
-        column
-            .chain([(parts.a.start + last * nx + last, 1.0)])
-            .chain(units)
-            .collect()
+        column.chain([(self.pole(), 1.0)]).chain(units).collect()
     }
 
     /// Share of the weight decay that a parameter bears: the network's weights bear it, its biases a tenth of it.

@@ -1,5 +1,8 @@
 //! Training in free run: many starts in parallel, each by Levenberg-Marquardt, chosen by free run.
 
+use super::free_run::Trajectory;
+use super::friction::{self, Friction};
+use super::leak::Leak;
 use super::network::Network;
 use super::output::OutputFunction;
 use super::problem::{self, Attempts, Experiment};
@@ -90,6 +93,12 @@ pub struct NeuralSSFit {
 const FIRST_MU: f64 = 1e-2;
 /// Relative reduction of the cost that counts as none.
 const NO_REDUCTION: f64 = 1e-7;
+/// Growth of the sensitivities' squares from one step to the next that counts as an explosion.
+const MOST_GROWTH: f64 = 1e3;
+/// Share of a position's starts that begin with an estimate of its friction, where one shows.
+const BRAKED: f64 = 0.7;
+/// One of so many iterations of a position is for its recent motion.
+const LED: usize = 3;
 /// Samples of an experiment that its state is first estimated from.
 const STATE_SAMPLES: usize = 2_000;
 /// Share of the output's variance that a linear model is taken to miss while it is.
@@ -204,7 +213,8 @@ impl<'a> Task<'a> {
             let mut problem =
                 problem::Training::new(&self.experiments, network, decay, &attempts, self.monitor);
             let (theta, dead) = self.drawn(&mut problem, start, &mut random)?;
-            Some((self.train(&mut problem, theta, &attempts)?, dead))
+            let (theta, taken) = self.led(&mut problem, theta, &attempts);
+            Some((self.train(&mut problem, theta, &attempts, taken)?, dead))
         };
         // nothing is drawn where models are trained further, so that another training would end the same
         let trainings = match self.settings.initial.is_empty() {
@@ -230,6 +240,11 @@ impl<'a> Task<'a> {
             let theta = self.resumed(model);
             return problem.cost(&theta).map(|_| (theta, 0));
         }
+        if let Some(theta) = self.braked(random) {
+            if problem.cost(&theta).is_some() {
+                return Some((theta, 0));
+            }
+        }
         starts::drawn(self.monitor, || {
             let theta = match &self.linear {
                 Some(linear) => Some(self.begun(linear, random)),
@@ -240,19 +255,99 @@ impl<'a> Task<'a> {
         })
     }
 
+    /// Most starts of a position know its dry friction; none where it is not their turn, or none shows.
+    fn braked(&self, random: &mut Random) -> Option<Vec<f64>> {
+        let Shape { nx, outputs, .. } = self.shape;
+        let is_position = self.shape.integrator && nx > 1 && outputs == 1;
+        if !is_position || random.between(0.0, 1.0) >= BRAKED {
+            return None;
+        }
+        let found = Friction::estimated(self.shape, &self.experiments, random)?;
+        let theta = found.theta(self.shape, self.settings.hidden_scale, random);
+        let network = Network::new(self.shape, self.settings.output, &theta);
+        Some(self.with_states(theta, &network, &self.unit_prior()))
+    }
+
+    /// A position is trained by its recent motion first; the parameters from which it goes on, and the iterations taken.
+    fn led(
+        &self,
+        problem: &mut problem::Training,
+        theta: Vec<f64>,
+        attempts: &Attempts,
+    ) -> (Vec<f64>, usize) {
+        let is_position = self.shape.integrator && self.shape.outputs == 1;
+        if !is_position || !self.settings.initial.is_empty() {
+            return (theta, 0);
+        }
+        let iterations = self.settings.max_iterations / LED;
+        let found = self.leaking(theta.clone(), iterations);
+        let found = found.and_then(|theta| self.with_positions(problem, theta, attempts));
+        (found.unwrap_or(theta), iterations)
+    }
+
+    /// The parameters after training behind the filter of [`Leak`].
+    fn leaking(&self, mut theta: Vec<f64>, iterations: usize) -> Option<Vec<f64>> {
+        let leak = Leak::new(&self.experiments, friction::pace(&self.experiments)?)?;
+        leak.entered(&mut theta, self.shape);
+        let own = self.shape.parameters();
+        let network = Network::new(self.shape, self.settings.output, &theta[..own]);
+        let attempts = Attempts::new(&network, &leak.experiments);
+        let decay = self.settings.weight_decay;
+        let mut problem =
+            problem::Training::new(&leak.experiments, network, decay, &attempts, self.monitor);
+        let settings = self.descent(iterations);
+        let outcome = lm::minimize(&mut problem, theta, &settings, self.monitor, |_, _| ());
+        self.monitor
+            .advance((iterations - outcome.iterations) as u64);
+        let mut theta = outcome.theta;
+        leak.left(&mut theta, self.shape);
+        outcome.cost.is_finite().then_some(theta)
+    }
+
+    /// With positions at which the free run has no mean error; none where it diverges.
+    fn with_positions(
+        &self,
+        problem: &mut problem::Training,
+        mut theta: Vec<f64>,
+        attempts: &Attempts,
+    ) -> Option<Vec<f64>> {
+        let (nx, own) = (self.shape.nx, self.shape.parameters());
+        problem.cost(&theta)?;
+        let reach = theta[self.shape.parts().c.end - 1];
+        let missed = |(run, e): (&Trajectory, &Experiment)| {
+            let errors = run.sums.iter().zip(&e.y).filter(|(_, y)| !y.is_nan());
+            let (n, sum) = errors.fold((0.0, 0.0), |(n, sum), (s, y)| (n + 1.0, sum + y - s));
+            sum / f64::max(n, 1.0)
+        };
+        let missed: Vec<f64> = attempts
+            .at(&theta)
+            .iter()
+            .zip(&self.experiments)
+            .map(missed)
+            .collect();
+        for (state, missed) in theta[own..].chunks_exact_mut(nx).zip(missed) {
+            state[nx - 1] += missed / reach;
+        }
+        problem.cost(&theta).map(|_| theta)
+    }
+
     /// A hidden layer beside the linear equations, and the states at which those come nearest to the experiments.
     fn begun(&self, linear: &Realisation, random: &mut Random) -> Vec<f64> {
-        let Shape { nx, outputs, .. } = self.shape;
         let network = Network::new(self.shape, self.settings.output, &linear.theta(self.shape));
+        let theta = draw::beside(linear, self.shape, self.settings.hidden_scale, random);
+        self.with_states(theta, &network, &self.unit_prior())
+    }
+
+    /// What is known of states before there is a run: they are scaled to unit variance.
+    fn unit_prior(&self) -> Statistics {
+        let Shape { nx, outputs, .. } = self.shape;
         let unit = (0..nx * nx).map(|i| f64::from(u8::from(i % (nx + 1) == 0)));
-        let prior = Statistics {
+        Statistics {
             state_mean: vec![0.0; nx],
             state_covariance: unit.collect(),
             residual_variance: vec![LINEAR_RESIDUAL; outputs],
             process_noise: 0.0,
-        };
-        let theta = draw::beside(linear, self.shape, self.settings.hidden_scale, random);
-        self.with_states(theta, &network, &prior)
+        }
     }
 
     /// A model that is trained further, and its states on the experiments.
@@ -281,14 +376,9 @@ impl<'a> Task<'a> {
         problem: &mut problem::Training,
         theta: Vec<f64>,
         attempts: &Attempts,
+        taken: usize,
     ) -> Option<Trained> {
-        let settings = lm::Settings {
-            max_iterations: self.settings.max_iterations,
-            damping: Damping::Identity,
-            mu: FIRST_MU,
-            reduction_tolerance: NO_REDUCTION,
-            ..lm::Settings::default()
-        };
+        let settings = self.descent(self.settings.max_iterations - taken);
         let mut referee = Referee::new(
             problem.network.clone(),
             &self.experiments,
@@ -303,7 +393,7 @@ impl<'a> Task<'a> {
             costs.push(error);
             referee.judge(theta, cost, error);
         });
-        let spare = self.settings.max_iterations - outcome.iterations;
+        let spare = settings.max_iterations - outcome.iterations;
         self.monitor.advance(spare as u64);
         let best = referee.best.take()?;
         self.finished(problem, best.theta, attempts)
@@ -317,6 +407,17 @@ impl<'a> Task<'a> {
                 discarded: 0,
                 sound,
             })
+    }
+
+    fn descent(&self, max_iterations: usize) -> lm::Settings {
+        lm::Settings {
+            max_iterations,
+            damping: Damping::Identity,
+            mu: FIRST_MU,
+            reduction_tolerance: NO_REDUCTION,
+            most_growth: MOST_GROWTH,
+            ..lm::Settings::default()
+        }
     }
 
     /// The model with all that its training run says, its initial states and the guard's verdict.
