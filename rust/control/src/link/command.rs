@@ -4,8 +4,8 @@ use super::Fields;
 use super::device::State;
 use super::identity::Limits;
 use crate::{
-    BIQUADS, Biquad, Cascade, Controller, Design, POINTS, Point, Refused, Schedule, Settings,
-    Standard,
+    AnyController, AnyDesign, BIQUADS, Biquad, Cascade, Design, POINTS, Point, Refused, Schedule,
+    Settings, Standard,
 };
 
 /// Shortest and longest time of a watchdog \[us\].
@@ -83,7 +83,7 @@ pub(super) struct Upload<'a> {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Gains {
     /// Without its sample time, which is the device's.
-    design: Design<f32>,
+    design: AnyDesign<f32>,
     /// The schedule came and is none.
     garbled: bool,
     /// The body has the fields of a device that knows observer, ramp and schedule.
@@ -97,28 +97,15 @@ impl Gains {
     ///
     /// # Errors
     /// The first setting that is outside its range.
-    pub(super) fn controller(&self, volt: f32, ts: f32) -> Result<Controller<f32>, Refused> {
-        Controller::new(self.clipped(volt, ts))
-    }
-
-    fn clipped(&self, volt: f32, ts: f32) -> Design<f32> {
-        let Settings { u_min, u_max, .. } = self.design.pid;
-        // not f32::max and f32::min, which would hide a NaN
-        let clipped = Settings {
-            u_min: if u_min < -volt { -volt } else { u_min },
-            u_max: if u_max > volt { volt } else { u_max },
-            ts,
-            ..self.design.pid
-        };
-        Design {
-            pid: clipped,
-            ..self.design
-        }
+    pub(super) fn controller(&self, volt: f32, ts: f32) -> Result<AnyController<f32>, Refused> {
+        self.design.bounded(volt, ts).controller()
     }
 
     /// Biquads from the next start on; GAINS come without any.
     pub(super) fn set_biquads(&mut self, biquads: Cascade<f32>) {
-        self.design.biquads = biquads;
+        match &mut self.design {
+            AnyDesign::Pid(design) => design.biquads = biquads,
+        }
     }
 
     /// # Errors
@@ -139,7 +126,7 @@ impl Gains {
     /// What keeps a controller from being made; in a frame of its own, as its parts fill much of a stack.
     #[inline(never)]
     pub(super) fn refused(&self, volt: f32, ts: f32) -> Option<Refused> {
-        Controller::check(&self.clipped(volt, ts)).err()
+        self.design.bounded(volt, ts).check().err()
     }
 }
 
@@ -281,25 +268,26 @@ fn gains<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
         ts: 0.0,
     };
     let (filter_time, counts_per_unit) = (fields.f32()?, fields.f32()?);
-    let mut gains = Gains {
-        design: Design {
-            filter_time,
-            filter_samples: fields.u8()?.into(),
-            ..Design::new(settings)
-        },
-        garbled: false,
-        long: !fields.is_empty(),
-        counts_per_unit,
+    let mut design = Design {
+        filter_time,
+        filter_samples: fields.u8()?.into(),
+        ..Design::new(settings)
     };
-    if gains.long {
-        gains.design.observer_time = fields.f32()?;
-        gains.design.r_rate = fields.f32()?;
+    let (mut garbled, long) = (false, !fields.is_empty());
+    if long {
+        design.observer_time = fields.f32()?;
+        design.r_rate = fields.f32()?;
         match schedule(fields)? {
-            Ok(schedule) => gains.design.schedule = schedule,
-            Err(_) => gains.garbled = true,
+            Ok(schedule) => design.schedule = schedule,
+            Err(_) => garbled = true,
         }
     }
-    Some(Command::Gains(gains))
+    Some(Command::Gains(Gains {
+        design: design.into(),
+        garbled,
+        long,
+        counts_per_unit,
+    }))
 }
 
 fn standard(fields: &mut Fields<'_>) -> Option<Standard<f32>> {

@@ -1,11 +1,11 @@
 //! Terms of runs that go side by side, from sums that are taken as they run.
 
-use sewfast_control::Controller;
+use sewfast_control::{AnyController, Controller, PidController};
 
 use super::LoadStep;
 use super::cost::{Course, Measure, SMOOTHING, Terms};
 use crate::Monitor;
-use crate::closed_loop::batch::{BatchLoop, MOST, Sums, Tally};
+use crate::closed_loop::batch::{BatchLoop, InLanes, MOST, Sums, Tally};
 use crate::closed_loop::{KernelPlant, Outcome, Signals};
 use crate::encoder::Encoder;
 use crate::metrics::Edge;
@@ -31,18 +31,28 @@ pub(super) struct Beside {
 }
 
 impl Beside {
-    /// Whether controllers can be run side by side, and had better be.
-    pub fn take(controllers: &[&Controller<f64>]) -> bool {
-        let ts = controllers.first().map(|c| c.settings().ts);
-        let alike = |c: &&Controller<f64>| Some(c.settings().ts) == ts && BatchLoop::takes(c);
-        controllers.len() > 1 && controllers.iter().all(alike)
+    /// Whether controllers can be run side by side, and had better be: several of one kind.
+    pub fn take(controllers: &[&AnyController<f64>]) -> bool {
+        let ts = controllers.first().map(|c| c.ts());
+        let alike = controllers.iter().all(|c| Some(c.ts()) == ts);
+        controllers.len() > 1 && alike && pids(controllers).is_some()
     }
 
     /// The terms of each controller's run; `None` where it diverges or on a stop.
     pub fn terms(
         &mut self,
         runs: &Runs<'_>,
-        controllers: &[&Controller<f64>],
+        controllers: &[&AnyController<f64>],
+        monitor: &Monitor,
+    ) -> Vec<Option<Terms>> {
+        let pids = pids(controllers).unwrap_or_default();
+        self.of_kind(runs, &pids, monitor)
+    }
+
+    fn of_kind(
+        &mut self,
+        runs: &Runs<'_>,
+        controllers: &[&impl InLanes],
         monitor: &Monitor,
     ) -> Vec<Option<Terms>> {
         let some = controllers.chunks(MOST);
@@ -53,7 +63,7 @@ impl Beside {
     fn some(
         &mut self,
         runs: &Runs<'_>,
-        controllers: &[&Controller<f64>],
+        controllers: &[&impl InLanes],
         monitor: &Monitor,
     ) -> Vec<Option<Terms>> {
         let kept = match runs.measure.map(|m| m.course()) {
@@ -77,7 +87,7 @@ impl Beside {
         if monitor.stopped() {
             return vec![None; controllers.len()];
         }
-        let ts = controllers[0].settings().ts;
+        let ts = controllers[0].ts();
         let overshoots = self.overshoots(runs, ts, used);
         (0..controllers.len())
             .map(|i| {
@@ -123,6 +133,12 @@ impl Beside {
         };
         self.tallies[..used].iter().map(of).collect()
     }
+}
+
+/// The controllers where all of them are PIDs that run in lanes.
+fn pids<'a>(controllers: &[&'a AnyController<f64>]) -> Option<Vec<&'a PidController<f64>>> {
+    let pid = |c: &&'a AnyController<f64>| c.pid().filter(|pid| pid.fits());
+    controllers.iter().map(pid).collect()
 }
 
 /// The terms that sums tell, in the order of operations of [`Measure::of`].

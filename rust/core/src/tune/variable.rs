@@ -2,7 +2,7 @@
 
 use std::f64::consts::PI;
 
-use sewfast_control::{Biquad, Cascade, Design, Point, Schedule, Standard};
+use sewfast_control::{AnyDesign, Biquad, Cascade, Design, Point, Schedule, Standard};
 
 use crate::{Error, Result};
 
@@ -87,8 +87,15 @@ impl Parameter {
         }
     }
 
-    /// Its value in a design; NaN for a point that the schedule does not have, or a biquad that is no notch.
-    pub fn of(self, design: &Design<f64>) -> f64 {
+    /// Its value in a design; NaN where that has no such number.
+    pub fn of(self, design: &AnyDesign<f64>) -> f64 {
+        match design {
+            AnyDesign::Pid(design) => self.of_pid(design),
+        }
+    }
+
+    /// NaN for a point that the schedule does not have, or a biquad that is no notch.
+    fn of_pid(self, design: &Design<f64>) -> f64 {
         let point = |k: usize, gain: fn(&Standard<f64>) -> f64| {
             let points = design.schedule.points();
             points.get(k).map_or(f64::NAN, |point| gain(&point.gains))
@@ -167,8 +174,8 @@ impl Parameter {
 
     /// Wide multiples of the start and of the sample time. A negative alpha or beta weights the reference by more than
     /// 1: feedforward that a slow feedback leaves room for.
-    fn bounds(self, start: &Design<f64>) -> Option<(f64, f64)> {
-        let (ts, own) = (start.pid.ts, self.of(start));
+    fn bounds(self, start: &AnyDesign<f64>) -> Option<(f64, f64)> {
+        let (ts, own) = (start.ts(), self.of(start));
         match self {
             Self::Kp | Self::KpAt(_) => Some(ordered(own / 50.0, own * 50.0)),
             Self::Ti | Self::TiAt(_) => Some((4.0 * ts, 1e4 * ts)),
@@ -259,27 +266,11 @@ impl Variable {
     pub fn new(
         parameter: Parameter,
         bounds: Option<(f64, f64)>,
-        start: &Design<f64>,
+        start: &AnyDesign<f64>,
     ) -> Result<Self> {
         let name = parameter.name();
-        if parameter.section().is_some() && parameter.of(start).is_nan() {
-            return Err(Error::setting(format!(
-                "expected a variable of a controller whose biquad of that number is a notch, got {name} with {} biquads; they \
-                 count from 0",
-                start.biquads.sections().len()
-            )));
-        }
-        if parameter.of(start).is_nan() {
-            return Err(Error::setting(format!(
-                "expected a variable of a controller with {} points in its schedule, got {name}; points count from 0",
-                start.schedule.points().len()
-            )));
-        }
-        let gain = matches!(parameter, Parameter::Kp | Parameter::Ti | Parameter::Td);
-        if gain && !start.schedule.is_empty() {
-            return Err(Error::setting(format!(
-                "expected gains of the schedule's points, which the controller uses, got {name}; search {name}[0], {name}[1] .."
-            )));
+        match start {
+            AnyDesign::Pid(design) => check_pid(parameter, design)?,
         }
         let Some((low, high)) = bounds.or(parameter.bounds(start)) else {
             return Err(Error::setting(format!(
@@ -306,7 +297,7 @@ impl Variable {
     }
 
     /// Refuses a bound that no controller can have.
-    fn probe(parameter: Parameter, value: f64, start: &Design<f64>) -> Result<()> {
+    fn probe(parameter: Parameter, value: f64, start: &AnyDesign<f64>) -> Result<()> {
         let fixed = Self {
             parameter,
             low: value,
@@ -315,7 +306,7 @@ impl Variable {
             given: true,
         };
         designed(&[fixed], &[0.0], start)
-            .and_then(|design| Ok(sewfast_control::Controller::new(design)?))
+            .and_then(|design| Ok(design.controller()?))
             .map(drop)
     }
 
@@ -323,27 +314,10 @@ impl Variable {
     ///
     /// # Errors
     /// `ErrorKind::Setting` for a start without usual bounds.
-    pub fn usual(start: &Design<f64>) -> Result<Vec<Self>> {
-        let points = start.schedule.points().len();
-        let mut all = match points {
-            0 => vec![Parameter::Kp, Parameter::Ti, Parameter::Td],
-            _ => (0..points)
-                .flat_map(|k| [Parameter::KpAt(k), Parameter::TiAt(k), Parameter::TdAt(k)])
-                .collect(),
+    pub fn usual(start: &AnyDesign<f64>) -> Result<Vec<Self>> {
+        let all = match start {
+            AnyDesign::Pid(design) => usual_of_pid(design),
         };
-        all.extend([Parameter::Alpha, Parameter::Beta]);
-        if start.pid.n.is_finite() {
-            all.push(Parameter::N);
-        }
-        for (k, section) in start.biquads.sections().iter().enumerate() {
-            if Notch::of(section, start.pid.ts).is_some() {
-                all.extend([
-                    Parameter::NotchFrequency(k),
-                    Parameter::NotchDepth(k),
-                    Parameter::NotchWidth(k),
-                ]);
-            }
-        }
         all.into_iter()
             .map(|parameter| Self::new(parameter, None, start))
             .collect()
@@ -380,8 +354,58 @@ impl Variable {
     }
 }
 
+/// Refuses what a PID does not have, or does not use.
+fn check_pid(parameter: Parameter, start: &Design<f64>) -> Result<()> {
+    let (name, absent) = (parameter.name(), parameter.of_pid(start).is_nan());
+    if parameter.section().is_some() && absent {
+        return Err(Error::setting(format!(
+            "expected a variable of a controller whose biquad of that number is a notch, got {name} with {} biquads; they \
+             count from 0",
+            start.biquads.sections().len()
+        )));
+    }
+    if absent {
+        return Err(Error::setting(format!(
+            "expected a variable of a controller with {} points in its schedule, got {name}; points count from 0",
+            start.schedule.points().len()
+        )));
+    }
+    let gain = matches!(parameter, Parameter::Kp | Parameter::Ti | Parameter::Td);
+    if gain && !start.schedule.is_empty() {
+        return Err(Error::setting(format!(
+            "expected gains of the schedule's points, which the controller uses, got {name}; search {name}[0], {name}[1] .."
+        )));
+    }
+    Ok(())
+}
+
+/// Gains, alpha and beta, `N` where there is a derivative filter, notches.
+fn usual_of_pid(start: &Design<f64>) -> Vec<Parameter> {
+    let points = start.schedule.points().len();
+    let mut all = match points {
+        0 => vec![Parameter::Kp, Parameter::Ti, Parameter::Td],
+        _ => (0..points)
+            .flat_map(|k| [Parameter::KpAt(k), Parameter::TiAt(k), Parameter::TdAt(k)])
+            .collect(),
+    };
+    all.extend([Parameter::Alpha, Parameter::Beta]);
+    if start.pid.n.is_finite() {
+        all.push(Parameter::N);
+    }
+    for (k, section) in start.biquads.sections().iter().enumerate() {
+        if Notch::of(section, start.pid.ts).is_some() {
+            all.extend([
+                Parameter::NotchFrequency(k),
+                Parameter::NotchDepth(k),
+                Parameter::NotchWidth(k),
+            ]);
+        }
+    }
+    all
+}
+
 /// Where a design lies in the box.
-pub(super) fn place(variables: &[Variable], design: &Design<f64>) -> Vec<f64> {
+pub(super) fn place(variables: &[Variable], design: &AnyDesign<f64>) -> Vec<f64> {
     variables
         .iter()
         .map(|v| v.place(v.parameter.of(design)))
@@ -389,7 +413,7 @@ pub(super) fn place(variables: &[Variable], design: &Design<f64>) -> Vec<f64> {
 }
 
 /// A start moved to the bounds that were asked for, where it lies outside.
-pub(super) fn moved(variables: &[Variable], start: &Design<f64>) -> Result<Design<f64>> {
+pub(super) fn moved(variables: &[Variable], start: &AnyDesign<f64>) -> Result<AnyDesign<f64>> {
     let outside = |v: &&Variable| {
         let own = v.parameter.of(start);
         v.given && !(v.low <= own && own <= v.high)
@@ -402,8 +426,14 @@ pub(super) fn moved(variables: &[Variable], start: &Design<f64>) -> Result<Desig
 pub(super) fn designed(
     variables: &[Variable],
     point: &[f64],
-    start: &Design<f64>,
-) -> Result<Design<f64>> {
+    start: &AnyDesign<f64>,
+) -> Result<AnyDesign<f64>> {
+    match start {
+        AnyDesign::Pid(start) => Ok(designed_pid(variables, point, start)?.into()),
+    }
+}
+
+fn designed_pid(variables: &[Variable], point: &[f64], start: &Design<f64>) -> Result<Design<f64>> {
     let mut design = *start;
     let mut points = start.schedule.points().to_vec();
     // notches that are not searched keep their bits

@@ -3,7 +3,8 @@
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_control::{
-    Biquad, Cascade, Controller as Core, Design, Point, Refused, Row, Schedule, Settings, Standard,
+    AnyDesign, Biquad, Cascade, Design, PidController as Core, Point, Refused, Row, Schedule,
+    Settings, Standard,
 };
 use sewfast_core::Error;
 
@@ -19,6 +20,21 @@ pub struct Controller {
 #[pyclass(module = "sewfast._core")]
 pub struct SingleController {
     core: Core<f32>,
+}
+
+/// A controller of any kind, as Python gives it.
+#[derive(FromPyObject)]
+pub enum AnyGiven<'py> {
+    Pid(Bound<'py, Controller>),
+}
+
+impl AnyGiven<'_> {
+    /// What it is made from.
+    pub fn design(&self) -> AnyDesign<f64> {
+        match self {
+            Self::Pid(controller) => (*controller.borrow().core.design()).into(),
+        }
+    }
 }
 
 /// Speed, then Kp, Ti, Td in standard form.

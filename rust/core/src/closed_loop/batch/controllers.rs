@@ -1,15 +1,50 @@
 //! Controllers, one in each lane; or a single one.
 
-use sewfast_control::{Controller, Numbers};
+use sewfast_control::{Controller, Numbers, PidController};
 
 use crate::simd::{Choice, LANES};
+
+/// A kind of controller that runs in lanes.
+pub(crate) trait InLanes: Controller<f64> {
+    /// Eight of them, or a single one.
+    type Lanes<V: Choice>: LaneController<V>;
+
+    /// Whether this one can.
+    fn fits(&self) -> bool;
+
+    /// The first eight of `controllers`, at rest; missing ones are the first again.
+    fn in_lanes<V: Choice>(controllers: &[&Self]) -> Self::Lanes<V>;
+}
+
+/// What a loop asks of the controllers in its lanes: in two parts, between which other work can be done.
+pub(crate) trait LaneController<V> {
+    /// Takes measured outputs.
+    fn take(&mut self, first: bool, measured: V);
+    /// From the reference and what was taken to the commands.
+    fn decide(&mut self, first: bool, r: f64, feedforward: Option<f64>) -> V;
+    /// The feedback after its filter, at the last sample.
+    fn filtered(&self) -> V;
+}
+
+impl InLanes for PidController<f64> {
+    type Lanes<V: Choice> = Controllers<V>;
+
+    fn fits(&self) -> bool {
+        self.numbers().is_some()
+    }
+
+    #[inline(always)]
+    fn in_lanes<V: Choice>(controllers: &[&Self]) -> Controllers<V> {
+        Controllers::new(controllers)
+    }
+}
 
 /// A derivative term below this is nothing: in a loop at rest it would fade on for ever among numbers so small that processors
 /// take a hundred times as long over them.
 const FADED: f64 = 1e-280;
 
-/// Eight of [`Controller`] with constant gains: the same operations in the same order.
-pub(in crate::closed_loop) struct Controllers<V> {
+/// Eight of [`PidController`] with constant gains: the same operations in the same order.
+pub(crate) struct Controllers<V> {
     average: Averages<V>,
     lag: V,
     /// `1 - a`, `b`, and 1 where there is an observer; `None` where no lane has one.
@@ -45,16 +80,16 @@ pub(in crate::closed_loop) struct Controllers<V> {
 impl<V: Choice> Controllers<V> {
     /// The first eight of `controllers`, at rest; missing ones are the first again.
     #[inline(always)]
-    pub fn new(controllers: &[&Controller<f64>]) -> Self {
+    pub fn new(controllers: &[&PidController<f64>]) -> Self {
         let lane = |i: usize| *controllers.get(i).unwrap_or(&controllers[0]);
         let number = |i: usize| lane(i).numbers();
         let each = |of: &dyn Fn(Numbers<f64>) -> f64| {
             V::load(&std::array::from_fn(|i| number(i).map_or(f64::NAN, of)))
         };
-        let setting = |of: &dyn Fn(&Controller<f64>) -> f64| {
+        let setting = |of: &dyn Fn(&PidController<f64>) -> f64| {
             V::load(&std::array::from_fn::<_, LANES, _>(|i| of(lane(i))))
         };
-        let any = |of: &dyn Fn(&Controller<f64>) -> bool| (0..LANES).any(|i| of(lane(i)));
+        let any = |of: &dyn Fn(&PidController<f64>) -> bool| (0..LANES).any(|i| of(lane(i)));
         let observer = [
             each(&|n| n.observer.map_or(0.0, |(keep, _)| keep)),
             each(&|n| n.observer.map_or(0.0, |(_, gain)| gain)),
@@ -93,27 +128,27 @@ impl<V: Choice> Controllers<V> {
             filtered: zero,
         }
     }
+}
 
-    /// From reference and measured outputs to the commands.
+impl<V: Choice> LaneController<V> for Controllers<V> {
     #[inline(always)]
-    pub fn step(&mut self, first: bool, r: f64, measured: V, feedforward: Option<f64>) -> V {
-        self.take(first, measured);
-        self.decide(first, r, feedforward)
-    }
-
-    /// Takes measured outputs.
-    #[inline(always)]
-    pub fn take(&mut self, first: bool, measured: V) {
+    fn take(&mut self, first: bool, measured: V) {
         self.filtered = self.filter(first, measured);
     }
 
-    /// From the reference and what was taken to the commands.
     #[inline(always)]
-    pub fn decide(&mut self, first: bool, r: f64, feedforward: Option<f64>) -> V {
+    fn decide(&mut self, first: bool, r: f64, feedforward: Option<f64>) -> V {
         let r = self.reference(first, r);
         self.control(r, self.filtered, feedforward)
     }
 
+    #[inline(always)]
+    fn filtered(&self) -> V {
+        self.filtered
+    }
+}
+
+impl<V: Choice> Controllers<V> {
     #[inline(always)]
     fn filter(&mut self, first: bool, x: V) -> V {
         let x = self.average.step(first, x);

@@ -1,7 +1,7 @@
 //! Loops in lanes against loops that run alone.
 
 use proptest::prelude::*;
-use sewfast_control::{Design, Settings, Standard};
+use sewfast_control::{AnyController, Design, PidController, Settings, Standard};
 
 use super::*;
 use crate::closed_loop::kernel_plant::{AnyOrder, ScalarPlant, SecondOrder};
@@ -77,7 +77,7 @@ fn references(seed: u64, samples: usize) -> Vec<f64> {
 /// A kernel that runs lanes, and each controller alone, on one level.
 struct Both<'a> {
     known: KernelPlant<'a>,
-    controllers: &'a [&'a Controller<f64>],
+    controllers: &'a [&'a PidController<f64>],
     signals: Signals<'a>,
     encoder: Option<&'a Encoder>,
 }
@@ -103,8 +103,8 @@ impl Kernel for Both<'_> {
         for (tally, group) in tallies.iter_mut().zip(groups) {
             tally.begin(group, 0);
         }
-        Grouped::<_, 0>(lanes(), &mut tallies).run::<V>();
-        let outcomes = Grouped::<_, 0>(lanes(), &mut records).run::<V>();
+        Grouped::<_, _, 0>(lanes(), &mut tallies).run::<V>();
+        let outcomes = Grouped::<_, _, 0>(lanes(), &mut records).run::<V>();
         let together = (0..self.controllers.len()).map(|i| {
             let end = ended(outcomes[i], self.signals.reference.len());
             let of = |record: &Vec<Lanes>| record[..end].iter().map(|g| g.0[i % LANES]).collect();
@@ -113,7 +113,10 @@ impl Kernel for Both<'_> {
         let alone = self.controllers.iter().map(|controller| {
             let mut constant = Constant::new(controller);
             let any = || ScalarPlant::<V, AnyOrder>::new(self.known);
-            let run = self.alone(any(), &mut Controller::clone(controller));
+            let run = self.alone(
+                any(),
+                &mut AnyController::from(PidController::clone(controller)),
+            );
             assert_eq!(run, self.alone(any(), &mut constant));
             if SecondOrder::takes(&self.known) {
                 let plant = ScalarPlant::<V, SecondOrder>::new(self.known);
@@ -158,7 +161,7 @@ fn check(
 ) -> Vec<(Level, Vec<Recorded>)> {
     let controllers: Vec<_> = designs
         .iter()
-        .map(|d| Controller::new(*d).unwrap())
+        .map(|d| PidController::new(*d).unwrap())
         .collect();
     let controllers: Vec<_> = controllers.iter().collect();
     let all = run_everywhere(|| Both {
@@ -271,7 +274,7 @@ fn all_lanes_end_on_a_stop() {
         ti: 0.1,
         td: 0.0,
     };
-    let controller = Controller::new(Design::new(Settings::new(gains, TS))).unwrap();
+    let controller = PidController::new(Design::new(Settings::new(gains, TS))).unwrap();
     let monitor = Monitor::default();
     monitor.request_stop();
     let lanes = BatchLoop {

@@ -3,7 +3,7 @@
 use super::rig::*;
 use crate::biquad::tests::{any_section, section};
 use crate::link::{Fields, Reason, State};
-use crate::{Biquad, Cascade, Controller, Design, Point, Schedule, Settings, Standard};
+use crate::{Biquad, Cascade, Design, PidController, Point, Schedule, Settings, Standard};
 use proptest::prelude::*;
 use std::vec;
 use std::vec::Vec;
@@ -96,7 +96,7 @@ proptest! {
             pid: settings, filter_samples: filter.into(), filter_time: 0.002, observer_time, r_rate,
             schedule: Schedule::new(&points).unwrap(), biquads: Cascade::new(&sections).unwrap(),
         };
-        let mut controller = Controller::<f32>::new(design).unwrap();
+        let mut controller = PidController::<f32>::new(design).unwrap();
         let mut expected = Vec::new();
         for (&reference, &count) in references.iter().zip(&moves) {
             rig.counts += count;
