@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from .commissioning import Commissioning, bode, commission
     from .comparison import Comparison, compare
     from .control.biquad import Biquad
-    from .control.controller import Controller, load_controller, paper_controller
+    from .control.controller import Controller, paper_controller
+    from .control.files import load_controller
     from .control.loop import ClosedLoopRun, run
     from .control.machine import Machine, record
     from .control.margins import Margins, margins, operating_point

@@ -378,7 +378,7 @@ def _identified(job: _Job, settings: Mapping[str, Any], controller: Controller |
     if controller is not None:
         from .tuning import tune
 
-        tuned = tune(model, start=controller, seed=settings["seed"], threads=1).controller
+        tuned = tune(model, start=controller, seed=settings["seed"], threads=1).pid
         standard = tuned.gains.to("standard")
         gains = {"Kp": standard.Kp, "Ti": standard.Ti, "Td": standard.Td}
     return Row(

@@ -10,7 +10,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 
 from .arrays import REVOLUTIONS_PER_SECOND
-from .control.controller import Controller
+from .control.controller import SampledController
 from .control.defaults import default_references
 from .control.loop import (
     ClosedLoopRun,
@@ -71,7 +71,7 @@ def disagreements(runs: Sequence[ClosedLoopRun]) -> tuple[Disagreement, ...]:
     runs : sequence of ClosedLoopRun
         Those that stand alone are not compared.
     """
-    groups: dict[tuple[Controller, str, bytes], list[ClosedLoopRun]] = {}
+    groups: dict[tuple[SampledController, str, bytes], list[ClosedLoopRun]] = {}
     for run in runs:
         groups.setdefault((run.controller, run.reference, run.r.tobytes()), []).append(run)
     return tuple(_of(group) for group in groups.values() if len(group) > 1)
@@ -447,10 +447,10 @@ class HasController(Protocol):
     """What came with a controller, as from `tune` or `commission`."""
 
     @property
-    def controller(self) -> Controller | None: ...
+    def controller(self) -> SampledController | None: ...
 
 
-Judgeable: TypeAlias = ClosedLoopRun | Sequence[ClosedLoopRun] | Controller | HasController
+Judgeable: TypeAlias = ClosedLoopRun | Sequence[ClosedLoopRun] | SampledController | HasController
 
 REFERENCES = ("trapezoid", "random")
 
@@ -539,7 +539,7 @@ def _runs(
     if isinstance(what, ClosedLoopRun):
         return [(what, None)]
     controller = getattr(what, "controller", what)
-    if isinstance(controller, Controller):
+    if isinstance(controller, SampledController):
         if not plants:
             raise SettingError(
                 "expected plants to run the controller on, got none; give judge(controller, models)"

@@ -154,10 +154,10 @@ def add_analyse(commands: Commands) -> None:
 
 def analyse_command(args: argparse.Namespace) -> None:
     from ..analysis import analyse
-    from ..control.controller import load_controller
+    from ..control.files import load_pid
 
     require_plot(args.plot)
-    controller = load_controller(args.controller)
+    controller = load_pid(args.controller)
     references = [
         reference_of(text, controller.Ts, controller.gains.y_unit) for text in args.reference or ()
     ]

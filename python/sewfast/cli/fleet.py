@@ -63,10 +63,10 @@ def add(commands: Commands) -> None:
 
 
 def fleet_command(args: argparse.Namespace) -> None:
-    from ..control.controller import load_controller
+    from ..control.files import load_pid
     from ..fleets import fleet
 
-    controller = None if args.controller is None else load_controller(args.controller)
+    controller = None if args.controller is None else load_pid(args.controller)
     with Progress("fleet") as progress:
         found = fleet(
             args.recordings,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import signals
-from ..control.controller import Controller
+from ..control.controller import Controller, SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import Machine, RecordedRun
 from ..dataset import FloatArray
@@ -205,7 +205,7 @@ def commission(
             journal.heed()
             return None if taken is None else taken.found(journal.stage, name, key)
 
-        def kept_run(name: str, key: str, controller: Controller) -> RecordedRun | None:
+        def kept_run(name: str, key: str, controller: SampledController) -> RecordedRun | None:
             journal.heed()
             if taken is None:
                 return None
@@ -426,19 +426,17 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
 
     alike = agreeing(first, trained.ensemble, practice)
     required, tuning = of(alike)
-    ensemble = agreeing(tuning.controller, alike, practice)
+    ensemble = agreeing(tuning.pid, alike, practice)
     if ensemble is not alike:
         # one that parts from the others has had its say in these gains
         required, tuning = of(ensemble)
     journal.keep(models=ensemble, rmse=trained.errors_of(ensemble))
     plants = "a linear model" if is_alone else "an ensemble of networks"
-    tuned = plan.thinning.fine(tuning.controller)
+    tuned = plan.thinning.fine(tuning.pid)
     controller = replace(tuned, notes=f"commissioned on {plants}")
     if tuning.warning is not None:
         journal.say(tuning.warning)
-    journal.keep(
-        tuning=tuning, controller=controller, met=required.met(tuning.controller, ensemble)
-    )
+    journal.keep(tuning=tuning, controller=controller, met=required.met(tuning.pid, ensemble))
     return ensemble, controller
 
 

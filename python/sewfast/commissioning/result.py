@@ -19,7 +19,7 @@ import numpy as np
 
 from .. import __version__, storage
 from ..analysis.analysis import NUMBERS as ANALYSIS
-from ..control.controller import Controller
+from ..control.controller import Controller, SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import RecordedRun
 from ..errors import DataError, SettingError
@@ -545,7 +545,7 @@ class Taken:
         )  # fmt: skip
 
     def found_run(
-        self, stage: str, name: str, key: str, controller: Controller, plant: str
+        self, stage: str, name: str, key: str, controller: SampledController, plant: str
     ) -> RecordedRun | None:
         """The same of a closed loop."""
         file, recording = self._found(stage, name, key), self.found(stage, name, key)

@@ -19,8 +19,8 @@ from ..errors import DataError, FitError, SettingError
 from ..gains import Gains, vector
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
-from .controller import Controller
-from .defaults import default_references, drive_references, pace_of
+from .controller import Controller, SampledController, pid_of
+from .defaults import default_references, drive_references
 
 if TYPE_CHECKING:
     from ..live import Kind
@@ -54,7 +54,7 @@ class ClosedLoopRun:
     u: FloatArray
     y: FloatArray
     feedback: FloatArray
-    controller: Controller
+    controller: SampledController
     plant: str
     reference: str
 
@@ -66,7 +66,7 @@ class ClosedLoopRun:
     @property
     def units(self) -> dict[str, str]:
         """The unit of each column by name."""
-        u, y = self.controller.gains.u_unit, self.controller.gains.y_unit
+        u, y = self.controller.u_unit, self.controller.y_unit
         return {"t": "s", "r": y, "u": u, "y": y, "feedback": y}
 
     def columns(self) -> dict[str, FloatArray]:
@@ -202,7 +202,7 @@ def run_html(found: HasMetrics, caption: str) -> str:
 
 
 def run(
-    controller: Controller,
+    controller: SampledController,
     on: Plant | Machine,
     reference: str | ArrayLike | None = None,
     *,
@@ -269,7 +269,7 @@ def run(
     Interrupted
         On Ctrl-C or `cancel`, of a drive; the motor is stopped, `best` is the run up to there.
     """
-    require_controller(controller, on, "run(controller, plant, reference)")
+    require_controller(controller, on, "run(controller, plant, reference)", SampledController)
     if reference is None:
         reference, name = _usual_reference(on, controller), name or "trapezoid"
     r = reference_samples(reference, controller, seed, plant=on)
@@ -298,7 +298,7 @@ def run(
     )
 
 
-def _usual_reference(on: Any, controller: Controller) -> str | FloatArray:
+def _usual_reference(on: Any, controller: SampledController) -> str | FloatArray:
     """A trapezoid for a plant whose range is known; a motor does not move without being asked."""
     if not isinstance(on, (Model, VirtualMachine)):
         raise SettingError(
@@ -326,16 +326,20 @@ def _beside(
     return signals
 
 
-def require_controller(controller: Any, plant: Any, call: str) -> None:
-    """Refuse what is no controller, such as the plant in its place.
+def require_controller(
+    controller: Any, plant: Any, call: str, kind: type[SampledController] = Controller
+) -> None:
+    """Refuse what is no controller, such as the plant in its place, or one of another kind.
 
     Raises
     ------
     SettingError
     """
-    if isinstance(controller, Controller):
+    if isinstance(controller, kind):
         return
-    swapped = isinstance(plant, Controller)
+    if isinstance(controller, SampledController):
+        pid_of(controller, call)
+    swapped = isinstance(plant, SampledController)
     raise SettingError(
         f"expected a Controller, got {type(controller).__name__}"
         + (" and the Controller in another place" if swapped else "")
@@ -344,7 +348,7 @@ def require_controller(controller: Any, plant: Any, call: str) -> None:
 
 
 def _on_machine(
-    controller: Controller,
+    controller: SampledController,
     on: Machine,
     r: FloatArray,
     name: str,
@@ -364,7 +368,7 @@ def _on_machine(
 
 
 def reference_samples(
-    reference: str | ArrayLike, controller: Controller, seed: int = 0, *, plant: Any = None
+    reference: str | ArrayLike, controller: SampledController, seed: int = 0, *, plant: Any = None
 ) -> FloatArray:
     """The samples of a reference given by name or as they are, shape (N,), never the caller's own.
 
@@ -382,12 +386,12 @@ def reference_samples(
     if not isinstance(reference, str):
         return vector("reference", reference).copy()
     samples = signals.reference(reference, seed)
-    unit, Ts = controller.gains.y_unit, controller.Ts
+    unit, Ts = controller.y_unit, controller.Ts
     if unit.lower() == "rpm" and math.isclose(Ts, signals.TS, rel_tol=1e-9):
         return samples
     if isinstance(plant, Model):
         made = drive_references(
-            plant, controller.u_min, controller.u_max, pace=pace_of(controller), seed=seed
+            plant, controller.u_min, controller.u_max, pace=controller.pace, seed=seed
         )
         return made[reference.replace("-", "_").lower()]
     raise SettingError(
@@ -397,7 +401,7 @@ def reference_samples(
     )
 
 
-def check_fits(controller: Controller, plant: Any) -> None:
+def check_fits(controller: SampledController, plant: Any) -> None:
     """Refuse a plant whose sample time or units are not the controller's.
 
     Raises
@@ -415,10 +419,10 @@ def check_fits(controller: Controller, plant: Any) -> None:
             f"expected plant and controller at one sample time, got {plant.Ts} s and "
             f"{controller.Ts} s; tune a controller for this plant"
         )
-    require_units(controller.gains, plant_units(plant))
+    require_units(controller, plant_units(plant))
 
 
-def require_units(gains: Gains, units: tuple[str, str]) -> None:
+def require_units(gains: Gains | SampledController, units: tuple[str, str]) -> None:
     """Refuse gains in other units than those of a plant's input and output; empty is unknown.
 
     Raises
@@ -527,7 +531,7 @@ def each_reference(references: Any, default: Sequence[str]) -> list[Any]:
 
 
 def trial(
-    controller: Controller, plant: Plant, reference: Any, title: str, seed: int = 0
+    controller: SampledController, plant: Plant, reference: Any, title: str, seed: int = 0
 ) -> ClosedLoopRun:
     """A run under the plant's title.
 

@@ -37,6 +37,7 @@ class Kind(IntEnum):
     START = 0x0A
     ECHO = 0x0B
     BIQUADS = 0x0C
+    CONTROLLER = 0x0D
     KEEP = 0x20
     DRIVE = 0x21
     CREDIT = 0x22
@@ -53,7 +54,7 @@ REASONS = (
 EVENTS = ("", "boot", "armed", "started", "finished", "stopped", "tripped", "cleared")
 MODES = {"commands": 0, "controller": 1, "direct": 2}
 
-PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED, DESIGN, BIQUADS = (1 << b for b in range(8))
+PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED, DESIGN, BIQUADS, KINDS = (1 << b for b in range(9))
 """Capabilities of a device."""
 
 
@@ -347,7 +348,7 @@ def _shown(name: str) -> str:
 
 hello, arm, keep, drive = LinkBodies.hello, LinkBodies.arm, LinkBodies.keep, LinkBodies.drive
 set_limits, upload, gains = LinkBodies.limits, LinkBodies.upload, LinkBodies.gains
-biquads, start = LinkBodies.biquads, LinkBodies.start
+biquads, controller, start = LinkBodies.biquads, LinkBodies.controller, LinkBodies.start
 
 
 def credit(us: int, until: int) -> bytes:
@@ -380,6 +381,7 @@ _FIELDS: dict[int, tuple[str, ...]] = {
         "counts per unit", "filter_samples", "observer_time", "r_rate", "schedule",
     ),
     Kind.BIQUADS: ("the number of biquads",),
+    Kind.CONTROLLER: ("kind", "counts per unit"),
     Kind.START: ("mode", "watchdog", "at", "length", "mask", "batch"),
 }  # fmt: skip
 

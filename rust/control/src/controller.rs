@@ -75,8 +75,29 @@ impl<T: Real> AnyDesign<T> {
         }
     }
 
+    /// A controller of the kind that a device is sent by this number, from the numbers that `next` gives one after the other,
+    /// without its sample time; `None` where they end too early, or for a number that is no kind's. The PID, which has commands of
+    /// its own, has none.
+    pub(crate) fn from_numbers(_kind: u8, _next: impl FnMut() -> Option<T>) -> Option<Self> {
+        None
+    }
+
+    /// The place of a setting among those numbers.
+    pub(crate) fn place_of(&self, _name: &str) -> Option<u32> {
+        match self {
+            Self::Pid(_) => None,
+        }
+    }
+
     /// The settings of the PID that it is; `None` where it is another kind.
     pub fn pid(&self) -> Option<&Design<T>> {
+        match self {
+            Self::Pid(design) => Some(design),
+        }
+    }
+
+    /// The settings of the PID that it is, to be changed.
+    pub(crate) fn pid_mut(&mut self) -> Option<&mut Design<T>> {
         match self {
             Self::Pid(design) => Some(design),
         }

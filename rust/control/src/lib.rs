@@ -21,7 +21,7 @@ pub mod schedule;
 pub mod tracker;
 
 pub use biquad::{BIQUADS, Biquad, Cascade};
-pub use controller::{AnyController, AnyDesign, Controller};
+pub use controller::*;
 pub use design::Design;
 pub use filter::{CAPACITY, Feedback};
 pub use gains::{Parallel, PerSample, Standard};

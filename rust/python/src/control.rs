@@ -14,17 +14,15 @@ use sewfast_core::{Error, Result};
 
 use crate::arrays::{array1, raise, slice};
 use crate::watch::watched_over;
-pub use controller::{AnyGiven, Controller, SingleController};
+pub use controller::{AnyGiven, Controller};
 use plant::Model;
 
 type Values<'py> = PyReadonlyArray1<'py, f64>;
 type Triple = (f64, f64, f64);
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_class::<Controller>()?;
-    module.add_class::<SingleController>()?;
+    controller::register(module)?;
     module.add_function(wrap_pyfunction!(convert_gains, module)?)?;
-    module.add_function(wrap_pyfunction!(controller::biquad, module)?)?;
     module.add_function(wrap_pyfunction!(closed_loop, module)?)?;
     module.add_function(wrap_pyfunction!(step_metrics, module)?)?;
     module.add_function(wrap_pyfunction!(effort, module)?)?;

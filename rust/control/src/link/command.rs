@@ -103,15 +103,25 @@ impl Gains {
 
     /// Biquads from the next start on; GAINS come without any.
     pub(super) fn set_biquads(&mut self, biquads: Cascade<f32>) {
-        match &mut self.design {
-            AnyDesign::Pid(design) => design.biquads = biquads,
+        if let Some(design) = self.design.pid_mut() {
+            design.biquads = biquads;
         }
+    }
+
+    /// The settings are a PID's, which every device knows that has mode 1.
+    pub(super) fn are_pid(&self) -> bool {
+        self.design.pid().is_some()
     }
 
     /// # Errors
     /// The field that is outside its range, or beyond the volt limit.
     pub(super) fn check(&self, volt: f32, ts: f32) -> Result<(), Refusal> {
-        let refused = |volt| self.refused(volt, ts).map(|refused| index_of(refused.name));
+        let refused = |volt| {
+            let name = self.refused(volt, ts)?.name;
+            // the numbers of another kind follow its number and the counts per unit
+            let place = self.design.place_of(name).map(|place| place + 2);
+            Some(place.unwrap_or_else(|| index_of(name)))
+        };
         Refusal::value(SCHEDULE).unless(!self.garbled)?;
         if let Some(field) = refused(f32::INFINITY) {
             return Err(Refusal::value(field));
@@ -119,7 +129,7 @@ impl Gains {
         let unit = self.counts_per_unit * ts;
         // a feedback that is not finite would leave the controller blind
         let holds = unit > 0.0 && unit.is_finite() && (MOST_COUNTS / unit).is_finite();
-        Refusal::value(11).unless(holds)?;
+        Refusal::value(if self.are_pid() { 11 } else { 1 }).unless(holds)?;
         refused(volt).map_or(Ok(()), |field| Err(Refusal::limit(field)))
     }
 
@@ -210,6 +220,7 @@ impl<'a> Command<'a> {
             0x0A => start(&mut fields),
             0x0B => Some(Self::Echo(fields.rest())).filter(|_| body.len() <= MAX_ECHO),
             0x0C => biquads(&mut fields).map(Self::Biquads),
+            0x0D => controller(&mut fields)?,
             _ => return Err(Refusal::unknown(kind)),
         };
         let whole = command.filter(|_| fields.is_empty());
@@ -296,6 +307,25 @@ fn standard(fields: &mut Fields<'_>) -> Option<Standard<f32>> {
         ti: fields.f32()?,
         td: fields.f32()?,
     })
+}
+
+/// A controller of another kind takes the place of the PID's gains.
+fn controller<'a>(fields: &mut Fields<'a>) -> Result<Option<Command<'a>>, Refusal> {
+    let (Some(kind), Some(counts_per_unit)) = (fields.u8(), fields.f32()) else {
+        return Ok(None);
+    };
+    let whole = fields.len();
+    let design = AnyDesign::from_numbers(kind, || fields.f32());
+    // no kind of this number: nothing of it was read
+    Refusal::value(0).unless(design.is_some() || whole == 0 || fields.len() < whole)?;
+    Ok(design.map(|design| {
+        Command::Gains(Gains {
+            design,
+            garbled: false,
+            long: false,
+            counts_per_unit,
+        })
+    }))
 }
 
 /// `None` where the body is too short for its points.

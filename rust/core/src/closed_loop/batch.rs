@@ -40,7 +40,7 @@ use crate::encoder::Encoder;
 use crate::neural::{Meanwhile, Nothing};
 use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
 pub(super) use controllers::Controllers;
-pub(crate) use controllers::{InLanes, LaneController};
+pub(crate) use controllers::{InLanes, LaneController, WithKind, are_of_a_kind, of_a_kind};
 
 /// Loops that run side by side at most: four groups, of which one computes while others wait for their results.
 pub(crate) const MOST: usize = 4 * LANES;

@@ -1,11 +1,13 @@
 //! Terms of runs that go side by side, from sums that are taken as they run.
 
-use sewfast_control::{AnyController, Controller, PidController};
+use sewfast_control::{AnyController, Controller};
 
 use super::LoadStep;
 use super::cost::{Course, Measure, SMOOTHING, Terms};
 use crate::Monitor;
-use crate::closed_loop::batch::{BatchLoop, InLanes, MOST, Sums, Tally};
+use crate::closed_loop::batch::{
+    BatchLoop, InLanes, MOST, Sums, Tally, WithKind, are_of_a_kind, of_a_kind,
+};
 use crate::closed_loop::{KernelPlant, Outcome, Signals};
 use crate::encoder::Encoder;
 use crate::metrics::Edge;
@@ -35,7 +37,7 @@ impl Beside {
     pub fn take(controllers: &[&AnyController<f64>]) -> bool {
         let ts = controllers.first().map(|c| c.ts());
         let alike = controllers.iter().all(|c| Some(c.ts()) == ts);
-        controllers.len() > 1 && alike && pids(controllers).is_some()
+        controllers.len() > 1 && alike && are_of_a_kind(controllers)
     }
 
     /// The terms of each controller's run; `None` where it diverges or on a stop.
@@ -45,19 +47,7 @@ impl Beside {
         controllers: &[&AnyController<f64>],
         monitor: &Monitor,
     ) -> Vec<Option<Terms>> {
-        let pids = pids(controllers).unwrap_or_default();
-        self.of_kind(runs, &pids, monitor)
-    }
-
-    fn of_kind(
-        &mut self,
-        runs: &Runs<'_>,
-        controllers: &[&impl InLanes],
-        monitor: &Monitor,
-    ) -> Vec<Option<Terms>> {
-        let some = controllers.chunks(MOST);
-        some.flat_map(|some| self.some(runs, some, monitor))
-            .collect()
+        of_a_kind(controllers, OfKind(self, runs, monitor)).unwrap_or_default()
     }
 
     fn some(
@@ -135,10 +125,18 @@ impl Beside {
     }
 }
 
-/// The controllers where all of them are PIDs that run in lanes.
-fn pids<'a>(controllers: &[&'a AnyController<f64>]) -> Option<Vec<&'a PidController<f64>>> {
-    let pid = |c: &&'a AnyController<f64>| c.pid().filter(|pid| pid.fits());
-    controllers.iter().map(pid).collect()
+/// Judges controllers of whatever kind it is given.
+struct OfKind<'a, 'b>(&'a mut Beside, &'a Runs<'b>, &'a Monitor);
+
+impl WithKind for OfKind<'_, '_> {
+    type Output = Vec<Option<Terms>>;
+
+    fn with<C: InLanes>(self, controllers: &[&C]) -> Self::Output {
+        let Self(beside, runs, monitor) = self;
+        let some = controllers.chunks(MOST);
+        some.flat_map(|some| beside.some(runs, some, monitor))
+            .collect()
+    }
 }
 
 /// The terms that sums tell, in the order of operations of [`Measure::of`].

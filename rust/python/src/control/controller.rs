@@ -10,6 +10,12 @@ use sewfast_core::Error;
 
 use crate::arrays::raise;
 
+pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<Controller>()?;
+    module.add_class::<SingleController>()?;
+    module.add_function(wrap_pyfunction!(biquad, module)?)
+}
+
 /// The controller's arithmetic (paper Fig. 16). Gains in standard form.
 #[pyclass(module = "sewfast._core")]
 pub struct Controller {

@@ -1,6 +1,6 @@
 //! Controllers, one in each lane; or a single one.
 
-use sewfast_control::{Controller, Numbers, PidController};
+use sewfast_control::{AnyController, Controller, Numbers, PidController};
 
 use crate::simd::{Choice, LANES};
 
@@ -24,6 +24,45 @@ pub(crate) trait LaneController<V> {
     fn decide(&mut self, first: bool, r: f64, feedforward: Option<f64>) -> V;
     /// The feedback after its filter, at the last sample.
     fn filtered(&self) -> V;
+}
+
+/// Work on controllers of one kind, whichever it is.
+pub(crate) trait WithKind {
+    /// What comes out.
+    type Output;
+
+    /// Does it.
+    fn with<C: InLanes>(self, controllers: &[&C]) -> Self::Output;
+}
+
+/// Does `work` with controllers that are all of one kind and fit in lanes; `None` for others.
+pub(crate) fn of_a_kind<W: WithKind>(
+    controllers: &[&AnyController<f64>],
+    work: W,
+) -> Option<W::Output> {
+    match controllers.first()? {
+        AnyController::Pid(_) => all(controllers, AnyController::pid).map(|all| work.with(&all)),
+    }
+}
+
+/// Whether controllers are all of one kind and fit in lanes.
+pub(crate) fn are_of_a_kind(controllers: &[&AnyController<f64>]) -> bool {
+    struct Nothing;
+    impl WithKind for Nothing {
+        type Output = ();
+
+        fn with<C: InLanes>(self, _controllers: &[&C]) {}
+    }
+    of_a_kind(controllers, Nothing).is_some()
+}
+
+/// The controllers within, where each has one that fits in lanes.
+fn all<'a, C: InLanes>(
+    controllers: &[&'a AnyController<f64>],
+    within: impl Fn(&'a AnyController<f64>) -> Option<&'a C>,
+) -> Option<Vec<&'a C>> {
+    let fitting = |c: &&'a AnyController<f64>| within(c).filter(|c| c.fits());
+    controllers.iter().map(fitting).collect()
 }
 
 impl InLanes for PidController<f64> {
