@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 import sewfast
-from sewfast.plotting import Drawing, Trace, draw, loop_panels
+from sewfast.plotting import Drawing, Trace, draw, loop_drawing, loop_panels
 from sewfast.readers import read_table
 from sewfast.report.artefacts import run_file
 
@@ -22,6 +22,7 @@ ASSETS = Path(__file__).parent / "assets"
 PICTURE = ASSETS / "closed_loop.svg"
 GALLERY = ASSETS / "gallery"
 BODE = ASSETS / "bode" / "compliant.png"
+STATES = ASSETS / "state_feedback.png"
 LARGEST = 150_000
 """Bytes of a picture: a page has to load it."""
 COLOURS = 64
@@ -97,6 +98,25 @@ def bode(file: Path) -> None:
     response.plot(fit=sewfast.fit_shaft(response), file=file)
 
 
+def state_feedback(file: Path) -> None:
+    """A tuned PID and tuned state feedback on the virtual machine, for tuning.md."""
+    machine = sewfast.VirtualMachine()
+    data = sewfast.record(machine, sewfast.signals.excitation("multisine")).dataset()
+    model = sewfast.identify(data, model="oe")
+    loops = []
+    for kind, look, label in (
+        ("state_feedback", "measured", "state feedback"),
+        ("pid", "model", "PID"),
+    ):
+        found = sewfast.tune(
+            model, "trapezoid", controller=kind, u_min=-20.0, u_max=20.0,
+            counts_per_rev=machine.counts_per_rev, evaluations=600,
+        )  # fmt: skip
+        run = sewfast.run(found.controller, machine, "trapezoid")
+        loops.append(Trace.of(run.columns(), look, label))
+    loop_drawing(loops, "RPM", "V", (-20.0, 20.0)).plot(file=file)
+
+
 def main() -> None:
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo")
     loops = traces(folder)
@@ -108,7 +128,7 @@ def main() -> None:
     GALLERY.mkdir(exist_ok=True)
     BODE.parent.mkdir(exist_ok=True)
     drawn = {GALLERY / f"{name}.png": plot for name, plot in gallery(folder).items()}
-    drawn[BODE] = bode
+    drawn[BODE], drawn[STATES] = bode, state_feedback
     for path, plot in drawn.items():
         plot(file=path)
         Image.open(path).convert("RGB").quantize(COLOURS).save(path, optimize=True)

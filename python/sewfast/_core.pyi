@@ -562,7 +562,42 @@ class Controller:
         """What the step computes with: gains per sample, filters, limits; ``rows`` of the schedule have speed, Kp,
         Kp Ts/Ti, Td and one over the distance to the next."""
 
-_Controller: TypeAlias = Controller
+class SingleStateFeedback:
+    """State feedback in single precision."""
+
+    def step(self, r: float, y: float, feedforward: float = 0.0) -> float: ...
+    def reset(self) -> None: ...
+    @property
+    def filtered(self) -> float: ...
+    @property
+    def numbers(self) -> dict[str, Any]: ...
+
+class StateFeedback:
+    """State feedback with an observer, one sample at a time; its gains follow from the weights."""
+
+    def __new__(
+        cls, *, num: Sequence[float], den: Sequence[float], rho: float, integral: float, noise: float, weight: float,
+        lead: float, r_rate: float, u_min: float, u_max: float, slew: float, Ts: float,
+    ) -> StateFeedback:
+        """``num`` and ``den`` have four numbers each, without the leading 0 and 1."""
+
+    def step(self, r: float, y: float, feedforward: float = 0.0) -> float: ...
+    def reset(self) -> None: ...
+    @property
+    def filtered(self) -> float:
+        """The output as observed, at the last step."""
+
+    def single(self) -> SingleStateFeedback:
+        """The same gains, rounded to single precision; at rest."""
+
+    def sent(self) -> list[float]:
+        """The numbers that a device is sent."""
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What the step computes with: num, den, K, L, rest (the states at an output of 1), Kr, Ki, lead."""
+
+_Controller: TypeAlias = Controller | StateFeedback
 
 _Plant: TypeAlias = Machine | LinearModel | NeuralOE | NeuralSS
 

@@ -34,7 +34,7 @@ FORMS = ("standard", "parallel", "per_sample")
 FIGURES = (".png", ".svg", ".pdf")
 
 TUNE = """\
-Tune a 2-DOF PID, or a controller of another kind (--controller), on identified models, by
+Tune a 2-DOF PID, or state feedback with an observer (--controller), on identified models, by
 simulating the loop with the encoder, the feedback filter and the command's limits in it. The
 models alone are used; no machine is touched. Several models are plants that one controller has to
 serve; of an ensemble every member is one.
@@ -66,6 +66,7 @@ examples:
   sewfast tune drive.json --load 1500:-2 --constraint recovery=70 -o firm.json
   sewfast tune one.json two.json --aggregate worst --variables Kp,Ti,alpha -o controller.json
   sewfast tune drive.json -o controller.json --plot tuned.png
+  sewfast tune drive.json --controller state-feedback -o states.json
   sewfast tune network.json --rival linear.json -o controller.json
   sewfast tune shaft.json --notch 75 --constraint Ms=1.7 --response response.json -o controller.json
   sewfast tune drive.json --pareto tracking,chatter --front front.png -o controller.json
@@ -104,7 +105,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--controller", default="pid", metavar="KIND",
-        help="kind of the controller where there is no --start (pid)",
+        help="kind of the controller where there is no --start, as state-feedback (pid)",
     )  # fmt: skip
     parser.add_argument(
         "--start", metavar="CONTROLLER.json",
@@ -134,7 +135,8 @@ def add(commands: Commands) -> None:
 def _add_search(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--variables", metavar="NAME[=LOW:HIGH],..",
-        help="what to search (Kp,Ti,Td,alpha,beta,N); also Tt, filter_samples, filter_time, observer_time, r_rate, notches",
+        help="what to search (Kp,Ti,Td,alpha,beta,N; of state feedback rho,integral,noise,weight,"
+        "lead); also Tt, filter_samples, filter_time, observer_time, r_rate, notches",
     )  # fmt: skip
     parser.add_argument(
         "--cost", action="append", metavar="NAME=WEIGHT", help="weight of a term; may repeat"

@@ -8,8 +8,11 @@ from .. import storage
 from ..errors import ModelFileError, SewfastError
 from ..storage import Fields
 from .controller import FORMAT, Controller, SampledController
+from .state_feedback import StateFeedback
 
-KINDS: dict[str, type[SampledController]] = {kind.KIND: kind for kind in (Controller,)}
+KINDS: dict[str, type[SampledController]] = {
+    kind.KIND: kind for kind in (Controller, StateFeedback)
+}
 """The kinds by name. A file without a kind, as all of versions 1 to 3, is a PID."""
 _VERSIONS = (1, 2, 3, 4)
 

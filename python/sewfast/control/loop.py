@@ -222,7 +222,7 @@ def run(
 
     Parameters
     ----------
-    controller : Controller
+    controller : Controller or StateFeedback
     on : Model, VirtualMachine, Drive or another Machine
         The plant. A model needs one input. Neither a model nor a virtual machine is changed. A
         drive (`sewfast.link`) runs the controller itself, in single precision; its limits must have

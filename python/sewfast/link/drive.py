@@ -541,7 +541,7 @@ class Drive(Unique):
 
         Parameters
         ----------
-        controller : Controller
+        controller : Controller or StateFeedback
         r : array, shape (N,)
             Reference at the device's sample time [y].
         name : str

@@ -56,7 +56,7 @@ class Plan:
         command when its time has come, which is only for slow plants.
     values : array, shape (N,)
         Commands in the unit of channel `u`, or references in the unit of the controller's output.
-    controller : Controller or None
+    controller : Controller, StateFeedback or None
         Of mode "controller".
     columns : sequence of str or None
         Channels to stream beside `counts` and `u`; None for those of the mode that the baud rate

@@ -41,9 +41,9 @@ class TuningResult:
 
     Attributes
     ----------
-    controller : Controller
+    controller : Controller or StateFeedback
         Ready to run.
-    start : Controller
+    start : Controller or StateFeedback
         The start of the search, moved to the given bounds if it lay outside.
     cost, start_cost : float
         Cost of both in the output's unit, over plants and references; inf if one diverges.
@@ -227,12 +227,12 @@ def tune(
         Moving average in the feedback. By default 8 ms, at most a tenth of the time constant.
     output_unit : str, optional
         Unit of the output if the model states none: an encoder needs it.
-    start : Controller, optional
+    start : Controller or StateFeedback, optional
         Start of the search; settings that are not searched are kept, and the five settings above
         are ignored. By default Table 1 on the first model's own step response.
     controller : str
-        The kind of controller where there is no start, as ``pid``; those of
-        `sewfast.control.files.KINDS`.
+        The kind of controller where there is no start, as ``pid`` or ``state_feedback``
+        (`StateFeedback`); those of `sewfast.control.files.KINDS`.
     variables : sequence of str or (str, float, float), optional
         What to search, by name or with its bounds: ``Kp``, ``Ti``, ``Td``, ``alpha``, ``beta``,
         ``N``, ``Tt``, ``filter_samples``, ``filter_time``, ``observer_time``, ``r_rate``;

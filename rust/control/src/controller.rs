@@ -4,7 +4,11 @@
 //! [`AnyController`], made from an [`AnyDesign`]: enumerations rather than trait objects, as a microcontroller has no heap and
 //! a search copies designs by the million. A new kind is a file of this crate and a row in each of the two.
 
+mod state_feedback;
+
 use crate::{Design, PidController, Real, Refused};
+
+pub use state_feedback::{NUMBERS, STATES, StateDesign, StateFeedback, Weights, lqg};
 
 /// One sampled controller from reference and measured output to the command.
 ///
@@ -38,6 +42,8 @@ pub trait Controller<T: Real> {
 pub enum AnyDesign<T> {
     /// Of a PID with its filters.
     Pid(Design<T>),
+    /// Of state feedback with an observer.
+    StateFeedback(StateDesign<T>),
 }
 
 impl<T: Real> AnyDesign<T> {
@@ -48,6 +54,9 @@ impl<T: Real> AnyDesign<T> {
     pub fn controller(&self) -> Result<AnyController<T>, Refused> {
         match self {
             Self::Pid(design) => PidController::new(*design).map(AnyController::Pid),
+            Self::StateFeedback(design) => {
+                StateFeedback::new(*design).map(AnyController::StateFeedback)
+            }
         }
     }
 
@@ -58,6 +67,7 @@ impl<T: Real> AnyDesign<T> {
     pub fn check(&self) -> Result<(), Refused> {
         match self {
             Self::Pid(design) => PidController::check(design),
+            Self::StateFeedback(design) => design.check(),
         }
     }
 
@@ -65,6 +75,7 @@ impl<T: Real> AnyDesign<T> {
     pub fn ts(&self) -> T {
         match self {
             Self::Pid(design) => design.pid.ts,
+            Self::StateFeedback(design) => design.ts,
         }
     }
 
@@ -72,20 +83,25 @@ impl<T: Real> AnyDesign<T> {
     pub fn limits(&self) -> (T, T) {
         match self {
             Self::Pid(design) => (design.pid.u_min, design.pid.u_max),
+            Self::StateFeedback(design) => (design.u_min, design.u_max),
         }
     }
 
     /// A controller of the kind that a device is sent by this number, from the numbers that `next` gives one after the other,
     /// without its sample time; `None` where they end too early, or for a number that is no kind's. The PID, which has commands of
     /// its own, has none.
-    pub(crate) fn from_numbers(_kind: u8, _next: impl FnMut() -> Option<T>) -> Option<Self> {
-        None
+    pub(crate) fn from_numbers(kind: u8, next: impl FnMut() -> Option<T>) -> Option<Self> {
+        match kind {
+            1 => StateDesign::from_numbers(next, T::ZERO).map(Self::StateFeedback),
+            _ => None,
+        }
     }
 
     /// The place of a setting among those numbers.
-    pub(crate) fn place_of(&self, _name: &str) -> Option<u32> {
+    pub(crate) fn place_of(&self, name: &str) -> Option<u32> {
         match self {
             Self::Pid(_) => None,
+            Self::StateFeedback(_) => Some(StateDesign::<T>::place_of(name)),
         }
     }
 
@@ -93,6 +109,7 @@ impl<T: Real> AnyDesign<T> {
     pub fn pid(&self) -> Option<&Design<T>> {
         match self {
             Self::Pid(design) => Some(design),
+            Self::StateFeedback(_) => None,
         }
     }
 
@@ -100,6 +117,7 @@ impl<T: Real> AnyDesign<T> {
     pub(crate) fn pid_mut(&mut self) -> Option<&mut Design<T>> {
         match self {
             Self::Pid(design) => Some(design),
+            Self::StateFeedback(_) => None,
         }
     }
 
@@ -107,6 +125,7 @@ impl<T: Real> AnyDesign<T> {
     pub(crate) fn bounded(mut self, bound: T, ts: T) -> Self {
         let (u_min, u_max, own_ts) = match &mut self {
             Self::Pid(Design { pid, .. }) => (&mut pid.u_min, &mut pid.u_max, &mut pid.ts),
+            Self::StateFeedback(d) => (&mut d.u_min, &mut d.u_max, &mut d.ts),
         };
         // comparisons, not min and max, which would hide a NaN
         if *u_min < -bound {
@@ -131,6 +150,8 @@ impl<T> From<Design<T>> for AnyDesign<T> {
 pub enum AnyController<T> {
     /// A PID with its filters.
     Pid(PidController<T>),
+    /// State feedback with an observer.
+    StateFeedback(StateFeedback<T>),
 }
 
 /// The controller within, whatever its kind.
@@ -138,6 +159,7 @@ macro_rules! within {
     ($any:expr, $controller:ident => $do:expr) => {
         match $any {
             AnyController::Pid($controller) => $do,
+            AnyController::StateFeedback($controller) => $do,
         }
     };
 }
@@ -174,7 +196,22 @@ impl<T: Real> AnyController<T> {
     pub fn pid(&self) -> Option<&PidController<T>> {
         match self {
             Self::Pid(controller) => Some(controller),
+            Self::StateFeedback(_) => None,
         }
+    }
+
+    /// The state feedback that it is; `None` where it is another kind.
+    pub fn state_feedback(&self) -> Option<&StateFeedback<T>> {
+        match self {
+            Self::StateFeedback(controller) => Some(controller),
+            Self::Pid(_) => None,
+        }
+    }
+}
+
+impl<T> From<StateDesign<T>> for AnyDesign<T> {
+    fn from(design: StateDesign<T>) -> Self {
+        Self::StateFeedback(design)
     }
 }
 

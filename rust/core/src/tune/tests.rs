@@ -553,3 +553,66 @@ fn variables_that_make_no_sense_are_refused() {
         assert!(refused.unwrap_err().message.contains("Kp twice"));
     });
 }
+
+#[test]
+fn weights_of_state_feedback_are_searched_and_give_their_gains() {
+    use sewfast_control::{STATES, StateDesign, Weights, lqg};
+
+    let (p, q) = ((-TS / 0.252_f64).exp(), (-TS / 0.0074_f64).exp());
+    let b = 490.0 * (1.0 - p) * (1.0 - q) / 2.0;
+    let none = [0.0; STATES];
+    let weights = Weights {
+        rho: 2e5,
+        integral: 20.0,
+        noise: 2e5,
+        reference: 1.0,
+    };
+    let bare = StateDesign {
+        a: [-p - q, p * q, 0.0, 0.0],
+        b: [b, b, 0.0, 0.0],
+        k: none,
+        l: none,
+        rest: none,
+        kr: 0.0,
+        ki: 0.0,
+        lead: 0.0,
+        r_rate: f64::INFINITY,
+        u_min: -20.0,
+        u_max: 20.0,
+        slew: f64::INFINITY,
+        ts: TS,
+        weights,
+    };
+    let begun = AnyDesign::from(lqg(bare, weights).unwrap());
+    with_task(start(), |task| {
+        let variables = Variable::usual(&begun).unwrap();
+        let names: Vec<_> = variables.iter().map(|v| v.parameter.name()).collect();
+        assert_eq!(names, ["rho", "integral", "noise", "weight", "lead"]);
+        let task = Task {
+            start: begun,
+            variables: &variables,
+            ..task.clone()
+        };
+        let tuned = tune(&task, Method::Genetic, options(400, 2), &Monitor::default()).unwrap();
+        assert!(tuned.cost < 0.5 * tuned.start_cost, "{tuned:?}");
+        let AnyDesign::StateFeedback(found) = tuned.design else {
+            panic!("{:?}", tuned.design);
+        };
+        assert_eq!(lqg(found, found.weights).unwrap(), found);
+        // several at once cost what each costs alone
+        let judged = costs(&task, &[tuned.design; 3], 2, &Monitor::default()).unwrap();
+        assert!(
+            judged
+                .iter()
+                .all(|j| j.cost.to_bits() == tuned.cost.to_bits())
+        );
+    });
+    for (parameter, start) in [
+        (Parameter::Kp, begun),
+        (Parameter::NotchDepth(0), begun),
+        (Parameter::Rho, Design::new(start()).into()),
+    ] {
+        let refused = Variable::new(parameter, None, &start).unwrap_err().message;
+        assert!(refused.contains(&parameter.name()), "{refused}");
+    }
+}

@@ -1,6 +1,8 @@
 //! Controllers, one in each lane; or a single one.
 
-use sewfast_control::{AnyController, Controller, Numbers, PidController};
+use sewfast_control::{
+    AnyController, Controller, Numbers, PidController, STATES, StateDesign, StateFeedback,
+};
 
 use crate::simd::{Choice, LANES};
 
@@ -42,6 +44,9 @@ pub(crate) fn of_a_kind<W: WithKind>(
 ) -> Option<W::Output> {
     match controllers.first()? {
         AnyController::Pid(_) => all(controllers, AnyController::pid).map(|all| work.with(&all)),
+        AnyController::StateFeedback(_) => {
+            all(controllers, AnyController::state_feedback).map(|all| work.with(&all))
+        }
     }
 }
 
@@ -268,6 +273,142 @@ impl<V: Choice> Controllers<V> {
         let kept = self.conditional.if_equal(V::splat(1.0), held, tracked);
         let kept = excess.if_equal(zero, integral, kept);
         self.ki.if_equal(zero, integral, kept)
+    }
+}
+
+impl InLanes for StateFeedback<f64> {
+    type Lanes<V: Choice> = StateLanes<V>;
+
+    fn fits(&self) -> bool {
+        true
+    }
+
+    #[inline(always)]
+    fn in_lanes<V: Choice>(controllers: &[&Self]) -> StateLanes<V> {
+        StateLanes::new(controllers)
+    }
+}
+
+/// Eight of [`StateFeedback`]: the same operations in the same order.
+pub(crate) struct StateLanes<V> {
+    a: [V; STATES],
+    b: [V; STATES],
+    k: [V; STATES],
+    l: [V; STATES],
+    rest: [V; STATES],
+    kr: V,
+    ki: V,
+    /// In samples.
+    lead: V,
+    /// Largest change of the reference in one sample; `None` where no lane has a ramp.
+    ramp: Option<V>,
+    low: V,
+    high: V,
+    /// Largest change of the command in one sample; `None` where no lane has a limit.
+    change: Option<V>,
+    /// States as predicted for the next sample; once a measurement was taken, as corrected by it.
+    x: [V; STATES],
+    q: V,
+    r: V,
+    u: V,
+    measured: V,
+    /// The output as observed.
+    observed: V,
+}
+
+impl<V: Choice> StateLanes<V> {
+    /// The first eight of `controllers`, at rest; missing ones are the first again.
+    #[inline(always)]
+    fn new(controllers: &[&StateFeedback<f64>]) -> Self {
+        let lane = |i: usize| controllers.get(i).unwrap_or(&controllers[0]).design();
+        let each = |of: &dyn Fn(&StateDesign<f64>) -> f64| {
+            V::load(&std::array::from_fn::<_, LANES, _>(|i| of(lane(i))))
+        };
+        let vector = |of: &dyn Fn(&StateDesign<f64>) -> [f64; STATES]| {
+            std::array::from_fn(|state| each(&|d| of(d)[state]))
+        };
+        let any = |of: &dyn Fn(&StateDesign<f64>) -> bool| (0..LANES).any(|i| of(lane(i)));
+        let zero = V::splat(0.0);
+        let (low, high) = (each(&|d| d.u_min), each(&|d| d.u_max));
+        Self {
+            a: vector(&|d| d.a),
+            b: vector(&|d| d.b),
+            k: vector(&|d| d.k),
+            l: vector(&|d| d.l),
+            rest: vector(&|d| d.rest),
+            kr: each(&|d| d.kr),
+            ki: each(&|d| d.ki),
+            lead: each(&|d| d.lead / d.ts),
+            ramp: any(&|d| d.r_rate < f64::INFINITY).then_some(each(&|d| d.r_rate * d.ts)),
+            low,
+            high,
+            change: any(&|d| d.slew < f64::INFINITY).then_some(each(&|d| d.slew * d.ts)),
+            x: [zero; STATES],
+            q: zero,
+            r: zero,
+            u: zero.at_least_each(low).at_most_each(high),
+            measured: zero,
+            observed: zero,
+        }
+    }
+}
+
+impl<V: Choice> LaneController<V> for StateLanes<V> {
+    #[inline(always)]
+    fn take(&mut self, first: bool, measured: V) {
+        if first {
+            self.x = self.rest.map(|x| x.mul(measured));
+        }
+        let innovation = measured.sub(self.x[0]);
+        for (x, gain) in self.x.iter_mut().zip(self.l) {
+            *x = x.add(gain.mul(innovation));
+        }
+        (self.measured, self.observed) = (measured, self.x[0]);
+    }
+
+    #[inline(always)]
+    fn decide(&mut self, first: bool, r: f64, feedforward: Option<f64>) -> V {
+        let (zero, y) = (V::splat(0.0), self.measured);
+        let mut r = V::splat(r);
+        if let Some(change) = self.ramp {
+            let from = if first { y } else { self.r };
+            r = limited(r, from.sub(change), from.add(change));
+        }
+        let before = if first { r } else { self.r };
+        let ([k1, k2, k3, k4], [x1, x2, x3, x4]) = (self.k, self.x);
+        let fed_back = (k1.mul(x1).add(k2.mul(x2))).add(k3.mul(x3).add(k4.mul(x4)));
+        let aimed = r.add(self.lead.mul(r.sub(before)));
+        let wanted = self.kr.mul(aimed).sub(fed_back).add(self.q);
+        let wanted = match feedforward {
+            None => wanted,
+            Some(added) => wanted.add(V::splat(added)),
+        };
+        let mut u = limited(wanted, self.low, self.high);
+        if let Some(change) = self.change {
+            u = limited(u, self.u.sub(change), self.u.add(change));
+        }
+        let (excess, change) = (u.sub(wanted), self.ki.mul(r.sub(y)));
+        let mut q = change.mul(excess).if_less(zero, self.q, self.q.add(change));
+        let shifted = [x2, x3, x4, zero];
+        let mut x: [V; STATES] =
+            std::array::from_fn(|i| shifted[i].sub(self.a[i].mul(x1)).add(self.b[i].mul(u)));
+        // 0 where the command is finite, else NaN: then the observer begins again, and the command stays
+        let sound = wanted.mul(zero);
+        if sound.abs().are_less(V::splat(1.0)) != V::ALL {
+            u = sound.if_equal(zero, u, self.u);
+            let kept = self.q.mul(zero).if_equal(zero, self.q, zero);
+            q = sound.if_equal(zero, q, kept);
+            for (x, rest) in x.iter_mut().zip(self.rest) {
+                *x = sound.if_equal(zero, *x, rest.mul(y));
+            }
+        }
+        (self.x, self.q, self.r, self.u) = (x, q, r, u);
+        u
+    }
+
+    #[inline(always)]
+    fn filtered(&self) -> V {
+        self.observed
     }
 }
 
