@@ -30,6 +30,7 @@ from .evidence import Residuals, estimate
 from .identification import identify
 from .kinds import Kind
 from .models import Model
+from .progress import shown_in_notebooks
 from .readers import read
 from .validation import validate
 
@@ -180,6 +181,7 @@ class Fleet:
         return "\n".join(lines)
 
 
+@shown_in_notebooks("fleet", "share failed")
 def fleet(
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
@@ -231,6 +233,7 @@ def fleet(
         As of `identify`; the same seed gives the same bits on any number of workers.
     progress : callable, optional
         Called with recordings done, recordings in all and the share that failed.
+        In a notebook a bar is shown where this is left out; None shows none.
 
     Returns
     -------

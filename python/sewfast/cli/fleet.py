@@ -7,8 +7,9 @@ import dataclasses
 from pathlib import Path
 
 from ..kinds import KINDS
+from ..progress import Progress
 from .arguments import Commands, add_command
-from .output import Progress, print_json
+from .output import print_json
 
 FLEET = """\
 Identify and check every recording of a folder, or of a manifest (CSV with a column file and, where
@@ -67,7 +68,7 @@ def fleet_command(args: argparse.Namespace) -> None:
     from ..fleets import fleet
 
     controller = None if args.controller is None else load_controller(args.controller)
-    with Progress("fleet") as progress:
+    with Progress("fleet", "share failed") as progress:
         found = fleet(
             args.recordings,
             inputs=args.input or "u",
@@ -81,7 +82,7 @@ def fleet_command(args: argparse.Namespace) -> None:
             workers=args.workers,
             memory=args.memory,
             seed=args.seed,
-            progress=lambda done, total, failed: progress.say(f"{done} of {total}"),
+            progress=progress,
         )
     if args.json:
         drifts = [dataclasses.asdict(drift) for drift in found.drifts]

@@ -16,6 +16,7 @@ from ..control.controller import Controller
 from ..control.loop import Plant, Plants, References, check_fits, each_plant, run
 from ..errors import FitError, Interrupted, SettingError
 from ..gains import whole
+from ..progress import shown_in_notebooks
 from .objective import Constraints, Cost, LoadStep
 from .task import (
     Aggregate,
@@ -164,6 +165,7 @@ class TuningResult:
         return "\n".join([*lines, str(self.controller)])
 
 
+@shown_in_notebooks("tune")
 def tune(
     models: Plants,
     references: References = None,
@@ -259,6 +261,7 @@ def tune(
         All processors by default.
     progress : callable, optional
         Called with (done, total, lowest cost).
+        In a notebook a bar is shown where this is left out; None shows none.
 
     Raises
     ------
