@@ -31,6 +31,9 @@ help: ## this list
 demo: $(REPORT) ## the whole experiment on the virtual machine; the report goes to demo/report.html
 	$(BIN)/sewfast demo --out $(OUT)
 
+$(OUT)/results.json: | $(REPORT)
+	$(BIN)/sewfast demo --out $(OUT)
+
 test: lint rust-test no-std c-test docs package python-test ## every check; ends with pytest's summary
 
 lint: rust-lint python-lint types stubs ## formatting, clippy, ruff, mypy, stubs
@@ -133,8 +136,8 @@ python-test: $(DEV) ## pytest, with every snippet of the documentation and every
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not alone'
 	$(BIN)/python -m pytest -m alone
 
-docs: $(DEV) ## the site, in site/index.html; works offline
-	$(BIN)/python docs/build.py
+docs: $(DEV) $(OUT)/results.json ## the site, in site/index.html, its pictures drawn from demo/; works offline
+	$(BIN)/python docs/build.py --results $(OUT)
 	$(BIN)/mkdocs build --strict --quiet
 
 # the wheel comes from the source archive alone and is imported where only numpy is installed
@@ -153,8 +156,7 @@ bench: $(VENV)/bench.stamp ## sewfast and its rivals in one run; writes docs/PER
 bench-parts: $(VENV)/bench.stamp ## every benchmark by itself, with its spread (pytest-benchmark)
 	$(BIN)/python -m pytest benches --benchmark-enable --benchmark-only -o python_files='bench_*.py' -s
 
-pictures: $(REPORT) ## the pictures of README and gallery, from demo/ (which is made where it is missing)
-	test -f $(OUT)/results.json || $(BIN)/sewfast demo --out $(OUT)
+pictures: $(DEV) $(OUT)/results.json ## the pictures of README and pages that are checked in, from demo/
 	$(BIN)/python docs/pictures.py $(OUT)
 
 accuracy: $(DEV) ## accuracy of the default configuration on public records, beside published figures (SEWFAST_DATA)
