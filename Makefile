@@ -66,8 +66,8 @@ studio: $(DEV) ## the studio in a real browser: from a slider's event to painted
 	$(BIN)/python benches/studio.py
 	$(BIN)/python benches/studio_stops.py
 
-fuzz-logs: $(DEV) ## damaged logs of every format, refused or read (COUNT=100000; a tenth of it where a library reads)
-	SEWFAST_DAMAGED=$(or $(COUNT),100000) $(BIN)/python -m pytest tests/readers/test_logs.py -k damaged_log
+fuzz-logs: $(DEV) ## damaged logs of every format, refused or read (COUNT=100000; ONLY="mf4 tdms"; hours)
+	$(BIN)/python tests/support/fuzzed_logs.py --count $(or $(COUNT),100000) $(if $(ONLY),--only $(ONLY))
 
 bits: $(DEV) ## deployed code against the core over ten million samples of every kind (an hour)
 	$(BIN)/python tests/support/deployed.py
