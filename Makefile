@@ -11,6 +11,8 @@ export PYO3_PYTHON := $(BIN)/python
 export CARGO_TARGET_DIR := $(CURDIR)/target
 export PYTHONDONTWRITEBYTECODE := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# one version of each tool and library, so that no release of theirs fails a build (make constraints)
+export PIP_CONSTRAINT := $(CURDIR)/packaging/constraints.txt
 export NO_MKDOCS_2_WARNING := 1
 ifneq ($(wildcard ../shared/data),)
 export SEWFAST_DATA ?= $(abspath ../shared/data)
@@ -23,7 +25,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors fleet fuzz-logs studio bits bode notches physics aarch64 licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors fleet fuzz-logs studio bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -109,6 +111,10 @@ aarch64: ## unit and property tests on an emulated 64-bit ARM (Debian: rustc-web
 	  CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc \
 	  CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER='qemu-aarch64 -L /usr/aarch64-linux-gnu' \
 	  cargo test --package sewfast-control --package sewfast-core --lib --profile checked --quiet -Zbuild-std --target $(ARM64)
+
+constraints: ## packaging/constraints.txt, the newest versions that fit together (needs uv)
+	uv pip compile pyproject.toml --extra dev --extra docs --extra bench --universal --python-version 3.10 \
+	  --upgrade --no-annotate --no-emit-index-url -o packaging/constraints.txt
 
 licences: ## LICENSE-THIRD-PARTY, from what the crates of a wheel say
 	$(PYTHON) tests/support/licences.py
