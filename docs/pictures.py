@@ -8,6 +8,7 @@ the repository.
 
 from __future__ import annotations
 
+import runpy
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -15,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from page_pictures import PICTURES
 from PIL import Image
 
 import sewfast
@@ -24,6 +24,7 @@ from sewfast.readers import read_table
 from sewfast.report.artefacts import run_file
 
 ASSETS = Path(__file__).parent / "assets"
+PICTURES = runpy.run_path(str(Path(__file__).with_name("page_pictures.py")))["PICTURES"]
 LARGEST = 150_000
 """Bytes of a picture: a page has to load it."""
 COLOURS = 64

@@ -33,7 +33,7 @@ from sewfast.readers import Table, logs, read_table
 sys.path.append(str(Path(__file__).parents[1] / "readers"))
 from test_logs import KINDS, blackbox, saleae
 
-logs.PATIENCE = 2.0
+PATIENCE = 2.0
 """For a reader that need not load its library first [s]."""
 MAKE = {n: kind[0] for n, kind in KINDS.items()} | {"run.bbl": blackbox, "run.bin": saleae}
 
@@ -111,6 +111,7 @@ def fuzz(name: str, count: int, seed: int, folder: Path) -> bool:
     if kind is not None and kind.module is not None:
         importlib.import_module(kind.module)
     read_table(whole)  # loads what is loaded when first used
+    logs.PATIENCE = PATIENCE
     forked = Forked(folder)
     logs.subprocess = SimpleNamespace(run=forked.run, TimeoutExpired=subprocess.TimeoutExpired)
     gc.freeze()

@@ -197,7 +197,7 @@ def commission(
             else _place(folder, bench, asked, overwrite=overwrite, resume=resume)
         )
         if taken is not None:
-            journal.keep(taken_in=taken.folder)
+            journal.keep(recorded_in=taken.folder)
 
         def note(name: str, key: str, recording: Recording, run: ClosedLoopRun | None) -> None:
             journal.note(name, recording)
