@@ -13,6 +13,8 @@ import itertools
 import json
 import math
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -516,8 +518,23 @@ def _connected(
             "memory_limit": memory,
             "dashboard_address": None,
         }
-        with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as made:
+        with _workers_without_ctrl_c():
+            cluster = distributed.LocalCluster(**options)
+        with cluster, distributed.Client(cluster) as made:
             yield made
+
+
+@contextmanager
+def _workers_without_ctrl_c() -> Iterator[None]:
+    """Processes that begin here leave Ctrl-C to this one, which ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 # --- What is kept on the way ----------------------------------------------------------------------

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from ..recordfile import Header
 
 
+DONE, FAULT, REFUSED, INTERRUPTED = 0, 1, 2, 130
+"""Exit codes (docs/cli.md)."""
+
+
 def print_json(value: Any) -> None:
     """Strict JSON: what is not finite becomes null."""
     print(json.dumps(_finite(value), indent=1, allow_nan=False))

@@ -34,7 +34,14 @@ from .task import (
 Method: TypeAlias = Literal["genetic", "cma-es"]
 
 EVALUATIONS = 1500
-"""Controllers tried unless said otherwise."""
+"""Controllers tried by default."""
+_ENDED_BY = {
+    "evaluations": "their number",
+    "converged": "convergence",
+    "time": "the time budget",
+    "interrupted": "Ctrl-C",
+}
+"""What a termination is called in a sentence."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +153,7 @@ class TuningResult:
         )
         return Table(
             f"cost {self.cost:.4g} {unit} (start {self.start_cost:.4g}), {self.evaluations} "
-            f"controllers tried, ended by {self.termination}",
+            f"controllers tried, ended by {_ENDED_BY.get(self.termination, self.termination)}",
             ("searched", "found", "from", "to"),
             rows,
         ).to_html([] if self.warning is None else [f"warning: {self.warning}"])
@@ -155,7 +162,7 @@ class TuningResult:
         unit = self.controller.gains.y_unit or "y"
         lines = [
             f"cost {self.cost:.4g} {unit} (start {self.start_cost:.4g}) after {self.evaluations} "
-            f"evaluations, {self.termination}",
+            f"evaluations, ended by {_ENDED_BY.get(self.termination, self.termination)}",
             "  searched  " + "\n            ".join(str(v) for v in self.variables),
         ]
         if self.constraints != Constraints():
