@@ -1,11 +1,16 @@
-"""Draws assets/closed_loop.svg, the picture of the README, from the demo's own results.
+"""Draws the pictures of README, gallery and pages, most of them from the demo's own results.
 
-sewfast demo --out demo && python docs/pictures.py demo      (or: make pictures)
+    sewfast demo --out demo && python docs/pictures.py demo      (or: make pictures)
+
+`make docs` draws them anew for the site (docs/build.py); those in docs/assets are for readers of
+the repository.
 """
 
 from __future__ import annotations
 
+import runpy
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,15 +19,12 @@ import numpy as np
 from PIL import Image
 
 import sewfast
-from sewfast.plotting import Drawing, Trace, draw, loop_drawing, loop_panels
+from sewfast.plotting import Drawing, Trace, draw, loop_panels
 from sewfast.readers import read_table
 from sewfast.report.artefacts import run_file
 
 ASSETS = Path(__file__).parent / "assets"
-PICTURE = ASSETS / "closed_loop.svg"
-GALLERY = ASSETS / "gallery"
-BODE = ASSETS / "bode" / "compliant.png"
-STATES = ASSETS / "state_feedback.png"
+PICTURES = runpy.run_path(str(Path(__file__).with_name("page_pictures.py")))["PICTURES"]
 LARGEST = 150_000
 """Bytes of a picture: a page has to load it."""
 COLOURS = 64
@@ -98,42 +100,29 @@ def bode(file: Path) -> None:
     response.plot(fit=sewfast.fit_shaft(response), file=file)
 
 
-def state_feedback(file: Path) -> None:
-    """A tuned PID and tuned state feedback on the virtual machine, for tuning.md."""
-    machine = sewfast.VirtualMachine()
-    data = sewfast.record(machine, sewfast.signals.excitation("multisine")).dataset()
-    model = sewfast.identify(data, model="oe")
-    loops = []
-    for kind, look, label in (
-        ("state_feedback", "measured", "state feedback"),
-        ("pid", "model", "PID"),
-    ):
-        found = sewfast.tune(
-            model, "trapezoid", controller=kind, u_min=-20.0, u_max=20.0,
-            counts_per_rev=machine.counts_per_rev, evaluations=600,
-        )  # fmt: skip
-        run = sewfast.run(found.controller, machine, "trapezoid")
-        loops.append(Trace.of(run.columns(), look, label))
-    loop_drawing(loops, "RPM", "V", (-20.0, 20.0)).plot(file=file)
-
-
-def main() -> None:
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo")
-    loops = traces(folder)
-    drawing(loops).plot(file=PICTURE)
+def draw_all(results: Path, assets: Path) -> list[Path]:
+    """Draw every picture into a folder; the files."""
+    assets.mkdir(parents=True, exist_ok=True)
+    loops = traces(results)
+    picture = assets / "closed_loop.svg"
+    drawing(loops).plot(file=picture)
     predicted, measured = loops
     apart = float(np.sqrt(np.mean((predicted.y - measured.y) ** 2)))
     print(f"predicted and measured are {apart:.1f} RPM rms apart")
-    written = [PICTURE]
-    GALLERY.mkdir(exist_ok=True)
-    BODE.parent.mkdir(exist_ok=True)
-    drawn = {GALLERY / f"{name}.png": plot for name, plot in gallery(folder).items()}
-    drawn[BODE], drawn[STATES] = bode, state_feedback
+    drawn: dict[Path, Callable[[Path], object]] = {assets / "bode" / "compliant.png": bode}
+    for name, plot in gallery(results).items():
+        drawn[assets / "gallery" / f"{name}.png"] = lambda file, plot=plot: plot(file=file)
+    for name, draw_page in PICTURES.items():
+        drawn[assets / "pages" / f"{name}.png"] = draw_page
     for path, plot in drawn.items():
-        plot(file=path)
+        path.parent.mkdir(exist_ok=True)
+        plot(path)
         Image.open(path).convert("RGB").quantize(COLOURS).save(path, optimize=True)
-        written.append(path)
-    for path in written:
+    return [picture, *drawn]
+
+
+def main() -> None:
+    for path in draw_all(Path(sys.argv[1] if len(sys.argv) > 1 else "demo"), ASSETS):
         size = path.stat().st_size
         print(f"{path}: {size // 1000} kB")
         if size > LARGEST:

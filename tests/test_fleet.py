@@ -251,6 +251,28 @@ def test_what_makes_no_fleet_is_refused(tmp_path: Path, folder: Path) -> None:
         fleet(folder, before=tmp_path / "other.csv", workers=0)
 
 
+def test_ctrl_c_says_what_is_kept(
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    from sewfast import fleets
+
+    done: list[str] = []
+    real = fleets._row
+
+    def interrupted(job: Any, *rest: Any) -> Any:
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(job.file)
+        return real(job, *rest)
+
+    monkeypatch.setattr(fleets, "_row", interrupted)
+    assert main(["fleet", str(folder), "-o", str(tmp_path / "a.csv"), "--workers", "0"]) == 130
+    assert "2 recordings are done and kept" in capsys.readouterr().err
+
+
 def test_the_command(
     folder: Path, tmp_path: Path, alone: Fleet, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,6 +13,8 @@ import itertools
 import json
 import math
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -30,6 +32,7 @@ from .evidence import Residuals, estimate
 from .identification import identify
 from .kinds import Kind
 from .models import Model
+from .progress import shown_in_notebooks
 from .readers import read
 from .validation import validate
 
@@ -180,6 +183,7 @@ class Fleet:
         return "\n".join(lines)
 
 
+@shown_in_notebooks("fleet", "share failed")
 def fleet(
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
@@ -231,6 +235,7 @@ def fleet(
         As of `identify`; the same seed gives the same bits on any number of workers.
     progress : callable, optional
         Called with recordings done, recordings in all and the share that failed.
+        In a notebook a bar is shown where this is left out; None shows none.
 
     Returns
     -------
@@ -513,8 +518,23 @@ def _connected(
             "memory_limit": memory,
             "dashboard_address": None,
         }
-        with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as made:
+        with _workers_without_ctrl_c():
+            cluster = distributed.LocalCluster(**options)
+        with cluster, distributed.Client(cluster) as made:
             yield made
+
+
+@contextmanager
+def _workers_without_ctrl_c() -> Iterator[None]:
+    """Processes that begin here leave Ctrl-C to this one, which ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 # --- What is kept on the way ----------------------------------------------------------------------

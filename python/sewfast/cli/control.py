@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import DataError, Interrupted, SettingError
+from ..progress import Progress
 from .arguments import (
     RECORDINGS,
     TABLES,
@@ -30,7 +31,7 @@ from .drive import (
     require_no_drive_options,
     say_interrupted,
 )
-from .output import Progress, print_json, write_columns
+from .output import print_json, write_columns
 
 if TYPE_CHECKING:
     from ..control.controller import Controller, SampledController

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import Interrupted, SettingError
+from ..progress import Progress
 from .arguments import (
     TABLES,
     Commands,
@@ -19,7 +20,7 @@ from .arguments import (
     require_plot,
 )
 from .control import reference_of
-from .output import Progress, print_json, print_rows
+from .output import print_json, print_rows
 
 if TYPE_CHECKING:
     from ..control.biquad import Biquad

@@ -21,6 +21,7 @@ from ..errors import DataError, Interrupted, SettingError
 from ..gains import vector
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
+from ..progress import shown_in_notebooks
 from ..recording import Recording
 from ..rules import Fopdt
 from ..threads import available
@@ -58,6 +59,7 @@ References = Mapping[str, ArrayLike] | Sequence[str]
 Between = Callable[[str, Commissioning], object]
 
 
+@shown_in_notebooks("commission")
 def commission(
     on: VirtualMachine | Machine,
     *,
@@ -130,6 +132,7 @@ def commission(
         All processors by default.
     progress : callable(done, total, stage), optional
         Called as each stage begins, within long ones, and at the end.
+        In a notebook a bar is shown where this is left out; None shows none.
     folder : path, optional
         Folder in which every recording is written as soon as it is taken, as
         `unfinished/NAME.mcap`, so that a process that is killed does not lose it;
@@ -194,7 +197,7 @@ def commission(
             else _place(folder, bench, asked, overwrite=overwrite, resume=resume)
         )
         if taken is not None:
-            journal.keep(taken_in=taken.folder)
+            journal.keep(recorded_in=taken.folder)
 
         def note(name: str, key: str, recording: Recording, run: ClosedLoopRun | None) -> None:
             journal.note(name, recording)

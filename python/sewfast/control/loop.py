@@ -109,7 +109,7 @@ class ClosedLoopRun:
         self,
         ax: Any = None,
         *,
-        beside: Sequence[ClosedLoopRun] = (),
+        others: Sequence[ClosedLoopRun] = (),
         file: str | os.PathLike[str] | None = None,
     ) -> Any:
         """Draw output and reference, the error and the command in three panels.
@@ -118,7 +118,7 @@ class ClosedLoopRun:
         ----------
         ax : Axes or sequence of Axes, optional
             One shows the output, further ones the error and the command.
-        beside : sequence of ClosedLoopRun
+        others : sequence of ClosedLoopRun
             Other runs over the same reference, such as one predicted by a model.
         file : path, optional
             Where to write the figure: PNG, SVG or PDF by its ending.
@@ -135,7 +135,7 @@ class ClosedLoopRun:
         """
         from ..plotting import Trace, loop_drawing
 
-        others = [beside] if isinstance(beside, ClosedLoopRun) else list(beside)
+        others = [others] if isinstance(others, ClosedLoopRun) else list(others)
         looks = ("machine", "model", "oe", "arx_raw", "arx") if others else ("measured",)
         traces = [
             Trace.of(run.columns(), look, run.plant)
@@ -151,23 +151,23 @@ class ClosedLoopRun:
 
     def __str__(self) -> str:
         unit = self.units | {n: unit or n for n, unit in self.units.items() if n in "uy"}
-        told = self.metrics()
+        metrics = self.metrics()
         lines = [f"{self.reference} on {self.plant}, {len(self.t) * self.Ts:g} s"]
-        if told["rmse"] is None:
+        if metrics["rmse"] is None:
             return f"{lines[0]}; no sample came"
         lines.append(
-            f"  error     {told['rmse']:.4g} {unit['y']} rms, {told['max_abs']:.4g} at most"
+            f"  error     {metrics['rmse']:.4g} {unit['y']} rms, {metrics['max_abs']:.4g} at most"
         )
-        if told["rise_time_ms"] is not None:
+        if metrics["rise_time_ms"] is not None:
             lines.append(
-                f"  first edge {told['rise_time_ms']:.1f} ms from 10 to 90 % (reference "
-                f"{told['reference_rise_time_ms']:.1f} ms), "
-                f"overshoot {told['overshoot_percent']:.2f} %"
+                f"  first edge {metrics['rise_time_ms']:.1f} ms from 10 to 90 % (reference "
+                f"{metrics['reference_rise_time_ms']:.1f} ms), "
+                f"overshoot {metrics['overshoot_percent']:.2f} %"
             )
-        saturated = 100.0 * (told["saturated"] or 0.0)
+        saturated = 100.0 * (metrics["saturated"] or 0.0)
         lines.append(
-            f"  command   {told['u_rms']:.4g} {unit['u']} rms, {told['du_rms']:.4g} from sample to "
-            f"sample, at a limit {saturated:.1f} % of the time"
+            f"  command   {metrics['u_rms']:.4g} {unit['u']} rms, {metrics['du_rms']:.4g} from "
+            f"sample to sample, at a limit {saturated:.1f} % of the time"
         )
         return "\n".join(lines)
 
@@ -274,7 +274,7 @@ def run(
         reference, name = _usual_reference(on, controller), name or "trapezoid"
     r = reference_samples(reference, controller, seed, plant=on)
     title = name or (reference if isinstance(reference, str) else "reference")
-    beside = _beside(on, feedforward, disturbance)
+    extra = _given(on, feedforward, disturbance)
     if not isinstance(on, (Model, VirtualMachine)):
         return _on_machine(
             controller, on, r, title, cancel, file=file, live=live, overwrite=overwrite
@@ -285,8 +285,8 @@ def run(
         controller.core(),
         r,
         counts_per_unit=controller.counts_per_unit,
-        feedforward=beside.get("feedforward"),
-        disturbance=beside.get("disturbance"),
+        feedforward=extra.get("feedforward"),
+        disturbance=extra.get("disturbance"),
     )
     return ClosedLoopRun(
         t=np.arange(len(r), dtype=np.float64) * controller.Ts,
@@ -308,10 +308,10 @@ def _usual_reference(on: Any, controller: SampledController) -> str | FloatArray
     return usual
 
 
-def _beside(
+def _given(
     on: Any, feedforward: ArrayLike | None, disturbance: ArrayLike | None
 ) -> dict[str, FloatArray]:
-    """The signals beside the reference that were given."""
+    """The signals other than the reference that were given."""
     given = {"feedforward": feedforward, "disturbance": disturbance}
     signals = {name: vector(name, v) for name, v in given.items() if v is not None}
     if "disturbance" in signals and not isinstance(on, Model):

@@ -46,11 +46,11 @@ def channels(link: Connection) -> tuple[Channel, ...]:
     if wire.schema_hash(identity.version, identity.period_us, bodies) != identity.schema:
         raise LinkError(
             "expected channels that match the device's schema hash, got others; connect again, "
-            "or mend the firmware"
+            "or fix the firmware"
         )
     found = tuple(map(wire.channel, bodies))
     if (found[0].encoding, found[1].encoding) != (0, 1):
-        raise LinkError("expected channel 0 to be counts and 1 the command; mend the firmware")
+        raise LinkError("expected channel 0 to be counts and 1 the command; fix the firmware")
     return found
 
 
@@ -322,7 +322,7 @@ class Drive(Unique):
         """Seconds until up to 200 bytes come back."""
         sent = time.monotonic()
         if self._link.ask(Kind.ECHO, data) != data:
-            raise LinkError("expected the bytes sent to ECHO, got others; mend the firmware")
+            raise LinkError("expected the bytes sent to ECHO, got others; fix the firmware")
         return time.monotonic() - sent
 
     # --- what it may do ---------------------------------------------------------------------------
@@ -628,7 +628,7 @@ class Drive(Unique):
         if not limits.are_set:
             raise SettingError(
                 "expected limits set on the device, it has none in this session; set them to what "
-                "motor and machine stand: drive.set_limits(volt=..., speed_rpm=..., ...)"
+                "motor and machine can take: drive.set_limits(volt=..., speed_rpm=..., ...)"
             )
         if what == "references":
             return profiles.references(plan.values, limits)

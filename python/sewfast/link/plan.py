@@ -649,7 +649,7 @@ def _more_time(watchdog: float) -> str:
         return ""
     return (
         f". A busy computer needs more time: --watchdog {longer * 1e3:g} (watchdog={longer:g}), "
-        "where the machine stands it"
+        "if the machine tolerates it"
     )
 
 

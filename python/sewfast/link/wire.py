@@ -252,7 +252,7 @@ def identity(body: bytes) -> Identity:
     if not 2 <= channels <= 16 or period == 0 or not (math.isfinite(counts) and counts >= 0):
         raise LinkError(
             "expected a device with 2 to 16 channels, a control period and counts per turn, got "
-            f"{channels}, {period} us and {counts}; mend the firmware"
+            f"{channels}, {period} us and {counts}; fix the firmware"
         )
     return Identity(
         _shown(name), _shown(firmware), version, boot, schema, name_of(STATES, state), channels,
@@ -273,7 +273,7 @@ def channel(body: bytes) -> Channel:
     if encoding > 2 or (encoding == 1 and steps == 0):
         raise LinkError(
             f"expected channel {number} in encoding 0, 1 (with steps per unit) or 2, got "
-            f"{encoding} with {steps} steps; update sewfast or mend the firmware"
+            f"{encoding} with {steps} steps; update sewfast or fix the firmware"
         )
     return Channel(number, encoding, steps, _shown(name), _shown(unit))
 
@@ -332,7 +332,7 @@ T = TypeVar("T")
 def _whole(told: T | None, body: bytes, name: str) -> T:
     if told is None:
         raise LinkError(
-            f"expected a whole reply to {name}, got {len(body)} bytes; mend the firmware "
+            f"expected a whole reply to {name}, got {len(body)} bytes; fix the firmware "
             "(docs/PROTOCOL.md)"
         )
     return told

@@ -18,6 +18,7 @@ from ..control.loop import Plants, References
 from ..errors import Interrupted, SettingError
 from ..gains import whole
 from ..plotting import Drawing, Panel, Table, lettered, significant
+from ..progress import shown_in_notebooks
 from ..writers import write_table
 from .objective import Constraints, Cost, LoadStep
 from .search import tune
@@ -156,6 +157,7 @@ class ParetoFront:
         return "\n".join([f"{len(self)} controllers", head, *rows, told])
 
 
+@shown_in_notebooks("pareto")
 def pareto(
     models: Plants,
     references: References = None,
@@ -194,6 +196,7 @@ def pareto(
         Candidates tried.
     progress : callable, optional
         Called with (done, total, lowest cost).
+        In a notebook a bar is shown where this is left out; None shows none.
 
     Returns
     -------

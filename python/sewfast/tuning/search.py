@@ -16,6 +16,7 @@ from ..control.controller import Controller, SampledController, pid_of
 from ..control.loop import Plant, Plants, References, check_fits, each_plant, run
 from ..errors import FitError, Interrupted, SettingError
 from ..gains import whole
+from ..progress import shown_in_notebooks
 from .objective import Constraints, Cost, LoadStep
 from .task import (
     Aggregate,
@@ -32,7 +33,14 @@ from .task import (
 Method: TypeAlias = Literal["genetic", "cma-es"]
 
 EVALUATIONS = 1500
-"""Controllers tried unless said otherwise."""
+"""Controllers tried by default."""
+_ENDED_BY = {
+    "evaluations": "their number",
+    "converged": "convergence",
+    "time": "the time budget",
+    "interrupted": "Ctrl-C",
+}
+"""What a termination is called in a sentence."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +163,7 @@ class TuningResult:
         )
         return Table(
             f"cost {self.cost:.4g} {unit} (start {self.start_cost:.4g}), {self.evaluations} "
-            f"controllers tried, ended by {self.termination}",
+            f"controllers tried, ended by {_ENDED_BY.get(self.termination, self.termination)}",
             ("searched", "found", "from", "to"),
             rows,
         ).to_html([] if self.warning is None else [f"warning: {self.warning}"])
@@ -164,7 +172,7 @@ class TuningResult:
         unit = self.controller.y_unit or "y"
         lines = [
             f"cost {self.cost:.4g} {unit} (start {self.start_cost:.4g}) after {self.evaluations} "
-            f"evaluations, {self.termination}",
+            f"evaluations, ended by {_ENDED_BY.get(self.termination, self.termination)}",
             "  searched  " + "\n            ".join(str(v) for v in self.variables),
         ]
         if self.constraints != Constraints():
@@ -174,6 +182,7 @@ class TuningResult:
         return "\n".join([*lines, str(self.controller)])
 
 
+@shown_in_notebooks("tune")
 def tune(
     models: Plants,
     references: References = None,
@@ -273,6 +282,7 @@ def tune(
         All processors by default.
     progress : callable, optional
         Called with (done, total, lowest cost).
+        In a notebook a bar is shown where this is left out; None shows none.
 
     Raises
     ------
