@@ -107,7 +107,7 @@ def check_command(args: argparse.Namespace) -> None:
 ANALYSE = """\
 A controller on models (every member of an ensemble) or on the virtual machine: margins over the
 operating range, steps of the reference and of a disturbance, what gains that are a little off and
-plants that are not as identified would cost, and what speaks against the simulated loops.
+plants that are not as identified would cost, and doubts about the simulated loops.
 """
 
 ANALYSE_EXAMPLES = """\
