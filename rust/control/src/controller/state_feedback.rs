@@ -250,7 +250,7 @@ impl<T: Real> StateFeedback<T> {
         let innovation = y - self.x[0];
         let mut x = self.x;
         for (x, gain) in x.iter_mut().zip(l) {
-            *x = *x + gain * innovation;
+            *x += gain * innovation;
         }
         let [k1, k2, k3, k4] = k;
         let fed_back = (k1 * x[0] + k2 * x[1]) + (k3 * x[2] + k4 * x[3]);

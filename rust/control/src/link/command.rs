@@ -177,6 +177,10 @@ pub(super) struct Start {
 
 /// A command with its fields, of the right length but otherwise as they came.
 #[derive(Clone, Copy, Debug)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "there is no heap to box it on, and one command lives at a time"
+)]
 pub(super) enum Command<'a> {
     Hello {
         from: u8,
