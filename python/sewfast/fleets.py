@@ -246,6 +246,7 @@ def fleet(
     SettingError
         For no recordings, an unknown file extension, or if Dask is needed and not installed.
     """
+    _require_settings(workers, controller, seed)
     jobs = _jobs(recordings, inputs, output, Ts)
     settings: dict[str, Any] = {"model": model, "seed": seed, "controller": None}
     if controller is not None:
@@ -254,6 +255,8 @@ def fleet(
     place = None if out is None else Path(out)
     if place is not None:
         _require_ending(place)
+        if place.is_dir():
+            raise SettingError(f"{place}: expected a file to write to, got a folder; name a file")
     journal = _Journal(None if place is None else place, settings)
     rows = {job.file: row for job in jobs if (row := journal.known(job)) is not None}
     waiting = [job for job in jobs if job.file not in rows]
@@ -270,6 +273,27 @@ def fleet(
         found.save(place)
         journal.remove()
     return found
+
+
+def _require_settings(workers: Any, controller: Any, seed: Any) -> None:
+    if workers is not None and not (_is_whole(workers) and workers >= 0):
+        raise SettingError(
+            f"workers: expected a whole number of 0 or more, got {workers!r}; 0 works in this "
+            "process, None takes every core"
+        )
+    if controller is not None and not isinstance(controller, Controller):
+        raise SettingError(
+            f"controller: expected a Controller, got {type(controller).__name__}; load one with "
+            "load_controller"
+        )
+    if not (_is_whole(seed) and 0 <= seed < 2**64):
+        raise SettingError(
+            f"seed: expected a whole number from 0 to 2^64 - 1, got {seed!r}; take 0"
+        )
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
 # --- What there is to do --------------------------------------------------------------------------
@@ -309,8 +333,13 @@ def _jobs(
             ]
         else:
             jobs = list(_manifest(root, names, output, Ts))
-    else:
+    elif isinstance(recordings, Sequence):
         jobs = [_Job(str(p), os.fspath(p), names, output, Ts) for p in recordings]
+    else:
+        raise SettingError(
+            f"recordings: expected a folder, a manifest or a list of files, got {recordings!r}; "
+            "name the folder"
+        )
     if not jobs:
         raise SettingError(
             f"expected recordings ({', '.join(READABLE)}), got none in {recordings}; name a folder "
@@ -507,9 +536,22 @@ def _connected(
             "'sewfast[fleet]', or give workers=0"
         ) from error
     if scheduler is not None:
-        with distributed.Client(scheduler) as made:
+        try:
+            made = distributed.Client(scheduler)
+        except (OSError, ValueError) as error:
+            raise SettingError(
+                f"scheduler: expected the address of a Dask scheduler, {scheduler!r} cannot be "
+                f"reached ({type(error).__name__}); start it, or check the address"
+            ) from error
+        with made:
             yield made
         return
+    try:
+        dask.utils.parse_bytes(memory)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise SettingError(
+            f"memory: expected a size such as '500MB', got {memory!r}; state its unit"
+        ) from error
     # a worker that was killed is no fault of the recording it was at
     with dask.config.set({"distributed.scheduler.allowed-failures": _RETRIES}):
         options = {
