@@ -562,6 +562,7 @@ class Controller:
         """What the step computes with: gains per sample, filters, limits; ``rows`` of the schedule have speed, Kp,
         Kp Ts/Ti, Td and one over the distance to the next."""
 
+@final
 class SingleStateFeedback:
     """State feedback in single precision."""
 
@@ -572,6 +573,7 @@ class SingleStateFeedback:
     @property
     def numbers(self) -> dict[str, Any]: ...
 
+@final
 class StateFeedback:
     """State feedback with an observer, one sample at a time; its gains follow from the weights."""
 
