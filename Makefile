@@ -11,6 +11,8 @@ export PYO3_PYTHON := $(BIN)/python
 export CARGO_TARGET_DIR := $(CURDIR)/target
 export PYTHONDONTWRITEBYTECODE := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# one version of each tool and library, so that no release of theirs fails a build (make constraints)
+export PIP_CONSTRAINT := $(CURDIR)/packaging/constraints.txt
 export NO_MKDOCS_2_WARNING := 1
 ifneq ($(wildcard ../shared/data),)
 export SEWFAST_DATA ?= $(abspath ../shared/data)
@@ -23,12 +25,15 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors fleet fuzz-logs studio bits bode notches physics aarch64 licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors fleet fuzz-logs studio bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
 
 demo: $(REPORT) ## the whole experiment on the virtual machine; the report goes to demo/report.html
+	$(BIN)/sewfast demo --out $(OUT)
+
+$(OUT)/results.json: | $(REPORT)
 	$(BIN)/sewfast demo --out $(OUT)
 
 test: lint rust-test no-std c-test docs package python-test ## every check; ends with pytest's summary
@@ -63,8 +68,8 @@ studio: $(DEV) ## the studio in a real browser: from a slider's event to painted
 	$(BIN)/python benches/studio.py
 	$(BIN)/python benches/studio_stops.py
 
-fuzz-logs: $(DEV) ## damaged logs of every format, refused or read (COUNT=100000; a tenth of it where a library reads)
-	SEWFAST_DAMAGED=$(or $(COUNT),100000) $(BIN)/python -m pytest tests/readers/test_logs.py -k damaged_log
+fuzz-logs: $(DEV) ## damaged logs of every format, refused or read (COUNT=100000; ONLY="mf4 tdms"; hours)
+	$(BIN)/python tests/support/fuzzed_logs.py --count $(or $(COUNT),100000) $(if $(ONLY),--only $(ONLY))
 
 bits: $(DEV) ## deployed code against the core over ten million samples of every kind (an hour)
 	$(BIN)/python tests/support/deployed.py
@@ -107,6 +112,10 @@ aarch64: ## unit and property tests on an emulated 64-bit ARM (Debian: rustc-web
 	  CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER='qemu-aarch64 -L /usr/aarch64-linux-gnu' \
 	  cargo test --package sewfast-control --package sewfast-core --lib --profile checked --quiet -Zbuild-std --target $(ARM64)
 
+constraints: ## packaging/constraints.txt, the newest versions that fit together (needs uv)
+	uv pip compile pyproject.toml --extra dev --extra docs --extra bench --universal --python-version 3.10 \
+	  --upgrade --no-annotate --no-emit-index-url -o packaging/constraints.txt
+
 licences: ## LICENSE-THIRD-PARTY, from what the crates of a wheel say
 	$(PYTHON) tests/support/licences.py
 
@@ -133,8 +142,8 @@ python-test: $(DEV) ## pytest, with every snippet of the documentation and every
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not alone'
 	$(BIN)/python -m pytest -m alone
 
-docs: $(DEV) ## the site, in site/index.html; works offline
-	$(BIN)/python docs/build.py
+docs: $(DEV) $(OUT)/results.json ## the site, in site/index.html, its pictures drawn from demo/; works offline
+	$(BIN)/python docs/build.py --results $(OUT)
 	$(BIN)/mkdocs build --strict --quiet
 
 # the wheel comes from the source archive alone and is imported where only numpy is installed
@@ -153,8 +162,7 @@ bench: $(VENV)/bench.stamp ## sewfast and its rivals in one run; writes docs/PER
 bench-parts: $(VENV)/bench.stamp ## every benchmark by itself, with its spread (pytest-benchmark)
 	$(BIN)/python -m pytest benches --benchmark-enable --benchmark-only -o python_files='bench_*.py' -s
 
-pictures: $(REPORT) ## the pictures of README and gallery, from demo/ (which is made where it is missing)
-	test -f $(OUT)/results.json || $(BIN)/sewfast demo --out $(OUT)
+pictures: $(DEV) $(OUT)/results.json ## the pictures of README and pages that are checked in, from demo/
 	$(BIN)/python docs/pictures.py $(OUT)
 
 accuracy: $(DEV) ## accuracy of the default configuration on public records, beside published figures (SEWFAST_DATA)

@@ -21,7 +21,7 @@ import numpy as np
 import sewfast
 from sewfast import Cost, signals
 from sewfast.tuning import costs, first_controller, tune
-from sewfast.tuning.task import applied, threads_or_all
+from sewfast.tuning.task import threads_or_all
 
 COST = Cost(tracking=1.0, chatter=5.0, overshoot=3.0, saturation=0.0)
 
@@ -57,7 +57,7 @@ def controller(point: Any) -> sewfast.Controller:
         linear = v.name in ("alpha", "beta")
         ratio = 1.0 if linear else v.high / v.low
         values[v.name] = v.low + place * (v.high - v.low) if linear else v.low * ratio**place
-    return applied(values, first_controller(model()), "")
+    return first_controller(model()).with_values(values, "")
 
 
 def start() -> Any:

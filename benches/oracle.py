@@ -23,7 +23,6 @@ from sewfast.control.loop import ClosedLoopRun
 from sewfast.control.margins import margins
 from sewfast.tuning.objective import Cost
 from sewfast.tuning.search import Variable
-from sewfast.tuning.task import applied
 
 EVALUATIONS = 200
 """From the tuned gains; two thirds of it in a first search, the rest close to its best."""
@@ -171,7 +170,7 @@ def _at(point: Sequence[float], box: Sequence[Variable], like: Controller) -> Co
         )
         if v.name == "filter_samples":
             values[v.name] = round(values[v.name])
-    return replace(applied(values, like, "oracle"), notes="oracle")
+    return replace(like.with_values(values, "oracle"), notes="oracle")
 
 
 def _place(controller: Controller, box: Sequence[Variable]) -> np.ndarray:

@@ -197,7 +197,7 @@ def logs(count: int) -> Iterator[str]:
             for n in ("k_v", "k_a")
         ]
         if None in off:
-            yield "k_a or k_v named as untold"
+            yield "k_a or k_v named as undetermined"
         else:
             yield "within 5 %" if max(o for o in off if o is not None) < 0.05 else "OFF"
 

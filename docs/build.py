@@ -1,11 +1,12 @@
 """Writes the site's sources into target/docs, complete: what a builder then reads needs no hooks.
 
-    python docs/build.py [FOLDER]
+    python docs/build.py [FOLDER] [--results DEMO]
 
 Pages are copied; `<!-- help COMMAND -->` becomes what `sewfast COMMAND --help` prints,
 `<!-- file LANGUAGE PATH from "TEXT" to "TEXT" -->` the lines of a file, and every `$$ .. $$`
 MathML, which browsers draw without a script and without a network. A formula that ends with
-`\\tag{7}` has its number at the right edge. Some executed pages become notebooks as well.
+`\\tag{7}` has its number at the right edge. Some executed pages become notebooks as well. With the
+results of `sewfast demo` the pictures are drawn anew; without, those in docs/assets are taken.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import argparse
 import os
 import re
 import shutil
-import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -28,10 +28,14 @@ _TAG = re.compile(r"\s*\\tag\{(\w+)\}")
 _LINK = re.compile(r"\]\((?!https?:|#)([^)]+?)\.md(#[^)]*)?\)")
 
 
-def main(folder: Path) -> None:
+def main(folder: Path, results: Path | None = None) -> None:
     """Write the whole tree anew; what was in the folder before goes."""
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(ROOT / "docs" / "assets", folder / "assets")
+    if results is not None:
+        from pictures import draw_all
+
+        draw_all(results, folder / "assets")
     for page in sorted((ROOT / "docs").glob("*.md")):
         text = page.read_text(encoding="utf-8")
         if page.stem in NOTEBOOKS:
@@ -120,4 +124,8 @@ def _elsewhere(prose: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "target" / "docs"))
+    parser = argparse.ArgumentParser(description="Writes the site's sources.")
+    parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "target" / "docs")
+    parser.add_argument("--results", type=Path, help="of sewfast demo, to draw the pictures from")
+    given = parser.parse_args()
+    main(given.folder, given.results)

@@ -1,11 +1,16 @@
-"""Draws assets/closed_loop.svg, the picture of the README, from the demo's own results.
+"""Draws the pictures of README, gallery and pages, most of them from the demo's own results.
 
-sewfast demo --out demo && python docs/pictures.py demo      (or: make pictures)
+    sewfast demo --out demo && python docs/pictures.py demo      (or: make pictures)
+
+`make docs` draws them anew for the site (docs/build.py); those in docs/assets are for readers of
+the repository.
 """
 
 from __future__ import annotations
 
+import runpy
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,9 +24,7 @@ from sewfast.readers import read_table
 from sewfast.report.artefacts import run_file
 
 ASSETS = Path(__file__).parent / "assets"
-PICTURE = ASSETS / "closed_loop.svg"
-GALLERY = ASSETS / "gallery"
-BODE = ASSETS / "bode" / "compliant.png"
+PICTURES = runpy.run_path(str(Path(__file__).with_name("page_pictures.py")))["PICTURES"]
 LARGEST = 150_000
 """Bytes of a picture: a page has to load it."""
 COLOURS = 64
@@ -97,23 +100,29 @@ def bode(file: Path) -> None:
     response.plot(fit=sewfast.fit_shaft(response), file=file)
 
 
-def main() -> None:
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "demo")
-    loops = traces(folder)
-    drawing(loops).plot(file=PICTURE)
+def draw_all(results: Path, assets: Path) -> list[Path]:
+    """Draw every picture into a folder; the files."""
+    assets.mkdir(parents=True, exist_ok=True)
+    loops = traces(results)
+    picture = assets / "closed_loop.svg"
+    drawing(loops).plot(file=picture)
     predicted, measured = loops
     apart = float(np.sqrt(np.mean((predicted.y - measured.y) ** 2)))
     print(f"predicted and measured are {apart:.1f} RPM rms apart")
-    written = [PICTURE]
-    GALLERY.mkdir(exist_ok=True)
-    BODE.parent.mkdir(exist_ok=True)
-    drawn = {GALLERY / f"{name}.png": plot for name, plot in gallery(folder).items()}
-    drawn[BODE] = bode
+    drawn: dict[Path, Callable[[Path], object]] = {assets / "bode" / "compliant.png": bode}
+    for name, plot in gallery(results).items():
+        drawn[assets / "gallery" / f"{name}.png"] = lambda file, plot=plot: plot(file=file)
+    for name, draw_page in PICTURES.items():
+        drawn[assets / "pages" / f"{name}.png"] = draw_page
     for path, plot in drawn.items():
-        plot(file=path)
+        path.parent.mkdir(exist_ok=True)
+        plot(path)
         Image.open(path).convert("RGB").quantize(COLOURS).save(path, optimize=True)
-        written.append(path)
-    for path in written:
+    return [picture, *drawn]
+
+
+def main() -> None:
+    for path in draw_all(Path(sys.argv[1] if len(sys.argv) > 1 else "demo"), ASSETS):
         size = path.stat().st_size
         print(f"{path}: {size // 1000} kB")
         if size > LARGEST:

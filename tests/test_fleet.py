@@ -251,6 +251,53 @@ def test_what_makes_no_fleet_is_refused(tmp_path: Path, folder: Path) -> None:
         fleet(folder, before=tmp_path / "other.csv", workers=0)
 
 
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"workers": -1}, "workers: expected a whole number of 0 or more"),
+        ({"workers": "2"}, "workers: expected a whole number of 0 or more"),
+        ({"seed": -1}, "seed: expected a whole number"),
+        ({"controller": 3}, "controller: expected a Controller"),
+        ({"memory": "lots"}, "memory: expected a size"),
+    ],
+)
+def test_settings_are_looked_at_before_any_work(
+    folder: Path, settings: dict[str, Any], words: str
+) -> None:
+    if "memory" in settings:
+        pytest.importorskip("distributed")
+    with pytest.raises(SettingError, match=words):
+        fleet(folder, **settings)
+
+
+def test_a_folder_in_place_of_the_table_is_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "table.csv").mkdir()
+    with pytest.raises(SettingError, match="got a folder"):
+        fleet(folder, out=tmp_path / "table.csv", workers=0)
+
+
+def test_ctrl_c_says_what_is_kept(
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    from sewfast import fleets
+
+    done: list[str] = []
+    real = fleets._row
+
+    def interrupted(job: Any, *rest: Any) -> Any:
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(job.file)
+        return real(job, *rest)
+
+    monkeypatch.setattr(fleets, "_row", interrupted)
+    assert main(["fleet", str(folder), "-o", str(tmp_path / "a.csv"), "--workers", "0"]) == 130
+    assert "2 recordings are done and kept" in capsys.readouterr().err
+
+
 def test_the_command(
     folder: Path, tmp_path: Path, alone: Fleet, capsys: pytest.CaptureFixture[str]
 ) -> None:

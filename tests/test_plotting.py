@@ -135,7 +135,7 @@ def test_a_notebook_shows_a_table(name: str) -> None:
 
 def test_predicted_beside_measured() -> None:
     measured = loop(VirtualMachine())
-    panels = measured.plot(beside=[loop(VirtualMachine(7))])
+    panels = measured.plot(others=[loop(VirtualMachine(7))])
     labels = [line.get_label() for line in panels[0].lines]
     assert len(labels) == 3
     assert labels[-1] == "reference"
@@ -150,7 +150,9 @@ def test_the_picture_of_the_readme_is_drawn_from_a_demo(tmp_path: Path) -> None:
     assert len(drawn) == 4
     labels = [line.get_label() for line in drawn[0].lines]
     assert labels[-3:] == [*reversed(script["LABELS"].values()), "reference"]
-    for picture in (script["PICTURE"], *script["GALLERY"].glob("*.png")):
+    drawn_pages = {p.stem for p in (script["ASSETS"] / "pages").glob("*.png")}
+    assert drawn_pages == set(script["PICTURES"])
+    for picture in script["ASSETS"].rglob("*.png"):
         assert picture.stat().st_size <= script["LARGEST"]
 
 

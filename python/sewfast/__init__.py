@@ -12,10 +12,12 @@ if TYPE_CHECKING:
     from .commissioning import Commissioning, bode, commission
     from .comparison import Comparison, compare
     from .control.biquad import Biquad
-    from .control.controller import Controller, load_controller, paper_controller
+    from .control.controller import Controller, paper_controller
+    from .control.files import load_controller
     from .control.loop import ClosedLoopRun, run
     from .control.machine import Machine, record
     from .control.margins import Margins, margins, operating_point
+    from .control.state_feedback import StateFeedback
     from .dataset import Dataset, Diagnosis, Experiment, diagnose
     from .deployment import Deployment, deploy
     from .errors import (
@@ -89,6 +91,7 @@ __all__ = [
     "SettingError",
     "SewfastError",
     "ShaftFit",
+    "StateFeedback",
     "TuningResult",
     "Validation",
     "VirtualMachine",
@@ -137,6 +140,7 @@ _HOMES = {
     "comparison": "Comparison compare",
     "analysis": "Analysis analyse",
     "control": "Biquad Controller Gains fit_fopdt load_controller paper_controller table_1",
+    "control.state_feedback": "StateFeedback",
     "tuning": "Constraints Cost LoadStep ParetoFront TuningResult pareto tune",
     "dataset": "Dataset Diagnosis Experiment diagnose",
     "identification.delays": "DelayEstimate delay",

@@ -562,10 +562,49 @@ class Controller:
         """What the step computes with: gains per sample, filters, limits; ``rows`` of the schedule have speed, Kp,
         Kp Ts/Ti, Td and one over the distance to the next."""
 
+@final
+class SingleStateFeedback:
+    """State feedback in single precision."""
+
+    def step(self, r: float, y: float, feedforward: float = 0.0) -> float: ...
+    def reset(self) -> None: ...
+    @property
+    def filtered(self) -> float: ...
+    @property
+    def numbers(self) -> dict[str, Any]: ...
+
+@final
+class StateFeedback:
+    """State feedback with an observer, one sample at a time; its gains follow from the weights."""
+
+    def __new__(
+        cls, *, num: Sequence[float], den: Sequence[float], rho: float, integral: float, noise: float, weight: float,
+        lead: float, r_rate: float, u_min: float, u_max: float, slew: float, Ts: float,
+    ) -> StateFeedback:
+        """``num`` and ``den`` have four numbers each, without the leading 0 and 1."""
+
+    def step(self, r: float, y: float, feedforward: float = 0.0) -> float: ...
+    def reset(self) -> None: ...
+    @property
+    def filtered(self) -> float:
+        """The output as observed, at the last step."""
+
+    def single(self) -> SingleStateFeedback:
+        """The same gains, rounded to single precision; at rest."""
+
+    def sent(self) -> list[float]:
+        """The numbers that a device is sent."""
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What the step computes with: num, den, K, L, rest (the states at an output of 1), Kr, Ki, lead."""
+
+_Controller: TypeAlias = Controller | StateFeedback
+
 _Plant: TypeAlias = Machine | LinearModel | NeuralOE | NeuralSS
 
 def closed_loop(
-    plant: _Plant, controller: Controller, reference: _F, *, counts_per_unit: float,
+    plant: _Plant, controller: _Controller, reference: _F, *, counts_per_unit: float,
     encoder_phase: float = 0.5, feedforward: _F | None = None, disturbance: _F | None = None,
 ) -> dict[str, _F]:
     """Keys u, y (true output), feedback (after encoder and filter); all (N,). From rest, controller reset.
@@ -590,8 +629,8 @@ class _Limits(TypedDict):
     Ms: float | None
     overshoot: float | None
     u: float | None
-    recovery: float | Controller | None
-    load: float | Controller | None
+    recovery: float | _Controller | None
+    load: float | _Controller | None
 
 class _Task(TypedDict):
     """What is tuned on what.
@@ -607,7 +646,7 @@ class _Task(TypedDict):
     references: Sequence[_F]
     disturbances: Sequence[_F]
     load_steps: Sequence[tuple[_F, _F, float, int]]
-    start: Controller
+    start: _Controller
     counts_per_unit: float
     variations: Sequence[tuple[float, int]]
     variables: Sequence[_Variable]
@@ -625,7 +664,7 @@ def tune(
     """
 
 def tuning_costs(
-    task: _Task, controllers: Sequence[Controller], *, threads: int, progress: _Progress = None
+    task: _Task, controllers: Sequence[_Controller], *, threads: int, progress: _Progress = None
 ) -> list[tuple[float, float]]:
     """Cost and violation of each controller."""
 
@@ -633,7 +672,7 @@ def tuning_loads(task: _Task) -> list[tuple[float, float]]:
     """Recovery [ms] and rms deviation [y] of the start on each plant in each variation, the worst over the load steps."""
 
 def pareto(
-    task: _Task, *, others: Sequence[Controller], objectives: Sequence[str], size: int, evaluations: int, seed: int, threads: int,
+    task: _Task, *, others: Sequence[_Controller], objectives: Sequence[str], size: int, evaluations: int, seed: int, threads: int,
     progress: _Progress = None,
 ) -> dict[str, Any]:
     """Returns controllers (values of the variables), values (of the objectives), variables, evaluations, termination."""
@@ -758,6 +797,9 @@ class LinkBodies:
     @staticmethod
     def biquads(sections: Sequence[Sequence[float]]) -> bytes:
         """Sections of c0, c1, a1, a2."""
+    @staticmethod
+    def controller(kind: int, counts_per_unit: float, values: Sequence[float]) -> bytes:
+        """The number of a kind, counts per unit and second, the numbers of the kind."""
     @staticmethod
     def start(mode: int, watchdog: int, at: int, length: int, mask: int, batch: int) -> bytes: ...
     @staticmethod

@@ -13,6 +13,8 @@ import itertools
 import json
 import math
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -30,6 +32,7 @@ from .evidence import Residuals, estimate
 from .identification import identify
 from .kinds import Kind
 from .models import Model
+from .progress import shown_in_notebooks
 from .readers import read
 from .validation import validate
 
@@ -180,6 +183,7 @@ class Fleet:
         return "\n".join(lines)
 
 
+@shown_in_notebooks("fleet", "share failed")
 def fleet(
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
@@ -231,6 +235,7 @@ def fleet(
         As of `identify`; the same seed gives the same bits on any number of workers.
     progress : callable, optional
         Called with recordings done, recordings in all and the share that failed.
+        In a notebook a bar is shown where this is left out; None shows none.
 
     Returns
     -------
@@ -241,6 +246,7 @@ def fleet(
     SettingError
         For no recordings, an unknown file extension, or if Dask is needed and not installed.
     """
+    _require_settings(workers, controller, seed)
     jobs = _jobs(recordings, inputs, output, Ts)
     settings: dict[str, Any] = {"model": model, "seed": seed, "controller": None}
     if controller is not None:
@@ -249,6 +255,8 @@ def fleet(
     place = None if out is None else Path(out)
     if place is not None:
         _require_ending(place)
+        if place.is_dir():
+            raise SettingError(f"{place}: expected a file to write to, got a folder; name a file")
     journal = _Journal(None if place is None else place, settings)
     rows = {job.file: row for job in jobs if (row := journal.known(job)) is not None}
     waiting = [job for job in jobs if job.file not in rows]
@@ -265,6 +273,27 @@ def fleet(
         found.save(place)
         journal.remove()
     return found
+
+
+def _require_settings(workers: Any, controller: Any, seed: Any) -> None:
+    if workers is not None and not (_is_whole(workers) and workers >= 0):
+        raise SettingError(
+            f"workers: expected a whole number of 0 or more, got {workers!r}; 0 works in this "
+            "process, None takes every core"
+        )
+    if controller is not None and not isinstance(controller, Controller):
+        raise SettingError(
+            f"controller: expected a Controller, got {type(controller).__name__}; load one with "
+            "load_controller"
+        )
+    if not (_is_whole(seed) and 0 <= seed < 2**64):
+        raise SettingError(
+            f"seed: expected a whole number from 0 to 2^64 - 1, got {seed!r}; take 0"
+        )
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
 # --- What there is to do --------------------------------------------------------------------------
@@ -304,8 +333,13 @@ def _jobs(
             ]
         else:
             jobs = list(_manifest(root, names, output, Ts))
-    else:
+    elif isinstance(recordings, Sequence):
         jobs = [_Job(str(p), os.fspath(p), names, output, Ts) for p in recordings]
+    else:
+        raise SettingError(
+            f"recordings: expected a folder, a manifest or a list of files, got {recordings!r}; "
+            "name the folder"
+        )
     if not jobs:
         raise SettingError(
             f"expected recordings ({', '.join(READABLE)}), got none in {recordings}; name a folder "
@@ -378,7 +412,7 @@ def _identified(job: _Job, settings: Mapping[str, Any], controller: Controller |
     if controller is not None:
         from .tuning import tune
 
-        tuned = tune(model, start=controller, seed=settings["seed"], threads=1).controller
+        tuned = tune(model, start=controller, seed=settings["seed"], threads=1).pid
         standard = tuned.gains.to("standard")
         gains = {"Kp": standard.Kp, "Ti": standard.Ti, "Td": standard.Td}
     return Row(
@@ -502,9 +536,22 @@ def _connected(
             "'sewfast[fleet]', or give workers=0"
         ) from error
     if scheduler is not None:
-        with distributed.Client(scheduler) as made:
+        try:
+            made = distributed.Client(scheduler)
+        except (OSError, ValueError) as error:
+            raise SettingError(
+                f"scheduler: expected the address of a Dask scheduler, {scheduler!r} cannot be "
+                f"reached ({type(error).__name__}); start it, or check the address"
+            ) from error
+        with made:
             yield made
         return
+    try:
+        dask.utils.parse_bytes(memory)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise SettingError(
+            f"memory: expected a size such as '500MB', got {memory!r}; state its unit"
+        ) from error
     # a worker that was killed is no fault of the recording it was at
     with dask.config.set({"distributed.scheduler.allowed-failures": _RETRIES}):
         options = {
@@ -513,8 +560,23 @@ def _connected(
             "memory_limit": memory,
             "dashboard_address": None,
         }
-        with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as made:
+        with _workers_without_ctrl_c():
+            cluster = distributed.LocalCluster(**options)
+        with cluster, distributed.Client(cluster) as made:
             yield made
+
+
+@contextmanager
+def _workers_without_ctrl_c() -> Iterator[None]:
+    """Processes that begin here leave Ctrl-C to this one, which ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 # --- What is kept on the way ----------------------------------------------------------------------

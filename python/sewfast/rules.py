@@ -81,12 +81,13 @@ class Fopdt:
 
     @property
     def warning(self) -> str:
-        """What speaks against gains from these numbers; empty where nothing does."""
+        """Why gains from this fit should not be trusted; empty if there is no reason."""
         if not self.overshoot_percent:
             return ""
         return (
-            f"overshoots by {self.overshoot_percent:.0f} %, which no first order with dead time "
-            "does: do not trust gains from these numbers, identify a model of second order or more"
+            f"overshoots by {self.overshoot_percent:.0f} %, which a first-order model with dead "
+            "time cannot: do not trust gains from this fit, identify a model of second order or "
+            "higher"
         )
 
     def response(self, t: ArrayLike) -> NDArray[np.float64]:
@@ -123,7 +124,7 @@ def fit_fopdt(
     Least squares over K, T, L and the level before the step. The record is used from its start to
     the second step of the input; the first may be anywhere after some samples. Samples on a limit
     of the output have no weight, and a machine that was not at rest is fitted with its free
-    response if that exceeds three of its standard errors. Standard errors hold for coloured
+    response if that exceeds three of its standard errors. Standard errors are valid for coloured
     residuals, which are whitened by an autoregression (Andrews, Monahan 1992). `Fopdt.warning`
     reports an overshoot beyond what the noise explains: the response is then not of first order.
 
@@ -292,7 +293,7 @@ def by_name(name: str) -> Callable[[Fopdt], Rule]:
     """
     rule = BY_NAME.get(str(name).replace("_", "-").lower())
     if rule is None:
-        raise SettingError(f"expected a rule out of {', '.join(BY_NAME)}, got {name!r}")
+        raise SettingError(f"expected one of the rules {', '.join(BY_NAME)}, got {name!r}")
     return rule
 
 

@@ -198,7 +198,7 @@ def _trapezoid(
 
 
 def _trapezoids(seed: int) -> FloatArray:
-    # Down to a slow run, not to rest: a crank that friction holds tells nothing of the drive.
+    # Down to a slow run, not to rest: a crank held by friction shows nothing about the drive.
     rise = np.linspace(0.0, _SLOW_RPM, round(0.1 / TS))
     return np.concatenate([rise, *(_trapezoid(*shape, low=_SLOW_RPM) for shape in TRAPEZOIDS)])
 

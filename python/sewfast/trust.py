@@ -1,4 +1,4 @@
-"""What speaks against a closed loop: training region, saturation, limit cycle, disagreement."""
+"""Doubts about a closed loop: training region, saturation, limit cycle, disagreement."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 
 from .arrays import REVOLUTIONS_PER_SECOND
-from .control.controller import Controller
+from .control.controller import SampledController
 from .control.defaults import default_references
 from .control.loop import (
     ClosedLoopRun,
@@ -71,7 +71,7 @@ def disagreements(runs: Sequence[ClosedLoopRun]) -> tuple[Disagreement, ...]:
     runs : sequence of ClosedLoopRun
         Those that stand alone are not compared.
     """
-    groups: dict[tuple[Controller, str, bytes], list[ClosedLoopRun]] = {}
+    groups: dict[tuple[SampledController, str, bytes], list[ClosedLoopRun]] = {}
     for run in runs:
         groups.setdefault((run.controller, run.reference, run.r.tobytes()), []).append(run)
     return tuple(_of(group) for group in groups.values() if len(group) > 1)
@@ -217,7 +217,7 @@ def _rms(values: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds; what exceeds one is warned of, or refused (`disagreement`).
+    """Bounds; exceeding one gives a warning, or a refusal (`disagreement`).
 
     Parameters
     ----------
@@ -353,7 +353,7 @@ FAR = 0.2
 
 
 def region(runs: Sequence[JudgedRun], limits: Limits) -> Line:
-    """Does a model have to say what it has never seen?"""
+    """Does the loop leave the region that the model was trained in?"""
     name, limit = "training region", f"<= {100 * limits.outside:g} %"
     known = [r for r in runs if math.isfinite(r.outside)]
     if not known:
@@ -366,7 +366,7 @@ def region(runs: Sequence[JudgedRun], limits: Limits) -> Line:
     if worst.outside <= limits.outside:
         text = "the loop stays where the model was trained"
         return Line(name, worst.outside, shown, limit, "ok", text)
-    far = "the loop runs where the model was not trained: what it promises there is a guess"
+    far = "the loop runs where the model was not trained: its predictions there are a guess"
     some = "some of the loop runs where the model was not trained"
     text = (
         f"{far if worst.outside > FAR else some} (worst: {worst.name}); record such operation, "
@@ -376,27 +376,30 @@ def region(runs: Sequence[JudgedRun], limits: Limits) -> Line:
 
 
 def saturation(runs: Sequence[JudgedRun], limits: Limits) -> Line:
-    """Does the loop lean on the limits of the command?"""
+    """Is the command at its limits for long?"""
     worst = max(runs, key=lambda r: r.saturated)
     name, limit = "saturation", f"<= {100 * limits.saturated:g} %"
     shown = f"{100 * worst.saturated:.1f} % of the time"
     if worst.saturated <= limits.saturated:
-        text = "the command keeps within its limits for most of the time"
+        text = "the command is within its limits most of the time"
         return Line(name, worst.saturated, shown, limit, "ok", text)
     text = (
-        f"the command stays at a limit (worst: {worst.name}): there the loop is open, gains say "
-        "nothing and a disturbance is not rejected; demand less, or check whether it swings"
+        f"the command stays at a limit (worst: {worst.name}): there the loop is open, gains "
+        "have no effect and a disturbance is not rejected; demand less, or check whether it "
+        "oscillates"
     )
     return Line(name, worst.saturated, shown, limit, "warn", text)
 
 
 def limit_cycle(runs: Sequence[JudgedRun], limits: Limits) -> Line:
-    """Does the loop swing by itself?"""
+    """Does the loop oscillate by itself?"""
     name = "limit cycle"
     limit = f"swing <= {100 * limits.swing:g} %, ripple <= {100 * limits.ripple:g} %"
     seen = [(r, r.oscillation) for r in runs if r.oscillation is not None]
     if not seen:
-        text = "no reference is constant for long enough to see whether the loop swings by itself"
+        text = (
+            "no reference is constant for long enough to see whether the loop oscillates by itself"
+        )
         return Line(name, math.nan, "not seen", limit, "info", text)
     cycling = [
         (r, o) for r, o in seen if o.lasts and (o.swing > limits.swing or o.ripple > limits.ripple)
@@ -410,13 +413,13 @@ def limit_cycle(runs: Sequence[JudgedRun], limits: Limits) -> Line:
     if not cycling:
         return Line(
             name, worst.swing, shown, limit, "ok",
-            "at constant reference the loop comes to rest, but for the encoder's steps and what "
-            "the load does",
+            "at constant reference the loop settles, except for encoder steps and the "
+            "load",
         )  # fmt: skip
     text = (
-        f"at a constant reference of {worst.level:g} {units['y']} the loop swings by itself, with "
-        f"about {worst.hertz:.3g} Hz (worst: {run.name}): it tracks as a limit cycle held by the "
-        "limits; lower the gains, filter the feedback, or take delay out of the loop"
+        f"at a constant reference of {worst.level:g} {units['y']} the loop oscillates by itself, "
+        f"at about {worst.hertz:.3g} Hz (worst: {run.name}): it tracks in a limit cycle that only "
+        "the limits contain; lower the gains, filter the feedback, or take delay out of the loop"
     )
     return Line(name, worst.swing, shown, limit, "warn", text)
 
@@ -425,16 +428,17 @@ def disagreement(found: Sequence[Disagreement], limits: Limits, unit: str) -> Li
     """Do models of the same plant promise the same?"""
     name, limit = "disagreement", f"<= {100 * limits.disagreement:g} % of the reference's span"
     if not found:
-        text = "one plant alone: nothing says how far its promise may be off; tune on several"
+        text = "one plant alone does not show how far its prediction may be off; tune on several"
         return Line(name, math.nan, "not known", limit, "info", text)
     worst = max(found, key=lambda d: d.share)
     shown = f"{worst.rms:.3g} {unit} rms, {100 * worst.share:.3g} %"
     if worst.share <= limits.disagreement:
-        text = f"{worst.plants} plants answer alike: what they promise does not hang on one of them"
+        text = f"{worst.plants} plants respond alike: the prediction does not depend on one of them"
         return Line(name, worst.share, shown, limit, "ok", text)
     text = (
-        f"{worst.plant} parts from the median of {worst.plants} plants on {worst.reference}: the "
-        "data do not decide what this loop will do; leave out members that fit badly, or record "
+        f"{worst.plant} deviates from the median of {worst.plants} plants on {worst.reference}: "
+        f"the "
+        "data do not determine what this loop will do; leave out members that fit badly, or record "
         "a closed loop and identify again"
     )
     return Line(name, worst.share, shown, limit, "fail", text)
@@ -447,10 +451,10 @@ class HasController(Protocol):
     """What came with a controller, as from `tune` or `commission`."""
 
     @property
-    def controller(self) -> Controller | None: ...
+    def controller(self) -> SampledController | None: ...
 
 
-Judgeable: TypeAlias = ClosedLoopRun | Sequence[ClosedLoopRun] | Controller | HasController
+Judgeable: TypeAlias = ClosedLoopRun | Sequence[ClosedLoopRun] | SampledController | HasController
 
 REFERENCES = ("trapezoid", "random")
 
@@ -539,7 +543,7 @@ def _runs(
     if isinstance(what, ClosedLoopRun):
         return [(what, None)]
     controller = getattr(what, "controller", what)
-    if isinstance(controller, Controller):
+    if isinstance(controller, SampledController):
         if not plants:
             raise SettingError(
                 "expected plants to run the controller on, got none; give judge(controller, models)"

@@ -120,7 +120,7 @@ def test_report_card_and_judgement_are_evidence(whole: Commissioning, tmp_path: 
     assert told["report card"]["verdict"] == whole.card.verdict
     page = whole.save(tmp_path / "out").read_text()
     assert "training region" in page
-    assert "Required beside the cost" in page
+    assert "Required besides the cost" in page
 
 
 def test_without_a_load_or_ms_nothing_is_required() -> None:

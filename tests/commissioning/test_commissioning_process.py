@@ -166,7 +166,7 @@ def test_a_whole_commissioning_stays_beside_an_unfinished_one(
     drive.save(tmp_path, overwrite=True)
     assert (tmp_path / "unfinished/step.mcap").exists()
     monkeypatch.chdir(tmp_path.parent)
-    own = replace(drive, taken_in=Path(tmp_path.name))
+    own = replace(drive, recorded_in=Path(tmp_path.name))
     own.save(tmp_path, overwrite=True)
     # a refused one may be resumed, of a verified one the tables hold the same
     assert (tmp_path / "unfinished/step.mcap").exists()

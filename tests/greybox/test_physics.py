@@ -70,12 +70,12 @@ def test_command_and_speed_show_what_it_takes_to_turn(record: Any, alone: Motor)
     assert alone.fit_percent > 97.0
 
 
-def test_without_a_current_neither_resistance_nor_inertia_is_told(alone: Motor) -> None:
+def test_without_a_current_neither_resistance_nor_inertia_is_printed(alone: Motor) -> None:
     assert not SI & set(alone.parameters)
-    assert set(alone.untold) >= SI
+    assert set(alone.undetermined) >= SI
     with pytest.raises(DataError, match="pass current"):
         alone.value("inertia")
-    assert "not told" in str(alone)
+    assert "not determined" in str(alone)
 
 
 def test_a_current_and_volts_tell_all_in_si_units(record: Any, whole: Motor) -> None:
@@ -88,7 +88,7 @@ def test_a_current_and_volts_tell_all_in_si_units(record: Any, whole: Motor) -> 
 
 def test_a_current_without_volts_tells_no_inertia(record: Any) -> None:
     motor = physics(record[1], current=record[2], structure=["lag", "coulomb"])
-    assert "volts" in motor.untold["inertia"]
+    assert "volts" in motor.undetermined["inertia"]
     p = record[0].parameters
     assert motor.value("resistance") == pytest.approx(
         p["resistance"] / p["amplifier_gain"], rel=0.1
@@ -191,8 +191,8 @@ def test_what_tells_nothing_is_refused(change: Any, error: type, says: str) -> N
 def test_a_step_to_one_speed_parts_nothing_but_the_time_constant() -> None:
     machine = VirtualMachine(31)
     motor = physics(sewfast.record(machine, sewfast.signals.excitation("step")))
-    assert {"k_v", "k_a", "k_s"} <= set(motor.untold)
-    assert "several speeds" in motor.untold["k_v"]
+    assert {"k_v", "k_a", "k_s"} <= set(motor.undetermined)
+    assert "several speeds" in motor.undetermined["k_v"]
     truth = truths(machine.parameters)
     T = truth["k_a"] / truth["k_v"]
     assert motor.value("time_constant") == pytest.approx(T, rel=0.02)
@@ -208,12 +208,12 @@ def test_a_limit_of_the_current_is_found() -> None:
     assert motor.value("k_a") == pytest.approx(truth["k_a"], rel=0.02)
 
 
-def test_one_direction_leaves_the_offset_untold() -> None:
+def test_one_direction_does_not_determine_the_offset() -> None:
     u, _ = linear()
     machine = VirtualMachine(3)
     recording, _ = recorded(machine, 1.0 + np.abs(np.repeat(u[:500], 20)))
     motor = physics(recording)
-    assert "one sign" in motor.untold["offset"]
+    assert "one sign" in motor.undetermined["offset"]
     assert motor.value("k_v") == pytest.approx(truths(machine.parameters)["k_v"], rel=0.02)
 
 
@@ -347,13 +347,13 @@ def test_a_file_holds_all_and_reads_strictly(alone: Motor, tmp_path: Path) -> No
     assert np.array_equal(again.simulate(np.ones(500)), alone.simulate(np.ones(500)))
     whole = json.loads(path.read_text())
     for change in (
-        {"version": 2},
+        {"version": 3},
         {"theta": {}},
         {"theta": {**whole["theta"], "k_a": -1.0}},
         {"parameters": []},
         {"parameters": {"k_v": {"value": 1.0}}},
         {"speed_unit": "furlongs"},
-        {"untold": {"k_v": 3}},
+        {"undetermined": {"k_v": 3}},
         {"converged": "yes"},
         {"samples": 1.5},
         {"extra": 1},
@@ -361,6 +361,15 @@ def test_a_file_holds_all_and_reads_strictly(alone: Motor, tmp_path: Path) -> No
         path.write_text(json.dumps({**whole, **change}))
         with pytest.raises(ModelFileError):
             load_motor(path)
+
+
+def test_a_file_of_version_1_is_read(alone: Motor, tmp_path: Path) -> None:
+    path = tmp_path / "motor.json"
+    alone.save(path)
+    whole = json.loads(path.read_text())
+    whole |= {"version": 1, "untold": whole.pop("undetermined")}
+    path.write_text(json.dumps(whole))
+    assert load_motor(path).to_dict() == alone.to_dict()
 
 
 def test_its_picture_is_drawn(alone: Motor, tmp_path: Path) -> None:

@@ -154,7 +154,7 @@ def test_a_silent_port_fails_at_the_device(silent: str) -> None:
 def test_a_port_that_answers_garbage_says_so(garbling: str) -> None:
     found = examine(garbling, echoes=10)["device"]
     assert found.verdict == "fail"
-    assert "no frames" in found.measured
+    assert "not frames" in found.measured
     assert "baud" in found.remedy
 
 

@@ -84,7 +84,7 @@ def test_greeting_sets_and_moves_nothing():
     ("answers", "message"),
     [
         (b"", r"to answer HELLO within 1 s, nothing came; check cable"),
-        (b"\x55\xaa" * 40, r"80 bytes came that are no frames .*baud rate \(115200\)"),
+        (b"\x55\xaa" * 40, r"80 bytes arrived that are not frames .*baud rate \(115200\)"),
     ],
 )
 def test_what_does_not_answer(answers, message):
@@ -98,7 +98,7 @@ def test_what_does_not_answer(answers, message):
 def test_a_line_that_only_echoes_is_told_apart():
     with simulated() as (device, port):
         device.hear = lambda data: device.wire.write(data) or b""
-        with pytest.raises(LinkError, match=r"only what was sent came back; .*joined"):
+        with pytest.raises(LinkError, match=r"what was sent came back; .*connected to each other"):
             linked(port)
 
 
@@ -203,7 +203,7 @@ def test_what_else_came_is_said_where_an_answer_did_not():
     with simulated() as (device, port):
         link = linked(port)
         device.intercept = lambda frame: device.send(0xC3, b"said") or True
-        with pytest.raises(LinkError, match=r"attempts, but 1\d other frames: it does not hear"):
+        with pytest.raises(LinkError, match=r"attempts, but 1\d other frames: it receives nothing"):
             link.status()
 
 

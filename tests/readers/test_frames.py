@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from decimal import Decimal
 from typing import Any
 
 import numpy as np
@@ -184,6 +185,27 @@ def test_polars_and_arrow_kinds_of_columns() -> None:
         assert np.array_equal(table["u"][:3], [1.0, np.nan, 3.0], equal_nan=True)
         assert np.array_equal(table["on"][:2], [1.0, np.nan], equal_nan=True)
         assert sewfast.read(table, inputs="on").Ts == pytest.approx(TS)
+
+
+@pytest.mark.parametrize("package", ["pandas", "polars"])
+def test_a_single_column_is_refused(package: str) -> None:
+    series = pytest.importorskip(package).Series("speed", U)
+    with pytest.raises(SettingError, match="one DataFrame"):
+        read(series)
+
+
+@pytest.mark.parametrize("package", ["pandas", "polars"])
+def test_decimals_are_numbers(package: str) -> None:
+    values = [Decimal(repr(round(v, 6))) for v in U.tolist()]
+    frame = pytest.importorskip(package).DataFrame({"t": T, "u": U, "speed": values})
+    found = sewfast.read(frame, inputs="u", output="speed").experiments[0].y
+    np.testing.assert_allclose(found, U, atol=1e-6)
+
+
+def test_what_is_masked_was_not_measured() -> None:
+    speed = np.ma.masked_array(U, mask=np.arange(N) == 3)
+    y = sewfast.read({"t": T, "u": U, "speed": speed}, inputs="u", output="speed").experiments[0].y
+    assert np.flatnonzero(np.isnan(y)).tolist() == [3]
 
 
 def test_anything_with_an_arrow_stream_is_read() -> None:

@@ -6,6 +6,8 @@ import importlib.util
 import itertools
 import os
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -422,6 +424,17 @@ def test_a_damaged_log_is_refused_or_read(name: str, tmp_path: Path) -> None:
             outcomes.add(DataError if str(place) in str(refused) else str)
     assert outcomes <= {Table, DataError}
     assert outcomes
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems bound no memory of a process")
+def test_a_reader_that_asks_for_more_memory_than_a_file_can_need_is_refused_it() -> None:
+    program = (
+        "import numpy as np; from sewfast.readers.logs import _bound_memory; "
+        "_bound_memory(1_000_000_000); np.ones(10_000_000); np.ones(1_000_000_000)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "Unable to allocate 7.45 GiB" in done.stderr.splitlines()[-1]
 
 
 @pytest.mark.parametrize("name", ["run.mf4", "run.tdms", "run.ulg", "run.bag", "run.mcap"])

@@ -116,6 +116,11 @@ def test_identifiers_are_unique_and_every_reference_leads_somewhere(structure: S
     assert set(structure.targets) <= set(structure.ids)
 
 
+def test_the_first_screen_has_the_verdict_and_the_picture_of_the_loop(page: str) -> None:
+    verdict, picture = page.index("erified: on the trapezoid"), page.index('<figure id="opening">')
+    assert page.index("<h1>") < verdict < picture < page.index('id="summary"')
+
+
 def test_every_figure_says_in_words_what_it_shows(structure: Structure) -> None:
     assert len(structure.figures) > len(PAPER_FIGURES)
     assert all({"role", "aria-label"} <= set(names) for names in structure.figures)

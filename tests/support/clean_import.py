@@ -3,7 +3,9 @@
 import sys
 from importlib.metadata import distributions
 
-import sewfast
+has_lock = getattr(sys, "_is_gil_enabled", lambda: True)()
+
+import sewfast  # noqa: E402
 
 installed = {d.name for d in distributions()}
 assert installed <= {"sewfast", "numpy", "pip", "setuptools"}, installed
@@ -21,5 +23,7 @@ model = sewfast.identify(data, model="oe")
 assert sewfast.validate(model, data).simulation.fit_percent > 90.0
 assert "scipy" not in sys.modules
 assert "matplotlib" not in sys.modules
+# a free-threaded interpreter locks itself for an extension that does not say that it needs no lock
+assert getattr(sys, "_is_gil_enabled", lambda: True)() == has_lock
 
 print("sewfast", sewfast.__version__, "works with numpy alone")

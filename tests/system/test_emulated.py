@@ -92,7 +92,8 @@ def test_recordings_on_credit_are_equal_and_the_processor_is_measured() -> None:
             figures = board.figures()
             made.append((chirp.counts, run.y, run.u))
         # ceilings, as an embedded developer plans by them
-        assert figures.code <= 40 * 1024
+        # state feedback and its command took 4.5 KB more than the PID alone
+        assert figures.code <= 46 * 1024
         assert figures.stack <= 4096
         assert figures.memory <= 16 * 1024
         assert figures.steps >= 4000

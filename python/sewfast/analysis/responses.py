@@ -349,12 +349,12 @@ def _cut(
     r: FloatArray, runs: Sequence[ClosedLoopRun], lead: int, first: int, steps: Steps,
     names: Sequence[str], kind: str,
 ) -> Responses:  # fmt: skip
-    gains = runs[0].controller.gains
+    controller = runs[0].controller
     t = (np.arange(first, len(r), dtype=np.float64) - lead) * runs[0].Ts
     return Responses(
         kind, t, r[first:], np.array([x.y[first:] for x in runs]),
         np.array([x.u[first:] for x in runs]), tuple(names), steps.level, steps.step, 0.0,
-        gains.y_unit, gains.u_unit,
+        controller.y_unit, controller.u_unit,
     )  # fmt: skip
 
 

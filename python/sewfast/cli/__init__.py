@@ -14,9 +14,8 @@ from pathlib import Path
 from ..errors import SettingError, SewfastError
 from . import project
 from .drive import is_port
+from .output import DONE, FAULT, INTERRUPTED, REFUSED
 from .parser import build_parser
-
-DONE, FAULT, REFUSED, INTERRUPTED = 0, 1, 2, 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -111,7 +111,7 @@ def add(commands: Commands) -> None:
 
 
 def command(args: argparse.Namespace) -> None:
-    from ..control import load_controller
+    from ..control.files import load_pid
     from ..frequency import fit_shaft
 
     require_place(args.out, (".json",))
@@ -128,7 +128,7 @@ def command(args: argparse.Namespace) -> None:
         raise SettingError(
             f"expected a record, DATA, or a machine, --on virtual, received {received}"
         )
-    controller = None if args.controller is None else load_controller(args.controller)
+    controller = None if args.controller is None else load_pid(args.controller)
     response = _of_record(args) if args.on is None else _of_machine(args, controller)
     if args.out is not None:
         response.save(args.out)

@@ -107,7 +107,7 @@ def check_command(args: argparse.Namespace) -> None:
 ANALYSE = """\
 A controller on models (every member of an ensemble) or on the virtual machine: margins over the
 operating range, steps of the reference and of a disturbance, what gains that are a little off and
-plants that are not as identified would cost, and what speaks against the simulated loops.
+plants that are not as identified would cost, and doubts about the simulated loops.
 """
 
 ANALYSE_EXAMPLES = """\
@@ -154,10 +154,10 @@ def add_analyse(commands: Commands) -> None:
 
 def analyse_command(args: argparse.Namespace) -> None:
     from ..analysis import analyse
-    from ..control.controller import load_controller
+    from ..control.files import load_pid
 
     require_plot(args.plot)
-    controller = load_controller(args.controller)
+    controller = load_pid(args.controller)
     references = [
         reference_of(text, controller.Ts, controller.gains.y_unit) for text in args.reference or ()
     ]

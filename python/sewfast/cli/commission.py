@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import Interrupted
+from ..progress import Progress
 from .arguments import Commands, add_command, add_overwrite
 from .drive import add_drive, is_port, machine_of, opened, require_no_drive_options
-from .output import Progress, print_json, print_rows
+from .output import print_json, print_rows
 
 if TYPE_CHECKING:
     from ..commissioning import Commissioning

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import DataError, Interrupted, SettingError
+from ..progress import Progress
 from .arguments import (
     RECORDINGS,
     TABLES,
@@ -30,10 +31,10 @@ from .drive import (
     require_no_drive_options,
     say_interrupted,
 )
-from .output import Progress, print_json, write_columns
+from .output import print_json, write_columns
 
 if TYPE_CHECKING:
-    from ..control.controller import Controller
+    from ..control.controller import Controller, SampledController
     from ..control.loop import ClosedLoopRun, Plant
     from ..dataset import FloatArray
     from ..evidence import Line
@@ -92,14 +93,14 @@ def add(commands: Commands) -> None:
 
 def run_command(args: argparse.Namespace) -> int | None:
     from ..commissioning.fmu import is_fmu
-    from ..control.controller import load_controller
+    from ..control.files import load_controller, load_pid
     from ..control.loop import run
 
     _settle_plant(args)
     require_plot(args.plot)
     if args.host_loop is not None:
-        controller = at_loops_period(args, load_controller(args.controller))
-        return run_host_loop(args, controller, _wanted(args, controller))
+        pid = at_loops_period(args, load_pid(args.controller))
+        return run_host_loop(args, pid, _wanted(args, pid))
     require_place(args.out, RECORDINGS if is_port(args.on) else TABLES)
     controller = load_controller(args.controller)
     name = None if args.reference is None else Path(args.reference).stem
@@ -200,11 +201,11 @@ def plant_of(text: str) -> Plant:
     return load_model(text)
 
 
-def _wanted(args: argparse.Namespace, controller: Controller) -> Any:
+def _wanted(args: argparse.Namespace, controller: SampledController) -> Any:
     """The reference of a run; None for the plant's usual one."""
     if args.reference is None:
         return None
-    return reference_of(args.reference, controller.Ts, controller.gains.y_unit)
+    return reference_of(args.reference, controller.Ts, controller.y_unit)
 
 
 def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:

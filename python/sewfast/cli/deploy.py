@@ -58,8 +58,8 @@ def add(commands: Commands) -> None:
 
 def deploy_command(args: argparse.Namespace) -> None:
     from .. import storage
-    from ..control import load_controller
     from ..control.controller import FORMAT as CONTROLLER
+    from ..control.files import load_pid
     from ..deployment import deploy
     from ..dynamic_model import FORMAT as MODEL
     from ..errors import ModelFileError
@@ -72,7 +72,7 @@ def deploy_command(args: argparse.Namespace) -> None:
             received=f"a file of format {found!r}",
             remedy="`sewfast identify` and `sewfast tune` write those",
         )  # fmt: skip
-    what = load_controller(args.file) if found == CONTROLLER else load_model(args.file)
+    what = load_pid(args.file) if found == CONTROLLER else load_model(args.file)
     done = deploy(
         what, args.folder, to=args.to, precision=args.precision, name=args.prefix,
         changeable=args.changeable,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import sys
 from pathlib import Path
 
 from ..kinds import KINDS
+from ..progress import Progress
 from .arguments import Commands, add_command
-from .output import Progress, print_json
+from .output import DONE, INTERRUPTED, print_json
 
 FLEET = """\
 Identify and check every recording of a folder, or of a manifest (CSV with a column file and, where
@@ -62,27 +64,42 @@ def add(commands: Commands) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of every search (0)")
 
 
-def fleet_command(args: argparse.Namespace) -> None:
-    from ..control.controller import load_controller
+def fleet_command(args: argparse.Namespace) -> int:
+    from ..control.files import load_pid
     from ..fleets import fleet
 
-    controller = None if args.controller is None else load_controller(args.controller)
-    with Progress("fleet") as progress:
-        found = fleet(
-            args.recordings,
-            inputs=args.input or "u",
-            output=args.output or "y",
-            Ts=args.ts,
-            model=args.model,
-            controller=controller,
-            before=args.before,
-            out=args.out,
-            scheduler=args.scheduler,
-            workers=args.workers,
-            memory=args.memory,
-            seed=args.seed,
-            progress=lambda done, total, failed: progress.say(f"{done} of {total}"),
-        )
+    controller = None if args.controller is None else load_pid(args.controller)
+    done = 0
+    with Progress("fleet", "share failed") as shown:
+
+        def progress(count: int, total: int, failed: float) -> None:
+            nonlocal done
+            done = count
+            shown(count, total, failed)
+
+        try:
+            found = fleet(
+                args.recordings,
+                inputs=args.input or "u",
+                output=args.output or "y",
+                Ts=args.ts,
+                model=args.model,
+                controller=controller,
+                before=args.before,
+                out=args.out,
+                scheduler=args.scheduler,
+                workers=args.workers,
+                memory=args.memory,
+                seed=args.seed,
+                progress=progress,
+            )
+        except KeyboardInterrupt:
+            print(
+                f"sewfast fleet: interrupted; {done} recordings are done and kept: the same "
+                "command goes on from there",
+                file=sys.stderr,
+            )
+            return INTERRUPTED
     if args.json:
         drifts = [dataclasses.asdict(drift) for drift in found.drifts]
         failed = [{"file": row.file, "message": row.message} for row in found.failed]
@@ -90,3 +107,4 @@ def fleet_command(args: argparse.Namespace) -> None:
         print_json({**summary, "file": str(args.out)})
     else:
         print(f"{found}\nwritten to {args.out}")
+    return DONE

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import Interrupted, SettingError
 from ..kinds import KINDS, TEXTS, spelled
+from ..progress import Progress
 from .arguments import (
     TABLES,
     Commands,
@@ -33,7 +34,7 @@ from .data import (
     read_training,
     split,
 )
-from .output import Progress, print_json, print_result, write_columns
+from .output import print_json, print_result, write_columns
 
 if TYPE_CHECKING:
     from ..dataset import Dataset, FloatArray

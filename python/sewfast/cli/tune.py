@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import Interrupted, SettingError
+from ..progress import Progress
 from .arguments import (
     TABLES,
     Commands,
@@ -19,11 +20,11 @@ from .arguments import (
     require_plot,
 )
 from .control import reference_of
-from .output import Progress, print_json, print_rows
+from .output import print_json, print_rows
 
 if TYPE_CHECKING:
     from ..control.biquad import Biquad
-    from ..control.controller import Controller
+    from ..control.controller import Controller, SampledController
     from ..gains import Gains
     from ..tuning.front import ParetoFront
     from ..tuning.objective import Constraints, Cost, LoadStep
@@ -34,9 +35,10 @@ FORMS = ("standard", "parallel", "per_sample")
 FIGURES = (".png", ".svg", ".pdf")
 
 TUNE = """\
-Tune a 2-DOF PID on identified models, by simulating the loop with the encoder, the feedback
-filter and the command's limits in it. The models alone are used; no machine is touched. Several
-models are plants that one controller has to serve; of an ensemble every member is one.
+Tune a 2-DOF PID, or state feedback with an observer (--controller), on identified models, by
+simulating the loop with the encoder, the feedback filter and the command's limits in it. The
+models alone are used; no machine is touched. Several models are plants that one controller has to
+serve; of an ensemble every member is one.
 
 Nothing but the model is needed. References cover the range that the drive was recorded over, at
 the pace of its step response; the command's limits are the recorded range of the input, with 0;
@@ -65,6 +67,7 @@ examples:
   sewfast tune drive.json --load 1500:-2 --constraint recovery=70 -o firm.json
   sewfast tune one.json two.json --aggregate worst --variables Kp,Ti,alpha -o controller.json
   sewfast tune drive.json -o controller.json --plot tuned.png
+  sewfast tune drive.json --controller state-feedback -o states.json
   sewfast tune network.json --rival linear.json -o controller.json
   sewfast tune shaft.json --notch 75 --constraint Ms=1.7 --response response.json -o controller.json
   sewfast tune drive.json --pareto tracking,chatter --front front.png -o controller.json
@@ -102,6 +105,10 @@ def add(commands: Commands) -> None:
         "--unit", metavar="UNIT", help="of the output, where the model states none: RPM, rad/s, .."
     )
     parser.add_argument(
+        "--controller", default="pid", metavar="KIND",
+        help="kind of the controller where there is no --start, as state-feedback (pid)",
+    )  # fmt: skip
+    parser.add_argument(
         "--start", metavar="CONTROLLER.json",
         help="what the search begins with, its limits, encoder and filters included; default: "
         "Table 1 on the first model's step response",
@@ -129,8 +136,8 @@ def add(commands: Commands) -> None:
 def _add_search(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--variables", metavar="NAME[=LOW:HIGH],..",
-        help="what to search (Kp,Ti,Td,alpha,beta,N); also Tt, filter_samples, filter_time, "
-        "observer_time, r_rate, notches",
+        help="what to search (Kp,Ti,Td,alpha,beta,N; of state feedback rho,integral,noise,weight,"
+        "lead); also Tt, filter_samples, filter_time, observer_time, r_rate, notches",
     )  # fmt: skip
     parser.add_argument(
         "--cost", action="append", metavar="NAME=WEIGHT", help="weight of a term; may repeat"
@@ -289,10 +296,28 @@ def _started(args: argparse.Namespace, models: list[Any]) -> dict[str, Any]:
     notches = _notches(args.notch)
     if not notches:
         return first
-    from ..tuning.task import first_controller
+    from ..tuning.task import first_of
 
-    start = first.get("start") or first_controller(models[0], **first)
+    start = _pid(first.get("start") or first_of(models[0], **first), "--notch")
     return {"start": replace(start, biquads=(*start.biquads, *notches))}
+
+
+def _pid(start: SampledController, option: str) -> Controller:
+    """The start of what is for PIDs only.
+
+    Raises
+    ------
+    SettingError
+        For a controller of another kind.
+    """
+    from ..control.controller import Controller
+
+    if isinstance(start, Controller):
+        return start
+    raise SettingError(
+        f"{option}: expected a PID, received {type(start).__name__}; leave {option} out, or tune a "
+        "PID (--controller pid)"
+    )
 
 
 def _first(args: argparse.Namespace) -> dict[str, Any]:
@@ -305,8 +330,12 @@ def _first(args: argparse.Namespace) -> dict[str, Any]:
     """
     if args.start is None:
         return _loop(args)
-    from ..control.controller import load_controller
+    from ..control.files import load_controller
 
+    if args.controller != "pid":
+        raise SettingError(
+            "--start: the file says of which kind its controller is; leave out --controller"
+        )
     given = [
         "--" + option.replace("_", "-")
         for option in ("u_min", "u_max", "limits_of", "counts_per_rev", "filter", "unit")
@@ -329,6 +358,7 @@ def _loop(args: argparse.Namespace) -> dict[str, Any]:
         "counts_per_rev": "model" if args.counts_per_rev is None else args.counts_per_rev,
         "filter_samples": args.filter,
         "output_unit": args.unit,
+        "controller": args.controller.replace("-", "_"),
     }
 
 
@@ -350,10 +380,10 @@ def _front(
     args: argparse.Namespace, models: list[Any], references: Any, settings: dict[str, Any]
 ) -> ParetoFront:
     from ..tuning.front import pareto
-    from ..tuning.task import first_controller
+    from ..tuning.task import first_of
 
     first = _started(args, models)
-    start = first.get("start") or first_controller(models[0], **first)
+    start = _pid(first.get("start") or first_of(models[0], **first), "--pareto")
     with Progress("tune") as progress:
         return pareto(
             models, references, objectives=args.pareto.split(","), start=start, **settings,
@@ -475,7 +505,7 @@ def _show_tuned(args: argparse.Namespace, found: TuningResult) -> None:
                 "file": str(args.out),
                 "cost": found.cost,
                 "start_cost": found.start_cost,
-                "cost_unit": found.controller.gains.y_unit,
+                "cost_unit": found.controller.y_unit,
                 "evaluations": found.evaluations,
                 "termination": found.termination,
                 "method": found.method,
@@ -519,7 +549,11 @@ def _show_front(args: argparse.Namespace, front: ParetoFront) -> None:
     _show_gains(args, front.picked)
 
 
-def _controller(controller: Controller) -> dict[str, Any]:
+def _controller(controller: SampledController) -> dict[str, Any]:
+    from ..control.controller import Controller
+
+    if not isinstance(controller, Controller):
+        return {"controller": controller.to_dict()}
     forms = forms_of(controller)
     return {
         "gains": {g.form: {**g.to_dict(), "units": g.units} for g in forms},
@@ -527,11 +561,14 @@ def _controller(controller: Controller) -> dict[str, Any]:
     }
 
 
-def _show_gains(args: argparse.Namespace, controller: Controller) -> None:
-    print("the same gains in every form:")
-    print_rows([gain_row(g) for g in forms_of(controller)])
+def _show_gains(args: argparse.Namespace, controller: SampledController) -> None:
+    from ..control.controller import Controller
+
+    if isinstance(controller, Controller):
+        print("the same gains in every form:")
+        print_rows([gain_row(g) for g in forms_of(controller)])
     if "from the recorded input" in controller.notes:
-        unit = controller.gains.u_unit or "u"
+        unit = controller.u_unit or "u"
         print(
             f"limits: {controller.u_min:g} to {controller.u_max:g} {unit}, all that the drive was "
             "recorded with; --u-min, --u-max say what else it can take"

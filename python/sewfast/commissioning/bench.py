@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from ..control.controller import Controller
+from ..control.controller import SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import (
     Followed,
@@ -81,7 +81,7 @@ class Around:
         return self.inner.excite(u, name)
 
     def follow(
-        self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
+        self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
     ) -> RecordedRun:
         if watch is None or not is_watched(self.inner):
             return self.inner.follow(controller, r, name)
@@ -117,7 +117,7 @@ class DriveBench(Around):
         return recording
 
     def follow(
-        self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
+        self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
     ) -> RecordedRun:
         options = {**cancelled_by(self.cancel), "watch": watch}
         run = self.drive.follow(controller, r, name, **options)
@@ -149,7 +149,7 @@ class NotedBench(Around):
 
     note: Callable[[str, str, Recording, ClosedLoopRun | None], object]
     kept: Callable[[str, str], Recording | None]
-    kept_run: Callable[[str, str, Controller], RecordedRun | None]
+    kept_run: Callable[[str, str, SampledController], RecordedRun | None]
 
     def excite(self, u: FloatArray, name: str) -> Recording:
         key = key_of(u)
@@ -158,7 +158,7 @@ class NotedBench(Around):
         return recording
 
     def follow(
-        self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
+        self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
     ) -> RecordedRun:
         key = key_of(r, controller)
         found = self.kept_run(name, key, controller)
@@ -173,7 +173,7 @@ class NotedBench(Around):
         return found
 
 
-def key_of(signal: FloatArray, controller: Controller | None = None) -> str:
+def key_of(signal: FloatArray, controller: SampledController | None = None) -> str:
     """What tells a command, or a reference with its controller, from any other."""
     design = "" if controller is None else json.dumps(controller.to_dict(), sort_keys=True)
     return hashlib.sha256(np.ascontiguousarray(signal).tobytes() + design.encode()).hexdigest()

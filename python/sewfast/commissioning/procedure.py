@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import signals
-from ..control.controller import Controller
+from ..control.controller import Controller, SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import Machine, RecordedRun
 from ..dataset import FloatArray
@@ -21,6 +21,7 @@ from ..errors import DataError, Interrupted, SettingError
 from ..gains import vector
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
+from ..progress import shown_in_notebooks
 from ..recording import Recording
 from ..rules import Fopdt
 from ..threads import available
@@ -58,6 +59,7 @@ References = Mapping[str, ArrayLike] | Sequence[str]
 Between = Callable[[str, Commissioning], object]
 
 
+@shown_in_notebooks("commission")
 def commission(
     on: VirtualMachine | Machine,
     *,
@@ -130,6 +132,7 @@ def commission(
         All processors by default.
     progress : callable(done, total, stage), optional
         Called as each stage begins, within long ones, and at the end.
+        In a notebook a bar is shown where this is left out; None shows none.
     folder : path, optional
         Folder in which every recording is written as soon as it is taken, as
         `unfinished/NAME.mcap`, so that a process that is killed does not lose it;
@@ -194,7 +197,7 @@ def commission(
             else _place(folder, bench, asked, overwrite=overwrite, resume=resume)
         )
         if taken is not None:
-            journal.keep(taken_in=taken.folder)
+            journal.keep(recorded_in=taken.folder)
 
         def note(name: str, key: str, recording: Recording, run: ClosedLoopRun | None) -> None:
             journal.note(name, recording)
@@ -205,7 +208,7 @@ def commission(
             journal.heed()
             return None if taken is None else taken.found(journal.stage, name, key)
 
-        def kept_run(name: str, key: str, controller: Controller) -> RecordedRun | None:
+        def kept_run(name: str, key: str, controller: SampledController) -> RecordedRun | None:
             journal.heed()
             if taken is None:
                 return None
@@ -426,19 +429,17 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
 
     alike = agreeing(first, trained.ensemble, practice)
     required, tuning = of(alike)
-    ensemble = agreeing(tuning.controller, alike, practice)
+    ensemble = agreeing(tuning.pid, alike, practice)
     if ensemble is not alike:
         # one that parts from the others has had its say in these gains
         required, tuning = of(ensemble)
     journal.keep(models=ensemble, rmse=trained.errors_of(ensemble))
     plants = "a linear model" if is_alone else "an ensemble of networks"
-    tuned = plan.thinning.fine(tuning.controller)
+    tuned = plan.thinning.fine(tuning.pid)
     controller = replace(tuned, notes=f"commissioned on {plants}")
     if tuning.warning is not None:
         journal.say(tuning.warning)
-    journal.keep(
-        tuning=tuning, controller=controller, met=required.met(tuning.controller, ensemble)
-    )
+    journal.keep(tuning=tuning, controller=controller, met=required.met(tuning.pid, ensemble))
     return ensemble, controller
 
 

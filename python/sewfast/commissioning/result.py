@@ -19,7 +19,7 @@ import numpy as np
 
 from .. import __version__, storage
 from ..analysis.analysis import NUMBERS as ANALYSIS
-from ..control.controller import Controller
+from ..control.controller import Controller, SampledController
 from ..control.loop import ClosedLoopRun
 from ..control.machine import RecordedRun
 from ..errors import DataError, SettingError
@@ -104,7 +104,7 @@ class Commissioning:
     notes : tuple of str
         Anything unusual: networks that failed, models that contradict each other, gains that were
         lowered.
-    taken_in : Path or None
+    recorded_in : Path or None
         The folder in which each recording was written as it was taken.
     """
 
@@ -133,7 +133,7 @@ class Commissioning:
     margins: Mapping[str, Any] | None = None
     sample_time: float | None = None
     notes: tuple[str, ...] = ()
-    taken_in: Path | None = None
+    recorded_in: Path | None = None
 
     @property
     def is_verified(self) -> bool:
@@ -545,7 +545,7 @@ class Taken:
         )  # fmt: skip
 
     def found_run(
-        self, stage: str, name: str, key: str, controller: Controller, plant: str
+        self, stage: str, name: str, key: str, controller: SampledController, plant: str
     ) -> RecordedRun | None:
         """The same of a closed loop."""
         file, recording = self._found(stage, name, key), self.found(stage, name, key)
@@ -830,7 +830,7 @@ def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
     _artefacts(found, folder)
     _analysis(found, folder)
     storage.write(folder / NUMBERS, FORMAT, VERSION, {"sewfast": __version__, **numbers(found)})
-    own = found.taken_in is not None and found.taken_in.resolve() == folder.resolve()
+    own = found.recorded_in is not None and found.recorded_in.resolve() == folder.resolve()
     if own and found.is_verified:
         # of any other there is something to resume
         with suppress(OSError):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..control.controller import Controller
+from ..control.controller import Controller, pid_of
 from ..control.loop import ClosedLoopRun
 from ..dataset import FloatArray
 from ..errors import FitError
@@ -349,7 +349,7 @@ class Thinning:
         if self.k == 1:
             return found
         kept = {n: np.ascontiguousarray(x[:: self.k]) for n, x in found.columns().items()}
-        controller = self.coarse(found.controller)
+        controller = self.coarse(pid_of(found.controller, "commission"))
         return ClosedLoopRun(
             **kept, controller=controller, plant=found.plant, reference=found.reference
         )

@@ -1,6 +1,7 @@
 """The controller and its loop.
 
-Read in this order: `biquad` (notches and the like), `controller` (settings, files, first gains),
+Read in this order: `biquad` (notches and the like), `controller` (what a controller of
+any kind is; the PID), `state_feedback` (the second kind), `files` (`load_controller`),
 `loop` (`run`: on a model or a machine), `machine` (`Machine`: all that is known of one; `record`),
 `defaults` (what is taken for a drive where nothing is stated), `margins` (of the linear loop),
 `systems` (the linear loop as state space), `forms` (a PID as MATLAB's and python-control's).
@@ -9,7 +10,9 @@ Read in this order: `biquad` (notches and the like), `controller` (settings, fil
 from ..gains import Form, Gains, vector
 from ..rules import Fopdt, Rule, fit_fopdt, table_1
 from .biquad import Biquad
-from .controller import Controller, load_controller, paper_controller
+from .controller import Controller, SampledController, paper_controller
+from .files import load_controller
+from .state_feedback import StateFeedback
 
 __all__ = [
     "Biquad",
@@ -18,6 +21,8 @@ __all__ = [
     "Form",
     "Gains",
     "Rule",
+    "SampledController",
+    "StateFeedback",
     "fit_fopdt",
     "load_controller",
     "paper_controller",

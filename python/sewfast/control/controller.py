@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from .. import _core, storage
 from ..arrays import counts_per_unit
-from ..errors import ModelFileError, SettingError, SewfastError
+from ..errors import SettingError
 from ..gains import Gains, real, whole
 from ..plotting import html_of
 from ..storage import Fields
 from .biquad import MOST, NUMBERS, Biquad
+
+GAIN_NAMES = ("Kp", "Ti", "Td")
+NOTCH_NAMES = ("notch_frequency", "notch_depth", "notch_width")
+SETTINGS = (
+    "alpha", "beta", "N", "Tt", "filter_samples", "filter_time", "observer_time", "r_rate",
+)  # fmt: skip
+"""What can be searched by name beside the gains of a schedule's points and of notches."""
 
 FORMAT = "sewfast.controller"
 VERSION = 3
@@ -35,8 +42,107 @@ _REALS = (*_FIRST_REALS, "observer_time", "r_rate")
 _OTHERS = ("version", "gains", "u_unit", "y_unit", "filter_samples", "counts_per_rev", "notes")
 
 
+_Kind = TypeVar("_Kind", bound="SampledController")
+
+
+class SampledController:
+    """What `run`, `tune` and a drive ask of a controller; the base of all kinds.
+
+    A kind has its settings as fields, and the members that raise NotImplementedError here.
+    """
+
+    KIND: ClassVar[str]
+    """Its name in files."""
+    VERSION: ClassVar[int] = 4
+    """Of its files."""
+
+    if TYPE_CHECKING:
+        # declared as properties: the fields of a frozen dataclass cannot be set
+        @property
+        def Ts(self) -> float: ...
+        @property
+        def u_min(self) -> float: ...
+        @property
+        def u_max(self) -> float: ...
+        @property
+        def counts_per_rev(self) -> float | None: ...
+        @property
+        def notes(self) -> str: ...
+        @property
+        def u_unit(self) -> str: ...
+        @property
+        def y_unit(self) -> str: ...
+
+    @property
+    def counts_per_unit(self) -> float:
+        """Encoder counts per second at an output of one unit; 0 for ideal feedback."""
+        if self.counts_per_rev is None:
+            return 0.0
+        return counts_per_unit(self.counts_per_rev, self.y_unit)
+
+    @property
+    def pace(self) -> float:
+        """A time constant for a plant of which only its controller is known [s]."""
+        raise NotImplementedError
+
+    def core(self) -> _core._Controller:
+        """The arithmetic itself, at rest."""
+        raise NotImplementedError
+
+    def sent(self) -> tuple[int, list[float]]:
+        """Number of the kind and its own numbers, as a device is sent them (docs/PROTOCOL.md)."""
+        raise NotImplementedError
+
+    @classmethod
+    def read(cls, fields: Fields) -> SampledController:
+        """The controller in a file.
+
+        Raises
+        ------
+        SewfastError
+            For a field that is missing or unknown, or a setting outside its range.
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def first(cls, plant: Any, **settings: Any) -> SampledController:
+        """What a search on a model begins with.
+
+        Settings are limits, encoder, units, the length of a filter or None, the middle of the
+        recorded output or None, and notes.
+
+        Raises
+        ------
+        SettingError
+            For a plant or a setting that the kind cannot have.
+        """
+        raise NotImplementedError
+
+    def with_values(self: _Kind, values: Mapping[str, float], notes: str) -> _Kind:
+        """The same with values that were searched, by name."""
+        raise NotImplementedError
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as JSON values."""
+        raise NotImplementedError
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it as JSON (docs/CONVENTIONS.md, Files); the file is either complete or absent.
+
+        Raises
+        ------
+        ModelFileError
+            If the file cannot be written.
+        """
+        storage.write(path, FORMAT, self.VERSION, self.to_dict())
+
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        return html_of(str(self))
+
+
 @dataclass(frozen=True)
-class Controller:
+class Controller(SampledController):
     """A sampled 2-DOF PID with limits, anti-windup and feedback filter (paper Eq. 9, Fig. 16).
 
     Parameters
@@ -81,6 +187,9 @@ class Controller:
     SettingError
         For a setting outside its range.
     """
+
+    KIND: ClassVar[str] = "pid"
+    VERSION: ClassVar[int] = VERSION
 
     gains: Gains
     Ts: float = 0.001
@@ -134,11 +243,20 @@ class Controller:
             )
 
     @property
-    def counts_per_unit(self) -> float:
-        """Encoder counts per second at an output of one unit; 0 for ideal feedback."""
-        if self.counts_per_rev is None:
-            return 0.0
-        return counts_per_unit(self.counts_per_rev, self.gains.y_unit)
+    def u_unit(self) -> str:
+        """Unit of the command, that of the gains."""
+        return self.gains.u_unit
+
+    @property
+    def y_unit(self) -> str:
+        """Unit of the output, that of the gains."""
+        return self.gains.y_unit
+
+    @property
+    def pace(self) -> float:
+        """A time constant for a plant of which only its controller is known [s]."""
+        Ti = self.gains.to("standard").Ti
+        return Ti if math.isfinite(Ti) else 50.0 * self.Ts
 
     def core(self) -> _core.Controller:
         """The arithmetic itself, at rest: `step(r, y, feedforward)` gives the command of a sample.
@@ -167,19 +285,24 @@ class Controller:
         """Coefficients of each biquad at the controller's sample time: `Biquad.coefficients`."""
         return [biquad.coefficients(self.Ts) for biquad in self.biquads]
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write it as JSON (docs/CONVENTIONS.md, Files); the file is either complete or absent.
-
-        Raises
-        ------
-        ModelFileError
-            If the file cannot be written.
-        """
-        storage.write(path, FORMAT, VERSION, self.to_dict())
+    def with_values(self, values: Mapping[str, float], notes: str) -> Controller:
+        """The same with values that were searched, by name; its gains in standard form."""
+        changes: dict[str, Any] = {name: values[name] for name in SETTINGS if name in values}
+        if "filter_samples" in changes:
+            changes["filter_samples"] = int(changes["filter_samples"])
+        if self.schedule:
+            changes["schedule"] = tuple(
+                (speed, _standard(point, values, [f"{gain}[{k}]" for gain in GAIN_NAMES]))
+                for k, (speed, point) in enumerate(self.schedule)
+            )
+        if self.biquads:
+            changes["biquads"] = tuple(_notch(b, k, values) for k, b in enumerate(self.biquads))
+        gains = _standard(self.gains, values, GAIN_NAMES)
+        return replace(self, gains=gains, notes=notes, **changes)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as JSON values; null means no such limit or filter."""
-        values = {name: _bounded(getattr(self, name)) for name in _REALS}
+        values = {name: bounded(getattr(self, name)) for name in _REALS}
         return {
             "gains": _gains_to_dict(self.gains),
             "u_unit": self.gains.u_unit,
@@ -192,9 +315,23 @@ class Controller:
             "notes": self.notes,
         }
 
-    def _repr_html_(self) -> str:
-        """A table for a notebook."""
-        return html_of(str(self))
+    @classmethod
+    def read(cls, fields: Fields) -> Controller:
+        """The controller in a file of versions 1 to 3."""
+        version = fields.integer("version")
+        reals = _FIRST_REALS if version == 1 else _REALS
+        later = (("schedule",) if version > 1 else ()) + (("biquads",) if version > 2 else ())
+        fields.require_only((*_OTHERS, *reals, *later))
+        units = {"u_unit": fields.text("u_unit"), "y_unit": fields.text("y_unit")}
+        return cls(
+            gains=_gains(fields.object("gains"), units),
+            filter_samples=fields.integer("filter_samples"),
+            schedule=_schedule(fields, units) if version > 1 else (),
+            biquads=_biquads(fields) if version > 2 else (),
+            counts_per_rev=fields.optional_number("counts_per_rev"),
+            notes=fields.text("notes"),
+            **{name: unbounded(fields, name, _UNBOUNDED) for name in reals},
+        )
 
     def __str__(self) -> str:
         u, y = self.gains.u_unit or "u", self.gains.y_unit or "y"
@@ -221,35 +358,38 @@ class Controller:
         return "\n".join([*lines, f"  notes     {self.notes}"] if self.notes else lines)
 
 
-def load_controller(path: str | os.PathLike[str]) -> Controller:
-    """Read a controller that `Controller.save` wrote; nothing in the file is executed.
+def _notch(own: Biquad, k: int, values: Mapping[str, float]) -> Biquad:
+    """Biquad number `k` with the values that are its own."""
+    names = [f"{name}[{k}]" for name in NOTCH_NAMES]
+    if not any(name in values for name in names):
+        return own
+    return Biquad.notch(
+        *(values.get(name, x) for name, x in zip(names, own.numbers, strict=True))
+    )  # fmt: skip
+
+
+def _standard(own: Gains, values: Mapping[str, float], names: Sequence[str]) -> Gains:
+    """The gains in standard form, with the values that have one of the names."""
+    standard = own.to("standard")
+    kept = (standard.Kp, standard.Ti, standard.Td)
+    Kp, Ti, Td = (values.get(name, own) for name, own in zip(names, kept, strict=True))
+    return Gains.standard(Kp, Ti, Td, u_unit=own.u_unit, y_unit=own.y_unit)
+
+
+def pid_of(controller: SampledController, use: str) -> Controller:
+    """A controller where only a PID will do; `use` says what for.
 
     Raises
     ------
-    ModelFileError
-        If the file is missing, damaged, of another format or of an unknown version, or holds a
-        setting outside its range; the message names the file and the field.
+    SettingError
+        For one of another kind.
     """
-    fields = Fields(os.fspath(path), storage.read(path, FORMAT, (1, 2, VERSION)))
-    version = fields.integer("version")
-    reals = _FIRST_REALS if version == 1 else _REALS
-    later = (("schedule",) if version > 1 else ()) + (("biquads",) if version > 2 else ())
-    fields.require_only((*_OTHERS, *reals, *later))
-    units = {"u_unit": fields.text("u_unit"), "y_unit": fields.text("y_unit")}
-    try:
-        return Controller(
-            gains=_gains(fields.object("gains"), units),
-            filter_samples=fields.integer("filter_samples"),
-            schedule=_schedule(fields, units) if version > 1 else (),
-            biquads=_biquads(fields) if version > 2 else (),
-            counts_per_rev=fields.optional_number("counts_per_rev"),
-            notes=fields.text("notes"),
-            **{name: _unbounded(fields, name, _UNBOUNDED) for name in reals},
-        )
-    except ModelFileError:
-        raise
-    except SewfastError as error:
-        raise ModelFileError(f"{path}: {error}") from error
+    if isinstance(controller, Controller):
+        return controller
+    raise SettingError(
+        name="controller", expected="a PID (Controller)", received=type(controller).__name__,
+        remedy=f"{use} knows no other kind; run(controller, model) simulates it",
+    )  # fmt: skip
 
 
 def _schedule(fields: Fields, units: Mapping[str, str]) -> tuple[tuple[float, Gains], ...]:
@@ -277,12 +417,12 @@ def _gains(part: Fields, units: Mapping[str, str]) -> Gains:
     if names is None:
         raise part.refuse("form", "standard, parallel or per_sample", form)
     part.require_only(("form", *names))
-    values = [_unbounded(part, name, {"Ti": math.inf}) for name in names]
+    values = [unbounded(part, name, {"Ti": math.inf}) for name in names]
     return Gains(form, *values, **units)  # type: ignore[arg-type]
 
 
 def _gains_to_dict(gains: Gains) -> dict[str, Any]:
-    return {name: _bounded(value) for name, value in gains.to_dict().items()}
+    return {name: bounded(value) for name, value in gains.to_dict().items()}
 
 
 def _points(schedule: Any) -> tuple[tuple[float, Gains], ...]:
@@ -315,13 +455,15 @@ def _sections(biquads: Any) -> tuple[Biquad, ...]:
     return tuple(given)
 
 
-def _unbounded(fields: Fields, name: str, unbounded: Mapping[str, float]) -> float:
-    if name in unbounded and fields.any(name) is None:
-        return unbounded[name]
+def unbounded(fields: Fields, name: str, infinite: Mapping[str, float]) -> float:
+    """The number of a field; where that is null, the infinity that it stands for."""
+    if name in infinite and fields.any(name) is None:
+        return infinite[name]
     return fields.number(name)
 
 
-def _bounded(value: Any) -> Any:
+def bounded(value: Any) -> Any:
+    """None for what JSON has no number for."""
     return None if isinstance(value, float) and math.isinf(value) else value
 
 

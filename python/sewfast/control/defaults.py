@@ -22,7 +22,7 @@ from ..evidence.residuals import representative
 from ..gains import real
 from ..models import Model
 from ..rules import Fopdt, fit_fopdt
-from .controller import Controller
+from .controller import SampledController
 
 NAMES = ("trapezoid", "trapezoids", "random")
 """References to tune on unless others are given."""
@@ -391,7 +391,7 @@ def _shapes(span: _Span, Ts: float, seed: int) -> dict[str, FloatArray]:
 
 
 def default_references(
-    plant: Any, controller: Controller, names: Sequence[str] = NAMES
+    plant: Any, controller: SampledController, names: Sequence[str] = NAMES
 ) -> list[str | FloatArray]:
     """References for a controller on a plant that nobody gave any for: names, or samples [y].
 
@@ -404,14 +404,8 @@ def default_references(
         As for `drive_references`.
     """
     low, high = controller.u_min, controller.u_max
-    if not isinstance(plant, Model) or catalogue_fits(plant, low, high, controller.gains.y_unit):
+    if not isinstance(plant, Model) or catalogue_fits(plant, low, high, controller.y_unit):
         return list(names)
-    made = drive_references(plant, low, high, pace=pace_of(controller))
+    made = drive_references(plant, low, high, pace=controller.pace)
     first, *others = (made[name] for name in names)
     return [first, *(r for r in others if len(r) <= _MOST_TUNED)]
-
-
-def pace_of(controller: Controller) -> float:
-    """A time constant for a plant of which only its controller is known [s]."""
-    Ti = controller.gains.to("standard").Ti
-    return Ti if math.isfinite(Ti) else 50.0 * controller.Ts

@@ -19,8 +19,8 @@ from ..errors import DataError, FitError, SettingError
 from ..gains import Gains, vector
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
-from .controller import Controller
-from .defaults import default_references, drive_references, pace_of
+from .controller import Controller, SampledController, pid_of
+from .defaults import default_references, drive_references
 
 if TYPE_CHECKING:
     from ..live import Kind
@@ -54,7 +54,7 @@ class ClosedLoopRun:
     u: FloatArray
     y: FloatArray
     feedback: FloatArray
-    controller: Controller
+    controller: SampledController
     plant: str
     reference: str
 
@@ -66,7 +66,7 @@ class ClosedLoopRun:
     @property
     def units(self) -> dict[str, str]:
         """The unit of each column by name."""
-        u, y = self.controller.gains.u_unit, self.controller.gains.y_unit
+        u, y = self.controller.u_unit, self.controller.y_unit
         return {"t": "s", "r": y, "u": u, "y": y, "feedback": y}
 
     def columns(self) -> dict[str, FloatArray]:
@@ -109,7 +109,7 @@ class ClosedLoopRun:
         self,
         ax: Any = None,
         *,
-        beside: Sequence[ClosedLoopRun] = (),
+        others: Sequence[ClosedLoopRun] = (),
         file: str | os.PathLike[str] | None = None,
     ) -> Any:
         """Draw output and reference, the error and the command in three panels.
@@ -118,7 +118,7 @@ class ClosedLoopRun:
         ----------
         ax : Axes or sequence of Axes, optional
             One shows the output, further ones the error and the command.
-        beside : sequence of ClosedLoopRun
+        others : sequence of ClosedLoopRun
             Other runs over the same reference, such as one predicted by a model.
         file : path, optional
             Where to write the figure: PNG, SVG or PDF by its ending.
@@ -135,7 +135,7 @@ class ClosedLoopRun:
         """
         from ..plotting import Trace, loop_drawing
 
-        others = [beside] if isinstance(beside, ClosedLoopRun) else list(beside)
+        others = [others] if isinstance(others, ClosedLoopRun) else list(others)
         looks = ("machine", "model", "oe", "arx_raw", "arx") if others else ("measured",)
         traces = [
             Trace.of(run.columns(), look, run.plant)
@@ -151,23 +151,23 @@ class ClosedLoopRun:
 
     def __str__(self) -> str:
         unit = self.units | {n: unit or n for n, unit in self.units.items() if n in "uy"}
-        told = self.metrics()
+        metrics = self.metrics()
         lines = [f"{self.reference} on {self.plant}, {len(self.t) * self.Ts:g} s"]
-        if told["rmse"] is None:
+        if metrics["rmse"] is None:
             return f"{lines[0]}; no sample came"
         lines.append(
-            f"  error     {told['rmse']:.4g} {unit['y']} rms, {told['max_abs']:.4g} at most"
+            f"  error     {metrics['rmse']:.4g} {unit['y']} rms, {metrics['max_abs']:.4g} at most"
         )
-        if told["rise_time_ms"] is not None:
+        if metrics["rise_time_ms"] is not None:
             lines.append(
-                f"  first edge {told['rise_time_ms']:.1f} ms from 10 to 90 % (reference "
-                f"{told['reference_rise_time_ms']:.1f} ms), "
-                f"overshoot {told['overshoot_percent']:.2f} %"
+                f"  first edge {metrics['rise_time_ms']:.1f} ms from 10 to 90 % (reference "
+                f"{metrics['reference_rise_time_ms']:.1f} ms), "
+                f"overshoot {metrics['overshoot_percent']:.2f} %"
             )
-        saturated = 100.0 * (told["saturated"] or 0.0)
+        saturated = 100.0 * (metrics["saturated"] or 0.0)
         lines.append(
-            f"  command   {told['u_rms']:.4g} {unit['u']} rms, {told['du_rms']:.4g} from sample to "
-            f"sample, at a limit {saturated:.1f} % of the time"
+            f"  command   {metrics['u_rms']:.4g} {unit['u']} rms, {metrics['du_rms']:.4g} from "
+            f"sample to sample, at a limit {saturated:.1f} % of the time"
         )
         return "\n".join(lines)
 
@@ -202,7 +202,7 @@ def run_html(found: HasMetrics, caption: str) -> str:
 
 
 def run(
-    controller: Controller,
+    controller: SampledController,
     on: Plant | Machine,
     reference: str | ArrayLike | None = None,
     *,
@@ -222,7 +222,7 @@ def run(
 
     Parameters
     ----------
-    controller : Controller
+    controller : Controller or StateFeedback
     on : Model, VirtualMachine, Drive or another Machine
         The plant. A model needs one input. Neither a model nor a virtual machine is changed. A
         drive (`sewfast.link`) runs the controller itself, in single precision; its limits must have
@@ -269,12 +269,12 @@ def run(
     Interrupted
         On Ctrl-C or `cancel`, of a drive; the motor is stopped, `best` is the run up to there.
     """
-    require_controller(controller, on, "run(controller, plant, reference)")
+    require_controller(controller, on, "run(controller, plant, reference)", SampledController)
     if reference is None:
         reference, name = _usual_reference(on, controller), name or "trapezoid"
     r = reference_samples(reference, controller, seed, plant=on)
     title = name or (reference if isinstance(reference, str) else "reference")
-    beside = _beside(on, feedforward, disturbance)
+    extra = _given(on, feedforward, disturbance)
     if not isinstance(on, (Model, VirtualMachine)):
         return _on_machine(
             controller, on, r, title, cancel, file=file, live=live, overwrite=overwrite
@@ -285,8 +285,8 @@ def run(
         controller.core(),
         r,
         counts_per_unit=controller.counts_per_unit,
-        feedforward=beside.get("feedforward"),
-        disturbance=beside.get("disturbance"),
+        feedforward=extra.get("feedforward"),
+        disturbance=extra.get("disturbance"),
     )
     return ClosedLoopRun(
         t=np.arange(len(r), dtype=np.float64) * controller.Ts,
@@ -298,7 +298,7 @@ def run(
     )
 
 
-def _usual_reference(on: Any, controller: Controller) -> str | FloatArray:
+def _usual_reference(on: Any, controller: SampledController) -> str | FloatArray:
     """A trapezoid for a plant whose range is known; a motor does not move without being asked."""
     if not isinstance(on, (Model, VirtualMachine)):
         raise SettingError(
@@ -308,10 +308,10 @@ def _usual_reference(on: Any, controller: Controller) -> str | FloatArray:
     return usual
 
 
-def _beside(
+def _given(
     on: Any, feedforward: ArrayLike | None, disturbance: ArrayLike | None
 ) -> dict[str, FloatArray]:
-    """The signals beside the reference that were given."""
+    """The signals other than the reference that were given."""
     given = {"feedforward": feedforward, "disturbance": disturbance}
     signals = {name: vector(name, v) for name, v in given.items() if v is not None}
     if "disturbance" in signals and not isinstance(on, Model):
@@ -326,16 +326,20 @@ def _beside(
     return signals
 
 
-def require_controller(controller: Any, plant: Any, call: str) -> None:
-    """Refuse what is no controller, such as the plant in its place.
+def require_controller(
+    controller: Any, plant: Any, call: str, kind: type[SampledController] = Controller
+) -> None:
+    """Refuse what is no controller, such as the plant in its place, or one of another kind.
 
     Raises
     ------
     SettingError
     """
-    if isinstance(controller, Controller):
+    if isinstance(controller, kind):
         return
-    swapped = isinstance(plant, Controller)
+    if isinstance(controller, SampledController):
+        pid_of(controller, call)
+    swapped = isinstance(plant, SampledController)
     raise SettingError(
         f"expected a Controller, got {type(controller).__name__}"
         + (" and the Controller in another place" if swapped else "")
@@ -344,7 +348,7 @@ def require_controller(controller: Any, plant: Any, call: str) -> None:
 
 
 def _on_machine(
-    controller: Controller,
+    controller: SampledController,
     on: Machine,
     r: FloatArray,
     name: str,
@@ -364,7 +368,7 @@ def _on_machine(
 
 
 def reference_samples(
-    reference: str | ArrayLike, controller: Controller, seed: int = 0, *, plant: Any = None
+    reference: str | ArrayLike, controller: SampledController, seed: int = 0, *, plant: Any = None
 ) -> FloatArray:
     """The samples of a reference given by name or as they are, shape (N,), never the caller's own.
 
@@ -382,12 +386,12 @@ def reference_samples(
     if not isinstance(reference, str):
         return vector("reference", reference).copy()
     samples = signals.reference(reference, seed)
-    unit, Ts = controller.gains.y_unit, controller.Ts
+    unit, Ts = controller.y_unit, controller.Ts
     if unit.lower() == "rpm" and math.isclose(Ts, signals.TS, rel_tol=1e-9):
         return samples
     if isinstance(plant, Model):
         made = drive_references(
-            plant, controller.u_min, controller.u_max, pace=pace_of(controller), seed=seed
+            plant, controller.u_min, controller.u_max, pace=controller.pace, seed=seed
         )
         return made[reference.replace("-", "_").lower()]
     raise SettingError(
@@ -397,7 +401,7 @@ def reference_samples(
     )
 
 
-def check_fits(controller: Controller, plant: Any) -> None:
+def check_fits(controller: SampledController, plant: Any) -> None:
     """Refuse a plant whose sample time or units are not the controller's.
 
     Raises
@@ -415,10 +419,10 @@ def check_fits(controller: Controller, plant: Any) -> None:
             f"expected plant and controller at one sample time, got {plant.Ts} s and "
             f"{controller.Ts} s; tune a controller for this plant"
         )
-    require_units(controller.gains, plant_units(plant))
+    require_units(controller, plant_units(plant))
 
 
-def require_units(gains: Gains, units: tuple[str, str]) -> None:
+def require_units(gains: Gains | SampledController, units: tuple[str, str]) -> None:
     """Refuse gains in other units than those of a plant's input and output; empty is unknown.
 
     Raises
@@ -527,7 +531,7 @@ def each_reference(references: Any, default: Sequence[str]) -> list[Any]:
 
 
 def trial(
-    controller: Controller, plant: Plant, reference: Any, title: str, seed: int = 0
+    controller: SampledController, plant: Plant, reference: Any, title: str, seed: int = 0
 ) -> ClosedLoopRun:
     """A run under the plant's title.
 

@@ -25,7 +25,7 @@ from ..machine import VirtualMachine
 from ..recordfile.writer import require_replaceable
 from ..recording import Recording
 from ..speed import Method, speed_from_counts
-from .controller import Controller
+from .controller import SampledController
 from .loop import ClosedLoopRun, run
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ class Machine(Protocol):
     def excite(self, u: FloatArray, name: str) -> Recording:
         """Apply commands [V], shape (N,), one per sample."""
 
-    def follow(self, controller: Controller, r: FloatArray, name: str) -> RecordedRun:
+    def follow(self, controller: SampledController, r: FloatArray, name: str) -> RecordedRun:
         """Run a controller along a reference [RPM], shape (N,)."""
 
 
@@ -113,7 +113,7 @@ class Streaming(Machine, Protocol):
 
     def excite(self, u: FloatArray, name: str, **options: Any) -> Recording: ...
     def follow(
-        self, controller: Controller, r: FloatArray, name: str, **options: Any
+        self, controller: SampledController, r: FloatArray, name: str, **options: Any
     ) -> RecordedRun: ...
     def stream(self, *arguments: Any, **options: Any) -> Any: ...
 
@@ -302,7 +302,7 @@ class MachineBench:
         return Recording(u, done.counts, y, done.speed_rpm, self.Ts, self.counts_per_rev, name)
 
     def follow(
-        self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
+        self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
     ) -> RecordedRun:
         # undisturbed, the machine does the same again and shows its counts
         found = run(controller, self.machine, r, name=name)
@@ -378,7 +378,7 @@ class SteppedBench:
         return self._recording(u, *self._played(lambda k, counts: float(u[k]), len(u)), name)
 
     def follow(
-        self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
+        self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
     ) -> RecordedRun:
         if not math.isclose(controller.Ts, self.Ts, rel_tol=0.01):
             raise SettingError(

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from ..control import Controller
+from ..control.controller import Controller, SampledController, pid_of
 from ..errors import ModelFileError, SettingError
 from ..models import Model
 from ..storage import replace_files
@@ -98,6 +98,8 @@ def deploy(
     ModelFileError
         If a file cannot be written; none is then.
     """
+    if isinstance(what, SampledController):
+        what = pid_of(what, "deploy")
     if not isinstance(what, Model | Controller):
         raise SettingError(
             f"expected a model or a controller, got {type(what).__name__}; load it with "

@@ -167,7 +167,7 @@ _STEPS = (
     (
         "parameters on these data",
         "train on this recording as well, and allow a network: a linear model is a compromise "
-        "where the plant bends; if that does not help, the plant has changed in between",
+        "where the plant is nonlinear; if that does not help, the plant has changed in between",
     ),
     (
         "residual with past residual times input",
@@ -178,8 +178,8 @@ _STEPS = (
         "let identify search for the structure (no model named): it tries other orders, delays and "
         "networks",
     ),
-    ("squared residual", "allow a network, or see whether the noise grows with the amplitude"),
-    ("mean residual", "see whether the zero of a sensor or an amplifier has moved"),
+    ("squared residual", "allow a network, or check whether the noise grows with the amplitude"),
+    ("mean residual", "check whether the zero of a sensor or an amplifier has moved"),
     ("samples per parameter", "record longer, or take a smaller model"),
     ("inside", "read the bands with care: noise or operation differ from the training data"),
 )
@@ -195,7 +195,9 @@ def summary(lines: Sequence[Line]) -> str:
         return f"useless here ({free.shown}); first {_step([free])}"
     shown = "" if free is None else f" ({free.shown})"
     if free is not None and free.verdict == "info":
-        return "the output is constant here, which says nothing of the model; record one that moves"
+        return (
+            "the output is constant here, which says nothing about the model; record one that moves"
+        )
     follows = f"the free run follows the data{shown}"
     if free is not None and free.verdict == "warn":
         follows = f"not good enough to tune on: the free run follows the data loosely{shown}"
@@ -209,7 +211,7 @@ def summary(lines: Sequence[Line]) -> str:
             f"good enough to tune on with care{shown}: {_counted(warned, 'warn')}; to do better, "
             f"{_step(warned)}"
         )
-    return f"good enough to tune a controller on{shown}: nothing here speaks against the model"
+    return f"good enough to tune a controller on{shown}: nothing here contradicts the model"
 
 
 def _counted(lines: Sequence[Line], verb: str) -> str:

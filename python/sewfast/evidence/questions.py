@@ -36,9 +36,9 @@ _FOUND = {
         "regimes"
     ),
     "autocorrelation": (
-        "the noise model is too simple: predictions one step ahead waste what past errors "
-        "say; raise "
-        "na and nb, or take model oe, which makes no promise about the noise"
+        "the noise model is too simple: predictions one step ahead do not use all that "
+        "past errors tell; raise "
+        "na and nb, or take model oe, which assumes nothing about the noise"
     ),
     "input": (
         "the input still explains part of the residual: dynamics or delay are missing; raise the "
@@ -61,7 +61,8 @@ _FOUND = {
         "grows with the amplitude"
     ),
     "product": (
-        "residual and input multiply: noise acts inside a nonlinear loop, or the gain drifts "
+        "the product of past residual and input explains part of the residual: noise acts inside "
+        "a nonlinear loop, or the gain drifts "
         "over the "
         "record; compare records from different times"
     ),
@@ -79,8 +80,8 @@ _PASSED = {
     "cubed_input": "no odd nonlinearity of the input is left in the residual",
     "output": "no function of the computed output is left in the residual",
     "squares": "the residual is as large for small inputs as for large ones",
-    "product": "residual and input do not multiply",
-    "feedback": "the input does not answer to the residual: recorded in open loop",
+    "product": "no product of past residual and input is left in the residual",
+    "feedback": "the input does not respond to the residual: recorded in open loop",
 }
 
 
@@ -98,8 +99,8 @@ def accuracy(scores: HorizonScores, unit: str, noise: float) -> list[Line]:
     found = [_free_run(free, unit, grade_of(free.fit_percent, free.rmse, noise))]
     text = (
         "started from measured outputs each time: the model's own errors have no time to grow, "
-        "while the noise of these outputs counts in full; it says little of a model that has to "
-        "run alone"
+        "while the noise of these outputs counts in full; it says little about a model that has "
+        "to run alone"
     )
     for name, s in scores.pooled.items():
         if name != "free run":
@@ -126,7 +127,7 @@ _GRADES: dict[str, tuple[Verdict, str]] = {
     "poor": (
         "warn",
         "the model follows the output loosely; look where the error is large (the plot), and "
-        "whether the data hold what drives the plant",
+        "whether the data contain what drives the plant",
     ),
     "useless": (
         "fail",
@@ -186,7 +187,10 @@ def bias(residuals: Residuals) -> Line:
     if abs(mean) <= 2.58 * error:
         verdict, text = _NO_OFFSET
     elif share < SMALL**2:
-        verdict, text = "ok", "a small offset, which matters little beside the rest of the residual"
+        verdict, text = (
+            "ok",
+            "a small offset, which matters little compared with the rest of the residual",
+        )
     else:
         verdict, text = _OFFSET
     return Line("mean residual", mean, shown, "99 % about 0", verdict, text)
@@ -270,7 +274,7 @@ def looseness(p: Parameters) -> Line:
     shown = f"{len(loose)} of {len(p.values)}"
     named = ", ".join(loose[:5]) + (", .." if len(loose) > 5 else "")
     text = "every parameter is larger than its standard error" if not loose else (
-        f"standard error larger than the value: {named}; a zero would do as well"
+        f"standard error larger than the value: {named}; zero would fit as well"
     )  # fmt: skip
     return Line("parameters near 0", float(len(loose)), shown, "", "info", text)
 
@@ -300,7 +304,7 @@ def coverage(b: Bands) -> Line:
     verdict: Verdict = (
         "ok" if low <= value <= high else "fail" if value < LEAST_COVERAGE else "warn"
     )
-    text = "the bands tell the truth about the error to expect"
+    text = "the bands describe the error to expect correctly"
     if value < low:
         text = (
             "fewer samples lie inside than promised: noise or operating range differ from the "
@@ -327,8 +331,8 @@ def region(outside: float, farthest: float) -> Line:
     text = "some samples are unlike any in the training data: the model extrapolates there"
     if outside > FAR_OUTSIDE:
         text = (
-            "the model is used where it was not trained: believe it here only as far as it was "
-            "measured, and not elsewhere; record such operation and identify again"
+            "the model is used where it was not trained: trust it only as far as it was "
+            "compared with measurements; record such operation and identify again"
         )
     text += f" (up to {farthest:.3g} times the region's bound)"
     return Line(name, outside, shown, limit, "warn", text)
@@ -379,7 +383,7 @@ def _spread_line(name: str, values: FloatArray, unit: str, none: str) -> Line:
     shown = (f"{low:.4g} {unit}" if same else f"{low:.4g} to {high:.4g} {unit}").rstrip()
     same = high - low <= 0.1 * max(abs(low), abs(high))
     text = (
-        "nearly the same over the operating range: one set of gains will do"
+        "nearly the same over the operating range: one set of gains is enough"
         if same
         else "varies over the operating range: check the loop at both ends, or schedule gains"
     )

@@ -18,6 +18,7 @@ from ..errors import SettingError
 from ..machine import VirtualMachine
 from ..models import Model
 from ..plotting import require
+from ..progress import shown_in_notebooks
 from ..recording import Recording
 from ..report import report
 from ..report.artefacts import (
@@ -154,6 +155,7 @@ class _Clock:
         return {stage: end - began for stage, began, end in pairs}
 
 
+@shown_in_notebooks("demo")
 def run_demo(
     out: str | os.PathLike[str],
     seed: int = 0,
@@ -179,6 +181,7 @@ def run_demo(
         Whether files of these names may be replaced that no experiment has left.
     progress : callable(done, total, stage), optional
         Called as each stage begins, and at the end.
+        In a notebook a bar is shown where this is left out; None shows none.
 
     Returns
     -------

@@ -16,7 +16,7 @@ from .. import _core, signals
 from ..commissioning import Commissioning, commission
 from ..commissioning.bench import DriveBench
 from ..commissioning.result import run_numbers
-from ..control.controller import Controller, paper_controller
+from ..control.controller import Controller, SampledController, paper_controller
 from ..control.loop import ClosedLoopRun, run
 from ..control.machine import RecordedRun, Watch, record
 from ..dataset import Dataset
@@ -70,7 +70,7 @@ class Rig(DriveBench):
 
     def follow(
         self,
-        controller: Controller,
+        controller: SampledController,
         r: NDArray[np.float64],
         name: str,
         *,

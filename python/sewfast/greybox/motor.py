@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 FORMAT = "sewfast-motor"
-VERSION = 1
+VERSION = 2
+"""Version 1 has `untold` for `undetermined`, and is read."""
 NAMES = tuple(_core.GREYBOX_PARAMETERS)
 CONFIDENCE = 1.96
 VAGUE = 1.0
@@ -71,7 +72,7 @@ class Motor:
         `stribeck_speed`, `load_1`, `load_2` (amplitude once, twice per turn), `inertia_2`
         (relative), `limit`. With a current also `k_e`, `k_b` (back-EMF, viscous) and `resistance`
         per unit of command; with volts R, Ke, J, friction and inductance in SI units.
-    untold : mapping of str by name
+    undetermined : mapping of str by name
         Parameters that the record does not determine, and why.
     terms : tuple of str
         Terms that the record shows besides back-EMF and inertia.
@@ -83,7 +84,7 @@ class Motor:
     """
 
     parameters: Mapping[str, Parameter]
-    untold: Mapping[str, str]
+    undetermined: Mapping[str, str]
     terms: tuple[str, ...]
     fit_percent: float
     rmse: float
@@ -113,8 +114,8 @@ class Motor:
             return self.parameters[name].value
         known = ", ".join(self.parameters)
         raise DataError(
-            f"{name}: {self.untold[name]}"
-            if name in self.untold
+            f"{name}: {self.undetermined[name]}"
+            if name in self.undetermined
             else f"expected a parameter of {known}, received {name!r}"
         )
 
@@ -273,7 +274,7 @@ class Motor:
         theta = [None if j == limit and math.isinf(v) else v for j, v in enumerate(self.theta)]
         return {
             "parameters": {n: vars(p) for n, p in self.parameters.items()},
-            "untold": dict(self.untold),
+            "undetermined": dict(self.undetermined),
             "terms": list(self.terms),
             **{n: getattr(self, n) for n in _NUMBERS},
             "u_unit": self.u_unit,
@@ -340,9 +341,9 @@ class Motor:
             f"{self.samples:,} samples ({terms}); 95 % intervals"
         ]
         lines += [f"  {name:<{width}}  {p}" for name, p in self.parameters.items()]
-        for why in dict.fromkeys(self.untold.values()):
-            names = [name for name, reason in self.untold.items() if reason == why]
-            lines.append(f"  not told: {', '.join(names)}: {why}")
+        for why in dict.fromkeys(self.undetermined.values()):
+            names = [name for name, reason in self.undetermined.items() if reason == why]
+            lines.append(f"  not determined: {', '.join(names)}: {why}")
         if not self.converged:
             lines.append("  note: the least squares did not converge; intervals may be wrong")
         if self.spikes:
@@ -372,18 +373,30 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
     ModelFileError
         For any other file.
     """
-    fields = storage.Fields(str(path), storage.read(path, FORMAT, (VERSION,)))
+    document = storage.read(path, FORMAT, (1, VERSION))
+    if document["version"] == 1 and "untold" in document:
+        document["undetermined"] = document.pop("untold")
+    fields = storage.Fields(str(path), document)
     fields.require_only(
-        ["version", "parameters", "untold", "terms", *_NUMBERS, "u_unit", "speed_unit", "theta"]
+        [
+            "version",
+            "parameters",
+            "undetermined",
+            "terms",
+            *_NUMBERS,
+            "u_unit",
+            "speed_unit",
+            "theta",
+        ]
     )
-    told = fields.object("parameters")
+    stored = fields.object("parameters")
     parameters = {}
-    for name in told.values:
-        one = told.object(name)
+    for name in stored.values:
+        one = stored.object(name)
         one.require_only(["value", "low", "high", "unit"])
         value, low, high = (one.number(n) for n in ("value", "low", "high"))
         parameters[name] = Parameter(value, low, high, one.text("unit"))
-    untold = fields.object("untold")
+    undetermined = fields.object("undetermined")
     theta = fields.object("theta")
     theta.require_only(NAMES)
     values = [math.inf if n == "limit" and theta.any(n) is None else theta.number(n) for n in NAMES]
@@ -399,7 +412,7 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
         raise fields.refuse("speed_unit", "rpm, rev/s, rad/s or deg/s", unit) from None
     return Motor(
         parameters,
-        {n: untold.text(n) for n in untold.values},
+        {n: undetermined.text(n) for n in undetermined.values},
         tuple(terms),
         fields.number("fit_percent"),
         fields.number("rmse"),
@@ -432,7 +445,7 @@ def motor_of(
     known = {**dict(zip(NAMES, estimate.theta, strict=True)), "R": estimate.resistance or math.nan}
     at = np.array([known[n] for n in estimate.names])
     parameters: dict[str, Parameter] = {}
-    untold: dict[str, str] = {}
+    undetermined: dict[str, str] = {}
     for name, unit, of in _quantities(estimate, records.u_unit, volts):
         value = of(known)
         slope = np.zeros(len(at))
@@ -444,7 +457,7 @@ def motor_of(
         half = CONFIDENCE * math.sqrt(max(float(slope @ estimate.covariance @ slope), 0.0))
         vague = half >= VAGUE * abs(value) and name not in _MAY_BE_NOTHING
         if not math.isfinite(half) or vague:
-            untold[name] = (
+            undetermined[name] = (
                 "the record does not part it from the others; add steps to several speeds, in both "
                 "directions"
                 if not half < APART * abs(value)
@@ -456,10 +469,10 @@ def motor_of(
         parameters[name] = Parameter(value, low, value + half, unit)
     for term, why in reasons.items():
         for name in _OF_TERM[term]:
-            untold.setdefault(name, why)
+            undetermined.setdefault(name, why)
     missing = _NO_CURRENT if estimate.resistance is None else _NO_VOLTS
     if estimate.resistance is None or volts is None:
-        untold |= {"resistance_ohm" if n == "resistance" else n: missing for n in _SI}
+        undetermined |= {"resistance_ohm" if n == "resistance" else n: missing for n in _SI}
     if volts is not None and estimate.resistance is not None:
         parameters["volts"] = Parameter(volts, volts, volts, f"V/{records.u_unit}".rstrip("/"))
     y, model = outcome
@@ -467,7 +480,7 @@ def motor_of(
     spread = float(np.linalg.norm(y - y.mean()))
     return Motor(
         parameters,
-        untold,
+        undetermined,
         estimate.terms,
         100.0 * (1.0 - float(np.linalg.norm(error)) / max(spread, 1e-300)),
         float(np.sqrt(np.mean(error**2))) / factor,

@@ -15,6 +15,7 @@ from ..evidence import remembered
 from ..kinds import KINDS, Kind, spelled
 from ..models import Model
 from ..models.files import STRUCTURED
+from ..progress import shown_in_notebooks
 from ..threads import Workers, available, require_workers
 from . import choice, further, lagged, linear, structured
 from .effort import Clock, Progress
@@ -46,6 +47,7 @@ _PAPER = {"na": 2, "nb": 2, "nk": 1, "hidden": 8}
 _PAPER_STARTS = 8
 
 
+@shown_in_notebooks("identify")
 def identify(
     data: Dataset,
     *,
@@ -127,6 +129,7 @@ def identify(
         decay. False trains on all data to the last iteration, for comparisons of methods.
     progress : callable(done, total, best_cost) or None
         Called from the calling thread from time to time, counting each stage from its start.
+        In a notebook a bar is shown where this is left out; None shows none.
 
     Returns
     -------

@@ -17,6 +17,7 @@ from ..dataset.experiment import in_effect
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, SettingError
 from ..plotting import Table, legend, lettered, significant, stacked
+from ..progress import shown_in_notebooks
 from .delays import LONGEST, DelayEstimate, LaggedRegression, Solution, delay
 
 Progress: TypeAlias = Callable[[int, int, float], object]
@@ -210,6 +211,7 @@ def _line(r: Structure, mark: str) -> str:
     return f"{r.na:3d} {r.nb:3d} {r.nk:3d} {numbers}  {mark}".rstrip()
 
 
+@shown_in_notebooks("orders")
 def orders(
     data: Dataset,
     *,
@@ -236,6 +238,7 @@ def orders(
     held_out : float
         That part, between 0 and 1.
     progress : callable(done, total, lowest_error) or None
+        In a notebook a bar is shown where this is left out; None shows none.
 
     Returns
     -------

@@ -297,7 +297,8 @@ class Connection(Unique):
         if foreign is not None:
             self._failed = DeviceReset(
                 f"{self.port.url}: expected the device to go on, it has been reset; its motor is "
-                "without command: see to its supply, connect again, set the limits and start anew"
+                "without command: check its power supply, connect again, set the limits and start "
+                "anew"
             )
             raise self._failed
         return True
@@ -360,8 +361,8 @@ class Connection(Unique):
         """
         if not self._owner.acquire(blocking=False):
             raise SettingError(
-                "expected one thread to use a drive, a second one came while it was in use; end a "
-                "run from elsewhere by the event that `stream` takes as cancel"
+                "expected one thread to use a drive, a second one used it at the same time; to "
+                "end a run from another thread, set the event that `stream` takes as cancel"
             )
         try:
             yield
@@ -468,7 +469,7 @@ class Connection(Unique):
         heard = "nor anything else; check cable and device"
         if others > 0:
             heard = (
-                f"but {others} other frames: it does not hear, or is too busy to answer; "
+                f"but {others} other frames: it receives nothing, or is too busy to answer; "
                 "see `sewfast doctor`"
             )
         return LinkError(
@@ -562,9 +563,9 @@ class Connection(Unique):
         remedy = "check cable, supply and that the firmware speaks this protocol (docs/PROTOCOL.md)"
         if self.receiver.counters["echoed"]:
             heard = "only what was sent came back"
-            remedy = "see whether transmit and receive are joined, and what is connected"
+            remedy = "check whether transmit and receive are connected to each other"
         elif self._bytes:
-            heard = f"{self._bytes} bytes came that are no frames for this host"
+            heard = f"{self._bytes} bytes arrived that are not frames for this host"
             remedy = f"check the baud rate ({self.port.baud}) and what runs on the device"
         return LinkError(
             f"{self.port.url}: expected a device to answer HELLO within {patience:g} s, {heard}; "

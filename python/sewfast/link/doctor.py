@@ -237,7 +237,7 @@ class Diagnosis:
         ends = {
             "ok": "nothing is wrong with it",
             "warn": "it works; see the warnings",
-            "fail": "it does not work as it is; see the failures",
+            "fail": "it does not work yet; see the failures",
         }
         return "\n".join([*map(str, self.findings), f"{self.port}: {ends[self.verdict]}"])
 
@@ -349,26 +349,26 @@ def _state(status: wire.Status) -> Finding:
         )  # fmt: skip
     if status.state == "boot":
         return Finding(
-            "state", "fail", "does not leave boot: no ten samples in a row were measured well",
+            "state", "fail", "stays in boot: it never measured ten samples in a row without error",
             "check encoder and sensors", values,
         )  # fmt: skip
     return Finding("state", "ok", status.state, values=values)
 
 
 _TRIPS = {
-    "watchdog": "its host fell silent or the cable was out: see the loss below, and give a busy "
+    "watchdog": "its host fell silent or the cable was unplugged: see the loss below, give a busy "
     "computer more time (--watchdog 250)",
-    "speed": "the speed limit was passed; check the limits and the controller",
-    "acceleration": "the acceleration limit was passed; check the limits and the encoder",
-    "current": "the current limit was passed; check the mechanics for a jam",
+    "speed": "the speed limit was exceeded; check the limits and the controller",
+    "acceleration": "the acceleration limit was exceeded; check the limits and the encoder",
+    "current": "the current limit was exceeded; check the mechanics for a jam",
     "underrun": "the profile ran dry; see the throughput below",
     "bad command": "a command was refused while running; check host and firmware versions",
-    "host changed": "another host greeted it while it ran; let one host use it",
+    "host changed": "another host connected while it was running; use one host only",
     "measurement": "a measurement was not finite; check the sensors",
     "no motion": "the motor did not move; check motor cable, drive supply and encoder",
     "stop input": "the stop input is active; release it",
     "late": "a control period came late; see the counters below",
-    "swinging": "the loop swung between its limits; lower the gains, look for a shaft resonance",
+    "swinging": "the loop oscillated between its limits; lower the gains or look for a resonance",
 }
 
 
@@ -461,21 +461,21 @@ def _loss(
     verdict: Verdict = "fail" if bad > LOSSY * 2 * echoes else "warn"
     return Finding(
         "loss", verdict, told,
-        "shorten or shield the cable, join the grounds, lower the baud rate, and see that nobody "
-        "else has the port open",
+        "shorten or shield the cable, connect the grounds, lower the baud rate, and make sure "
+        "that no other program has the port open",
         values,
     )  # fmt: skip
 
 
 def _clock(drive: Drive) -> Finding:
     if drive.identity.on_credit:
-        return Finding("clock", "ok", "stands still but for what the host grants")
+        return Finding("clock", "ok", "advances only by what the host grants")
     bounds = drive.clock
     if bounds is None:
-        return Finding("clock", "warn", "no answer to compare the clocks by")
+        return Finding("clock", "warn", "no answer, so that the clocks cannot be compared")
     if not bounds.consistent:
         return Finding(
-            "clock", "fail", str(bounds), "the device's clock jumps; mend its timer in the firmware"
+            "clock", "fail", str(bounds), "the device's clock jumps; fix its timer in the firmware"
         )
     low, high = bounds.drift_ppm
     values = {
@@ -487,7 +487,7 @@ def _clock(drive: Drive) -> Finding:
             "clock",
             "warn",
             str(bounds),
-            "see the firmware's clock: a crystal keeps 100 ppm",
+            "check the firmware's clock: a crystal is within 100 ppm",
             values,
         )
     return Finding("clock", "ok", str(bounds), values=values)
@@ -509,7 +509,9 @@ def _counters(after: wire.Status, before: wire.Status, drive: Drive) -> Finding:
     if 2 * after.late_us >= drive.identity.period_us:
         remedies.append("control periods come late: shorten what else the firmware does")
     if after.foreign != before.foreign:
-        remedies.append("frames of another host came meanwhile: let one program use the line")
+        remedies.append(
+            "frames of another host arrived meanwhile: use the line from one program only"
+        )
     verdict: Verdict = "warn" if remedies else "ok"
     return Finding("counters", verdict, told, "; ".join(remedies), values)
 
@@ -617,7 +619,7 @@ def _named(held: list[tuple[int, str]]) -> str:
 def _opened(url: str, port: Port) -> Finding:
     if _is_local(url) and (held := holders(url)):
         return Finding(
-            "port", "warn", f"opens, but {_named(held)} has it open too and takes bytes away",
+            "port", "warn", f"opens, but {_named(held)} has it open too and receives some bytes",
             "end that program (a serial monitor, ModemManager)", {"holders": held},
         )  # fmt: skip
     return Finding("port", "ok", port.describe())
@@ -640,7 +642,7 @@ def _latency(url: str) -> Iterator[Finding]:
         return
     yield Finding(
         "latency timer", "warn", f"{milliseconds} ms: the adapter holds bytes back for that long",
-        f"echo 1 | sudo tee {file}, or setserial {url} low_latency; for good by a udev rule: "
+        f"echo 1 | sudo tee {file}, or setserial {url} low_latency; permanently by a udev rule: "
         'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"',
         values,
     )  # fmt: skip

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import counts_per_unit
-from ..control.controller import Controller
+from ..control.controller import Controller, SampledController
 from ..control.machine import RecordedRun, Watch
 from ..errors import LinkError, SettingError
 from ..gains import Gains, real
@@ -46,11 +46,11 @@ def channels(link: Connection) -> tuple[Channel, ...]:
     if wire.schema_hash(identity.version, identity.period_us, bodies) != identity.schema:
         raise LinkError(
             "expected channels that match the device's schema hash, got others; connect again, "
-            "or mend the firmware"
+            "or fix the firmware"
         )
     found = tuple(map(wire.channel, bodies))
     if (found[0].encoding, found[1].encoding) != (0, 1):
-        raise LinkError("expected channel 0 to be counts and 1 the command; mend the firmware")
+        raise LinkError("expected channel 0 to be counts and 1 the command; fix the firmware")
     return found
 
 
@@ -72,8 +72,8 @@ def limit(name: str, value: float | None, present: float, ceiling: float) -> flo
     return min(value, ceiling)
 
 
-def fitting(controller: Controller, streamed: Sequence[Channel]) -> Gains:
-    """The controller's gains in standard form.
+def require_units(controller: SampledController, streamed: Sequence[Channel]) -> None:
+    """Refuse a controller in other units than the device's.
 
     Raises
     ------
@@ -81,10 +81,38 @@ def fitting(controller: Controller, streamed: Sequence[Channel]) -> Gains:
         Where they are not in the device's units.
     """
     units = {c.name: c.unit for c in streamed}
-    gains = controller.gains.to("standard")
-    _require_units(gains.u_unit, units.get("u", ""), "command")
-    _require_units(gains.y_unit, units.get("feedback", "RPM"), "output")
-    return gains
+    _require_units(controller.u_unit, units.get("u", ""), "command")
+    _require_units(controller.y_unit, units.get("feedback", "RPM"), "output")
+
+
+def fitting(controller: Controller, streamed: Sequence[Channel]) -> Gains:
+    """The controller's gains in standard form; refuses other units as `require_units`."""
+    require_units(controller, streamed)
+    return controller.gains.to("standard")
+
+
+def other_kind(
+    controller: SampledController, streamed: Sequence[Channel], identity: Identity
+) -> bytes:
+    """Body of CONTROLLER for one that is no PID; the encoder is the device's own.
+
+    Raises
+    ------
+    SettingError
+        Where it is not in the device's units, or the device does not know it.
+    """
+    require_units(controller, streamed)
+    if not identity.capabilities & wire.KINDS:
+        raise SettingError(
+            name="controller", expected="a PID (Controller) for this device",
+            received=f"{type(controller).__name__}, which its firmware does not know",
+            remedy="tune a PID (--controller pid), or build the firmware with this sewfast and set "
+            "SEWFAST_CAN_KINDS",
+        )  # fmt: skip
+    kind, numbers = controller.sent()
+    return wire.controller(
+        kind, counts_per_unit(identity.counts_per_rev, controller.y_unit), numbers
+    )
 
 
 def gains(controller: Controller, streamed: Sequence[Channel], identity: Identity) -> bytes:
@@ -294,7 +322,7 @@ class Drive(Unique):
         """Seconds until up to 200 bytes come back."""
         sent = time.monotonic()
         if self._link.ask(Kind.ECHO, data) != data:
-            raise LinkError("expected the bytes sent to ECHO, got others; mend the firmware")
+            raise LinkError("expected the bytes sent to ECHO, got others; fix the firmware")
         return time.monotonic() - sent
 
     # --- what it may do ---------------------------------------------------------------------------
@@ -336,7 +364,7 @@ class Drive(Unique):
         ]
         return wire.limits(self._link.ask(Kind.LIMITS, wire.set_limits(values)))
 
-    def set_controller(self, controller: Controller) -> None:
+    def set_controller(self, controller: SampledController) -> None:
         """Load a controller into the device; its encoder is the device's own.
 
         Raises
@@ -344,6 +372,9 @@ class Drive(Unique):
         SettingError
             Where sample time or units are not the device's.
         """
+        if not isinstance(controller, Controller):
+            self._link.ask(Kind.CONTROLLER, other_kind(controller, self.channels, self.identity))
+            return
         body = gains(controller, self.channels, self.identity)
         self._link.ask(Kind.GAINS, body)
         # GAINS leave none
@@ -496,7 +527,7 @@ class Drive(Unique):
 
     def follow(
         self,
-        controller: Controller,
+        controller: SampledController,
         r: NDArray[np.float64],
         name: str = "reference",
         *,
@@ -510,7 +541,7 @@ class Drive(Unique):
 
         Parameters
         ----------
-        controller : Controller
+        controller : Controller or StateFeedback
         r : array, shape (N,)
             Reference at the device's sample time [y].
         name : str
@@ -597,7 +628,7 @@ class Drive(Unique):
         if not limits.are_set:
             raise SettingError(
                 "expected limits set on the device, it has none in this session; set them to what "
-                "motor and machine stand: drive.set_limits(volt=..., speed_rpm=..., ...)"
+                "motor and machine can take: drive.set_limits(volt=..., speed_rpm=..., ...)"
             )
         if what == "references":
             return profiles.references(plan.values, limits)

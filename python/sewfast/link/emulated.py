@@ -134,7 +134,7 @@ class EmulatedBoard:
     firmware : path
         ELF file, as of `build_firmware`, which says by its addresses for which board it was linked.
     clock : {"credit", "real"}
-        On credit the board's time stands still but for what the host grants: a busy computer
+        On credit the board's time advances only by what the host grants: a busy computer
         changes no recording, and instructions are counted. In real time its clock is the
         computer's.
     boot_id : int or None

@@ -433,7 +433,8 @@ class HostLoopRun:
             lines.append(f"  {self.message}")
         if not self.stop_confirmed and self.outcome != "reset":
             lines.append(
-                "  STOP was not answered: the device's watchdog stops the motor; see that it stands"
+                "  STOP was not answered: the device's watchdog stops the motor; make sure that "
+                "it is at rest"
             )
         if told["rmse"] is not None:
             lines.append(
@@ -462,7 +463,7 @@ _ENDS = {
     "interrupted": "interrupted",
     "ended": "the device ended the run early; see `sewfast doctor` for its state",
     "silent": "no sample came within the watchdog time, so the motor was stopped; check the cable",
-    "reset": "the device was reset; its motor is without command: see to its supply",
+    "reset": "the device was reset; its motor is without command: check its power supply",
     "port_lost": "the port vanished, the device's watchdog stops the motor; check the cable",
 }
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray
-from ..control.controller import Controller
+from ..control.controller import SampledController
 from ..control.machine import RecordedRun, Watch, cancelled_by
 from ..errors import Interrupted, LinkError, SettingError, SewfastError
 from ..gains import vector
@@ -56,7 +56,7 @@ class Plan:
         command when its time has come, which is only for slow plants.
     values : array, shape (N,)
         Commands in the unit of channel `u`, or references in the unit of the controller's output.
-    controller : Controller or None
+    controller : Controller, StateFeedback or None
         Of mode "controller".
     columns : sequence of str or None
         Channels to stream beside `counts` and `u`; None for those of the mode that the baud rate
@@ -74,7 +74,7 @@ class Plan:
 
     mode: Mode
     values: NDArray[np.float64]
-    controller: Controller | None = None
+    controller: SampledController | None = None
     columns: Sequence[str] | None = None
     batch: int | None = None
 
@@ -508,7 +508,7 @@ def excite(
 
 
 def follow(
-    drive: Drive, controller: Controller, r: FloatArray, name: str, **options: Any
+    drive: Drive, controller: SampledController, r: FloatArray, name: str, **options: Any
 ) -> RecordedRun:
     """A controller on a drive along a reference; see `Drive.follow`."""
 
@@ -541,7 +541,7 @@ def _recording(
 def _run(
     columns: Mapping[str, FloatArray],
     drive: Drive,
-    controller: Controller,
+    controller: SampledController,
     r: FloatArray,
     name: str,
 ) -> RecordedRun:
@@ -649,7 +649,7 @@ def _more_time(watchdog: float) -> str:
         return ""
     return (
         f". A busy computer needs more time: --watchdog {longer * 1e3:g} (watchdog={longer:g}), "
-        "where the machine stands it"
+        "if the machine tolerates it"
     )
 
 

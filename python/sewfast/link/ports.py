@@ -189,7 +189,7 @@ class Port(Unique, ABC):
             The operating system's number of the error.
         error : BaseException
         """
-        return "a port that opens", "it did not", "see `sewfast ports` for what there is"
+        return "a port that opens", "it did not", "`sewfast ports` lists what is connected"
 
     @staticmethod
     def losing(url: str, number: int | None, error: BaseException) -> Texts:
@@ -238,7 +238,7 @@ class SerialPort(Port):
     _serial: Any = None
 
     def describe(self) -> str:
-        return "opens, and nobody else is seen to have it open"
+        return "opens, and no other program seems to have it open"
 
     @staticmethod
     def opening(url: str, number: int | None, error: BaseException) -> Texts:
@@ -253,7 +253,7 @@ class SerialPort(Port):
         if number in _DENIED:
             return "a port that you may open", "permission was denied", _permission(url)
         if number in _NO_TERMINAL:
-            remedy = "see `sewfast ports` for what there is"
+            remedy = "`sewfast ports` lists what is connected"
             return "a serial port", "it is something else", remedy
         if isinstance(error, ValueError):
             remedy = "give a rate that the adapter offers, such as 115200"

@@ -124,7 +124,7 @@ REST_US = 120_000
 STEP_US = 20_000
 ARMS_WITHIN = 10.0
 """Longest wait for a motor that the device finds still moving [s]."""
-HALTED = "expected a run to start, it was stopped from elsewhere before"
+HALTED = "expected a run to start, it was stopped before by another thread"
 MOVING = 11
 """Result of ARM where the motor moves."""
 _ENDS = ("finished", "stopped", "tripped")
@@ -207,7 +207,7 @@ class Run:
             if profile.end == before:
                 raise LinkError(
                     f"expected room for {self.link.identity.capacity} values, the device takes no "
-                    f"more than {before}; mend the firmware"
+                    f"more than {before}; fix the firmware"
                 )
 
     def begin(self) -> None:
@@ -227,7 +227,7 @@ class Run:
         if abs(start_us - link.newest) >= 2**32:
             raise LinkError(
                 f"expected a start at the device's present time of {link.newest} us, got "
-                f"{start_us} us; mend the firmware"
+                f"{start_us} us; fix the firmware"
             )
         self._heard = self._asked = time.monotonic()
         self.start_us = start_us
@@ -367,7 +367,7 @@ class Run:
             what = f"had tripped: {status.reason}" if mine else "runs something else"
             raise LinkError(
                 f"{self.link.port.url}: expected the run to go on after {sum(away):.2f} s without "
-                f"the port, the device {what}, after {status.taken} samples; see to cable and "
+                f"the port, the device {what}, after {status.taken} samples; check cable and "
                 f"plug, or give the watchdog more time than {self.link.watchdog:g} s"
             )
         self.ended = True

@@ -135,8 +135,8 @@ class VirtualDevice(Unique):
         self._end = weakref.finalize(self, _end, self._server, folder)
         if anyone and not pty and not _is_loopback(self.port):
             warnings.warn(
-                f"{self.port}: whoever reaches this port can start the motor; let a firewall or an "
-                "SSH tunnel decide who does",
+                f"{self.port}: anyone who can reach this port can start the motor; restrict access "
+                "by a firewall or an SSH tunnel",
                 stacklevel=2,
             )
 

@@ -37,6 +37,7 @@ class Kind(IntEnum):
     START = 0x0A
     ECHO = 0x0B
     BIQUADS = 0x0C
+    CONTROLLER = 0x0D
     KEEP = 0x20
     DRIVE = 0x21
     CREDIT = 0x22
@@ -53,7 +54,7 @@ REASONS = (
 EVENTS = ("", "boot", "armed", "started", "finished", "stopped", "tripped", "cleared")
 MODES = {"commands": 0, "controller": 1, "direct": 2}
 
-PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED, DESIGN, BIQUADS = (1 << b for b in range(8))
+PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED, DESIGN, BIQUADS, KINDS = (1 << b for b in range(9))
 """Capabilities of a device."""
 
 
@@ -251,7 +252,7 @@ def identity(body: bytes) -> Identity:
     if not 2 <= channels <= 16 or period == 0 or not (math.isfinite(counts) and counts >= 0):
         raise LinkError(
             "expected a device with 2 to 16 channels, a control period and counts per turn, got "
-            f"{channels}, {period} us and {counts}; mend the firmware"
+            f"{channels}, {period} us and {counts}; fix the firmware"
         )
     return Identity(
         _shown(name), _shown(firmware), version, boot, schema, name_of(STATES, state), channels,
@@ -272,7 +273,7 @@ def channel(body: bytes) -> Channel:
     if encoding > 2 or (encoding == 1 and steps == 0):
         raise LinkError(
             f"expected channel {number} in encoding 0, 1 (with steps per unit) or 2, got "
-            f"{encoding} with {steps} steps; update sewfast or mend the firmware"
+            f"{encoding} with {steps} steps; update sewfast or fix the firmware"
         )
     return Channel(number, encoding, steps, _shown(name), _shown(unit))
 
@@ -331,7 +332,7 @@ T = TypeVar("T")
 def _whole(told: T | None, body: bytes, name: str) -> T:
     if told is None:
         raise LinkError(
-            f"expected a whole reply to {name}, got {len(body)} bytes; mend the firmware "
+            f"expected a whole reply to {name}, got {len(body)} bytes; fix the firmware "
             "(docs/PROTOCOL.md)"
         )
     return told
@@ -347,7 +348,7 @@ def _shown(name: str) -> str:
 
 hello, arm, keep, drive = LinkBodies.hello, LinkBodies.arm, LinkBodies.keep, LinkBodies.drive
 set_limits, upload, gains = LinkBodies.limits, LinkBodies.upload, LinkBodies.gains
-biquads, start = LinkBodies.biquads, LinkBodies.start
+biquads, controller, start = LinkBodies.biquads, LinkBodies.controller, LinkBodies.start
 
 
 def credit(us: int, until: int) -> bytes:
@@ -380,6 +381,7 @@ _FIELDS: dict[int, tuple[str, ...]] = {
         "counts per unit", "filter_samples", "observer_time", "r_rate", "schedule",
     ),
     Kind.BIQUADS: ("the number of biquads",),
+    Kind.CONTROLLER: ("kind", "counts per unit"),
     Kind.START: ("mode", "watchdog", "at", "length", "mask", "batch"),
 }  # fmt: skip
 

@@ -7,6 +7,7 @@ NaT) is NaN; moments and durations become seconds from the first one.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 from ..arrays import FloatArray
 from ..errors import DataError, SettingError
 from .containers import Table, from_headers
+
+_NUMBER = (int, float, np.number, Decimal)
 
 Found = tuple[str, FloatArray | None, str, str]
 """Header, numbers or None, unit where it stands beside the header, why there are no numbers."""
@@ -107,7 +110,14 @@ def _arrow(frame: Any) -> Any:
             f"reading {type(frame).__name__} needs pyarrow, which is not installed: "
             'pip install "sewfast[parquet]"'
         ) from e
-    return pa.table(frame)
+    try:
+        return pa.table(frame)
+    except pa.ArrowException as e:
+        # a single column, such as a Series, is a stream as well
+        raise SettingError(
+            f"expected a table with a column for each signal, got {type(frame).__name__}: put the "
+            "columns into one DataFrame, or use Dataset.from_arrays"
+        ) from e
 
 
 def _of_pandas(frame: Any) -> Iterator[Found]:
@@ -137,7 +147,9 @@ def _of_series(column: Any) -> tuple[FloatArray | None, str, str]:
 def _of_polars(frame: Any) -> Iterator[Found]:
     for name in frame.columns:
         column = frame[name]
-        if column.dtype.is_temporal() or column.dtype.is_numeric():
+        if column.dtype.is_decimal():
+            yield name, *_numbers(column.cast(float).to_numpy())
+        elif column.dtype.is_temporal() or column.dtype.is_numeric():
             yield name, *_numbers(column.to_numpy())
         elif str(column.dtype) == "Boolean":
             yield name, *_numbers(column.cast(int).to_numpy())
@@ -163,6 +175,10 @@ def _with_unit(name: str, found: tuple[Any, str, str], units: Any) -> Found:
 
 def _array(values: Any) -> NDArray[Any]:
     try:
+        if isinstance(values, np.ma.MaskedArray):
+            # what is masked was not measured
+            mask = np.ma.getmaskarray(values)
+            return np.where(mask, np.nan, np.asarray(values.data, dtype=np.float64))
         return np.asarray(values)
     except (ValueError, TypeError):
         # lists of different lengths, or no list at all
@@ -180,6 +196,6 @@ def _numbers(values: NDArray[Any]) -> tuple[FloatArray | None, str, str]:
         known = values[~np.isnat(values)]
         since = values - known[0] if kind == "M" and len(known) else values
         return since / np.timedelta64(1, "s"), "s", ""
-    if kind == "O" and all(v is None or isinstance(v, (int, float, np.number)) for v in values):
+    if kind == "O" and all(v is None or isinstance(v, _NUMBER) for v in values):
         return np.array([np.nan if v is None else v for v in values], dtype=np.float64), "", ""
     return None, "", f"holds {values.dtype}"

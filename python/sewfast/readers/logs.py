@@ -33,6 +33,8 @@ LARGEST = 50_000_000
 """Rows of a table, at the most."""
 PATIENCE, PATIENCE_PER_MB = 20.0, 5.0
 """For a reader, and for each megabyte that it reads [s]."""
+MEMORY, MEMORY_PER_BYTE = 2_000_000_000, 50
+"""For a reader, and for each byte that it reads [B]: a damaged length makes it ask for any."""
 _DEPTH = 8
 """Of a message within messages."""
 _ELEMENTS = 64
@@ -114,9 +116,11 @@ def send(name: str) -> None:
     """In the process of a reader: what it finds in the file of the command line, as `.npz`."""
     out, sys.stdout = sys.stdout.buffer, sys.stderr
     path = Path(sys.argv[1])
+    raw = path.read_bytes()
+    _bound_memory(MEMORY + MEMORY_PER_BYTE * len(raw))
     arrays: dict[str, Any] = {}
     texts: list[str] = []
-    for k, signal in enumerate(_KINDS[name].signals(path, path.read_bytes())):
+    for k, signal in enumerate(_KINDS[name].signals(path, raw)):
         values = np.asarray(signal.values)
         arrays[f"{k}.y"] = values if values.dtype.kind in "biuf" else np.array("not numeric")
         if signal.t is not None:
@@ -126,6 +130,17 @@ def send(name: str) -> None:
     whole = io.BytesIO()
     np.savez(whole, texts=np.array(texts, dtype=str), **arrays)
     out.write(whole.getvalue())
+
+
+def _bound_memory(most: int) -> None:
+    """Let this process have no more than `most` bytes, where the system can see to that."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if hard == resource.RLIM_INFINITY or hard > most:
+        resource.setrlimit(resource.RLIMIT_DATA, (most, hard))
 
 
 def joined(path: Path, signals: Sequence[Signal], kind: str) -> Table:

@@ -112,7 +112,7 @@ def _gains(found: Mapping[str, Any]) -> Table:
 
 
 def _met(found: Mapping[str, Any]) -> Table | None:
-    """What the gains do of what was required beside the cost."""
+    """How the gains meet what was required besides the cost."""
     met = found.get("met")
     if not met or not (met["Ms"] or met["load"]):
         return None
@@ -127,7 +127,8 @@ def _met(found: Mapping[str, Any]) -> Table | None:
         tuned, rule = (milliseconds(max(met["recovery_ms"][n])) for n in ("tuned", "rule"))
         what = f"slowest recovery from a load of {significant(volt)} V at {significant(level)} RPM"
         rows.append((what, tuned, f"{rule}, under Eq. 12's gains"))
-    return Table("Required beside the cost.", ("what", "found", "allowed"), tuple(rows), words=True)
+    header = ("what", "found", "allowed")
+    return Table("Required besides the cost.", header, tuple(rows), words=True)
 
 
 def _opinion(found: Mapping[str, Any]) -> Table | None:
@@ -150,7 +151,7 @@ def _judged(name: str, judged: Mapping[str, Any]) -> Table:
     rows = tuple(
         (x["name"], x["shown"], x["limit"], x["verdict"], x["meaning"]) for x in judged["lines"]
     )
-    header = ("question", "found", "limit", "verdict", "what it says")
+    header = ("question", "found", "limit", "verdict", "what it means")
     return Table(f"{name.capitalize()}: {judged['verdict']}.", header, rows, words=True)
 
 

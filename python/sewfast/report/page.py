@@ -28,7 +28,7 @@ class Goal:
     Attributes
     ----------
     demand, reached : str
-        What was asked for and what came out, in words.
+        What is required and what was measured, in words.
     met : bool or None
         None where the number is undefined.
     """
@@ -57,6 +57,19 @@ def goals(artefacts: Artefacts) -> tuple[Goal, ...]:
         _overshoot(artefacts),
         _alike(artefacts),
         _duration(artefacts),
+    )
+
+
+def verdict(a: Artefacts) -> str:
+    """In one sentence, whether the machine did what had been predicted."""
+    path = "control.trapezoid"
+    met = all(goal.met for goal in (_rise(a), _overshoot(a), _alike(a)))
+    return (
+        f"{'Verified' if met else 'Not verified'}: on the trapezoid the speed of the machine is "
+        f"within {rpm(a.number(f'{path}.model_vs_machine_rmse_rpm'))} rms of its prediction. It "
+        f"rises in {milliseconds(a.number(f'{path}.machine.rise_time_ms'))}, the reference in "
+        f"{milliseconds(a.number(f'{path}.reference_rise_time_ms'))}, and overshoots by "
+        f"{percent(a.number(f'{path}.machine.overshoot_percent'), 1)}."
     )
 
 
@@ -215,19 +228,23 @@ def _scores(artefacts: Artefacts, kind: str, caption: str) -> Table:
         for m in MODELS
         for r in SCORED
     }
-    told = kind == "simulation"
+    with_records = kind == "simulation"
     rows = []
     best = set()
     for i, m in enumerate(MODELS):
-        cells = [labels.MODEL[m], *([_trained_on(artefacts, m)] if told else [])]
+        cells = [labels.MODEL[m], *([_trained_on(artefacts, m)] if with_records else [])]
         for j, r in enumerate(SCORED):
             fit = artefacts.number(f"identification.{m}.{r}.{kind}.fit_percent")
             cells.append(f"{significant(found[m, r])}\N{NO-BREAK SPACE}({percent(fit, 1)})")
             known = [x for n in MODELS if (x := found[n, r]) is not None]
             if found[m, r] is not None and found[m, r] == min(known):
-                best.add((i, j + 1 + told))
+                best.add((i, j + 1 + with_records))
         rows.append(tuple(cells))
-    header = ("model", *(["trained on"] if told else []), *(labels.RECORD[r] for r in SCORED))
+    header = (
+        "model",
+        *(["trained on"] if with_records else []),
+        *(labels.RECORD[r] for r in SCORED),
+    )
     return Table(caption, header, tuple(rows), frozenset(best))
 
 
@@ -389,6 +406,7 @@ def _source(name: str) -> str:
 def _context(artefacts: Artefacts) -> dict[str, Any]:
     numbers = {
         "goals": goals(artefacts),
+        "verdict": verdict(artefacts),
         "speed": speed_table(artefacts),
         "scores": identification_tables(artefacts),
         "gains": gains_table(artefacts),
@@ -408,6 +426,7 @@ def _context(artefacts: Artefacts) -> dict[str, Any]:
     # drawn last: where a number is missing nothing is drawn in vain
     with style():
         return numbers | {
+            "opening": pictures.opening_picture(artefacts),
             "recorded": pictures.recorded_pictures(artefacts),
             "scaled": pictures.scaled_pictures(artefacts),
             "predicted": pictures.prediction_pictures(artefacts),

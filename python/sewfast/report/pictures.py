@@ -9,6 +9,7 @@ import numpy as np
 
 from ..plotting import (
     LOOKS,
+    Drawing,
     Float,
     Picture,
     Table,
@@ -154,7 +155,7 @@ def _scaled(columns: Columns, number: str, title: str) -> Picture:
     return Picture(key, f"Fig. {number}", title, alt, caption, svg(figure, key, alt))
 
 
-# --- Predictions beside the machine's speed: the paper's Fig. 8 to 11 and 13 to 15 ----------------
+# --- Predictions and the machine's speed: the paper's Fig. 8 to 11 and 13 to 15 ----------------
 
 
 _ZOOM = 2.0
@@ -364,6 +365,27 @@ _PURPOSE = {
 
 _MAGNIFIED = 0.4
 """Width of the magnified rise [s]."""
+
+
+def opening_picture(artefacts: Artefacts) -> Picture:
+    """What it is all for: the trapezoid as predicted and as measured, and its rise magnified."""
+    names = {"model": "predicted on the model", "machine": "measured on the machine"}
+    traces = [
+        Trace.of(artefacts.runs["trapezoid", plant], plant, label) for plant, label in names.items()
+    ]
+    output, _, _ = loop_panels(traces, "RPM", "V")
+    window = _rise(traces[0])
+
+    def whole(ax: Axes) -> None:
+        output(ax)
+        ax.set_xlabel("time [s]")
+
+    rows = ((whole, lambda ax: _magnify(ax, traces, window)),)
+    figure = Drawing(rows, (2.7,), (1.4, 1.0), share_x=False).figure()
+    title = "Closed loop, predicted and measured"
+    alt = f"{title}: a trapezoid of 3,000 RPM on the model and on the machine, its rise magnified"
+    caption = "Fig. 19 shows the tracking error and the command of the same run."
+    return Picture("opening", "", title, alt, caption, svg(figure, "opening", alt))
 
 
 def loop_pictures(artefacts: Artefacts) -> list[Picture]:

@@ -109,11 +109,11 @@ def run(
 ) -> dict[str, Any]:  # fmt: skip
     """Run a controller of the folder along a named reference."""
     from .. import signals
-    from ..control.controller import load_controller
+    from ..control.files import load_pid
     from ..control.loop import run
 
     found = run(
-        load_controller(folder / controller), drive, scale * signals.reference(reference, seed),
+        load_pid(folder / controller), drive, scale * signals.reference(reference, seed),
         name=reference, file=folder / file, cancel=bench.cancel,
     )  # fmt: skip
     return {"text": f"{found}\n{file}", "file": file}
@@ -150,7 +150,7 @@ def copies(kind: str, place: Place, asked: dict[str, Any]) -> dict[str, str]:
     if kind == "run":
         reference, seed, scale, file = (asked[k] for k in ("reference", "seed", "scale", "file"))
         r = f"{scale!r} * sewfast.signals.reference({reference!r}, {seed})"
-        load = f"controller = sewfast.load_controller({asked['controller']!r})"
+        load = f"controller = sewfast.load_pid({asked['controller']!r})"
         call = f"sewfast.run(controller, drive, {r}, name={reference!r}, file={file!r})"
         words = ["run", asked["controller"], f"--reference={REFERENCE}", "-o", file]
         # the command line takes a reference as it is

@@ -239,7 +239,7 @@ class Project:
         ------
         SettingError, ModelFileError, FitError
         """
-        from ..control.controller import load_controller
+        from ..control.files import load_pid
         from ..models import load_model
         from .tuning import Tuning
 
@@ -249,7 +249,7 @@ class Project:
         key = [(path, path.stat().st_mtime_ns) for path in paths]
         with self._lock:
             if self._tuning is None or self._tuning[0] != key:
-                start = load_controller(paths[1]) if controller is not None else None
+                start = load_pid(paths[1]) if controller is not None else None
                 self._tuning = (key, Tuning(load_model(paths[0]), str(model), start))
             return self._tuning[1]
 

@@ -162,7 +162,6 @@ class Tuning:
         SettingError
             For an unknown name, or what is no number in its range.
         """
-        from ..tuning.task import applied
 
         found = self._search_of(values)
         if found is not None:
@@ -171,7 +170,7 @@ class Tuning:
         unmoved = {knob.name: knob.value for knob in self.knobs}
         if all(wanted.get(name, value) == value for name, value in unmoved.items()):
             return self.start
-        return applied(wanted, self.start, "tuned by hand in the studio")
+        return self.start.with_values(wanted, "tuned by hand in the studio")
 
     def _checked(self, values: Mapping[str, Any]) -> dict[str, float]:
         known = {knob.name: knob for knob in self.knobs}
@@ -272,8 +271,8 @@ class Tuning:
         except Interrupted as stopped:
             # when it was stopped cannot be repeated: these are values like any that a hand has set
             return {"values": self._values_of(stopped.best), "interrupted": True}
-        found = self._values_of(result.controller)
-        self._found.append(_Found(found, result.controller, start, evaluations, seed))
+        found = self._values_of(result.pid)
+        self._found.append(_Found(found, result.pid, start, evaluations, seed))
         return {
             "values": found,
             "interrupted": False,

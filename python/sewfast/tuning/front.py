@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import _core
-from ..control.controller import Controller
+from ..control.controller import Controller, pid_of
 from ..control.loop import Plants, References
 from ..errors import Interrupted, SettingError
 from ..gains import whole
 from ..plotting import Drawing, Panel, Table, lettered, significant
+from ..progress import shown_in_notebooks
 from ..writers import write_table
 from .objective import Constraints, Cost, LoadStep
 from .search import tune
-from .task import Aggregate, Progress, TuningTask, Wanted, applied, threads_or_all
+from .task import Aggregate, Progress, TuningTask, Wanted, threads_or_all
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -156,6 +157,7 @@ class ParetoFront:
         return "\n".join([f"{len(self)} controllers", head, *rows, told])
 
 
+@shown_in_notebooks("pareto")
 def pareto(
     models: Plants,
     references: References = None,
@@ -194,6 +196,7 @@ def pareto(
         Candidates tried.
     progress : callable, optional
         Called with (done, total, lowest cost).
+        In a notebook a bar is shown where this is left out; None shows none.
 
     Returns
     -------
@@ -235,7 +238,7 @@ def pareto(
     task = TuningTask.of(models, references, start=tuned.start, first={}, **settings)
     found = _core.pareto(
         task.core(variables, ms="Ms" in names),
-        others=[tuned.controller.core()],
+        others=[tuned.pid.core()],
         objectives=names,
         size=whole("size", size),
         evaluations=max(1, total - first),
@@ -243,7 +246,7 @@ def pareto(
         threads=threads_or_all(threads),
         progress=_shifted(progress, first, total),
     )
-    return _front(found, task, names, first, tuned.controller)
+    return _front(found, task, names, first, tuned.pid)
 
 
 def _checked(objectives: Sequence[str]) -> list[str]:
@@ -269,17 +272,18 @@ def _front(
     interrupted = found["termination"] == "interrupted"
     if interrupted and not found["controllers"]:
         raise Interrupted(tuned)
+    start = pid_of(task.start, "pareto")
     names = [name for name, _, _ in found["variables"]]
     notes = "on the front of " + ", ".join(objectives) + task.assumed
     # different controllers with the same values are one choice; the rows stay in their order
     values, rows = np.unique(np.array(found["values"]), axis=0, return_index=True)
     front = ParetoFront(
         controllers=tuple(
-            applied(dict(zip(names, found["controllers"][i], strict=True)), task.start, notes)
+            start.with_values(dict(zip(names, found["controllers"][i], strict=True)), notes)
             for i in rows
         ),
         objectives=tuple(objectives),
-        units=_units(objectives, task.start),
+        units=_units(objectives, start),
         values=values,
         pick=knee(values),
         evaluations=before + int(found["evaluations"]),

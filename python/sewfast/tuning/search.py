@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import _core
-from ..control.controller import Controller
+from ..control.controller import Controller, SampledController, pid_of
 from ..control.loop import Plant, Plants, References, check_fits, each_plant, run
 from ..errors import FitError, Interrupted, SettingError
 from ..gains import whole
+from ..progress import shown_in_notebooks
 from .objective import Constraints, Cost, LoadStep
 from .task import (
     Aggregate,
@@ -25,7 +26,6 @@ from .task import (
     TuningTask,
     Variable,
     Wanted,
-    applied,
     budget,
     threads_or_all,
 )
@@ -33,7 +33,14 @@ from .task import (
 Method: TypeAlias = Literal["genetic", "cma-es"]
 
 EVALUATIONS = 1500
-"""Controllers tried unless said otherwise."""
+"""Controllers tried by default."""
+_ENDED_BY = {
+    "evaluations": "their number",
+    "converged": "convergence",
+    "time": "the time budget",
+    "interrupted": "Ctrl-C",
+}
+"""What a termination is called in a sentence."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +49,9 @@ class TuningResult:
 
     Attributes
     ----------
-    controller : Controller
+    controller : Controller or StateFeedback
         Ready to run.
-    start : Controller
+    start : Controller or StateFeedback
         The start of the search, moved to the given bounds if it lay outside.
     cost, start_cost : float
         Cost of both in the output's unit, over plants and references; inf if one diverges.
@@ -66,8 +73,8 @@ class TuningResult:
         The comparison with a rival; None without one, or if no gains suit it.
     """
 
-    controller: Controller
-    start: Controller
+    controller: SampledController
+    start: SampledController
     cost: float
     start_cost: float
     variables: tuple[Variable, ...]
@@ -86,6 +93,17 @@ class TuningResult:
         Models of two kinds that contradict each other on which gains are good.
         """
         return None if self.opinion is None else self.opinion.warning
+
+    @property
+    def pid(self) -> Controller:
+        """The controller, for what knows PIDs only.
+
+        Raises
+        ------
+        SettingError
+            For one of another kind.
+        """
+        return pid_of(self.controller, "what comes next")
 
     @property
     def evaluations(self) -> int:
@@ -138,23 +156,23 @@ class TuningResult:
         """A table for a notebook."""
         from ..plotting import Table, significant
 
-        unit = self.controller.gains.y_unit or "y"
+        unit = self.controller.y_unit or "y"
         rows = tuple(
             (v.name, significant(v.value, 4), significant(v.low), significant(v.high))
             for v in self.variables
         )
         return Table(
             f"cost {self.cost:.4g} {unit} (start {self.start_cost:.4g}), {self.evaluations} "
-            f"controllers tried, ended by {self.termination}",
+            f"controllers tried, ended by {_ENDED_BY.get(self.termination, self.termination)}",
             ("searched", "found", "from", "to"),
             rows,
         ).to_html([] if self.warning is None else [f"warning: {self.warning}"])
 
     def __str__(self) -> str:
-        unit = self.controller.gains.y_unit or "y"
+        unit = self.controller.y_unit or "y"
         lines = [
             f"cost {self.cost:.4g} {unit} (start {self.start_cost:.4g}) after {self.evaluations} "
-            f"evaluations, {self.termination}",
+            f"evaluations, ended by {_ENDED_BY.get(self.termination, self.termination)}",
             "  searched  " + "\n            ".join(str(v) for v in self.variables),
         ]
         if self.constraints != Constraints():
@@ -164,6 +182,7 @@ class TuningResult:
         return "\n".join([*lines, str(self.controller)])
 
 
+@shown_in_notebooks("tune")
 def tune(
     models: Plants,
     references: References = None,
@@ -173,7 +192,8 @@ def tune(
     counts_per_rev: Encoder = "model",
     filter_samples: int | None = None,
     output_unit: str | None = None,
-    start: Controller | None = None,
+    start: SampledController | None = None,
+    controller: str = Controller.KIND,
     variables: Sequence[Wanted] | None = None,
     cost: Cost | None = None,
     aggregate: Aggregate = "mean",
@@ -216,9 +236,12 @@ def tune(
         Moving average in the feedback. By default 8 ms, at most a tenth of the time constant.
     output_unit : str, optional
         Unit of the output if the model states none: an encoder needs it.
-    start : Controller, optional
+    start : Controller or StateFeedback, optional
         Start of the search; settings that are not searched are kept, and the five settings above
         are ignored. By default Table 1 on the first model's own step response.
+    controller : str
+        The kind of controller where there is no start, as ``pid`` or ``state_feedback``
+        (`StateFeedback`); those of `sewfast.control.files.KINDS`.
     variables : sequence of str or (str, float, float), optional
         What to search, by name or with its bounds: ``Kp``, ``Ti``, ``Td``, ``alpha``, ``beta``,
         ``N``, ``Tt``, ``filter_samples``, ``filter_time``, ``observer_time``, ``r_rate``;
@@ -259,6 +282,7 @@ def tune(
         All processors by default.
     progress : callable, optional
         Called with (done, total, lowest cost).
+        In a notebook a bar is shown where this is left out; None shows none.
 
     Raises
     ------
@@ -275,6 +299,7 @@ def tune(
         "counts_per_rev": counts_per_rev,
         "filter_samples": filter_samples,
         "output_unit": output_unit,
+        "controller": controller,
     }
     if not isinstance(method, str):
         raise SettingError(f"expected method 'genetic' or 'cma-es', got {method!r}")
@@ -364,7 +389,7 @@ def _asked(
     """The result with a second opinion on it, and the gains that are least wrong."""
     found: list[TuningResult] = [result]
 
-    def brief(on: TuningTask) -> Controller:
+    def brief(on: TuningTask) -> SampledController:
         try:
             found.append(search.brief().on(on, variables))
         except Interrupted:
@@ -393,7 +418,7 @@ def _in_time(result: TuningResult, violation: float) -> TuningResult:
 
 
 def costs(
-    controllers: Controller | Sequence[Controller],
+    controllers: SampledController | Sequence[SampledController],
     models: Plants,
     references: References = None,
     *,
@@ -414,8 +439,8 @@ def costs(
     SettingError, DataError
         For controllers, plants or references that cannot be used.
     """
-    given = [controllers] if isinstance(controllers, Controller) else controllers
-    several = isinstance(given, Sequence) and all(isinstance(c, Controller) for c in given)
+    given = [controllers] if isinstance(controllers, SampledController) else controllers
+    several = isinstance(given, Sequence) and all(isinstance(c, SampledController) for c in given)
     if not (several and given):
         raise SettingError(f"expected controllers to compare, got {controllers!r}")
     if len({c.counts_per_unit for c in given}) > 1:
@@ -446,7 +471,7 @@ def costs(
 
 
 def recoveries(
-    controller: Controller,
+    controller: SampledController,
     models: Plants,
     loads: Sequence[LoadStep],
     *,
@@ -485,8 +510,8 @@ def _result(found: Mapping[str, Any], task: TuningTask, method: str) -> TuningRe
     began = {v.name: value for v, value in zip(variables, found["start"], strict=True)}
     notes = "tuned by simulated closed loops" + task.assumed
     return TuningResult(
-        controller=applied(values, task.start, notes),
-        start=applied(began, task.start, task.start.notes) if found["moved"] else task.start,
+        controller=task.start.with_values(values, notes),
+        start=task.start.with_values(began, task.start.notes) if found["moved"] else task.start,
         cost=found["cost"],
         start_cost=found["start_cost"],
         variables=variables,
@@ -519,7 +544,7 @@ _TITLES = (
     "others, tuned on the models and the rival",
 )
 
-Search = Callable[[TuningTask], Controller]
+Search = Callable[[TuningTask], SampledController]
 """Searches a task; FitError where nothing keeps to its constraints."""
 
 
@@ -537,7 +562,7 @@ class SecondOpinion:
         Which keep to the constraints on the models, and may be taken.
     """
 
-    candidates: tuple[Controller, ...]
+    candidates: tuple[SampledController, ...]
     costs: NDArray[np.float64]
     allowed: NDArray[np.bool_]
 
@@ -582,7 +607,7 @@ class SecondOpinion:
 
 
 def second_opinion(
-    own: Controller, task: TuningTask, rival: TuningTask, search: Search
+    own: SampledController, task: TuningTask, rival: TuningTask, search: Search
 ) -> SecondOpinion | None:
     """Ask a rival about gains that were tuned on a task.
 
@@ -620,7 +645,7 @@ def second_opinion(
 
 
 def _opinion(
-    candidates: tuple[Controller, ...], task: TuningTask, rival: TuningTask
+    candidates: tuple[SampledController, ...], task: TuningTask, rival: TuningTask
 ) -> SecondOpinion:
     on_models = [_judged(task, c) for c in candidates]
     on_rival = [_judged(rival, c)[0] for c in candidates]
@@ -631,7 +656,7 @@ def _opinion(
     )
 
 
-def _judged(task: TuningTask, controller: Controller) -> tuple[float, float]:
+def _judged(task: TuningTask, controller: SampledController) -> tuple[float, float]:
     """Cost, and by how much constraints are broken."""
     return _core.tuning_costs(task.core(), [controller.core()], threads=1)[0]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from .. import _core
 from ..arrays import REVOLUTIONS_PER_SECOND
-from ..control.biquad import Biquad
-from ..control.controller import Controller
+from ..control.controller import GAIN_NAMES, NOTCH_NAMES, Controller, SampledController
 from ..control.defaults import (
     beyond_record,
     command_limits,
@@ -23,6 +22,7 @@ from ..control.defaults import (
     filter_length,
     require_one_input,
 )
+from ..control.files import KINDS
 from ..control.loop import (
     Plant,
     Plants,
@@ -56,7 +56,7 @@ class TuningTask:
     references: list[Any]
     loads: list[LoadStep]
     disturbances: list[Any]
-    start: Controller
+    start: SampledController
     variations: list[tuple[float, int]]
     cost: Cost
     aggregate: str
@@ -69,7 +69,7 @@ class TuningTask:
         models: Plants,
         references: References,
         *,
-        start: Controller | None,
+        start: SampledController | None,
         first: Mapping[str, Any],
         cost: Cost | None,
         aggregate: str,
@@ -83,14 +83,14 @@ class TuningTask:
         if not given:
             raise SettingError("expected at least one plant to tune on, got none")
         plants = each_plant(given)
-        if not (start is None or isinstance(start, Controller)):
+        if not (start is None or isinstance(start, SampledController)):
             raise SettingError(
                 f"expected a Controller to start from, got {type(start).__name__}; read a file "
                 "with load_controller"
             )
         derived = start is None
         if start is None:
-            start = first_controller(given[0], **first)
+            start = first_of(given[0], **first)
         for plant in given:
             check_fits(start, plant)
         if references is None:
@@ -113,6 +113,12 @@ class TuningTask:
     def core(self, names: Sequence[Wanted] | None = None, *, ms: bool = False) -> _core._Task:
         """As the core takes it, with variables by name; `ms`: Ms is asked for anyway."""
         asked = ms or self.constraints.Ms is not None
+        if asked and not isinstance(self.start, Controller):
+            raise SettingError(
+                name="Ms", expected="a PID to take it of", received=type(self.start).__name__,
+                remedy="leave it out: plants with other gains and delays (variations) are among "
+                "those that the controller has to serve",
+            )  # fmt: skip
         loops, measured = self._loops() if asked else ([], [])
         return {
             "plants": [plant.core for plant in self.plants],
@@ -158,7 +164,7 @@ class TuningTask:
         )
 
 
-def _assumed(start: Controller, given: list[Any], *, derived: bool) -> str:
+def _assumed(start: SampledController, given: list[Any], *, derived: bool) -> str:
     """What of the limits has to be said in a controller's notes."""
     if derived:
         _, _, said = start.notes.partition("; ")
@@ -172,9 +178,9 @@ def threads_or_all(threads: int | None) -> int:
     return whole("threads", available() if threads is None else threads)
 
 
-def default_variations(controller: Controller) -> tuple[tuple[float, int], ...]:
+def default_variations(controller: SampledController) -> tuple[tuple[float, int], ...]:
     """(gain, extra delay in samples) of the plants that a controller is tuned on; see `tune`."""
-    delay = max(1, controller.filter_samples // 4)
+    delay = max(1, getattr(controller, "filter_samples", 1) // 4)
     return ((1.0, 0), *((gain, delay) for gain in GAINS))
 
 
@@ -244,11 +250,6 @@ def _checked(variations: Sequence[tuple[float, int]]) -> list[tuple[float, int]]
 
 Wanted: TypeAlias = str | tuple[str, float, float]
 
-GAIN_NAMES = ("Kp", "Ti", "Td")
-NOTCH_NAMES = ("notch_frequency", "notch_depth", "notch_width")
-SETTINGS = (
-    "alpha", "beta", "N", "Tt", "filter_samples", "filter_time", "observer_time", "r_rate",
-)  # fmt: skip
 _EDGE = 1e-3
 
 
@@ -285,7 +286,7 @@ class Variable:
 
 
 def wanted(
-    variables: Sequence[Wanted] | None, start: Controller
+    variables: Sequence[Wanted] | None, start: SampledController
 ) -> list[tuple[str, tuple[float, float] | None]]:
     """Names and bounds as the core takes them; ``schedule`` stands for the gains of all points,
     ``notches`` for all that the start's notches are made from.
@@ -305,12 +306,14 @@ def wanted(
     return [one for given in variables for one in _one(given, start)]
 
 
-def usual_variables(start: Controller) -> list[Wanted] | None:
+def usual_variables(start: SampledController) -> list[Wanted] | None:
     """What is searched unless it is named, where the core's usual bounds do not hold it; else None.
 
     These leave Ti at 4 sample times or more. A drive whose time constant is a few sample times
     begins below that.
     """
+    if not isinstance(start, Controller):
+        return None
     Ti = start.gains.to("standard").Ti
     if start.schedule or not 0.0 < Ti < 8.0 * start.Ts:
         return None
@@ -319,9 +322,9 @@ def usual_variables(start: Controller) -> list[Wanted] | None:
     return [*names, "notches"] if any(b.kind == "notch" for b in start.biquads) else names
 
 
-def _one(given: Any, start: Controller) -> list[tuple[str, tuple[float, float] | None]]:
+def _one(given: Any, start: SampledController) -> list[tuple[str, tuple[float, float] | None]]:
     if given == "schedule":
-        points = len(start.schedule)
+        points = len(getattr(start, "schedule", ()))
         if not points:
             raise SettingError(
                 "expected a start with a gain schedule for the variable 'schedule', got one with "
@@ -329,7 +332,9 @@ def _one(given: Any, start: Controller) -> list[tuple[str, tuple[float, float] |
             )
         return [(f"{gain}[{k}]", None) for k in range(points) for gain in GAIN_NAMES]
     if given == "notches":
-        found = [k for k, biquad in enumerate(start.biquads) if biquad.kind == "notch"]
+        found = [
+            k for k, biquad in enumerate(getattr(start, "biquads", ())) if biquad.kind == "notch"
+        ]
         if not found:
             raise SettingError(
                 "expected a start with a notch for the variable 'notches', got none; give "
@@ -351,42 +356,6 @@ def _one(given: Any, start: Controller) -> list[tuple[str, tuple[float, float] |
             f"{high:g}"
         )
     return [(name, (low, high))]
-
-
-def applied(values: Mapping[str, float], start: Controller, notes: str) -> Controller:
-    """The start with these values by name; its gains in standard form."""
-    gains = _standard(start.gains, values, GAIN_NAMES)
-    known = {field.name for field in fields(start)}
-    changes: dict[str, Any] = {n: values[n] for n in SETTINGS if n in values and n in known}
-    if "filter_samples" in changes:
-        changes["filter_samples"] = int(changes["filter_samples"])
-    schedule = getattr(start, "schedule", ())
-    if schedule:
-        changes["schedule"] = tuple(
-            (speed, _standard(point, values, [f"{gain}[{k}]" for gain in GAIN_NAMES]))
-            for k, (speed, point) in enumerate(schedule)
-        )
-    if start.biquads:
-        changes["biquads"] = tuple(_notch(b, k, values) for k, b in enumerate(start.biquads))
-    return replace(start, gains=gains, notes=notes, **changes)
-
-
-def _notch(own: Biquad, k: int, values: Mapping[str, float]) -> Biquad:
-    """Biquad number `k` with the values that are its own."""
-    names = [f"{name}[{k}]" for name in NOTCH_NAMES]
-    if not any(name in values for name in names):
-        return own
-    return Biquad.notch(
-        *(values.get(name, x) for name, x in zip(names, own.numbers, strict=True))
-    )  # fmt: skip
-
-
-def _standard(own: Gains, values: Mapping[str, float], names: Sequence[str]) -> Gains:
-    """The gains in standard form, with the values that have one of the names."""
-    standard = own.to("standard")
-    kept = (standard.Kp, standard.Ti, standard.Td)
-    Kp, Ti, Td = (values.get(name, own) for name, own in zip(names, kept, strict=True))
-    return Gains.standard(Kp, Ti, Td, u_unit=own.u_unit, y_unit=own.y_unit)
 
 
 # --- The controller to start from -----------------------------------------------------------------
@@ -419,11 +388,7 @@ def first_controller(
     FitError
         Where no step of the model settles.
     """
-    if not isinstance(plant, Model):
-        raise SettingError(
-            "expected a model to find a start from, got a machine; give start=, or tune on a model"
-        )
-    require_one_input(plant)
+    plant = _require_model(plant)
     low, high, note = command_limits([plant], u_min, u_max)
     u_unit, y_unit = _units(plant, output_unit)
     step = drive_step(plant, low, high)
@@ -446,6 +411,59 @@ def first_controller(
         counts_per_rev=_encoder(plant, counts_per_rev, y_unit),
         notes="; ".join(n for n in ("Table 1 on the model's step response", note) if n),
     )
+
+
+def first_of(
+    plant: Plant,
+    controller: str = Controller.KIND,
+    *,
+    u_min: float | None = None,
+    u_max: float | None = None,
+    counts_per_rev: Encoder = "model",
+    filter_samples: int | None = None,
+    output_unit: str | None = None,
+) -> SampledController:
+    """The first controller of a kind; parameters are those of `tune`.
+
+    Raises
+    ------
+    SettingError
+        For an unknown kind, or as `first_controller`.
+    """
+    if controller == Controller.KIND:
+        return first_controller(
+            plant, u_min=u_min, u_max=u_max, counts_per_rev=counts_per_rev,
+            filter_samples=filter_samples, output_unit=output_unit,
+        )  # fmt: skip
+    if controller not in KINDS:
+        raise SettingError(
+            name="controller", expected=" or ".join(KINDS), received=f"{controller!r}",
+            remedy="pid suits most drives",
+        )  # fmt: skip
+    plant = _require_model(plant)
+    low, high, note = command_limits([plant], u_min, u_max)
+    u_unit, y_unit = _units(plant, output_unit)
+    recorded = plant.training.get("output_range")
+    return KINDS[controller].first(
+        plant,
+        u_min=low,
+        u_max=high,
+        counts_per_rev=_encoder(plant, counts_per_rev, y_unit),
+        u_unit=u_unit,
+        y_unit=y_unit,
+        filter_samples=filter_samples,
+        middle=None if recorded is None else float(np.mean(recorded)),
+        notes="; ".join(n for n in ("begun with the model's own gain", note) if n),
+    )
+
+
+def _require_model(plant: Plant) -> Model:
+    if not isinstance(plant, Model):
+        raise SettingError(
+            "expected a model to find a start from, got a machine; give start=, or tune on a model"
+        )
+    require_one_input(plant)
+    return plant
 
 
 def _units(plant: Model, stated: str | None) -> tuple[str, str]:

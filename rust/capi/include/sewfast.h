@@ -39,6 +39,7 @@ extern "C" {
 #define SEWFAST_COMPUTED 32u    /* computed devices only: ARM takes them back to their initial state */
 #define SEWFAST_CAN_DESIGN 64u  /* its PID has observer, reference ramp and gain schedule */
 #define SEWFAST_CAN_BIQUADS 128u /* its PID has biquads */
+#define SEWFAST_CAN_KINDS 256u /* runs controllers of other kinds (CONTROLLER) */
 
 /* How a channel's samples are written. */
 enum sewfast_encoding {

@@ -1,10 +1,10 @@
-//! [`Controller`] in storage of the caller.
+//! [`PidController`] in storage of the caller.
 
 use crate::{place, tell};
 use core::ffi::c_void;
 use core::ptr::null_mut;
 use sewfast_control::{
-    BIQUADS, Biquad, Cascade, Controller, Design, POINTS, Point, Refused, Schedule, Settings,
+    BIQUADS, Biquad, Cascade, Design, POINTS, PidController, Point, Refused, Schedule, Settings,
     Standard,
 };
 
@@ -108,7 +108,7 @@ fn number(name: &str) -> i32 {
 /// Bytes that a controller takes.
 #[unsafe(no_mangle)]
 pub extern "C" fn sewfast_pid_size() -> usize {
-    size_of::<Controller<f32>>()
+    size_of::<PidController<f32>>()
 }
 
 /// A controller at rest in `storage`; null where it is refused.
@@ -122,10 +122,10 @@ pub unsafe extern "C" fn sewfast_pid_init(
     size: usize,
     settings: *const CSettings,
     refusal: *mut i32,
-) -> *mut Controller<f32> {
+) -> *mut PidController<f32> {
     // SAFETY: by contract.
     let settings = unsafe { settings.as_ref() };
-    let made = match (place::<Controller<f32>>(storage, size), settings) {
+    let made = match (place::<PidController<f32>>(storage, size), settings) {
         (Some(place), Some(settings)) => {
             settings.controller().map(|controller| {
                 // SAFETY: place is fit for a controller.
@@ -141,8 +141,8 @@ pub unsafe extern "C" fn sewfast_pid_init(
 }
 
 impl CSettings {
-    fn controller(&self) -> Result<Controller<f32>, i32> {
-        let made = self.design().and_then(Controller::new);
+    fn controller(&self) -> Result<PidController<f32>, i32> {
+        let made = self.design().and_then(PidController::new);
         made.map_err(|refused| number(refused.name))
     }
 
@@ -307,24 +307,24 @@ pub unsafe extern "C" fn sewfast_pid_resonance(
     unsafe { put(biquad, made) }
 }
 
-/// [`Controller::step`]; 0 where there is no controller.
+/// [`PidController::step`]; 0 where there is no controller.
 ///
 /// # Safety
 /// `pid` is null or came from [`sewfast_pid_init`], used by one context at a time.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn sewfast_pid_step(pid: *mut Controller<f32>, r: f32, y: f32) -> f32 {
+pub unsafe extern "C" fn sewfast_pid_step(pid: *mut PidController<f32>, r: f32, y: f32) -> f32 {
     // SAFETY: by contract.
     let pid = unsafe { pid.as_mut() };
     pid.map_or(0.0, |pid| pid.step(r, y))
 }
 
-/// [`Controller::step_with`]; 0 where there is no controller.
+/// [`PidController::step_with`]; 0 where there is no controller.
 ///
 /// # Safety
 /// As for [`sewfast_pid_step`].
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn sewfast_pid_step_with(
-    pid: *mut Controller<f32>,
+    pid: *mut PidController<f32>,
     r: f32,
     y: f32,
     feedforward: f32,
@@ -334,13 +334,13 @@ pub unsafe extern "C" fn sewfast_pid_step_with(
     pid.map_or(0.0, |pid| pid.step_with(r, y, feedforward))
 }
 
-/// [`Controller::set_design`]; 0, the number of the setting that is refused, or -1 where something is null.
+/// [`PidController::set_design`]; 0, the number of the setting that is refused, or -1 where something is null.
 ///
 /// # Safety
 /// As for [`sewfast_pid_step`]; `settings` is null or can be read.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn sewfast_pid_change(
-    pid: *mut Controller<f32>,
+    pid: *mut PidController<f32>,
     settings: *const CSettings,
 ) -> i32 {
     // SAFETY: by contract.
@@ -352,35 +352,35 @@ pub unsafe extern "C" fn sewfast_pid_change(
     done.map_or_else(|refused| number(refused.name), |()| 0)
 }
 
-/// [`Controller::set_manual`]; whether `u` is finite.
+/// [`PidController::set_manual`]; whether `u` is finite.
 ///
 /// # Safety
 /// As for [`sewfast_pid_step`].
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn sewfast_pid_set_manual(pid: *mut Controller<f32>, u: f32) -> bool {
+pub unsafe extern "C" fn sewfast_pid_set_manual(pid: *mut PidController<f32>, u: f32) -> bool {
     // SAFETY: by contract.
     let pid = unsafe { pid.as_mut() };
     pid.is_some_and(|pid| pid.set_manual(u).is_ok())
 }
 
-/// [`Controller::set_automatic`].
+/// [`PidController::set_automatic`].
 ///
 /// # Safety
 /// As for [`sewfast_pid_step`].
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn sewfast_pid_set_automatic(pid: *mut Controller<f32>) {
+pub unsafe extern "C" fn sewfast_pid_set_automatic(pid: *mut PidController<f32>) {
     // SAFETY: by contract.
     if let Some(pid) = unsafe { pid.as_mut() } {
         pid.set_automatic();
     }
 }
 
-/// [`Controller::reset`].
+/// [`PidController::reset`].
 ///
 /// # Safety
 /// As for [`sewfast_pid_step`].
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn sewfast_pid_reset(pid: *mut Controller<f32>) {
+pub unsafe extern "C" fn sewfast_pid_reset(pid: *mut PidController<f32>) {
     // SAFETY: by contract.
     if let Some(pid) = unsafe { pid.as_mut() } {
         pid.reset();

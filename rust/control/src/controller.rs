@@ -1,244 +1,241 @@
-//! The whole controller of the paper's Fig. 16: feedback filter, reference ramp, biquads, then two-degree-of-freedom PID.
+//! What every controller is: the interface, and the kinds behind it.
 //!
-//! Biquads act on the reference and on the feedback alike. As the PID is linear in both, that is what they would do behind it,
-//! on the command, where drives have them: the machine's resonance is neither fed back nor excited by the reference. But limits,
-//! slew, anti-windup and the operator's command stay where they are, on the command that the machine gets.
+//! A loop, a device and a search know a controller by [`Controller`]. Where one is chosen while the program runs, it is an
+//! [`AnyController`], made from an [`AnyDesign`]: enumerations rather than trait objects, as a microcontroller has no heap and
+//! a search copies designs by the million. A new kind is a file of this crate and a row in each of the two.
 
-use crate::biquad::Memory;
-use crate::pid::Terms;
-use crate::schedule::{Row, Table};
-use crate::{Design, Feedback, Pid, Ramp, Real, Refused, Settings};
+mod state_feedback;
 
-/// What the step of a controller with constant gains computes with: for code that steps many controllers at once with
-/// the same operations in the same order.
-#[derive(Clone, Copy, Debug)]
-pub struct Numbers<T> {
-    /// Gains of the PID.
-    pub terms: Terms<T>,
-    /// Share of the excess taken from the integral in one sample; see [`Settings::tracking`].
-    pub tracking: T,
-    /// Samples of the moving average.
-    pub samples: usize,
-    /// Weight of a new sample in the first-order lag.
-    pub lag: T,
-    /// `1 - a` and `b` of the observer; `None` where it passes its input through.
-    pub observer: Option<(T, T)>,
-    /// Largest change of the reference in one sample \[y\].
-    pub ramp: T,
-}
+use crate::{Design, PidController, Real, Refused};
 
-/// Feedback filter, reference ramp, biquads, gain schedule and PID behind one step.
-#[derive(Clone, Debug)]
-pub struct Controller<T> {
-    design: Design<T>,
-    filter: Feedback<T>,
-    ramp: Ramp<T>,
-    /// The biquads' memory of the feedback.
-    of_y: Memory<T>,
-    /// The biquads' memory of the reference.
-    of_r: Memory<T>,
-    table: Option<Table<T>>,
-    pid: Pid<T>,
-    filtered: T,
-}
+pub use state_feedback::{NUMBERS, STATES, StateDesign, StateFeedback, Weights, lqg};
 
-impl<T: Real> Controller<T> {
-    /// A controller at rest, in automatic.
-    ///
-    /// # Errors
-    /// The first setting that is outside its range.
-    pub fn new(design: Design<T>) -> Result<Self, Refused> {
-        let Design {
-            pid,
-            filter_samples,
-            filter_time,
-            observer_time,
-            r_rate,
-            schedule,
-            biquads: _,
-        } = design;
-        let ts = pid.ts;
-        Ok(Self {
-            pid: Pid::new(pid)?,
-            filter: Feedback::new(filter_samples, filter_time, observer_time, ts)?,
-            ramp: Ramp::new(r_rate, ts)?,
-            of_y: Memory::new(),
-            of_r: Memory::new(),
-            table: Table::new(&schedule, &pid),
-            design,
-            filtered: T::ZERO,
-        })
-    }
+/// One sampled controller from reference and measured output to the command.
+///
+/// Whatever comes, the command is finite, within the limits and no further from the last one than slew allows; every
+/// implementation runs through the laws of `pid_controller/tests/any.rs`.
+pub trait Controller<T: Real> {
+    /// Back to the state before the first sample.
+    fn reset(&mut self);
 
-    /// What [`new`](Self::new) would refuse, without the controller, which fills most of a small processor's stack.
-    ///
-    /// # Errors
-    /// The first setting that is outside its range.
-    pub fn check(design: &Design<T>) -> Result<(), Refused> {
-        let ts = design.pid.ts;
-        Pid::new(design.pid)?;
-        Feedback::new(
-            design.filter_samples,
-            design.filter_time,
-            design.observer_time,
-            ts,
-        )?;
-        Ramp::new(design.r_rate, ts)?;
-        Ok(())
-    }
+    /// From reference `r` and measured output `y` to the command of this sample, with a command that is added before the limits.
+    fn step_with(&mut self, r: T, y: T, feedforward: T) -> T;
 
-    /// Back to the state before the first sample, in automatic.
-    pub fn reset(&mut self) {
-        self.filter.reset();
-        self.ramp.reset();
-        self.of_y.started = false;
-        self.of_r.started = false;
-        self.pid.reset();
-        self.filtered = T::ZERO;
-    }
-
-    /// From reference and measured output to the command: filter, control, limit.
-    ///
-    /// Whatever comes, the command is finite, within the limits and no further from the last one than slew allows.
-    /// A measurement that is not finite is skipped: the filter keeps its memory, the command its value. One at which the
-    /// filter's sum leaves the numbers is skipped too, and the filter begins again with the next.
-    pub fn step(&mut self, r: T, y: T) -> T {
+    /// [`step_with`](Self::step_with) without a command that is added.
+    fn step(&mut self, r: T, y: T) -> T {
         // x + (-0) is x for every x, even for -0
         self.step_with(r, y, -T::ZERO)
     }
 
-    /// [`step`](Self::step) with a command that is added before the limits.
-    pub fn step_with(&mut self, r: T, y: T, feedforward: T) -> T {
-        if !y.is_finite() {
-            return self.pid.hold();
-        }
-        let filtered = self.filter.step(y);
-        if !filtered.is_finite() {
-            self.filter.reset();
-            return self.pid.hold();
-        }
-        let sections = self.design.biquads.sections();
-        if !self.of_y.started {
-            self.of_y.rest_at(filtered);
-        }
-        let filtered = self.of_y.step(sections, filtered);
-        if !filtered.is_finite() {
-            self.of_y.started = false;
-            return self.pid.hold();
-        }
-        self.filtered = filtered;
-        let ramped = self.ramp.step(r, filtered);
-        let r = self.referred(ramped);
-        let terms = match &self.table {
-            Some(table) => table.at(self.filtered),
-            None => self.pid.terms(),
-        };
-        self.pid.step_by(terms, r, self.filtered, feedforward)
-    }
+    /// The output as the controller sees it, after its filter or observer, at the last step.
+    fn filtered(&self) -> T;
 
-    /// The reference after the biquads, which stood at the first output before it, as the ramp did: a step of the reference is
-    /// filtered too. One that is not finite passes them by, and the PID skips it.
-    fn referred(&mut self, r: T) -> T {
-        if !r.is_finite() {
-            return r;
-        }
-        if !self.of_r.started {
-            self.of_r.rest_at(self.filtered);
-        }
-        let filtered = self.of_r.step(self.design.biquads.sections(), r);
-        self.of_r.started = filtered.is_finite();
-        filtered
-    }
+    /// Sample time \[s\].
+    fn ts(&self) -> T;
 
-    /// Another design from the next sample on, without a bump in the command: filter, ramp and derivative keep what they
-    /// remember, other biquads begin at rest where the former's signals were, and the integral term takes up what the other
-    /// terms change by.
-    ///
-    /// Without integral action what it took up stays; [`reset`](Self::reset) forgets it.
+    /// Least and largest command \[u\].
+    fn limits(&self) -> (T, T);
+}
+
+/// The settings of a controller of any kind.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum AnyDesign<T> {
+    /// Of a PID with its filters.
+    Pid(Design<T>),
+    /// Of state feedback with an observer.
+    StateFeedback(StateDesign<T>),
+}
+
+impl<T: Real> AnyDesign<T> {
+    /// The controller, at rest.
     ///
     /// # Errors
-    /// The first setting that is outside its range, or another sample time; nothing is changed then.
-    pub fn set_design(&mut self, design: Design<T>) -> Result<(), Refused> {
-        let (ts, now) = (design.pid.ts, self.design.pid.ts);
-        let expected = "the sample time at which the controller runs";
-        Refused::unless(ts == now, "Ts", expected, ts.to_f64())?;
-        let new = Self::new(design)?;
-        self.filter = new.filter.after(&self.filter);
-        self.ramp = new.ramp.after(&self.ramp);
-        let terms = match &new.table {
-            Some(table) => table.at(self.filtered),
-            None => new.pid.terms(),
-        };
-        if design.biquads != self.design.biquads {
-            for (memory, last) in [
-                (&mut self.of_y, self.filtered),
-                (&mut self.of_r, self.pid.reference()),
-            ] {
-                if memory.started {
-                    memory.rest_at(last);
-                }
+    /// The first setting that is outside its range.
+    pub fn controller(&self) -> Result<AnyController<T>, Refused> {
+        match self {
+            Self::Pid(design) => PidController::new(*design).map(AnyController::Pid),
+            Self::StateFeedback(design) => {
+                StateFeedback::new(*design).map(AnyController::StateFeedback)
             }
         }
-        self.pid.change(design.pid, terms);
-        (self.table, self.design) = (new.table, design);
-        Ok(())
     }
 
-    /// Hands the command to the operator: from the next sample on it is `u`, within the limits.
-    ///
-    /// Filter, ramp and derivative keep following, and the integral term is what automatic would need for the same command.
-    /// A sample without measurement applies `u` all the same.
+    /// What [`controller`](Self::controller) would refuse, without the controller, which fills most of a small processor's stack.
     ///
     /// # Errors
-    /// A command that is not finite.
-    pub fn set_manual(&mut self, u: T) -> Result<(), Refused> {
-        self.pid.set_manual(u)
+    /// The first setting that is outside its range.
+    pub fn check(&self) -> Result<(), Refused> {
+        match self {
+            Self::Pid(design) => PidController::check(design),
+            Self::StateFeedback(design) => design.check(),
+        }
     }
 
-    /// Hands the command back to the controller, which begins where the operator's was.
-    pub fn set_automatic(&mut self) {
-        self.pid.set_automatic();
+    /// Sample time \[s\].
+    pub fn ts(&self) -> T {
+        match self {
+            Self::Pid(design) => design.pid.ts,
+            Self::StateFeedback(design) => design.ts,
+        }
     }
 
-    /// Whether the command is the operator's.
-    pub fn is_manual(&self) -> bool {
-        self.pid.is_manual()
+    /// Least and largest command \[u\].
+    pub fn limits(&self) -> (T, T) {
+        match self {
+            Self::Pid(design) => (design.pid.u_min, design.pid.u_max),
+            Self::StateFeedback(design) => (design.u_min, design.u_max),
+        }
     }
 
-    /// The feedback after its filter, at the last step.
-    pub fn filtered(&self) -> T {
-        self.filtered
+    /// A controller of the kind that a device is sent by this number, from the numbers that `next` gives one after the other,
+    /// without its sample time; `None` where they end too early, or for a number that is no kind's. The PID, which has commands of
+    /// its own, has none.
+    pub(crate) fn from_numbers(kind: u8, next: impl FnMut() -> Option<T>) -> Option<Self> {
+        match kind {
+            1 => StateDesign::from_numbers(next, T::ZERO).map(Self::StateFeedback),
+            _ => None,
+        }
     }
 
-    /// What it is made from.
-    pub fn design(&self) -> &Design<T> {
-        &self.design
+    /// The place of a setting among those numbers.
+    pub(crate) fn place_of(&self, name: &str) -> Option<u32> {
+        match self {
+            Self::Pid(_) => None,
+            Self::StateFeedback(_) => Some(StateDesign::<T>::place_of(name)),
+        }
     }
 
-    /// The schedule as the step uses it, one row more than points at least, the last one repeated; empty for constant gains.
-    pub fn rows(&self) -> &[Row<T>] {
-        self.table.as_ref().map_or(&[], Table::rows)
+    /// The settings of the PID that it is; `None` where it is another kind.
+    pub fn pid(&self) -> Option<&Design<T>> {
+        match self {
+            Self::Pid(design) => Some(design),
+            Self::StateFeedback(_) => None,
+        }
     }
 
-    /// What a step computes with; `None` where the gains follow a schedule or there are biquads.
-    pub fn numbers(&self) -> Option<Numbers<T>> {
-        let (samples, lag, observer) = self.filter.parts();
-        let constant = self.table.is_none() && self.design.biquads.is_empty();
-        constant.then(|| Numbers {
-            terms: self.pid.terms(),
-            tracking: self.settings().tracking(),
-            samples,
-            lag,
-            observer: observer.weights(),
-            ramp: self.ramp.change(),
-        })
+    /// The settings of the PID that it is, to be changed.
+    pub(crate) fn pid_mut(&mut self) -> Option<&mut Design<T>> {
+        match self {
+            Self::Pid(design) => Some(design),
+            Self::StateFeedback(_) => None,
+        }
     }
 
-    /// The settings of the PID.
-    pub fn settings(&self) -> &Settings<T> {
-        self.pid.settings()
+    /// The same at another sample time \[s\], with limits that are no wider than `bound` to either side.
+    pub(crate) fn bounded(mut self, bound: T, ts: T) -> Self {
+        let (u_min, u_max, own_ts) = match &mut self {
+            Self::Pid(Design { pid, .. }) => (&mut pid.u_min, &mut pid.u_max, &mut pid.ts),
+            Self::StateFeedback(d) => (&mut d.u_min, &mut d.u_max, &mut d.ts),
+        };
+        // comparisons, not min and max, which would hide a NaN
+        if *u_min < -bound {
+            *u_min = -bound;
+        }
+        if *u_max > bound {
+            *u_max = bound;
+        }
+        *own_ts = ts;
+        self
     }
 }
 
-#[cfg(test)]
-mod tests;
+impl<T> From<Design<T>> for AnyDesign<T> {
+    fn from(design: Design<T>) -> Self {
+        Self::Pid(design)
+    }
+}
+
+/// A controller of any kind.
+#[derive(Clone, Debug)]
+pub enum AnyController<T> {
+    /// A PID with its filters.
+    Pid(PidController<T>),
+    /// State feedback with an observer.
+    StateFeedback(StateFeedback<T>),
+}
+
+/// The controller within, whatever its kind.
+macro_rules! within {
+    ($any:expr, $controller:ident => $do:expr) => {
+        match $any {
+            AnyController::Pid($controller) => $do,
+            AnyController::StateFeedback($controller) => $do,
+        }
+    };
+}
+
+impl<T: Real> Controller<T> for AnyController<T> {
+    #[inline]
+    fn reset(&mut self) {
+        within!(self, controller => controller.reset());
+    }
+
+    #[inline]
+    fn step_with(&mut self, r: T, y: T, feedforward: T) -> T {
+        within!(self, controller => controller.step_with(r, y, feedforward))
+    }
+
+    #[inline]
+    fn filtered(&self) -> T {
+        within!(self, controller => controller.filtered())
+    }
+
+    #[inline]
+    fn ts(&self) -> T {
+        within!(self, controller => controller.ts())
+    }
+
+    #[inline]
+    fn limits(&self) -> (T, T) {
+        within!(self, controller => controller.limits())
+    }
+}
+
+impl<T: Real> AnyController<T> {
+    /// The PID that it is; `None` where it is another kind.
+    pub fn pid(&self) -> Option<&PidController<T>> {
+        match self {
+            Self::Pid(controller) => Some(controller),
+            Self::StateFeedback(_) => None,
+        }
+    }
+
+    /// The state feedback that it is; `None` where it is another kind.
+    pub fn state_feedback(&self) -> Option<&StateFeedback<T>> {
+        match self {
+            Self::StateFeedback(controller) => Some(controller),
+            Self::Pid(_) => None,
+        }
+    }
+}
+
+impl<T> From<StateDesign<T>> for AnyDesign<T> {
+    fn from(design: StateDesign<T>) -> Self {
+        Self::StateFeedback(design)
+    }
+}
+
+impl<T> From<PidController<T>> for AnyController<T> {
+    fn from(controller: PidController<T>) -> Self {
+        Self::Pid(controller)
+    }
+}
+
+/// Refuses limits between which there is no command.
+pub(crate) fn check_limits<T: Real>((u_min, u_max): (T, T)) -> Result<(), Refused> {
+    let (bounded, above) = (u_min < T::INFINITY, u_max > u_min);
+    Refused::unless(bounded, "u_min", "a finite limit or -inf", u_min.to_f64())?;
+    Refused::unless(above, "u_max", "a limit above u_min", u_max.to_f64())
+}
+
+/// The command for a wanted one: within the limits, and no further than `change` from the `last` one. Limits that were narrowed
+/// since the last command are reached at the slew rate.
+///
+/// The last command is finite: at first it is 0 or a limit next to it, and later it came from here. No comparison holds for
+/// NaN, which passes any clamp; what is not finite is the last command again.
+pub(crate) fn limited<T: Real>(wanted: T, last: T, (u_min, u_max): (T, T), change: T) -> T {
+    let limited = wanted
+        .limit(u_min, u_max)
+        .limit(last - change, last + change);
+    if limited.is_finite() { limited } else { last }
+}

@@ -1,16 +1,16 @@
-//! Everything that a [`Controller`](crate::Controller) is made from.
+//! Everything that a [`PidController`](crate::PidController) is made from.
 
 use crate::{Cascade, Real, Schedule, Settings};
 
 /// The settings of a whole controller; symbols as in docs/CONVENTIONS.md.
 ///
 /// ```
-/// use sewfast_control::{Controller, Design, Settings, Standard};
+/// use sewfast_control::{PidController, Design, Settings, Standard};
 ///
 /// let gains = Standard { kp: 0.02, ti: 0.25, td: 0.004 };
 /// let pid = Settings { u_min: -20.0, u_max: 20.0, ..Settings::new(gains, 1e-3) };
 /// let design = Design { observer_time: 0.004, r_rate: 5000.0, ..Design::new(pid) };
-/// assert!(Controller::new(design).is_ok());
+/// assert!(PidController::new(design).is_ok());
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Design<T> {

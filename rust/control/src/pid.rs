@@ -1,5 +1,6 @@
 //! The two-degree-of-freedom PID controller (paper Eq. 9, Fig. 16), one sample at a time.
 
+use crate::controller::{check_limits, limited};
 use crate::gains::sample_time;
 use crate::{Real, Refused, Standard};
 
@@ -68,14 +69,7 @@ impl<T: Real> Settings<T> {
             "0, a time of Ts or more, or inf",
             self.tt.to_f64(),
         )?;
-        let (low, high) = (self.u_min, self.u_max);
-        unless(
-            low < T::INFINITY,
-            "u_min",
-            "a finite limit or -inf",
-            low.to_f64(),
-        )?;
-        unless(high > low, "u_max", "a limit above u_min", high.to_f64())?;
+        check_limits((self.u_min, self.u_max))?;
         Ok(self)
     }
 }
@@ -307,10 +301,7 @@ impl<T: Real> Pid<T> {
         &self.settings
     }
 
-    /// The one way to the command. Limits that were narrowed since the last command are reached at the slew rate.
-    ///
-    /// The last command is finite: at first it is 0 or a limit next to it, and later it came from here. No comparison holds
-    /// for NaN, which passes any clamp; what is not finite is the last command again.
+    /// The one way to the command.
     fn limited(&self, wanted: T) -> T {
         let Settings {
             u_min,
@@ -319,11 +310,7 @@ impl<T: Real> Pid<T> {
             ts,
             ..
         } = self.settings;
-        let change = slew * ts;
-        let limited = wanted
-            .limit(u_min, u_max)
-            .limit(self.u - change, self.u + change);
-        if limited.is_finite() { limited } else { self.u }
+        limited(wanted, self.u, (u_min, u_max), slew * ts)
     }
 
     /// The integral to keep when the limits moved the output by `excess`.

@@ -10,7 +10,7 @@ pub use kernel_plant::KernelPlant;
 pub use plants::{LaggedPlant, StatePlant, Varied};
 pub use signals::Signals;
 
-use sewfast_control::{Controller, Refused};
+use sewfast_control::{AnyController, Refused};
 
 use crate::encoder::Encoder;
 use crate::simd;
@@ -112,7 +112,7 @@ impl Run {
     pub fn record(
         &mut self,
         plant: &mut (impl Plant + ?Sized),
-        controller: &mut Controller<f64>,
+        controller: &mut AnyController<f64>,
         reference: &[f64],
         encoder: Option<&Encoder>,
         monitor: &Monitor,
@@ -125,7 +125,7 @@ impl Run {
     pub fn record_with(
         &mut self,
         plant: &mut (impl Plant + ?Sized),
-        controller: &mut Controller<f64>,
+        controller: &mut AnyController<f64>,
         signals: Signals<'_>,
         encoder: Option<&Encoder>,
         monitor: &Monitor,
@@ -217,7 +217,7 @@ impl Run {
 /// As for [`closed_loop_with`].
 pub fn closed_loop(
     plant: &mut (impl Plant + ?Sized),
-    controller: &mut Controller<f64>,
+    controller: &mut AnyController<f64>,
     reference: &[f64],
     encoder: Option<&Encoder>,
     monitor: &Monitor,
@@ -232,7 +232,7 @@ pub fn closed_loop(
 /// an [`Outcome`], not an error.
 pub fn closed_loop_with(
     plant: &mut (impl Plant + ?Sized),
-    controller: &mut Controller<f64>,
+    controller: &mut AnyController<f64>,
     signals: Signals<'_>,
     encoder: Option<&Encoder>,
     monitor: &Monitor,

@@ -17,7 +17,7 @@ pub use front::{Front, Objective, pareto};
 pub use load::{LoadLimit, LoadStep};
 pub use variable::{Parameter, Variable};
 
-use sewfast_control::{Controller, Design, Settings};
+use sewfast_control::{AnyDesign, Design};
 
 use crate::closed_loop::{Plant, Signals};
 use crate::encoder::Encoder;
@@ -42,7 +42,7 @@ pub struct Task<'a, P> {
     /// The encoder of plants that bring none; `None` for ideal feedback.
     pub encoder: Option<Encoder>,
     /// The controller to begin with; what is not searched is kept.
-    pub start: Design<f64>,
+    pub start: AnyDesign<f64>,
     /// What is searched.
     pub variables: &'a [Variable],
     /// What counts how much.
@@ -77,9 +77,9 @@ pub enum Method {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tuned {
     /// The best controller.
-    pub design: Design<f64>,
+    pub design: AnyDesign<f64>,
     /// What the search began with: the task's start, moved to the bounds that were asked for.
-    pub start: Design<f64>,
+    pub start: AnyDesign<f64>,
     /// Its cost.
     pub cost: f64,
     /// Sum of its relative violations of the constraints; above 0 only where the search was interrupted.
@@ -160,7 +160,7 @@ pub fn tune<P: Plant + Clone + Send + Sync>(
 /// As [`tune`], but for designs that are of no use.
 pub fn costs<P: Plant + Clone + Send + Sync>(
     task: &Task<'_, P>,
-    designs: &[Design<f64>],
+    designs: &[AnyDesign<f64>],
     threads: usize,
     monitor: &Monitor,
 ) -> Result<Vec<Judgement>> {
@@ -182,7 +182,7 @@ pub fn costs<P: Plant + Clone + Send + Sync>(
 /// As [`tune`]; `ErrorKind::Fit` where a run diverges or on a stop.
 pub fn loaded<P: Plant + Clone>(
     task: &Task<'_, P>,
-    design: &Design<f64>,
+    design: &AnyDesign<f64>,
     monitor: &Monitor,
 ) -> Result<Vec<LoadLimit>> {
     task.check()?;
@@ -248,19 +248,15 @@ impl<'a, P> Task<'a, P> {
     }
 
     fn check(&self) -> Result<()> {
-        let controller = Controller::new(self.start)?;
-        let Settings {
-            u_min,
-            u_max,
-            gains,
-            ..
-        } = *controller.settings();
+        self.start.check()?;
+        let (u_min, u_max) = self.start.limits();
         if !(u_min.is_finite() && u_max.is_finite()) {
             return Err(Error::setting(format!(
                 "expected finite output limits to tune within, got {u_min} and {u_max}; give those of the amplifier"
             )));
         }
-        if gains.kp == 0.0 && self.start.schedule.is_empty() {
+        let no_sign = |pid: &Design<f64>| pid.pid.gains.kp == 0.0 && pid.schedule.is_empty();
+        if self.start.pid().is_some_and(no_sign) {
             return Err(Error::setting(
                 "expected a start with Kp other than 0, got 0; its sign says which way the plant acts",
             ));

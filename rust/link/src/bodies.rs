@@ -84,6 +84,16 @@ pub fn biquads(sections: &[[f64; 4]]) -> Body {
     })
 }
 
+/// CONTROLLER: the number of a kind, counts per unit, then the numbers of the kind.
+#[must_use]
+pub fn controller(kind: u8, counts_per_unit: f64, values: &[f64]) -> Body {
+    written(|b| {
+        b.u8(kind);
+        numbers(b, &[counts_per_unit]);
+        numbers(b, values);
+    })
+}
+
 /// What single precision holds of each; beyond its range that is infinite.
 fn numbers(body: &mut Body, values: &[f64]) {
     for &value in values {
@@ -378,6 +388,10 @@ mod tests {
         let expected = [2, 1, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0, 4, 0, 5];
         assert_eq!(bytes(&start.body()), expected);
         assert_eq!(bytes(&biquads(&[[0.0; 4]; 3])).len(), 49);
+        assert_eq!(
+            bytes(&controller(1, 1.0, &[0.0])),
+            [1, 0, 0, 0x80, 0x3F, 0, 0, 0, 0]
+        );
         let mut body = gains([0.0; 12], 7);
         design(&mut body, 0.0, f64::INFINITY, &[[1.0; 4]; 2]);
         assert_eq!(bytes(&body).len(), 49 + 9 + 32);

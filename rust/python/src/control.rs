@@ -14,17 +14,15 @@ use sewfast_core::{Error, Result};
 
 use crate::arrays::{array1, raise, slice};
 use crate::watch::watched_over;
-pub use controller::{Controller, SingleController};
+pub use controller::{AnyGiven, Controller};
 use plant::Model;
 
 type Values<'py> = PyReadonlyArray1<'py, f64>;
 type Triple = (f64, f64, f64);
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
-    module.add_class::<Controller>()?;
-    module.add_class::<SingleController>()?;
+    controller::register(module)?;
     module.add_function(wrap_pyfunction!(convert_gains, module)?)?;
-    module.add_function(wrap_pyfunction!(controller::biquad, module)?)?;
     module.add_function(wrap_pyfunction!(closed_loop, module)?)?;
     module.add_function(wrap_pyfunction!(step_metrics, module)?)?;
     module.add_function(wrap_pyfunction!(effort, module)?)?;
@@ -95,14 +93,14 @@ fn unknown_form(form: &str) -> Error {
 fn closed_loop<'py>(
     py: Python<'py>,
     plant: &Bound<'py, PyAny>,
-    controller: &Bound<'py, Controller>,
+    controller: AnyGiven<'py>,
     reference: Values<'py>,
     counts_per_unit: f64,
     encoder_phase: f64,
     feedforward: Option<Values<'py>>,
     disturbance: Option<Values<'py>>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let (model, mut controller) = (Model::of(plant)?, controller.borrow().core.clone());
+    let (model, design) = (Model::of(plant)?, controller.design());
     let beside = |values: &'_ Option<Values<'py>>, name| -> PyResult<Option<Vec<f64>>> {
         let values = values.as_ref().map(|values| slice(values, name));
         Ok(values.transpose()?.map(<[f64]>::to_vec))
@@ -116,7 +114,8 @@ fn closed_loop<'py>(
     };
     let run = watched_over(py, signals.reference.len(), |monitor| {
         let encoder = looped::encoder(counts_per_unit, encoder_phase)?;
-        let ts = controller.settings().ts;
+        let mut controller = design.controller()?;
+        let ts = design.ts();
         let mut plant = model.plant(ts)?;
         let encoder = encoder.as_ref();
         looped::closed_loop_with(&mut plant, &mut controller, signals, encoder, monitor)

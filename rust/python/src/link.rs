@@ -134,6 +134,11 @@ impl LinkBodies {
     }
 
     #[staticmethod]
+    fn controller(py: Python<'_>, kind: u8, counts_per_unit: f64, values: Vec<f64>) -> Wire<'_> {
+        wire(py, &bodies::controller(kind, counts_per_unit, &values))
+    }
+
+    #[staticmethod]
     fn start(
         py: Python<'_>,
         mode: u8,

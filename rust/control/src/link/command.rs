@@ -4,8 +4,8 @@ use super::Fields;
 use super::device::State;
 use super::identity::Limits;
 use crate::{
-    BIQUADS, Biquad, Cascade, Controller, Design, POINTS, Point, Refused, Schedule, Settings,
-    Standard,
+    AnyController, AnyDesign, BIQUADS, Biquad, Cascade, Design, POINTS, Point, Refused, Schedule,
+    Settings, Standard,
 };
 
 /// Shortest and longest time of a watchdog \[us\].
@@ -83,7 +83,7 @@ pub(super) struct Upload<'a> {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Gains {
     /// Without its sample time, which is the device's.
-    design: Design<f32>,
+    design: AnyDesign<f32>,
     /// The schedule came and is none.
     garbled: bool,
     /// The body has the fields of a device that knows observer, ramp and schedule.
@@ -97,34 +97,31 @@ impl Gains {
     ///
     /// # Errors
     /// The first setting that is outside its range.
-    pub(super) fn controller(&self, volt: f32, ts: f32) -> Result<Controller<f32>, Refused> {
-        Controller::new(self.clipped(volt, ts))
-    }
-
-    fn clipped(&self, volt: f32, ts: f32) -> Design<f32> {
-        let Settings { u_min, u_max, .. } = self.design.pid;
-        // not f32::max and f32::min, which would hide a NaN
-        let clipped = Settings {
-            u_min: if u_min < -volt { -volt } else { u_min },
-            u_max: if u_max > volt { volt } else { u_max },
-            ts,
-            ..self.design.pid
-        };
-        Design {
-            pid: clipped,
-            ..self.design
-        }
+    pub(super) fn controller(&self, volt: f32, ts: f32) -> Result<AnyController<f32>, Refused> {
+        self.design.bounded(volt, ts).controller()
     }
 
     /// Biquads from the next start on; GAINS come without any.
     pub(super) fn set_biquads(&mut self, biquads: Cascade<f32>) {
-        self.design.biquads = biquads;
+        if let Some(design) = self.design.pid_mut() {
+            design.biquads = biquads;
+        }
+    }
+
+    /// The settings are a PID's, which every device knows that has mode 1.
+    pub(super) fn are_pid(&self) -> bool {
+        self.design.pid().is_some()
     }
 
     /// # Errors
     /// The field that is outside its range, or beyond the volt limit.
     pub(super) fn check(&self, volt: f32, ts: f32) -> Result<(), Refusal> {
-        let refused = |volt| self.refused(volt, ts).map(|refused| index_of(refused.name));
+        let refused = |volt| {
+            let name = self.refused(volt, ts)?.name;
+            // the numbers of another kind follow its number and the counts per unit
+            let place = self.design.place_of(name).map(|place| place + 2);
+            Some(place.unwrap_or_else(|| index_of(name)))
+        };
         Refusal::value(SCHEDULE).unless(!self.garbled)?;
         if let Some(field) = refused(f32::INFINITY) {
             return Err(Refusal::value(field));
@@ -132,14 +129,14 @@ impl Gains {
         let unit = self.counts_per_unit * ts;
         // a feedback that is not finite would leave the controller blind
         let holds = unit > 0.0 && unit.is_finite() && (MOST_COUNTS / unit).is_finite();
-        Refusal::value(11).unless(holds)?;
+        Refusal::value(if self.are_pid() { 11 } else { 1 }).unless(holds)?;
         refused(volt).map_or(Ok(()), |field| Err(Refusal::limit(field)))
     }
 
     /// What keeps a controller from being made; in a frame of its own, as its parts fill much of a stack.
     #[inline(never)]
     pub(super) fn refused(&self, volt: f32, ts: f32) -> Option<Refused> {
-        Controller::check(&self.clipped(volt, ts)).err()
+        self.design.bounded(volt, ts).check().err()
     }
 }
 
@@ -180,6 +177,10 @@ pub(super) struct Start {
 
 /// A command with its fields, of the right length but otherwise as they came.
 #[derive(Clone, Copy, Debug)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "there is no heap to box it on, and one command lives at a time"
+)]
 pub(super) enum Command<'a> {
     Hello {
         from: u8,
@@ -223,6 +224,7 @@ impl<'a> Command<'a> {
             0x0A => start(&mut fields),
             0x0B => Some(Self::Echo(fields.rest())).filter(|_| body.len() <= MAX_ECHO),
             0x0C => biquads(&mut fields).map(Self::Biquads),
+            0x0D => controller(&mut fields)?,
             _ => return Err(Refusal::unknown(kind)),
         };
         let whole = command.filter(|_| fields.is_empty());
@@ -281,25 +283,26 @@ fn gains<'a>(fields: &mut Fields<'a>) -> Option<Command<'a>> {
         ts: 0.0,
     };
     let (filter_time, counts_per_unit) = (fields.f32()?, fields.f32()?);
-    let mut gains = Gains {
-        design: Design {
-            filter_time,
-            filter_samples: fields.u8()?.into(),
-            ..Design::new(settings)
-        },
-        garbled: false,
-        long: !fields.is_empty(),
-        counts_per_unit,
+    let mut design = Design {
+        filter_time,
+        filter_samples: fields.u8()?.into(),
+        ..Design::new(settings)
     };
-    if gains.long {
-        gains.design.observer_time = fields.f32()?;
-        gains.design.r_rate = fields.f32()?;
+    let (mut garbled, long) = (false, !fields.is_empty());
+    if long {
+        design.observer_time = fields.f32()?;
+        design.r_rate = fields.f32()?;
         match schedule(fields)? {
-            Ok(schedule) => gains.design.schedule = schedule,
-            Err(_) => gains.garbled = true,
+            Ok(schedule) => design.schedule = schedule,
+            Err(_) => garbled = true,
         }
     }
-    Some(Command::Gains(gains))
+    Some(Command::Gains(Gains {
+        design: design.into(),
+        garbled,
+        long,
+        counts_per_unit,
+    }))
 }
 
 fn standard(fields: &mut Fields<'_>) -> Option<Standard<f32>> {
@@ -308,6 +311,25 @@ fn standard(fields: &mut Fields<'_>) -> Option<Standard<f32>> {
         ti: fields.f32()?,
         td: fields.f32()?,
     })
+}
+
+/// A controller of another kind takes the place of the PID's gains.
+fn controller<'a>(fields: &mut Fields<'a>) -> Result<Option<Command<'a>>, Refusal> {
+    let (Some(kind), Some(counts_per_unit)) = (fields.u8(), fields.f32()) else {
+        return Ok(None);
+    };
+    let whole = fields.len();
+    let design = AnyDesign::from_numbers(kind, || fields.f32());
+    // no kind of this number: nothing of it was read
+    Refusal::value(0).unless(design.is_some() || whole == 0 || fields.len() < whole)?;
+    Ok(design.map(|design| {
+        Command::Gains(Gains {
+            design,
+            garbled: false,
+            long: false,
+            counts_per_unit,
+        })
+    }))
 }
 
 /// `None` where the body is too short for its points.

@@ -36,7 +36,7 @@ use super::stream::Stream;
 use super::transmit::{Transmit, Weight};
 use super::watchdog::Watchdog;
 use super::{Body, Deframer};
-use crate::{Controller, Refused};
+use crate::{AnyController, Refused};
 use core::num::NonZeroU64;
 
 mod execute;
@@ -90,7 +90,7 @@ struct Run {
     samples: u32,
     /// The command of mode 2.
     drive: f32,
-    controller: Option<Controller<f32>>,
+    controller: Option<AnyController<f32>>,
     /// Most that a sample came late \[us\].
     latest: u32,
     late_before: bool,

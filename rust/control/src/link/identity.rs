@@ -30,6 +30,8 @@ pub mod capability {
     pub const DESIGN: u32 = 1 << 6;
     /// Its PID has biquads.
     pub const BIQUADS: u32 = 1 << 7;
+    /// Runs controllers of the kinds that CONTROLLER names along uploaded references, beside its PID.
+    pub const KINDS: u32 = 1 << 8;
 }
 
 /// How a channel's samples are written.

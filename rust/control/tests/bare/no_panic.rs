@@ -7,7 +7,7 @@
 use core::panic::PanicInfo;
 use sewfast_control::link::{Body, Deframer, Fields, Header, MAX_WIRE, encode};
 use sewfast_control::model::{Equation, Model, Orders, Scaling};
-use sewfast_control::{Controller, Design, Point, Schedule};
+use sewfast_control::{PidController, Design, Point, Schedule};
 
 #[panic_handler]
 fn halt(_: &PanicInfo<'_>) -> ! {
@@ -52,25 +52,25 @@ pub fn schedule(points: &[Point<f32>]) -> Option<Schedule<f32>> {
 
 /// Any design.
 #[unsafe(no_mangle)]
-pub fn make(design: &Design<f32>) -> Option<Controller<f32>> {
-    Controller::new(*design).ok()
+pub fn make(design: &Design<f32>) -> Option<PidController<f32>> {
+    PidController::new(*design).ok()
 }
 
 /// Any signals.
 #[unsafe(no_mangle)]
-pub fn control(controller: &mut Controller<f32>, r: f32, y: f32, feedforward: f32) -> f32 {
+pub fn control(controller: &mut PidController<f32>, r: f32, y: f32, feedforward: f32) -> f32 {
     controller.step_with(r, y, feedforward)
 }
 
 /// The same in double precision.
 #[unsafe(no_mangle)]
-pub fn control_double(controller: &mut Controller<f64>, r: f64, y: f64, feedforward: f64) -> f64 {
+pub fn control_double(controller: &mut PidController<f64>, r: f64, y: f64, feedforward: f64) -> f64 {
     controller.step_with(r, y, feedforward)
 }
 
 /// Any change while it runs.
 #[unsafe(no_mangle)]
-pub fn change(controller: &mut Controller<f32>, design: &Design<f32>, u: f32) -> bool {
+pub fn change(controller: &mut PidController<f32>, design: &Design<f32>, u: f32) -> bool {
     let changed = controller.set_design(*design).is_ok();
     let manual = controller.set_manual(u).is_ok();
     controller.set_automatic();

@@ -6,7 +6,7 @@
 
 use core::panic::PanicInfo;
 use sewfast_control::link::{Device, Measurement};
-use sewfast_control::{Controller, Design, Settings, Standard};
+use sewfast_control::{PidController, Design, Settings, Standard};
 
 #[panic_handler]
 fn halt(_: &PanicInfo<'_>) -> ! {
@@ -17,7 +17,7 @@ fn halt(_: &PanicInfo<'_>) -> ! {
 #[unsafe(no_mangle)]
 pub extern "C" fn one_step(r: f32, y: f32) -> f32 {
     let gains = Standard { kp: 0.02, ti: 0.25, td: 0.004 };
-    match Controller::<f32>::new(Design::new(Settings::new(gains, 1e-3))) {
+    match PidController::<f32>::new(Design::new(Settings::new(gains, 1e-3))) {
         Ok(mut controller) => controller.step(r, y),
         Err(_) => f32::NAN,
     }

@@ -2,7 +2,7 @@
 
 use std::hint::black_box;
 
-use sewfast_control::{Controller, Design, Settings, Standard};
+use sewfast_control::{AnyController, AnyDesign, Design, PidController, Settings, Standard};
 use sewfast_core::closed_loop::{LaggedPlant, Run, encoder};
 use sewfast_core::lagged::{Lagged, Lags};
 use sewfast_core::linear::LinearModel;
@@ -241,7 +241,8 @@ fn counts(encoded: bool) -> f64 {
 fn closed_loop(encoded: bool) -> Call {
     let model: &'static NeuralOE = Box::leak(Box::new(network()));
     let mut plant = LaggedPlant::new(model, TS).expect("a plant");
-    let mut controller = Controller::new(design(8, encoded)).expect("a controller");
+    let mut controller =
+        AnyController::from(PidController::new(design(8, encoded)).expect("a controller"));
     let encoder = encoder(counts(encoded), 0.5).expect("an encoder");
     let (r, mut run) = (levels(LOOP), Run::with_capacity(LOOP));
     Box::new(move || {
@@ -259,7 +260,7 @@ fn closed_loop(encoded: bool) -> Call {
 fn candidates(encoded: bool) -> Call {
     let model: &'static NeuralOE = Box::leak(Box::new(network()));
     let plants = [LaggedPlant::new(model, TS).expect("a plant")];
-    let designs: Vec<_> = (0..CANDIDATES).map(|c| design(c, encoded)).collect();
+    let designs: Vec<AnyDesign<f64>> = (0..CANDIDATES).map(|c| design(c, encoded).into()).collect();
     let variables = [Variable::new(Parameter::Alpha, None, &designs[0]).expect("a variable")];
     let r = levels(SHORT_LOOP);
     let cost = Cost {

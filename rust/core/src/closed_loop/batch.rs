@@ -33,8 +33,6 @@ mod controllers;
 #[cfg(test)]
 mod tests;
 
-use sewfast_control::Controller;
-
 use super::kernel_plant::{BatchPlant, KernelPlant};
 use super::{Outcome, RUNAWAY, Signals, WATCHED};
 use crate::Monitor;
@@ -42,6 +40,7 @@ use crate::encoder::Encoder;
 use crate::neural::{Meanwhile, Nothing};
 use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
 pub(super) use controllers::Controllers;
+pub(crate) use controllers::{InLanes, LaneController, WithKind, are_of_a_kind, of_a_kind};
 
 /// Loops that run side by side at most: four groups, of which one computes while others wait for their results.
 pub(crate) const MOST: usize = 4 * LANES;
@@ -53,38 +52,33 @@ pub(crate) trait Notes {
 }
 
 /// The loops of some controllers around one plant, from rest.
-pub(crate) struct BatchLoop<'a> {
+pub(crate) struct BatchLoop<'a, C> {
     pub known: KernelPlant<'a>,
-    /// At least one, with constant gains and one sample time; at most [`MOST`].
-    pub controllers: &'a [&'a Controller<f64>],
+    /// At least one, all of which fit in lanes and have one sample time; at most [`MOST`].
+    pub controllers: &'a [&'a C],
     pub signals: Signals<'a>,
     /// The encoder; `None` for ideal feedback.
     pub encoder: Option<&'a Encoder>,
     pub monitor: &'a Monitor,
 }
 
-impl BatchLoop<'_> {
-    /// Whether a controller can be run in a lane.
-    pub fn takes(controller: &Controller<f64>) -> bool {
-        controller.numbers().is_some()
-    }
-
+impl<C: InLanes> BatchLoop<'_, C> {
     /// Runs them; `notes` has an entry for every eight controllers. How each run ended stands in its place.
     ///
     /// Notes of a lane after its end mean nothing.
     pub fn run(self, notes: &mut [impl Notes]) -> [Outcome; MOST] {
         if (self.known.lags.na, self.known.lags.regressors()) == (2, 4) {
-            simd::run(Grouped::<_, 4>(self, notes))
+            simd::run(Grouped::<_, _, 4>(self, notes))
         } else {
-            simd::run(Grouped::<_, 0>(self, notes))
+            simd::run(Grouped::<_, _, 0>(self, notes))
         }
     }
 }
 
 /// Groups of loops around a plant; `N` is 4 for two outputs and two inputs in its regressor, 0 for any.
-struct Grouped<'a, 'b, S, const N: usize>(BatchLoop<'a>, &'b mut [S]);
+struct Grouped<'a, 'b, C, S, const N: usize>(BatchLoop<'a, C>, &'b mut [S]);
 
-impl<S: Notes, const N: usize> Kernel for Grouped<'_, '_, S, N> {
+impl<C: InLanes, S: Notes, const N: usize> Kernel for Grouped<'_, '_, C, S, N> {
     type Output = [Outcome; MOST];
 
     #[inline(always)]
@@ -93,7 +87,7 @@ impl<S: Notes, const N: usize> Kernel for Grouped<'_, '_, S, N> {
         // on the heap, so that one pointer finds all of a group
         let mut groups = Vec::with_capacity(notes.len());
         for g in 0..notes.len() {
-            groups.push(Loops::<V>::new(&lanes, g));
+            groups.push(Loops::<V, C::Lanes<V>>::new(&lanes, g));
         }
         let mut ends = Ends::new(lanes.controllers.len());
         let signals = &lanes.signals;
@@ -104,7 +98,7 @@ impl<S: Notes, const N: usize> Kernel for Grouped<'_, '_, S, N> {
             }
             for (g, notes) in notes.iter_mut().enumerate() {
                 let now = Now { k, r, g, signals };
-                turn::<_, _, N>(&mut groups, notes, &mut ends, now);
+                turn::<_, _, _, N>(&mut groups, notes, &mut ends, now);
             }
             if ends.running == 0 {
                 return ends.outcomes;
@@ -126,8 +120,8 @@ struct Now<'a> {
 /// A group decides, while the plants of the group that decided half a round ago take their step: both have time until what
 /// comes out is asked for. A group alone does one after the other.
 #[inline(always)]
-fn turn<V: F64x8, S: Notes, const N: usize>(
-    groups: &mut [Loops<'_, V>],
+fn turn<V: F64x8, C: LaneController<V>, S: Notes, const N: usize>(
+    groups: &mut [Loops<'_, V, C>],
     notes: &mut S,
     ends: &mut Ends,
     now: Now<'_>,
@@ -181,9 +175,9 @@ impl Ends {
 }
 
 /// Eight loops.
-struct Loops<'a, V> {
+struct Loops<'a, V, C> {
     plants: BatchPlant<'a>,
-    controllers: Controllers<V>,
+    controllers: C,
     /// With counts per sample and unit of speed.
     encoder: Option<(&'a Encoder, f64)>,
     /// Counters at the last sample.
@@ -193,17 +187,17 @@ struct Loops<'a, V> {
     applied: V,
 }
 
-impl<'a, V: F64x8> Loops<'a, V> {
+impl<'a, V: F64x8, C: LaneController<V>> Loops<'a, V, C> {
     #[inline(always)]
-    fn new(lanes: &BatchLoop<'a>, group: usize) -> Self {
+    fn new<K: InLanes<Lanes<V> = C>>(lanes: &BatchLoop<'a, K>, group: usize) -> Self {
         let own = &lanes.controllers[LANES * group..];
-        let ts = own[0].settings().ts;
+        let ts = own[0].ts();
         let per_speed = |encoder: &Encoder| ts * encoder.counts_per_unit();
         let encoder = lanes.encoder.map(|encoder| (encoder, per_speed(encoder)));
         let zero = V::splat(0.0);
         Self {
             plants: BatchPlant::new(lanes.known),
-            controllers: Controllers::new(own),
+            controllers: K::in_lanes::<V>(own),
             encoder,
             before: encoder.map_or(zero, |(encoder, _)| encoder.counts(zero)),
             measured: zero,
@@ -233,7 +227,7 @@ impl<'a, V: F64x8> Loops<'a, V> {
         let u = self
             .controllers
             .decide(k == 0, r, signals.feedforward_at(k));
-        notes.put(k, r, u, y, self.controllers.filtered);
+        notes.put(k, r, u, y, self.controllers.filtered());
         self.applied = match signals.disturbance_at(k) {
             None => u,
             Some(added) => u.add(V::splat(added)),
@@ -243,18 +237,18 @@ impl<'a, V: F64x8> Loops<'a, V> {
 
 /// What one group of loops does in a sample but for its plants' steps, in stages: a processor goes on with another group's
 /// plants while a stage waits for its numbers.
-struct Decision<'a, 'b, V, S> {
-    loops: &'a mut Loops<'b, V>,
+struct Decision<'a, 'b, V, C, S> {
+    loops: &'a mut Loops<'b, V, C>,
     notes: &'a mut S,
     ends: &'a mut Ends,
     now: Now<'a>,
     stage: usize,
 }
 
-impl<'a, 'b, V: F64x8, S: Notes> Decision<'a, 'b, V, S> {
+impl<'a, 'b, V: F64x8, C: LaneController<V>, S: Notes> Decision<'a, 'b, V, C, S> {
     #[inline(always)]
     fn new(
-        loops: &'a mut Loops<'b, V>,
+        loops: &'a mut Loops<'b, V, C>,
         notes: &'a mut S,
         ends: &'a mut Ends,
         now: Now<'a>,
@@ -280,7 +274,7 @@ impl<'a, 'b, V: F64x8, S: Notes> Decision<'a, 'b, V, S> {
 /// Stages of a [`Decision`].
 const STAGES: usize = 3;
 
-impl<V: F64x8, S: Notes> Meanwhile for Decision<'_, '_, V, S> {
+impl<V: F64x8, C: LaneController<V>, S: Notes> Meanwhile for Decision<'_, '_, V, C, S> {
     #[inline(always)]
     fn go(&mut self) {
         let Now { k, r, g, signals } = self.now;
@@ -347,7 +341,7 @@ impl Default for Tally {
 
 impl Tally {
     /// Begins anew, for runs of these controllers whose outputs of so many samples are kept.
-    pub fn begin(&mut self, controllers: &[&Controller<f64>], kept: usize) {
+    pub fn begin(&mut self, controllers: &[&impl InLanes], kept: usize) {
         let mut y = std::mem::take(&mut self.y);
         y.resize(kept, Lanes::ZERO);
         *self = Self {
@@ -355,8 +349,7 @@ impl Tally {
             ..Self::default()
         };
         for (i, controller) in controllers.iter().take(LANES).enumerate() {
-            let settings = controller.settings();
-            (self.low.0[i], self.high.0[i]) = (settings.u_min, settings.u_max);
+            (self.low.0[i], self.high.0[i]) = controller.limits();
         }
     }
 

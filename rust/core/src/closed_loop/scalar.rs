@@ -5,9 +5,9 @@
 //! Zen 4, 16 %; with an encoder's moving average of 8 it gains nothing). A schedule, or whatever else a lane cannot hold, goes through the
 //! general controller.
 
-use sewfast_control::Controller;
+use sewfast_control::{AnyController, Controller, PidController};
 
-use super::batch::{BatchLoop, Controllers};
+use super::batch::{Controllers, InLanes, LaneController};
 use super::kernel_plant::{AnyOrder, KernelPlant, ScalarPlant, SecondOrder};
 use super::{Plant, Run, Signals};
 use crate::Monitor;
@@ -26,13 +26,13 @@ pub(super) trait LoopController {
     fn filtered(&self) -> f64;
 }
 
-impl LoopController for Controller<f64> {
+impl LoopController for AnyController<f64> {
     fn reset(&mut self) {
-        self.reset();
+        Controller::reset(self);
     }
 
     fn ts(&self) -> f64 {
-        self.settings().ts
+        Controller::ts(self)
     }
 
     fn decide(&mut self, _first: bool, r: f64, measured: f64, feedforward: Option<f64>) -> f64 {
@@ -43,20 +43,20 @@ impl LoopController for Controller<f64> {
     }
 
     fn filtered(&self) -> f64 {
-        self.filtered()
+        Controller::filtered(self)
     }
 }
 
 /// A controller with constant gains as a lane computes it: what it does not have is not computed, and all of it is
 /// compiled into its caller.
 pub(super) struct Constant<'a> {
-    controller: &'a Controller<f64>,
+    controller: &'a PidController<f64>,
     numbers: Controllers<f64>,
 }
 
 impl<'a> Constant<'a> {
     #[inline(always)]
-    pub fn new(controller: &'a Controller<f64>) -> Self {
+    pub fn new(controller: &'a PidController<f64>) -> Self {
         Self {
             controller,
             numbers: Controllers::new(&[controller]),
@@ -77,7 +77,8 @@ impl LoopController for Constant<'_> {
 
     #[inline(always)]
     fn decide(&mut self, first: bool, r: f64, measured: f64, feedforward: Option<f64>) -> f64 {
-        self.numbers.step(first, r, measured, feedforward)
+        self.numbers.take(first, measured);
+        self.numbers.decide(first, r, feedforward)
     }
 
     #[inline(always)]
@@ -90,7 +91,7 @@ impl LoopController for Constant<'_> {
 pub(super) struct ScalarLoop<'a> {
     pub run: &'a mut Run,
     pub known: KernelPlant<'a>,
-    pub controller: &'a Controller<f64>,
+    pub controller: &'a AnyController<f64>,
     pub signals: Signals<'a>,
     pub encoder: Option<&'a Encoder>,
     pub monitor: &'a Monitor,
@@ -101,16 +102,19 @@ impl Kernel for ScalarLoop<'_> {
 
     #[inline(always)]
     fn run<V: F64x8>(self) {
-        let controller = self.controller;
-        if !BatchLoop::takes(controller) {
-            let plant = ScalarPlant::<V, AnyOrder>::new(self.known);
-            self.around(plant, &mut controller.clone());
-        } else if SecondOrder::takes(&self.known) {
-            let plant = ScalarPlant::<V, SecondOrder>::new(self.known);
-            self.around(plant, &mut Constant::new(controller));
+        let constant = self.controller.pid().filter(|pid| pid.fits());
+        if let Some(pid) = constant {
+            if SecondOrder::takes(&self.known) {
+                let plant = ScalarPlant::<V, SecondOrder>::new(self.known);
+                self.around(plant, &mut Constant::new(pid));
+            } else {
+                let plant = ScalarPlant::<V, AnyOrder>::new(self.known);
+                self.around(plant, &mut Constant::new(pid));
+            }
         } else {
             let plant = ScalarPlant::<V, AnyOrder>::new(self.known);
-            self.around(plant, &mut Constant::new(controller));
+            let mut controller = self.controller.clone();
+            self.around(plant, &mut controller);
         }
     }
 }

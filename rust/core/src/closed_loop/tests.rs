@@ -4,7 +4,7 @@ use nalgebra::{Matrix3, Vector3};
 
 mod state_space;
 
-use sewfast_control::{Biquad, Cascade, Design, Settings, Standard};
+use sewfast_control::{Biquad, Cascade, Design, PidController, Settings, Standard};
 
 use super::*;
 use crate::lagged::Lagged;
@@ -15,7 +15,7 @@ const TS: f64 = 1e-3;
 
 fn closed(
     plant: &mut impl Plant,
-    controller: &mut Controller<f64>,
+    controller: &mut AnyController<f64>,
     reference: &[f64],
     encoder: Option<&Encoder>,
 ) -> Result<Run> {
@@ -26,12 +26,12 @@ fn lag() -> LinearModel {
     LinearModel::new(vec![-0.98], vec![9.8], 1, 1, 0.0).unwrap()
 }
 
-fn controller(settings: Settings<f64>, samples: usize) -> Controller<f64> {
+fn controller(settings: Settings<f64>, samples: usize) -> AnyController<f64> {
     let design = Design {
         filter_samples: samples,
         ..Design::new(settings)
     };
-    Controller::new(design).unwrap()
+    PidController::new(design).unwrap().into()
 }
 
 fn pi(kp: f64, ti: f64) -> Settings<f64> {

@@ -1,6 +1,6 @@
 use super::*;
 use proptest::prelude::*;
-use sewfast_control::{Biquad, Cascade, Controller, Design, Settings, Standard};
+use sewfast_control::{AnyController, Biquad, Cascade, Design, PidController, Settings, Standard};
 
 use crate::Monitor;
 use crate::closed_loop::{LaggedPlant, Run};
@@ -29,7 +29,7 @@ fn margins_of(path: &Path, plant: &Plant) -> Margins {
 }
 
 /// The crate's own controller with the path's settings.
-fn controller(path: &Path) -> Controller<f64> {
+fn controller(path: &Path) -> PidController<f64> {
     let settings = Settings {
         n: path.n,
         ..Settings::new(path.gains, path.ts)
@@ -41,7 +41,7 @@ fn controller(path: &Path) -> Controller<f64> {
         biquads: path.biquads,
         ..Design::new(settings)
     };
-    Controller::new(design).unwrap()
+    PidController::new(design).unwrap()
 }
 
 /// Amplitude and phase of `x` at `omega` over whole periods at its end.
@@ -95,10 +95,10 @@ fn a_sine_through_the_closed_loop_comes_out_as_the_formula_says() {
     let reference: Vec<f64> = (0..20_000).map(|k| (theta * k as f64).cos()).collect();
     let mut run = Run::default();
     let mut plant_of_loop = LaggedPlant::new(&model, TS).unwrap();
-    let (mut controller, encoder) = (controller(&path), Encoder::ideal(26.2));
+    let (controller, encoder) = (controller(&path), Encoder::ideal(26.2));
     run.record(
         &mut plant_of_loop,
-        &mut controller,
+        &mut AnyController::from(controller.clone()),
         &reference,
         Some(&encoder),
         &Monitor::default(),

@@ -1,6 +1,6 @@
 //! One thread's plants and memory: terms and costs of controllers over all plants and references.
 
-use sewfast_control::{Controller, Design, Settings};
+use sewfast_control::{AnyController, AnyDesign, Controller};
 
 use super::beside::{Beside, Runs};
 use super::cost::{Measure, Terms, Weights};
@@ -30,7 +30,7 @@ pub(super) const TOGETHER: usize = MOST;
 
 impl<P: Plant + Clone> Bench<P> {
     pub(super) fn new(task: &Task<'_, P>) -> Result<Self> {
-        let Settings { u_min, u_max, .. } = task.start.pid;
+        let (u_min, u_max) = task.start.limits();
         let weights = task.cost.weights(span(task.references), u_max - u_min)?;
         let longest = (0..task.runs()).map(|k| task.signals(k).reference.len());
         let longest = longest.max().unwrap_or(0);
@@ -64,7 +64,7 @@ impl<P: Plant + Clone> Bench<P> {
     pub(super) fn judge_one(
         &mut self,
         task: &Task<'_, P>,
-        design: &Design<f64>,
+        design: &AnyDesign<f64>,
         monitor: &Monitor,
     ) -> Judgement {
         let judged = self.judge(task, &[(*design, Judgement::HOPELESS)], monitor);
@@ -77,7 +77,7 @@ impl<P: Plant + Clone> Bench<P> {
     pub(super) fn judge(
         &mut self,
         task: &Task<'_, P>,
-        trials: &[(Design<f64>, Judgement)],
+        trials: &[(AnyDesign<f64>, Judgement)],
         monitor: &Monitor,
     ) -> Vec<Judgement> {
         let weights = self.weights;
@@ -111,7 +111,7 @@ impl<P: Plant + Clone> Bench<P> {
     pub(super) fn terms(
         &mut self,
         task: &Task<'_, P>,
-        designs: &[Design<f64>],
+        designs: &[AnyDesign<f64>],
         monitor: &Monitor,
     ) -> Vec<Option<(Terms, f64)>> {
         let mut means = vec![Some(Mean::default()); designs.len()];
@@ -126,7 +126,7 @@ impl<P: Plant + Clone> Bench<P> {
             mean.own = mean.own.plus(&terms, 1.0 / task.alike(run));
             true
         });
-        let aggregated = |(mean, design): (Option<Mean>, &Design<f64>)| {
+        let aggregated = |(mean, design): (Option<Mean>, &AnyDesign<f64>)| {
             let mut mean = mean?;
             mean.go_to(task.plants.len(), task);
             let runs = mean.late + task.constraints.of_runs(&mean.largest);
@@ -144,11 +144,11 @@ impl<P: Plant + Clone> Bench<P> {
     fn each_run(
         &mut self,
         task: &Task<'_, P>,
-        designs: Vec<Design<f64>>,
+        designs: Vec<AnyDesign<f64>>,
         monitor: &Monitor,
         mut take: impl FnMut(usize, usize, usize, Option<Terms>) -> bool,
     ) {
-        let made = designs.into_iter().map(Controller::new).enumerate();
+        let made = designs.iter().map(AnyDesign::controller).enumerate();
         let mut open: Vec<_> = made.filter_map(|(i, made)| Some((i, made.ok()?))).collect();
         for plant in 0..self.plants.len() {
             for run in 0..task.runs() {
@@ -166,10 +166,10 @@ impl<P: Plant + Clone> Bench<P> {
         task: &Task<'_, P>,
         plant: usize,
         run: usize,
-        open: &mut [(usize, Controller<f64>)],
+        open: &mut [(usize, AnyController<f64>)],
         monitor: &Monitor,
     ) -> Vec<Option<Terms>> {
-        let controllers: Vec<&Controller<f64>> = open.iter().map(|(_, c)| c).collect();
+        let controllers: Vec<&AnyController<f64>> = open.iter().map(|(_, c)| c).collect();
         match self.plants[plant].known() {
             Some(known) if Beside::take(&controllers) => {
                 let course = Runs {
@@ -192,10 +192,10 @@ impl<P: Plant + Clone> Bench<P> {
     pub(super) fn loaded(
         &mut self,
         task: &Task<'_, P>,
-        design: &Design<f64>,
+        design: &AnyDesign<f64>,
         monitor: &Monitor,
     ) -> Option<Vec<LoadLimit>> {
-        let mut controller = Controller::new(*design).ok()?;
+        let mut controller = design.controller().ok()?;
         let mut all = Vec::with_capacity(self.plants.len());
         for plant in 0..self.plants.len() {
             let mut worst = Terms::default();
@@ -216,7 +216,7 @@ impl<P: Plant + Clone> Bench<P> {
         task: &Task<'_, P>,
         plant: usize,
         run: usize,
-        controller: &mut Controller<f64>,
+        controller: &mut AnyController<f64>,
         monitor: &Monitor,
     ) -> Option<Terms> {
         let signals = task.signals(run);
@@ -226,14 +226,12 @@ impl<P: Plant + Clone> Bench<P> {
         if self.run.outcome != Outcome::Completed || monitor.stopped() {
             return None;
         }
-        let Settings {
-            u_min, u_max, ts, ..
-        } = *controller.settings();
+        let ts = controller.ts();
         if let Some(load) = task.loads.get(run) {
             return Some(load.terms(&self.run, ts));
         }
         let measure = &self.measures[run - task.loads.len()];
-        Some(measure.of(signals.reference, &self.run, (u_min, u_max), ts))
+        Some(measure.of(signals.reference, &self.run, controller.limits(), ts))
     }
 }
 

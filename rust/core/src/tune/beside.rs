@@ -1,11 +1,13 @@
 //! Terms of runs that go side by side, from sums that are taken as they run.
 
-use sewfast_control::Controller;
+use sewfast_control::{AnyController, Controller};
 
 use super::LoadStep;
 use super::cost::{Course, Measure, SMOOTHING, Terms};
 use crate::Monitor;
-use crate::closed_loop::batch::{BatchLoop, MOST, Sums, Tally};
+use crate::closed_loop::batch::{
+    BatchLoop, InLanes, MOST, Sums, Tally, WithKind, are_of_a_kind, of_a_kind,
+};
 use crate::closed_loop::{KernelPlant, Outcome, Signals};
 use crate::encoder::Encoder;
 use crate::metrics::Edge;
@@ -31,29 +33,27 @@ pub(super) struct Beside {
 }
 
 impl Beside {
-    /// Whether controllers can be run side by side, and had better be.
-    pub fn take(controllers: &[&Controller<f64>]) -> bool {
-        let ts = controllers.first().map(|c| c.settings().ts);
-        let alike = |c: &&Controller<f64>| Some(c.settings().ts) == ts && BatchLoop::takes(c);
-        controllers.len() > 1 && controllers.iter().all(alike)
+    /// Whether controllers can be run side by side, and had better be: several of one kind.
+    pub fn take(controllers: &[&AnyController<f64>]) -> bool {
+        let ts = controllers.first().map(|c| c.ts());
+        let alike = controllers.iter().all(|c| Some(c.ts()) == ts);
+        controllers.len() > 1 && alike && are_of_a_kind(controllers)
     }
 
     /// The terms of each controller's run; `None` where it diverges or on a stop.
     pub fn terms(
         &mut self,
         runs: &Runs<'_>,
-        controllers: &[&Controller<f64>],
+        controllers: &[&AnyController<f64>],
         monitor: &Monitor,
     ) -> Vec<Option<Terms>> {
-        let some = controllers.chunks(MOST);
-        some.flat_map(|some| self.some(runs, some, monitor))
-            .collect()
+        of_a_kind(controllers, OfKind(self, runs, monitor)).unwrap_or_default()
     }
 
     fn some(
         &mut self,
         runs: &Runs<'_>,
-        controllers: &[&Controller<f64>],
+        controllers: &[&impl InLanes],
         monitor: &Monitor,
     ) -> Vec<Option<Terms>> {
         let kept = match runs.measure.map(|m| m.course()) {
@@ -77,7 +77,7 @@ impl Beside {
         if monitor.stopped() {
             return vec![None; controllers.len()];
         }
-        let ts = controllers[0].settings().ts;
+        let ts = controllers[0].ts();
         let overshoots = self.overshoots(runs, ts, used);
         (0..controllers.len())
             .map(|i| {
@@ -122,6 +122,20 @@ impl Beside {
             })
         };
         self.tallies[..used].iter().map(of).collect()
+    }
+}
+
+/// Judges controllers of whatever kind it is given.
+struct OfKind<'a, 'b>(&'a mut Beside, &'a Runs<'b>, &'a Monitor);
+
+impl WithKind for OfKind<'_, '_> {
+    type Output = Vec<Option<Terms>>;
+
+    fn with<C: InLanes>(self, controllers: &[&C]) -> Self::Output {
+        let Self(beside, runs, monitor) = self;
+        let some = controllers.chunks(MOST);
+        some.flat_map(|some| beside.some(runs, some, monitor))
+            .collect()
     }
 }
 

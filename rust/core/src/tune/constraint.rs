@@ -2,14 +2,14 @@
 
 use std::fmt;
 
-use sewfast_control::Design;
+use sewfast_control::AnyDesign;
 
 use super::LoadLimit;
 use super::cost::Terms;
 use crate::{Error, Result};
 
 /// The largest sensitivity `Ms` of a design's linear loops; infinite for an unstable one.
-pub type Sensitivity<'a> = dyn Fn(&Design<f64>) -> f64 + Sync + 'a;
+pub type Sensitivity<'a> = dyn Fn(&AnyDesign<f64>) -> f64 + Sync + 'a;
 
 /// Limits that are kept before anything is weighed (Deb 2000): infeasible candidates are compared by the sum of their
 /// relative violations.
@@ -60,7 +60,7 @@ impl Constraints<'_> {
     }
 
     /// Relative violation by the linear loops; infinite for an unstable one.
-    pub(super) fn of_loops(&self, design: &Design<f64>) -> f64 {
+    pub(super) fn of_loops(&self, design: &AnyDesign<f64>) -> f64 {
         self.ms.map_or(0.0, |(limit, sensitivity)| {
             excess(sensitivity(design), limit)
         })

@@ -1,6 +1,6 @@
 //! What can be had: the front of controllers of which none is better than another in everything.
 
-use sewfast_control::Design;
+use sewfast_control::AnyDesign;
 
 use super::bench::{Bench, TOGETHER};
 use super::variable::{designed, place};
@@ -59,7 +59,7 @@ impl Objective {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Front {
     /// The controllers, by their first objective.
-    pub designs: Vec<Design<f64>>,
+    pub designs: Vec<AnyDesign<f64>>,
     /// The objectives of each.
     pub values: Vec<Vec<f64>>,
     /// Controllers tried.
@@ -75,7 +75,7 @@ pub struct Front {
 pub fn pareto<P: Plant + Clone + Send + Sync>(
     task: &Task<'_, P>,
     objectives: &[Objective],
-    starts: &[Design<f64>],
+    starts: &[AnyDesign<f64>],
     size: usize,
     options: Options,
     monitor: &Monitor,
@@ -88,7 +88,7 @@ pub fn pareto<P: Plant + Clone + Send + Sync>(
         objectives,
         bench: Bench::new(task)?.with_all_terms(task),
     };
-    let places = |design: &Design<f64>| place(task.variables, design);
+    let places = |design: &AnyDesign<f64>| place(task.variables, design);
     let starts: Vec<Vec<f64>> = starts.iter().map(places).collect();
     let found = nsga2::search(&problem, &starts, size, options, monitor)?;
     let feasible = found
@@ -152,7 +152,7 @@ struct Several<'a, P> {
 }
 
 impl<P: Plant + Clone + Send + Sync> Several<'_, P> {
-    fn value(&self, objective: Objective, terms: &Terms, design: &Design<f64>) -> f64 {
+    fn value(&self, objective: Objective, terms: &Terms, design: &AnyDesign<f64>) -> f64 {
         match objective {
             Objective::Cost => self.bench.weights().of(terms),
             Objective::Tracking => terms.tracking,
@@ -202,7 +202,7 @@ impl<P: Plant + Clone + Send + Sync> Objectives for Several<'_, P> {
 }
 
 impl<P: Plant + Clone + Send + Sync> Several<'_, P> {
-    fn values(&self, (design, (terms, violation)): (Design<f64>, (Terms, f64))) -> Values {
+    fn values(&self, (design, (terms, violation)): (AnyDesign<f64>, (Terms, f64))) -> Values {
         let objectives = self.objectives.iter();
         Values {
             violation,

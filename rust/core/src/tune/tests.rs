@@ -5,7 +5,7 @@ mod beside;
 use super::*;
 use crate::closed_loop::{LaggedPlant, Varied};
 use crate::linear::LinearModel;
-use sewfast_control::{Biquad, Cascade, Point, Schedule, Standard};
+use sewfast_control::{Biquad, Cascade, Design, Point, Schedule, Settings, Standard};
 
 const TS: f64 = 1e-3;
 
@@ -14,6 +14,10 @@ fn drive() -> LinearModel {
     let (p, q) = ((-TS / 0.252_f64).exp(), (-TS / 0.0074_f64).exp());
     let b = 490.0 * (1.0 - p) * (1.0 - q) / 2.0;
     LinearModel::new(vec![-p - q, p * q], vec![b, b], 1, 1, 0.0).unwrap()
+}
+
+fn pid_of(design: &AnyDesign<f64>) -> Design<f64> {
+    *design.pid().unwrap()
 }
 
 fn trapezoid() -> Vec<f64> {
@@ -44,10 +48,10 @@ fn with_task<T>(
     let (model, r) = (drive(), trapezoid());
     let plants = [0.8, 1.0, 1.25]
         .map(|gain| Varied::new(LaggedPlant::new(&model, TS).unwrap(), gain, 0).unwrap());
-    let start = Design {
+    let start = AnyDesign::from(Design {
         filter_samples: 8,
         ..Design::new(start)
-    };
+    });
     let usual = Variable::new(Parameter::Alpha, None, &start).unwrap();
     work(&Task {
         plants: &plants,
@@ -90,7 +94,7 @@ fn finds_much_better_gains_than_its_start() {
     });
 }
 
-fn cost<P: Plant + Clone + Send + Sync>(task: &Task<'_, P>, design: &Design<f64>) -> f64 {
+fn cost<P: Plant + Clone + Send + Sync>(task: &Task<'_, P>, design: &AnyDesign<f64>) -> f64 {
     let judged = costs(task, &[*design], 1, &Monitor::default()).unwrap()[0];
     judged.cost
 }
@@ -249,7 +253,7 @@ fn what_is_not_searched_is_kept_and_what_is_stays_within_bounds() {
             ..task.clone()
         };
         let tuned = tune(&task, Method::Genetic, options(100, 2), &Monitor::default()).unwrap();
-        let Design { pid, .. } = tuned.design;
+        let Design { pid, .. } = pid_of(&tuned.design);
         let kept = Settings {
             gains: Standard {
                 kp: pid.gains.kp,
@@ -259,8 +263,11 @@ fn what_is_not_searched_is_kept_and_what_is_stays_within_bounds() {
         };
         assert_eq!(pid, kept);
         assert!((0.005..=0.02).contains(&pid.gains.kp), "{tuned:?}");
-        assert!((4..=6).contains(&tuned.design.filter_samples), "{tuned:?}");
-        assert!(tuned.design.observer_time >= 0.25 * TS && tuned.cost < tuned.start_cost);
+        assert!(
+            (4..=6).contains(&pid_of(&tuned.design).filter_samples),
+            "{tuned:?}"
+        );
+        assert!(pid_of(&tuned.design).observer_time >= 0.25 * TS && tuned.cost < tuned.start_cost);
     });
 }
 
@@ -269,12 +276,13 @@ fn the_gains_of_a_schedule_are_searched_and_keep_their_speeds() {
     with_task(start(), |task| {
         let point = |speed| Point {
             speed,
-            gains: task.start.pid.gains,
+            gains: pid_of(&task.start).pid.gains,
         };
         let start = Design {
             schedule: Schedule::new(&[point(0.0), point(2000.0)]).unwrap(),
-            ..task.start
-        };
+            ..pid_of(&task.start)
+        }
+        .into();
         let variables = Variable::usual(&start).unwrap();
         assert_eq!(variables.len(), 9);
         let task = Task {
@@ -283,7 +291,8 @@ fn the_gains_of_a_schedule_are_searched_and_keep_their_speeds() {
             ..task.clone()
         };
         let tuned = tune(&task, Method::Genetic, options(400, 2), &Monitor::default()).unwrap();
-        let points = tuned.design.schedule.points();
+        let tuned_pid = pid_of(&tuned.design);
+        let points = tuned_pid.schedule.points();
         assert_eq!((points[0].speed, points[1].speed), (0.0, 2000.0));
         assert_ne!(points[0].gains, points[1].gains);
         assert!(tuned.cost < 0.7 * tuned.start_cost, "{tuned:?}");
@@ -294,7 +303,7 @@ fn the_gains_of_a_schedule_are_searched_and_keep_their_speeds() {
 fn constraints_are_kept_and_what_cannot_be_kept_is_said() {
     with_task(start(), |task| {
         // Stands for the linear loop: the more gain, the more sensitive.
-        let sensitivity = |design: &Design<f64>| 1.0 + 100.0 * design.pid.gains.kp;
+        let sensitivity = |design: &AnyDesign<f64>| 1.0 + 100.0 * pid_of(design).pid.gains.kp;
         let within = |constraints| Task {
             constraints,
             ..task.clone()
@@ -306,7 +315,7 @@ fn constraints_are_kept_and_what_cannot_be_kept_is_said() {
         };
         let task = within(limited(14.0));
         let tuned = tune(&task, Method::Genetic, options(300, 2), &Monitor::default()).unwrap();
-        assert!(tuned.violation == 0.0 && tuned.design.pid.gains.kp <= 0.008);
+        assert!(tuned.violation == 0.0 && pid_of(&tuned.design).pid.gains.kp <= 0.008);
         let free = tune(
             &within(Constraints::default()),
             Method::Genetic,
@@ -462,8 +471,10 @@ fn notches_are_searched_and_other_biquads_keep_their_bits() {
     with_task(self::start(), |task| {
         let start = Design {
             biquads: Cascade::new(&[low_pass, notch(60.0, 0.1, 0.5)]).unwrap(),
-            ..task.start
+            ..pid_of(&task.start)
         };
+        let began = start.biquads;
+        let start = AnyDesign::from(start);
         let variables = Variable::usual(&start).unwrap();
         let names: Vec<_> = variables.iter().map(|v| v.parameter.name()).collect();
         assert!(names.contains(&"notch_frequency[1]".into()));
@@ -477,8 +488,9 @@ fn notches_are_searched_and_other_biquads_keep_their_bits() {
             ..task.clone()
         };
         let tuned = tune(&task, Method::Genetic, options(200, 1), &Monitor::default()).unwrap();
-        let sections = tuned.design.biquads.sections();
-        assert!(sections[0] == low_pass && sections[1] != start.biquads.sections()[1]);
+        let found = pid_of(&tuned.design).biquads;
+        let sections = found.sections();
+        assert!(sections[0] == low_pass && sections[1] != began.sections()[1]);
         assert!(tuned.cost < tuned.start_cost);
         let values = variables.iter().map(|v| (v, v.parameter.of(&tuned.design)));
         for (v, value) in values {
@@ -497,20 +509,24 @@ fn notches_are_searched_and_other_biquads_keep_their_bits() {
         ..Design::new(self::start())
     };
     for k in [0, 1] {
-        let refused = Variable::new(Parameter::NotchDepth(k), None, &start).unwrap_err();
+        let refused = Variable::new(Parameter::NotchDepth(k), None, &start.into()).unwrap_err();
         assert!(refused.message.contains("biquad of that number is a notch"));
     }
     let start = Design {
         biquads: Cascade::new(&[notch(60.0, 0.1, 0.5)]).unwrap(),
         ..start
     };
-    let beyond = Variable::new(Parameter::NotchFrequency(0), Some((10.0, 600.0)), &start);
+    let beyond = Variable::new(
+        Parameter::NotchFrequency(0),
+        Some((10.0, 600.0)),
+        &start.into(),
+    );
     assert!(beyond.unwrap_err().message.contains("half the sample rate"));
 }
 
 #[test]
 fn variables_that_make_no_sense_are_refused() {
-    let start = Design::new(start());
+    let start = AnyDesign::from(Design::new(start()));
     let refused = |parameter, bounds| {
         Variable::new(parameter, bounds, &start)
             .unwrap_err()
@@ -536,4 +552,67 @@ fn variables_that_make_no_sense_are_refused() {
         let refused = tune(&task, Method::Genetic, options(2, 1), &Monitor::default());
         assert!(refused.unwrap_err().message.contains("Kp twice"));
     });
+}
+
+#[test]
+fn weights_of_state_feedback_are_searched_and_give_their_gains() {
+    use sewfast_control::{STATES, StateDesign, Weights, lqg};
+
+    let (p, q) = ((-TS / 0.252_f64).exp(), (-TS / 0.0074_f64).exp());
+    let b = 490.0 * (1.0 - p) * (1.0 - q) / 2.0;
+    let none = [0.0; STATES];
+    let weights = Weights {
+        rho: 2e5,
+        integral: 20.0,
+        noise: 2e5,
+        reference: 1.0,
+    };
+    let bare = StateDesign {
+        a: [-p - q, p * q, 0.0, 0.0],
+        b: [b, b, 0.0, 0.0],
+        k: none,
+        l: none,
+        rest: none,
+        kr: 0.0,
+        ki: 0.0,
+        lead: 0.0,
+        r_rate: f64::INFINITY,
+        u_min: -20.0,
+        u_max: 20.0,
+        slew: f64::INFINITY,
+        ts: TS,
+        weights,
+    };
+    let begun = AnyDesign::from(lqg(bare, weights).unwrap());
+    with_task(start(), |task| {
+        let variables = Variable::usual(&begun).unwrap();
+        let names: Vec<_> = variables.iter().map(|v| v.parameter.name()).collect();
+        assert_eq!(names, ["rho", "integral", "noise", "weight", "lead"]);
+        let task = Task {
+            start: begun,
+            variables: &variables,
+            ..task.clone()
+        };
+        let tuned = tune(&task, Method::Genetic, options(400, 2), &Monitor::default()).unwrap();
+        assert!(tuned.cost < 0.5 * tuned.start_cost, "{tuned:?}");
+        let AnyDesign::StateFeedback(found) = tuned.design else {
+            panic!("{:?}", tuned.design);
+        };
+        assert_eq!(lqg(found, found.weights).unwrap(), found);
+        // several at once cost what each costs alone
+        let judged = costs(&task, &[tuned.design; 3], 2, &Monitor::default()).unwrap();
+        assert!(
+            judged
+                .iter()
+                .all(|j| j.cost.to_bits() == tuned.cost.to_bits())
+        );
+    });
+    for (parameter, start) in [
+        (Parameter::Kp, begun),
+        (Parameter::NotchDepth(0), begun),
+        (Parameter::Rho, Design::new(start()).into()),
+    ] {
+        let refused = Variable::new(parameter, None, &start).unwrap_err().message;
+        assert!(refused.contains(&parameter.name()), "{refused}");
+    }
 }

@@ -2,7 +2,9 @@
 
 use std::f64::consts::PI;
 
-use sewfast_control::{Biquad, Cascade, Design, Point, Schedule, Standard};
+use sewfast_control::{
+    AnyDesign, Biquad, Cascade, Design, Point, Schedule, Standard, StateDesign, lqg,
+};
 
 use crate::{Error, Result};
 
@@ -24,6 +26,12 @@ pub enum Parameter {
     FilterTime,
     ObserverTime,
     RRate,
+    /// Of state feedback: what its gains are made from, and its feedforward.
+    Rho,
+    Integral,
+    Noise,
+    Weight,
+    Lead,
     /// `Kp`, `Ti` and `Td` of a point of the gain schedule, counted from 0.
     KpAt(usize),
     TiAt(usize),
@@ -34,7 +42,7 @@ pub enum Parameter {
     NotchWidth(usize),
 }
 
-const NAMES: [(&str, Parameter); 11] = [
+const NAMES: [(&str, Parameter); 16] = [
     ("Kp", Parameter::Kp),
     ("Ti", Parameter::Ti),
     ("Td", Parameter::Td),
@@ -46,6 +54,11 @@ const NAMES: [(&str, Parameter); 11] = [
     ("filter_time", Parameter::FilterTime),
     ("observer_time", Parameter::ObserverTime),
     ("r_rate", Parameter::RRate),
+    ("rho", Parameter::Rho),
+    ("integral", Parameter::Integral),
+    ("noise", Parameter::Noise),
+    ("weight", Parameter::Weight),
+    ("lead", Parameter::Lead),
 ];
 
 impl Parameter {
@@ -87,8 +100,29 @@ impl Parameter {
         }
     }
 
-    /// Its value in a design; NaN for a point that the schedule does not have, or a biquad that is no notch.
-    pub fn of(self, design: &Design<f64>) -> f64 {
+    /// Its value in a design; NaN where that has no such number.
+    pub fn of(self, design: &AnyDesign<f64>) -> f64 {
+        match design {
+            AnyDesign::Pid(design) => self.of_pid(design),
+            AnyDesign::StateFeedback(design) => self.of_states(design),
+        }
+    }
+
+    /// NaN for what state feedback does not have.
+    fn of_states(self, design: &StateDesign<f64>) -> f64 {
+        match self {
+            Self::Rho => design.weights.rho,
+            Self::Integral => design.weights.integral,
+            Self::Noise => design.weights.noise,
+            Self::Weight => design.weights.reference,
+            Self::Lead => design.lead,
+            Self::RRate => design.r_rate,
+            _ => f64::NAN,
+        }
+    }
+
+    /// NaN for a point that the schedule does not have, or a biquad that is no notch.
+    fn of_pid(self, design: &Design<f64>) -> f64 {
         let point = |k: usize, gain: fn(&Standard<f64>) -> f64| {
             let points = design.schedule.points();
             points.get(k).map_or(f64::NAN, |point| gain(&point.gains))
@@ -110,6 +144,7 @@ impl Parameter {
             Self::FilterTime => design.filter_time,
             Self::ObserverTime => design.observer_time,
             Self::RRate => design.r_rate,
+            Self::Rho | Self::Integral | Self::Noise | Self::Weight | Self::Lead => f64::NAN,
             Self::KpAt(k) => point(k, |g| g.kp),
             Self::TiAt(k) => point(k, |g| g.ti),
             Self::TdAt(k) => point(k, |g| g.td),
@@ -157,18 +192,22 @@ impl Parameter {
             Self::KpAt(k) => points[k].gains.kp = value,
             Self::TiAt(k) => points[k].gains.ti = value,
             Self::TdAt(k) => points[k].gains.td = value,
-            Self::NotchFrequency(_) | Self::NotchDepth(_) | Self::NotchWidth(_) => {}
+            // of a notch, done above; or of state feedback, refused before
+            _ => {}
         }
     }
 
     fn is_linear(self) -> bool {
-        matches!(self, Self::Alpha | Self::Beta | Self::FilterSamples)
+        matches!(
+            self,
+            Self::Alpha | Self::Beta | Self::FilterSamples | Self::Weight | Self::Lead
+        )
     }
 
     /// Wide multiples of the start and of the sample time. A negative alpha or beta weights the reference by more than
     /// 1: feedforward that a slow feedback leaves room for.
-    fn bounds(self, start: &Design<f64>) -> Option<(f64, f64)> {
-        let (ts, own) = (start.pid.ts, self.of(start));
+    fn bounds(self, start: &AnyDesign<f64>) -> Option<(f64, f64)> {
+        let (ts, own) = (start.ts(), self.of(start));
         match self {
             Self::Kp | Self::KpAt(_) => Some(ordered(own / 50.0, own * 50.0)),
             Self::Ti | Self::TiAt(_) => Some((4.0 * ts, 1e4 * ts)),
@@ -181,6 +220,11 @@ impl Parameter {
             Self::FilterTime | Self::ObserverTime => Some((0.25 * ts, 30.0 * ts)),
             Self::RRate if own.is_finite() => Some((own / 10.0, own * 10.0)),
             Self::RRate => None,
+            Self::Rho | Self::Noise => Some((1e-4 * own, 1e4 * own)),
+            Self::Integral if own > 0.0 => Some((own / 100.0, own * 100.0)),
+            Self::Integral => None,
+            Self::Weight => Some((0.0, 1.2)),
+            Self::Lead => Some((0.0, 30.0 * ts)),
             Self::NotchFrequency(_) => Some((own / 1.5, (own * 1.5).min(0.45 / ts))),
             Self::NotchDepth(_) => Some((0.01, 1.0)),
             Self::NotchWidth(_) => Some((0.05, 3.0)),
@@ -259,27 +303,12 @@ impl Variable {
     pub fn new(
         parameter: Parameter,
         bounds: Option<(f64, f64)>,
-        start: &Design<f64>,
+        start: &AnyDesign<f64>,
     ) -> Result<Self> {
         let name = parameter.name();
-        if parameter.section().is_some() && parameter.of(start).is_nan() {
-            return Err(Error::setting(format!(
-                "expected a variable of a controller whose biquad of that number is a notch, got {name} with {} biquads; they \
-                 count from 0",
-                start.biquads.sections().len()
-            )));
-        }
-        if parameter.of(start).is_nan() {
-            return Err(Error::setting(format!(
-                "expected a variable of a controller with {} points in its schedule, got {name}; points count from 0",
-                start.schedule.points().len()
-            )));
-        }
-        let gain = matches!(parameter, Parameter::Kp | Parameter::Ti | Parameter::Td);
-        if gain && !start.schedule.is_empty() {
-            return Err(Error::setting(format!(
-                "expected gains of the schedule's points, which the controller uses, got {name}; search {name}[0], {name}[1] .."
-            )));
+        match start {
+            AnyDesign::Pid(design) => check_pid(parameter, design)?,
+            AnyDesign::StateFeedback(design) => check_states(parameter, design)?,
         }
         let Some((low, high)) = bounds.or(parameter.bounds(start)) else {
             return Err(Error::setting(format!(
@@ -306,7 +335,7 @@ impl Variable {
     }
 
     /// Refuses a bound that no controller can have.
-    fn probe(parameter: Parameter, value: f64, start: &Design<f64>) -> Result<()> {
+    fn probe(parameter: Parameter, value: f64, start: &AnyDesign<f64>) -> Result<()> {
         let fixed = Self {
             parameter,
             low: value,
@@ -315,7 +344,7 @@ impl Variable {
             given: true,
         };
         designed(&[fixed], &[0.0], start)
-            .and_then(|design| Ok(sewfast_control::Controller::new(design)?))
+            .and_then(|design| Ok(design.controller()?))
             .map(drop)
     }
 
@@ -323,27 +352,11 @@ impl Variable {
     ///
     /// # Errors
     /// `ErrorKind::Setting` for a start without usual bounds.
-    pub fn usual(start: &Design<f64>) -> Result<Vec<Self>> {
-        let points = start.schedule.points().len();
-        let mut all = match points {
-            0 => vec![Parameter::Kp, Parameter::Ti, Parameter::Td],
-            _ => (0..points)
-                .flat_map(|k| [Parameter::KpAt(k), Parameter::TiAt(k), Parameter::TdAt(k)])
-                .collect(),
+    pub fn usual(start: &AnyDesign<f64>) -> Result<Vec<Self>> {
+        let all = match start {
+            AnyDesign::Pid(design) => usual_of_pid(design),
+            AnyDesign::StateFeedback(_) => OF_STATES.to_vec(),
         };
-        all.extend([Parameter::Alpha, Parameter::Beta]);
-        if start.pid.n.is_finite() {
-            all.push(Parameter::N);
-        }
-        for (k, section) in start.biquads.sections().iter().enumerate() {
-            if Notch::of(section, start.pid.ts).is_some() {
-                all.extend([
-                    Parameter::NotchFrequency(k),
-                    Parameter::NotchDepth(k),
-                    Parameter::NotchWidth(k),
-                ]);
-            }
-        }
         all.into_iter()
             .map(|parameter| Self::new(parameter, None, start))
             .collect()
@@ -380,8 +393,84 @@ impl Variable {
     }
 }
 
+/// What is searched of state feedback.
+const OF_STATES: [Parameter; 5] = [
+    Parameter::Rho,
+    Parameter::Integral,
+    Parameter::Noise,
+    Parameter::Weight,
+    Parameter::Lead,
+];
+
+/// Refuses what state feedback does not have.
+fn check_states(parameter: Parameter, start: &StateDesign<f64>) -> Result<()> {
+    if !parameter.of_states(start).is_nan() {
+        return Ok(());
+    }
+    Err(Error::setting(format!(
+        "expected a variable of state feedback, {} or r_rate, got {}; that is one of a PID",
+        OF_STATES.map(Parameter::name).join(", "),
+        parameter.name()
+    )))
+}
+
+/// Refuses what a PID does not have, or does not use.
+fn check_pid(parameter: Parameter, start: &Design<f64>) -> Result<()> {
+    let (name, absent) = (parameter.name(), parameter.of_pid(start).is_nan());
+    if OF_STATES.contains(&parameter) {
+        return Err(Error::setting(format!(
+            "expected a variable of a PID, got {name}, which is one of state feedback; give a start of that kind"
+        )));
+    }
+    if parameter.section().is_some() && absent {
+        return Err(Error::setting(format!(
+            "expected a variable of a controller whose biquad of that number is a notch, got {name} with {} biquads; they \
+             count from 0",
+            start.biquads.sections().len()
+        )));
+    }
+    if absent {
+        return Err(Error::setting(format!(
+            "expected a variable of a controller with {} points in its schedule, got {name}; points count from 0",
+            start.schedule.points().len()
+        )));
+    }
+    let gain = matches!(parameter, Parameter::Kp | Parameter::Ti | Parameter::Td);
+    if gain && !start.schedule.is_empty() {
+        return Err(Error::setting(format!(
+            "expected gains of the schedule's points, which the controller uses, got {name}; search {name}[0], {name}[1] .."
+        )));
+    }
+    Ok(())
+}
+
+/// Gains, alpha and beta, `N` where there is a derivative filter, notches.
+fn usual_of_pid(start: &Design<f64>) -> Vec<Parameter> {
+    let points = start.schedule.points().len();
+    let mut all = match points {
+        0 => vec![Parameter::Kp, Parameter::Ti, Parameter::Td],
+        _ => (0..points)
+            .flat_map(|k| [Parameter::KpAt(k), Parameter::TiAt(k), Parameter::TdAt(k)])
+            .collect(),
+    };
+    all.extend([Parameter::Alpha, Parameter::Beta]);
+    if start.pid.n.is_finite() {
+        all.push(Parameter::N);
+    }
+    for (k, section) in start.biquads.sections().iter().enumerate() {
+        if Notch::of(section, start.pid.ts).is_some() {
+            all.extend([
+                Parameter::NotchFrequency(k),
+                Parameter::NotchDepth(k),
+                Parameter::NotchWidth(k),
+            ]);
+        }
+    }
+    all
+}
+
 /// Where a design lies in the box.
-pub(super) fn place(variables: &[Variable], design: &Design<f64>) -> Vec<f64> {
+pub(super) fn place(variables: &[Variable], design: &AnyDesign<f64>) -> Vec<f64> {
     variables
         .iter()
         .map(|v| v.place(v.parameter.of(design)))
@@ -389,7 +478,7 @@ pub(super) fn place(variables: &[Variable], design: &Design<f64>) -> Vec<f64> {
 }
 
 /// A start moved to the bounds that were asked for, where it lies outside.
-pub(super) fn moved(variables: &[Variable], start: &Design<f64>) -> Result<Design<f64>> {
+pub(super) fn moved(variables: &[Variable], start: &AnyDesign<f64>) -> Result<AnyDesign<f64>> {
     let outside = |v: &&Variable| {
         let own = v.parameter.of(start);
         v.given && !(v.low <= own && own <= v.high)
@@ -402,8 +491,41 @@ pub(super) fn moved(variables: &[Variable], start: &Design<f64>) -> Result<Desig
 pub(super) fn designed(
     variables: &[Variable],
     point: &[f64],
-    start: &Design<f64>,
-) -> Result<Design<f64>> {
+    start: &AnyDesign<f64>,
+) -> Result<AnyDesign<f64>> {
+    match start {
+        AnyDesign::Pid(start) => Ok(designed_pid(variables, point, start)?.into()),
+        AnyDesign::StateFeedback(start) => Ok(designed_states(variables, point, start)?.into()),
+    }
+}
+
+fn designed_states(
+    variables: &[Variable],
+    point: &[f64],
+    start: &StateDesign<f64>,
+) -> Result<StateDesign<f64>> {
+    let (mut design, mut weights) = (*start, start.weights);
+    for (variable, place) in variables.iter().zip(point) {
+        let value = variable.value(*place);
+        match variable.parameter {
+            Parameter::Rho => weights.rho = value,
+            Parameter::Integral => weights.integral = value,
+            Parameter::Noise => weights.noise = value,
+            Parameter::Weight => weights.reference = value,
+            Parameter::Lead => design.lead = value,
+            Parameter::RRate => design.r_rate = value,
+            _ => {}
+        }
+    }
+    // gains whose weights are not searched keep their bits
+    Ok(if weights == start.weights {
+        design
+    } else {
+        lqg(design, weights)?
+    })
+}
+
+fn designed_pid(variables: &[Variable], point: &[f64], start: &Design<f64>) -> Result<Design<f64>> {
     let mut design = *start;
     let mut points = start.schedule.points().to_vec();
     // notches that are not searched keep their bits

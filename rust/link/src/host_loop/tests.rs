@@ -1,7 +1,7 @@
 //! The loop against a device of a few lines, in computed time.
 
 use sewfast_control::link::{Body, Deframer, Fields, Header, MAX_WIRE, encode};
-use sewfast_control::{Controller, Design, Settings as Pid, Standard};
+use sewfast_control::{Design, PidController, Settings as Pid, Standard};
 
 use super::{HostLoop, Outcome, Settings, kind};
 use crate::samples::Channel;
@@ -199,7 +199,7 @@ fn host_loop(ticks: usize) -> HostLoop {
         counts_per_unit: 1.0,
     };
     let counts = Channel::described(0, 1).unwrap();
-    let controller = Controller::new(Design::new(pid)).unwrap();
+    let controller = PidController::new(Design::new(pid)).unwrap();
     HostLoop::new(settings, &[counts], controller, vec![1000.0; ticks]).unwrap()
 }
 

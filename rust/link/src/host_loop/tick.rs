@@ -1,6 +1,6 @@
 //! The loop without port or clock: time and bytes in, at most one frame out.
 
-use sewfast_control::Controller;
+use sewfast_control::PidController;
 use sewfast_control::link::{Body, Header, MAX_WIRE, encode};
 
 use sewfast_core::Result;
@@ -46,7 +46,7 @@ pub struct HostLoop {
 #[derive(Debug)]
 pub(super) struct State {
     pub settings: Settings,
-    pub controller: Controller<f64>,
+    pub controller: PidController<f64>,
     pub reference: Vec<f64>,
     pub phase: Phase,
     pub outcome: Option<Outcome>,
@@ -77,7 +77,7 @@ impl HostLoop {
     pub fn new(
         settings: Settings,
         channels: &[Channel],
-        mut controller: Controller<f64>,
+        mut controller: PidController<f64>,
         reference: Vec<f64>,
     ) -> Result<Self> {
         settings.check(channels.len(), reference.len(), controller.settings().ts)?;

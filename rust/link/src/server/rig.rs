@@ -18,7 +18,8 @@ const CAPABILITIES: u32 = capability::PROFILE
     | capability::CURRENT
     | capability::COMPUTED
     | capability::DESIGN
-    | capability::BIQUADS;
+    | capability::BIQUADS
+    | capability::KINDS;
 
 const CHANNELS: [Channel; 6] = [
     channel("counts", "1", Encoding::Counts, 1, Source::Counts),

@@ -3,11 +3,20 @@
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use sewfast_control::{
-    Biquad, Cascade, Controller as Core, Design, Point, Refused, Row, Schedule, Settings, Standard,
+    AnyDesign, Biquad, Cascade, Design, PidController as Core, Point, Refused, Row, STATES,
+    Schedule, Settings, Standard, StateDesign, StateFeedback as States, Weights, lqg,
 };
 use sewfast_core::Error;
 
 use crate::arrays::raise;
+
+pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<Controller>()?;
+    module.add_class::<SingleController>()?;
+    module.add_class::<StateFeedback>()?;
+    module.add_class::<SingleStateFeedback>()?;
+    module.add_function(wrap_pyfunction!(biquad, module)?)
+}
 
 /// The controller's arithmetic (paper Fig. 16). Gains in standard form.
 #[pyclass(module = "sewfast._core")]
@@ -19,6 +28,23 @@ pub struct Controller {
 #[pyclass(module = "sewfast._core")]
 pub struct SingleController {
     core: Core<f32>,
+}
+
+/// A controller of any kind, as Python gives it.
+#[derive(FromPyObject)]
+pub enum AnyGiven<'py> {
+    Pid(Bound<'py, Controller>),
+    StateFeedback(Bound<'py, StateFeedback>),
+}
+
+impl AnyGiven<'_> {
+    /// What it is made from.
+    pub fn design(&self) -> AnyDesign<f64> {
+        match self {
+            Self::Pid(controller) => (*controller.borrow().core.design()).into(),
+            Self::StateFeedback(controller) => (*controller.borrow().core.design()).into(),
+        }
+    }
 }
 
 /// Speed, then Kp, Ti, Td in standard form.
@@ -261,3 +287,120 @@ controller_methods!(Controller, f64 {
 });
 
 controller_methods!(SingleController, f32 {});
+
+/// State feedback with an observer, its gains from weights; see `sewfast_control::state_feedback`.
+#[pyclass(module = "sewfast._core")]
+pub struct StateFeedback {
+    pub core: States<f64>,
+}
+
+/// The same arithmetic in single precision.
+#[pyclass(module = "sewfast._core")]
+pub struct SingleStateFeedback {
+    core: States<f32>,
+}
+
+macro_rules! state_feedback_methods {
+    ($class:ident, $float:ty { $($own:tt)* }) => {
+        #[pymethods]
+        impl $class {
+            $($own)*
+
+            #[pyo3(signature = (r, y, feedforward=0.0))]
+            fn step(&mut self, r: $float, y: $float, feedforward: $float) -> $float {
+                self.core.step_with(r, y, feedforward)
+            }
+
+            fn reset(&mut self) {
+                self.core.reset();
+            }
+
+            #[getter]
+            fn filtered(&self) -> $float {
+                self.core.filtered()
+            }
+
+            /// What the step computes with.
+            #[getter]
+            fn numbers<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+                let (design, found) = (self.core.design(), PyDict::new(py));
+                for (name, vector) in [
+                    ("den", design.a),
+                    ("num", design.b),
+                    ("K", design.k),
+                    ("L", design.l),
+                    ("rest", design.rest),
+                ] {
+                    found.set_item(name, vector.map(f64::from))?;
+                }
+                for (name, value) in [("Kr", design.kr), ("Ki", design.ki), ("lead", design.lead)] {
+                    found.set_item(name, f64::from(value))?;
+                }
+                Ok(found)
+            }
+        }
+    };
+}
+
+state_feedback_methods!(StateFeedback, f64 {
+    #[new]
+    #[pyo3(signature = (*, num, den, rho, integral, noise, weight, lead, r_rate, u_min, u_max, slew, Ts))]
+    #[expect(non_snake_case, reason = "the field's names")]
+    #[expect(clippy::too_many_arguments, reason = "Python's keywords, one by one")]
+    fn new(
+        py: Python<'_>,
+        num: [f64; STATES],
+        den: [f64; STATES],
+        rho: f64,
+        integral: f64,
+        noise: f64,
+        weight: f64,
+        lead: f64,
+        r_rate: f64,
+        u_min: f64,
+        u_max: f64,
+        slew: f64,
+        Ts: f64,
+    ) -> PyResult<Self> {
+        let weights = Weights {
+            rho,
+            integral,
+            noise,
+            reference: weight,
+        };
+        let none = [0.0; STATES];
+        let plant = StateDesign {
+            a: den,
+            b: num,
+            k: none,
+            l: none,
+            rest: none,
+            kr: 0.0,
+            ki: 0.0,
+            lead,
+            r_rate,
+            u_min,
+            u_max,
+            slew,
+            ts: Ts,
+            weights,
+        };
+        let made = lqg(plant, weights).and_then(States::new);
+        let core = made.map_err(|refused| raise(py, Error::from(refused)))?;
+        Ok(Self { core })
+    }
+
+    /// The same gains in single precision.
+    fn single(&self, py: Python<'_>) -> PyResult<SingleStateFeedback> {
+        let made = States::new(self.core.design().single());
+        let core = made.map_err(|refused| raise(py, Error::from(refused)))?;
+        Ok(SingleStateFeedback { core })
+    }
+
+    /// What a device is sent, before the counts per unit and second.
+    fn sent(&self) -> Vec<f64> {
+        self.core.design().numbers().to_vec()
+    }
+});
+
+state_feedback_methods!(SingleStateFeedback, f32 {});

@@ -4,13 +4,13 @@ mod task;
 
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use sewfast_control::Design;
+use sewfast_control::AnyDesign;
 use sewfast_core::closed_loop::Run;
 use sewfast_core::search::Options;
 use sewfast_core::tune::{self as tuning, Method, Objective, Tuned, Variable, terms};
 use sewfast_core::{Error, Result};
 
-use super::controller::Controller;
+use super::controller::AnyGiven;
 use super::{Values, named};
 use crate::arrays::{array1, raise, slice};
 use crate::watch::watched;
@@ -124,7 +124,7 @@ fn described(variables: &[Variable]) -> Vec<(String, f64, f64)> {
     variables.iter().map(described).collect()
 }
 
-fn values(variables: &[Variable], design: &Design<f64>) -> Vec<f64> {
+fn values(variables: &[Variable], design: &AnyDesign<f64>) -> Vec<f64> {
     variables.iter().map(|v| v.parameter.of(design)).collect()
 }
 
@@ -134,7 +134,7 @@ fn values(variables: &[Variable], design: &Design<f64>) -> Vec<f64> {
 fn tuning_costs<'py>(
     py: Python<'py>,
     task: Asked<'py>,
-    controllers: Vec<Bound<'py, Controller>>,
+    controllers: Vec<AnyGiven<'py>>,
     threads: usize,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Vec<(f64, f64)>> {
@@ -152,9 +152,8 @@ fn tuning_costs<'py>(
     Ok(judged.iter().map(|j| (j.cost, j.violation)).collect())
 }
 
-fn designs(controllers: &[Bound<'_, Controller>]) -> Vec<Design<f64>> {
-    let design = |c: &Bound<'_, Controller>| *c.borrow().core.design();
-    controllers.iter().map(design).collect()
+fn designs(controllers: &[AnyGiven<'_>]) -> Vec<AnyDesign<f64>> {
+    controllers.iter().map(AnyGiven::design).collect()
 }
 
 /// Recovery [ms] and rms deviation [y] of each plant in each variation under the load steps, the worst of these.
@@ -174,7 +173,7 @@ fn tuning_loads<'py>(py: Python<'py>, task: Asked<'py>) -> PyResult<Vec<(f64, f6
 fn pareto<'py>(
     py: Python<'py>,
     task: Asked<'py>,
-    others: Vec<Bound<'py, Controller>>,
+    others: Vec<AnyGiven<'py>>,
     objectives: Vec<String>,
     size: usize,
     evaluations: usize,

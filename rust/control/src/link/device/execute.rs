@@ -302,6 +302,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         Refusal::state(self.state).unless(self.run.planned.is_none())?;
         Refusal::unsupported(0).unless(self.can(capability::PID))?;
         Refusal::unsupported(13).unless(!gains.long || self.can(capability::DESIGN))?;
+        Refusal::unsupported(0).unless(gains.are_pid() || self.can(capability::KINDS))?;
         gains.check(self.bounds().volt, self.ts)?;
         self.gains = Some(gains);
         Ok(())
@@ -314,6 +315,7 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
         Refusal::unsupported(0).unless(self.can(capability::BIQUADS))?;
         let biquads = biquads?;
         let gains = self.gains.as_mut().ok_or(Refusal::value(0))?;
+        Refusal::value(0).unless(gains.are_pid() || biquads.is_empty())?;
         gains.set_biquads(biquads);
         Ok(())
     }

@@ -1,6 +1,7 @@
 //! A control period: measure, limits, filter, control, limit, apply.
 
 use super::{Core, Event, Measurement, Output, Reason, State, capability};
+use crate::Controller;
 use crate::link::guard::Trip;
 use crate::link::identity::{Limits, Source};
 use crate::link::stream::to_steps;
@@ -126,8 +127,8 @@ impl<const CAPACITY: usize, const TRANSMIT: usize> Core<CAPACITY, TRANSMIT> {
 
     /// The limits of the loop's command: the controller's own, which lie within the volt limit, where it is here.
     fn range(&self, volt: f32) -> (f32, f32) {
-        let own = self.run.controller.as_ref().map(|c| c.settings());
-        own.map_or((-volt, volt), |s| (s.u_min, s.u_max))
+        let own = self.run.controller.as_ref().map(Controller::limits);
+        own.unwrap_or((-volt, volt))
     }
 
     /// The command as it is recorded: what is applied is what the host gets to see.

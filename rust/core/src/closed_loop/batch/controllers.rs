@@ -1,15 +1,94 @@
 //! Controllers, one in each lane; or a single one.
 
-use sewfast_control::{Controller, Numbers};
+use sewfast_control::{
+    AnyController, Controller, Numbers, PidController, STATES, StateDesign, StateFeedback,
+};
 
 use crate::simd::{Choice, LANES};
+
+/// A kind of controller that runs in lanes.
+pub(crate) trait InLanes: Controller<f64> {
+    /// Eight of them, or a single one.
+    type Lanes<V: Choice>: LaneController<V>;
+
+    /// Whether this one can.
+    fn fits(&self) -> bool;
+
+    /// The first eight of `controllers`, at rest; missing ones are the first again.
+    fn in_lanes<V: Choice>(controllers: &[&Self]) -> Self::Lanes<V>;
+}
+
+/// What a loop asks of the controllers in its lanes: in two parts, between which other work can be done.
+pub(crate) trait LaneController<V> {
+    /// Takes measured outputs.
+    fn take(&mut self, first: bool, measured: V);
+    /// From the reference and what was taken to the commands.
+    fn decide(&mut self, first: bool, r: f64, feedforward: Option<f64>) -> V;
+    /// The feedback after its filter, at the last sample.
+    fn filtered(&self) -> V;
+}
+
+/// Work on controllers of one kind, whichever it is.
+pub(crate) trait WithKind {
+    /// What comes out.
+    type Output;
+
+    /// Does it.
+    fn with<C: InLanes>(self, controllers: &[&C]) -> Self::Output;
+}
+
+/// Does `work` with controllers that are all of one kind and fit in lanes; `None` for others.
+pub(crate) fn of_a_kind<W: WithKind>(
+    controllers: &[&AnyController<f64>],
+    work: W,
+) -> Option<W::Output> {
+    match controllers.first()? {
+        AnyController::Pid(_) => all(controllers, AnyController::pid).map(|all| work.with(&all)),
+        AnyController::StateFeedback(_) => {
+            all(controllers, AnyController::state_feedback).map(|all| work.with(&all))
+        }
+    }
+}
+
+/// Whether controllers are all of one kind and fit in lanes.
+pub(crate) fn are_of_a_kind(controllers: &[&AnyController<f64>]) -> bool {
+    struct Nothing;
+    impl WithKind for Nothing {
+        type Output = ();
+
+        fn with<C: InLanes>(self, _controllers: &[&C]) {}
+    }
+    of_a_kind(controllers, Nothing).is_some()
+}
+
+/// The controllers within, where each has one that fits in lanes.
+fn all<'a, C: InLanes>(
+    controllers: &[&'a AnyController<f64>],
+    within: impl Fn(&'a AnyController<f64>) -> Option<&'a C>,
+) -> Option<Vec<&'a C>> {
+    let fitting = |c: &&'a AnyController<f64>| within(c).filter(|c| c.fits());
+    controllers.iter().map(fitting).collect()
+}
+
+impl InLanes for PidController<f64> {
+    type Lanes<V: Choice> = Controllers<V>;
+
+    fn fits(&self) -> bool {
+        self.numbers().is_some()
+    }
+
+    #[inline(always)]
+    fn in_lanes<V: Choice>(controllers: &[&Self]) -> Controllers<V> {
+        Controllers::new(controllers)
+    }
+}
 
 /// A derivative term below this is nothing: in a loop at rest it would fade on for ever among numbers so small that processors
 /// take a hundred times as long over them.
 const FADED: f64 = 1e-280;
 
-/// Eight of [`Controller`] with constant gains: the same operations in the same order.
-pub(in crate::closed_loop) struct Controllers<V> {
+/// Eight of [`PidController`] with constant gains: the same operations in the same order.
+pub(crate) struct Controllers<V> {
     average: Averages<V>,
     lag: V,
     /// `1 - a`, `b`, and 1 where there is an observer; `None` where no lane has one.
@@ -45,16 +124,16 @@ pub(in crate::closed_loop) struct Controllers<V> {
 impl<V: Choice> Controllers<V> {
     /// The first eight of `controllers`, at rest; missing ones are the first again.
     #[inline(always)]
-    pub fn new(controllers: &[&Controller<f64>]) -> Self {
+    pub fn new(controllers: &[&PidController<f64>]) -> Self {
         let lane = |i: usize| *controllers.get(i).unwrap_or(&controllers[0]);
         let number = |i: usize| lane(i).numbers();
         let each = |of: &dyn Fn(Numbers<f64>) -> f64| {
             V::load(&std::array::from_fn(|i| number(i).map_or(f64::NAN, of)))
         };
-        let setting = |of: &dyn Fn(&Controller<f64>) -> f64| {
+        let setting = |of: &dyn Fn(&PidController<f64>) -> f64| {
             V::load(&std::array::from_fn::<_, LANES, _>(|i| of(lane(i))))
         };
-        let any = |of: &dyn Fn(&Controller<f64>) -> bool| (0..LANES).any(|i| of(lane(i)));
+        let any = |of: &dyn Fn(&PidController<f64>) -> bool| (0..LANES).any(|i| of(lane(i)));
         let observer = [
             each(&|n| n.observer.map_or(0.0, |(keep, _)| keep)),
             each(&|n| n.observer.map_or(0.0, |(_, gain)| gain)),
@@ -93,27 +172,27 @@ impl<V: Choice> Controllers<V> {
             filtered: zero,
         }
     }
+}
 
-    /// From reference and measured outputs to the commands.
+impl<V: Choice> LaneController<V> for Controllers<V> {
     #[inline(always)]
-    pub fn step(&mut self, first: bool, r: f64, measured: V, feedforward: Option<f64>) -> V {
-        self.take(first, measured);
-        self.decide(first, r, feedforward)
-    }
-
-    /// Takes measured outputs.
-    #[inline(always)]
-    pub fn take(&mut self, first: bool, measured: V) {
+    fn take(&mut self, first: bool, measured: V) {
         self.filtered = self.filter(first, measured);
     }
 
-    /// From the reference and what was taken to the commands.
     #[inline(always)]
-    pub fn decide(&mut self, first: bool, r: f64, feedforward: Option<f64>) -> V {
+    fn decide(&mut self, first: bool, r: f64, feedforward: Option<f64>) -> V {
         let r = self.reference(first, r);
         self.control(r, self.filtered, feedforward)
     }
 
+    #[inline(always)]
+    fn filtered(&self) -> V {
+        self.filtered
+    }
+}
+
+impl<V: Choice> Controllers<V> {
     #[inline(always)]
     fn filter(&mut self, first: bool, x: V) -> V {
         let x = self.average.step(first, x);
@@ -194,6 +273,142 @@ impl<V: Choice> Controllers<V> {
         let kept = self.conditional.if_equal(V::splat(1.0), held, tracked);
         let kept = excess.if_equal(zero, integral, kept);
         self.ki.if_equal(zero, integral, kept)
+    }
+}
+
+impl InLanes for StateFeedback<f64> {
+    type Lanes<V: Choice> = StateLanes<V>;
+
+    fn fits(&self) -> bool {
+        true
+    }
+
+    #[inline(always)]
+    fn in_lanes<V: Choice>(controllers: &[&Self]) -> StateLanes<V> {
+        StateLanes::new(controllers)
+    }
+}
+
+/// Eight of [`StateFeedback`]: the same operations in the same order.
+pub(crate) struct StateLanes<V> {
+    a: [V; STATES],
+    b: [V; STATES],
+    k: [V; STATES],
+    l: [V; STATES],
+    rest: [V; STATES],
+    kr: V,
+    ki: V,
+    /// In samples.
+    lead: V,
+    /// Largest change of the reference in one sample; `None` where no lane has a ramp.
+    ramp: Option<V>,
+    low: V,
+    high: V,
+    /// Largest change of the command in one sample; `None` where no lane has a limit.
+    change: Option<V>,
+    /// States as predicted for the next sample; once a measurement was taken, as corrected by it.
+    x: [V; STATES],
+    q: V,
+    r: V,
+    u: V,
+    measured: V,
+    /// The output as observed.
+    observed: V,
+}
+
+impl<V: Choice> StateLanes<V> {
+    /// The first eight of `controllers`, at rest; missing ones are the first again.
+    #[inline(always)]
+    fn new(controllers: &[&StateFeedback<f64>]) -> Self {
+        let lane = |i: usize| controllers.get(i).unwrap_or(&controllers[0]).design();
+        let each = |of: &dyn Fn(&StateDesign<f64>) -> f64| {
+            V::load(&std::array::from_fn::<_, LANES, _>(|i| of(lane(i))))
+        };
+        let vector = |of: &dyn Fn(&StateDesign<f64>) -> [f64; STATES]| {
+            std::array::from_fn(|state| each(&|d| of(d)[state]))
+        };
+        let any = |of: &dyn Fn(&StateDesign<f64>) -> bool| (0..LANES).any(|i| of(lane(i)));
+        let zero = V::splat(0.0);
+        let (low, high) = (each(&|d| d.u_min), each(&|d| d.u_max));
+        Self {
+            a: vector(&|d| d.a),
+            b: vector(&|d| d.b),
+            k: vector(&|d| d.k),
+            l: vector(&|d| d.l),
+            rest: vector(&|d| d.rest),
+            kr: each(&|d| d.kr),
+            ki: each(&|d| d.ki),
+            lead: each(&|d| d.lead / d.ts),
+            ramp: any(&|d| d.r_rate < f64::INFINITY).then_some(each(&|d| d.r_rate * d.ts)),
+            low,
+            high,
+            change: any(&|d| d.slew < f64::INFINITY).then_some(each(&|d| d.slew * d.ts)),
+            x: [zero; STATES],
+            q: zero,
+            r: zero,
+            u: zero.at_least_each(low).at_most_each(high),
+            measured: zero,
+            observed: zero,
+        }
+    }
+}
+
+impl<V: Choice> LaneController<V> for StateLanes<V> {
+    #[inline(always)]
+    fn take(&mut self, first: bool, measured: V) {
+        if first {
+            self.x = self.rest.map(|x| x.mul(measured));
+        }
+        let innovation = measured.sub(self.x[0]);
+        for (x, gain) in self.x.iter_mut().zip(self.l) {
+            *x = x.add(gain.mul(innovation));
+        }
+        (self.measured, self.observed) = (measured, self.x[0]);
+    }
+
+    #[inline(always)]
+    fn decide(&mut self, first: bool, r: f64, feedforward: Option<f64>) -> V {
+        let (zero, y) = (V::splat(0.0), self.measured);
+        let mut r = V::splat(r);
+        if let Some(change) = self.ramp {
+            let from = if first { y } else { self.r };
+            r = limited(r, from.sub(change), from.add(change));
+        }
+        let before = if first { r } else { self.r };
+        let ([k1, k2, k3, k4], [x1, x2, x3, x4]) = (self.k, self.x);
+        let fed_back = (k1.mul(x1).add(k2.mul(x2))).add(k3.mul(x3).add(k4.mul(x4)));
+        let aimed = r.add(self.lead.mul(r.sub(before)));
+        let wanted = self.kr.mul(aimed).sub(fed_back).add(self.q);
+        let wanted = match feedforward {
+            None => wanted,
+            Some(added) => wanted.add(V::splat(added)),
+        };
+        let mut u = limited(wanted, self.low, self.high);
+        if let Some(change) = self.change {
+            u = limited(u, self.u.sub(change), self.u.add(change));
+        }
+        let (excess, change) = (u.sub(wanted), self.ki.mul(r.sub(y)));
+        let mut q = change.mul(excess).if_less(zero, self.q, self.q.add(change));
+        let shifted = [x2, x3, x4, zero];
+        let mut x: [V; STATES] =
+            std::array::from_fn(|i| shifted[i].sub(self.a[i].mul(x1)).add(self.b[i].mul(u)));
+        // 0 where the command is finite, else NaN: then the observer begins again, and the command stays
+        let sound = wanted.mul(zero);
+        if sound.abs().are_less(V::splat(1.0)) != V::ALL {
+            u = sound.if_equal(zero, u, self.u);
+            let kept = self.q.mul(zero).if_equal(zero, self.q, zero);
+            q = sound.if_equal(zero, q, kept);
+            for (x, rest) in x.iter_mut().zip(self.rest) {
+                *x = sound.if_equal(zero, *x, rest.mul(y));
+            }
+        }
+        (self.x, self.q, self.r, self.u) = (x, q, r, u);
+        u
+    }
+
+    #[inline(always)]
+    fn filtered(&self) -> V {
+        self.observed
     }
 }
 

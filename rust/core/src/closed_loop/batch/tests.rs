@@ -1,7 +1,10 @@
 //! Loops in lanes against loops that run alone.
 
 use proptest::prelude::*;
-use sewfast_control::{Design, Settings, Standard};
+use sewfast_control::{
+    AnyController, Design, PidController, STATES, Settings, Standard, StateDesign, StateFeedback,
+    Weights, lqg,
+};
 
 use super::*;
 use crate::closed_loop::kernel_plant::{AnyOrder, ScalarPlant, SecondOrder};
@@ -77,7 +80,7 @@ fn references(seed: u64, samples: usize) -> Vec<f64> {
 /// A kernel that runs lanes, and each controller alone, on one level.
 struct Both<'a> {
     known: KernelPlant<'a>,
-    controllers: &'a [&'a Controller<f64>],
+    controllers: &'a [&'a PidController<f64>],
     signals: Signals<'a>,
     encoder: Option<&'a Encoder>,
 }
@@ -103,8 +106,8 @@ impl Kernel for Both<'_> {
         for (tally, group) in tallies.iter_mut().zip(groups) {
             tally.begin(group, 0);
         }
-        Grouped::<_, 0>(lanes(), &mut tallies).run::<V>();
-        let outcomes = Grouped::<_, 0>(lanes(), &mut records).run::<V>();
+        Grouped::<_, _, 0>(lanes(), &mut tallies).run::<V>();
+        let outcomes = Grouped::<_, _, 0>(lanes(), &mut records).run::<V>();
         let together = (0..self.controllers.len()).map(|i| {
             let end = ended(outcomes[i], self.signals.reference.len());
             let of = |record: &Vec<Lanes>| record[..end].iter().map(|g| g.0[i % LANES]).collect();
@@ -113,7 +116,10 @@ impl Kernel for Both<'_> {
         let alone = self.controllers.iter().map(|controller| {
             let mut constant = Constant::new(controller);
             let any = || ScalarPlant::<V, AnyOrder>::new(self.known);
-            let run = self.alone(any(), &mut Controller::clone(controller));
+            let run = self.alone(
+                any(),
+                &mut AnyController::from(PidController::clone(controller)),
+            );
             assert_eq!(run, self.alone(any(), &mut constant));
             if SecondOrder::takes(&self.known) {
                 let plant = ScalarPlant::<V, SecondOrder>::new(self.known);
@@ -158,7 +164,7 @@ fn check(
 ) -> Vec<(Level, Vec<Recorded>)> {
     let controllers: Vec<_> = designs
         .iter()
-        .map(|d| Controller::new(*d).unwrap())
+        .map(|d| PidController::new(*d).unwrap())
         .collect();
     let controllers: Vec<_> = controllers.iter().collect();
     let all = run_everywhere(|| Both {
@@ -271,7 +277,7 @@ fn all_lanes_end_on_a_stop() {
         ti: 0.1,
         td: 0.0,
     };
-    let controller = Controller::new(Design::new(Settings::new(gains, TS))).unwrap();
+    let controller = PidController::new(Design::new(Settings::new(gains, TS))).unwrap();
     let monitor = Monitor::default();
     monitor.request_stop();
     let lanes = BatchLoop {
@@ -311,6 +317,101 @@ fn levels_differ_by_rounding_only() {
         for (a, b) in records[0].1[1].iter().zip(&all[0].1[0].1[1]) {
             // what is forgotten at once by this plant is some units in the last place of the outputs' range
             assert!((a - b).abs() <= 1e-12 * 2000.0, "{level:?}: {a} {b}");
+        }
+    }
+}
+
+/// A kernel that runs state feedback in lanes, and each controller alone, on one level.
+struct States<'a> {
+    known: KernelPlant<'a>,
+    controllers: &'a [&'a StateFeedback<f64>],
+    signals: Signals<'a>,
+    encoder: Option<&'a Encoder>,
+}
+
+impl Kernel for States<'_> {
+    type Output = (Vec<Recorded>, Vec<Recorded>);
+
+    #[inline(always)]
+    fn run<V: F64x8>(self) -> Self::Output {
+        let monitor = Monitor::default();
+        let lanes = BatchLoop {
+            known: self.known,
+            controllers: self.controllers,
+            signals: self.signals,
+            encoder: self.encoder,
+            monitor: &monitor,
+        };
+        let groups = self.controllers.len().div_ceil(LANES);
+        let mut records: Vec<_> = (0..groups).map(|_| Records::default()).collect();
+        let outcomes = Grouped::<_, _, 0>(lanes, &mut records).run::<V>();
+        let together = (0..self.controllers.len()).map(|i| {
+            let end = ended(outcomes[i], self.signals.reference.len());
+            let of = |record: &Vec<Lanes>| record[..end].iter().map(|g| g.0[i % LANES]).collect();
+            (outcomes[i], records[i / LANES].0.each_ref().map(of))
+        });
+        let together = together.collect();
+        let alone = self.controllers.iter().map(|&controller| {
+            let mut plant = ScalarPlant::<V, AnyOrder>::new(self.known);
+            let mut controller = AnyController::StateFeedback(controller.clone());
+            let mut run = Run::default();
+            let (signals, encoder) = (self.signals, self.encoder);
+            run.fill(&mut plant, &mut controller, signals, encoder, &monitor);
+            (run.outcome, [run.u, run.y, run.feedback])
+        });
+        (together, alone.collect())
+    }
+}
+
+prop_compose! {
+    fn state_designs()(
+        rho in 1.0..1e6_f64, integral in prop_oneof![Just(0.0), 0.1..50.0_f64], noise in 1.0..1e6_f64,
+        reference in 0.0..1.2_f64, lead in 0.0..0.03_f64, high in 1.0..25.0_f64,
+        (slew, r_rate) in (prop_oneof![Just(f64::INFINITY), 100.0..5e3_f64], prop_oneof![Just(f64::INFINITY), 1e3..1e5_f64]),
+        pole in 0.9..0.999_f64, fast in 0.1..0.9_f64,
+    ) -> StateDesign<f64> {
+        let none = [0.0; STATES];
+        let plant = StateDesign {
+            a: [-pole - fast, pole * fast, 0.0, 0.0],
+            b: [3.0, 2.0, 0.0, 0.0],
+            k: none, l: none, rest: none, kr: 0.0, ki: 0.0, lead, r_rate, u_min: -0.6 * high, u_max: high, slew, ts: TS,
+            weights: Weights { rho, integral, noise, reference },
+        };
+        lqg(plant, plant.weights).unwrap()
+    }
+}
+
+proptest! {
+    #![proptest_config(crate::laws::cases(60))]
+    #[test]
+    fn a_lane_of_state_feedback_is_its_loop_to_the_bit(
+        designs in prop::collection::vec(state_designs(), 1..=MOST),
+        seed in any::<u64>(), counts in prop_oneof![Just(0.0), Just(26.2)],
+        (pushed, fed) in any::<(bool, bool)>(),
+        huge in prop_oneof![Just(1.0), Just(1e300)],
+    ) {
+        // gains that no number holds: the command stays, and the observer begins again
+        let huge = |d: &StateDesign<f64>| StateDesign { k: d.k.map(|k| k * huge), ..*d };
+        let designs: Vec<_> = designs.iter().enumerate().map(|(i, d)| if i == 1 { huge(d) } else { *d }).collect();
+        let model = network(seed, Lags::new(2, 2, 1, 1).unwrap(), 6, true, f64::INFINITY);
+        let plant = LaggedPlant::new(&model, TS).unwrap();
+        let reference = references(seed, 200);
+        let beside: Vec<f64> = (0..200).map(|k| if k > 90 { -2.5 } else { 0.25 }).collect();
+        let signals = Signals {
+            disturbance: pushed.then_some(&beside),
+            feedforward: fed.then_some(&beside[..150]),
+            ..Signals::new(&reference)
+        };
+        let controllers: Vec<_> = designs.iter().map(|d| StateFeedback::new(*d).unwrap()).collect();
+        let controllers: Vec<_> = controllers.iter().collect();
+        let encoder = encoder(counts, 0.5).unwrap();
+        let all = run_everywhere(|| States {
+            known: plant.known().unwrap(), controllers: &controllers, signals, encoder: encoder.as_ref(),
+        });
+        for (level, (together, alone)) in all {
+            for (i, (lane, alone)) in together.iter().zip(&alone).enumerate() {
+                prop_assert!(bits(lane) == bits(alone), "{level:?}, lane {i}: {lane:?} {alone:?}");
+            }
         }
     }
 }

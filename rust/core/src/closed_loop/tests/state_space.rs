@@ -91,7 +91,7 @@ proptest! {
         };
         let run = closed_loop_with(
             &mut LaggedPlant::new(&model, TS).unwrap(),
-            &mut Controller::new(design).unwrap(),
+            &mut PidController::new(design).unwrap().into(),
             signals,
             None,
             &Monitor::default(),

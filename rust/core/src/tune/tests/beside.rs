@@ -4,14 +4,14 @@ use super::*;
 use crate::random::Random;
 
 /// Controllers of all sorts, some of which diverge or sit at their limits.
-fn designs(start: &Design<f64>) -> Vec<Design<f64>> {
+fn designs(start: &AnyDesign<f64>) -> Vec<AnyDesign<f64>> {
     let mut random = Random::new(5);
     let mut design = || {
-        let mut design = *start;
+        let mut design = pid_of(start);
         design.pid.gains.kp *= random.between(0.2, 8.0);
         design.pid.gains.ti *= random.between(0.1, 2.0);
         design.filter_samples = (random.uniform() * 12.0) as usize + 1;
-        design
+        design.into()
     };
     (0..21).map(|_| design()).collect()
 }
@@ -54,7 +54,7 @@ fn controllers_side_by_side_are_worth_what_they_are_worth_alone() {
     });
 }
 
-fn compare<P: Plant + Clone + Send + Sync>(task: &Task<'_, P>, designs: &[Design<f64>]) {
+fn compare<P: Plant + Clone + Send + Sync>(task: &Task<'_, P>, designs: &[AnyDesign<f64>]) {
     let judged = |designs: &[_], threads| {
         let judged = costs(task, designs, threads, &Monitor::default()).unwrap();
         let bits = |j: &Judgement| [j.cost.to_bits(), j.violation.to_bits()];

@@ -4,7 +4,7 @@ use sewfast_control::link::{
     Body, Deframer, Device, Header, Identity, Limits, MAX_WIRE, Measurement, Reason, Source, State,
 };
 use sewfast_control::link::{Channel as Streamed, Encoding, capability, encode};
-use sewfast_control::{Controller, Design, Settings as Pid, Standard};
+use sewfast_control::{Design, PidController, Settings as Pid, Standard};
 use sewfast_core::machine::{Machine, Parameters};
 
 use super::super::{HostLoop, Outcome, Settings};
@@ -32,7 +32,7 @@ static CHANNELS: [Streamed; 2] = [
     },
 ];
 
-fn controller() -> Controller<f64> {
+fn controller() -> PidController<f64> {
     let gains = Standard {
         kp: 0.002,
         ti: 0.25,
@@ -44,7 +44,7 @@ fn controller() -> Controller<f64> {
         tt: 0.0,
         ..Pid::new(gains, TS)
     };
-    Controller::new(Design::new(settings)).unwrap()
+    PidController::new(Design::new(settings)).unwrap()
 }
 
 fn reference() -> Vec<f64> {

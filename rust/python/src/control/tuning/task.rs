@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use numpy::{Complex64, PyReadonlyArray1};
 use pyo3::prelude::*;
-use sewfast_control::Design;
+use sewfast_control::AnyDesign;
 use sewfast_core::closed_loop::{Varied, encoder};
 use sewfast_core::loop_transfer as linear;
 use sewfast_core::tune::{
@@ -14,7 +14,7 @@ use sewfast_core::tune::{
 use sewfast_core::{Error, Monitor, Result};
 
 use super::super::Values;
-use super::super::controller::Controller;
+use super::super::controller::AnyGiven;
 use super::super::plant::{AnyPlant, Model};
 use crate::arrays::{raise, slice};
 
@@ -27,7 +27,7 @@ type Load<'py> = (Values<'py>, Values<'py>, f64, usize);
 #[derive(FromPyObject)]
 enum Most<'py> {
     Number(f64),
-    Rival(Bound<'py, Controller>),
+    Rival(AnyGiven<'py>),
 }
 
 /// The limits by name.
@@ -50,7 +50,7 @@ pub struct Asked<'py> {
     references: Vec<Values<'py>>,
     disturbances: Vec<Values<'py>>,
     load_steps: Vec<Load<'py>>,
-    start: Bound<'py, Controller>,
+    start: AnyGiven<'py>,
     counts_per_unit: f64,
     variations: Vec<(f64, usize)>,
     variables: Vec<Wanted>,
@@ -69,7 +69,7 @@ pub struct Given {
     load_steps: Vec<OwnedLoad>,
     variations: Vec<(f64, usize)>,
     counts_per_unit: f64,
-    pub start: Design<f64>,
+    pub start: AnyDesign<f64>,
     pub variables: Vec<Variable>,
     cost: Cost,
     aggregate: Aggregate,
@@ -111,18 +111,18 @@ impl OwnedLoad {
 
 enum OwnedMost {
     Number(f64),
-    Rival(Box<Design<f64>>),
+    Rival(Box<AnyDesign<f64>>),
 }
 
 impl OwnedMost {
     fn new(most: &Most<'_>) -> Self {
         match most {
             Most::Number(limit) => Self::Number(*limit),
-            Most::Rival(rival) => Self::Rival(Box::new(*rival.borrow().core.design())),
+            Most::Rival(rival) => Self::Rival(Box::new(rival.design())),
         }
     }
 
-    fn rival(&self) -> Option<&Design<f64>> {
+    fn rival(&self) -> Option<&AnyDesign<f64>> {
         match self {
             Self::Number(_) => None,
             Self::Rival(design) => Some(design),
@@ -171,7 +171,7 @@ fn loops(given: &[Fraction<'_>]) -> PyResult<Vec<linear::Plant>> {
 impl Given {
     pub fn new(py: Python<'_>, asked: &Asked<'_>) -> PyResult<Self> {
         let refused = |e| raise(py, e);
-        let start = *asked.start.borrow().core.design();
+        let start = asked.start.design();
         let owned = |name: &'static str, signals: &[Values<'_>]| -> PyResult<Vec<Vec<f64>>> {
             let samples = |s: &Values<'_>| slice(s, name).map(<[f64]>::to_vec);
             signals.iter().map(samples).collect()
@@ -202,7 +202,7 @@ impl Given {
             recovery: limits.recovery.as_ref().map(OwnedMost::new),
             load: limits.load.as_ref().map(OwnedMost::new),
             loops: loops(&asked.linear_plants)?,
-            measured: measured(&asked.measured, start.pid.ts)?,
+            measured: measured(&asked.measured, start.ts())?,
         })
     }
 
@@ -212,7 +212,7 @@ impl Given {
         monitor: &Monitor,
         work: impl FnOnce(&Task<'_, Varied<AnyPlant<'_>>>) -> Result<T>,
     ) -> Result<T> {
-        let plants = varied(&self.models, &self.variations, self.start.pid.ts)?;
+        let plants = varied(&self.models, &self.variations, self.start.ts())?;
         let references: Vec<&[f64]> = self.references.iter().map(Vec::as_slice).collect();
         let disturbances: Vec<&[f64]> = self.disturbances.iter().map(Vec::as_slice).collect();
         let load_steps: Vec<LoadStep<'_>> = self.load_steps.iter().map(OwnedLoad::step).collect();
@@ -222,7 +222,7 @@ impl Given {
             ));
         }
         let encoder = encoder(self.counts_per_unit, 0.5)?;
-        let sensitivity = |design: &Design<f64>| {
+        let sensitivity = |design: &AnyDesign<f64>| {
             let paths = paths(design, encoder.is_some());
             let of = |path: &linear::Path| {
                 let plants = self.loops.iter().map(|plant| {
@@ -286,7 +286,7 @@ impl Given {
             Some(rival) if Some(rival) != first => Some(of(rival)?),
             _ => None,
         };
-        let least = 1e3 * self.start.pid.ts;
+        let least = 1e3 * self.start.ts();
         let limit = |k: usize| {
             let compared = |did: &Vec<LoadLimit>| self.is_compared(k).then(|| did[k]);
             let recovery = did.as_ref().and_then(compared);
@@ -302,7 +302,10 @@ impl Given {
 }
 
 /// The feedback paths of a design: one, or one for each point of its schedule.
-fn paths(design: &Design<f64>, encoder: bool) -> Vec<linear::Path> {
+fn paths(design: &AnyDesign<f64>, encoder: bool) -> Vec<linear::Path> {
+    let Some(design) = design.pid() else {
+        return Vec::new();
+    };
     let points = design.schedule.points();
     let constant = points.is_empty().then_some(design.pid.gains);
     let all = points.iter().map(|p| p.gains).chain(constant);
@@ -318,7 +321,7 @@ fn paths(design: &Design<f64>, encoder: bool) -> Vec<linear::Path> {
     all.map(of).collect()
 }
 
-fn variables(wanted: &[Wanted], start: &Design<f64>) -> Result<Vec<Variable>> {
+fn variables(wanted: &[Wanted], start: &AnyDesign<f64>) -> Result<Vec<Variable>> {
     if wanted.is_empty() {
         return Variable::usual(start);
     }

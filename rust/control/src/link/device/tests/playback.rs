@@ -2,8 +2,11 @@
 
 use super::rig::*;
 use crate::biquad::tests::{any_section, section};
-use crate::link::{Fields, Reason, State};
-use crate::{Biquad, Cascade, Controller, Design, Point, Schedule, Settings, Standard};
+use crate::link::{Body, Fields, Reason, State};
+use crate::{
+    Biquad, Cascade, Design, PidController, Point, STATES, Schedule, Settings, Standard,
+    StateDesign, StateFeedback, Weights, lqg,
+};
 use proptest::prelude::*;
 use std::vec;
 use std::vec::Vec;
@@ -96,7 +99,7 @@ proptest! {
             pid: settings, filter_samples: filter.into(), filter_time: 0.002, observer_time, r_rate,
             schedule: Schedule::new(&points).unwrap(), biquads: Cascade::new(&sections).unwrap(),
         };
-        let mut controller = Controller::<f32>::new(design).unwrap();
+        let mut controller = PidController::<f32>::new(design).unwrap();
         let mut expected = Vec::new();
         for (&reference, &count) in references.iter().zip(&moves) {
             rig.counts += count;
@@ -118,6 +121,104 @@ proptest! {
         }
         prop_assert_eq!(heard, expected);
     }
+}
+
+/// A motor of 490 RPM/V behind state feedback, as a host sends it.
+fn state_feedback() -> StateDesign<f64> {
+    let none = [0.0; STATES];
+    let weights = Weights {
+        rho: 2e5,
+        integral: 20.0,
+        noise: 2e5,
+        reference: 0.9,
+    };
+    let plant = StateDesign {
+        a: [-1.869_639_6, 0.870_140_2, 0.0, 0.0],
+        b: [0.12265, 0.12265, 0.0, 0.0],
+        k: none,
+        l: none,
+        rest: none,
+        kr: 0.0,
+        ki: 0.0,
+        lead: 2e-3,
+        r_rate: 1e5,
+        u_min: -20.0,
+        u_max: 8.0,
+        slew: 2000.0,
+        ts: 1e-3,
+        weights,
+    };
+    lqg(plant, weights).unwrap()
+}
+
+/// The body of CONTROLLER.
+fn kind(number: u8, per_unit: f32, numbers: &[f32]) -> Body {
+    let mut body = Body::new();
+    body.u8(number).f32(per_unit);
+    for &x in numbers {
+        body.f32(x);
+    }
+    body
+}
+
+proptest! {
+    #[test]
+    fn state_feedback_is_the_controller_too(
+        references in prop::collection::vec(0f32..3000.0, 1..50),
+        moves in prop::collection::vec(-60i32..90, 50),
+    ) {
+        let (design, per_unit) = (state_feedback().single(), 25.0);
+        let mut rig = Rig::armed();
+        let body = kind(1, per_unit, &design.numbers());
+        prop_assert_eq!(rig.command(0x0D, body.bytes().unwrap()).0, 0);
+        prop_assert_eq!(rig.references(0, &references).0, 0);
+        let body = start(1, 0, references.len() as u32, 0b01_1011, 4);
+        prop_assert_eq!(rig.command(0x0A, body.bytes().unwrap()).0, 0);
+        // the volt limit of the session clips what the host allows
+        let clipped = StateDesign { u_min: -10.0, ..design };
+        let mut controller = StateFeedback::new(clipped).unwrap();
+        for (&reference, &count) in references.iter().zip(&moves) {
+            rig.counts += count;
+            rig.keep();
+            let wanted = controller.step_with(reference, count as f32 / (1e-3 * per_unit), -0.0);
+            let u = (wanted * 1000.0).round() / 1000.0;
+            prop_assert_eq!(rig.sample(), crate::link::Output { u, enabled: true });
+        }
+    }
+}
+
+#[test]
+fn another_controller_is_refused_by_its_field() {
+    let numbers = state_feedback().single().numbers();
+    let mut rig = Rig::armed();
+    let mut sent = |number, per_unit, change: Option<(usize, f32)>| {
+        let mut numbers = numbers;
+        if let Some((place, value)) = change {
+            numbers[place] = value;
+        }
+        let body = kind(number, per_unit, &numbers);
+        let answer = rig.command(0x0D, body.bytes().unwrap());
+        let detail = answer.1.try_into().map_or(0, u32::from_le_bytes);
+        (answer.0, detail)
+    };
+    assert_eq!(sent(7, 25.0, None), (3, 0));
+    assert_eq!(sent(1, 0.0, None), (3, 1));
+    for (place, value, field) in [
+        (1, f32::NAN, 0),
+        (9, INF, 8),
+        (21, INF, 20),
+        (23, 0.0, 23),
+        (24, 9.0, 25),
+        (26, -1.0, 26),
+    ] {
+        assert_eq!(sent(1, 25.0, Some((place, value))), (3, field + 2));
+    }
+    assert_eq!(sent(1, 25.0, Some((25, -15.0))).0, 6);
+    assert_eq!(sent(1, 25.0, None), (0, 0));
+    let short = kind(1, 25.0, &numbers[1..]);
+    assert_eq!(rig.command(0x0D, short.bytes().unwrap()).0, 2);
+    let sections = [Biquad::notch(60.0, 0.1, 0.5, 1e-3).unwrap()];
+    assert_eq!(rig.command(0x0C, biquads(&sections).bytes().unwrap()).0, 3);
 }
 
 #[test]

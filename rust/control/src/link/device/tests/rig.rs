@@ -49,7 +49,8 @@ pub fn identity() -> Identity {
             | can::DRIVE
             | can::CURRENT
             | can::DESIGN
-            | can::BIQUADS,
+            | can::BIQUADS
+            | can::KINDS,
         ceilings: Limits {
             volt: 20.0,
             speed: 5000.0,

@@ -71,7 +71,7 @@ proptest! {
     fn a_change_of_design_moves_nothing_at_once(
         old in free(), new in free(), r in -40.0..40.0, y in -40.0..40.0, feedforward in -5.0..5.0,
     ) {
-        let mut controller = Controller::new(old).unwrap();
+        let mut controller = PidController::new(old).unwrap();
         controller.step_with(r, y / 2.0, feedforward);
         let samples = 20_000 + settling(&old.biquads, 40.0);
         let before = (0..samples).map(|_| controller.step_with(r, y, feedforward)).last().unwrap();
@@ -89,7 +89,7 @@ proptest! {
         let inf = f64::INFINITY;
         let old = Design::new(Settings { n, ..pid(kp, inf, td) });
         let new = Design::new(Settings { n, ..pid(kp2, inf, td2) });
-        let mut controller = Controller::new(old).unwrap();
+        let mut controller = PidController::new(old).unwrap();
         let before = (0..5000).map(|k| controller.step(0.0, slope * f64::from(k))).last().unwrap();
         controller.set_design(new).unwrap();
         let after = controller.step(0.0, slope * 5000.0);
@@ -102,7 +102,7 @@ proptest! {
     ) {
         let pid = Settings { u_min: -limit, u_max: limit, slew: 1e4, ..design.pid };
         let design = Design { pid, ..design };
-        let mut left = Controller::new(design).unwrap();
+        let mut left = PidController::new(design).unwrap();
         let mut touched = left.clone();
         for (r, y) in signals {
             prop_assert_eq!(left.step(r, y).to_bits(), touched.step(r, y).to_bits());
@@ -116,7 +116,7 @@ proptest! {
     ) {
         let pid = Settings { u_min: -10.0, u_max: 10.0, ..design.pid };
         let design = Design { pid, ..design };
-        let mut controller = Controller::new(design).unwrap();
+        let mut controller = PidController::new(design).unwrap();
         controller.step_with(r, y / 3.0, feedforward);
         controller.set_manual(manual).unwrap();
         let mut u = 0.0;
@@ -136,7 +136,7 @@ proptest! {
         signals in prop::collection::vec((prop::num::f64::ANY, prop::num::f64::ANY, prop::num::f64::ANY, 0..5), 40),
     ) {
         let limited = |d: Design<f64>| Design { pid: Settings { u_min: -3.0, u_max: 5.0, slew: 1e3, tt: 0.01, ..d.pid }, ..d };
-        let mut controller = Controller::new(limited(design)).unwrap();
+        let mut controller = PidController::new(limited(design)).unwrap();
         let mut last = 0.0;
         for (r, y, feedforward, what) in signals {
             match what {
@@ -161,7 +161,7 @@ proptest! {
         let points: Vec<_> =
             (0..count).map(|i| Point { speed: spacing * i as f64, gains }).collect();
         let scheduled = Design { schedule: Schedule::new(&points).unwrap(), ..design };
-        let (mut a, mut b) = (Controller::new(constant).unwrap(), Controller::new(scheduled).unwrap());
+        let (mut a, mut b) = (PidController::new(constant).unwrap(), PidController::new(scheduled).unwrap());
         for (r, y) in signals {
             prop_assert_eq!(a.step(r, y).to_bits(), b.step(r, y).to_bits());
         }
@@ -171,7 +171,7 @@ proptest! {
     fn feedforward_is_added_before_the_limits(
         design in free(), signals in prop::collection::vec((-40.0..40.0, -40.0..40.0, -20.0..20.0), 40),
     ) {
-        let mut with = Controller::new(design).unwrap();
+        let mut with = PidController::new(design).unwrap();
         let mut without = with.clone();
         for (r, y, feedforward) in signals {
             let (u, base) = (with.step_with(r, y, feedforward), without.step(r, y));
@@ -186,7 +186,7 @@ fn feeds_back_the_filtered_output_and_skips_a_lost_measurement() {
         filter_samples: 2,
         ..Design::new(pid(1.0, f64::INFINITY, 0.0))
     };
-    let mut controller = Controller::new(design).unwrap();
+    let mut controller = PidController::new(design).unwrap();
     assert_eq!(controller.step(0.0, 4.0), -4.0);
     assert_eq!(controller.step(0.0, 0.0), -2.0);
     assert_eq!(controller.filtered(), 2.0);
@@ -210,12 +210,12 @@ fn biquads_act_as_on_the_command() {
             ..gains
         })
     };
-    let mut filtered = Controller::new(design).unwrap();
+    let mut filtered = PidController::new(design).unwrap();
     let plain = Design {
         biquads: Cascade::NONE,
         ..design
     };
-    let mut plain = Controller::new(plain).unwrap();
+    let mut plain = PidController::new(plain).unwrap();
     let mut behind = crate::biquad::Memory::new();
     behind.rest_at(0.0);
     for k in 0..500_i32 {
@@ -234,7 +234,7 @@ fn biquads_filter_a_step_of_the_reference_at_the_first_sample() {
         biquads: Cascade::new(&[low_pass]).unwrap(),
         ..Design::new(pid(1.0, f64::INFINITY, 0.0))
     };
-    let mut controller = Controller::new(design).unwrap();
+    let mut controller = PidController::new(design).unwrap();
     for _ in 0..2 {
         let first = controller.step(100.0, 20.0);
         assert!(first > 0.0 && first < 0.05, "{first}");
@@ -251,7 +251,7 @@ fn biquads_outlive_what_is_no_number() {
         biquads: Cascade::new(&[notch; 4]).unwrap(),
         ..Design::new(pid(1.0, f64::INFINITY, 0.0))
     };
-    let mut controller = Controller::new(design).unwrap();
+    let mut controller = PidController::new(design).unwrap();
     controller.step(3.0, 1.0);
     for (r, y) in [
         (f64::NAN, 1.0),
@@ -275,7 +275,7 @@ fn anti_windup_sees_the_feedforward() {
         u_max: 1.0,
         ..pid(0.1, 0.1, 0.0)
     });
-    let mut controller = Controller::new(design).unwrap();
+    let mut controller = PidController::new(design).unwrap();
     for _ in 0..1000 {
         assert_eq!(controller.step_with(1.0, 0.0, 2.0), 1.0);
     }
@@ -289,7 +289,7 @@ fn the_reference_ramps_from_the_first_output() {
         r_rate: 1000.0,
         ..Design::new(pid(1.0, f64::INFINITY, 0.0))
     };
-    let mut controller = Controller::new(design).unwrap();
+    let mut controller = PidController::new(design).unwrap();
     for _ in 0..2 {
         let u: Vec<f64> = (0..3).map(|_| controller.step(100.0, 50.0)).collect();
         assert_eq!(u, [1.0, 2.0, 3.0]);
@@ -304,7 +304,7 @@ fn manual_works_without_a_measurement_and_is_slewed() {
         slew: 500.0,
         ..pid(1.0, 1.0, 0.0)
     });
-    let mut controller = Controller::new(design).unwrap();
+    let mut controller = PidController::new(design).unwrap();
     controller.step(1.0, 1.0);
     controller.set_manual(5.0).unwrap();
     let lost: Vec<f64> = (0..5).map(|_| controller.step(1.0, f64::NAN)).collect();
@@ -320,7 +320,7 @@ fn manual_works_without_a_measurement_and_is_slewed() {
 #[test]
 fn a_change_that_is_refused_changes_nothing() {
     let design = Design::new(pid(1.0, 1.0, 0.0));
-    let mut controller = Controller::new(design).unwrap();
+    let mut controller = PidController::new(design).unwrap();
     let slower = Settings {
         ts: 2e-3,
         ..design.pid
@@ -343,7 +343,7 @@ fn a_change_that_is_refused_changes_nothing() {
 #[test]
 fn refuses_what_its_parts_refuse() {
     let good = Design::new(pid(1.0, 1.0, 0.0));
-    let refused = |design| Controller::<f64>::new(design).unwrap_err().name;
+    let refused = |design| PidController::<f64>::new(design).unwrap_err().name;
     let r_rate = 0.0;
     assert_eq!(refused(Design { r_rate, ..good }), "r_rate");
     let filter_samples = 65;
@@ -408,7 +408,7 @@ fn whole() -> Design<Counted> {
 
 /// Operations of each step over inputs of every kind.
 fn costs(design: Design<Counted>, manual: bool) -> (Vec<u64>, Vec<u64>) {
-    let mut controller = Controller::new(design).unwrap();
+    let mut controller = PidController::new(design).unwrap();
     let (mut taken, mut skipped) = (Vec::new(), Vec::new());
     let values = [
         0.0,

@@ -1,7 +1,7 @@
 //! The safety law: whatever comes, the command is finite, within its limits and its slew; and the controller finds back.
 
 use crate::biquad::tests::{any_section, section, settling};
-use crate::{Cascade, Controller, Design, Point, Real, Schedule, Settings, Standard};
+use crate::{Cascade, Design, PidController, Point, Real, Schedule, Settings, Standard};
 use proptest::prelude::*;
 use std::vec::Vec;
 
@@ -78,7 +78,7 @@ macro_rules! laws {
                     let biquads = Cascade::new(&sections).unwrap();
                     let whole = Design { pid, filter_samples, filter_time, observer_time, r_rate, schedule, biquads };
                     // a ramp so slow that a sample of it is 0 is refused
-                    if Controller::new(whole).is_ok() { whole } else { Design { r_rate: $float::INFINITY, ..whole } }
+                    if PidController::new(whole).is_ok() { whole } else { Design { r_rate: $float::INFINITY, ..whole } }
                 })
             }
 
@@ -93,7 +93,7 @@ macro_rules! laws {
                     (one, other) in designs(),
                     signals in prop::collection::vec((number(), number(), number(), 0..9), 60),
                 ) {
-                    let mut controller = Controller::new(one).unwrap();
+                    let mut controller = PidController::new(one).unwrap();
                     let mut last = (0.0 as $float).limit(one.pid.u_min, one.pid.u_max);
                     let mut fresh = true;
                     for (r, y, feedforward, what) in signals {
@@ -132,7 +132,7 @@ macro_rules! laws {
                     let sections: Vec<_> = given.into_iter().map(section).collect();
                     let biquads = Cascade::new(&sections).unwrap();
                     let design = Design { filter_samples: samples, filter_time, observer_time, biquads, ..Design::new(pid) };
-                    let mut controller = Controller::new(design).unwrap();
+                    let mut controller = PidController::new(design).unwrap();
                     for (r, y, feedforward) in garbage {
                         controller.step_with(r, y, feedforward);
                     }
@@ -164,7 +164,7 @@ fn a_command_given_by_hand_before_the_first_measurement_does_not_jump_at_a_chang
             1e-3,
         )
     };
-    let mut controller = Controller::new(Design::new(pid)).unwrap();
+    let mut controller = PidController::new(Design::new(pid)).unwrap();
     controller.set_manual(5.0).unwrap();
     for expected in [1.0, 2.0, 3.0] {
         assert_eq!(controller.step(0.0, f64::NAN), expected);
@@ -189,7 +189,7 @@ fn a_measurement_near_the_largest_number_costs_its_samples_only() {
         filter_samples: 4,
         ..Design::new(pid)
     };
-    let mut controller = Controller::new(design).unwrap();
+    let mut controller = PidController::new(design).unwrap();
     for y in [1.0, 1e308, 1e308, 1e308, -1e308] {
         controller.step(1.0, y);
     }

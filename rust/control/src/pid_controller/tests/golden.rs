@@ -1,6 +1,6 @@
 //! Golden bits of filter and PID alone: a part that is switched off leaves no trace in them.
 
-use crate::{Controller, Design, Real, Settings, Standard};
+use crate::{Design, PidController, Real, Settings, Standard};
 
 /// Numbers from -1 to 1, the same for ever.
 struct Noise(u64);
@@ -60,13 +60,13 @@ macro_rules! golden {
     };
 }
 
-fn made<T: Real>(pid: Settings<T>, filter_samples: usize, filter_time: T) -> Controller<T> {
+fn made<T: Real>(pid: Settings<T>, filter_samples: usize, filter_time: T) -> PidController<T> {
     let design = Design {
         filter_samples,
         filter_time,
         ..Design::new(pid)
     };
-    Controller::new(design).unwrap()
+    PidController::new(design).unwrap()
 }
 
 golden!(double f64 made);

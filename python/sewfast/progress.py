@@ -1,0 +1,173 @@
+"""How far long work is: a bar in a terminal, a bar in a notebook, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import html
+import math
+import sys
+import threading
+import time
+from collections.abc import Callable
+from functools import wraps
+from importlib import import_module
+from types import TracebackType
+from typing import Any, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_WIDTH = 24
+_FIRST_LINE, _LATER = 10.0, 1.5
+"""Where stderr is no terminal: seconds until the first line, and the factor to each next one."""
+_FIRST_BAR, _BETWEEN = 0.5, 0.2
+"""In a notebook: seconds until the bar appears, and at least between two pictures of it."""
+_shown = threading.local()
+"""Whether a bar is shown already: work that starts other work shows one bar, its own."""
+
+
+class Progress:
+    """Shows `done/total`, the best cost or the stage, and the seconds so far.
+
+    On a terminal a line is drawn anew. In a notebook a bar appears after half a second and goes
+    when the work ends. Elsewhere (a file, a pipe, a build's log) a line is printed after 10 s and
+    then at growing intervals, so that nobody takes long work for a hang. Use it in a `with`, which
+    wipes line and bar at the end.
+
+    Parameters
+    ----------
+    title : str
+        Of the work, such as `identify`.
+    value : str
+        Name of the number that comes with the counts.
+    """
+
+    def __init__(self, title: str, value: str = "best") -> None:
+        self._title = title
+        self._value = value
+        self._began = time.monotonic()
+        self._bar = _Bar() if in_notebook() else None
+        self._on = self._bar is None and sys.stderr.isatty()
+        self._next = _FIRST_LINE
+
+    def __call__(self, done: int, total: int, best: float | str) -> None:
+        """Show steps and, with them, a number (a cost) or a text (a stage)."""
+        if isinstance(best, str):
+            text = best
+        else:
+            text = f"{self._value} {best:.4g}" if math.isfinite(best) else ""
+        self._show(done / max(total, 1), f"{done}/{total}", text)
+
+    def count(self, done: int, total: int) -> None:
+        """Show work that has steps but no cost."""
+        self._show(done / max(total, 1), f"{done}/{total}", "")
+
+    def say(self, text: str) -> None:
+        """Show a stage that has no steps to count."""
+        self._show(None, "", text)
+
+    def _show(self, share: float | None, count: str, text: str) -> None:
+        seconds = time.monotonic() - self._began
+        if self._bar is not None:
+            self._bar.draw(self._title, share, "  ".join(filter(None, (count, text))), seconds)
+        elif self._on:
+            if share is None:
+                self._draw(f"{self._title}: {text}  {seconds:.0f} s")
+            else:
+                filled = min(int(_WIDTH * share), _WIDTH)
+                bar = "=" * filled + " " * (_WIDTH - filled)
+                parts = (f"{self._title} [{bar}] {count}", text, f"{seconds:.0f} s")
+                self._draw("  ".join(filter(None, parts)))
+        elif seconds >= self._next:
+            self._next = _LATER * seconds
+            percent = "" if share is None else f"{100 * share:.0f} %"
+            said = ", ".join(filter(None, (percent, text)))
+            print(f"{self._title}: {said}, {seconds:.0f} s", file=sys.stderr, flush=True)
+
+    def _draw(self, line: str) -> None:
+        # back to the first column, the line, then clear what an older one left
+        print(f"\r{line}\x1b[K", end="", file=sys.stderr, flush=True)
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._bar is not None:
+            self._bar.remove()
+        elif self._on:
+            self._draw("")
+
+
+def in_notebook() -> bool:
+    """Whether this code runs in a cell of a notebook: IPython is there, with a kernel."""
+    shell: Any = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return getattr(shell, "kernel", None) is not None
+
+
+def shown_in_notebooks(
+    title: str, value: str = "best"
+) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorate a function with `progress`: in a notebook a bar is shown where it is left out.
+
+    Only in the main thread, where a cell runs, and once: work that starts other work shows its own
+    bar. `progress=None` shows none.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        @wraps(function)
+        def called(*args: P.args, **options: P.kwargs) -> R:
+            in_main = threading.current_thread() is threading.main_thread()
+            if (
+                "progress" in options
+                or not in_main
+                or getattr(_shown, "one", False)
+                or not in_notebook()
+            ):
+                return function(*args, **options)
+            _shown.one = True
+            try:
+                with Progress(title, value) as progress:
+                    options["progress"] = progress
+                    return function(*args, **options)
+            finally:
+                _shown.one = False
+
+        return called
+
+    return decorate
+
+
+class _Bar:
+    """A bar below a notebook's cell, drawn anew in its place."""
+
+    def __init__(self) -> None:
+        self._handle: Any = None
+        self._next = _FIRST_BAR
+
+    def draw(self, title: str, share: float | None, text: str, seconds: float) -> None:
+        if seconds < self._next:
+            return
+        self._next = seconds + _BETWEEN
+        value = "" if share is None else f' value="{share:.3f}"'
+        line = f"{text}  {seconds:.0f} s"
+        page = (
+            f"<div>{html.escape(title)} <progress{value} "
+            f'style="width: 20em; vertical-align: middle"></progress> {html.escape(line)}</div>'
+        )
+        self._put({"text/html": page, "text/plain": f"{title}: {line}"})
+
+    def remove(self) -> None:
+        if self._handle is not None:
+            self._put({"text/html": "", "text/plain": ""})
+
+    def _put(self, content: dict[str, str]) -> None:
+        if self._handle is None:
+            # a notebook runs, so it is there
+            self._handle = import_module("IPython.display").DisplayHandle()
+            self._handle.display(content, raw=True)
+        else:
+            self._handle.update(content, raw=True)

@@ -1,0 +1,266 @@
+//! The whole controller of the paper's Fig. 16: feedback filter, reference ramp, biquads, then two-degree-of-freedom PID.
+//!
+//! Biquads act on the reference and on the feedback alike. As the PID is linear in both, that is what they would do behind it,
+//! on the command, where drives have them: the machine's resonance is neither fed back nor excited by the reference. But limits,
+//! slew, anti-windup and the operator's command stay where they are, on the command that the machine gets.
+
+use crate::biquad::Memory;
+use crate::pid::Terms;
+use crate::schedule::{Row, Table};
+use crate::{Controller, Design, Feedback, Pid, Ramp, Real, Refused, Settings};
+
+/// What the step of a controller with constant gains computes with: for code that steps many controllers at once with
+/// the same operations in the same order.
+#[derive(Clone, Copy, Debug)]
+pub struct Numbers<T> {
+    /// Gains of the PID.
+    pub terms: Terms<T>,
+    /// Share of the excess taken from the integral in one sample; see [`Settings::tracking`].
+    pub tracking: T,
+    /// Samples of the moving average.
+    pub samples: usize,
+    /// Weight of a new sample in the first-order lag.
+    pub lag: T,
+    /// `1 - a` and `b` of the observer; `None` where it passes its input through.
+    pub observer: Option<(T, T)>,
+    /// Largest change of the reference in one sample \[y\].
+    pub ramp: T,
+}
+
+/// Feedback filter, reference ramp, biquads, gain schedule and PID behind one step.
+#[derive(Clone, Debug)]
+pub struct PidController<T> {
+    design: Design<T>,
+    filter: Feedback<T>,
+    ramp: Ramp<T>,
+    /// The biquads' memory of the feedback.
+    of_y: Memory<T>,
+    /// The biquads' memory of the reference.
+    of_r: Memory<T>,
+    table: Option<Table<T>>,
+    pid: Pid<T>,
+    filtered: T,
+}
+
+impl<T: Real> PidController<T> {
+    /// A controller at rest, in automatic.
+    ///
+    /// # Errors
+    /// The first setting that is outside its range.
+    pub fn new(design: Design<T>) -> Result<Self, Refused> {
+        let Design {
+            pid,
+            filter_samples,
+            filter_time,
+            observer_time,
+            r_rate,
+            schedule,
+            biquads: _,
+        } = design;
+        let ts = pid.ts;
+        Ok(Self {
+            pid: Pid::new(pid)?,
+            filter: Feedback::new(filter_samples, filter_time, observer_time, ts)?,
+            ramp: Ramp::new(r_rate, ts)?,
+            of_y: Memory::new(),
+            of_r: Memory::new(),
+            table: Table::new(&schedule, &pid),
+            design,
+            filtered: T::ZERO,
+        })
+    }
+
+    /// What [`new`](Self::new) would refuse, without the controller, which fills most of a small processor's stack.
+    ///
+    /// # Errors
+    /// The first setting that is outside its range.
+    pub fn check(design: &Design<T>) -> Result<(), Refused> {
+        let ts = design.pid.ts;
+        Pid::new(design.pid)?;
+        Feedback::new(
+            design.filter_samples,
+            design.filter_time,
+            design.observer_time,
+            ts,
+        )?;
+        Ramp::new(design.r_rate, ts)?;
+        Ok(())
+    }
+
+    /// Back to the state before the first sample, in automatic.
+    pub fn reset(&mut self) {
+        self.filter.reset();
+        self.ramp.reset();
+        self.of_y.started = false;
+        self.of_r.started = false;
+        self.pid.reset();
+        self.filtered = T::ZERO;
+    }
+
+    /// From reference and measured output to the command: filter, control, limit.
+    ///
+    /// Whatever comes, the command is finite, within the limits and no further from the last one than slew allows.
+    /// A measurement that is not finite is skipped: the filter keeps its memory, the command its value. One at which the
+    /// filter's sum leaves the numbers is skipped too, and the filter begins again with the next.
+    pub fn step(&mut self, r: T, y: T) -> T {
+        // x + (-0) is x for every x, even for -0
+        self.step_with(r, y, -T::ZERO)
+    }
+
+    /// [`step`](Self::step) with a command that is added before the limits.
+    pub fn step_with(&mut self, r: T, y: T, feedforward: T) -> T {
+        if !y.is_finite() {
+            return self.pid.hold();
+        }
+        let filtered = self.filter.step(y);
+        if !filtered.is_finite() {
+            self.filter.reset();
+            return self.pid.hold();
+        }
+        let sections = self.design.biquads.sections();
+        if !self.of_y.started {
+            self.of_y.rest_at(filtered);
+        }
+        let filtered = self.of_y.step(sections, filtered);
+        if !filtered.is_finite() {
+            self.of_y.started = false;
+            return self.pid.hold();
+        }
+        self.filtered = filtered;
+        let ramped = self.ramp.step(r, filtered);
+        let r = self.referred(ramped);
+        let terms = match &self.table {
+            Some(table) => table.at(self.filtered),
+            None => self.pid.terms(),
+        };
+        self.pid.step_by(terms, r, self.filtered, feedforward)
+    }
+
+    /// The reference after the biquads, which stood at the first output before it, as the ramp did: a step of the reference is
+    /// filtered too. One that is not finite passes them by, and the PID skips it.
+    fn referred(&mut self, r: T) -> T {
+        if !r.is_finite() {
+            return r;
+        }
+        if !self.of_r.started {
+            self.of_r.rest_at(self.filtered);
+        }
+        let filtered = self.of_r.step(self.design.biquads.sections(), r);
+        self.of_r.started = filtered.is_finite();
+        filtered
+    }
+
+    /// Another design from the next sample on, without a bump in the command: filter, ramp and derivative keep what they
+    /// remember, other biquads begin at rest where the former's signals were, and the integral term takes up what the other
+    /// terms change by.
+    ///
+    /// Without integral action what it took up stays; [`reset`](Self::reset) forgets it.
+    ///
+    /// # Errors
+    /// The first setting that is outside its range, or another sample time; nothing is changed then.
+    pub fn set_design(&mut self, design: Design<T>) -> Result<(), Refused> {
+        let (ts, now) = (design.pid.ts, self.design.pid.ts);
+        let expected = "the sample time at which the controller runs";
+        Refused::unless(ts == now, "Ts", expected, ts.to_f64())?;
+        let new = Self::new(design)?;
+        self.filter = new.filter.after(&self.filter);
+        self.ramp = new.ramp.after(&self.ramp);
+        let terms = match &new.table {
+            Some(table) => table.at(self.filtered),
+            None => new.pid.terms(),
+        };
+        if design.biquads != self.design.biquads {
+            for (memory, last) in [
+                (&mut self.of_y, self.filtered),
+                (&mut self.of_r, self.pid.reference()),
+            ] {
+                if memory.started {
+                    memory.rest_at(last);
+                }
+            }
+        }
+        self.pid.change(design.pid, terms);
+        (self.table, self.design) = (new.table, design);
+        Ok(())
+    }
+
+    /// Hands the command to the operator: from the next sample on it is `u`, within the limits.
+    ///
+    /// Filter, ramp and derivative keep following, and the integral term is what automatic would need for the same command.
+    /// A sample without measurement applies `u` all the same.
+    ///
+    /// # Errors
+    /// A command that is not finite.
+    pub fn set_manual(&mut self, u: T) -> Result<(), Refused> {
+        self.pid.set_manual(u)
+    }
+
+    /// Hands the command back to the controller, which begins where the operator's was.
+    pub fn set_automatic(&mut self) {
+        self.pid.set_automatic();
+    }
+
+    /// Whether the command is the operator's.
+    pub fn is_manual(&self) -> bool {
+        self.pid.is_manual()
+    }
+
+    /// The feedback after its filter, at the last step.
+    pub fn filtered(&self) -> T {
+        self.filtered
+    }
+
+    /// What it is made from.
+    pub fn design(&self) -> &Design<T> {
+        &self.design
+    }
+
+    /// The schedule as the step uses it, one row more than points at least, the last one repeated; empty for constant gains.
+    pub fn rows(&self) -> &[Row<T>] {
+        self.table.as_ref().map_or(&[], Table::rows)
+    }
+
+    /// What a step computes with; `None` where the gains follow a schedule or there are biquads.
+    pub fn numbers(&self) -> Option<Numbers<T>> {
+        let (samples, lag, observer) = self.filter.parts();
+        let constant = self.table.is_none() && self.design.biquads.is_empty();
+        constant.then(|| Numbers {
+            terms: self.pid.terms(),
+            tracking: self.settings().tracking(),
+            samples,
+            lag,
+            observer: observer.weights(),
+            ramp: self.ramp.change(),
+        })
+    }
+
+    /// The settings of the PID.
+    pub fn settings(&self) -> &Settings<T> {
+        self.pid.settings()
+    }
+}
+
+impl<T: Real> Controller<T> for PidController<T> {
+    fn reset(&mut self) {
+        self.reset();
+    }
+
+    fn step_with(&mut self, r: T, y: T, feedforward: T) -> T {
+        self.step_with(r, y, feedforward)
+    }
+
+    fn filtered(&self) -> T {
+        self.filtered
+    }
+
+    fn ts(&self) -> T {
+        self.settings().ts
+    }
+
+    fn limits(&self) -> (T, T) {
+        (self.settings().u_min, self.settings().u_max)
+    }
+}
+
+#[cfg(test)]
+mod tests;
