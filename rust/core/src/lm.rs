@@ -468,6 +468,48 @@ mod tests {
         );
     }
 
+    /// A line that falls towards 3, whose sensitivities explode beyond 2.
+    struct Cliff;
+
+    impl Problem for Cliff {
+        fn parameters(&self) -> usize {
+            1
+        }
+
+        fn cost(&mut self, t: &[f64]) -> Option<f64> {
+            Some(0.5 * (3.0 - t[0]) * (3.0 - t[0]))
+        }
+
+        fn normal_equations(&mut self, t: &[f64], jtj: &mut [f64], jte: &mut [f64]) {
+            jtj[0] = if t[0] > 2.0 { 1e9 } else { 1.0 };
+            jte[0] = 3.0 - t[0];
+        }
+    }
+
+    #[test]
+    fn takes_back_a_step_into_exploding_sensitivities() {
+        let run = |most_growth: f64, start: f64| {
+            let settings = Settings {
+                damping: Damping::Identity,
+                max_iterations: 40,
+                most_growth,
+                ..Settings::default()
+            };
+            let none = Monitor::default();
+            minimize(&mut Cliff, vec![start], &settings, &none, |_, _| {})
+        };
+        // the first step leads to 2.997, and 1e9 in its place leads nowhere
+        assert!(run(f64::INFINITY, 0.0).theta[0] > 2.99);
+        let careful = run(1e3, 0.0);
+        assert!(
+            careful.theta[0] > 1.5 && careful.theta[0] < 2.9,
+            "{careful:?}"
+        );
+        assert_eq!(careful.iterations, 40);
+        // a start within the explosion has nothing to go back to
+        assert!(run(1e3, 2.5).theta[0] > 2.4);
+    }
+
     /// The valley, two costs at once; it tells only those below the limit and counts the calls.
     struct Twice(usize);
 

@@ -93,7 +93,8 @@ pub struct NeuralSSFit {
 const FIRST_MU: f64 = 1e-2;
 /// Relative reduction of the cost that counts as none.
 const NO_REDUCTION: f64 = 1e-7;
-/// Growth of the sensitivities' squares from one step to the next that counts as an explosion.
+/// Growth of the sensitivities' squares from one step to the next that counts as an explosion. Asked of positions, where
+/// it has been measured: friction that overshoots the standstill is what explodes.
 const MOST_GROWTH: f64 = 1e3;
 /// Share of a position's starts that begin with an estimate of its friction, where one shows.
 const BRAKED: f64 = 0.7;
@@ -415,7 +416,10 @@ impl<'a> Task<'a> {
             damping: Damping::Identity,
             mu: FIRST_MU,
             reduction_tolerance: NO_REDUCTION,
-            most_growth: MOST_GROWTH,
+            most_growth: match self.shape.integrator {
+                true => MOST_GROWTH,
+                false => f64::INFINITY,
+            },
             ..lm::Settings::default()
         }
     }
