@@ -302,8 +302,8 @@ impl System {
             return false;
         }
         let trace = |jtj: &[f64]| jtj.iter().step_by(self.size + 1).sum::<f64>();
-        let exploded =
-            !self.last.0.is_empty() && !(trace(&self.jtj) <= most_growth * trace(&self.last.0));
+        let (now, before) = (trace(&self.jtj), trace(&self.last.0));
+        let exploded = !self.last.0.is_empty() && (now.is_nan() || now > most_growth * before);
         if exploded {
             self.jtj.copy_from_slice(&self.last.0);
             self.jte.copy_from_slice(&self.last.1);

@@ -241,10 +241,11 @@ impl<'a> Task<'a> {
             let theta = self.resumed(model);
             return problem.cost(&theta).map(|_| (theta, 0));
         }
-        if let Some(theta) = self.braked(random) {
-            if problem.cost(&theta).is_some() {
-                return Some((theta, 0));
-            }
+        if let Some(theta) = self
+            .braked(random)
+            .filter(|theta| problem.cost(theta).is_some())
+        {
+            return Some((theta, 0));
         }
         starts::drawn(self.monitor, || {
             let theta = match &self.linear {
