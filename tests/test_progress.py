@@ -80,7 +80,10 @@ def test_identify_and_tune_show_a_bar_in_a_notebook_unless_progress_is_given(cel
     sewfast.identify(data, model="neural_oe", na=1, nb=1, hidden=2, starts=1, progress=None)
     assert len(cell) == 1
     steps: list[int] = []
-    given: Any = lambda done, total, best: steps.append(done)  # noqa: E731
+
+    def given(done: int, total: int, best: float) -> None:
+        steps.append(done)
+
     sewfast.identify(data, model="neural_oe", na=1, nb=1, hidden=2, starts=1, progress=given)
     assert steps
     assert len(cell) == 1

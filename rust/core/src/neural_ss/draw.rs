@@ -32,7 +32,7 @@ pub(super) fn beside(
     if shape.integrator && random.between(0.0, 1.0) < SWITCHING {
         switch(&mut theta, linear, shape, random);
     }
-    hold(&mut theta, shape);
+    shape.hold(&mut theta);
     theta
 }
 
@@ -44,13 +44,6 @@ pub(super) fn hide(theta: &mut [f64], shape: Shape, scale: f64, random: &mut Ran
     theta[parts.bh].fill_with(|| random.between(-1.0, 1.0));
     theta[parts.e].fill_with(|| REACH * random.normal());
     theta[parts.g].fill_with(|| REACH * random.normal());
-}
-
-/// Sets the parameters that an integrator holds.
-pub(super) fn hold(theta: &mut [f64], shape: Shape) {
-    for (i, value) in shape.held() {
-        theta[i] = value;
-    }
 }
 
 /// The first hidden unit becomes a smooth sign of the speed.

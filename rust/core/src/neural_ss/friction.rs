@@ -13,6 +13,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::draw;
 use super::problem::Experiment;
+use super::scaling::root_mean_square;
 use super::shape::Shape;
 use crate::random::Random;
 
@@ -79,9 +80,7 @@ impl Friction {
                 .collect()
         };
         let speeds: Vec<Vec<[f64; 2]>> = experiments.iter().map(speeds).collect();
-        let known = speeds.iter().flatten().filter(|v| v[0].is_finite());
-        let (count, squares) = known.fold((0.0, 0.0), |(n, q), v| (n + 1.0, q + v[0] * v[0]));
-        let speed = (squares / f64::max(count, 1.0)).sqrt();
+        let speed = root_mean_square(speeds.iter().flatten().map(|v| v[0]));
         let width = shape.inputs + 3;
         let (mut left, mut right) = (DMatrix::zeros(width, width), DVector::zeros(width));
         let mut moving = 0;
@@ -153,7 +152,7 @@ impl Friction {
             theta[parts.wu.start + shape.inputs..][..shape.inputs].fill(0.0);
             theta[parts.bh.start + 1] = 1.0;
         }
-        draw::hold(&mut theta, shape);
+        shape.hold(&mut theta);
         theta
     }
 
@@ -192,6 +191,17 @@ fn triangular_means(v: &[f64], inputs: usize, m: usize) -> Vec<f64> {
 mod tests {
     use super::*;
 
+    fn position(nx: usize) -> Shape {
+        Shape {
+            nx,
+            nk: 1,
+            inputs: 1,
+            outputs: 1,
+            hidden: 2,
+            integrator: true,
+        }
+    }
+
     /// A carriage of one input that is pushed to and fro against dry friction, its position in scaled units.
     fn carriage(a: f64, b: f64, c: f64, d: f64) -> Experiment {
         let (mut speed, mut position) = (0.0, 0.0);
@@ -213,14 +223,7 @@ mod tests {
 
     #[test]
     fn finds_the_friction_of_a_carriage() {
-        let shape = Shape {
-            nx: 2,
-            nk: 1,
-            inputs: 1,
-            outputs: 1,
-            hidden: 2,
-            integrator: true,
-        };
+        let shape = position(2);
         let experiments = [carriage(0.995, 1e-3, 2e-4, 3e-5)];
         for seed in 0..8 {
             let found = Friction::estimated(shape, &experiments, &mut Random::new(seed)).unwrap();
@@ -238,14 +241,7 @@ mod tests {
         use super::super::problem::{Attempts, Training};
         use crate::Monitor;
         use crate::lm::Problem;
-        let shape = Shape {
-            nx: 3,
-            nk: 1,
-            inputs: 1,
-            outputs: 1,
-            hidden: 2,
-            integrator: true,
-        };
+        let shape = position(3);
         let truth = Friction {
             a: 0.995,
             b: vec![1e-3],
@@ -271,14 +267,7 @@ mod tests {
 
     #[test]
     fn estimates_nothing_where_nothing_moves() {
-        let shape = Shape {
-            nx: 2,
-            nk: 1,
-            inputs: 1,
-            outputs: 1,
-            hidden: 2,
-            integrator: true,
-        };
+        let shape = position(2);
         for y in [vec![0.0; 400], vec![f64::NAN; 400], vec![1.0; 2]] {
             let v = vec![0.5; y.len()];
             let experiments = [Experiment {

@@ -107,9 +107,7 @@ impl NeuralSS {
                 theta[to.c.start + p * nx + state] = REACH * random.normal() / size.max(1.0);
             }
         }
-        for (i, value) in new.held() {
-            theta[i] = value;
-        }
+        new.hold(&mut theta);
         Self::new(new, self.output(), theta, self.scaling.clone(), statistics)
     }
 

@@ -7,6 +7,7 @@
 //! filtered; the training that follows, with the pole at 1 and the outputs as they are, mends that.
 
 use super::problem::Experiment;
+use super::scaling::root_mean_square;
 use super::shape::Shape;
 
 /// Time constant of the leak, in samples in which a position moves by a quarter of its standard deviation.
@@ -24,9 +25,7 @@ impl Leak {
     pub fn new(experiments: &[Experiment], pace: usize) -> Option<Self> {
         let pole = 1.0 - 1.0 / (MEMORY * pace as f64).max(2.0);
         let mut filtered: Vec<Experiment> = experiments.iter().map(|e| behind(pole, e)).collect();
-        let known = filtered.iter().flat_map(|e| &e.y).filter(|y| !y.is_nan());
-        let (count, squares) = known.fold((0.0, 0.0), |(n, q), y| (n + 1.0, q + y * y));
-        let scale = (squares / f64::max(count, 1.0)).sqrt();
+        let scale = root_mean_square(filtered.iter().flat_map(|e| e.y.iter().copied()));
         if scale <= 0.0 {
             return None;
         }

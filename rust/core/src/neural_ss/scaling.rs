@@ -77,6 +77,13 @@ impl Scaling {
     }
 }
 
+/// Root mean square of the values that are numbers; 0 where there are none.
+pub(super) fn root_mean_square(values: impl Iterator<Item = f64>) -> f64 {
+    let known = values.filter(|v| !v.is_nan());
+    let (count, squares) = known.fold((0.0, 0.0), |(n, q), v| (n + 1.0, q + v * v));
+    (squares / f64::max(count, 1.0)).sqrt()
+}
+
 /// Mean and standard deviation of the values that are numbers.
 pub(super) fn moments(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
     let known = values.filter(|v| !v.is_nan());

@@ -110,6 +110,13 @@ impl Shape {
         column.chain([(self.pole(), 1.0)]).chain(units).collect()
     }
 
+    /// Sets the parameters that an integrator holds.
+    pub(super) fn hold(&self, theta: &mut [f64]) {
+        for (i, value) in self.held() {
+            theta[i] = value;
+        }
+    }
+
     /// Share of the weight decay that a parameter bears: the network's weights bear it, its biases a tenth of it.
     pub(super) fn decay(&self, parameter: usize) -> f64 {
         let parts = self.parts();

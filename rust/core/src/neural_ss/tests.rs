@@ -14,9 +14,7 @@ fn random_model(seed: u64, shape: Shape, output: OutputFunction) -> NeuralSS {
         let width = range.len() / shape.nx;
         theta[range].iter_mut().for_each(|t| *t /= width as f64);
     }
-    for (i, value) in shape.held() {
-        theta[i] = value;
-    }
+    shape.hold(&mut theta);
     let ramp = |n: usize, first: f64| (0..n).map(|i| first + 0.3 * i as f64).collect::<Vec<_>>();
     let scaling = Scaling {
         u_mean: ramp(shape.inputs, 0.1),

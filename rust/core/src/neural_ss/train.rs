@@ -97,9 +97,9 @@ const NO_REDUCTION: f64 = 1e-7;
 /// it has been measured: friction that overshoots the standstill is what explodes.
 const MOST_GROWTH: f64 = 1e3;
 /// Share of a position's starts that begin with an estimate of its friction, where one shows.
-const BRAKED: f64 = 0.7;
+const WITH_FRICTION: f64 = 0.7;
 /// One of so many iterations of a position is for its recent motion.
-const LED: usize = 3;
+const RECENT_MOTION: usize = 3;
 /// Samples of an experiment that its state is first estimated from.
 const STATE_SAMPLES: usize = 2_000;
 /// Share of the output's variance that a linear model is taken to miss while it is.
@@ -214,7 +214,7 @@ impl<'a> Task<'a> {
             let mut problem =
                 problem::Training::new(&self.experiments, network, decay, &attempts, self.monitor);
             let (theta, dead) = self.drawn(&mut problem, start, &mut random)?;
-            let (theta, taken) = self.led(&mut problem, theta, &attempts);
+            let (theta, taken) = self.by_recent_motion(&mut problem, theta, &attempts);
             Some((self.train(&mut problem, theta, &attempts, taken)?, dead))
         };
         // nothing is drawn where models are trained further, so that another training would end the same
@@ -242,7 +242,7 @@ impl<'a> Task<'a> {
             return problem.cost(&theta).map(|_| (theta, 0));
         }
         if let Some(theta) = self
-            .braked(random)
+            .with_friction(random)
             .filter(|theta| problem.cost(theta).is_some())
         {
             return Some((theta, 0));
@@ -258,10 +258,10 @@ impl<'a> Task<'a> {
     }
 
     /// Most starts of a position know its dry friction; none where it is not their turn, or none shows.
-    fn braked(&self, random: &mut Random) -> Option<Vec<f64>> {
+    fn with_friction(&self, random: &mut Random) -> Option<Vec<f64>> {
         let Shape { nx, outputs, .. } = self.shape;
         let is_position = self.shape.integrator && nx > 1 && outputs == 1;
-        if !is_position || random.between(0.0, 1.0) >= BRAKED {
+        if !is_position || random.between(0.0, 1.0) >= WITH_FRICTION {
             return None;
         }
         let found = Friction::estimated(self.shape, &self.experiments, random)?;
@@ -271,7 +271,7 @@ impl<'a> Task<'a> {
     }
 
     /// A position is trained by its recent motion first; the parameters from which it goes on, and the iterations taken.
-    fn led(
+    fn by_recent_motion(
         &self,
         problem: &mut problem::Training,
         theta: Vec<f64>,
@@ -281,7 +281,7 @@ impl<'a> Task<'a> {
         if !is_position || !self.settings.initial.is_empty() {
             return (theta, 0);
         }
-        let iterations = self.settings.max_iterations / LED;
+        let iterations = self.settings.max_iterations / RECENT_MOTION;
         let found = self.leaking(theta.clone(), iterations);
         let found = found.and_then(|theta| self.with_positions(problem, theta, attempts));
         (found.unwrap_or(theta), iterations)
