@@ -127,7 +127,7 @@ def test_a_port_that_others_reach_needs_a_word_and_is_warned_of() -> None:
     with pytest.raises(LinkError, match="whoever reaches the port can start the motor"):
         VirtualDevice(endpoint="tcp", address="0.0.0.0:0")
     with (
-        pytest.warns(UserWarning, match="whoever reaches this port can start the motor"),
+        pytest.warns(UserWarning, match="anyone who can reach this port can start the motor"),
         VirtualDevice(endpoint="tcp", address="0.0.0.0:0", anyone=True),
     ):
         pass

@@ -150,7 +150,7 @@ def copies(kind: str, place: Place, asked: dict[str, Any]) -> dict[str, str]:
     if kind == "run":
         reference, seed, scale, file = (asked[k] for k in ("reference", "seed", "scale", "file"))
         r = f"{scale!r} * sewfast.signals.reference({reference!r}, {seed})"
-        load = f"controller = sewfast.load_pid({asked['controller']!r})"
+        load = f"controller = sewfast.load_controller({asked['controller']!r})"
         call = f"sewfast.run(controller, drive, {r}, name={reference!r}, file={file!r})"
         words = ["run", asked["controller"], f"--reference={REFERENCE}", "-o", file]
         # the command line takes a reference as it is
