@@ -5,7 +5,7 @@
     make battery [SPLIT=..] [FAMILIES="NAME .."] [SEEDS=..] [QUICK=1]
 
 Each family draws another system for every seed. Which families there are, and which of the two
-halves each belongs to, stands in benches/battery/families.py; what the errors are held against in
+halves each belongs to, stands in benches/battery/families/; what the errors are held against in
 references.py; what is reported in scoring.py. Families of the half HELD are for the record: no rule
 may be made on them.
 """
