@@ -189,6 +189,12 @@ def test_own_references_are_verified_on() -> None:
     np.testing.assert_array_equal(found.comparisons[0].predicted.r, r)
 
 
+def test_a_constant_reference_is_judged_by_the_way_from_rest() -> None:
+    found = commission(VirtualMachine(), references={"hold": np.full(1500, 900.0)}, **SMALL)
+    assert found.is_verified
+    assert found.comparisons[0].span == 900.0
+
+
 def test_a_drive_behind_a_port_is_commissioned_as_the_machine_is(whole: Commissioning) -> None:
     with VirtualDevice(fast=True) as device, connect(device.port) as drive:
         drive.set_limits()

@@ -215,10 +215,17 @@ def test_demands_that_contradict_are_refused_before_anything_moves(
     assert bench.played == 0
 
 
-@pytest.mark.parametrize("samples", [[], [1.0, float("nan")]])
-def test_a_reference_that_cannot_be_run_is_refused(samples: list[float]) -> None:
+@pytest.mark.parametrize(
+    ("samples", "match"),
+    [
+        ([], "finite samples in the reference 'mine'"),
+        ([1.0, float("nan")], "finite samples in the reference 'mine'"),
+        ([0.0, 0.0], "a reference that moves"),
+    ],
+)
+def test_a_reference_that_cannot_be_run_is_refused(samples: list[float], match: str) -> None:
     bench = bent()
-    with pytest.raises(DataError, match="finite samples in the reference 'mine'"):
+    with pytest.raises(DataError, match=match):
         commission(bench, references={"mine": samples})
     assert bench.played == 0
 

@@ -483,4 +483,8 @@ def _whole(name: str, reference: ArrayLike) -> FloatArray:
             f"expected finite samples in the reference {name!r}, got "
             + ("none" if not len(samples) else "NaN or infinity")
         )
+    if not samples.any():
+        raise DataError(
+            f"expected a reference that moves, got {name!r} of zeros only; give the speed to follow"
+        )
     return samples

@@ -29,6 +29,11 @@ class Disagreement(Refusal):
     """Networks that do not agree on what a controller does."""
 
 
+def span(reference: FloatArray) -> float:
+    """Of a reference and the rest that it is begun at, in its unit."""
+    return float(max(reference.max(), 0.0) - min(reference.min(), 0.0))
+
+
 def agreeing(
     controller: Controller, ensemble: Ensemble, references: Mapping[str, FloatArray]
 ) -> Ensemble:
@@ -45,7 +50,7 @@ def agreeing(
         runs = np.array([_output(controller, m, r) for m in members])
         known = np.isfinite(runs).all(axis=1)
         median = np.median(runs[known], axis=0) if known.any() else np.zeros(len(r))
-        distances = np.sqrt(np.mean((runs - median) ** 2, axis=1)) / np.ptp(r)
+        distances = np.sqrt(np.mean((runs - median) ** 2, axis=1)) / span(r)
         apart = np.maximum(apart, np.where(known, distances, np.inf))
     kept = [m for m, share in zip(members, apart, strict=True) if share <= DISAGREE]
     if 2 * len(kept) < len(members):
@@ -96,8 +101,8 @@ class Comparison:
 
     @property
     def span(self) -> float:
-        """Of the reference [RPM]."""
-        return float(np.ptp(self.predicted.r))
+        """Of the reference and the rest that it is begun at [RPM]: what errors are judged by."""
+        return span(self.predicted.r)
 
     @property
     def apart(self) -> float | None:
@@ -230,7 +235,7 @@ class Watching:
         n = self._k * len(predicted.r)
         self._u, self._counts = np.full(n, np.nan), np.full(n, np.nan)
         self._judged, self._squares, self._railed = 0, 0.0, 0
-        self._allowed = n * (SURE * APART * float(np.ptp(predicted.r))) ** 2
+        self._allowed = n * (SURE * APART * span(predicted.r)) ** 2
         self._window = max(10, round(WINDOW / self._Ts))
         self._most = max(
             TIMES * self._chatter_predicted(), FLOOR * max(abs(controller.u_min), controller.u_max)
@@ -253,8 +258,8 @@ class Watching:
     def _chatter_predicted(self) -> float:
         """The largest of any window, from sample to sample of the machine [V]."""
         changes = np.diff(self._predicted.u, append=self._predicted.u[-1]) / math.sqrt(self._k)
-        span = min(len(changes), max(5, self._window // self._k))
-        return float(np.sqrt(np.convolve(changes**2, np.ones(span) / span, "valid").max()))
+        width = min(len(changes), max(5, self._window // self._k))
+        return float(np.sqrt(np.convolve(changes**2, np.ones(width) / width, "valid").max()))
 
     def _chatters(self, end: int) -> None:
         recent = self._u[max(0, end - self._window) : end]
