@@ -24,16 +24,10 @@ from sewfast.identification.folds import (
     free_runs,
 )
 from sewfast.identification.orders import LinearTable, raised
-from sewfast.identification.search import (
-    HALVING_ITERATIONS,
-    STILL_NEAR,
-    Candidate,
-    Search,
-    best_of_each_size,
-    counting,
-)
+from sewfast.identification.search import HALVING_ITERATIONS, STILL_NEAR, Search
 from sewfast.identification.task import Task
 from sewfast.identification.training import Start, Structure
+from sewfast.identification.trials import Candidate, best_of_each_size, counting
 
 F = NDArray[np.float64]
 SMALL: dict[str, Any] = {"nx": 1, "nk": 1, "hidden": 4, "starts": 2, "iterations": 30}

@@ -22,19 +22,17 @@ from .effort import Look, Pool, Stopped
 from .folds import LEAST_HELD_OUT, SHARE, Split, compared, errors_of, folds, free_runs
 from .linear import linear_model
 from .orders import LEAST_GAIN, LinearCandidate, LinearTable
-from .search import (
-    BY_FAR,
-    STILL_NEAR,
-    STILL_WORTH_A_FEEDTHROUGH,
-    Candidate,
-    Search,
-    best_of_each_size,
-    counting,
-    decayed,
-    median_of,
-)
+from .search import STILL_NEAR, Search, decayed
 from .task import Provenance, Task, arrays, documented, finite, with_provenance, wrap
 from .training import Network, Request, Start, Structure, train
+from .trials import (
+    BY_FAR,
+    STILL_WORTH_A_FEEDTHROUGH,
+    Candidate,
+    best_of_each_size,
+    counting,
+    median_of,
+)
 from .verdict import verdict
 
 WORTH_IT = 0.9

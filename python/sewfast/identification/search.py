@@ -1,55 +1,33 @@
-"""The search for a structure: cheap trials of many, longer ones of the better half, then growth.
-
-All sizes are counted in multiplications, not in seconds, so that a seed gives the same model on
-every machine; a time budget is converted into multiplications by the speed of the first trials.
-"""
+"""The search for a structure: cheap trials of many, longer ones of the better half, then growth."""
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from .. import _core
 from ..dataset import Diagnosis, diagnose
-from ..errors import FitError
-from ..models.base import EnsembleCore
-from .effort import Look, Pool
-from .folds import RUNAWAY, Errors, Split, compared, errors_of, free_runs
-from .orders import MISLED, LinearTable, slowest_pole
-from .outputs import ABS, LINEAR, Output, named, rectified_start, rms_error, suggested
-from .task import Provenance, Task, arrays, finite
-from .training import Network, Request, Start, Structure, train
+from .folds import compared
+from .orders import MISLED, slowest_pole
+from .outputs import ABS, LINEAR, Output, named, rms_error, suggested
+from .task import arrays
+from .training import Request, Structure
+from .trials import SHARE_OF_LINEAR, WORTH_A_FEEDTHROUGH, Candidate, Trials, best_of_each_size
 
-SMALL, LARGE = 3_750, 45_000
-"""Samples up to which a data set is small, and above which it is large."""
-TRIAL_SAMPLES, TRIAL_SAMPLES_LARGE = 20_000, 12_000
-"""Fitted samples of a trial. Fewer than 20,000 cost a factor of up to 3 in the final error."""
-SEARCH_OPERATIONS, SEARCH_OPERATIONS_LARGE = 1.8e11, 5e11
-"""Multiplications after which nothing further is tried; a core makes some 1.4e10 in a second."""
-WORST = 3.0
-"""Starts whose J exceeds this multiple of the best one's are left out of a candidate."""
-SAMPLES_PER_PARAMETER = 4
 MOST_NX, MOST_HIDDEN, MOST_HIDDEN_SMALL = 8, 32, 16
 LEAST_DECAY, MOST_DECAY = 1e-10, 1e-1
 DECAY_MATTERS = 6_000
 """Samples from which on the climb does not ask for another weight decay; the end does."""
 HOPELESS = 0.98
 """Where the best network of the second halving is not below this part of the linear error."""
-BY_FAR = 0.2
-"""Below this part of the linear error on the newest part a network needs no other evidence."""
 WORTH_A_STEP = 0.97
 """A step of the climb must bring the error below this part."""
 LEAST_STEP = 0.01
 """Relative gain of a step that is taken where the gain is known to be one."""
-WORTH_A_FEEDTHROUGH, STILL_WORTH_A_FEEDTHROUGH = 0.5, 0.9
-"""nk = 0 is no plant for a loop, and a smoothed speed leans ahead a little: it must be worth it, at
-equal size, and beside the best with a delay, whose further states may have made up for it."""
 WORTH_A_RECTIFIER = 0.8
 FAR_BEHIND = 2.0
 """A kind of network whose best is this many times worse than the other's climbs no further."""
@@ -70,143 +48,13 @@ SAYS_LITTLE = 0.5
 INTEGRATING_ITERATIONS, INTEGRATING_STARTS = 60, 8
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A structure, its trained starts, and the held-out errors of their median."""
-
-    structure: Structure
-    starts: tuple[Start, ...]
-    errors: Errors
-    iterations: int
-    converged: bool = False
-
-    @property
-    def error(self) -> float:
-        """Root mean square on what is held out."""
-        return self.errors.rmse
-
-    @property
-    def members(self) -> list[Start]:
-        """The starts that count: sound unless none is, not far worse than the best; best first."""
-        return counting(self.starts)
-
-    @property
-    def models(self) -> list[Network]:
-        """Of the starts that count."""
-        return [s.model for s in self.members]
-
-    @property
-    def is_sound(self) -> bool:
-        """Whether any start has passed the guard."""
-        return any(s.is_sound for s in self.starts)
-
-    def to_json(self) -> Provenance:
-        """For the table."""
-        row = self.structure.to_json() | {"starts": len(self.starts)}
-        row |= {"sound": sum(s.is_sound for s in self.starts)}
-        return row | {"free_run_rmse": finite(self.error)}
-
-
-def counting(starts: Iterable[Start]) -> list[Start]:
-    """Sound starts, unless there is none, that are not far worse than the best; best first."""
-    starts = list(starts)
-    able = sorted([s for s in starts if s.is_sound] or starts, key=lambda s: s.cost)
-    return [s for s in able if s.cost <= WORST * able[0].cost]
-
-
-def best_of_each_size(ranked: Iterable[Candidate]) -> list[Candidate]:
-    """The first one of each kind and number of states."""
-    found: dict[tuple[object, ...], Candidate] = {}
-    for c in ranked:
-        found.setdefault(c.structure.size, c)
-    return list(found.values())
-
-
-def median_of(models: Sequence[Network]) -> Any:
-    """One model as it is, several as their median."""
-    return models[0] if len(models) == 1 else EnsembleCore(tuple(models), "median")
-
-
-@dataclass
-class Search:
-    """One search: what it works on, what it has spent, and the candidates that it found.
-
-    Attributes
-    ----------
-    trials : tuple of Split
-        The folds, as short as trials are; the newest first.
-    linear : LinearTable
-    candidates : dict of Structure to Candidate
-        On the newest fold; the latest training of each.
-    operations : float
-        Multiplications spent.
-    """
-
-    task: Task
-    folds: tuple[Split, ...]
-    pool: Pool
-    wants_network: bool = False
-    candidates: dict[Structure, Candidate] = field(default_factory=dict)
-    operations: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.samples = len(self.task.data)
-        self.inputs = self.task.data.n_inputs
-        size = TRIAL_SAMPLES_LARGE if self.is_large else TRIAL_SAMPLES
-        self.trials = tuple(f.shortened(size, size) for f in self.folds[:2])
-        self.linear = LinearTable(self.task, self.folds[:1], self.pool)
-        self.most = SEARCH_OPERATIONS_LARGE if self.is_large else SEARCH_OPERATIONS
-        self.budget, self.rate = self.most, 0.0
-        # part of a time budget at which the present stage has to be done; 0 for the search's own
-        self.share = 0.0
-        # whether the screening has found that the output depends on the input of the same sample
-        self.feeds_through = False
-        self._starts: dict[tuple[int, int, str, int], _core.LinearModel | None] = {}
-        self._guarded = arrays(self.task.data)
-
-    @property
-    def is_small(self) -> bool:
-        """Little data: variance is what matters, and many starts are cheap."""
-        return self.samples <= SMALL
-
-    @property
-    def is_large(self) -> bool:
-        """Much data: little variance, and larger networks to gain from."""
-        return self.samples > LARGE
-
-    @property
-    def until(self) -> float | None:
-        """When the present stage has to end, on `time.perf_counter`."""
-        return self.pool.clock.until(self.share or self._share_of_search)
-
-    @property
-    def _share_of_search(self) -> float:
-        """Networks that will not be better by far are verified, which takes time as well."""
-        best, linear = self.best, self.linear
-        if self.wants_network or best is None or not linear.eligible:
-            return SHARE_OF_SEARCH
-        # the climb can be expected to halve the error
-        is_by_far = best.error <= 2.0 * BY_FAR * linear.best.rmse
-        return SHARE_OF_SEARCH if is_by_far else SHARE_OF_SEARCH_VERIFIED
-
-    def able(self, operations: float) -> float:
-        """The part of these operations for which the present stage has time, at most 1."""
-        if self.until is None:
-            return 1.0
-        left = max(0.0, self.until - time.perf_counter())
-        return min(1.0, left * self.rate / max(operations, 1.0))
-
-    @property
-    def decay(self) -> float:
-        """Weight decay to begin with."""
-        return 1e-4 if self.samples < 4_000 else 1e-7 if self.is_large else 1e-5
+class Search(Trials):
+    """One search: its steps, and what is tried in each."""
 
     @property
     def is_released(self) -> bool:
         """Whether a finalist is asked with less weight decay: the climb has not asked for it."""
         return self.samples >= DECAY_MATTERS
-
-    # --- the steps ------------------------------------------------------------------------------
 
     def run(self) -> None:
         """Linear models, then networks of every likely size, then what grows out of the best."""
@@ -329,45 +177,6 @@ class Search:
             return None
         new = min(better, key=lambda c: c.error)
         return new if new.converged else self.continued([new], 30, [0])[0]
-
-    def best_of(self, kind: str) -> Candidate | None:
-        """The lowest held-out error of one kind, a sound candidate first."""
-        return self._lowest(c for c in self.eligible if c.structure.kind == kind)
-
-    def _ranked(self, kind: str) -> list[Candidate]:
-        """The best sound candidate of each size of one kind, the best first."""
-        sound = [c for c in self.eligible if c.structure.kind == kind and c.is_sound]
-        return best_of_each_size(sorted(sound, key=lambda c: c.error))
-
-    @property
-    def best(self) -> Candidate | None:
-        """The lowest held-out error, a sound candidate first."""
-        return self._lowest(self.eligible)
-
-    @property
-    def eligible(self) -> list[Candidate]:
-        """Candidates that may be chosen: with direct feedthrough only where it is worth it."""
-        found = [c for c in self.candidates.values() if math.isfinite(c.error) and c.starts]
-        delayed = min((c.error for c in found if c.structure.nk > 0), default=math.inf)
-        worth = STILL_WORTH_A_FEEDTHROUGH if self.feeds_through else WORTH_A_FEEDTHROUGH
-        most = delayed if self.task.nk == 0 else worth * delayed
-        return [c for c in found if c.structure.nk > 0 or c.error < most]
-
-    @staticmethod
-    def _lowest(candidates: Iterable[Candidate]) -> Candidate | None:
-        finite_ = [c for c in candidates if math.isfinite(c.error)]
-        sound = [c for c in finite_ if c.is_sound] or finite_
-        return min(sound, key=lambda c: c.error, default=None)
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the search has had its share of operations or of the time budget."""
-        self.pool.clock.truncated |= self._is_late
-        return self._is_late or self.operations >= self.budget
-
-    @property
-    def _is_late(self) -> bool:
-        return self.until is not None and time.perf_counter() >= self.until
 
     # --- what is tried --------------------------------------------------------------------------
 
@@ -558,194 +367,6 @@ class Search:
         # go on for long
         is_small_step = worth == WORTH_A_STEP and not self.is_large
         return is_small_step and ratio < -max(2.0 * deviation, LEAST_STEP)
-
-    def is_affordable(self, s: Structure, fold: int = 0) -> bool:
-        """Whether the fold has samples enough for its parameters."""
-        wanted = s.parameters(self.inputs) * SAMPLES_PER_PARAMETER
-        is_given = None not in (self.task.nx, self.task.hidden)
-        return is_given or wanted <= len(self.trials[fold].fitted)
-
-    # --- training -------------------------------------------------------------------------------
-
-    def tried(
-        self,
-        wanted: Sequence[tuple[Structure, int, int]],
-        fold: int = 0,
-        share: float | None = None,
-    ) -> list[Candidate]:
-        """Candidates of (structure, iterations, starts), trained afresh side by side."""
-        self._prepare([s for s, _, _ in wanted], fold)
-        requests = [self.request(s, i, starts=n, fold=fold) for s, i, n in wanted]
-        found = self.trained(requests, share)
-        pairs = zip(wanted, found, strict=True)
-        return [self.judged(s, starts, i, fold) for (s, i, _), starts in pairs]
-
-    def continued(
-        self, candidates: Sequence[Candidate], iterations: int, fresh: Sequence[int]
-    ) -> list[Candidate]:
-        """Candidates trained further, each with so many fresh starts; never worse than before."""
-        requests = []
-        for c, more in zip(candidates, fresh, strict=True):
-            requests.append(self.request(c.structure, iterations, initial=c.models))
-            total = c.iterations + iterations
-            more = min(more, self._limited(more + len(c.starts)) - len(c.starts))
-            requests.append(
-                self.request(c.structure, total, starts=max(more, 0), first=len(c.starts))
-            )
-        trained = iter(self.trained(requests))
-        found = []
-        for c in candidates:
-            starts = [*next(trained), *next(trained)]
-            new = self.judged(c.structure, starts, c.iterations + iterations)
-            if new.error > c.error:
-                new = replace(c, iterations=c.iterations + iterations, converged=True)
-            else:
-                new = replace(new, converged=new.error > 0.995 * c.error)
-            self.candidates[c.structure] = new
-            found.append(new)
-        return found
-
-    def request(
-        self,
-        s: Structure,
-        iterations: int,
-        *,
-        starts: int = 0,
-        first: int = 0,
-        initial: Sequence[Network] = (),
-        fold: int = 0,
-    ) -> Request:
-        """Starts of a structure on a trial's data, or models to be trained further on them."""
-        data = self.trials[fold]
-        needs_linear = not initial or s.kind == "neural_oe"
-        linear = self.start(s.nx, s.nk, s.output, fold) if needs_linear else None
-        most = self.task.iterations
-        iterations = iterations if most is None else min(iterations, most)
-        return Request(s, data.fitted, data.held, iterations, linear, starts, first, tuple(initial))
-
-    def trained(
-        self,
-        requests: Sequence[Request],
-        share: float | None = None,
-    ) -> list[list[Start]]:
-        """Starts of every request, looked at by the guard."""
-        wanted = sum(r.operations for r in requests)
-        self.operations += wanted
-        began = time.perf_counter()
-        if share is None:
-            share = max(self.pool.share, min(0.6, 0.25 + 0.35 * self.operations / self.budget))
-        found = train(
-            requests,
-            self.pool,
-            self.task.seed,
-            workers=self.task.workers,
-            until=self.until,
-            share=share,
-        )
-        if not self._is_late:
-            self._calibrate(time.perf_counter() - began, wanted)
-        return self.guarded(found)
-
-    def guarded(self, found: Sequence[Sequence[Start]]) -> list[list[Start]]:
-        """The starts with what the guard finds on whole records."""
-        flat = [start for starts in found for start in starts]
-        bounds = self.bounding_models
-
-        def fault(start: Start, look: Look) -> str:
-            return _core.guard(start.model, self._guarded, linear=bounds)
-
-        faults = iter(self.pool.map(fault, flat, until=self.pool.clock.until(SHARE_OF_GUARD)))
-        return [[replace(s, fault=_said(next(faults))) for s in starts] for starts in found]
-
-    @property
-    def bounding_models(self) -> list[_core.LinearModel]:
-        """Linear models whose memory bounds that of networks."""
-        if not self.linear.eligible:
-            return []
-        most = max(2, self.linear.choice.order)
-        usable = [c for c in self.linear.eligible if c.order <= most]
-        model = max(usable, key=lambda c: c.order).models[0]
-        return [] if model is None else [model]
-
-    def judged(
-        self, s: Structure, starts: Sequence[Start], iterations: int, fold: int = 0
-    ) -> Candidate:
-        """The candidate with the held-out errors of its members' median."""
-        models = [start.model for start in counting(starts)]
-        held = self.trials[fold]
-        errors = errors_of(free_runs(median_of(models), held), held) if models else RUNAWAY
-        found = Candidate(s, tuple(starts), errors, iterations)
-        if fold == 0:
-            self.candidates[s] = found
-            self.pool.best = min(self.pool.best, found.error)
-        return found
-
-    def start(
-        self, nx: int, nk: int, output: Output = LINEAR, fold: int = 0
-    ) -> _core.LinearModel | None:
-        """The linear model that networks of this order and delay begin at."""
-        if fold == 0 and output != ABS:
-            self.linear.add([(nx, nk)], self.until)
-            return self.linear.start(nx, nk)
-        key = (nx, nk, output.name, fold)
-        if key not in self._starts:
-            self._prepare([Structure(nx, nk, 1, 0.0, output)], fold)
-        return self._starts[key]
-
-    def _prepare(self, structures: Sequence[Structure], fold: int) -> None:
-        """Fit what `start` needs, side by side."""
-        plain = {(s.nx, s.nk) for s in structures if s.output != ABS}
-        if fold == 0:
-            self.linear.add(sorted(plain), self.until)
-        keys = {
-            (s.nx, s.nk, s.output.name, fold): s for s in structures if s.output == ABS or fold > 0
-        }
-        missing = [(k, s) for k, s in keys.items() if k not in self._starts]
-
-        def fit(job: tuple[Any, Structure], look: Look) -> _core.LinearModel | None:
-            s, data = job[1], self.trials[fold].fitted
-            try:
-                if s.output == ABS:
-                    return rectified_start(data, s.nx, s.nk, look)
-                return _core.fit_oe(
-                    arrays(self.trials[fold].shortened(6_000, 6_000).fitted),
-                    na=s.nx, nb=s.nx + 1, nk=s.nk, max_iterations=60, progress=look,
-                ).model  # fmt: skip
-            except FitError:
-                return None
-
-        for (key, _), model in zip(
-            missing, self.pool.map(fit, missing, until=self.until), strict=True
-        ):
-            self._starts[key] = model
-
-    # --- effort ---------------------------------------------------------------------------------
-
-    def _limited(self, starts: int) -> int:
-        return starts if self.task.starts is None else min(starts, self.task.starts)
-
-    def _calibrate(self, seconds: float, operations: float) -> None:
-        """Convert what is left of a time budget into multiplications, by the best speed so far."""
-        until = self.until
-        # short trainings of small networks say little of the speed of long ones
-        self.rate = max(self.rate, operations / max(seconds, 1e-3))
-        if until is not None:
-            left = max(0.0, until - time.perf_counter())
-            self.budget = min(self.most, self.operations + self.rate * left)
-
-    def rows(self) -> Iterator[Provenance]:
-        """The table: linear models, then networks in the order of their trials."""
-        yield from self.linear.rows()
-        yield from (c.to_json() for c in self.candidates.values())
-
-
-SHARE_OF_GUARD = 0.92
-SHARE_OF_LINEAR, SHARE_OF_SEARCH, SHARE_OF_SEARCH_VERIFIED = 0.12, 0.58, 0.45
-"""Parts of a time budget after which no linear model, and no network, is tried any more."""
-
-
-def _said(fault: str | None) -> str:
-    return "not asked within the time budget" if fault is None else fault
 
 
 def decayed(s: Structure, factor: float) -> Structure:
