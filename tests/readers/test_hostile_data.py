@@ -139,7 +139,7 @@ def test_an_interruption_between_two_pieces_of_work_keeps_the_best(
     def interrupt(self: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(choice.Choice, "_worth_asking", interrupt)
+    monkeypatch.setattr(choice.Choice, "worth_asking", interrupt)
     with pytest.raises(Interrupted) as caught:
         identify(dataset(*record()), time_budget=2.0)
     assert isinstance(caught.value.best, Model)

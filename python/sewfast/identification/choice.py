@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,43 +19,31 @@ from ..dataset.experiment import mean_square, weights_of
 from ..errors import FitError, Interrupted
 from ..models import Ensemble, LinearOE, Model, NeuralOE, NeuralSS
 from .effort import Look, Pool, Stopped
-from .folds import LEAST_HELD_OUT, SHARE, Split, compared, errors_of, folds, free_runs
+from .finals import (
+    ALONE,
+    ENOUGH_TO_CHOOSE_BY,
+    SHARE_OF_FINAL,
+    SHARE_OF_REFIT,
+    SHARE_OF_VERIFYING,
+    WORTH_IT,
+    WORTH_LOOKING,
+    Finals,
+)
+from .folds import LEAST_HELD_OUT, SHARE, compared, errors_of, folds, free_runs
 from .linear import linear_model
 from .orders import LEAST_GAIN, LinearCandidate, LinearTable
-from .search import STILL_NEAR, Search, decayed
+from .search import Search
 from .task import Provenance, Task, arrays, documented, finite, with_provenance, wrap
-from .training import Network, Request, Start, Structure, train
+from .training import Network, Request, Structure, train
 from .trials import (
-    BY_FAR,
     STILL_WORTH_A_FEEDTHROUGH,
     Candidate,
-    best_of_each_size,
     counting,
     median_of,
 )
 from .verdict import verdict
 
-WORTH_IT = 0.9
-"""A network must bring the error below this part of the best linear model's."""
-WORTH_LOOKING = 0.97
-"""Where the median of the starts does not even reach this, nothing is asked."""
-LEAST_PASSING = 0.5
-"""Part of the network sizes that must beat linear models on the earlier part, too."""
-VERIFIED = 4
-"""Structures that are learned again on the earlier fold."""
-FINALISTS = 3
-RELEASED = 0.01
-"""Weight decay makes the search surer, and biases what it finds: one finalist is trained with this
-part of it as well, and what is held out decides."""
-WITHIN, WITHIN_LARGE = 2.0, 1.3
-"""How much larger than the best one's a finalist's error may be."""
 WORTH_AN_INTEGRATOR = 0.7
-ENOUGH_TO_CHOOSE_BY = 1_500
-"""Held-out samples from which on a single start, or structure, may be taken instead of a median."""
-MOST_STARTS_LARGE = 2
-"""Starts of a finalist that are trained to the end on much data."""
-ALONE = 0.98
-"""A single start must bring the error of the median below this part: a median errs less often."""
 ABOUT_EQUAL = 0.02
 """Up to this larger an error on little data counts as none: fewer parameters are the safer bet."""
 MOST_MEMBERS = 15
@@ -65,17 +53,6 @@ LIKELY = 1.5
 """Linear models whose error on the newest part is within this factor are asked on earlier ones."""
 TOGETHER = 1.25
 """On little data the median goes over all finalists whose error is within this factor."""
-FINAL_OPERATIONS, FINAL_OPERATIONS_LARGE = 1.5e11, 1.25e12
-LEGS = 3
-LEG_ITERATIONS = 80
-BEHIND = 1.15
-"""A finalist that is behind by more after a leg is not trained on."""
-BEHIND_LARGE = 1.01
-"""The same on much data, where held-out errors are sure and iterations dear."""
-FINISHED = 0.995
-"""A leg that does not bring the error below this part ends the training."""
-SHARE_OF_VERIFYING, SHARE_OF_FINAL, SHARE_OF_REFIT = 0.64, 0.84, 0.9
-"""Parts of a time budget at which each stage has to be done."""
 
 
 def auto(task: Task) -> Model:
@@ -105,26 +82,18 @@ def _identified(task: Task, wants_network: bool) -> Model:
 
 
 @dataclass
-class Choice:
+class Choice(Finals):
     """The end of a search: from its candidates to one model."""
 
-    search: Search
-    began: float
-    reasons: list[str] = field(default_factory=list)
     is_linear: bool = False
-
-    def __post_init__(self) -> None:
-        self.task = self.search.task
-        self.wants_network = self.search.wants_network
-        self.clock = self.search.pool.clock
-        self.split = self.search.folds[0]
+    is_interrupted: bool = False
 
     def model(self) -> Model:
         """The chosen model, with the second best as alternatives."""
-        asked = self._worth_asking()
+        asked = self.worth_asking()
         while asked:
-            finalists = self._finalists(asked)
-            finished = self._finish(finalists)
+            finalists = self.finalists(asked)
+            finished = self.finish(finalists)
             chosen = self._sound_and_settled(finished)
             if chosen:
                 others = [c for c in finished if c.is_sound and c not in chosen]
@@ -136,245 +105,6 @@ class Choice:
             return self._network(self._any_network(), [])
         self.is_linear = True
         return self._linear()
-
-    # --- against the linear model ---------------------------------------------------------------
-
-    @property
-    def linear(self) -> LinearCandidate | None:
-        """The linear model with the lowest held-out error: what a network has to beat."""
-        return self.search.linear.best if self.search.linear.eligible else None
-
-    def _worth_asking(self) -> list[Candidate]:
-        """Candidates credibly better than linear, the best first."""
-        found = self.search.eligible
-        ranked = sorted([c for c in found if c.is_sound], key=lambda c: c.error)
-        linear = self.linear
-        if self.wants_network or linear is None:
-            if self.wants_network:
-                self.reasons.append("a state-space network was asked for")
-            only = [c for c in ranked or found if c.structure.kind == "neural_ss"]
-            return only if self.wants_network else ranked
-        if not ranked:
-            self.reasons.append(self._why_no_network(found))
-            return []
-        ratio = ranked[0].error / max(linear.rmse, 1e-300)
-        self.reasons.append(
-            f"free-run error of the best network on data not trained on: {100 * ratio:.1f} % of "
-            "the best linear model's"
-        )
-        if ratio >= WORTH_LOOKING:
-            return []
-        return ranked if ratio <= BY_FAR else self._verified(ranked, linear)
-
-    def _why_no_network(self, found: Sequence[Candidate]) -> str:
-        if found:
-            return "no network forgets its initial state and withstands larger inputs"
-        if self.clock.truncated:
-            return "the time budget left no time for a network"
-        return "no network could be trained: too few samples, or no start had a finite free run"
-
-    def _verified(self, ranked: Sequence[Candidate], linear: LinearCandidate) -> list[Candidate]:
-        """Those that beat linear models on two later parts, most starts alone as well.
-
-        Forward chaining: the best structure of each size is learned again from what is before an
-        earlier fifth, so that a win by luck, of the start or of the part, is none.
-        """
-        search = self.search
-        asked = best_of_each_size(ranked)[:VERIFIED]
-        newest = search.trials[0]
-        winning = [c for c in asked if self._usual(c, newest) < WORTH_IT * linear.rmse]
-        passed, parts = [(c.error, c) for c in winning], 1
-        if winning and len(search.trials) > 1:
-            search.share = SHARE_OF_VERIFYING
-            earlier = LinearTable(self.task, [search.folds[1]], search.pool)
-            nk = linear.nk
-            # another part may ask for another order, and the network has to beat that one, too
-            orders = {1, 2, 3, search.linear.choice.order, linear.order}
-            earlier.add([(o, nk) for o in sorted(orders)], search.until)
-            bound = earlier.best.rmse if earlier.candidates else math.inf
-            able = [c for c in winning if search.is_affordable(c.structure, 1)]
-            again = self._learned_again(able)
-            # what the time budget has left unasked has not failed; where it is all, one part counts
-            if again or not able:
-                learned = [c for c, _ in again]
-                unasked = [c for c in able if c not in learned]
-                asked = [c for c in asked if c not in unasked]
-                passed, parts = [(c.error, c) for c in winning if c not in able], 2
-            for c, other in again:
-                if self._usual(other, search.trials[1]) < WORTH_IT * bound:
-                    passed.append((math.sqrt(c.error * other.error), c))
-        passed.sort(key=lambda p: p[0])
-        self.reasons.append(
-            f"{len(passed)} of {len(asked)} network sizes beat it, most starts alone as well, on "
-            f"{parts} later part(s)"
-        )
-        if len(passed) < LEAST_PASSING * len(asked):
-            # one of four sizes passes by luck now and then; what the data show, most sizes can see
-            return []
-        sizes = {c.structure.size: c for _, c in passed}
-        kept = []
-        for c in ranked:
-            size = sizes.get(c.structure.size)
-            if size is not None and c.structure.hidden <= size.structure.hidden:
-                kept.append(c)
-        order = [id(c) for _, c in passed]
-        return sorted(kept, key=lambda c: order.index(id(c)) if id(c) in order else len(order))
-
-    def _learned_again(self, able: Sequence[Candidate]) -> list[tuple[Candidate, Candidate]]:
-        """Those that could be learned afresh from what is before the earlier fifth, and how.
-
-        With a time budget in as many starts as there is time for; if not even two of each, then the
-        best structures alone.
-        """
-        search = self.search
-        starts, least = 3 if search.is_large else 6, 2
-        samples = len(search.trials[1].fitted)
-        wanted = [80 * c.structure.operations(search.inputs, samples) for c in able]
-        share = search.able(starts * sum(wanted))
-        starts = max(least, int(share * starts))
-        ends = [n for n in range(1, len(able) + 1) if search.able(starts * sum(wanted[:n])) == 1.0]
-        some = able[: max(ends, default=1)]
-        found = search.tried([(c.structure, 80, starts) for c in some], 1)
-        return [(c, other) for c, other in zip(some, found, strict=True) if other.starts]
-
-    def _usual(self, c: Candidate, held: Split) -> float:
-        """The error of the median of the starts, or of the median start where that is larger.
-
-        One start of six that is stuck says nothing of the others.
-        """
-        each = [errors_of(free_runs(m, held), held).rmse for m in c.models]
-        return max(c.error, float(np.median(each)))
-
-    # --- training to the end --------------------------------------------------------------------
-
-    def _finalists(self, ranked: Sequence[Candidate]) -> list[Candidate]:
-        """Up to three of different structure, about as good as the best; of different size first.
-
-        A search that has led to the wrong size has led there with all its neighbours.
-        """
-        within = WITHIN_LARGE if len(self.task.data) >= 20_000 else WITHIN
-        first = ranked[0]
-        found: list[Candidate] = []
-        seen: set[tuple[object, ...]] = set()
-        for c in (*best_of_each_size(ranked), *ranked):
-            s = c.structure
-            key = (s.kind, s.nx, s.hidden, s.nk, s.integrator, s.output.name)
-            close = c.error <= within * first.error or (
-                # held-out data that repeat what was learned do not tell small networks apart
-                s.integrator and first.structure.integrator and self.search.repeats
-            )
-            if close and key not in seen and len(found) < FINALISTS:
-                seen.add(key)
-                found.append(c)
-        if all(c.structure.integrator for c in found):
-            plain = next((c for c in ranked if not c.structure.integrator), None)
-            if plain is not None and plain.error <= STILL_NEAR * first.error:
-                found[FINALISTS - 1 :] = [plain]
-        if self.search.is_released and not first.structure.integrator:
-            released = replace(first, structure=decayed(first.structure, RELEASED))
-            found[FINALISTS - 1 :] = [released]
-        return found
-
-    def _finish(self, finalists: Sequence[Candidate]) -> list[Candidate]:
-        """More starts, then all fitted data, until nothing is gained any more."""
-        search = self.search
-        search.share = SHARE_OF_FINAL
-        until = search.until
-        budget = FINAL_OPERATIONS_LARGE if search.is_large else FINAL_OPERATIONS
-        budget *= search.able(budget)
-        alive = self._with_more_starts(finalists, budget / 3.0)
-        alive = [self._rejudged(c) for c in alive]
-        spent = 0.0
-        for leg in range(LEGS):
-            if self.clock.over(SHARE_OF_FINAL):
-                break
-            requests = self._leg(alive, (budget - spent) / (LEGS - leg))
-            spent += sum(r.operations for r in requests)
-            found = search.guarded(
-                train(
-                    requests,
-                    search.pool,
-                    self.task.seed,
-                    workers=self.task.workers,
-                    until=until,
-                    share=0.6 + 0.35 * (leg + 1) / LEGS,
-                )
-            )
-            following = [self._better(c, starts) for c, starts in zip(alive, found, strict=True)]
-            gained = any(
-                n.error < FINISHED * c.error for c, n in zip(alive, following, strict=True)
-            )
-            alive = following
-            if not search.is_small and not (search.repeats and alive[0].structure.integrator):
-                best = min(c.error for c in alive)
-                behind = BEHIND_LARGE if search.is_large else BEHIND
-                alive = [c for c in alive if c.error <= behind * best]
-            if not gained:
-                break
-        return sorted(alive, key=lambda c: c.error)
-
-    def _with_more_starts(self, finalists: Sequence[Candidate], budget: float) -> list[Candidate]:
-        search, requests = self.search, []
-        for c in finalists:
-            many = 16 if search.is_small else 12 if c.structure.integrator else 6
-            many = 4 if len(self.task.data) >= 25_000 and not c.structure.integrator else many
-            wanted = many if self.task.starts is None else self.task.starts
-            request = search.request(c.structure, 60, starts=1, first=20)
-            can = int(budget / len(finalists) / request.operations)
-            requests.append(replace(request, starts=max(0, min(wanted - len(c.starts), can))))
-        added = search.trained(requests, 0.6)
-        return [
-            search.judged(c.structure, [*c.starts, *starts], c.iterations)
-            for c, starts in zip(finalists, added, strict=True)
-        ]
-
-    def _leg(self, alive: Sequence[Candidate], budget: float) -> list[Request]:
-        """One leg for the starts that count: as many iterations as the budget allows."""
-        task, requests = self.task, []
-        for c in alive:
-            each = c.structure.operations(self.search.inputs, len(self.split.fitted))
-            share = budget / len(alive)
-            most = LEG_ITERATIONS if task.iterations is None else task.iterations
-            able = max(1, int(share / (each * 30)))
-            kept = c.models[: min(able, MOST_STARTS_LARGE) if self.search.is_large else able]
-            iterations = int(min(most, max(5, share / (each * len(kept)))))
-            linear = self.search.start(c.structure.nx, c.structure.nk, c.structure.output)
-            requests.append(
-                Request(
-                    c.structure,
-                    self.split.fitted,
-                    self.split.held,
-                    iterations,
-                    linear if c.structure.kind == "neural_oe" else None,
-                    initial=kept,
-                )
-            )
-        return requests
-
-    def _rejudged(self, c: Candidate) -> Candidate:
-        """The same starts, judged on all that is held out."""
-        models = c.models
-        return replace(c, errors=errors_of(free_runs(median_of(models), self.split), self.split))
-
-    def _better(self, before: Candidate, starts: Sequence[Start]) -> Candidate:
-        """The candidate after a leg, unless that has made it worse."""
-        if not starts:
-            return before
-        after = self._rejudged(replace(before, starts=tuple(starts)))
-        if after.error <= 1.02 * before.error and (after.is_sound or not before.is_sound):
-            return self._alone(after)
-        return before
-
-    def _alone(self, c: Candidate) -> Candidate:
-        """The best start alone, where long held-out data say that it is better so."""
-        if len(c.models) < 2 or self.split.scored < ENOUGH_TO_CHOOSE_BY:
-            return c
-        if self.search.is_large:
-            return self._rejudged(replace(c, starts=(c.members[0],)))
-        if c.structure.integrator and self.search.repeats:
-            return c
-        one = self._rejudged(replace(c, starts=(c.members[0],)))
-        return one if one.error < ALONE * c.error else c
 
     # --- the choice -----------------------------------------------------------------------------
 
@@ -444,7 +174,8 @@ class Choice:
     def _refitted(self, c: Candidate, most: int) -> list[Network]:
         """A few iterations on everything, the held-out part included, where that stays sound."""
         search, models = self.search, c.models[:most]
-        if self.split.is_given or self.clock.over(SHARE_OF_REFIT):
+        is_late = self.is_interrupted or self.clock.over(SHARE_OF_REFIT)
+        if self.split.is_given or is_late:
             return models
         linear = search.start(c.structure.nx, c.structure.nk, c.structure.output)
         request = Request(
@@ -609,7 +340,7 @@ class Choice:
         bound = math.inf if linear is None else linear.rmse
         if best is not None and best.error < WORTH_IT * bound and not self.is_linear:
             self.reasons = ["interrupted: the best candidate so far"]
-            self._refitted = lambda c, most: c.models[:most]  # type: ignore[method-assign]
+            self.is_interrupted = True
             model = self._network([best], [])
             return with_provenance(model, {"termination": "interrupted"})
         if linear is None or linear.models[0] is None:
