@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -255,6 +256,17 @@ def test_the_best_of_every_number_of_states_is_trained_beyond_the_screening() ->
     assert near <= {c.structure.size for c in kept}
     firsts = best_of_each_size(sorted(alive, key=lambda c: c.error))
     assert len({c.structure.size for c in firsts}) == len(firsts)
+
+
+@pytest.mark.parametrize(("samples", "hidden"), [(4_000, 16), (46_000, 8)])
+def test_on_much_data_the_smaller_of_equal_networks_goes_on(samples: int, hidden: int) -> None:
+    data = bent_data(samples, noise=0.1)
+    search = Search(task(data), folds(data), pool())
+    held = Errors(np.ones(50), np.ones(50))
+    least, close, worse = (replace(held, squares=held.squares * f**2) for f in (1.0, 1.01, 1.03))
+    sizes = {16: least, 8: close, 4: worse}
+    found = [Candidate(Structure(2, 1, h, 1e-7), (), e, 60) for h, e in sizes.items()]
+    assert search.simplest(found).structure.hidden == hidden
 
 
 def test_a_repeated_trajectory_is_seen_and_a_random_one_is_not() -> None:

@@ -194,7 +194,8 @@ class Finals:
         first = ranked[0]
         found: list[Candidate] = []
         seen: set[tuple[object, ...]] = set()
-        for c in (*best_of_each_size(ranked), *ranked):
+        firsts = [self._simplest_of_size(c, ranked) for c in best_of_each_size(ranked)]
+        for c in (*firsts, *ranked):
             s = c.structure
             key = (s.kind, s.nx, s.hidden, s.nk, s.integrator, s.output.name)
             close = c.error <= within * first.error or (
@@ -209,9 +210,15 @@ class Finals:
             if plain is not None and plain.error <= STILL_NEAR * first.error:
                 found[FINALISTS - 1 :] = [plain]
         if self.search.is_released and not first.structure.integrator:
-            released = replace(first, structure=decayed(first.structure, RELEASED))
+            leading = found[0]
+            released = replace(leading, structure=decayed(leading.structure, RELEASED))
             found[FINALISTS - 1 :] = [released]
         return found
+
+    def _simplest_of_size(self, c: Candidate, ranked: Sequence[Candidate]) -> Candidate:
+        """The network of the same states with the fewest hidden units that does about as well."""
+        same = [o for o in ranked if replace(o.structure, hidden=c.structure.hidden) == c.structure]
+        return self.search.simplest([c, *same])
 
     def finish(self, finalists: Sequence[Candidate]) -> list[Candidate]:
         """More starts, then all fitted data, until nothing is gained any more."""

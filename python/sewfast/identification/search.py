@@ -175,7 +175,7 @@ class Search(Trials):
         better = [new for new in own if self._is_step(new, best)]
         if not better:
             return None
-        new = min(better, key=lambda c: c.error)
+        new = self.simplest(better)
         return new if new.converged else self.continued([new], 30, [0])[0]
 
     # --- what is tried --------------------------------------------------------------------------
@@ -363,9 +363,10 @@ class Search(Trials):
         if found.error < worth * best.error:
             # of many steps on few held-out samples some gain by luck, and lead to large networks
             return not self.is_small or ratio < -deviation
-        # below the noise a step gains little of the error, and still gains; on much data that would
-        # go on for long
-        is_small_step = worth == WORTH_A_STEP and not self.is_large
+        # below the noise a step gains little of the error, and still gains; on much data wider
+        # networks would go on doing so for long
+        is_cheap = not self.is_large or found.structure.hidden <= best.structure.hidden
+        is_small_step = worth == WORTH_A_STEP and is_cheap
         return is_small_step and ratio < -max(2.0 * deviation, LEAST_STEP)
 
 

@@ -33,6 +33,9 @@ WORST = 3.0
 SAMPLES_PER_PARAMETER = 4
 BY_FAR = 0.2
 """Below this part of the linear error on the newest part a network needs no other evidence."""
+NEARLY = 1.02
+"""Up to this larger an error counts as equal in trials on much data: the smaller network trains
+further in the same time, and extrapolates better."""
 WORTH_A_FEEDTHROUGH, STILL_WORTH_A_FEEDTHROUGH = 0.5, 0.9
 """nk = 0 is no plant for a loop, and a smoothed speed leans ahead a little: it must be worth it, at
 equal size, and beside the best with a delay, whose further states may have made up for it."""
@@ -224,6 +227,12 @@ class Trials:
         finite_ = [c for c in candidates if math.isfinite(c.error)]
         sound = [c for c in finite_ if c.is_sound] or finite_
         return min(sound, key=lambda c: c.error, default=None)
+
+    def simplest(self, candidates: Sequence[Candidate]) -> Candidate:
+        """The best; on much data the one with the fewest parameters that does about as well."""
+        most = (NEARLY if self.is_large else 1.0) * min(c.error for c in candidates)
+        near = [c for c in candidates if c.error <= most]
+        return min(near, key=lambda c: (c.structure.parameters(self.inputs), c.error))
 
     def rows(self) -> Iterator[Provenance]:
         """The table: linear models, then networks in the order of their trials."""
