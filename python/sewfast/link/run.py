@@ -122,12 +122,39 @@ ARMED_SILENCE = 0.25
 REST_US = 120_000
 """Device's time without a count after which a motor is taken to be at rest; ARM wants 100 ms."""
 STEP_US = 20_000
+MEASURED_WITHIN = 1.0
+"""Longest wait for a device that boots to have measured well [s]."""
 ARMS_WITHIN = 10.0
 """Longest wait for a motor that the device finds still moving [s]."""
 HALTED = "expected a run to start, it was stopped before by another thread"
 MOVING = 11
 """Result of ARM where the motor moves."""
 _ENDS = ("finished", "stopped", "tripped")
+
+
+def wait_for_rest(link: Connection, timeout: float) -> None:
+    """Wait until the encoder has not moved for a while, as `Drive.wait_for_rest` says."""
+    status = link.status()
+    since = began = status.time_us
+    # a device on credit that takes none must not be waited for either
+    deadline = time.monotonic() + timeout + (5.0 if link.identity.on_credit else 0.0)
+    while status.time_us - since < REST_US:
+        if status.time_us - began > timeout * 1e6 or time.monotonic() > deadline:
+            raise LinkError(
+                f"expected the motor at rest within {timeout:g} s, it turns at "
+                f"{status.speed_rpm:.0f} RPM; brake it or wait longer"
+            )
+        link.let_pass(STEP_US)
+        before, status = status, link.status()
+        if status.counts != before.counts:
+            since = status.time_us
+
+
+def await_measurement(link: Connection) -> None:
+    """Boot ends by itself after some good samples; a device on credit needs time for them."""
+    deadline = time.monotonic() + MEASURED_WITHIN
+    while link.status().state == "boot" and time.monotonic() < deadline:
+        link.let_pass(STEP_US)
 
 
 def arm_at_rest(link: Connection) -> None:
@@ -381,8 +408,7 @@ class Run:
         if not n:
             return
         first, last = int(times[0]), int(times[-1])
-        self._heard = self.link.heard = time.monotonic()
-        self.link.newest = max(self.link.newest, last)
+        self._heard = time.monotonic()
         named = dict(zip(self.layout.names, columns, strict=True))
         if last - first == (n - 1) * self.period:
             self._deliver((first - start_us) // self.period, named)
