@@ -71,10 +71,13 @@ class Drive(Unique):
         """As `connect`, for a drive of a class of one's own."""
         if watchdog is not None and not 0.001 <= real("watchdog", watchdog) <= 10.0:
             raise SettingError(
-                f"expected a watchdog of .001 to 10 s, got {watchdog}; .1 suits most"
-            )
+                name="watchdog", expected=".001 to 10 s", received=f"{watchdog}",
+                remedy=".1 suits most",
+            )  # fmt: skip
         if not 0.0 <= real("resume", resume) < math.inf:
-            raise SettingError(f"expected resume of 0 s or more, got {resume}; 1 suits most")
+            raise SettingError(
+                name="resume", expected="0 s or more", received=f"{resume}", remedy="1 suits most"
+            )
         port = open_port(url, baud)
         try:
             return cls(Connection(port, watchdog=watchdog, patience=PATIENCE, resume=resume))
@@ -170,7 +173,10 @@ class Drive(Unique):
         """Seconds until up to 200 bytes come back."""
         sent = time.monotonic()
         if self._link.ask(Kind.ECHO, data) != data:
-            raise LinkError("expected the bytes sent to ECHO, got others; fix the firmware")
+            raise LinkError(
+                name=self._link.port.url, expected="the bytes sent to ECHO", received="others",
+                remedy="fix the firmware",
+            )  # fmt: skip
         return time.monotonic() - sent
 
     # --- what it may do ---------------------------------------------------------------------------
@@ -276,7 +282,9 @@ class Drive(Unique):
             Values that fitted; `stream` sends the rest while it runs.
         """
         if what not in ("commands", "references"):
-            raise SettingError(f"expected what='commands' or 'references', got {what!r}")
+            raise SettingError(
+                name="what", expected="'commands' or 'references'", received=repr(what)
+            )
         plan = Plan("commands", values)  # type: ignore[arg-type]
         run = Run(
             self._link, plan, Layout(self.channels[:2], 1), self._profile(what, plan), _Nobody()
@@ -475,8 +483,10 @@ class Drive(Unique):
         limits = self.limits()
         if not limits.are_set:
             raise SettingError(
-                "expected limits set on the device, it has none in this session; set them to what "
-                "motor and machine can take: drive.set_limits(volt=..., speed_rpm=..., ...)"
+                name="limits",
+                expected="those of motor and machine, set in this session",
+                received="none",
+                remedy="set them first: drive.set_limits(volt=..., speed_rpm=..., ...)",
             )
         if what == "references":
             return profiles.references(plan.values, limits)
@@ -489,9 +499,10 @@ class Drive(Unique):
         status = self.status()
         if status.state == "tripped":
             raise LinkError(
-                f"expected an idle device, it has tripped: {status.reason}; find out why, then "
-                "clear it (drive.clear())"
-            )
+                name=self._link.port.url, expected="an idle device",
+                received=f"one that has tripped: {status.reason}",
+                remedy="find out why, then clear it (drive.clear())",
+            )  # fmt: skip
         if status.state in ("armed", "running"):
             self.stop()
 

@@ -104,8 +104,9 @@ def run_on_host(
     require_controller(controller, drive, call)
     if not isinstance(drive, Drive):
         raise SettingError(
-            f"expected a Drive to run on, got {type(drive).__name__}; connect to one, then {call}"
-        )
+            name="drive", expected="a Drive to run on", received=type(drive).__name__,
+            remedy=f"connect to one, then {call}",
+        )  # fmt: skip
     ratio = _ratio(drive, controller)
     r = _reference(reference, controller, seed)
     plan = Plan("direct", r, columns=columns, batch=batch or _batch(ratio))
@@ -166,21 +167,22 @@ def _ratio(drive: Drive, controller: Controller) -> int:
     """Samples of the drive in a period of the loop."""
     if os.name == "nt":
         raise SettingError(
-            "expected Linux or macOS for a loop on the host, got Windows; run the controller on "
-            "the device"
-        )
+            expected="Linux or macOS for a loop on the host", received="Windows",
+            remedy="run the controller on the device",
+        )  # fmt: skip
     if drive.identity.on_credit:
         raise SettingError(
-            "expected a device in real time for a loop on the host, this one's time stands still "
-            "between grants; start it without --fast"
-        )
+            name="drive", expected="a device in real time for a loop on the host",
+            received="one whose time stands still between grants", remedy="start it without --fast",
+        )  # fmt: skip
     ratio = controller.Ts / drive.identity.Ts
     whole = round(ratio)
     if whole < 2 or abs(ratio - whole) > 1e-6 * whole:
         raise SettingError(
-            "expected a controller at a whole number, 2 or more, of the device's "
-            f"{drive.identity.Ts:g} s, got {controller.Ts:g} s; convert it with at_period, or run "
-            "it on the device"
+            name="controller",
+            expected=f"one at a whole number, 2 or more, of the device's {drive.identity.Ts:g} s",
+            received=f"{controller.Ts:g} s",
+            remedy="convert it with at_period, or run it on the device",
         )
     return whole
 
@@ -193,9 +195,9 @@ def _reference(reference: str | ArrayLike, controller: Controller, seed: int) ->
         return reference_samples(reference, controller, seed)
     if controller.gains.y_unit.lower() != "rpm":
         raise SettingError(
-            f"expected a controller in RPM for the reference {reference!r}, got "
-            f"{controller.gains.y_unit!r}; give the reference as samples"
-        )
+            name="controller", expected=f"one in RPM for the reference {reference!r}",
+            received=repr(controller.gains.y_unit), remedy="give the reference as samples",
+        )  # fmt: skip
     assert isinstance(reference, str)
     return np.ascontiguousarray(signals.reference(reference, seed)[::step])
 
@@ -231,9 +233,9 @@ def _raise_where_it_never_ran(outcome: Mapping[str, Any]) -> None:
         raise LinkError(told)
     if outcome["name"] == "unanswered":
         raise LinkError(
-            f"expected an answer to {wire.Kind(outcome['command']).name}, none came; check cable "
-            "and device, then connect again"
-        )
+            expected=f"an answer to {wire.Kind(outcome['command']).name}", received="none",
+            remedy="check cable and device, then connect again",
+        )  # fmt: skip
 
 
 def _run(

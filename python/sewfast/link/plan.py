@@ -66,20 +66,23 @@ class Plan:
 
     def __post_init__(self) -> None:
         if self.mode not in wire.MODES:
-            raise SettingError(f"expected a mode out of {', '.join(wire.MODES)}, got {self.mode!r}")
+            raise SettingError(
+                name="mode", expected=f"one of {', '.join(wire.MODES)}", received=repr(self.mode)
+            )
         values = vector("values", self.values).copy()
         if not 0 < len(values) < 2**32 or not np.all(np.isfinite(values)):
             raise SettingError(
-                f"expected at least one value, all finite, got {len(values)} of which "
-                f"{int(np.count_nonzero(~np.isfinite(values)))} are not; mend the signal"
-            )
+                name="values", expected="at least one, all finite",
+                received=f"{len(values)}, {np.count_nonzero(~np.isfinite(values))} of them not",
+                remedy="mend the signal",
+            )  # fmt: skip
         values.setflags(write=False)
         object.__setattr__(self, "values", values)
         if (self.controller is None) == (self.mode == "controller"):
             raise SettingError(
-                f"expected a controller in mode 'controller' and none elsewhere, got "
-                f"{'none' if self.controller is None else 'one'} in mode {self.mode!r}"
-            )
+                name="controller", expected="one in mode 'controller' and none elsewhere",
+                received=f"{'none' if self.controller is None else 'one'} in mode {self.mode!r}",
+            )  # fmt: skip
 
 
 class Sink(Protocol):
@@ -172,15 +175,16 @@ def require_capable(plan: Plan, identity: Identity) -> None:
     """
     if not identity.capabilities & _CAPABILITIES[plan.mode]:
         raise SettingError(
-            f"expected a device that offers mode {plan.mode!r}, {identity.name!r} does not; "
-            "choose another mode or update its firmware"
-        )
+            name="mode", expected="one that the device offers",
+            received=f"{plan.mode!r}, which {identity.name!r} does not",
+            remedy="choose another mode or update its firmware",
+        )  # fmt: skip
     controller = plan.controller
     if controller and not math.isclose(controller.Ts, identity.Ts, rel_tol=1e-6):
         raise SettingError(
-            f"expected a controller for the device's period of {identity.Ts:g} s, got one for "
-            f"{controller.Ts:g} s; tune it at that sample time"
-        )
+            name="controller", expected=f"one for the device's period of {identity.Ts:g} s",
+            received=f"one for {controller.Ts:g} s", remedy="tune it at that sample time",
+        )  # fmt: skip
 
 
 def layout(plan: Plan, channels: Sequence[Channel], identity: Identity, baud: float) -> Layout:
@@ -203,9 +207,9 @@ def layout(plan: Plan, channels: Sequence[Channel], identity: Identity, baud: fl
     unknown = [w for w in wanted if w not in names]
     if unknown:
         raise SettingError(
-            f"expected columns out of {', '.join(names)}, got {', '.join(unknown)}; "
-            "the device streams no others"
-        )
+            name="columns", expected=f"some of {', '.join(names)}", received=", ".join(unknown),
+            remedy="the device streams no others",
+        )  # fmt: skip
     extra = [names[w] for w in wanted if names[w].number > 1]
     for count in range(len(extra), -1, -1):
         chosen = tuple(sorted({*channels[:2], *extra[:count]}, key=lambda c: c.number))
@@ -239,12 +243,14 @@ def _fits(encodings: Sequence[int], batch: int, identity: Identity, baud: float)
 def _too_much(plan: Plan, out: Sequence[Channel], identity: Identity, baud: float) -> SettingError:
     if plan.batch is not None and _batch(plan, out, identity, math.inf) is None:
         return SettingError(
-            f"expected a batch that fits a frame of {wire.MAX_BODY} bytes, got {plan.batch}; "
-            "leave it to sewfast (batch=None)"
-        )
+            name="batch", expected=f"one that fits a frame of {wire.MAX_BODY} bytes",
+            received=f"{plan.batch}", remedy="leave it to sewfast (batch=None)",
+        )  # fmt: skip
     leave = f"leave out {', '.join(c.name for c in out)}" if out else "use a longer period"
     batch = "any batch" if plan.batch is None else f"batches of {plan.batch}"
     return SettingError(
-        f"expected columns that {baud:g} baud carries each {identity.Ts:g} s with a tenth to spare "
-        f"in {batch}, got more; {leave}, or raise the baud rate of both sides"
-    )
+        name="columns",
+        expected=f"what {baud:g} baud carries each {identity.Ts:g} s with a tenth to spare in "
+        f"{batch}",
+        received="more", remedy=f"{leave}, or raise the baud rate of both sides",
+    )  # fmt: skip

@@ -26,12 +26,16 @@ def channels(link: Connection) -> tuple[Channel, ...]:
     bodies = [link.ask(Kind.DESCRIBE, bytes([k])) for k in range(identity.channels)]
     if wire.schema_hash(identity.version, identity.period_us, bodies) != identity.schema:
         raise LinkError(
-            "expected channels that match the device's schema hash, got others; connect again, "
-            "or fix the firmware"
-        )
+            name=link.port.url, expected="channels that match the device's schema hash",
+            received="others", remedy="connect again, or fix the firmware",
+        )  # fmt: skip
     found = tuple(map(wire.channel, bodies))
     if (found[0].encoding, found[1].encoding) != (0, 1):
-        raise LinkError("expected channel 0 to be counts and 1 the command; fix the firmware")
+        raise LinkError(
+            name=link.port.url, expected="channel 0 to be counts and 1 the command",
+            received=f"encodings {found[0].encoding} and {found[1].encoding}",
+            remedy="fix the firmware",
+        )  # fmt: skip
     return found
 
 
@@ -47,9 +51,9 @@ def limit(name: str, value: float | None, present: float, ceiling: float) -> flo
         return present if present else ceiling
     if not 0.0 < real(name, value) <= ceiling * (1.0 + 1e-6):
         raise SettingError(
-            f"expected {name} above 0 and at most {ceiling:g}, the device's ceiling, got {value}; "
-            f"{'lower' if value > ceiling else 'raise'} it"
-        )
+            name=name, expected=f"above 0 and at most {ceiling:g}, the device's ceiling",
+            received=f"{value}", remedy=f"{'lower' if value > ceiling else 'raise'} it",
+        )  # fmt: skip
     return min(value, ceiling)
 
 
@@ -112,9 +116,10 @@ def gains(controller: Controller, streamed: Sequence[Channel], identity: Identit
         unknown.append("biquads")
     if unknown:
         raise SettingError(
-            f"expected a controller without {' and '.join(unknown)} for this device, whose "
-            "firmware does not know them; leave them out, or build the firmware with this sewfast"
-        )
+            name="controller", expected=f"one without {' and '.join(unknown)} for this device",
+            received="one with what its firmware does not know",
+            remedy="leave it out, or build the firmware with this sewfast",
+        )  # fmt: skip
     values = (
         g.Kp, g.Ti, g.Td, c.alpha, c.beta, c.N, c.Tt, c.u_min, c.u_max, c.slew, c.filter_time,
         counts_per_unit(identity.counts_per_rev, g.y_unit),
@@ -126,6 +131,6 @@ def gains(controller: Controller, streamed: Sequence[Channel], identity: Identit
 def _require_units(given: str, device: str, what: str) -> None:
     if given.lower() != device.lower():
         raise SettingError(
-            f"expected a controller whose {what} is in {device}, as the device's, got {given}; "
-            "convert its gains"
-        )
+            name="controller", expected=f"one whose {what} is in {device}, as the device's",
+            received=given, remedy="convert its gains",
+        )  # fmt: skip
