@@ -224,6 +224,8 @@ def test_a_manifest_says_how_each_is_read(tmp_path: Path, folder: Path) -> None:
         ("path\nown.csv\n", "a column file"),
         ("file,Ts\nown.csv,fast\n", "line 2: expected Ts"),
         ("file\nown.csv\nown.csv\n", "twice"),
+        ("file,Ts\n,1\n", "line 2: expected the name of a file, .*, got none"),
+        ("file,Ts\nown.csv,1,2\n", "got more cells than columns"),
         ("", "a column file"),
     ):
         manifest.write_text(text)
@@ -274,6 +276,8 @@ def test_a_folder_in_place_of_the_table_is_refused(folder: Path, tmp_path: Path)
     (tmp_path / "table.csv").mkdir()
     with pytest.raises(SettingError, match="got a folder"):
         fleet(folder, out=tmp_path / "table.csv", workers=0)
+    with pytest.raises(SettingError, match="which does not exist"):
+        fleet(folder, out=tmp_path / "nix" / "table.csv", workers=0)
 
 
 def test_ctrl_c_says_what_is_kept(

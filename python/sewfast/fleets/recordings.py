@@ -109,7 +109,13 @@ def _manifest(path: Path, inputs: tuple[str, ...], output: str, Ts: float | None
             raise SettingError(
                 f"{path}, line {number}: expected Ts as a number of seconds, got {row['Ts']!r}"
             ) from None
-        file = row["file"] or ""
+        file = row["file"]
+        if not file or None in row:
+            found = "more cells than columns" if file else "none"
+            raise SettingError(
+                f"{path}, line {number}: expected the name of a file, and a cell for each column, "
+                f"got {found}; correct the line"
+            )
         names = tuple(row["inputs"].split(";")) if row.get("inputs") else inputs
         yield Job(file, str(path.parent / file), names, row.get("output") or output, own)
 
