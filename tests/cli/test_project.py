@@ -136,19 +136,19 @@ def test_in_doubt_it_asks(tmp_path: Path) -> None:
 
 
 def test_quiet_and_verbose(tmp_path: Path) -> None:
-    stranger(tmp_path / "bench.csv", "time_ms;u;y")
+    stranger(tmp_path / "bench.csv", "time_ms;u;y", above="")
     fit = ("identify", "bench.csv", "--model", "arx", "-o", "m.json")
     plain = sewfast(tmp_path, *fit)
     assert plain.err == "bench.csv: input u, output y\n"
     quiet = sewfast(tmp_path, *fit, "-q")
     assert (quiet.out, quiet.err) == (plain.out, "")
     first, second, third = sewfast(tmp_path, *fit, "-v").err.splitlines()
-    assert first == "bench.csv: read, 2000 rows of t, u, y"
+    assert first == "bench.csv: read, 2000 rows of time_ms, u, y"
     assert second == "bench.csv: input u, output y"
     assert third.startswith("identify: done in ")
     assert f"{(tmp_path / 'm.json').resolve()}: written" in sewfast(tmp_path, *fit, "-vv").err
     # errors are not left out, and the two contradict each other
-    assert "expected" in refused(tmp_path, "identify", "nix.csv", "-q")
+    assert "no such file" in refused(tmp_path, "identify", "nix.csv", "-q")
     assert "not allowed with" in refused(tmp_path, *fit, "-q", "-v")
 
 
