@@ -96,7 +96,7 @@ def _from_a_process(path: Path, raw: bytes, name: str) -> list[Signal]:
     except subprocess.TimeoutExpired:
         raise DataError(
             f"{path}: expected {title}, but its reader found no end within {limit:.0f} s; the file "
-            "is damaged"
+            "is damaged, or this computer is busy: try again"
         ) from None
     if done.returncode != 0:
         lines = done.stderr.decode(errors="replace").strip().splitlines()
