@@ -85,6 +85,7 @@ def carry_out(
     *,
     cancel: threading.Event | None = None,
     between: Callable[[str, Commissioning], object] | None = None,
+    before_writing: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
     """Commission a machine or a drive into the folder `commissioned`, and say what came of it.
 
@@ -106,6 +107,8 @@ def carry_out(
         on, seed=asked.seed, members=asked.members, evaluations=asked.evaluations,
         progress=progress, cancel=cancel, between=between,
     )  # fmt: skip
+    if before_writing is not None:
+        before_writing()
     found.save(place)
     return {
         "verdict": found.verdict,
