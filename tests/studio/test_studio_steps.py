@@ -256,9 +256,9 @@ def _upload(page: Page, file: str, content: bytes, piece: int = 40_000) -> dict[
         return answer
     for at in range(0, len(content), piece):
         page.socket.send(content[at : at + piece])
-        told = page.event("received")
-        if "error" in told:
-            return told
+        answer = page.event("received")
+        if "error" in answer:
+            return answer
     return page.ask("upload_end")
 
 

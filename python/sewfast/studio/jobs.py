@@ -15,8 +15,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -29,7 +29,11 @@ BETWEEN_REPORTS = 0.05
 GRACE = 0.4
 """Seconds that a cancelled step has to hand over its best so far, before its process is ended."""
 
+LAST_WORDS = 5.0
+"""Seconds that a step has to end by itself where the server is gone."""
+
 CANCELLED = "cancelled; nothing was written"
+LATE = "cancelled after its files had been written; they are whole"
 
 _PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast.studio.jobs import main; main()"
 
@@ -50,7 +54,7 @@ class Jobs:
         self._lock = threading.Lock()
         self._program: subprocess.Popen[bytes] | None = None
         self._ear: threading.Thread | None = None
-        self._cancelled = self._writes = False
+        self._cancelled = self._writes = self._wrote = False
 
     def start(
         self, event: str, step: str, *arguments: Any,
@@ -77,7 +81,7 @@ class Jobs:
         with self._lock:
             if self._ear is not None and self._ear.is_alive():
                 raise SettingError("something else is running; cancel it or wait for its end")
-            self._cancelled = self._writes = False
+            self._cancelled = self._writes = self._wrote = False
             program = self._program = subprocess.Popen(
                 [sys.executable, "-c", _PROGRAM.format(path=sys.path)],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE,
@@ -89,7 +93,7 @@ class Jobs:
             )
             self._ear.start()
         assert program.stdin is not None
-        with suppress(OSError):  # it has ended already, and the listener says so
+        with suppress(OSError, ValueError):  # it has ended already, and the listener says so
             program.stdin.write(pickle.dumps((self.folder, event, step, arguments)))
             program.stdin.flush()
 
@@ -97,19 +101,25 @@ class Jobs:
         """End the step; within `GRACE` it may hand over what it has."""
         with self._lock:
             program = self._program
-            if program is None or self._cancelled or self._writes:
+            if program is None or self._cancelled:
                 return
             self._cancelled = True
             assert program.stdin is not None
             with suppress(OSError):
                 program.stdin.close()
-            timer = threading.Timer(GRACE, self._end, (program,))
-            timer.daemon = True
-            timer.start()
+        self._end_soon(program)
 
-    def _end(self, program: subprocess.Popen[bytes]) -> None:
-        if not self._writes:
-            program.kill()
+    def _end_soon(self, program: subprocess.Popen[bytes]) -> None:
+        def end() -> None:
+            # files that are being written become whole first
+            if self._writes and program.poll() is None:
+                self._end_soon(program)
+            else:
+                program.kill()
+
+        timer = threading.Timer(GRACE, end)
+        timer.daemon = True
+        timer.start()
 
     def close(self) -> None:
         """Cancel, and wait for the end."""
@@ -132,7 +142,7 @@ class Jobs:
                 if kind == "progress":
                     self._tell(value)
                 elif kind == "writes":
-                    self._writes = True
+                    self._writes, self._wrote = value, True
                 else:
                     found = {kind: value}
         program.wait()
@@ -140,10 +150,13 @@ class Jobs:
             program.stdin.close()
         if found is None:
             found = {
-                "error": CANCELLED if self._cancelled else
+                "error": CANCELLED if self._cancelled and not self._wrote else
+                LATE if self._cancelled else
                 f"the process of this step ended without a result (exit {program.returncode}); the "
                 "studio goes on: try again, with less data or a simpler model"
             }  # fmt: skip
+        elif found.get("error") == CANCELLED and self._wrote:
+            found = {"error": LATE}
         elif "found" in found and finish is not None:
             try:
                 found = {"found": finish(found["found"])}
@@ -168,6 +181,7 @@ class Report:
         self._send, self._event = send, event
         self._sent, self._stage = -math.inf, ""
         self.cancelled = threading.Event()
+        self.lock = threading.Lock()
 
     def __call__(self, done: int, total: int, best: float | str) -> None:
         if self.cancelled.is_set():
@@ -180,11 +194,15 @@ class Report:
                 "event": "progress", "of": self._event, "done": done, "total": total, "best": best
             })  # fmt: skip
 
-    def begin_writing(self) -> None:
-        """From here on the step is no longer cancelled, so that its files are whole."""
-        if self.cancelled.is_set():
-            raise KeyboardInterrupt
-        self._send("writes", None)
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Nothing interrupts what is done inside, so that files are whole or not there."""
+        with self.lock:
+            if self.cancelled.is_set():
+                raise KeyboardInterrupt
+            self._send("writes", True)
+            yield
+            self._send("writes", False)
 
 
 def main() -> None:
@@ -210,9 +228,13 @@ def main() -> None:
 
     def watch() -> None:
         asked.read()
-        if not done.is_set():
+        with report.lock:
+            if done.is_set():
+                return
             report.cancelled.set()
             _thread.interrupt_main()
+        time.sleep(LAST_WORDS)
+        os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
     try:

@@ -6,6 +6,7 @@ import os
 import re
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -254,16 +255,15 @@ class Project:
         self,
         step: Step,
         progress: Progress | None = None,
-        before_writing: Callable[[], None] | None = None,
+        writing: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> dict[str, Any]:
         """A model from the recording, written to `model.json`."""
         from ..identification import identify
 
         data = self._read(step)
         model = identify(data, model=step.model, seed=step.seed, progress=progress)
-        if before_writing is not None:
-            before_writing()
-        model.save(self.folder / MODEL)
+        with writing():
+            model.save(self.folder / MODEL)
         choice = model.training.get("choice", {})
         return {
             "text": str(model),

@@ -362,13 +362,13 @@ class Studio:
         try:
             if upload is None or page is not self._writer:
                 raise SettingError("expected no bytes, as no file is under way; upload it again")
-            told: dict[str, Any] = {"bytes": upload.add(piece)}
+            answer: dict[str, Any] = {"bytes": upload.add(piece)}
         except SettingError as e:
             self._uploads.pop(page, None)
             if upload is not None:
                 upload.abandon()
-            told = {"error": str(e)}
-        page.send(to_text({"event": "received", **told}))
+            answer = {"error": str(e)}
+        page.send(to_text({"event": "received", **answer}))
 
     # --- The drive --------------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def identify(folder: Path, report: Report, step: Step) -> dict[str, Any]:
     """A model from a recording, written to `model.json`."""
-    return Project(folder).identify(step, report, report.begin_writing)
+    return Project(folder).identify(step, report, report.writing)
 
 
 def bode(
@@ -45,7 +45,7 @@ def commission(folder: Path, report: Report, asked: Commission) -> dict[str, Any
     from ..machine import VirtualMachine
 
     machine = VirtualMachine.from_name(asked.machine)
-    return carry_out(asked, machine, folder, report, before_writing=report.begin_writing)
+    return carry_out(asked, machine, folder, report, writing=report.writing)
 
 
 def write_report(folder: Path, report: Report) -> dict[str, Any]:
@@ -53,10 +53,10 @@ def write_report(folder: Path, report: Report) -> dict[str, Any]:
     from ..report import report as write
 
     report(0, 1, "report")
-    report.begin_writing()
-    written = write(folder / COMMISSIONED)
+    with report.writing():
+        written = write(folder / COMMISSIONED)
     return {
         "file": written.relative_to(folder).as_posix(),
-        "python": f"import sewfast\n\nprint(sewfast.report({COMMISSIONED!r}))\n",
+        "python": f"from sewfast.report import report\n\nprint(report({COMMISSIONED!r}))\n",
         "commands": f"sewfast report {COMMISSIONED}\n",
     }
