@@ -848,6 +848,61 @@ _Anomaly: TypeAlias = Literal[
 ]
 
 @final
+class LinkClient:
+    """A session with a device as bytes and times: it has neither port nor clock (docs/PROTOCOL.md).
+
+    Times of the host are in microseconds of a clock that does not run backwards. Feed it what came, see what expired, write
+    what it transmits, by ``due`` at the latest. Samples, counters and anomalies are those of ``LinkReceiver``.
+    """
+
+    def __new__(cls, session: int) -> LinkClient: ...
+    def set_watchdog(self, us: int) -> None:
+        """For how long the device may go on without a heartbeat; STOP is repeated for as long at least."""
+    def receive(
+        self, now_us: int, data: bytes
+    ) -> tuple[list[tuple[int, int, int, bytes, int, int]], list[tuple[int, int, int, int, int, float, int]], bool]:
+        """Replies (kind, result, detail, body, device's time, when the command was sent first), events (code, state, reason,
+        run, samples, value, device's time), and whether all that came is of the boot that was greeted."""
+    def greet(self, patience_us: int) -> None:
+        """Puts HELLO under way, before anything else, for so long."""
+    def end_greeting(self) -> None: ...
+    def begin(self, kind: int, body: bytes) -> None:
+        """Puts a command under way; SettingError for a body of more than 231 bytes."""
+    def forget(self) -> None:
+        """Ends the command under way."""
+    def expire(self, now_us: int) -> tuple[int, int, int, int] | None:
+        """Kind, attempts, microseconds waited and other frames that came, of what was repeated in vain."""
+    def transmit(self, now_us: int) -> bytes:
+        """The frame under way, where it is new or to be repeated; empty otherwise."""
+    def keep(self, now_us: int) -> bytes:
+        """A heartbeat."""
+    def drive(self, now_us: int, u: float) -> bytes:
+        """The command of a direct run [V]; a heartbeat too."""
+    def grant(self, now_us: int, until_us: int) -> bytes:
+        """The time of a device on credit may advance so far; a heartbeat too."""
+    def go_on(self, command: int, heartbeat: int) -> None:
+        """Goes on after these numbers, which somebody else has reached; what came meanwhile is not missing."""
+    @property
+    def is_busy(self) -> bool: ...
+    @property
+    def due(self) -> int | None:
+        """When ``transmit`` or ``expire`` is to be called at the latest; None while nothing is under way."""
+    @property
+    def newest(self) -> int:
+        """Greatest time that any of the device's frames carried [us]."""
+    @property
+    def heard(self) -> int | None:
+        """When any of its frames came last."""
+    @property
+    def sequences(self) -> tuple[int, int]:
+        """Numbers of the last command and of the last heartbeat."""
+    def expect(self, channels: Sequence[tuple[int, int]], period_us: int) -> None: ...
+    def take(self) -> tuple[NDArray[np.int64], list[_F]]: ...
+    @property
+    def counters(self) -> dict[str, int]: ...
+    def anomalies(self) -> list[tuple[_Anomaly, int, int]]: ...
+
+@final
 class LinkReceiver:
     """Receives what a device sends. Damaged, repeated and late frames are counted, listed and not used.
 

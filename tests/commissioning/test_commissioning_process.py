@@ -26,7 +26,8 @@ from sewfast import (
     commission,
     read_table,
 )
-from sewfast.commissioning.result import Taken, prepare, require_own
+from sewfast.commissioning.checkpoint import Taken, prepare
+from sewfast.commissioning.result import require_own
 from sewfast.control.loop import run as closed_loop
 from sewfast.control.machine import MachineBench, RecordedRun, Watch, record
 from sewfast.dataset import FloatArray

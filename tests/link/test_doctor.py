@@ -19,6 +19,7 @@ from link_device import TRIPPED, ScriptedDevice
 from sewfast.cli import main
 from sewfast.errors import SettingError
 from sewfast.link import Diagnosis, Finding, VirtualDevice, doctor, examine, wire
+from sewfast.link.access import Access
 from sewfast.link.doctor import _counters, _round_trip, _state, _throughput, _unopened
 
 pytest.importorskip("serial", reason="opens pseudo-terminals as serial ports")
@@ -232,7 +233,7 @@ def test_permission_is_judged_as_the_kernel_does(
 
 
 def test_permission_remedies_name_the_group_or_the_rule() -> None:
-    denied = doctor.Access(False, "uucp", "root", "crw-rw----", member=False)
+    denied = Access(False, "uucp", "root", "crw-rw----", member=False)
     remedy = doctor.permission_remedy(denied, 0x0403, 0x6001)
     assert "usermod -aG uucp" in remedy
     assert 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6001"' in remedy
@@ -247,7 +248,7 @@ def test_a_port_that_is_not_mine_fails_with_its_group(
 ) -> None:
     port = tmp_path / "port"
     port.touch()
-    denied = doctor.Access(False, "dialout", "root", "crw-rw----", member=False)
+    denied = Access(False, "dialout", "root", "crw-rw----", member=False)
     monkeypatch.setattr(doctor, "access", lambda path: denied)
     from sewfast.errors import LinkError
 

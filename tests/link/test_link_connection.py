@@ -18,6 +18,7 @@ from test_link_drive import Kept
 import link_device as script
 from link_device import golden
 from link_simulated import SimulatedPort, driven, linked, simulated
+from sewfast import _core
 from sewfast.errors import LinkError, SewfastError
 from sewfast.link import Plan, connect, wire
 from sewfast.link.wire import Kind
@@ -168,7 +169,7 @@ def test_replies_of_earlier_commands_and_repeats_are_not_used():
         device.mangle = lambda kind, wire: [kept[0], wire]
         assert link.ask(Kind.ECHO, b"two") == b"two"
         # a new frame that answers the command before
-        old = struct.pack("<I", link._sequence) + b"\0two"
+        old = struct.pack("<I", link.receiver.sequences[0]) + b"\0two"
         device.mangle = lambda kind, wire: [wire]
         device.send(0x8B, old)
         assert link.ask(Kind.ECHO, b"three") == b"three"
@@ -254,10 +255,7 @@ def test_a_refusal_names_the_field():
 
 @given(st.sampled_from([*Kind][:11]), st.binary(max_size=60))
 def test_a_reply_with_any_body_is_read_or_refused(kind, body):
-    found = wire.reply(0x80 + kind, 5, body)
-    if found is None:
-        return
-    _, reply = found
+    reply = wire.Reply(kind, 0, 0, body, 5)
     readers = {
         Kind.HELLO: wire.identity, Kind.DESCRIBE: wire.channel, Kind.LIMITS: wire.limits,
         Kind.UPLOAD: wire.uploaded, Kind.START: wire.started,
@@ -272,7 +270,7 @@ def test_what_single_precision_does_not_hold_is_infinite():
     assert struct.unpack("<4f", wire.set_limits((1e300, -1e300, 1.5, np.inf)))[:3] == (
         np.inf, -np.inf, 1.5,
     )  # fmt: skip
-    assert struct.unpack("<If", wire.drive(5, -1e39)) == (5, -np.inf)
+    assert struct.unpack("<If", _core.LinkBodies.drive(5, -1e39)) == (5, -np.inf)
 
 
 @given(st.text(max_size=24))
@@ -360,7 +358,9 @@ def test_hostile_frames_leave_the_memory_as_it_was():
         for fed in range(0, FRAMES, CHUNK):
             if not link.is_busy:
                 link.begin(frames.dice.choice(ASKED))
-            device.wire.out = b"".join(frames.next(link._sequence) for _ in range(CHUNK))
+            device.wire.out = b"".join(
+                frames.next(link.receiver.sequences[0]) for _ in range(CHUNK)
+            )
             try:
                 link.turn(0.0)
             except LinkError:

@@ -88,7 +88,7 @@ def test_places_in_a_folder_that_is_not_there(
         (lambda d: run(CONTROLLER, U, U), SettingError, "to run on, got ndarray"),
         (lambda d: run_on_host(CONTROLLER, d, U), SettingError, r"order is run_on_host\(drive, c"),
         (lambda d: run_on_host(d, None, U), SettingError, "a Controller, got NoneType"),
-        (lambda d: run_on_host(None, CONTROLLER, U), SettingError, "a Drive .* got NoneType"),
+        (lambda d: run_on_host(None, CONTROLLER, U), SettingError, "a Drive .* received NoneType"),
         (lambda d: read_recording(None), DataError, "name, got None"),
         (lambda d: export(3.0, "x.csv"), DataError, r"name, got 3\.0"),
     ],

@@ -54,7 +54,7 @@ def test_a_run_that_tripped_meanwhile_says_so(served):
     with connect(served.url, watchdog=1.0, resume=10.0) as drive:
         drive.set_limits(volt=10.0)
         sink = Kept(once(lambda: served.do(lambda: replug(served, 1.5))))
-        with pytest.raises(LinkError, match=r"the device had tripped: watchdog"):
+        with pytest.raises(LinkError, match=r"a device that had tripped: watchdog"):
             drive.stream(Plan("commands", LONG), sink)
         assert drive.outcome is not None
         assert drive.outcome.state == "tripped"

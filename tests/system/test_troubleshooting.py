@@ -28,6 +28,10 @@ def _texts(tree: ast.AST) -> Iterator[str]:
             yield "".join(v.value if isinstance(v, ast.Constant) else "\0" for v in node.values)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             yield node.value
+        elif isinstance(node, ast.Call):
+            fields = {k.arg: next(_texts(k.value), "\0") for k in node.keywords if k.arg}
+            if "expected" in fields:
+                yield str(SettingError(**{k: v for k, v in fields.items() if k in FIELDS}))
 
 
 def _explained() -> Iterator[str]:
@@ -42,6 +46,9 @@ def _explained() -> Iterator[str]:
     with pytest.raises(SettingError) as another:
         open_port("another://drive")
     yield str(another.value)
+
+
+FIELDS = ("name", "expected", "received", "remedy")
 
 
 @cache

@@ -88,7 +88,8 @@ def add(commands: Commands) -> None:
 
 
 def command(args: argparse.Namespace) -> int | None:
-    from ..commissioning.result import FOLDER, prepare, require_own
+    from ..commissioning.checkpoint import FOLDER, prepare
+    from ..commissioning.result import require_own
 
     if not is_port(args.on):
         require_no_drive_options(args)

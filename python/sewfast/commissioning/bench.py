@@ -30,7 +30,7 @@ from ..control.machine import (
 from ..dataset import FloatArray
 from ..errors import FitError, LinkError
 from ..link import Drive
-from ..link.plan import conditions_of, device_of
+from ..link.record import conditions_of, device_of
 from ..recording import Recording
 
 __all__ = ["Bench", "Followed", "MachineBench", "Stepped", "SteppedBench"]

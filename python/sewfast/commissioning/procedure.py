@@ -29,19 +29,12 @@ from ..tuning.objective import Cost
 from ..tuning.search import TuningResult
 from . import excitations
 from .bench import NotedBench, bench_of, told_of
+from .checkpoint import STAGES, Taken
 from .demands import MS, Demands, Refusal, demands
 from .excitations import first_motion, standard, step_response
 from .gains import Requirements, cause, cautious, cost_of, first_gains, ruled, search, start_of
-from .result import (
-    STAGES,
-    VERIFIED,
-    VERIFIED_POORLY,
-    Commissioning,
-    Journal,
-    Progress,
-    Taken,
-    require_own,
-)
+from .journal import Journal, Progress
+from .result import VERIFIED, VERIFIED_POORLY, Commissioning, require_own
 from .shaking import margins_at_work
 from .slow import Thinning, turn_load
 from .small_signal import SHAKEN_AT, SmallSignal, small_signal

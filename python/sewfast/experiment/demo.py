@@ -11,7 +11,8 @@ from typing import Any, TypeAlias
 
 from .. import __version__, storage
 from ..commissioning import Commissioning
-from ..commissioning.result import first_taken, numbers_in, prepare
+from ..commissioning.checkpoint import prepare
+from ..commissioning.result import first_taken, numbers_in
 from ..control.controller import Controller, paper_controller
 from ..control.loop import ClosedLoopRun
 from ..errors import SettingError

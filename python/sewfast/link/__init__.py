@@ -1,16 +1,18 @@
 """The link to a real or virtual drive: ports, sessions, runs (docs/PROTOCOL.md).
 
 Read in this order: `ports` (transports, their failures), `wire` (what bodies stand for),
-`connection` (a session: commands repeated until answered, heartbeats, the clocks), `drive`
-(`Drive`), `plan` (what a run is to do, and what became of it), `run` (the pump of a run with its
-way out). Beside them: `host_loop` (a controller on this computer), `doctor`, `virtual` and
+`connection` (a session: the core's client on a port) and its `clock`, `drive` (`Drive`), `plan`
+(what a run is to do, and what became of it) and `settings` (what must fit before it moves), `run`
+(the pump of a run with its way out), `record` (into memory, a file and a live view). Then
+`host_loop` and `host_run` (a controller on this computer), `doctor` and `access`, `virtual` and
 `emulated` (devices without a motor).
 """
 
-from .connection import ClockBounds
+from .clock import ClockBounds
 from .doctor import Diagnosis, Finding, examine
 from .drive import Drive, connect
-from .host_loop import HostLoopRun, Jitter, at_period, run_on_host
+from .host_loop import at_period, run_on_host
+from .host_run import HostLoopRun, Jitter
 from .plan import Layout, Outcome, Plan, Sink
 from .ports import Port, PortInfo, list_ports, open_port
 from .virtual import VirtualDevice

@@ -6,7 +6,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, suppress
 from types import TracebackType
 from typing import Any, Literal, TypeVar
@@ -14,175 +14,23 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import counts_per_unit
 from ..control.controller import Controller, SampledController
 from ..control.machine import RecordedRun, Watch
 from ..errors import LinkError, SettingError
-from ..gains import Gains, real
+from ..gains import real
 from ..live import Kind as View
 from ..recording import Recording
 from ..speed import Method
 from . import run as profiles
 from . import wire
-from .connection import ClockBounds, Connection, DeviceReset, Loan
-from .plan import Layout, Outcome, Plan, Sink, excite, follow, layout, require_capable
+from .clock import ClockBounds
+from .connection import Connection, DeviceReset, Loan
+from .plan import Layout, Outcome, Plan, Sink, layout, require_capable
 from .ports import Unique, open_port
-from .run import REST_US, STEP_US, Run
+from .record import excite, follow
+from .run import Run, await_measurement, wait_for_rest
+from .settings import channels, fitting, gains, limit, other_kind
 from .wire import Channel, Identity, Kind, Limits, Status
-
-# --- Terms of host and device: its channels, limits within its ceilings, controllers in its units -
-
-
-def channels(link: Connection) -> tuple[Channel, ...]:
-    """What the device can stream, as it describes it.
-
-    Raises
-    ------
-    LinkError
-        Where that is not what its schema hash stands for.
-    """
-    identity = link.identity
-    bodies = [link.ask(Kind.DESCRIBE, bytes([k])) for k in range(identity.channels)]
-    if wire.schema_hash(identity.version, identity.period_us, bodies) != identity.schema:
-        raise LinkError(
-            "expected channels that match the device's schema hash, got others; connect again, "
-            "or fix the firmware"
-        )
-    found = tuple(map(wire.channel, bodies))
-    if (found[0].encoding, found[1].encoding) != (0, 1):
-        raise LinkError("expected channel 0 to be counts and 1 the command; fix the firmware")
-    return found
-
-
-def limit(name: str, value: float | None, present: float, ceiling: float) -> float:
-    """The limit to set: the one asked for, the one in force, or the device's ceiling.
-
-    Raises
-    ------
-    SettingError
-        For a limit that is not above 0 or is above the ceiling.
-    """
-    if value is None:
-        return present if present else ceiling
-    if not 0.0 < real(name, value) <= ceiling * (1.0 + 1e-6):
-        raise SettingError(
-            f"expected {name} above 0 and at most {ceiling:g}, the device's ceiling, got {value}; "
-            f"{'lower' if value > ceiling else 'raise'} it"
-        )
-    return min(value, ceiling)
-
-
-def require_units(controller: SampledController, streamed: Sequence[Channel]) -> None:
-    """Refuse a controller in other units than the device's.
-
-    Raises
-    ------
-    SettingError
-        Where they are not in the device's units.
-    """
-    units = {c.name: c.unit for c in streamed}
-    _require_units(controller.u_unit, units.get("u", ""), "command")
-    _require_units(controller.y_unit, units.get("feedback", "RPM"), "output")
-
-
-def fitting(controller: Controller, streamed: Sequence[Channel]) -> Gains:
-    """The controller's gains in standard form; refuses other units as `require_units`."""
-    require_units(controller, streamed)
-    return controller.gains.to("standard")
-
-
-def other_kind(
-    controller: SampledController, streamed: Sequence[Channel], identity: Identity
-) -> bytes:
-    """Body of CONTROLLER for one that is no PID; the encoder is the device's own.
-
-    Raises
-    ------
-    SettingError
-        Where it is not in the device's units, or the device does not know it.
-    """
-    require_units(controller, streamed)
-    if not identity.capabilities & wire.KINDS:
-        raise SettingError(
-            name="controller", expected="a PID (Controller) for this device",
-            received=f"{type(controller).__name__}, which its firmware does not know",
-            remedy="tune a PID (--controller pid), or build the firmware with this sewfast and set "
-            "SEWFAST_CAN_KINDS",
-        )  # fmt: skip
-    kind, numbers = controller.sent()
-    return wire.controller(
-        kind, counts_per_unit(identity.counts_per_rev, controller.y_unit), numbers
-    )
-
-
-def gains(controller: Controller, streamed: Sequence[Channel], identity: Identity) -> bytes:
-    """Body of GAINS for a controller; the encoder is the device's own.
-
-    Raises
-    ------
-    SettingError
-        Where its gains are not in the device's units, or the device does not know its parts.
-    """
-    g, c = fitting(controller, streamed), controller
-    named = ("observer_time", bool(c.observer_time)), ("r_rate", c.r_rate != math.inf)
-    further = [name for name, used in (*named, ("schedule", bool(c.schedule))) if used]
-    unknown = [] if identity.capabilities & wire.DESIGN else list(further)
-    if c.biquads and not identity.capabilities & wire.BIQUADS:
-        unknown.append("biquads")
-    if unknown:
-        raise SettingError(
-            f"expected a controller without {' and '.join(unknown)} for this device, whose "
-            "firmware does not know them; leave them out, or build the firmware with this sewfast"
-        )
-    values = (
-        g.Kp, g.Ti, g.Td, c.alpha, c.beta, c.N, c.Tt, c.u_min, c.u_max, c.slew, c.filter_time,
-        counts_per_unit(identity.counts_per_rev, g.y_unit),
-    )  # fmt: skip
-    design = (c.observer_time, c.r_rate, c.schedule_rows()) if further else None
-    return wire.gains(values, c.filter_samples, design)
-
-
-def _require_units(given: str, device: str, what: str) -> None:
-    if given.lower() != device.lower():
-        raise SettingError(
-            f"expected a controller whose {what} is in {device}, as the device's, got {given}; "
-            "convert its gains"
-        )
-
-
-# --- Rest: time that passes on the device until its motor stands still or it has measured well ----
-
-
-MEASURED_WITHIN = 1.0
-
-
-def wait_for_rest(link: Connection, timeout: float) -> None:
-    """Wait until the encoder has not moved for a while, as `Drive.wait_for_rest` says."""
-    status = link.status()
-    since = began = status.time_us
-    # a device on credit that takes none must not be waited for either
-    deadline = time.monotonic() + timeout + (5.0 if link.identity.on_credit else 0.0)
-    while status.time_us - since < REST_US:
-        if status.time_us - began > timeout * 1e6 or time.monotonic() > deadline:
-            raise LinkError(
-                f"expected the motor at rest within {timeout:g} s, it turns at "
-                f"{status.speed_rpm:.0f} RPM; brake it or wait longer"
-            )
-        link.let_pass(STEP_US)
-        before, status = status, link.status()
-        if status.counts != before.counts:
-            since = status.time_us
-
-
-def await_measurement(link: Connection) -> None:
-    """Boot ends by itself after some good samples; a device on credit needs time for them."""
-    deadline = time.monotonic() + MEASURED_WITHIN
-    while link.status().state == "boot" and time.monotonic() < deadline:
-        link.let_pass(STEP_US)
-
-
-# --- `Drive`: a motor drive behind a port; `connect` opens it -------------------------------------
-
 
 PATIENCE = 3.0
 
@@ -223,10 +71,13 @@ class Drive(Unique):
         """As `connect`, for a drive of a class of one's own."""
         if watchdog is not None and not 0.001 <= real("watchdog", watchdog) <= 10.0:
             raise SettingError(
-                f"expected a watchdog of .001 to 10 s, got {watchdog}; .1 suits most"
-            )
+                name="watchdog", expected=".001 to 10 s", received=f"{watchdog}",
+                remedy=".1 suits most",
+            )  # fmt: skip
         if not 0.0 <= real("resume", resume) < math.inf:
-            raise SettingError(f"expected resume of 0 s or more, got {resume}; 1 suits most")
+            raise SettingError(
+                name="resume", expected="0 s or more", received=f"{resume}", remedy="1 suits most"
+            )
         port = open_port(url, baud)
         try:
             return cls(Connection(port, watchdog=watchdog, patience=PATIENCE, resume=resume))
@@ -322,7 +173,10 @@ class Drive(Unique):
         """Seconds until up to 200 bytes come back."""
         sent = time.monotonic()
         if self._link.ask(Kind.ECHO, data) != data:
-            raise LinkError("expected the bytes sent to ECHO, got others; fix the firmware")
+            raise LinkError(
+                name=self._link.port.url, expected="the bytes sent to ECHO", received="others",
+                remedy="fix the firmware",
+            )  # fmt: skip
         return time.monotonic() - sent
 
     # --- what it may do ---------------------------------------------------------------------------
@@ -428,7 +282,9 @@ class Drive(Unique):
             Values that fitted; `stream` sends the rest while it runs.
         """
         if what not in ("commands", "references"):
-            raise SettingError(f"expected what='commands' or 'references', got {what!r}")
+            raise SettingError(
+                name="what", expected="'commands' or 'references'", received=repr(what)
+            )
         plan = Plan("commands", values)  # type: ignore[arg-type]
         run = Run(
             self._link, plan, Layout(self.channels[:2], 1), self._profile(what, plan), _Nobody()
@@ -627,8 +483,10 @@ class Drive(Unique):
         limits = self.limits()
         if not limits.are_set:
             raise SettingError(
-                "expected limits set on the device, it has none in this session; set them to what "
-                "motor and machine can take: drive.set_limits(volt=..., speed_rpm=..., ...)"
+                name="limits",
+                expected="those of motor and machine, set in this session",
+                received="none",
+                remedy="set them first: drive.set_limits(volt=..., speed_rpm=..., ...)",
             )
         if what == "references":
             return profiles.references(plan.values, limits)
@@ -641,9 +499,10 @@ class Drive(Unique):
         status = self.status()
         if status.state == "tripped":
             raise LinkError(
-                f"expected an idle device, it has tripped: {status.reason}; find out why, then "
-                "clear it (drive.clear())"
-            )
+                name=self._link.port.url, expected="an idle device",
+                received=f"one that has tripped: {status.reason}",
+                remedy="find out why, then clear it (drive.clear())",
+            )  # fmt: skip
         if status.state in ("armed", "running"):
             self.stop()
 

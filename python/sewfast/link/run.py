@@ -101,9 +101,10 @@ def _require_within(name: str, values: NDArray[np.float64], limit: float, unit: 
     if len(beyond):
         k = int(beyond[0])
         raise SettingError(
-            f"expected {name} within +-{limit:g} {unit}, got {values[k]:g} at sample {k} and "
-            f"{len(beyond)} beyond in all; scale the signal or raise the limit (set_limits)"
-        )
+            name=name, expected=f"within +-{limit:g} {unit}",
+            received=f"{values[k]:g} at sample {k} and {len(beyond)} beyond in all",
+            remedy="scale the signal or raise the limit (set_limits)",
+        )  # fmt: skip
 
 
 # --- Run: one run on a device, from its upload to the last sample, with its way out ---------------
@@ -122,12 +123,45 @@ ARMED_SILENCE = 0.25
 REST_US = 120_000
 """Device's time without a count after which a motor is taken to be at rest; ARM wants 100 ms."""
 STEP_US = 20_000
+MEASURED_WITHIN = 1.0
+"""Longest wait for a device that boots to have measured well [s]."""
 ARMS_WITHIN = 10.0
 """Longest wait for a motor that the device finds still moving [s]."""
-HALTED = "expected a run to start, it was stopped before by another thread"
 MOVING = 11
 """Result of ARM where the motor moves."""
 _ENDS = ("finished", "stopped", "tripped")
+
+
+def wait_for_rest(link: Connection, timeout: float) -> None:
+    """Wait until the encoder has not moved for a while, as `Drive.wait_for_rest` says."""
+    status = link.status()
+    since = began = status.time_us
+    # a device on credit that takes none must not be waited for either
+    deadline = time.monotonic() + timeout + (5.0 if link.identity.on_credit else 0.0)
+    while status.time_us - since < REST_US:
+        if status.time_us - began > timeout * 1e6 or time.monotonic() > deadline:
+            raise LinkError(
+                name=link.port.url, expected=f"the motor at rest within {timeout:g} s",
+                received=f"{status.speed_rpm:.0f} RPM", remedy="brake it or wait longer",
+            )  # fmt: skip
+        link.let_pass(STEP_US)
+        before, status = status, link.status()
+        if status.counts != before.counts:
+            since = status.time_us
+
+
+def await_measurement(link: Connection) -> None:
+    """Boot ends by itself after some good samples; a device on credit needs time for them."""
+    deadline = time.monotonic() + MEASURED_WITHIN
+    while link.status().state == "boot" and time.monotonic() < deadline:
+        link.let_pass(STEP_US)
+
+
+def halted(link: Connection) -> LinkError:
+    """Another thread has ended the run before it began."""
+    return LinkError(
+        name=link.port.url, expected="a run to start", received="a stop from another thread"
+    )
 
 
 def arm_at_rest(link: Connection) -> None:
@@ -146,7 +180,7 @@ def arm_at_rest(link: Connection) -> None:
     while (reply := link.request(Kind.ARM, body)).result == MOVING and time.monotonic() < until:
         link.let_pass(STEP_US)
         if link.halted:
-            raise LinkError(HALTED)
+            raise halted(link)
     reply.checked()
 
 
@@ -206,15 +240,17 @@ class Run:
             profile.answered(self.link.request(Kind.UPLOAD, piece))
             if profile.end == before:
                 raise LinkError(
-                    f"expected room for {self.link.identity.capacity} values, the device takes no "
-                    f"more than {before}; fix the firmware"
+                    name=self.link.port.url,
+                    expected=f"room for {self.link.identity.capacity} values",
+                    received=f"a device that takes no more than {before}",
+                    remedy="fix the firmware",
                 )
 
     def begin(self) -> None:
         """Arm and start; the motor moves from here on."""
         link, layout = self.link, self.layout
         if link.halted:
-            raise LinkError(HALTED)
+            raise halted(link)
         link.receiver.expect([(c.encoding, c.steps_per_unit) for c in layout.channels], self.period)
         link.receiver.take()
         link.events.clear()
@@ -226,9 +262,10 @@ class Run:
         self.run, start_us = wire.started(link.ask(Kind.START, body))
         if abs(start_us - link.newest) >= 2**32:
             raise LinkError(
-                f"expected a start at the device's present time of {link.newest} us, got "
-                f"{start_us} us; fix the firmware"
-            )
+                name=link.port.url,
+                expected=f"a start at the device's present time of {link.newest} us",
+                received=f"{start_us} us", remedy="fix the firmware",
+            )  # fmt: skip
         self._heard = self._asked = time.monotonic()
         self.start_us = start_us
 
@@ -366,9 +403,11 @@ class Run:
         if not mine or status.state == "tripped":
             what = f"had tripped: {status.reason}" if mine else "runs something else"
             raise LinkError(
-                f"{self.link.port.url}: expected the run to go on after {sum(away):.2f} s without "
-                f"the port, the device {what}, after {status.taken} samples; check cable and "
-                f"plug, or give the watchdog more time than {self.link.watchdog:g} s"
+                name=self.link.port.url,
+                expected=f"the run to go on after {sum(away):.2f} s without the port",
+                received=f"a device that {what}, after {status.taken} samples",
+                remedy="check cable and plug, or give the watchdog more time than "
+                f"{self.link.watchdog:g} s",
             )
         self.ended = True
 
@@ -381,8 +420,7 @@ class Run:
         if not n:
             return
         first, last = int(times[0]), int(times[-1])
-        self._heard = self.link.heard = time.monotonic()
-        self.link.newest = max(self.link.newest, last)
+        self._heard = time.monotonic()
         named = dict(zip(self.layout.names, columns, strict=True))
         if last - first == (n - 1) * self.period:
             self._deliver((first - start_us) // self.period, named)

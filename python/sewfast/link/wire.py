@@ -20,6 +20,8 @@ from ..errors import LinkError
 VERSION, MAX_BODY = LinkBodies.VERSION, LinkBodies.MAX_BODY
 LARGEST = 3.4028234e38
 """Of single precision."""
+LATEST = 2**64 - 1
+"""Time that a frame can carry [us]."""
 
 
 class Kind(IntEnum):
@@ -42,9 +44,6 @@ class Kind(IntEnum):
     DRIVE = 0x21
     CREDIT = 0x22
 
-
-REPLY = 0x80
-SAMPLES, EVENT, BEAT = 0xC0, 0xC1, 0xC2
 
 STATES = ("boot", "idle", "armed", "running", "tripped")
 REASONS = (
@@ -230,18 +229,6 @@ class Reply:
         return self.body
 
 
-def reply(kind: int, time_us: int, body: bytes) -> tuple[int, Reply] | None:
-    """The command's sequence and its reply; None for what is no reply."""
-    head = LinkBodies.reply(body)
-    if head is None:
-        return None
-    sequence, result, rest = head
-    detail = LinkBodies.detail(rest) if result else 0
-    if detail is None:
-        return None
-    return sequence, Reply(kind & ~REPLY, result, detail, b"" if result else rest, time_us)
-
-
 def identity(body: bytes) -> Identity:
     """The reply to HELLO."""
     told, session, key = _whole(LinkBodies.greeting(body), body, "HELLO")
@@ -260,12 +247,6 @@ def identity(body: bytes) -> Identity:
     )  # fmt: skip
 
 
-def greets(reply: Reply, session: int) -> bool:
-    """Whether a reply to HELLO is to that of `session`, not to another host's before."""
-    told = None if reply.result else LinkBodies.greeting(reply.body)
-    return bool(reply.result) or (told is not None and told[1] == session)
-
-
 def channel(body: bytes) -> Channel:
     """The reply to DESCRIBE."""
     told = _whole(LinkBodies.description(body), body, "DESCRIBE")
@@ -277,9 +258,6 @@ def channel(body: bytes) -> Channel:
         )
     return Channel(number, encoding, steps, _shown(name), _shown(unit))
 
-
-host_time = LinkBodies.host_time
-"""What stands for the time in a host's frames: its session above its clock, which wraps."""
 
 schema_hash = LinkBodies.schema
 """CRC-32 of version, period and the bodies of all DESCRIBE replies in order."""
@@ -306,12 +284,10 @@ def limits(body: bytes) -> Limits:
     return Limits(volt, speed, acceleration, current, (a, b, c, d))
 
 
-def event(time_us: int, body: bytes) -> Event | None:
-    """An event; None where its body is not one."""
-    told = LinkBodies.event(body)
-    if told is None:
-        return None
-    code, state, reason, run, samples, value = told
+def event(
+    code: int, state: int, reason: int, run: int, samples: int, value: float, time_us: int
+) -> Event:
+    """An event from its fields, as the core has read them."""
     names = (name_of(EVENTS, code), name_of(STATES, state), name_of(REASONS, reason))
     return Event(*names, run, samples, value, time_us)
 
@@ -346,14 +322,10 @@ def _shown(name: str) -> str:
 # --- commands -----------------------------------------------------------------------------------
 
 
-hello, arm, keep, drive = LinkBodies.hello, LinkBodies.arm, LinkBodies.keep, LinkBodies.drive
-set_limits, upload, gains = LinkBodies.limits, LinkBodies.upload, LinkBodies.gains
+arm, set_limits, upload, gains = (
+    LinkBodies.arm, LinkBodies.limits, LinkBodies.upload, LinkBodies.gains
+)  # fmt: skip
 biquads, controller, start = LinkBodies.biquads, LinkBodies.controller, LinkBodies.start
-
-
-def credit(us: int, until: int) -> bytes:
-    """Of a computed device, whose time may advance to `until` [us]; as far as there is time."""
-    return LinkBodies.credit(us, min(until, 2**64 - 1))
 
 
 def body_size(encodings: Sequence[int], batch: int) -> int:

@@ -343,6 +343,28 @@ impl Event {
     }
 }
 
+/// What a device says of itself while it does not run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Beat {
+    /// Its boot id.
+    pub boot: u32,
+    /// Its state.
+    pub state: u8,
+    /// Reason of its last trip.
+    pub reason: u8,
+}
+
+impl Beat {
+    /// The fields of a beat; the speed behind them is not read.
+    pub fn of(fields: &mut Fields<'_>) -> Option<Self> {
+        Some(Self {
+            boot: fields.u32()?,
+            state: fields.u8()?,
+            reason: fields.u8()?,
+        })
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

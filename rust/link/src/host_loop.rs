@@ -13,7 +13,6 @@ mod memory;
 mod outcome;
 #[cfg(unix)]
 mod port;
-mod request;
 mod settings;
 mod tick;
 mod ticks;
@@ -30,19 +29,6 @@ pub use ticks::{Tick, Ticks};
 
 /// Room that is made for samples and ticks before the start, so that none is made during all but the longest runs.
 const ROOM: usize = 4_000_000;
-
-/// Kinds of the protocol's frames.
-mod kind {
-    pub const STATUS: u8 = 0x03;
-    pub const ARM: u8 = 0x05;
-    pub const STOP: u8 = 0x06;
-    pub const START: u8 = 0x0A;
-    pub const KEEP: u8 = 0x20;
-    pub const DRIVE: u8 = 0x21;
-    pub const REPLY: u8 = 0x80;
-    pub const EVENT: u8 = 0xC1;
-    pub const BEAT: u8 = 0xC2;
-}
 
 #[cfg(test)]
 mod tests;

@@ -2,6 +2,7 @@
 
 pub mod anomalies;
 pub mod bodies;
+pub mod client;
 pub mod host_loop;
 pub mod receiver;
 pub mod samples;
@@ -9,5 +10,6 @@ pub mod sequence;
 pub mod server;
 
 pub use anomalies::{Anomaly, Counters, Kind};
+pub use client::Client;
 pub use receiver::Receiver;
 pub use samples::{Channel, Encoding};

@@ -4,11 +4,10 @@ use sewfast_control::link::{Deframer, Frame, Rejected};
 use sewfast_core::Result;
 
 use crate::anomalies::{Anomaly, Counters, Kind, Log};
+use crate::client::kind::SAMPLES;
 use crate::samples::{Batch, Channel, Columns, Samples};
 use crate::sequence::{Sequence, Verdict};
 
-/// The kind of a frame with samples.
-const SAMPLES: u8 = 0xC0;
 /// Set in the kind of every frame of a device.
 const OF_A_DEVICE: u8 = 0x80;
 
@@ -85,6 +84,11 @@ impl Receiver {
         if let Some(samples) = self.intake.samples.as_mut() {
             samples.append_to(columns);
         }
+    }
+
+    /// Device time of the newest sample that has not been taken \[us\].
+    pub fn newest(&self) -> Option<i64> {
+        self.intake.samples.as_ref().and_then(Samples::newest)
     }
 
     /// How often everything has happened.

@@ -179,6 +179,11 @@ impl Samples {
         }
     }
 
+    /// Time of the newest sample that has not been taken \[us\].
+    pub fn newest(&self) -> Option<i64> {
+        self.columns.0.last().copied()
+    }
+
     /// The samples since the last call.
     pub fn take(&mut self) -> Columns {
         let (times, values) = &mut self.columns;

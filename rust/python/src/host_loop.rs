@@ -3,8 +3,8 @@
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 use sewfast_core::{Error, Result};
-use sewfast_link::Channel;
 use sewfast_link::host_loop::{HostLoop, Locked, Outcome, Settings, Tick};
+use sewfast_link::{Channel, Client};
 
 use numpy::{PyArray1, PyReadonlyArray1};
 
@@ -40,12 +40,8 @@ fn host_loop<'py>(
     lock_memory: bool,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
+    let client = Client::new(session, watchdog).continued(tag, key, command, heartbeat);
     let settings = Settings {
-        tag,
-        session,
-        key,
-        command,
-        heartbeat,
         device_period,
         ratio,
         watchdog,
@@ -60,7 +56,7 @@ fn host_loop<'py>(
             .iter()
             .map(|&(code, steps)| Channel::described(code, steps));
         let channels = channels.collect::<Result<Vec<_>>>()?;
-        let mut looped = HostLoop::new(settings, &channels, controller, reference)?;
+        let mut looped = HostLoop::new(client, settings, &channels, controller, reference)?;
         let memory = lock_memory.then(Locked::new);
         run(port, &mut looped, monitor)?;
         Ok((

@@ -9,11 +9,13 @@ use sewfast_control::link::identity::VERSION;
 use sewfast_control::link::{Body, Fields, Header, MAX_BODY, MAX_WIRE, encode};
 use sewfast_core::{Error, Result};
 use sewfast_link::bodies::{self, Description, Event, Greeting, Start, Status};
+use sewfast_link::client::{Client, Event as Heard};
 use sewfast_link::{Channel, Receiver};
 
 use crate::arrays::{array1, raise};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<LinkClient>()?;
     module.add_class::<LinkReceiver>()?;
     module.add_class::<LinkBodies>()?;
     module.add_function(wrap_pyfunction!(link_frame, module)?)
@@ -258,11 +260,7 @@ impl LinkReceiver {
     }
 
     fn expect(&self, py: Python<'_>, channels: Vec<(u8, u32)>, period_us: u32) -> PyResult<()> {
-        let described = |&(encoding, steps): &(u8, u32)| Channel::described(encoding, steps);
-        let channels: Result<Vec<Channel>> = channels.iter().map(described).collect();
-        channels
-            .and_then(|channels| self.lock().expect(&channels, period_us))
-            .map_err(|e| raise(py, e))
+        expect(py, &mut self.lock(), &channels, period_us)
     }
 
     fn feed<'py>(&self, py: Python<'py>, data: &[u8]) -> Vec<Frame<'py>> {
@@ -276,32 +274,205 @@ impl LinkReceiver {
     }
 
     fn take<'py>(&self, py: Python<'py>) -> PyResult<Columns<'py>> {
-        let (times, columns) = self.lock().take();
-        let columns = columns.into_iter().map(|column| array1(py, column));
-        let columns = PyList::new(py, columns.collect::<Vec<_>>())?;
-        Ok((PyArray1::from_vec(py, times), columns))
+        take(py, &mut self.lock())
     }
 
     #[getter]
     fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let named = PyDict::new(py);
-        for (name, count) in self.lock().counters().named() {
-            named.set_item(name, count)?;
-        }
-        Ok(named)
+        counters(py, &self.lock())
     }
 
-    fn anomalies(&self) -> Vec<(&'static str, u32, u32)> {
-        let mut core = self.lock();
-        let listed = core.anomalies();
-        listed
-            .map(|a| (a.kind.name(), a.sequence, a.count))
-            .collect()
+    fn anomalies(&self) -> Vec<Listed> {
+        anomalies(&mut self.lock())
     }
 }
 
 impl LinkReceiver {
     fn lock(&self) -> MutexGuard<'_, Receiver> {
+        self.core.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn expect(
+    py: Python<'_>,
+    receiver: &mut Receiver,
+    channels: &[(u8, u32)],
+    period_us: u32,
+) -> PyResult<()> {
+    let described = |&(encoding, steps): &(u8, u32)| Channel::described(encoding, steps);
+    let channels: Result<Vec<Channel>> = channels.iter().map(described).collect();
+    channels
+        .and_then(|channels| receiver.expect(&channels, period_us))
+        .map_err(|e| raise(py, e))
+}
+
+fn take<'py>(py: Python<'py>, receiver: &mut Receiver) -> PyResult<Columns<'py>> {
+    let (times, columns) = receiver.take();
+    let columns = columns.into_iter().map(|column| array1(py, column));
+    let columns = PyList::new(py, columns.collect::<Vec<_>>())?;
+    Ok((PyArray1::from_vec(py, times), columns))
+}
+
+fn counters<'py>(py: Python<'py>, receiver: &Receiver) -> PyResult<Bound<'py, PyDict>> {
+    let named = PyDict::new(py);
+    for (name, count) in receiver.counters().named() {
+        named.set_item(name, count)?;
+    }
+    Ok(named)
+}
+
+type Listed = (&'static str, u32, u32);
+
+fn anomalies(receiver: &mut Receiver) -> Vec<Listed> {
+    let listed = receiver.anomalies();
+    listed
+        .map(|a| (a.kind.name(), a.sequence, a.count))
+        .collect()
+}
+
+/// A session with a device; see docs/PROTOCOL.md.
+#[pyclass(frozen, module = "sewfast._core")]
+struct LinkClient {
+    // a live view reads the counters from another thread than the one that takes turns
+    core: Mutex<Client>,
+}
+
+/// Kind, result, detail, body, time of the device, when the command was sent first.
+type Replied<'py> = (u8, u8, u32, Bound<'py, PyBytes>, u64, u64);
+/// Code, state, reason, run, samples, value, time of the device.
+type Happened = (u8, u8, u8, u32, u32, f32, u64);
+
+#[pymethods]
+impl LinkClient {
+    #[new]
+    fn new(session: u32) -> Self {
+        Self {
+            core: Mutex::new(Client::new(session, 0)),
+        }
+    }
+
+    fn set_watchdog(&self, us: u32) {
+        self.lock().set_watchdog(us);
+    }
+
+    fn receive<'py>(
+        &self,
+        py: Python<'py>,
+        now_us: u64,
+        data: &[u8],
+    ) -> (Vec<Replied<'py>>, Vec<Happened>, bool) {
+        let (mut replies, mut events, mut same_boot) = (Vec::new(), Vec::new(), true);
+        let mut core = self.lock();
+        core.receive(now_us, data);
+        while let Some(heard) = core.event() {
+            match heard {
+                Heard::Reply(r) => {
+                    let body = PyBytes::new(py, r.body.bytes().unwrap_or_default());
+                    replies.push((r.kind, r.result, r.detail, body, r.time, r.sent));
+                }
+                Heard::Happened(e, time) => {
+                    events.push((e.code, e.state, e.reason, e.run, e.samples, e.value, time))
+                }
+                Heard::Beat(_) => {}
+                Heard::Reset => same_boot = false,
+            }
+        }
+        (replies, events, same_boot)
+    }
+
+    fn greet(&self, patience_us: u64) {
+        self.lock().greet(patience_us);
+    }
+
+    fn end_greeting(&self) {
+        self.lock().end_greeting();
+    }
+
+    fn begin(&self, py: Python<'_>, kind: u8, body: &[u8]) -> PyResult<()> {
+        let mut whole = Body::new();
+        whole.add(body);
+        if whole.bytes().is_none() {
+            return Err(too_long(py, &body.len().to_string()));
+        }
+        self.lock().begin(kind, whole);
+        Ok(())
+    }
+
+    fn forget(&self) {
+        self.lock().forget();
+    }
+
+    fn expire(&self, now_us: u64) -> Option<(u8, u64, u64, u64)> {
+        let unanswered = self.lock().expire(now_us)?;
+        let (attempts, waited) = (unanswered.attempts, unanswered.waited);
+        Some((unanswered.kind, attempts, waited, unanswered.others))
+    }
+
+    fn transmit<'py>(&self, py: Python<'py>, now_us: u64) -> Bound<'py, PyBytes> {
+        PyBytes::new(py, self.lock().transmit(now_us))
+    }
+
+    fn keep<'py>(&self, py: Python<'py>, now_us: u64) -> Bound<'py, PyBytes> {
+        PyBytes::new(py, self.lock().keep(now_us))
+    }
+
+    fn drive<'py>(&self, py: Python<'py>, now_us: u64, u: f64) -> Bound<'py, PyBytes> {
+        PyBytes::new(py, self.lock().drive(now_us, u))
+    }
+
+    fn grant<'py>(&self, py: Python<'py>, now_us: u64, until_us: u64) -> Bound<'py, PyBytes> {
+        PyBytes::new(py, self.lock().grant(now_us, until_us))
+    }
+
+    fn go_on(&self, command: u32, heartbeat: u32) {
+        self.lock().go_on(command, heartbeat);
+    }
+
+    #[getter]
+    fn is_busy(&self) -> bool {
+        self.lock().is_busy()
+    }
+
+    #[getter]
+    fn due(&self) -> Option<u64> {
+        self.lock().due()
+    }
+
+    #[getter]
+    fn newest(&self) -> u64 {
+        self.lock().newest()
+    }
+
+    #[getter]
+    fn heard(&self) -> Option<u64> {
+        self.lock().heard()
+    }
+
+    #[getter]
+    fn sequences(&self) -> (u32, u32) {
+        self.lock().sequences()
+    }
+
+    fn expect(&self, py: Python<'_>, channels: Vec<(u8, u32)>, period_us: u32) -> PyResult<()> {
+        expect(py, self.lock().receiver(), &channels, period_us)
+    }
+
+    fn take<'py>(&self, py: Python<'py>) -> PyResult<Columns<'py>> {
+        take(py, self.lock().receiver())
+    }
+
+    #[getter]
+    fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        counters(py, self.lock().receiver())
+    }
+
+    fn anomalies(&self) -> Vec<Listed> {
+        anomalies(self.lock().receiver())
+    }
+}
+
+impl LinkClient {
+    fn lock(&self) -> MutexGuard<'_, Client> {
         self.core.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

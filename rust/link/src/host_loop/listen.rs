@@ -1,11 +1,11 @@
-//! What the loop makes of the device's frames.
+//! What the loop makes of what the device says.
 
-use sewfast_control::link::{Body, Fields, Frame};
+use sewfast_control::link::{Body, Fields};
 
-use super::kind;
 use super::outcome::Outcome;
-use super::tick::{HostLoop, Phase, State};
-use crate::bodies::{self, Status};
+use super::tick::{HostLoop, Phase};
+use crate::bodies::{self, Beat, Status};
+use crate::client::{Event, Reply, kind};
 
 /// States of the device, by the protocol's numbers.
 const BOOT: u8 = 0;
@@ -18,34 +18,22 @@ const DISARMED: u8 = 5;
 const TRIP: u8 = 6;
 
 impl HostLoop {
-    /// Takes the frames and samples in `received`.
+    /// Takes what the device says and the samples in `received`.
     pub(super) fn listen(&mut self, now: u64, received: &[u8]) {
-        let state = &mut self.state;
-        self.receiver.feed(received, |frame| state.hear(now, frame));
-        self.receiver.append_to(&mut state.history.columns);
-        state.take(now);
-        if self.receiver.counters().resets > 0 {
-            state.reset();
+        self.client.receive(now, received);
+        while let Some(event) = self.client.event() {
+            match event {
+                Event::Reply(reply) => self.reply(now, &reply),
+                Event::Happened(event, _) => self.happened(&event),
+                Event::Beat(beat) => self.beat(&beat),
+                Event::Reset => self.reset(),
+            }
         }
-    }
-}
-
-impl State {
-    fn hear(&mut self, now: u64, frame: &Frame<'_>) {
-        if frame.header.tag != self.settings.tag {
-            return self.reset();
-        }
-        if self.phase == Phase::Starting {
+        if self.phase == Phase::Starting && self.client.heard() == Some(now) {
             self.heard = now;
         }
-        let mut fields = Fields::new(frame.body);
-        // A frame too short for its kind says nothing.
-        let _ = match frame.header.kind {
-            kind::EVENT => self.event(&mut fields),
-            kind::BEAT => self.beat(&mut fields),
-            reply if reply == self.request.kind | kind::REPLY => self.reply(now, &mut fields),
-            _ => None,
-        };
+        self.client.receiver().append_to(&mut self.history.columns);
+        self.take(now);
     }
 
     /// Looks at the samples that have come; those of an earlier run are dropped.
@@ -70,20 +58,18 @@ impl State {
         }
     }
 
-    fn reply(&mut self, now: u64, fields: &mut Fields<'_>) -> Option<()> {
-        let (sequence, result) = bodies::reply(fields)?;
-        if sequence != self.request.sequence || self.request.sent == 0 {
-            return None;
-        }
-        if self.request.sent == 1 {
-            let trip = now.saturating_sub(self.request.at);
+    fn reply(&mut self, now: u64, reply: &Reply) {
+        if let Some(trip) = reply.round_trip {
             self.round_trip = Some(self.round_trip.map_or(trip, |least| least.min(trip)));
         }
-        if result == 0 {
-            return self.done_with(now, fields);
+        if reply.result != 0 {
+            return self.refused(reply);
         }
-        self.refused(result, fields.u32()?);
-        Some(())
+        let mut fields = Fields::new(reply.body.bytes().unwrap_or_default());
+        // a body too short for its kind is as good as none: it would come again as it is
+        if self.done_with(now, &mut fields).is_none() {
+            self.give_up(reply.kind);
+        }
     }
 
     fn done_with(&mut self, now: u64, fields: &mut Fields<'_>) -> Option<()> {
@@ -91,7 +77,8 @@ impl State {
             Phase::Arming => {
                 self.phase = Phase::Starting;
                 self.heard = now;
-                self.request(kind::START, self.start_body());
+                let body = self.start_body();
+                self.client.begin(kind::START, body);
             }
             Phase::Starting => {
                 let (_run, start) = bodies::started(fields)?;
@@ -100,7 +87,7 @@ impl State {
             Phase::Stopping => {
                 self.stopped = true;
                 self.phase = Phase::Asking;
-                self.request(kind::STATUS, Body::new());
+                self.client.begin(kind::STATUS, Body::new());
             }
             Phase::Asking => {
                 self.conclude(Status::of(fields)?);
@@ -116,15 +103,14 @@ impl State {
         self.history.keep(self.start, self.length() as usize);
         self.heard = now;
         self.set_grid(now, false);
-        self.request.sent = 0;
     }
 
-    fn refused(&mut self, result: u8, detail: u32) {
+    fn refused(&mut self, reply: &Reply) {
         match self.phase {
             Phase::Arming | Phase::Starting => self.stop(Outcome::Refused {
-                command: self.request.kind,
-                result,
-                detail,
+                command: reply.kind,
+                result: reply.result,
+                detail: reply.detail,
             }),
             _ => self.phase = Phase::Done,
         }
@@ -160,8 +146,7 @@ impl State {
         self.stop(Outcome::Tripped { reason, value });
     }
 
-    fn event(&mut self, fields: &mut Fields<'_>) -> Option<()> {
-        let event = bodies::Event::of(fields)?;
+    fn happened(&mut self, event: &bodies::Event) {
         if self.phase == Phase::Running {
             match event.code {
                 FINISHED => self.finished(),
@@ -170,20 +155,17 @@ impl State {
                 _ => {}
             }
         }
-        Some(())
     }
 
     /// Said while not running, so that an event that was lost is noticed.
-    fn beat(&mut self, fields: &mut Fields<'_>) -> Option<()> {
-        let (_boot, state, reason) = (fields.u32()?, fields.u8()?, fields.u8()?);
+    fn beat(&mut self, beat: &Beat) {
         if self.phase == Phase::Running {
-            match state {
-                TRIPPED => self.tripped(reason, f32::NAN),
+            match beat.state {
+                TRIPPED => self.tripped(beat.reason, f32::NAN),
                 BOOT | IDLE => self.stop(Outcome::Ended),
                 _ => {}
             }
         }
-        Some(())
     }
 
     /// A device that has reset is safe, and knows nothing of this session.

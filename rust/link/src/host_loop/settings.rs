@@ -7,19 +7,9 @@ const LONGEST_WATCHDOG: u32 = 10_000_000;
 /// The shortest watchdog time of the protocol \[us\].
 const SHORTEST_WATCHDOG: u32 = 1_000;
 
-/// Numbers of the session and of the loop.
+/// Numbers of the loop.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings {
-    /// Low 16 bits of the device's boot id.
-    pub tag: u16,
-    /// The session's number.
-    pub session: u32,
-    /// What the device gave in its reply to HELLO, for ARM to repeat.
-    pub key: u32,
-    /// Sequence of the session's last command.
-    pub command: u32,
-    /// Sequence of the session's last heartbeat.
-    pub heartbeat: u32,
     /// The device's sample time \[us\].
     pub device_period: u32,
     /// Samples of the device in one period of the loop.
@@ -116,11 +106,6 @@ mod tests {
 
     fn settings() -> Settings {
         Settings {
-            tag: 1,
-            session: 5,
-            key: 0,
-            command: 0,
-            heartbeat: 0,
             device_period: 1000,
             ratio: 10,
             watchdog: 50_000,

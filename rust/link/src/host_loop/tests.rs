@@ -3,7 +3,8 @@
 use sewfast_control::link::{Body, Deframer, Fields, Header, MAX_WIRE, encode};
 use sewfast_control::{Design, PidController, Settings as Pid, Standard};
 
-use super::{HostLoop, Outcome, Settings, kind};
+use super::{HostLoop, Outcome, Settings};
+use crate::client::{Client, kind};
 use crate::samples::Channel;
 
 mod whatever_happens;
@@ -186,11 +187,6 @@ fn host_loop(ticks: usize) -> HostLoop {
         ..Pid::new(gains, PERIOD as f64 * 1e-6)
     };
     let settings = Settings {
-        tag: TAG,
-        session: SESSION,
-        key: 0,
-        command: 3,
-        heartbeat: 8,
         device_period: 1000,
         ratio: 10,
         watchdog: 50_000,
@@ -200,7 +196,8 @@ fn host_loop(ticks: usize) -> HostLoop {
     };
     let counts = Channel::described(0, 1).unwrap();
     let controller = PidController::new(Design::new(pid)).unwrap();
-    HostLoop::new(settings, &[counts], controller, vec![1000.0; ticks]).unwrap()
+    let client = Client::new(SESSION, 0).continued(TAG, 0, 3, 8);
+    HostLoop::new(client, settings, &[counts], controller, vec![1000.0; ticks]).unwrap()
 }
 
 /// A loop and a device whose clocks differ by a constant.
@@ -397,7 +394,7 @@ fn gives_up_a_device_that_never_answers() {
 #[test]
 fn says_stop_for_as_long_as_the_motor_may_turn() {
     let mut world = World::new(10);
-    world.looped.state.settings.watchdog = 5_000_000;
+    world.looped.client.set_watchdog(5_000_000);
     world.peer.deaf = true;
     world.looped.stop(Outcome::Interrupted);
     world.serve(u64::MAX);

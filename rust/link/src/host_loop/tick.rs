@@ -1,20 +1,17 @@
 //! The loop without port or clock: time and bytes in, at most one frame out.
 
 use sewfast_control::PidController;
-use sewfast_control::link::{Body, Header, MAX_WIRE, encode};
-
+use sewfast_control::link::Body;
 use sewfast_core::Result;
 
 use super::age::Age;
 use super::history::History;
-use super::kind;
 use super::outcome::Outcome;
-use super::request::Request;
 use super::settings::Settings;
 use super::ticks::{Tick, Ticks};
 use crate::anomalies::Counters;
 use crate::bodies::{self, Status};
-use crate::receiver::Receiver;
+use crate::client::{Client, kind};
 use crate::samples::Channel;
 
 /// How long after the usual arrival of samples a tick comes \[us\]: what their delay may vary by.
@@ -37,44 +34,35 @@ pub(super) enum Phase {
 /// A controller that drives a device in mode 2: arms and starts it, says a command each period, stops it.
 #[derive(Debug)]
 pub struct HostLoop {
-    pub(super) receiver: Receiver,
-    pub(super) state: State,
-    wire: [u8; MAX_WIRE],
-}
-
-/// Everything but the receiver, which lends out the frame that changes this.
-#[derive(Debug)]
-pub(super) struct State {
-    pub settings: Settings,
-    pub controller: PidController<f64>,
-    pub reference: Vec<f64>,
-    pub phase: Phase,
-    pub outcome: Option<Outcome>,
-    pub request: Request,
-    pub command: u32,
-    pub heartbeat: u32,
-    pub fed: u64,
-    pub start: i64,
-    pub deadline: u64,
-    pub next: usize,
-    pub newest: Option<i64>,
-    pub used: Option<i64>,
-    pub heard: u64,
-    pub age: Age,
-    pub round_trip: Option<u64>,
-    pub stopped: bool,
-    pub status: Option<Status>,
-    pub history: History,
-    pub ticks: Ticks,
+    pub(super) client: Client,
+    pub(super) settings: Settings,
+    pub(super) controller: PidController<f64>,
+    pub(super) reference: Vec<f64>,
+    pub(super) phase: Phase,
+    pub(super) outcome: Option<Outcome>,
+    pub(super) fed: u64,
+    pub(super) start: i64,
+    pub(super) deadline: u64,
+    pub(super) next: usize,
+    pub(super) newest: Option<i64>,
+    pub(super) used: Option<i64>,
+    pub(super) heard: u64,
+    pub(super) age: Age,
+    pub(super) round_trip: Option<u64>,
+    pub(super) stopped: bool,
+    pub(super) status: Option<Status>,
+    pub(super) history: History,
+    pub(super) ticks: Ticks,
 }
 
 impl HostLoop {
-    /// A loop at rest that has sent nothing; `channels` are those of the mask, counts first, and `reference` has a value for
-    /// each of its periods.
+    /// A loop at rest that has sent nothing, in a session that `client` has greeted; `channels` are those of the mask, counts
+    /// first, and `reference` has a value for each of its periods.
     ///
     /// # Errors
     /// `ErrorKind::Setting` for settings that no loop can run with.
     pub fn new(
+        mut client: Client,
         settings: Settings,
         channels: &[Channel],
         mut controller: PidController<f64>,
@@ -82,18 +70,16 @@ impl HostLoop {
     ) -> Result<Self> {
         settings.check(channels.len(), reference.len(), controller.settings().ts)?;
         controller.reset();
-        let mut receiver = Receiver::new();
-        receiver.expect(channels, settings.device_period)?;
+        client.set_watchdog(settings.watchdog);
+        client.receiver().expect(channels, settings.device_period)?;
+        client.arm();
         let samples = (reference.len() * settings.ratio as usize).min(super::ROOM);
-        let body = bodies::arm(settings.watchdog, settings.key);
-        let state = State {
+        Ok(Self {
+            client,
             settings,
             controller,
             phase: Phase::Arming,
             outcome: None,
-            request: Request::new(kind::ARM, settings.command.wrapping_add(1), body),
-            command: settings.command.wrapping_add(1),
-            heartbeat: settings.heartbeat,
             fed: 0,
             start: 0,
             deadline: 0,
@@ -108,11 +94,6 @@ impl HostLoop {
             history: History::with_capacity(samples, channels.len()),
             ticks: Ticks::with_capacity(reference.len().min(super::ROOM)),
             reference,
-        };
-        Ok(Self {
-            receiver,
-            state,
-            wire: [0; MAX_WIRE],
         })
     }
 
@@ -121,125 +102,112 @@ impl HostLoop {
     /// A call before [`wake`](Self::wake) only listens. A deadline missed by more than a period is skipped and counted.
     pub fn tick(&mut self, now: u64, received: &[u8]) -> &[u8] {
         self.listen(now, received);
-        let said = match self.state.phase {
-            Phase::Running => self.state.drive(now),
-            Phase::Done => None,
-            _ => self.state.ask(now),
-        };
-        let length = said.and_then(|(header, body)| encode(&header, body.bytes()?, &mut self.wire));
-        self.wire.get(..length.unwrap_or(0)).unwrap_or_default()
+        let u = self.drive(now);
+        match (self.phase, u) {
+            (Phase::Running, Some(u)) => self.client.drive(now, u),
+            (Phase::Running | Phase::Done, _) => &[],
+            _ => self.ask(now),
+        }
     }
 
     /// When [`tick`](Self::tick) is to be called at the latest \[us\].
     pub fn wake(&self) -> u64 {
-        let state = &self.state;
-        match state.phase {
-            Phase::Running => state.deadline,
-            Phase::Starting => state.request.due().min(state.keep_due()),
+        let due = self.client.due().unwrap_or(0);
+        match self.phase {
+            Phase::Running => self.deadline,
+            Phase::Starting => due.min(self.keep_due()),
             Phase::Done => 0,
-            _ => state.request.due(),
+            _ => due,
         }
-    }
-
-    /// Ends the loop: the next frame out is STOP, and no command to the motor follows it.
-    pub fn stop(&mut self, why: Outcome) {
-        self.state.stop(why);
     }
 
     /// Counts a command that did not leave.
     pub fn unsent(&mut self) {
-        self.state.ticks.unsent += 1;
+        self.ticks.unsent += 1;
     }
 
     /// True once everything has been said and answered, or given up.
     pub fn done(&self) -> bool {
-        self.state.phase == Phase::Done
+        self.phase == Phase::Done
     }
 
     /// Ends the loop without another word: there is no port to say it on.
     pub fn abandon(&mut self, why: Outcome) {
-        self.state.stop(why);
-        self.state.phase = Phase::Done;
+        self.stop(why);
+        self.phase = Phase::Done;
     }
 
     /// How it ended; none while it runs.
     pub fn outcome(&self) -> Option<&Outcome> {
-        self.state.outcome.as_ref()
+        self.outcome.as_ref()
     }
 
     /// What was decided at each tick.
     pub fn ticks(&self) -> &Ticks {
-        &self.state.ticks
+        &self.ticks
     }
 
     /// Every sample of the run that came.
     pub fn history(&self) -> &History {
-        &self.state.history
+        &self.history
     }
 
     /// What the device says of the run that has ended, where that answer came.
     pub fn status(&self) -> Option<&Status> {
-        self.state.status.as_ref()
+        self.status.as_ref()
     }
 
     /// Device time of the run's first sample \[us\]; 0 where it never began.
     pub fn start(&self) -> i64 {
-        self.state.start
+        self.start
     }
 
     /// The shortest time in which a command was answered \[us\].
     pub fn round_trip(&self) -> Option<u64> {
-        self.state.round_trip
+        self.round_trip
     }
 
     /// How often frames were lost, refused or late on the way to the host.
     pub fn counters(&self) -> &Counters {
-        self.receiver.counters()
+        self.client.counters()
     }
 
     /// True once the device has answered STOP.
     pub fn stopped(&self) -> bool {
-        self.state.stopped
+        self.stopped
     }
 
     /// Sequences of the last command and of the last heartbeat, from which the session goes on.
     pub fn sequences(&self) -> (u32, u32) {
-        (self.state.command, self.state.heartbeat)
+        self.client.sequences()
     }
 
     /// Ticks that are over, and how many there are in all.
     pub fn progress(&self) -> (usize, usize) {
-        (self.state.next, self.state.reference.len())
+        (self.next, self.reference.len())
     }
 }
 
-type Said = Option<(Header, Body)>;
-
-impl State {
-    /// Sends the request under way, again, or gives it up; feeds the watchdog of an armed device meanwhile.
-    fn ask(&mut self, now: u64) -> Said {
-        if self.request.exhausted(now, self.settings.watchdog) {
-            self.give_up();
+impl HostLoop {
+    /// Repeats the command under way, or gives it up; feeds the watchdog of an armed device meanwhile.
+    fn ask(&mut self, now: u64) -> &[u8] {
+        if let Some(unanswered) = self.client.expire(now) {
+            self.give_up(unanswered.kind);
         }
-        if self.phase == Phase::Done {
-            return None;
-        }
-        if now >= self.request.due() {
-            self.request.sent += 1;
-            self.request.at = now;
+        if self.client.due().is_some_and(|due| now >= due) {
             self.fed = now;
-            let header = self.header(self.request.kind, self.request.sequence, now);
-            return Some((header, self.request.body));
+            return self.client.transmit(now);
         }
         if self.phase == Phase::Starting && now >= self.keep_due() {
-            return Some(self.keep(now));
+            self.fed = now;
+            return self.client.keep(now);
         }
-        None
+        &[]
     }
 
-    fn give_up(&mut self) {
+    pub(super) fn give_up(&mut self, command: u8) {
         match self.phase {
-            Phase::Arming | Phase::Starting => self.stop(Outcome::Unanswered(self.request.kind)),
+            Phase::Arming | Phase::Starting => self.stop(Outcome::Unanswered(command)),
             _ => self.phase = Phase::Done,
         }
     }
@@ -256,9 +224,9 @@ impl State {
         }
     }
 
-    /// A tick, where its deadline has come: measure, control, command.
-    fn drive(&mut self, now: u64) -> Said {
-        if now < self.deadline {
+    /// A tick, where its deadline has come: measure, control; the command. None where there is none, or the loop ends.
+    fn drive(&mut self, now: u64) -> Option<f64> {
+        if self.phase != Phase::Running || now < self.deadline {
             return None;
         }
         let (late, period) = (now - self.deadline, self.settings.period());
@@ -269,21 +237,15 @@ impl State {
         self.deadline = now - late % period + period;
         let Some(&r) = self.reference.get(self.next) else {
             self.stop(Outcome::Completed);
-            return self.ask(now);
+            return None;
         };
         if now.saturating_sub(self.heard) > u64::from(self.settings.watchdog) {
             self.stop(Outcome::Silent);
-            return self.ask(now);
+            return None;
         }
         let u = self.control(now, late, r);
         self.next += 1;
-        let body = bodies::drive(self.settings.watchdog, u);
-        Some((self.heartbeat(kind::DRIVE, now), body))
-    }
-
-    fn keep(&mut self, now: u64) -> (Header, Body) {
-        let body = bodies::keep(self.settings.watchdog);
-        (self.heartbeat(kind::KEEP, now), body)
+        Some(u)
     }
 
     /// The command for this tick, from the speed over the newest period; without a new sample the last command stays.
@@ -313,26 +275,20 @@ impl State {
         u
     }
 
-    /// Ends the loop for the first reason that is given.
+    /// Ends the loop, for the first reason that is given: the next frame out is STOP, and no command to the motor follows it.
     pub fn stop(&mut self, why: Outcome) {
         if self.outcome.is_none() {
             self.outcome = Some(why);
         }
         if matches!(self.phase, Phase::Arming | Phase::Starting | Phase::Running) {
             self.phase = Phase::Stopping;
-            self.request(kind::STOP, Body::new());
+            self.client.begin(kind::STOP, Body::new());
         }
-    }
-
-    /// Puts the next command under way.
-    pub fn request(&mut self, kind: u8, body: Body) {
-        self.command = self.command.wrapping_add(1);
-        self.request = Request::new(kind, self.command, body);
     }
 
     /// Sets the grid of deadlines shortly after the first samples, so that all ticks find fresh ones; without samples it begins
     /// when half the watchdog time is over.
-    pub fn set_grid(&mut self, now: u64, sampled: bool) {
+    pub(super) fn set_grid(&mut self, now: u64, sampled: bool) {
         self.deadline = if sampled {
             now + (self.settings.period() / 16).min(MARGIN)
         } else {
@@ -341,7 +297,7 @@ impl State {
     }
 
     /// START of mode 2, at the next sample; the host stops it before it ends by itself.
-    pub fn start_body(&self) -> Body {
+    pub(super) fn start_body(&self) -> Body {
         let s = &self.settings;
         let start = bodies::Start {
             mode: 2,
@@ -355,24 +311,9 @@ impl State {
     }
 
     /// Most samples of the device in the run: the reference, the batch before its first tick, and a period for what is late.
-    pub fn length(&self) -> u32 {
+    pub(super) fn length(&self) -> u32 {
         let periods = self.reference.len() as u64 + 1;
         let samples = periods * u64::from(self.settings.ratio) + u64::from(self.settings.batch);
         u32::try_from(samples).unwrap_or(u32::MAX)
-    }
-
-    fn heartbeat(&mut self, kind: u8, now: u64) -> Header {
-        self.heartbeat = self.heartbeat.wrapping_add(1);
-        self.fed = now;
-        self.header(kind, self.heartbeat, now)
-    }
-
-    fn header(&self, kind: u8, sequence: u32, time: u64) -> Header {
-        Header {
-            kind,
-            tag: self.settings.tag,
-            sequence,
-            time: Header::host_time(self.settings.session, time),
-        }
     }
 }

@@ -2,8 +2,9 @@
 
 use proptest::prelude::*;
 
-use super::super::{Outcome, kind};
+use super::super::Outcome;
 use super::{World, host_loop};
+use crate::client::kind;
 
 /// What happens between two calls.
 #[derive(Clone, Debug)]

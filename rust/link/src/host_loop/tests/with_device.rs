@@ -8,6 +8,7 @@ use sewfast_control::{Design, PidController, Settings as Pid, Standard};
 use sewfast_core::machine::{Machine, Parameters};
 
 use super::super::{HostLoop, Outcome, Settings};
+use crate::client::Client;
 use crate::samples::Channel;
 
 const RATIO: u32 = 20;
@@ -176,11 +177,6 @@ fn pair() -> (Bench, HostLoop) {
 
 fn host_loop(key: u32) -> HostLoop {
     let settings = Settings {
-        tag: 3,
-        session: 99,
-        key,
-        command: 1,
-        heartbeat: 0,
         device_period: 1000,
         ratio: RATIO,
         watchdog: 80_000,
@@ -190,7 +186,8 @@ fn host_loop(key: u32) -> HostLoop {
     };
     let channels =
         [(0, 1), (1, 1000)].map(|(code, steps)| Channel::described(code, steps).unwrap());
-    HostLoop::new(settings, &channels, controller(), reference()).unwrap()
+    let client = Client::new(99, 80_000).continued(3, key, 1, 0);
+    HostLoop::new(client, settings, &channels, controller(), reference()).unwrap()
 }
 
 /// Serves the loop to its end; `disturb` is called before each millisecond.

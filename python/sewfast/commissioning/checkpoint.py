@@ -1,0 +1,205 @@
+"""`Taken`: the recordings of a commissioning as files, each written as soon as it is there."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..control.controller import SampledController
+from ..control.loop import ClosedLoopRun
+from ..control.machine import RecordedRun
+from ..errors import DataError, SettingError
+from ..recordfile import save_columns
+from ..recordfile.reader import RecordedFile, read_header, read_recording
+from ..recordfile.writer import ENDING, require_replaceable
+from ..recording import Recording
+from ..report.commissioned import file_name
+
+STAGES = (
+    "first motion",
+    "step response",
+    "small signals",
+    "limits",
+    "closed loop",
+    "training",
+    "tuning",
+    "verification",
+)
+
+FOLDER = "unfinished"
+"""Of its own, so that a killed commissioning and an earlier whole one never mix."""
+_MARK = "commissioning"
+"""The setting that tells these files from any others."""
+
+
+@dataclass
+class Taken:
+    """Without it a process that is killed, or a computer without power, loses what a machine did.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the commissioning; the files lie in its `unfinished` until `folder.write` has written
+        the tables that hold the same.
+    device, conditions : mapping
+        What the recordings are made on, and under which settings.
+    resume : bool
+        Whether what lies there is of an attempt that this one goes on from.
+    """
+
+    folder: Path
+    device: Mapping[str, Any]
+    conditions: Mapping[str, Any]
+    resume: bool = False
+    _has_warned: bool = field(default=False, init=False)
+
+    def begin(self) -> None:
+        """Make the place; files of an earlier commissioning would pass for this one's.
+
+        Raises
+        ------
+        DataError
+        """
+        try:
+            if not self.resume:
+                clear(self.folder)
+        except OSError as error:
+            raise DataError(
+                f"{self.folder / FOLDER}: recordings of an earlier commissioning cannot be taken "
+                f"away ({error.strerror}); choose another folder"
+            ) from error
+        prepare(self.folder / FOLDER)
+
+    def keep(
+        self, stage: str, name: str, key: str, recording: Recording, run: ClosedLoopRun | None
+    ) -> None:
+        """Write one; an earlier one of that name was not good enough.
+
+        A file that cannot be written is warned of, once: what the machine did is in memory as well.
+        """
+        columns = recording.columns()
+        del columns["t"]
+        own: dict[str, Any] = {}
+        if run is not None:
+            own = {"controller": run.controller.to_dict()}
+            columns |= {"r": run.r, "speed": run.y, "feedback": run.feedback}
+        settings = {_MARK: {"stage": stage, "key": key, **self.conditions}, **own}
+        header = recording.header(device=self.device, **settings)
+        units = {"r": "RPM", "speed": "RPM", "feedback": "RPM"}
+        known = {**header.columns, **{n: u for n, u in units.items() if n in columns}}
+        try:
+            save_columns(self._place(stage, name), replace(header, columns=known), columns)
+        except DataError as error:
+            if not self._has_warned:
+                self._has_warned = True
+                warnings.warn(
+                    f"{error}; the commissioning goes on, its recordings are in memory alone",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+
+    def _place(self, stage: str, name: str) -> Path:
+        if stage == STAGES[-1]:
+            # a reference may have the name of an excitation
+            name = f"{stage}_{name}"
+        return self.folder / FOLDER / f"{file_name(name)}{ENDING}"
+
+    def found(self, stage: str, name: str, key: str) -> Recording | None:
+        """What an earlier attempt has recorded of the very same, whole; None where it has not."""
+        file = self._found(stage, name, key)
+        if file is None:
+            return None
+        c, header = file.columns, file.header
+        return Recording(
+            c["u"], c["counts"], c["y"], c.get("speed_true"), header.Ts,
+            float(header.counts_per_rev or 0.0), name,
+        )  # fmt: skip
+
+    def found_run(
+        self, stage: str, name: str, key: str, controller: SampledController, plant: str
+    ) -> RecordedRun | None:
+        """The same of a closed loop."""
+        file, recording = self._found(stage, name, key), self.found(stage, name, key)
+        if file is None or recording is None:
+            return None
+        c = file.columns
+        t = np.arange(len(c["u"]), dtype=np.float64) * recording.Ts
+        return RecordedRun(
+            t, c["r"], c["u"], c["speed"], c["feedback"], controller, plant, name, recording
+        )
+
+    def _found(self, stage: str, name: str, key: str) -> RecordedFile | None:
+        if not self.resume:
+            return None
+        try:
+            file = read_recording(self._place(stage, name))
+        except (DataError, OSError):
+            return None
+        known = file.header.settings.get(_MARK, {})
+        same = {"key": key, **self.conditions}
+        is_same = all(known.get(name) == value for name, value in same.items())
+        return file if file.complete and is_same else None
+
+
+def prepare(folder: Path) -> None:
+    """Make the folder, so that one that cannot be made is refused before the machine moves.
+
+    Raises
+    ------
+    DataError
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be made ({error.strerror}); choose a folder that is writable"
+        ) from error
+
+
+def clear(folder: Path) -> None:
+    """Take the files away: of an earlier commissioning, or of one whose tables are there."""
+    place = folder / FOLDER
+    for file in _inside(place):
+        if _is_own(file):
+            file.unlink()
+    with suppress(OSError):
+        # what somebody else has put there stays
+        place.rmdir()
+
+
+def require_repeatable(folder: Path) -> None:
+    """Refuse files there that a virtual machine could not make again.
+
+    Raises
+    ------
+    SettingError
+    """
+    for file in _inside(folder / FOLDER):
+        if not _is_own(file):
+            raise SettingError(
+                f"{file}: expected nothing but recordings of a commissioning in this folder; "
+                "choose another folder, or overwrite them (--overwrite)"
+            )
+        require_replaceable(file, overwrite=False)
+
+
+def _inside(place: Path) -> list[Path]:
+    return sorted(place.iterdir()) if place.is_dir() else []
+
+
+def _is_own(file: Path) -> bool:
+    """Such a file, or what was being written of one when its process was killed."""
+    if not file.is_file():
+        return False
+    if file.name.startswith(".") and f"{ENDING}." in file.name and file.suffix == ".tmp":
+        return True
+    try:
+        return file.suffix == ENDING and _MARK in read_header(file).settings
+    except DataError:
+        return False
