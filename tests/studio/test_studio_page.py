@@ -196,7 +196,10 @@ class Keys:
         self.browser = browser
 
     def send(self, *keys: str) -> None:
-        self.browser.switch_to.active_element.send_keys(*keys)
+        from selenium.webdriver import ActionChains
+
+        # to the page and not to an element: a file field would take them for a path
+        ActionChains(self.browser).send_keys(*keys).perform()
 
     def reach(self, name: str) -> None:
         """By Tab alone, which goes round."""
@@ -214,8 +217,11 @@ class Keys:
         self.send("\ue007")
 
     def write(self, name: str, text: str) -> None:
+        from selenium.webdriver import ActionChains
+
         self.reach(name)
-        self.send("\ue009a\ue000", text)
+        ActionChains(self.browser).key_down("\ue009").send_keys("a").key_up("\ue009").perform()
+        self.send(text)
 
 
 @pytest.mark.alone
