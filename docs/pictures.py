@@ -25,7 +25,10 @@ from sewfast.report.artefacts import run_file
 
 ASSETS = Path(__file__).parent / "assets"
 STUDIO = runpy.run_path(str(Path(__file__).with_name("studio_pictures.py")))
-PICTURES = runpy.run_path(str(Path(__file__).with_name("page_pictures.py")))["PICTURES"]
+PICTURES = {
+    **runpy.run_path(str(Path(__file__).with_name("page_pictures.py")))["PICTURES"],
+    **runpy.run_path(str(Path(__file__).with_name("diagrams.py")))["DIAGRAMS"],
+}
 LARGEST = 150_000
 """Bytes of a picture: a page has to load it."""
 COLOURS = 64

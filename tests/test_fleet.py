@@ -164,19 +164,19 @@ def test_no_machine_drifts_by_itself(tmp_path: Path, alone: Fleet) -> None:
 def test_what_is_done_is_not_done_again(
     folder: Path, alone: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sewfast import fleets
+    from sewfast.fleets import running
 
-    asked: list[str] = []
-    real = fleets._row
+    worked: list[str] = []
+    real = running.row_of
 
     def interrupted(job: Any, *rest: Any) -> Any:
-        if len(asked) == 3:
+        if len(worked) == 3:
             raise KeyboardInterrupt
-        asked.append(job.file)
+        worked.append(job.file)
         return real(job, *rest)
 
     out = tmp_path / "table.csv"
-    monkeypatch.setattr(fleets, "_row", interrupted)
+    monkeypatch.setattr(running, "row_of", interrupted)
     with pytest.raises(KeyboardInterrupt):
         fleet(folder, out=out, workers=0)
     journal = tmp_path / ".table.csv.journal"
@@ -184,27 +184,27 @@ def test_what_is_done_is_not_done_again(
     # and the process was killed in the middle of a line
     journal.write_text(journal.read_text() + '{"of": [1, 2')
     monkeypatch.setattr(
-        fleets, "_row", lambda job, *rest: asked.append(job.file) or real(job, *rest)
+        running, "row_of", lambda job, *rest: worked.append(job.file) or real(job, *rest)
     )
     found = fleet(folder, out=out, workers=0)
-    assert sorted(asked) == [f"m{i}.npz" for i in range(MACHINES)]
+    assert sorted(worked) == [f"m{i}.npz" for i in range(MACHINES)]
     assert bits(found) == bits(alone) == bits(load_fleet(out))
     assert not journal.exists()
 
 
 def test_other_settings_begin_anew(folder: Path, tmp_path: Path) -> None:
-    from sewfast import fleets
+    from sewfast.fleets import running
 
     out = tmp_path / "table.json"
-    jobs = fleets._jobs(folder, "u", "y", None)
-    kept = fleets._Journal(out, {"model": "oe", "seed": 0, "controller": None})
+    jobs = running.jobs_of(folder, "u", "y", None)
+    kept = running.Journal(out, {"model": "oe", "seed": 0, "controller": None})
     with kept:
-        kept.add(jobs[0], fleets.Row("m0.npz", kind="kept"))
-    again = fleets._Journal(out, {"model": "oe", "seed": 0, "controller": None})
+        kept.add(jobs[0], running.Row("m0.npz", kind="kept"))
+    again = running.Journal(out, {"model": "oe", "seed": 0, "controller": None})
     known = again.known(jobs[0])
     assert known is not None
     assert known.kind == "kept"
-    assert fleets._Journal(out, {"model": "arx", "seed": 0}).known(jobs[0]) is None
+    assert running.Journal(out, {"model": "arx", "seed": 0}).known(jobs[0]) is None
     os.utime(jobs[0].path, ns=(time.time_ns(), time.time_ns()))
     assert again.known(jobs[0]) is None
 
@@ -224,6 +224,8 @@ def test_a_manifest_says_how_each_is_read(tmp_path: Path, folder: Path) -> None:
         ("path\nown.csv\n", "a column file"),
         ("file,Ts\nown.csv,fast\n", "line 2: expected Ts"),
         ("file\nown.csv\nown.csv\n", "twice"),
+        ("file,Ts\n,1\n", "line 2: expected the name of a file, .*, got none"),
+        ("file,Ts\nown.csv,1,2\n", "got more cells than columns"),
         ("", "a column file"),
     ):
         manifest.write_text(text)
@@ -274,6 +276,8 @@ def test_a_folder_in_place_of_the_table_is_refused(folder: Path, tmp_path: Path)
     (tmp_path / "table.csv").mkdir()
     with pytest.raises(SettingError, match="got a folder"):
         fleet(folder, out=tmp_path / "table.csv", workers=0)
+    with pytest.raises(SettingError, match="which does not exist"):
+        fleet(folder, out=tmp_path / "nix" / "table.csv", workers=0)
 
 
 def test_ctrl_c_says_what_is_kept(
@@ -282,10 +286,10 @@ def test_ctrl_c_says_what_is_kept(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    from sewfast import fleets
+    from sewfast.fleets import running
 
     done: list[str] = []
-    real = fleets._row
+    real = running.row_of
 
     def interrupted(job: Any, *rest: Any) -> Any:
         if len(done) == 2:
@@ -293,7 +297,7 @@ def test_ctrl_c_says_what_is_kept(
         done.append(job.file)
         return real(job, *rest)
 
-    monkeypatch.setattr(fleets, "_row", interrupted)
+    monkeypatch.setattr(running, "row_of", interrupted)
     assert main(["fleet", str(folder), "-o", str(tmp_path / "a.csv"), "--workers", "0"]) == 130
     assert "2 recordings are done and kept" in capsys.readouterr().err
 

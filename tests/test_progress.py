@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import sys
 import threading
@@ -156,3 +157,34 @@ def test_a_pipe_gets_a_line_now_and_then(
             call(shown)
     lines = capsys.readouterr().err.splitlines()
     assert [line.removeprefix(expected) for line in lines] == ["11 s", "17 s"]
+
+
+def test_the_log_has_lines_where_it_is_turned_on(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    @shown_in_notebooks("identify")
+    def work(progress: Any = None) -> None:
+        if progress is not None:
+            progress(1, 4, 2.5)
+
+    monkeypatch.setattr(progress, "_FIRST_LINE", 0.0)
+    work()
+    assert caplog.messages == []
+    caplog.set_level(logging.INFO, "sewfast")
+    work()
+    assert [m.partition(" in ")[0] for m in caplog.messages] == [
+        "identify: 25 %, best 2.5, 0 s", "identify: done",
+    ]  # fmt: skip
+    caplog.clear()
+    work(progress=None)
+    assert [m.partition(" in ")[0] for m in caplog.messages] == ["identify: done"]
+
+
+def test_quiet_progress_shows_nothing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(progress, "_FIRST_LINE", 0.0)
+    with Progress("identify", quiet=True) as shown:
+        shown(1, 2, 1.0)
+        shown.say("stage")
+    assert capsys.readouterr().err == ""

@@ -936,6 +936,26 @@ class LinkReceiver:
         did not. rejected: the number expected then. untaken: ``count`` samples found no room.
         """
 
+@final
+class LinkUpload:
+    """A run's values as the device stores them, uploaded ahead of it piece by piece."""
+
+    @staticmethod
+    def commands(values: _F, steps_per_unit: int, limit: float) -> LinkUpload:
+        """Rounded to steps of the device's command channel, and not beyond ``limit`` after that."""
+    @staticmethod
+    def references(values: _F, limit: float) -> LinkUpload:
+        """In single precision, and not beyond ``limit``."""
+    @property
+    def end(self) -> int:
+        """How many values the device has."""
+    @property
+    def is_whole(self) -> bool: ...
+    def piece(self, room: int) -> bytes | None:
+        """Body of the next UPLOAD, where a full frame or the rest has room."""
+    def answered(self, result: int, detail: int, body: bytes) -> bool:
+        """Takes the reply to an UPLOAD: its end, or where the device wants to go on. False where it refuses the values."""
+
 # --- host_loop.rs -----------------------------------------------------------------------------------------
 
 def host_loop(

@@ -154,7 +154,7 @@ WIDTH = 9.2
 BUCKETS = 700
 """A series is drawn by the smallest and largest value in each of at most this many buckets."""
 
-# Okabe and Ito's colours; the line style tells them apart without colour
+# Okabe and Ito's colours; the line style distinguishes them without colour
 LOOKS: dict[str, dict[str, Any]] = {
     "truth": {"color": "#a9a9a9", "lw": 2.8, "ls": "-"},
     "command": {"color": "#333333", "lw": 1.0, "ls": "-"},
@@ -460,7 +460,7 @@ def lettered(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-# --- Series: closed loops, measured beside computed outputs ---------------------------------------
+# --- Series: closed loops, measured and computed outputs ------------------------------------------
 
 
 CYCLE = ("measured", "model", "oe", "arx_raw", "arx", "truth")

@@ -1,8 +1,12 @@
-"""How far long work is: a bar in a terminal, a bar in a notebook, a line now and then elsewhere."""
+"""How far long work is: a bar in a terminal, a bar in a notebook, a line now and then elsewhere.
+
+Whoever turns on Python's logger `sewfast` at level INFO finds those lines in the log instead.
+"""
 
 from __future__ import annotations
 
 import html
+import logging
 import math
 import sys
 import threading
@@ -16,6 +20,7 @@ from typing import Any, ParamSpec, TypeVar
 P = ParamSpec("P")
 R = TypeVar("R")
 
+LOG = logging.getLogger(__package__)
 _WIDTH = 24
 _FIRST_LINE, _LATER = 10.0, 1.5
 """Where stderr is no terminal: seconds until the first line, and the factor to each next one."""
@@ -39,15 +44,17 @@ class Progress:
         Of the work, such as `identify`.
     value : str
         Name of the number that comes with the counts.
+    quiet : bool
+        Show nothing.
     """
 
-    def __init__(self, title: str, value: str = "best") -> None:
+    def __init__(self, title: str, value: str = "best", *, quiet: bool = False) -> None:
         self._title = title
         self._value = value
         self._began = time.monotonic()
-        self._bar = _Bar() if in_notebook() else None
-        self._on = self._bar is None and sys.stderr.isatty()
-        self._next = _FIRST_LINE
+        self._bar = _Bar() if in_notebook() and not quiet else None
+        self._on = self._bar is None and not quiet and sys.stderr.isatty()
+        self._next = math.inf if quiet else _FIRST_LINE
 
     def __call__(self, done: int, total: int, best: float | str) -> None:
         """Show steps and, with them, a number (a cost) or a text (a stage)."""
@@ -80,8 +87,11 @@ class Progress:
         elif seconds >= self._next:
             self._next = _LATER * seconds
             percent = "" if share is None else f"{100 * share:.0f} %"
-            said = ", ".join(filter(None, (percent, text)))
-            print(f"{self._title}: {said}, {seconds:.0f} s", file=sys.stderr, flush=True)
+            shown = ", ".join(filter(None, (percent, text)))
+            self._line(f"{self._title}: {shown}, {seconds:.0f} s")
+
+    def _line(self, text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
 
     def _draw(self, line: str) -> None:
         # back to the first column, the line, then clear what an older one left
@@ -111,34 +121,45 @@ def in_notebook() -> bool:
 def shown_in_notebooks(
     title: str, value: str = "best"
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a function with `progress`: in a notebook a bar is shown where it is left out.
+    """Decorate a function with `progress`: where it is left out, a notebook shows a bar, and the
+    logger `sewfast` gets a line now and then if its level is INFO. It logs what the work took, too.
 
     Only in the main thread, where a cell runs, and once: work that starts other work shows its own
-    bar. `progress=None` shows none.
+    progress. `progress=None` shows none.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         @wraps(function)
         def called(*args: P.args, **options: P.kwargs) -> R:
             in_main = threading.current_thread() is threading.main_thread()
-            if (
-                "progress" in options
-                or not in_main
-                or getattr(_shown, "one", False)
-                or not in_notebook()
-            ):
+            logged = LOG.isEnabledFor(logging.INFO)
+            if not in_main or getattr(_shown, "one", False) or not (logged or in_notebook()):
                 return function(*args, **options)
             _shown.one = True
+            began = time.monotonic()
             try:
-                with Progress(title, value) as progress:
-                    options["progress"] = progress
-                    return function(*args, **options)
+                with Progress(title, value) if in_notebook() else _Logged(title, value) as progress:
+                    options.setdefault("progress", progress)
+                    found = function(*args, **options)
+                LOG.info("%s: done in %.1f s", title, time.monotonic() - began)
+                return found
             finally:
                 _shown.one = False
 
         return called
 
     return decorate
+
+
+class _Logged(Progress):
+    """Lines of the log."""
+
+    def __init__(self, title: str, value: str) -> None:
+        super().__init__(title, value)
+        self._bar, self._on = None, False
+
+    def _line(self, text: str) -> None:
+        LOG.info("%s", text)
 
 
 class _Bar:

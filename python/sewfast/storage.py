@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import math
 import os
 import secrets
@@ -18,11 +19,13 @@ import numpy as np
 from .arrays import FloatArray
 from .errors import ModelFileError
 
+LOG = logging.getLogger(__package__)
+
 # --- Files that appear whole or not at all --------------------------------------------------------
 
 
 def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
-    """Put `content` in place of a file: a temporary name beside it, renamed once it is whole.
+    """Put `content` in place of a file: a temporary name first, renamed once it is whole.
 
     Raises
     ------
@@ -54,6 +57,7 @@ def replace_files(contents: Mapping[Any, bytes]) -> None:
                 raise OSError(error.errno, error.strerror, os.fspath(path)) from error
         for temporary, target in staged:
             temporary.replace(target)
+            LOG.debug("%s: written", target)
     finally:
         for temporary, _ in staged:
             with suppress(OSError):
@@ -61,7 +65,7 @@ def replace_files(contents: Mapping[Any, bytes]) -> None:
 
 
 def _names(path: str | os.PathLike[str]) -> tuple[Path, Path]:
-    """A free temporary name beside a file, and where it goes."""
+    """A free temporary name in the folder of a file, and where it goes."""
     if "\0" in os.fspath(path):
         raise OSError(errno.EINVAL, "a name cannot hold the character 0")
     target = Path(path).resolve()
@@ -109,7 +113,7 @@ def write(
 
 
 def replace(path: str | os.PathLike[str], content: str | bytes) -> None:
-    """Put ``content`` in place of a file: a temporary name beside it, renamed once it is whole.
+    """Put ``content`` in place of a file: a temporary name first, renamed once it is whole.
 
     Raises
     ------

@@ -135,6 +135,37 @@ def test_in_doubt_it_asks(tmp_path: Path) -> None:
     assert "--input COL" in said
 
 
+def test_quiet_and_verbose(tmp_path: Path) -> None:
+    stranger(tmp_path / "bench.csv", "time_ms;u;y", above="")
+    fit = ("identify", "bench.csv", "--model", "arx", "-o", "m.json")
+    plain = sewfast(tmp_path, *fit)
+    assert plain.err == "bench.csv: input u, output y\n"
+    quiet = sewfast(tmp_path, *fit, "-q")
+    assert (quiet.out, quiet.err) == (plain.out, "")
+    first, second, third = sewfast(tmp_path, *fit, "-v").err.splitlines()
+    assert first == "bench.csv: read, 2000 rows of time_ms, u, y"
+    assert second == "bench.csv: input u, output y"
+    assert third.startswith("identify: done in ")
+    assert f"{(tmp_path / 'm.json').resolve()}: written" in sewfast(tmp_path, *fit, "-vv").err
+    # errors are not left out, and the two contradict each other
+    assert "no such file" in refused(tmp_path, "identify", "nix.csv", "-q")
+    assert "not allowed with" in refused(tmp_path, *fit, "-q", "-v")
+
+
+def test_look_draws_columns_that_need_no_names(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    stranger(tmp_path / "bench.csv", "time_ms;voltage_V;speed_rpm")
+    assert "input voltage" in sewfast(tmp_path, "look", "bench.csv", "--plot", "a.png").err
+    assert (tmp_path / "a.png").stat().st_size > 0
+    stranger(tmp_path / "bench.csv", "time_ms;a;b")
+    said = refused(tmp_path, "look", "bench.csv", "--plot", "b.png")
+    assert "which column is the input" in said
+
+
+def test_a_message_does_not_steer_the_terminal(tmp_path: Path) -> None:
+    assert "\x1b" not in refused(tmp_path, "identify", "\x1b[2Jbench.csv")
+
+
 # --- init -----------------------------------------------------------------------------------------
 
 
@@ -235,6 +266,11 @@ def test_without_a_port_it_is_asked_for(tmp_path: Path) -> None:
     assert "PORT" in refused(tmp_path, "stop")
 
 
+def test_a_byte_order_mark_is_no_setting(tmp_path: Path) -> None:
+    (tmp_path / NAME).write_text('port = "COM3"\n', encoding="utf-8-sig")
+    assert load(tmp_path / NAME).port == "COM3"
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -245,6 +281,9 @@ def test_without_a_port_it_is_asked_for(tmp_path: Path) -> None:
         ('[limits]\nu_max = "9"', "[limits] u_max: expected a number, received '9'"),
         ("[limits]\nu_max = nan", "expected a number"),
         ("[limits]\nu_max = true", "expected a number"),
+        ("[limits]\nu_min = 3\nu_max = -3", "expected u_min below u_max, received u_min = 3"),
+        ("[limits]\nu_min = 3\nu_max = 3", "expected u_min below u_max"),
+        ("[limits]\nvolt = -8", "[limits] volt: expected a positive number, received -8"),
         ("limits = 3", "expected a table, [limits], received 3"),
         ("port = 3", "expected a text"),
         ("[columns]\ninput = []", "expected at least one name"),

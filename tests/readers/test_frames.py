@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -246,3 +247,38 @@ def test_a_stream_without_pyarrow_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(SettingError, match=r"Stream needs pyarrow.*sewfast\[parquet\]"):
         sewfast.read(Stream(), inputs="u")
+
+
+def test_integers_that_numpy_does_not_have() -> None:
+    pl = pytest.importorskip("polars")
+    u = pl.Series("u", [1, 2, 3]).cast(pl.Int128)
+    table = sewfast.read_table(pl.DataFrame([pl.Series("t", [0.0, 0.1, 0.2]), u]))
+    assert table["u"].tolist() == [1.0, 2.0, 3.0]
+
+
+def test_a_query_that_cannot_be_computed_is_refused() -> None:
+    pl = pytest.importorskip("polars")
+    lazy = pl.DataFrame({"t": [0.0, 0.1]}).lazy().select("nope")
+    with pytest.raises(DataError, match=r"LazyFrame: expected a query .* unable to find column"):
+        sewfast.read_table(lazy)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"inputs": 1}, "inputs: expected the name of a column, received 1"),
+        ({"inputs": [None]}, "inputs: expected the name of a column, received None"),
+        ({"output": 2}, "output: expected the name of a column, received 2"),
+        ({"Ts": "0.1"}, "Ts: expected a positive sample time in seconds, received '0.1'"),
+    ],
+)
+def test_names_and_times_of_another_type_are_refused(options: dict[str, Any], words: str) -> None:
+    columns = {"t": np.arange(4) * 0.1, "u": np.arange(4.0), "y": np.arange(4.0)}
+    with pytest.raises(SettingError, match=re.escape(words)):
+        sewfast.read(columns, **{"inputs": "u", "output": "y", **options})
+
+
+def test_a_time_column_without_numbers_is_named() -> None:
+    columns = {"t": np.array(["a", "b", "c"]), "u": np.arange(3.0), "y": np.arange(3.0)}
+    with pytest.raises(DataError, match="column 't' holds"):
+        sewfast.read(columns, inputs="u", output="y")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
+import os
 import re
+import sys
 import threading
 import tracemalloc
 from pathlib import Path
@@ -417,3 +420,38 @@ def growth(path: Path, blocks: int) -> int:
             return tracemalloc.get_traced_memory()[0]
     finally:
         tracemalloc.stop()
+
+
+class Msvcrt:
+    """The locks of Windows' C library as documented: of bytes from the present position on."""
+
+    LK_NBLCK, LK_UNLCK = 2, 0
+
+    def __init__(self) -> None:
+        self.held: dict[tuple[int, int], int] = {}
+
+    def locking(self, file: int, mode: int, count: int) -> None:
+        assert count == 1
+        place = os.fstat(file).st_ino, os.lseek(file, 0, os.SEEK_CUR)
+        if mode == self.LK_UNLCK and self.held.get(place) == file:
+            del self.held[place]
+        elif mode == self.LK_NBLCK and place not in self.held:
+            self.held[place] = file
+        else:
+            raise PermissionError(errno.EACCES, "Permission denied")
+
+
+def test_a_recording_is_locked_where_only_windows_locks_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library = Msvcrt()
+    monkeypatch.setitem(sys.modules, "fcntl", None)
+    monkeypatch.setitem(sys.modules, "msvcrt", library)
+    path = tmp_path / "run.mcap"
+    with RecordWriter(path, header(10)) as out:
+        assert len(library.held) == 1
+        with pytest.raises(SettingError, match="nobody else writes"):
+            RecordWriter(path, header(10), overwrite=True)
+        out.samples(0, {name: values[:10] for name, values in signals(10).items()})
+    assert library.held == {}
+    assert len(read_recording(path)) == 10

@@ -11,10 +11,10 @@ import traceback
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from ..errors import SettingError, SewfastError
+from ..errors import SettingError, SewfastError, printable
 from . import project
 from .drive import is_port
-from .output import DONE, FAULT, INTERRUPTED, REFUSED
+from .output import DONE, FAULT, INTERRUPTED, REFUSED, logging_to_stderr
 from .parser import build_parser
 
 
@@ -32,11 +32,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 done, 1 a fault in sewfast, 2 refused, 130 interrupted.
     """
     try:
-        args = _parsed(argv)
+        args, found = _parsed(argv)
     except KeyboardInterrupt:
         return _say("sewfast: interrupted; nothing was written", INTERRUPTED)
     except SewfastError as e:
         return _say(f"sewfast: {e}", REFUSED)
+    with logging_to_stderr(quiet=args.quiet, verbose=args.verbose):
+        found.fill(args)
+        return _carried_out(args)
+
+
+def _carried_out(args: argparse.Namespace) -> int:
+    """One command: its exit code, or that of the exception that ended it."""
     began = time.time()
     try:
         if args.out_of is not None and args.out is None:
@@ -68,8 +75,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fault(args, e)
 
 
-def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
-    """The command line, with what the project file says where that says nothing."""
+def _parsed(argv: Sequence[str] | None) -> tuple[argparse.Namespace, project.Project]:
+    """The command line, and the project whose settings stand in for what it leaves out."""
     parser = build_parser()
     try:
         found = project.find()
@@ -78,9 +85,7 @@ def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
         parser.parse_args(argv)
         raise
     found.relax(parser)
-    args = parser.parse_args(argv)
-    found.fill(args)
-    return args
+    return parser.parse_args(argv), found
 
 
 def _interrupted(args: argparse.Namespace, began: float) -> str:
@@ -107,7 +112,8 @@ def _fault(args: argparse.Namespace, e: Exception) -> int:
 
 
 def _say(message: str, code: int) -> int:
-    print(message, file=sys.stderr)
+    # a message holds names of files, ports and columns, which must not steer the terminal
+    print("\n".join(map(printable, message.split("\n"))), file=sys.stderr)
     return code
 
 
@@ -150,7 +156,7 @@ def _written(args: argparse.Namespace) -> Iterator[tuple[str, Path]]:
             yield option, path
     out = getattr(args, "out", None)
     if isinstance(out, Path) and out.suffix not in ("", ".mcap") and _is_recorded(args):
-        # what a drive does is recorded beside the table
+        # what a drive does is recorded in the table's folder
         yield "-o", out.with_suffix(".mcap")
 
 

@@ -34,6 +34,14 @@ def add_command(
         name, help=summary, description=text, epilog=examples, formatter_class=Help
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    level = parser.add_mutually_exclusive_group()
+    level.add_argument(
+        "-q", "--quiet", action="store_true", help="no progress and no notes: result and errors"
+    )
+    level.add_argument(
+        "-v", "--verbose", action="count", default=0,
+        help="log what is read and what work takes; -vv: what is written, too",
+    )  # fmt: skip
     parser.add_argument("--debug", action="store_true", help="show where a fault comes from")
     parser.set_defaults(command=command, out_of=None)
     return parser

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 BODE = """\
 The Bode plot of a drive, with error bars, and the resonance of its shaft. A machine (--on) is
-brought to a working speed and shaken there by sines of random phases, so that noise and distortion
-are told apart; of a record averaged spectra are taken. Two masses and a shaft, or a rigid machine,
-are fitted to it.
+brought to a working speed and shaken there by sines of random phases, which separates noise from
+distortion; of a record averaged spectra are taken. Two masses and a shaft, or a rigid machine, are
+fitted to it.
 
 The machine turns at --speed, a little faster and slower, for a minute or less. Under a controller
 (--controller) the reference is shaken instead, and the loop's margins are printed as measured.

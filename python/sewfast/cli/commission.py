@@ -21,7 +21,7 @@ TEXT = """\
 Do what an engineer does to a drive: find out which command moves it, record its step response,
 take first gains by rule, record a closed loop under these and pulses up to the command's limit,
 train an ensemble of networks, tune the gains on all of them, run them on the machine and report
-the prediction beside the measurement. It stops with a reason where the evidence is not good enough.
+prediction and measurement together. It stops with a reason where the evidence is not good enough.
 
 The machine turns freely up to a quarter more than the top speed (--speed), again and again, each
 time from rest. DIR holds recordings, models, controllers, runs and report.html; Ctrl-C stops the
@@ -67,7 +67,7 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--load", type=float, metavar="V",
         help="load in volts of command that the loop is to bear no worse than Eq. 12's "
-        "(a tenth of --u-max; 0: not asked for)",
+        "(a tenth of --u-max; 0: not required)",
     )  # fmt: skip
     parser.add_argument(
         "--Ms", type=float, default=2.0, metavar="MS", help="largest sensitivity allowed (2)"
@@ -137,7 +137,7 @@ def _kept(args: argparse.Namespace) -> int | None:
 def _commissioned(args: argparse.Namespace) -> Commissioning:
     from ..commissioning import commission
 
-    with Progress("commission") as progress:
+    with Progress("commission", quiet=args.quiet) as progress:
         options = {
             "u_max": args.u_max,
             "speed": args.speed,
@@ -167,7 +167,7 @@ Carry out the paper's experiment on the virtual sewing machine: excite, record, 
 tune, run, report. Takes about a minute.
 
 DIR/report.html is the page to look at; DIR/results.json holds its numbers. Recordings, models and
-the controller lie beside them, ready for the other commands.
+the controller are written with them, ready for the other commands.
 """
 
 REPORT = """\
@@ -200,7 +200,7 @@ def add_demo(commands: Commands) -> None:
 def demo_command(args: argparse.Namespace) -> None:
     from ..experiment import run_demo
 
-    with Progress("demo") as progress:
+    with Progress("demo", quiet=args.quiet) as progress:
         results = run_demo(
             args.out, args.seed, overwrite=args.overwrite,
             progress=lambda done, total, stage: progress.say(stage),

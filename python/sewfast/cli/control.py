@@ -152,7 +152,7 @@ def _settle_plant(args: argparse.Namespace) -> None:
             args.controller, args.plant = args.plant, args.controller
         if is_port(args.plant):
             raise SettingError(
-                f"{args.plant}: expected a model or a virtual machine beside the controller; a "
+                f"{args.plant}: expected a model or a virtual machine with the controller; a "
                 f"drive is given by --on {args.plant}"
             )
         args.on = args.plant
@@ -267,7 +267,7 @@ def add_host_loop(parser: argparse.ArgumentParser) -> None:
 
 
 def at_loops_period(args: argparse.Namespace, controller: Controller) -> Controller:
-    """The controller at the sample time asked for; other arguments are checked too.
+    """The controller at the requested sample time; other arguments are checked too.
 
     Raises
     ------
@@ -295,7 +295,7 @@ def at_loops_period(args: argparse.Namespace, controller: Controller) -> Control
 def run_host_loop(
     args: argparse.Namespace, controller: Controller, reference: str | FloatArray
 ) -> int | None:
-    """Run it, write what is asked for, and say how it ended.
+    """Run it, write its files, and say how it ended.
 
     Returns
     -------
@@ -308,7 +308,7 @@ def run_host_loop(
     code = None
     with opened(args) as drive:
         try:
-            with Progress("run") as progress:
+            with Progress("run", quiet=args.quiet) as progress:
                 found = run_on_host(
                     drive,
                     controller,

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..errors import DataError, SettingError
 from .arguments import Commands, add_columns, add_command, add_plot, require_plot
-from .output import print_json, print_result
+from .output import note, print_json, print_result
 from .project import with_units
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) 
         inputs, counts = _of_recording(table, inputs, output, counts)
     if not inputs and not output and not counts and (found := roles(table)) is not None:
         inputs, output = (found.input,), found.output
-        print(f"{path}: input {found.input}, output {found.output}", file=sys.stderr)
+        note(f"{path}: input {found.input}, output {found.output}")
     if not inputs:
         raise _unnamed(table, "input", "--input COL")
     if not output and not counts:
@@ -57,8 +56,8 @@ def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) 
 
 def _with_notes(data: Dataset) -> Dataset:
     """The data; what was done in reading them goes to standard error."""
-    for note in data.notes:
-        print(note, file=sys.stderr)
+    for text in data.notes:
+        note(text)
     return data
 
 
@@ -230,7 +229,7 @@ def add_hold(parser: argparse._ActionsContainer) -> None:
 
 
 def held(data: Dataset, args: argparse.Namespace) -> Dataset:
-    """The data with missing inputs held, where that is asked for."""
+    """The data with missing inputs held, where an option selects that."""
     before = len(data.notes)
     data = data.fill_inputs("hold") if args.hold_inputs else data
     _tell(data, before)
@@ -276,8 +275,8 @@ def prepared(
 
 
 def _tell(data: Dataset, before: int) -> None:
-    for note in data.notes[before:]:
-        print(note, file=sys.stderr)
+    for text in data.notes[before:]:
+        note(text)
 
 
 def _detrended(data: Dataset, order: str | None, like: Dataset | None) -> Dataset:
@@ -320,9 +319,12 @@ def add_look(commands: Commands) -> None:
 
 
 def look_command(args: argparse.Namespace) -> None:
+    from ..readers import roles
+
     require_plot(args.plot)
     tables = [] if args.input or args.output or args.counts else _unnamed_columns(args)
-    if tables:
+    # a picture is of input and output; columns that show which is which need not be named for it
+    if tables and not (args.plot is not None and all(roles(t) is not None for t in tables)):
         _show_columns(tables, args)
         return
     found = prepared(read_training(args), args).summary()

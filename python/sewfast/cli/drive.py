@@ -214,7 +214,7 @@ def _named(machine: str) -> str:
 
 
 def require_no_drive_options(args: argparse.Namespace) -> None:
-    """Refuse what only a drive behind a port can be told, where `--on` names none.
+    """Refuse settings that only a drive behind a port has, where `--on` names none.
 
     Raises
     ------
@@ -265,7 +265,7 @@ def _ceilings(drive: Drive) -> dict[str, float]:
 
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """A run that is told to end, or whose terminal is closed, ends as by Ctrl-C: motor first."""
+    """A run that receives SIGTERM, or whose terminal is closed, ends as by Ctrl-C: motor first."""
     numbers = [getattr(signal, name, None) for name in ("SIGTERM", "SIGHUP")]
     before = {n: signal.signal(n, signal.default_int_handler) for n in numbers if n is not None}
     try:
@@ -312,7 +312,7 @@ def _limits(text: str) -> dict[str, float]:
 
 
 def recording_place(out: Path | None, *, overwrite: bool) -> Path:
-    """Where the recording of a drive goes: the output itself, or `.mcap` beside it.
+    """Where the recording of a drive goes: the output itself, or `.mcap` in the same folder.
 
     Raises
     ------
@@ -329,7 +329,7 @@ def recording_place(out: Path | None, *, overwrite: bool) -> Path:
     place = out.with_suffix(".mcap")
     require_replaceable(place, overwrite=overwrite)
     if not place.exists():
-        # a table beside its recording was made from it; this one is all there is
+        # a table next to its recording can be made again from it; this one cannot
         require_free([out], overwrite=overwrite)
     return place
 

@@ -70,7 +70,7 @@ def fleet_command(args: argparse.Namespace) -> int:
 
     controller = None if args.controller is None else load_pid(args.controller)
     done = 0
-    with Progress("fleet", "share failed") as shown:
+    with Progress("fleet", "share failed", quiet=args.quiet) as shown:
 
         def progress(count: int, total: int, failed: float) -> None:
             nonlocal done

@@ -25,7 +25,7 @@ First gains for a drive, from a recorded step response or from K, T and L of K e
 
 A rule gives gains, alpha and beta; printed are the gains in all three forms and the margins of the
 sampled loop with hold, derivative filter, feedback filter and encoder in it. What hold, filter and
-encoder add to the dead time is added to L before the rule is asked.
+encoder add to the dead time is added to L before the rule is applied.
 """
 
 EXAMPLES = """\

@@ -84,7 +84,7 @@ def orders_command(args: argparse.Namespace) -> None:
     from ..identification.order_table import orders
 
     data = prepared(read_training(args), args)
-    with Progress("orders") as progress:
+    with Progress("orders", quiet=args.quiet) as progress:
         table = orders(
             data,
             na=args.na,
@@ -225,7 +225,7 @@ def identify_command(args: argparse.Namespace) -> int | None:
     train = prepared(train, args, cut=True)
     held = None if held is None else prepared(held, args, like=train, cut=True)
     try:
-        with Progress("identify") as progress:
+        with Progress("identify", quiet=args.quiet) as progress:
             model = _identify(args, train, held, progress)
     except Interrupted as e:
         e.best.save(args.out)
@@ -245,7 +245,7 @@ def identify_command(args: argparse.Namespace) -> int | None:
 
 
 def _save_alternatives(args: argparse.Namespace, model: Model) -> list[Path]:
-    """Files beside the model's, the best alternative first."""
+    """Files in the model's folder, the best alternative first."""
     out = Path(args.out)
     paths = []
     for i, other in enumerate(model.alternatives, start=1):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +19,42 @@ if TYPE_CHECKING:
 
 DONE, FAULT, REFUSED, INTERRUPTED = 0, 1, 2, 130
 """Exit codes (docs/cli.md)."""
+
+
+LOG = logging.getLogger(__package__)
+"""Notes of the commands; the package's own logger is the one above it."""
+
+
+def note(text: str) -> None:
+    """A note on standard error, which `--quiet` leaves out."""
+    LOG.info("%s", text)
+
+
+class _ToStderr(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        print(record.getMessage(), file=sys.stderr, flush=True)
+
+
+@contextmanager
+def logging_to_stderr(*, quiet: bool = False, verbose: int = 0) -> Iterator[None]:
+    """Notes, and with `verbose` the package's log, on standard error while a command runs."""
+    package = LOG.parent
+    assert package is not None
+    if any(isinstance(handler, _ToStderr) for handler in package.handlers):
+        # a stage of another command, which has set all this
+        yield
+        return
+    before = [(logger, logger.level) for logger in (LOG, package)]
+    handler = _ToStderr()
+    LOG.setLevel(logging.WARNING if quiet else logging.INFO)
+    package.setLevel((logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)])
+    package.addHandler(handler)
+    try:
+        yield
+    finally:
+        package.removeHandler(handler)
+        for logger, level in before:
+            logger.setLevel(level)
 
 
 def print_json(value: Any) -> None:

@@ -62,7 +62,7 @@ exit codes:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that says what was probably meant, and that shows its help where nothing is asked.
+    """A parser that suggests what was probably meant; without a command it shows its help.
 
     argparse makes the parsers of the commands of the same class.
     """

@@ -88,7 +88,7 @@ def command(args: argparse.Namespace) -> int:
         _say("compiling the firmware")
         firmware = build_firmware(args.source, board=args.board or "mps2-an386")
     elif args.board is not None:
-        raise SettingError("--board: leave it out beside --firmware, which says for which it is")
+        raise SettingError("--board: leave it out with --firmware, which states the board")
     with EmulatedBoard(firmware, clock=args.clock, boot_id=args.seed + 1) as board:
         _prepare(args.out, args.overwrite, make=True)
         first = Controller(
@@ -154,6 +154,8 @@ def _carried_out(args: argparse.Namespace, words: list[str]) -> tuple[int, Any]:
     from . import main
 
     _say(f"$ sewfast {' '.join(words)}")
+    if args.quiet:
+        words = [*words, "--quiet"]
     if not args.json:
         return main(words), None
     with redirect_stdout(StringIO()) as printed:

@@ -1,4 +1,4 @@
-"""`sewfast init`, and the project file `sewfast.toml`: what every command need not be told again.
+"""`sewfast init`, and the project file `sewfast.toml`: settings that need not be repeated.
 
 The file is looked for in the working folder and in those above it. Whatever is given on the command
 line wins, and so do the columns that a model was made from.
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import SettingError, printable
 from .arguments import Commands, add_command
 from .drive import LIMITS, is_port
-from .output import print_json
+from .output import note, print_json
 
 if TYPE_CHECKING:
     from ..readers import Table
@@ -91,7 +91,7 @@ class Project:
                 self._take(args, taken, name, value)
         if taken:
             shown = printable(", ".join(f"{name} = {value}" for name, value in taken.items()))
-            print(f"from {self.path}: {shown}", file=sys.stderr)
+            note(f"from {self.path}: {shown}")
 
     def _fill_port(self, args: argparse.Namespace, taken: dict[str, Any]) -> None:
         if args.name in ("record", "commission", "run") and getattr(args, "plant", None) is None:
@@ -163,6 +163,17 @@ def load(path: Path) -> Project:
     numbers = {
         name: _number(path, f"[limits] {name}", value) for name, value in tables["limits"].items()
     }
+    for name, value in numbers.items():
+        if name in LIMITS and value <= 0.0:
+            raise SettingError(
+                f"{path}: [limits] {name}: expected a positive number, received {value:g}"
+            )
+    low, high = (numbers.get(name) for name in _RANGE)
+    if low is not None and high is not None and low >= high:
+        raise SettingError(
+            f"{path}: [limits]: expected u_min below u_max, received u_min = {low:g} and "
+            f"u_max = {high:g}; exchange or correct them"
+        )
     limits = {name: numbers[name] for name in LIMITS if name in numbers}
     if limits and len(limits) < len(LIMITS):
         missing = ", ".join(name for name in LIMITS if name not in limits)
@@ -197,7 +208,7 @@ def _parsed(path: Path) -> dict[str, Any]:
     if len(raw) > _LARGEST:
         raise SettingError(f"{path}: expected a few lines of settings, received {len(raw)} bytes")
     try:
-        found: dict[str, Any] = toml.loads(raw.decode("utf-8"))
+        found: dict[str, Any] = toml.loads(raw.decode("utf-8-sig"))
     except (UnicodeDecodeError, ValueError, RecursionError) as e:
         raise SettingError(f"{path}: expected TOML, received something else: {e}") from e
     return found

@@ -126,10 +126,10 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--rival", metavar="MODEL.json",
         help="a model of another kind of the same drive, for a second opinion on the gains: a "
-        "linear one beside a network",
+        "linear one next to a network",
     )  # fmt: skip
     _add_search(parser)
-    add_plot(parser, "draw the tuned loop beside the start's; of --pareto the front")
+    add_plot(parser, "draw the tuned loop and the start's; of --pareto the front")
     add_named_output(parser, "controller", "model", "controller file to write")
 
 
@@ -313,7 +313,7 @@ def _notches(given: list[str] | None) -> list[Biquad]:
 
 
 def _started(args: argparse.Namespace, models: list[Any]) -> dict[str, Any]:
-    """`_first` with the notches that are asked for."""
+    """`_first` with the notches that the options name."""
     first = _first(args)
     notches = _notches(args.notch)
     if not notches:
@@ -391,7 +391,7 @@ def _tuned(
     from ..tuning.search import tune
 
     rival = None if args.rival is None else load_model(args.rival)
-    with Progress("tune") as progress:
+    with Progress("tune", quiet=args.quiet) as progress:
         return tune(
             models, references, **_started(args, models), **settings, rival=rival,
             method=args.method, time_budget=args.time_budget, progress=progress,
@@ -406,7 +406,7 @@ def _front(
 
     first = _started(args, models)
     start = _pid(first.get("start") or first_of(models[0], **first), "--pareto")
-    with Progress("tune") as progress:
+    with Progress("tune", quiet=args.quiet) as progress:
         return pareto(
             models, references, objectives=args.pareto.split(","), start=start, **settings,
             progress=progress,

@@ -6,8 +6,8 @@ whether the parameters were estimated on these data or on others (Ljung 1999, se
 16.6; Breusch and Godfrey 1978). R is Bartlett's: the residual as it is, coloured, with an
 autoregression for R. A strongly coloured residual knows its own R too badly for 25 sums at once,
 and the form acquits too often; whitened by the same autoregression it is exact, but then accuses
-for the curvature of the model, which is large beside the innovation. The statistic of a test is
-the mean of both.
+for the curvature of the model, which is large compared with the innovation. The statistic of a test
+is the mean of both.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-"""Okabe and Ito's, told apart by everyone."""
+"""Okabe and Ito's: distinct for readers with a colour deficiency, too."""
 _STYLES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1, 2)))
 _MARKERS = "osD^vP"
 _MOST_PANELS = 6
@@ -313,7 +313,7 @@ _DRAWINGS: dict[str, Callable[[ReportCard], Drawing]] = {
 
 
 def shade(n: int, count: int) -> str:
-    """From dark to light in one hue: order is told by lightness, in grey print as well."""
+    """From dark to light in one hue: lightness shows the order, in grey print as well."""
     import matplotlib
 
     share = n / max(count - 1, 1)

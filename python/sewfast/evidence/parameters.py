@@ -219,7 +219,7 @@ def estimate(model: DynamicModel, residuals: Residuals) -> Parameters | None:
 
 
 def penalty(model: DynamicModel, residuals: Residuals) -> FloatArray:
-    """The weight decay as a diagonal beside Psi'Psi, in the data's units; zero where there is none.
+    """The weight decay as a diagonal added to Psi'Psi, in the data's units; zero without one.
 
     The training cost is 1/(2N) sum (e/y_scale)^2 + decay/2 |w|^2 (docs/CONVENTIONS.md).
     """

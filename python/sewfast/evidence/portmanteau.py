@@ -183,7 +183,7 @@ def _innovations(
 ) -> _Columns:
     """Whitened residuals, less what better parameters would take of them.
 
-    A change of the parameters too small to see in the residual can be large beside its innovation.
+    A change of the parameters too small to see in the residual can be large against its innovation.
     """
     white = [
         np.where(k, noise.whitened(e[:, None])[:, 0], 0.0)

@@ -175,7 +175,7 @@ class TrainingRegion:
         signals = [np.column_stack(run) for run in runs]
         together = np.concatenate(signals)
         centre = together.mean(axis=0)
-        # a change of the output that is small beside the output itself is no new region
+        # a change of the output that is small compared with the output itself is no new region
         floor = np.zeros(points.shape[1])
         floor[-1] = 0.1 * 0.5 * float(np.ptp(together[:, -1]))
         largest = np.maximum(

@@ -245,7 +245,7 @@ class Residuals:
     def of(
         cls, model: DynamicModel, data: Dataset, init: int = INIT, horizon: Horizon | None = None
     ) -> Residuals:
-        """Residuals of a model, at the horizon that it was made for unless told otherwise.
+        """Residuals of a model, at the horizon that it was made for unless stated otherwise.
 
         Raises
         ------
@@ -295,7 +295,7 @@ class Residuals:
 
     @property
     def mean(self) -> float:
-        """Of the residuals, beside what the initial state explains; 0 where it explains all."""
+        """Of the residuals, without what the initial state explains; 0 where it explains all."""
         ones = self.constants
         length = float(sum(one @ one for one in ones))
         total = float(sum(one @ r.error for one, r in zip(ones, self.runs, strict=True)))

@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import _core
 from ..control.controller import Controller, SampledController
 from ..control.machine import RecordedRun, Watch
 from ..errors import LinkError, SettingError
@@ -475,11 +476,11 @@ class Drive(Unique):
         """Time that the device goes on without a word from here [s]."""
         return self._link.watchdog
 
-    def _profile_of(self, plan: Plan) -> profiles.Profile | None:
+    def _profile_of(self, plan: Plan) -> _core.LinkUpload | None:
         profile = self._profile("references" if plan.mode == "controller" else "commands", plan)
         return None if plan.mode == "direct" else profile
 
-    def _profile(self, what: str, plan: Plan) -> profiles.Profile:
+    def _profile(self, what: str, plan: Plan) -> _core.LinkUpload:
         limits = self.limits()
         if not limits.are_set:
             raise SettingError(

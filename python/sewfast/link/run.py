@@ -6,70 +6,20 @@ import math
 import threading
 import time
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .._core import LinkUpload
 from ..errors import LinkError, SettingError
 from . import wire
 from .connection import SILENCE, Connection, DeviceReset
 from .plan import Columns, Layout, Outcome, Plan, Sink
 from .wire import Channel, Event, Kind, Limits, Reply, Status
 
-# --- Profile: a run's values as the device stores them, uploaded ahead of it piece by piece -------
 
-
-COMMANDS: Literal[0] = 0
-REFERENCES: Literal[1] = 1
-_DTYPES: dict[int, str] = {COMMANDS: "<i2", REFERENCES: "<f4"}
-
-
-class Profile:
-    """Values in the device's steps, and how far they have been uploaded.
-
-    Parameters
-    ----------
-    table : 0 or 1
-        Commands in steps of channel `u`, or references as f32.
-    values : array, shape (N,)
-    """
-
-    def __init__(self, table: Literal[0, 1], values: NDArray[Any]) -> None:
-        self.table = table
-        self.values = np.ascontiguousarray(values, dtype=_DTYPES[table])
-        self.per_frame = (wire.MAX_BODY - 5) // self.values.itemsize
-        self.end = 0
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether the device has all of it."""
-        return self.end >= len(self.values)
-
-    def piece(self, room: int) -> bytes | None:
-        """Body of the next UPLOAD where a full frame, or the rest, has room; None where not."""
-        count = min(self.per_frame, len(self.values) - self.end)
-        if count <= 0 or room < count:
-            return None
-        part = self.values[self.end : self.end + count]
-        return wire.upload(self.table, self.end, part.tobytes())
-
-    def answered(self, reply: wire.Reply) -> None:
-        """Take the reply to an UPLOAD: its end, or where the device wants to go on.
-
-        Raises
-        ------
-        LinkError
-            Where the device refuses the values.
-        """
-        if reply.result == 9:
-            self.end = min(reply.detail, len(self.values))
-        elif reply.result not in (4, 7):
-            # no room yet, or the run has ended: neither is an error of the values
-            self.end = wire.uploaded(reply.checked())[0]
-
-
-def commands(values: NDArray[np.float64], u: Channel, limits: Limits) -> Profile:
+def commands(values: NDArray[np.float64], u: Channel, limits: Limits) -> LinkUpload:
     """Commands rounded to the device's steps.
 
     Raises
@@ -79,11 +29,10 @@ def commands(values: NDArray[np.float64], u: Channel, limits: Limits) -> Profile
     """
     limit = min(limits.volt, 32_767 / u.steps_per_unit)
     _require_within("commands", values, limit, u.unit)
-    top = np.floor(np.float32(limit) * u.steps_per_unit)
-    return Profile(COMMANDS, np.clip(np.rint(values * u.steps_per_unit), -top, top))
+    return LinkUpload.commands(values, u.steps_per_unit, limit)
 
 
-def references(values: NDArray[np.float64], limits: Limits) -> Profile:
+def references(values: NDArray[np.float64], limits: Limits) -> LinkUpload:
     """References as the device stores them.
 
     Raises
@@ -93,7 +42,7 @@ def references(values: NDArray[np.float64], limits: Limits) -> Profile:
     """
     limit = min(limits.speed_rpm, wire.LARGEST)
     _require_within("references", values, limit, "RPM")
-    return Profile(REFERENCES, np.clip(values, -limit, limit))
+    return LinkUpload.references(values, limit)
 
 
 def _require_within(name: str, values: NDArray[np.float64], limit: float, unit: str) -> None:
@@ -105,6 +54,12 @@ def _require_within(name: str, values: NDArray[np.float64], limit: float, unit: 
             received=f"{values[k]:g} at sample {k} and {len(beyond)} beyond in all",
             remedy="scale the signal or raise the limit (set_limits)",
         )  # fmt: skip
+
+
+def _take_reply(profile: LinkUpload, reply: Reply) -> None:
+    """Take the reply to an UPLOAD; raises LinkError where the device refuses the values."""
+    if not profile.answered(reply.result, reply.detail, reply.body):
+        wire.uploaded(reply.checked())
 
 
 # --- Run: one run on a device, from its upload to the last sample, with its way out ---------------
@@ -192,13 +147,13 @@ class Run:
     link : Connection
     plan : Plan
     layout : Layout
-    profile : Profile or None
+    profile : LinkUpload or None
         None in mode "direct".
     sink : Sink
     """
 
     def __init__(
-        self, link: Connection, plan: Plan, layout: Layout, profile: Profile | None, sink: Sink
+        self, link: Connection, plan: Plan, layout: Layout, profile: LinkUpload | None, sink: Sink
     ) -> None:
         self.link, self.plan, self.layout, self.profile = link, plan, layout, profile
         self.sink = sink
@@ -237,7 +192,7 @@ class Run:
         profile = self.profile
         while profile is not None and (piece := profile.piece(self._room())) is not None:
             before = profile.end
-            profile.answered(self.link.request(Kind.UPLOAD, piece))
+            _take_reply(profile, self.link.request(Kind.UPLOAD, piece))
             if profile.end == before:
                 raise LinkError(
                     name=self.link.port.url,
@@ -369,7 +324,7 @@ class Run:
 
     def _answered(self, reply: Reply) -> None:
         if reply.kind == Kind.UPLOAD and self.profile is not None:
-            self.profile.answered(reply)
+            _take_reply(self.profile, reply)
             if reply.result:
                 # the run has ended, or the device sees it otherwise: STATUS comes next
                 self._heard = self._asked = -math.inf

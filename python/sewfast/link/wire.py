@@ -322,9 +322,7 @@ def _shown(name: str) -> str:
 # --- commands -----------------------------------------------------------------------------------
 
 
-arm, set_limits, upload, gains = (
-    LinkBodies.arm, LinkBodies.limits, LinkBodies.upload, LinkBodies.gains
-)  # fmt: skip
+arm, set_limits, gains = LinkBodies.arm, LinkBodies.limits, LinkBodies.gains
 biquads, controller, start = LinkBodies.biquads, LinkBodies.controller, LinkBodies.start
 
 

@@ -265,7 +265,7 @@ def _require_whole(header: _Header) -> None:
 
 
 def _flight(header: _Header, data: _Bytes) -> tuple[list[str], array[int]]:
-    """Every main frame, each with the last slow one beside it."""
+    """Every main frame, each with the last slow one."""
     main, slow = header.frames["I"], header.frames.get("S")
     names = [*main.names, *(slow.names if slow is not None else ())]
     held: list[int] = [0] * (len(slow.names) if slow is not None else 0)

@@ -49,7 +49,7 @@ def read_delimited(path: Path, raw: bytes) -> Table:
     a row of units below it gives the units. The delimiter is comma, semicolon or tab; with the last
     two, numbers may have decimal commas.
     Empty cells are NaN. Columns with text are kept as unusable, each with the line and the cell,
-    so that they only matter to who asks for them.
+    so that they only matter to those who select them.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def _above_numbers(
         heads.pop()
         header = heads[0]
     elif len(heads) == len(above):
-        # names and a row of text: an ordinary table, whose columns with text are told later
+        # names and a row of text: an ordinary table, whose columns with text are named later
         return None
     else:
         header = heads[-1]

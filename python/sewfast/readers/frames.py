@@ -21,7 +21,7 @@ from .containers import Table, from_headers
 _NUMBER = (int, float, np.number, Decimal)
 
 Found = tuple[str, FloatArray | None, str, str]
-"""Header, numbers or None, unit where it stands beside the header, why there are no numbers."""
+"""Header, numbers or None, unit where that is kept elsewhere, why there are no numbers."""
 
 
 def table_of(frame: Any) -> Table:
@@ -43,7 +43,7 @@ def table_of(frame: Any) -> Table:
     """
     kinds = {c.__module__.partition(".")[0] for c in type(frame).__mro__}
     if "polars" in kinds and hasattr(frame, "collect"):
-        frame = frame.collect()
+        frame = _collected_lazily(frame)
     if "pandas" in kinds and hasattr(frame, "columns"):
         found = _of_pandas(frame)
     elif "polars" in kinds and hasattr(frame, "columns"):
@@ -60,6 +60,18 @@ def table_of(frame: Any) -> Table:
             f"columns), got {type(frame).__name__}; for arrays: Dataset.from_arrays"
         )
     return collected(Path(type(frame).__name__), found)
+
+
+def _collected_lazily(frame: Any) -> Any:
+    """The table of a polars LazyFrame, which is computed only now, and may fail in any way."""
+    try:
+        return frame.collect()
+    except Exception as e:
+        reason = str(e).partition("\n")[0]
+        raise DataError(
+            f"LazyFrame: expected a query that can be computed, received {type(e).__name__}: "
+            f"{reason}; correct the query"
+        ) from e
 
 
 def collected(path: Path, found: Iterator[Found]) -> Table:
@@ -147,7 +159,8 @@ def _of_series(column: Any) -> tuple[FloatArray | None, str, str]:
 def _of_polars(frame: Any) -> Iterator[Found]:
     for name in frame.columns:
         column = frame[name]
-        if column.dtype.is_decimal():
+        if column.dtype.is_decimal() or "128" in str(column.dtype):
+            # NumPy has no such integers
             yield name, *_numbers(column.cast(float).to_numpy())
         elif column.dtype.is_temporal() or column.dtype.is_numeric():
             yield name, *_numbers(column.to_numpy())

@@ -1,7 +1,7 @@
 """Logs of other tools -> `Table`: MDF, TDMS, ULog, WPILOG, ROS bags, Betaflight, Saleae.
 
 Such a log holds signals that each have time stamps of their own. The signal with the most samples
-gives the rows; those with the same stamps stand beside it as they are, any other is held: each row
+gives the rows; those with the same stamps are added as they are, any other is held: each row
 has its last value, NaN before the first. No value is interpolated.
 
 A reader of somebody else's, given a damaged file, may raise anything, print, crash in its C parts
@@ -96,11 +96,11 @@ def _from_a_process(path: Path, raw: bytes, name: str) -> list[Signal]:
     except subprocess.TimeoutExpired:
         raise DataError(
             f"{path}: expected {title}, but its reader found no end within {limit:.0f} s; the file "
-            "is damaged"
+            "is damaged, or this computer is busy: try again"
         ) from None
     if done.returncode != 0:
-        said = done.stderr.decode(errors="replace").strip().splitlines()
-        reason = said[-1] if done.returncode > 0 and said else "its reader crashed on it"
+        lines = done.stderr.decode(errors="replace").strip().splitlines()
+        reason = lines[-1] if done.returncode > 0 and lines else "its reader crashed on it"
         raise DataError(
             f"{path}: expected {title}, but it cannot be read: {printable(reason)[:200]}"
         )

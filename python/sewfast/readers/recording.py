@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from ..dataset import Dataset, Experiment, FloatArray
 from ..dataset.experiment import as_weights, require_some_weight
-from ..errors import DataError, SettingError
+from ..errors import DataError, SettingError, printable
 from ..recordfile.format import MAGIC
 from ..recordfile.reader import decode_recording
 from ..speed import speed_between_gaps
@@ -22,6 +23,8 @@ from .delimited import read_delimited
 from .frames import collected, of_arrow, table_of
 from .logs import is_log, read_log
 from .timebase import TOLERANCE, Grid, time_base
+
+LOG = logging.getLogger("sewfast")
 
 # --- Parquet -> Table -----------------------------------------------------------------------------
 
@@ -69,7 +72,7 @@ def read_mcap(path: Path, raw: bytes) -> Table:
     return Table(path, columns, found.units, Ts=header.Ts, counts_per_rev=header.counts_per_rev)
 
 
-# --- One file of any known format -> Table, told apart by its first bytes, then by its extension --
+# --- One file of any known format -> Table; recognised by its first bytes, then by its extension
 
 
 def read_table(path: Any) -> Table:
@@ -102,6 +105,13 @@ def read_table(path: Any) -> Table:
         return table_of(path)
     path = Path(path)
     raw = _bytes(path)
+    table = _table(path, raw)
+    rows = max(map(len, table.columns.values()), default=0)
+    LOG.info("%s: read, %d rows of %s", path, rows, printable(", ".join(table.names)))
+    return table
+
+
+def _table(path: Path, raw: bytes) -> Table:
     if is_log(raw):
         return read_log(path, raw)
     if raw.startswith(MAGIC) or path.suffix.lower() == ".mcap":
@@ -203,7 +213,15 @@ def read(
         If the sample time is missing or settings contradict each other.
     """
     table = path if isinstance(path, Table) else read_table(path)
-    names = (inputs,) if isinstance(inputs, str) else tuple(inputs)
+    names = (
+        (inputs,) if isinstance(inputs, str) or not isinstance(inputs, Iterable) else tuple(inputs)
+    )
+    for role, one in [*(("inputs", n) for n in names), ("output", output), ("counts", counts)]:
+        if not isinstance(one, str | None) or (role == "inputs" and one is None):
+            raise SettingError(
+                f"{role}: expected the name of a column, received {one!r}; names are text, as in "
+                f"'{table.names[0] if len(table) else 'u'}'"
+            )
     if not names:
         raise SettingError("inputs: expected at least one column name, received none")
     if counts is not None and counts_per_rev is None:

@@ -152,8 +152,12 @@ def _means(values: FloatArray, edges: FloatArray, ends: FloatArray) -> FloatArra
 
 def time_column(table: Table) -> str | None:
     """The column that is named as time: t, time, timestamp, seconds, also time_ms and the like."""
-    names = [n for n in table.names if _TIME.fullmatch(n.lower())]
+    names = [n for n in table.names if _is_time(n)]
     return next((n for n in names if n.lower() in ("t", "time")), next(iter(names), None))
+
+
+def _is_time(name: str) -> bool:
+    return _TIME.fullmatch(name.lower()) is not None
 
 
 def time_base(table: Table, given: float | None, column: str | None = None) -> TimeBase:
@@ -176,8 +180,10 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
     SettingError
         Where there is neither a time column nor a sample time.
     """
-    if given is not None and not (math.isfinite(given) and given > 0):
-        raise SettingError(f"Ts: expected a positive sample time in seconds, received {given}")
+    if given is not None and not (
+        isinstance(given, (int, float, np.number)) and math.isfinite(given) and given > 0
+    ):
+        raise SettingError(f"Ts: expected a positive sample time in seconds, received {given!r}")
     name = table.resolve(column) if column is not None else time_column(table)
     stated = table.Ts is not None and column is None
     if stated and (table.Ts_source == "the header" or name is None):
@@ -188,6 +194,8 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
         return TimeBase(_agreed(table, table.Ts_source, table.Ts, given))
     if name is None:
         if given is None:
+            for spoiled in filter(_is_time, table.unusable):
+                table.resolve(spoiled)  # says why it cannot be used
             raise SettingError(
                 f"{table.path}: no column t or time; state the sample time in seconds (Ts, --ts), "
                 f"or name the column (time=...); available: {', '.join(table.names[:30])}"

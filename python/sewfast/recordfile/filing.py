@@ -10,6 +10,7 @@ import time
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -21,6 +22,8 @@ from .format import Assembler, Header, Message, Topic, bearable, opening
 
 
 _BATCH = 1 << 16
+_LOCKED = 0x7FFF_0000
+"""The byte that is locked on Windows, where others cannot read locked bytes: beyond recordings."""
 
 
 class Mark(NamedTuple):
@@ -81,27 +84,45 @@ def _own(path: Path, file: int) -> None:
         Where another one has it.
     """
     try:
-        import fcntl
-    except ImportError:
-        return
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _lock(file)
     except BlockingIOError:
         raise SettingError(
             f"{path}: expected a file that nobody else writes, a recording is being made in it; it "
             "is kept: choose another name"
         ) from None
-    except OSError:
-        # a file system without locks
+    except (ImportError, OSError):
+        # a file system or a Python without locks
         pass
+
+
+def _lock(file: int, *, free: bool = False) -> None:
+    """Take the lock of an open file, or give it back; on Windows as documented, not run there.
+
+    Raises
+    ------
+    BlockingIOError
+        Where another process has it.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        msvcrt: Any = import_module("msvcrt")
+        position = os.lseek(file, 0, os.SEEK_CUR)
+        os.lseek(file, _LOCKED, os.SEEK_SET)
+        try:
+            msvcrt.locking(file, msvcrt.LK_UNLCK if free else msvcrt.LK_NBLCK, 1)
+        except PermissionError as e:
+            raise BlockingIOError(e.errno, e.strerror) from e
+        finally:
+            os.lseek(file, position, os.SEEK_SET)
+    else:
+        fcntl.flock(file, fcntl.LOCK_UN if free else fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _give_back(file: int) -> None:
     with suppress(ImportError, OSError):
-        import fcntl
-
         # a process that was forked meanwhile must not keep it
-        fcntl.flock(file, fcntl.LOCK_UN)
+        _lock(file, free=True)
     with suppress(OSError):
         os.close(file)
 

@@ -8,8 +8,10 @@ pub mod receiver;
 pub mod samples;
 pub mod sequence;
 pub mod server;
+pub mod upload;
 
 pub use anomalies::{Anomaly, Counters, Kind};
 pub use client::Client;
 pub use receiver::Receiver;
 pub use samples::{Channel, Encoding};
+pub use upload::Upload;

@@ -2,7 +2,7 @@
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use numpy::PyArray1;
+use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyList};
 use sewfast_control::link::identity::VERSION;
@@ -10,13 +10,14 @@ use sewfast_control::link::{Body, Fields, Header, MAX_BODY, MAX_WIRE, encode};
 use sewfast_core::{Error, Result};
 use sewfast_link::bodies::{self, Description, Event, Greeting, Start, Status};
 use sewfast_link::client::{Client, Event as Heard};
-use sewfast_link::{Channel, Receiver};
+use sewfast_link::{Channel, Receiver, Upload};
 
-use crate::arrays::{array1, raise};
+use crate::arrays::{array1, raise, slice};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<LinkClient>()?;
     module.add_class::<LinkReceiver>()?;
+    module.add_class::<LinkUpload>()?;
     module.add_class::<LinkBodies>()?;
     module.add_function(wrap_pyfunction!(link_frame, module)?)
 }
@@ -474,5 +475,50 @@ impl LinkClient {
 impl LinkClient {
     fn lock(&self) -> MutexGuard<'_, Client> {
         self.core.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// A run's values as the device stores them; see docs/PROTOCOL.md.
+#[pyclass(module = "sewfast._core")]
+struct LinkUpload {
+    core: Upload,
+}
+
+#[pymethods]
+impl LinkUpload {
+    #[staticmethod]
+    fn commands(
+        values: PyReadonlyArray1<'_, f64>,
+        steps_per_unit: u32,
+        limit: f64,
+    ) -> PyResult<Self> {
+        let core = Upload::commands(slice(&values, "values")?, steps_per_unit, limit);
+        Ok(Self { core })
+    }
+
+    #[staticmethod]
+    fn references(values: PyReadonlyArray1<'_, f64>, limit: f64) -> PyResult<Self> {
+        let core = Upload::references(slice(&values, "values")?, limit);
+        Ok(Self { core })
+    }
+
+    #[getter]
+    fn end(&self) -> usize {
+        self.core.end()
+    }
+
+    #[getter]
+    fn is_whole(&self) -> bool {
+        self.core.is_whole()
+    }
+
+    fn piece<'py>(&self, py: Python<'py>, room: i64) -> PyResult<Option<Bound<'py, PyBytes>>> {
+        let piece = self.core.piece(usize::try_from(room).unwrap_or(0));
+        piece.map(|body| wire(py, &body)).transpose()
+    }
+
+    fn answered(&mut self, result: u8, detail: u32, body: &[u8]) -> bool {
+        let end = bodies::uploaded(&mut Fields::new(body)).map(|(end, _)| end);
+        self.core.answered(result, detail, end)
     }
 }

@@ -1,0 +1,208 @@
+"""One recording of a fleet: where it is listed, how it is read, and the row it becomes."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..control.controller import Controller
+from ..dataset import Dataset
+from ..errors import SettingError, SewfastError
+from ..evidence import Residuals, estimate
+from ..identification import identify
+from ..models import Model
+from ..readers import read
+from ..validation import validate
+from .table import Row
+
+READABLE = (".csv", ".mat", ".npz", ".parquet", ".mcap")
+TRAINED = 0.7
+"""Share of a recording that is identified from; the rest is what the figures are of."""
+
+
+# --- What there is to do --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Job:
+    """One recording and how it is read."""
+
+    file: str
+    path: str
+    inputs: tuple[str, ...]
+    output: str
+    Ts: float | None = None
+
+    def fingerprint(self) -> list[Any]:
+        """What changes where the file does."""
+        try:
+            stat = os.stat(self.path)
+        except OSError:
+            return [None, None, *self.inputs, self.output, self.Ts]
+        return [stat.st_size, stat.st_mtime_ns, *self.inputs, self.output, self.Ts]
+
+
+def jobs_of(
+    recordings: Any, inputs: str | Sequence[str], output: str, Ts: float | None
+) -> list[Job]:
+    names = (inputs,) if isinstance(inputs, str) else tuple(inputs)
+    if isinstance(recordings, str | os.PathLike):
+        root = Path(recordings)
+        if root.is_dir():
+            files = sorted(p for p in root.rglob("*") if p.suffix.lower() in READABLE)
+            jobs = [
+                Job(p.relative_to(root).as_posix(), str(p), names, output, Ts)
+                for p in files
+                if p.is_file()
+            ]
+        else:
+            jobs = list(_manifest(root, names, output, Ts))
+    elif isinstance(recordings, Sequence):
+        jobs = [Job(str(p), os.fspath(p), names, output, Ts) for p in recordings]
+    else:
+        raise SettingError(
+            f"recordings: expected a folder, a manifest or a list of files, got {recordings!r}; "
+            "name the folder"
+        )
+    if not jobs:
+        raise SettingError(
+            f"expected recordings ({', '.join(READABLE)}), got none in {recordings}; name a folder "
+            "that holds some, or a manifest"
+        )
+    seen: set[str] = set()
+    for job in jobs:
+        if job.file in seen:
+            raise SettingError(
+                f"expected every recording once, got {job.file} twice; take one of them out"
+            )
+        seen.add(job.file)
+    return jobs
+
+
+def _manifest(path: Path, inputs: tuple[str, ...], output: str, Ts: float | None) -> Iterator[Job]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SettingError(
+            f"{path}: expected a folder, or a manifest in CSV, got none that can be read ({error})"
+        ) from error
+    rows = csv.DictReader(io.StringIO(text))
+    known = ("file", "inputs", "output", "Ts")
+    if "file" not in (rows.fieldnames or ()) or not set(rows.fieldnames or ()) <= set(known):
+        raise SettingError(
+            f"{path}: expected a manifest with a column file and any of inputs, output, Ts, got "
+            f"{', '.join(rows.fieldnames or ()) or 'nothing'}"
+        )
+    for number, row in enumerate(rows, start=2):
+        try:
+            own = float(row["Ts"]) if row.get("Ts") else Ts
+        except ValueError:
+            raise SettingError(
+                f"{path}, line {number}: expected Ts as a number of seconds, got {row['Ts']!r}"
+            ) from None
+        file = row["file"]
+        if not file or None in row:
+            found = "more cells than columns" if file else "none"
+            raise SettingError(
+                f"{path}, line {number}: expected the name of a file, and a cell for each column, "
+                f"got {found}; correct the line"
+            )
+        names = tuple(row["inputs"].split(";")) if row.get("inputs") else inputs
+        yield Job(file, str(path.parent / file), names, row.get("output") or output, own)
+
+
+# --- One recording --------------------------------------------------------------------------------
+
+
+def row_of(job: Job, settings: Mapping[str, Any], controller: Controller | None) -> Row:
+    """All that is done with one recording; what it cannot do is its message."""
+    try:
+        return _identified(job, settings, controller)
+    except SewfastError as error:
+        return Row(job.file, "failed", str(error))
+    except (OSError, MemoryError, ArithmeticError, np.linalg.LinAlgError) as error:
+        return Row(job.file, "failed", f"{type(error).__name__}: {error}")
+
+
+def _identified(job: Job, settings: Mapping[str, Any], controller: Controller | None) -> Row:
+    data = read(job.path, inputs=job.inputs, output=job.output, Ts=job.Ts)
+    samples = sum(len(e.y) for e in data.experiments)
+    cut = int(TRAINED * samples)
+    model = identify(
+        data.slice(f"0:{cut}"), model=settings["model"], seed=settings["seed"], threads=1
+    )
+    held = data.slice(f"{cut}:{samples}")
+    scores = validate(model, held).simulation
+    runs = zip(held.experiments, model.simulate(held), strict=True)
+    noise = float(np.nanstd(np.concatenate([e.y - run for e, run in runs])))
+    quantities: dict[str, Any] = {}
+    if not model.members and model.kind in ("arx", "oe", "iv"):
+        quantities = _physical(model, data.slice(f"0:{cut}"))
+    gains: dict[str, Any] = {}
+    if controller is not None:
+        from ..tuning import tune
+
+        tuned = tune(model, start=controller, seed=settings["seed"], threads=1).pid
+        standard = tuned.gains.to("standard")
+        gains = {"Kp": standard.Kp, "Ti": standard.Ti, "Td": standard.Td}
+    return Row(
+        job.file,
+        samples=samples,
+        Ts=data.Ts,
+        kind=model.kind,
+        fit_percent=float(scores.fit_percent),
+        rmse=float(scores.rmse),
+        noise=noise,
+        verdict=str(model.training.get("verdict", "")),
+        parameters=hashlib.sha256(model.theta.tobytes()).hexdigest()[:16],
+        **quantities,
+        **gains,
+    )
+
+
+def _physical(model: Model, data: Dataset) -> dict[str, float]:
+    """Gain and average residence time of a linear model, with their standard errors.
+
+    Ts (B'(1)/B(1) - A'(1)/A(1)) for G = B/A in the delay operator; it does not move where a pole
+    and a zero nearly cancel. The errors follow from the parameters' covariance by their slopes.
+    """
+    found = estimate(model, Residuals.of(model, data))
+    theta, na, nk = model.theta, model.orders["na"], model.orders["nk"]
+    inputs = len(model.input_names)
+
+    def quantities(values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        a, b = values[:na], values[na : len(values) - 1].reshape(inputs, -1)
+        b, total, final = b[0], 1.0 + float(a.sum()), float(b[0].sum())
+        if total == 0.0 or final == 0.0:
+            return np.full(2, math.nan)
+        later = nk + np.arange(len(b))
+        residence = later @ b / final - np.arange(1, na + 1) @ a / total
+        return np.array([final / total, model.Ts * residence])
+
+    value = quantities(theta)
+    errors = np.full(2, math.nan)
+    if found is not None:
+        steps = 1e-6 * np.maximum(np.abs(theta), 1e-3)
+        slopes = np.array(
+            [
+                (quantities(theta + step * axis) - quantities(theta - step * axis)) / (2.0 * step)
+                for step, axis in zip(steps, np.eye(len(theta)), strict=True)
+            ]
+        )
+        with np.errstate(invalid="ignore"):
+            errors = np.sqrt(np.diag(slopes.T @ found.covariance @ slopes))
+    return {
+        "gain": float(value[0]),
+        "gain_error": float(errors[0]),
+        "residence_time": float(value[1]),
+        "residence_time_error": float(errors[1]),
+    }

@@ -1,0 +1,330 @@
+"""`fleet`: every recording on its worker, and the journal from which the same call goes on."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import storage
+from ..control.controller import Controller
+from ..errors import SettingError
+from ..kinds import Kind
+from ..progress import shown_in_notebooks
+from .recordings import Job, jobs_of, row_of
+from .table import FORMAT, Fleet, Row, drifts, earlier_rows, require_ending
+
+_IN_FLIGHT = 4
+"""Recordings handed out at once for each worker: no more lie in the scheduler's memory."""
+_RETRIES = 50
+"""Workers that may die over one recording before it is taken for the cause."""
+
+
+@shown_in_notebooks("fleet", "share failed")
+def fleet(
+    recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    *,
+    inputs: str | Sequence[str] = "u",
+    output: str = "y",
+    Ts: float | None = None,
+    model: Kind = "oe",
+    controller: Controller | None = None,
+    before: str | os.PathLike[str] | Fleet | None = None,
+    out: str | os.PathLike[str] | None = None,
+    client: Any = None,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    memory: str = "500MB",
+    seed: int = 0,
+    progress: Callable[[int, int, float], object] | None = None,
+) -> Fleet:
+    """Identify and check many recordings.
+
+    Parameters
+    ----------
+    recordings : path or sequence of paths
+        A folder (with its subfolders), a manifest (CSV with a column `file` and, if they differ,
+        `inputs` (several apart by `;`), `output`, `Ts`), or files.
+    inputs, output, Ts
+        As of `sewfast.read`.
+    model : str
+        As of `identify`. Linear output error by default: its gain and residence time can be
+        compared from run to run, and it takes a fraction of a second.
+    controller : Controller, optional
+        Tuned anew for every model, from these settings.
+    before : path or Fleet, optional
+        An earlier result (`.csv`, `.json`, `.parquet`): `drifts` lists what has moved beyond its
+        bands.
+    out : path, optional
+        Where to write the table (`.csv`, `.json`, `.parquet`). A journal is kept next to it until
+        everything is done; the same call continues from it and processes only what is new or
+        changed.
+    client : dask.distributed.Client, optional
+        Your own cluster.
+    scheduler : str, optional
+        Address of one, such as `tcp://host:8786`.
+    workers : int, optional
+        Processes on this computer if there is neither; by default as many as cores. 0 works in this
+        process, without Dask.
+    memory : str
+        Limit for each worker on this computer; a worker that uses more is restarted.
+    seed : int
+        As of `identify`; the same seed gives the same bits on any number of workers.
+    progress : callable, optional
+        Called with recordings done, recordings in all and the share that failed.
+        In a notebook a bar is shown where this is left out; None shows none.
+
+    Returns
+    -------
+    Fleet
+
+    Raises
+    ------
+    SettingError
+        For no recordings, an unknown file extension, or if Dask is needed and not installed.
+    """
+    _require_settings(workers, controller, seed)
+    jobs = jobs_of(recordings, inputs, output, Ts)
+    settings: dict[str, Any] = {"model": model, "seed": seed, "controller": None}
+    if controller is not None:
+        settings["controller"] = controller.to_dict()
+    earlier = earlier_rows(before)
+    place = None if out is None else Path(out)
+    if place is not None:
+        require_ending(place)
+        if place.is_dir():
+            raise SettingError(f"{place}: expected a file to write to, got a folder; name a file")
+        if not place.parent.is_dir():
+            raise SettingError(
+                f"{place}: expected a folder to write to, got {place.parent}, which does not "
+                "exist; create it"
+            )
+    journal = Journal(None if place is None else place, settings)
+    rows = {job.file: row for job in jobs if (row := journal.known(job)) is not None}
+    waiting = [job for job in jobs if job.file not in rows]
+    with journal:
+        for job, row in _worked(waiting, settings, controller, client, scheduler, workers, memory):
+            rows[job.file] = row
+            journal.add(job, row)
+            if progress is not None:
+                failed = sum(r.status != "ok" for r in rows.values()) / len(rows)
+                progress(len(rows), len(jobs), failed)
+    ordered = tuple(rows[file] for file in sorted(rows))
+    found = Fleet(ordered, tuple(drifts(earlier, ordered)))
+    if place is not None:
+        found.save(place)
+        journal.remove()
+    return found
+
+
+def _require_settings(workers: Any, controller: Any, seed: Any) -> None:
+    if workers is not None and not (_is_whole(workers) and workers >= 0):
+        raise SettingError(
+            f"workers: expected a whole number of 0 or more, got {workers!r}; 0 works in this "
+            "process, None takes every core"
+        )
+    if controller is not None and not isinstance(controller, Controller):
+        raise SettingError(
+            f"controller: expected a Controller, got {type(controller).__name__}; load one with "
+            "load_controller"
+        )
+    if not (_is_whole(seed) and 0 <= seed < 2**64):
+        raise SettingError(
+            f"seed: expected a whole number from 0 to 2^64 - 1, got {seed!r}; take 0"
+        )
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+# --- Where it is done -----------------------------------------------------------------------------
+
+
+def _worked(
+    jobs: Sequence[Job],
+    settings: Mapping[str, Any],
+    controller: Controller | None,
+    client: Any,
+    scheduler: str | None,
+    workers: int | None,
+    memory: str,
+) -> Iterator[tuple[Job, Row]]:
+    """Rows as they are finished, in any order."""
+    if workers == 0 and client is None and scheduler is None:
+        for job in jobs:
+            yield job, row_of(job, settings, controller)
+        return
+    if not jobs:
+        return
+    with _connected(client, scheduler, workers, memory) as connected:
+        as_completed = import_module("distributed").as_completed
+        killed = import_module("distributed.scheduler").KilledWorker
+
+        waiting = iter(jobs)
+        submitted: dict[str, Job] = {}
+
+        def submit(job: Job) -> Any:
+            future = connected.submit(
+                row_of, job, settings, controller, pure=False, retries=_RETRIES
+            )
+            submitted[future.key] = job
+            return future
+
+        count = max(1, len(connected.scheduler_info(n_workers=-1)["workers"]))
+        first = [submit(job) for job in itertools.islice(waiting, _IN_FLIGHT * count)]
+        running = as_completed(first)
+        for future in running:
+            job = submitted.pop(future.key)
+            try:
+                row = future.result()
+            except killed:
+                row = Row(
+                    job.file, "failed", f"expected {memory} to suffice, but the worker died over "
+                    "it again and again; give more memory, or a shorter recording",
+                )  # fmt: skip
+            except Exception as error:
+                row = Row(job.file, "failed", f"{type(error).__name__}: {error}")
+            future.release()
+            following = next(waiting, None)
+            if following is not None:
+                running.add(submit(following))
+            yield job, row
+
+
+@contextmanager
+def _connected(
+    client: Any, scheduler: str | None, workers: int | None, memory: str
+) -> Iterator[Any]:
+    if client is not None:
+        yield client
+        return
+    try:
+        dask, distributed = import_module("dask"), import_module("distributed")
+    except ImportError as error:
+        raise SettingError(
+            "expected Dask to work on several recordings at once, got none; pip install "
+            "'sewfast[fleet]', or give workers=0"
+        ) from error
+    if scheduler is not None:
+        try:
+            made = distributed.Client(scheduler)
+        except (OSError, ValueError) as error:
+            raise SettingError(
+                f"scheduler: expected the address of a Dask scheduler, {scheduler!r} cannot be "
+                f"reached ({type(error).__name__}); start it, or check the address"
+            ) from error
+        with made:
+            yield made
+        return
+    try:
+        dask.utils.parse_bytes(memory)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise SettingError(
+            f"memory: expected a size such as '500MB', got {memory!r}; state its unit"
+        ) from error
+    # a worker that was killed is no fault of the recording it was at
+    with dask.config.set({"distributed.scheduler.allowed-failures": _RETRIES}):
+        options = {
+            "n_workers": workers or os.cpu_count() or 1,
+            "threads_per_worker": 1,
+            "memory_limit": memory,
+            "dashboard_address": None,
+        }
+        with _workers_without_ctrl_c():
+            cluster = distributed.LocalCluster(**options)
+        with cluster, distributed.Client(cluster) as made:
+            yield made
+
+
+@contextmanager
+def _workers_without_ctrl_c() -> Iterator[None]:
+    """Processes that begin here leave Ctrl-C to this one, which ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+# --- What is kept on the way ----------------------------------------------------------------------
+
+
+@dataclass
+class Journal:
+    """A line for each row that is done, in the folder of the table that is to be written.
+
+    The first line says for which settings; a journal of others is begun anew. A last line that was
+    cut off is left out.
+    """
+
+    out: Path | None
+    settings: Mapping[str, Any]
+    _rows: dict[str, tuple[list[Any], Row]] = field(default_factory=dict)
+    _file: Any = None
+
+    def __post_init__(self) -> None:
+        place = self.place
+        if place is None or not place.exists():
+            return
+        lines = place.read_text(encoding="utf-8", errors="replace").splitlines()
+        entries = [entry for line in lines if (entry := _parsed(line)) is not None]
+        if not entries or entries[0] != self._head():
+            return
+        for entry in entries[1:]:
+            row = Row(**entry["row"])
+            self._rows[row.file] = (entry["of"], row)
+
+    @property
+    def place(self) -> Path | None:
+        return None if self.out is None else self.out.with_name(f".{self.out.name}.journal")
+
+    def _head(self) -> dict[str, Any]:
+        return {"format": FORMAT, "version": 1, "settings": json.loads(json.dumps(self.settings))}
+
+    def known(self, job: Job) -> Row | None:
+        """The row of a recording that has not changed since."""
+        fingerprint, row = self._rows.get(job.file, (None, None))
+        return row if fingerprint == job.fingerprint() else None
+
+    def __enter__(self) -> Journal:
+        if self.place is not None:
+            lines = [self._head(), *({"of": f, "row": asdict(r)} for f, r in self._rows.values())]
+            storage.replace(self.place, "".join(json.dumps(line) + "\n" for line in lines))
+            self._file = self.place.open("a", encoding="utf-8")
+        return self
+
+    def add(self, job: Job, row: Row) -> None:
+        if self._file is not None:
+            line = {"of": job.fingerprint(), "row": asdict(row)}
+            self._file.write(json.dumps(line) + "\n")
+            self._file.flush()
+
+    def __exit__(self, *_: object) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def remove(self) -> None:
+        if self.place is not None:
+            self.place.unlink(missing_ok=True)
+
+
+def _parsed(line: str) -> dict[str, Any] | None:
+    try:
+        found = json.loads(line)
+    except json.JSONDecodeError:
+        return None
+    return found if isinstance(found, dict) else None

@@ -1,0 +1,271 @@
+"""The table of a fleet: a row for each recording, its files, and what has drifted since another."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from .. import storage
+from ..errors import SettingError
+
+FORMAT = "sewfast.fleet"
+SIGMAS = 4.0
+LEAST_CHANGE = 0.02
+"""Of a gain or a residence time: less is no drift, however certain it is."""
+NOISE_RATIO = 1.5
+"""Between the residuals of two recordings, either way, from which on it is drift."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was found from one recording.
+
+    Attributes
+    ----------
+    file : str
+        Relative to the folder, or as the manifest has it.
+    status : str
+        `ok`, or `failed` where there is a message instead of a model.
+    message : str
+    samples : int
+    Ts : float
+        [s]
+    kind : str
+        Of the model.
+    fit_percent, rmse : float
+        In free run on the last 30 % of the recording, from which nothing was learned.
+    noise : float
+        Standard deviation of the residual there.
+    gain, gain_error : float
+        Steady gain from the first input and its standard error; NaN for networks.
+    residence_time, residence_time_error : float
+        Average residence time [s] and its standard error: of a first-order lag its time constant
+        and dead time together, of others the area between step response and final value over the
+        gain (Astrom and Hagglund 2006, chapter 2); NaN for networks and integrators.
+    verdict : str
+        Of `identify`, in words.
+    parameters : str
+        Start of the hash of all parameters: equal for equal bits.
+    Kp, Ti, Td : float
+        Gains of the controller tuned for it, in standard form; NaN where there is no controller.
+    """
+
+    file: str
+    status: str = "ok"
+    message: str = ""
+    samples: int = 0
+    Ts: float = math.nan
+    kind: str = ""
+    fit_percent: float = math.nan
+    rmse: float = math.nan
+    noise: float = math.nan
+    gain: float = math.nan
+    gain_error: float = math.nan
+    residence_time: float = math.nan
+    residence_time_error: float = math.nan
+    verdict: str = ""
+    parameters: str = ""
+    Kp: float = math.nan
+    Ti: float = math.nan
+    Td: float = math.nan
+
+
+COLUMNS = tuple(Row.__dataclass_fields__)
+
+
+@dataclass(frozen=True)
+class Drift:
+    """A machine that is not what it was.
+
+    Attributes
+    ----------
+    file : str
+    quantity : str
+        `gain`, `residence_time` or `noise`.
+    before, now : float
+    sigmas : float
+        The change over its standard error; infinite for `noise`, which is judged by its ratio.
+    """
+
+    file: str
+    quantity: str
+    before: float
+    now: float
+    sigmas: float
+
+    def __str__(self) -> str:
+        certain = "" if math.isinf(self.sigmas) else f" ({self.sigmas:.1f} standard errors)"
+        return f"{self.file}: {self.quantity} {self.before:.4g} -> {self.now:.4g}{certain}"
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """All rows, by file.
+
+    Attributes
+    ----------
+    rows : tuple of Row
+    drifts : tuple of Drift
+        Compared with an earlier run, if one was given.
+    """
+
+    rows: tuple[Row, ...]
+    drifts: tuple[Drift, ...] = ()
+
+    @property
+    def failed(self) -> tuple[Row, ...]:
+        """The rows without a model."""
+        return tuple(row for row in self.rows if row.status != "ok")
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the rows as `.csv`, `.json` or `.parquet`; the file is either complete or absent.
+
+        Raises
+        ------
+        SettingError
+            For another ending, or `.parquet` without pyarrow.
+        ModelFileError
+            If the file cannot be written.
+        """
+        place = Path(path)
+        require_ending(place)
+        storage.replace(place, _content(self.rows, place.suffix.lower()))
+
+    def __str__(self) -> str:
+        done = [row for row in self.rows if row.status == "ok"]
+        lines = [f"{len(self.rows)} recordings: {len(done)} identified, {len(self.failed)} failed"]
+        if done:
+            fits = sorted(row.fit_percent for row in done)
+            middle, worst = fits[len(fits) // 2], min(done, key=lambda row: row.fit_percent)
+            lines.append(
+                f"fit on the held-back 30 %: median {middle:.1f} %, worst "
+                f"{worst.fit_percent:.1f} % ({worst.file})"
+            )
+        lines += [f"failed  {row.file}: {row.message}" for row in self.failed[:10]]
+        if len(self.failed) > 10:
+            lines.append(f"  and {len(self.failed) - 10} more; they are in the table")
+        lines += [f"drift   {drift}" for drift in self.drifts]
+        return "\n".join(lines)
+
+
+# --- Tables ---------------------------------------------------------------------------------------
+
+
+def require_ending(place: Path) -> None:
+    if place.suffix.lower() not in (".csv", ".json", ".parquet"):
+        raise SettingError(
+            f"{place}: expected a name that ends in .csv, .json or .parquet, got {place.name}"
+        )
+
+
+def _content(rows: Sequence[Row], ending: str) -> str | bytes:
+    if ending == ".parquet":
+        arrow, parquet = _arrow()
+        columns = {name: [getattr(row, name) for row in rows] for name in COLUMNS}
+        place = io.BytesIO()
+        parquet.write_table(arrow.table(columns), place)
+        return place.getvalue()
+    if ending == ".json":
+        known = [{k: _or_none(v) for k, v in asdict(row).items()} for row in rows]
+        return json.dumps({"format": FORMAT, "version": 1, "rows": known}, indent=1) + "\n"
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows([_cell(getattr(row, name)) for name in COLUMNS] for row in rows)
+    return text.getvalue()
+
+
+def _or_none(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else repr(value)
+    return str(value).replace("\n", " ")
+
+
+def _arrow() -> tuple[Any, Any]:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise SettingError(
+            "expected pyarrow for Parquet, got none; pip install 'sewfast[parquet]', or write .csv"
+        ) from error
+    return pyarrow, pyarrow.parquet
+
+
+def load_fleet(path: str | os.PathLike[str]) -> Fleet:
+    """Read a table that `Fleet.save` wrote.
+
+    Raises
+    ------
+    SettingError
+        Where there is none, or it lacks columns.
+    """
+    place = Path(path)
+    require_ending(place)
+    try:
+        if place.suffix.lower() == ".parquet":
+            rows = _arrow()[1].read_table(place).to_pylist()
+        elif place.suffix.lower() == ".json":
+            rows = json.loads(place.read_text(encoding="utf-8"))["rows"]
+        else:
+            with place.open(encoding="utf-8-sig", newline="") as file:
+                rows = list(csv.DictReader(file))
+        return Fleet(tuple(_read(row) for row in rows))
+    except SettingError:
+        raise
+    except Exception as error:
+        raise SettingError(
+            f"{place}: expected a table that `sewfast fleet` wrote, got {type(error).__name__}: "
+            f"{error}"
+        ) from error
+
+
+def _read(row: Mapping[str, Any]) -> Row:
+    values: dict[str, Any] = {}
+    for name, of in Row.__dataclass_fields__.items():
+        value = row[name]
+        if of.type == "float":
+            value = math.nan if value in (None, "") else float(value)
+        elif of.type == "int":
+            value = int(value)
+        else:
+            value = str(value or "")
+        values[name] = value
+    return Row(**values)
+
+
+# --- Drift ----------------------------------------------------------------------------------------
+
+
+def earlier_rows(before: Any) -> dict[str, Row]:
+    if before is None:
+        return {}
+    found = before if isinstance(before, Fleet) else load_fleet(before)
+    return {row.file: row for row in found.rows if row.status == "ok"}
+
+
+def drifts(earlier: Mapping[str, Row], rows: Sequence[Row]) -> Iterator[Drift]:
+    for row in rows:
+        old = earlier.get(row.file)
+        if old is None or row.status != "ok":
+            continue
+        for quantity in ("gain", "residence_time"):
+            was, now = getattr(old, quantity), getattr(row, quantity)
+            error = math.hypot(getattr(old, f"{quantity}_error"), getattr(row, f"{quantity}_error"))
+            change = abs(now - was)
+            if change > SIGMAS * error and change > LEAST_CHANGE * abs(was):
+                yield Drift(row.file, quantity, was, now, change / error if error else math.inf)
+        ratio = row.noise / old.noise if old.noise > 0.0 else 1.0
+        if ratio > NOISE_RATIO or ratio < 1.0 / NOISE_RATIO:
+            yield Drift(row.file, "noise", old.noise, row.noise, math.inf)
