@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -74,6 +75,8 @@ class Steps:
         return {**getattr(self.project, name)(step), **self._copies(step, name)}
 
     def _bode(self, step: Step, reference: str | None, segment: int | None) -> None:
+        # what resampling filters out looks ahead, which hides the delay
+        step = replace(step, resample=None)
         copies = {
             "python": self.project.python(step, "bode", reference, segment),
             "commands": self.project.commands(step, "bode", reference, segment),
