@@ -124,27 +124,32 @@ def demands(
     """
     volt = bench.volt if u_max is None else real("u_max", u_max)
     if not 0.0 < volt < math.inf:
-        raise SettingError(f"expected a u_max above 0 V, got {volt:g}; give the amplifier's limit")
+        raise SettingError(
+            name="u_max", expected="above 0 V", received=f"{volt:g}",
+            remedy="give the amplifier's limit",
+        )  # fmt: skip
     if volt > bench.volt * (1.0 + 1e-6):
         raise SettingError(
-            f"expected a u_max within the machine's limit of {bench.volt:g} V, got {volt:g}"
-        )
+            name="u_max", expected=f"within the machine's limit of {bench.volt:g} V",
+            received=f"{volt:g}",
+        )  # fmt: skip
     asked = [*(references or {}).values(), *(practice or {}).values()]
     named = max(float(r.max()) for r in asked) if asked else None
     top = real("speed", speed if speed is not None else named if named is not None else 2000.0)
     if not 0.0 < top < math.inf:
-        raise SettingError(f"expected a top speed above 0 RPM, got {top:g}")
+        raise SettingError(name="speed", expected="above 0 RPM", received=f"{top:g}")
     if named is not None and named > top * (1.0 + 1e-9):
         raise SettingError(
-            f"expected references up to the top speed of {top:g} RPM, got one up to {named:g}; "
-            "raise speed, or lower that reference"
-        )
+            name="references", expected=f"none beyond the top speed of {top:g} RPM",
+            received=f"one up to {named:g}", remedy="raise speed, or lower that reference",
+        )  # fmt: skip
     if top * OVER > bench.speed:
         raise SettingError(
-            f"expected a speed limit of the machine of {OVER:g} times the top speed, that is "
-            f"{OVER * top:g} RPM, as training goes beyond the working range; its limit is "
-            f"{bench.speed:g}: raise that limit, or lower speed"
-        )
+            name="speed",
+            expected=f"a limit of the machine of {OVER:g} times that, {OVER * top:g} RPM, as "
+            "training goes beyond the working range",
+            received=f"{bench.speed:g}", remedy="raise that limit, or lower speed",
+        )  # fmt: skip
     return Demands(
         volt,
         top,
@@ -166,8 +171,9 @@ def _load(load: float | None, volt: float) -> float | None:
     size = real("load", load)
     if not 0.0 <= size < volt:
         raise SettingError(
-            f"expected a load from 0 V to below u_max = {volt:g} V, got {size:g}; 0 for none"
-        )
+            name="load", expected=f"from 0 V to below u_max = {volt:g} V", received=f"{size:g}",
+            remedy="0 for none",
+        )  # fmt: skip
     return size
 
 
@@ -180,14 +186,15 @@ def _fixed(references: Mapping[str, FloatArray] | None) -> Mapping[str, FloatArr
         file = file_name(name)
         if len(file.encode()) > LONGEST_NAME:
             raise SettingError(
-                f"expected names of references of up to {LONGEST_NAME} bytes, got {name[:40]!r}.. "
-                f"of {len(file.encode())}; shorten it"
-            )
+                name="references", expected=f"names of up to {LONGEST_NAME} bytes",
+                received=f"{name[:40]!r}.. of {len(file.encode())}", remedy="shorten it",
+            )  # fmt: skip
         if file in files:
             raise SettingError(
-                f"expected references whose names differ in letters, digits, '-', '_' or '.', got "
-                f"{files[file]!r} and {name!r}, which would be one file; rename one"
-            )
+                name="references", expected="names that differ in letters, digits, '-', '_' or '.'",
+                received=f"{files[file]!r} and {name!r}, which would be one file",
+                remedy="rename one",
+            )  # fmt: skip
         files[file] = name
     return MappingProxyType(dict(references))
 
@@ -195,5 +202,5 @@ def _fixed(references: Mapping[str, FloatArray] | None) -> Mapping[str, FloatArr
 def _at_least(least: int, name: str, value: int) -> int:
     number = whole(name, value)
     if number < least:
-        raise SettingError(f"expected {name} of {least} or more, got {number}")
+        raise SettingError(name=name, expected=f"{least} or more", received=f"{number}")
     return number

@@ -182,8 +182,9 @@ def commission(
         journal = Journal(bench.name, progress, cancel, between)
         if resume and folder is None:
             raise SettingError(
-                "expected the folder of the attempt to resume, got none; give folder='DIR'"
-            )
+                name="folder", expected="that of the attempt to resume", received="none",
+                remedy="give folder='DIR'",
+            )  # fmt: skip
         taken = (
             None
             if folder is None
@@ -228,9 +229,9 @@ def _place(
     """Where the recordings go as they come, made before anything moves."""
     if not isinstance(name, (str, os.PathLike)) or not str(name) or "\0" in str(name):
         raise SettingError(
-            f"expected a folder's name, got {name!r}; as in folder='commissioned', or '.' for the "
-            "present one"
-        )
+            name="folder", expected="a folder's name", received=repr(name),
+            remedy="as in folder='commissioned', or '.' for the present one",
+        )  # fmt: skip
     folder = Path(name)
     require_own(folder, overwrite=overwrite or resume)
     device, conditions = told_of(bench)
@@ -455,16 +456,16 @@ def _samples(
         return None
     if isinstance(references, str) or not references:
         raise SettingError(
-            "expected references by name, as a mapping from names to samples or a sequence of "
-            f"names, got {references!r}; leave it out for the standard ones"
-        )
+            name="references", expected="a mapping from names to samples, or a sequence of names",
+            received=repr(references), remedy="leave it out for the standard ones",
+        )  # fmt: skip
     if isinstance(references, Mapping):
         return {str(name): _whole(str(name), r) for name, r in references.items()}
     if abs(bench.Ts - signals.TS) > 1e-9:
         raise SettingError(
-            f"expected a machine at {signals.TS} s for references by name, this one has "
-            f"{bench.Ts:g} s; give references as samples"
-        )
+            name="references", expected=f"names on a machine at {signals.TS} s only",
+            received=f"one at {bench.Ts:g} s", remedy="give references as samples",
+        )  # fmt: skip
     return {name: signals.reference(name, seed) for name in references}
 
 
@@ -473,7 +474,7 @@ def _whole(name: str, reference: ArrayLike) -> FloatArray:
     samples = vector(name, reference).copy()
     if not (len(samples) and np.all(np.isfinite(samples))):
         raise DataError(
-            f"expected finite samples in the reference {name!r}, got "
-            + ("none" if not len(samples) else "NaN or infinity")
-        )
+            name=name, expected="finite samples of a reference",
+            received="NaN or infinity" if len(samples) else "none",
+        )  # fmt: skip
     return samples
