@@ -283,7 +283,7 @@ def test_the_whole_way_by_keyboard(studio: Studio, browser: Any) -> None:
     keys.press("report-link")
     until(lambda: len(browser.window_handles) == 2)
     browser.switch_to.window(browser.window_handles[1])
-    until(lambda: "Commissioning of" in browser.title)
+    until(lambda: "commissioning of" in browser.title)
     assert [e for e in browser.get_log("browser") if e["level"] == "SEVERE"] == []
 
 
