@@ -13,7 +13,7 @@ from typing import Any
 
 from ..errors import SettingError
 from .arguments import Commands, add_command, add_overwrite
-from .output import print_json
+from .output import note, print_json
 
 PIL = """\
 Processor in the loop: compile the example firmware for a Cortex-M4 or M7, start it in the emulator
@@ -85,7 +85,7 @@ def command(args: argparse.Namespace) -> int:
     _prepare(args.out, args.overwrite, make=False)
     firmware = args.firmware
     if firmware is None:
-        _say("compiling the firmware")
+        note("compiling the firmware")
         firmware = build_firmware(args.source, board=args.board or "mps2-an386")
     elif args.board is not None:
         raise SettingError("--board: leave it out with --firmware, which states the board")
@@ -100,7 +100,7 @@ def command(args: argparse.Namespace) -> int:
         for name, words in _stages(args, board.port):
             code, results[name] = _carried_out(args, words)
             if code:
-                _say(f"{name} ended with {code}")
+                print(f"{name} ended with {code}", file=sys.stderr, flush=True)
                 return code
         figures = board.figures()
     if args.json:
@@ -153,7 +153,7 @@ def _carried_out(args: argparse.Namespace, words: list[str]) -> tuple[int, Any]:
     """One stage: its exit code, and with --json what it printed."""
     from . import main
 
-    _say(f"$ sewfast {' '.join(words)}")
+    note(f"$ sewfast {' '.join(words)}")
     if args.quiet:
         words = [*words, "--quiet"]
     if not args.json:
@@ -162,7 +162,3 @@ def _carried_out(args: argparse.Namespace, words: list[str]) -> tuple[int, Any]:
         code = main([*words, "--json"])
     text = printed.getvalue()
     return code, json.loads(text) if text.strip() else None
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
