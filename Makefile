@@ -25,7 +25,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors fleet fuzz-logs studio bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures accuracy battery commissioning drives motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -67,6 +67,12 @@ fleet: $(DEV) ## 2,000 recordings on one worker and on two, and with a worker ki
 studio: $(DEV) ## the studio in a real browser: from a slider's event to painted plots, from Esc to output off
 	$(BIN)/python benches/studio.py
 	$(BIN)/python benches/studio_stops.py
+
+studio-hour: $(DEV) ## the studio through an hour of live signals: pictures a second, gaps, growth (SECONDS=3600)
+	$(BIN)/python benches/studio_hour.py --seconds $(or $(SECONDS),3600)
+
+studio-kills: $(DEV) ## browser killed, hung, frozen or closed, studio killed, link pulled: output off after (TRIALS=50)
+	$(BIN)/python benches/studio_kills.py --trials $(or $(TRIALS),50)
 
 fuzz-logs: $(DEV) ## damaged logs of every format, refused or read (COUNT=100000; ONLY="mf4 tdms"; hours)
 	$(BIN)/python tests/support/fuzzed_logs.py --count $(or $(COUNT),100000) $(if $(ONLY),--only $(ONLY))

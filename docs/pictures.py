@@ -24,6 +24,7 @@ from sewfast.readers import read_table
 from sewfast.report.artefacts import run_file
 
 ASSETS = Path(__file__).parent / "assets"
+STUDIO = runpy.run_path(str(Path(__file__).with_name("studio_pictures.py")))
 PICTURES = {
     **runpy.run_path(str(Path(__file__).with_name("page_pictures.py")))["PICTURES"],
     **runpy.run_path(str(Path(__file__).with_name("diagrams.py")))["DIAGRAMS"],
@@ -120,8 +121,10 @@ def draw_all(results: Path, assets: Path) -> list[Path]:
     for path, plot in drawn.items():
         path.parent.mkdir(exist_ok=True)
         plot(path)
+    made = [*drawn, *(STUDIO["draw_studio"](assets / "studio") if STUDIO["can_draw"]() else [])]
+    for path in made:
         Image.open(path).convert("RGB").quantize(COLOURS).save(path, optimize=True)
-    return [picture, *drawn]
+    return [picture, *made]
 
 
 def main() -> None:

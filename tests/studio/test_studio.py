@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import base64
-import contextlib
 import http.client
 import json
-import os
 import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,39 +19,13 @@ import pytest
 
 import sewfast
 from cli import PROGRAM, environment
-from sewfast.errors import FitError, SettingError
-from sewfast.studio import Project, Step, Studio, make_demo
+from sewfast.errors import SettingError
+from sewfast.studio import Project, Step, Studio
 from sewfast.studio.commissioning import envelope
 from sewfast.tuning import costs, first_controller
-from studio_page import Page, websockets
+from studio_page import EVIL, Page, websockets
 
-EVIL = '<script>document.title="run"</script>'
 STEP = {"file": "run.csv", "inputs": ["u"], "output": "y", "resample": 0.02, "model": "oe"}
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    excitation = sewfast.signals.excitation("saturating")[:6000]
-    found = sewfast.record(sewfast.VirtualMachine(seed=1), excitation)
-    place = tmp_path / "machine"
-    place.mkdir()
-    t = np.arange(len(found)) * found.Ts
-    for name in ("run.csv", "run2.csv"):
-        columns = {"t": t, "u": found.u, "y": found.y, EVIL: found.y}
-        sewfast.write_table(place / name, columns)
-    return place
-
-
-@pytest.fixture
-def studio(folder: Path) -> Iterator[Studio]:
-    with Studio(Project(folder)) as running:
-        yield running
-
-
-@pytest.fixture
-def page(studio: Studio) -> Iterator[Page]:
-    with Page(studio) as found:
-        yield found
 
 
 # --- Who is let in --------------------------------------------------------------------------------
@@ -183,22 +153,6 @@ def test_one_page_writes_and_others_look_on(studio: Studio, page: Page) -> None:
 
 
 # --- Tuning ---------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("demo")
-    make_demo(place)
-    return place
-
-
-@pytest.fixture
-def tuned(demo: Path, tmp_path: Path) -> Iterator[Studio]:
-    place = tmp_path / "machine"
-    place.mkdir()
-    shutil.copy(demo / "drive.json", place)
-    with Studio(Project(place, demo=True)) as running:
-        yield running
 
 
 MOVE = {"model": "drive.json", "values": {"Kp": 0.03, "Ti": 0.07}}
@@ -360,7 +314,7 @@ def test_the_machine_is_commissioned_and_the_copies_do_the_same(tuned: Studio) -
     with Page(tuned) as page:
         assert page.ask("commission", **BRIEF)["found"] is None
         assert page.event("progress")["best"] == "first motion"
-        found = page.hear(lambda m: m.get("event") == "commissioned", 120)["found"]
+        found = page.hear(lambda m: m.get("event") == "commissioned", 300)["found"]
         assert found["verdict"].startswith("verified")
         names = [curve["name"] for curve in found["references"][0]["curves"]]
         assert names == ["measured", "predicted"]
@@ -512,203 +466,3 @@ def test_ctrl_c_ends_it_cleanly(folder: Path) -> None:
             _, err = process.communicate(timeout=20)
     assert (process.returncode, err) == (0, "")
     assert time.monotonic() - began < 5.0
-
-
-# --- In a browser ---------------------------------------------------------------------------------
-
-
-def _until(true: Callable[[], object], seconds: float = 30) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end, "the page did not get there"
-        time.sleep(0.05)
-
-
-@pytest.mark.alone
-def test_the_way_by_clicks(studio: Studio, browser: Any) -> None:
-    def at(name: str) -> Any:
-        return browser.find_element("id", name)
-
-    browser.get(studio.address)
-    _until(lambda: "u" in at("inputs").text)
-    assert studio.token not in browser.current_url
-    assert EVIL in at("output").text  # shown as text, and not run
-    at("resample").send_keys("0.02")
-    at("look").click()
-    _until(lambda: len(browser.find_elements("css selector", "#signals canvas")) == 2)
-    at("model").send_keys("oe")
-    at("identify").click()
-    _until(lambda: "free run explains" in at("headline").text)
-    at("validate").click()
-    _until(lambda: "Report card" in at("card").text)
-    if "STUDIO_PICTURES" in os.environ:
-        _take_pictures(browser, Path(os.environ["STUDIO_PICTURES"]))
-    for width in (1200, 600):  # 600: what 200 % zoom leaves of a window of 1200
-        browser.set_window_size(width, 900)
-        assert browser.execute_script(WIDE) <= 0
-    painted = "return [...document.querySelectorAll('#data canvas')].every(c => c.getContext('2d')"
-    painted += ".getImageData(0, 0, c.width, c.height).data.some(v => v))"
-    assert browser.execute_script(painted)
-    assert browser.title == "sewfast studio"
-    assert browser.get_log("browser") == []
-
-
-WIDE = "return document.documentElement.scrollWidth - innerWidth"
-NUMBER = """
-const row = [...document.querySelectorAll('#numbers tr')].find(r => r.cells[0].textContent === arguments[0]);
-return row && row.cells[1].textContent;
-"""  # noqa: E501
-
-
-@pytest.mark.alone
-def test_tuning_by_keyboard(tuned: Studio, browser: Any) -> None:
-    from selenium.webdriver.common.keys import Keys
-
-    def at(name: str) -> Any:
-        return browser.find_element("id", name)
-
-    def number(title: str) -> Any:
-        return browser.execute_script(NUMBER, title)
-
-    browser.set_window_size(1600, 1000)
-    browser.get(tuned.address)
-    _until(lambda: number("Ms"))
-    _until(lambda: "start" in at("cost").text)
-    before, first = number("Ms"), at("knob-Kp-value").get_attribute("value")
-    at("knob-Kp").send_keys(Keys.ARROW_RIGHT * 10)
-    _until(lambda: number("Ms") != before)
-    _until(lambda: "(" in at("cost").text and "old" not in at("cost").get_attribute("class"))
-    moved = {"Kp": float(at("knob-Kp-value").get_attribute("value"))}
-    shown, _ = tuned.project.tuning("drive.json").move(moved)
-    assert float(number("Ms")) == pytest.approx(shown["Ms"], rel=5e-3)
-    assert float(number("overshoot")) == pytest.approx(shown["overshoot_percent"], rel=5e-3)
-    at("pin-A").click()
-    at("view-tune").send_keys("z")
-    for _ in range(9):
-        at("undo").send_keys(Keys.ENTER)
-    _until(lambda: number("Ms") == before)
-    assert at("knob-Kp-value").get_attribute("value") == first
-    at("take-A").click()
-    _until(lambda: float(at("knob-Kp-value").get_attribute("value")) == moved["Kp"])
-    at("evaluations").clear()
-    at("evaluations").send_keys("40")
-    at("search").click()
-    _until(lambda: "found" in at("tune-progress").text)
-    at("save").click()
-    _until(lambda: "written" in at("saved").text)
-    at("copy-python").click()
-    _until(lambda: "evaluations=40" in at("tune-copy").text)
-    script, place = at("tune-copy").text, tuned.project.folder / "controller.json"
-    written = place.read_bytes()
-    place.unlink()
-    subprocess.run([sys.executable, "-c", script], cwd=place.parent, check=True)
-    assert place.read_bytes() == written
-    if "STUDIO_PICTURES" in os.environ:
-        _take_pictures(browser, Path(os.environ["STUDIO_PICTURES"]), "tune", (2200, 1500, 700))
-    for width in (1600, 1000, 600):
-        browser.set_window_size(width, 900)
-        assert browser.execute_script(WIDE) <= 0
-    assert browser.get_log("browser") == []
-
-
-@pytest.mark.alone
-def test_from_the_demo_to_a_verified_controller(tuned: Studio, browser: Any) -> None:
-    def at(name: str) -> Any:
-        return browser.find_element("id", name)
-
-    browser.get(tuned.address)
-    _until(lambda: browser.execute_script(NUMBER, "Ms"))
-    at("view-commission").click()
-    for name, value in (("machine-seed", "1"), ("networks", "1"), ("commission-tries", "100")):
-        at(name).clear()
-        at(name).send_keys(value)
-    at("commission-start").click()
-    _until(lambda: "verified" in at("commission-verdict").text, 120)
-    stages = at("stages").text
-    assert stages.startswith("first motion")
-    assert "verification" in stages
-    assert len(browser.find_elements("css selector", "#loops canvas")) == 4
-    if "STUDIO_PICTURES" in os.environ:
-        _take_pictures(browser, Path(os.environ["STUDIO_PICTURES"]), "commission", (1200,))
-    browser.set_window_size(600, 900)
-    assert browser.execute_script(WIDE) <= 0
-    assert browser.get_log("browser") == []
-
-
-@pytest.mark.alone
-def test_a_loop_that_diverges_leaves_no_old_curve(
-    tuned: Studio, browser: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def diverges(*_: object) -> None:
-        raise FitError("runs away")
-
-    painted = "return document.querySelector('#step-plot canvas').getContext('2d')"
-    painted += ".getImageData(0, 0, 900, 200).data.some(v => v)"
-    browser.get(tuned.address)
-    _until(lambda: browser.execute_script(NUMBER, "Ms"))
-    assert browser.execute_script(painted)
-    # a command with limits keeps the loop around a stable model finite
-    monkeypatch.setattr("sewfast.analysis.responses.responses", diverges)
-    browser.find_element("id", "knob-Kp").send_keys("\ue014")  # arrow right
-    _until(lambda: "broken: stable" in browser.find_element("id", "lights").text)
-    assert "diverges" in browser.execute_script(
-        "return document.querySelector('#step-plot canvas').getAttribute('aria-label')"
-    )
-    assert not browser.execute_script(painted)
-
-
-@pytest.mark.alone
-def test_no_view_keeps_anybody_out(tuned: Studio, browser: Any) -> None:
-    """No violation that axe knows: names, contrast, landmarks."""
-    axe = pytest.importorskip("axe_selenium_python").Axe(browser)
-    browser.get(tuned.address)
-    _until(lambda: browser.execute_script(NUMBER, "Ms"))
-    axe.inject()
-    for view in ("tune", "data", "drive", "commission"):
-        browser.find_element("id", f"view-{view}").click()
-        assert axe.run()["violations"] == [], view
-
-
-@pytest.mark.alone
-def test_the_page_finds_its_state_again(tuned: Studio, browser: Any) -> None:
-    browser.get(tuned.address)
-    _until(lambda: browser.execute_script(NUMBER, "Ms"))
-    browser.refresh()
-    _until(lambda: browser.execute_script(NUMBER, "Ms"))
-    assert "holds" in browser.find_element("id", "control").text
-
-
-def _take_pictures(
-    browser: Any, folder: Path, name: str = "look", widths: tuple[int, ...] = (1200, 600)
-) -> None:
-    browser.execute_script("scrollTo(0, 0)")
-    for width in widths:
-        height = 1000 if name == "tune" and width > 800 else 2600
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
-        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-        time.sleep(0.3)
-        found = browser.execute_cdp_cmd("Page.captureScreenshot", {})
-        (folder / f"{name}-{width}.png").write_bytes(base64.b64decode(found["data"]))
-    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-
-
-@pytest.mark.alone
-def test_the_way_by_keyboard(studio: Studio, browser: Any) -> None:
-    from selenium.webdriver.common.keys import Keys
-
-    browser.get(studio.address)
-    _until(lambda: browser.execute_script("return document.querySelector('#inputs').length > 0"))
-    for _ in range(12):
-        browser.switch_to.active_element.send_keys(Keys.TAB)
-        if browser.switch_to.active_element.get_attribute("id") == "look":
-            break
-    browser.switch_to.active_element.send_keys(Keys.ENTER)
-    _until(lambda: browser.find_elements("css selector", "#signals canvas"))
-
-
-@pytest.mark.alone
-def test_a_page_without_the_token_is_told(studio: Studio, browser: Any) -> None:
-    browser.get(studio.address.split("#")[0])
-    with contextlib.suppress(AssertionError):
-        _until(lambda: "not connected" in browser.find_element("id", "control").text, 10)
-    assert "not connected" in browser.find_element("id", "control").text

@@ -13,9 +13,9 @@ PATIENCE = 60.0
 """Long enough for any machine; reached only where something is wrong [s]."""
 
 
-def until(condition: Callable[[], Any]) -> Any:
+def until(condition: Callable[[], Any], patience: float = PATIENCE) -> Any:
     """What a condition gives as soon as it is true."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + patience
     while not (found := condition()):
         assert time.monotonic() < deadline, "it did not happen"
         time.sleep(0.005)

@@ -16,6 +16,9 @@ from sewfast.studio import Studio
 
 websockets = pytest.importorskip("websockets.sync.client")
 
+EVIL = '<script>document.title="run"</script>'
+"""Name of a column, which a page must show and not run."""
+
 
 class Page:
     """A socket that gave its token."""

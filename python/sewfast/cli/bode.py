@@ -20,7 +20,6 @@ from .drive import add_drive, is_port, machine_of, opened, require_no_drive_opti
 from .output import print_json
 
 if TYPE_CHECKING:
-    from ..dataset import Dataset
     from ..frequency import FrequencyResponse, ShaftFit
 
 BODE = """\
@@ -206,7 +205,7 @@ def _of_machine(args: argparse.Namespace, controller: Any) -> FrequencyResponse:
 
 def _of_record(args: argparse.Namespace) -> FrequencyResponse:
     from .. import storage
-    from ..commissioning import bode
+    from ..commissioning import bode, unsmoothed
     from ..frequency import load_response
     from ..frequency.response import FORMAT
     from .data import read_training
@@ -230,23 +229,3 @@ def _of_record(args: argparse.Namespace) -> FrequencyResponse:
         data if data.counts is None else unsmoothed(source, data), reference=args.reference,
         segment=args.segment,
     )  # fmt: skip
-
-
-def unsmoothed(source: str, data: Dataset) -> Dataset:
-    """With the difference of counts as its speed: an estimate that looks ahead has no delay."""
-    from dataclasses import replace
-
-    from ..readers import parse_source, read_table
-    from ..speed import speed_from_counts
-
-    assert data.counts is not None
-    column, per_rev = data.counts
-    counts = read_table(parse_source(source)[0])[column]
-    one = data.experiments[0]
-    if len(data.experiments) > 1 or len(counts) != len(one.y):
-        raise DataError(
-            f"{source}: expected one even record without gaps, got {len(data.experiments)} pieces; "
-            "cut one out"
-        )
-    y = speed_from_counts(counts, data.Ts, per_rev, method="difference")
-    return replace(data, experiments=(replace(one, y=y),), looks_ahead=False)

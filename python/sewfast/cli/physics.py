@@ -109,8 +109,8 @@ def command(args: argparse.Namespace) -> None:
 
 def _data(args: argparse.Namespace) -> Dataset:
     """The records, of counts their differences: a smoothed speed has lost what friction does."""
+    from ..commissioning import unsmoothed
     from ..dataset import Dataset
-    from .bode import unsmoothed
     from .data import read_training
 
     sources, found = args.data, []

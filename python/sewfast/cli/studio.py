@@ -9,8 +9,8 @@ from .arguments import Commands, add_command
 from .output import print_json
 
 STUDIO = """\
-Open a page in the browser: look at recordings, identify a model, validate it, tune a controller,
-record, run and commission a drive.
+Open a page in the browser: look at recordings, identify a model, validate it, draw Bode plots,
+tune a controller, record, run and commission a drive.
 Every step can be copied as Python or as commands, and its result is a file that the command line
 reads (model.json, controller.json).
 It needs the package websockets: pip install "sewfast[studio]". Only this computer can reach the
@@ -22,6 +22,7 @@ examples:
   sewfast studio                            the recordings of this folder
   sewfast studio recordings/run.csv         one of them first
   sewfast studio drive.json                 sliders for the controller of a model
+  sewfast studio /dev/ttyUSB0               a drive, with this folder for its recordings
   sewfast studio --demo                     the same with a computed machine, in a folder that
                                             is gone afterwards
   sewfast studio --no-browser --port 8377   with ssh -L 8377:127.0.0.1:8377 from elsewhere
@@ -33,7 +34,10 @@ def add(commands: Commands) -> None:
         commands, "studio", studio_command,
         summary="look, identify, validate, tune on a local page", text=STUDIO, examples=EXAMPLES,
     )  # fmt: skip
-    parser.add_argument("place", nargs="?", metavar="FOLDER|FILE", help="project folder (this one)")
+    parser.add_argument(
+        "place", nargs="?", metavar="FOLDER|FILE|PORT",
+        help="project folder (this one), a recording or model in it, or the port of a drive",
+    )  # fmt: skip
     parser.add_argument(
         "--demo", action="store_true", help="records and a model of the virtual machine"
     )
@@ -50,15 +54,17 @@ def studio_command(args: argparse.Namespace) -> None:
     import webbrowser
 
     from ..studio import Project, Studio, make_demo
+    from .drive import is_port
 
     if args.demo and args.place is not None:
         raise SettingError(f"--demo: expected no folder, received {args.place}; leave one out")
     with contextlib.ExitStack() as left, contextlib.suppress(KeyboardInterrupt):
-        place = args.place or "."
+        port = args.place if args.place is not None and is_port(args.place) else None
+        place = "." if port is not None else args.place or "."
         if args.demo:
             place = left.enter_context(tempfile.TemporaryDirectory(prefix="sewfast-"))
             make_demo(place)
-        studio = left.enter_context(Studio(Project(place, demo=args.demo), args.port))
+        studio = left.enter_context(Studio(Project(place, demo=args.demo, port=port), args.port))
         if args.json:
             print_json({"address": studio.address, "folder": str(studio.project.folder)})
         else:

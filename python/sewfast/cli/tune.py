@@ -147,6 +147,10 @@ def _add_search(parser: argparse.ArgumentParser) -> None:
         help="limit of Ms, overshoot [%%], u, recovery [ms] or load; may repeat",
     )  # fmt: skip
     parser.add_argument(
+        "--speed", type=float, metavar="Y",
+        help="output about which networks are linearised for --constraint Ms=..",
+    )  # fmt: skip
+    parser.add_argument(
         "--load", action="append", metavar="LEVEL:COMMAND",
         help="a load step to bear: a level that is held and a command behind the limits that comes "
         "on, as in 1500:-2; may repeat",
@@ -241,13 +245,15 @@ def _settings(args: argparse.Namespace) -> dict[str, Any]:
 def _on_response(
     args: argparse.Namespace, constraints: Constraints, models: list[Any]
 ) -> Constraints:
-    """Ms on the linear models and on the bands of a measured response.
+    """Ms on the linear models, on networks about a speed, and on the bands of a response.
 
     Raises
     ------
     SettingError
         For a response without a limit of Ms, or without a linear model.
     """
+    if args.speed is not None:
+        constraints = _about(args, constraints, models)
     if args.response is None:
         return constraints
     from ..frequency import load_response
@@ -257,13 +263,29 @@ def _on_response(
         raise SettingError(
             "--response: expected a limit of Ms to take on it as well; give --constraint Ms=1.7"
         )
-    linear = [model for model in models if hasattr(model, "to_tf")]
+    linear = constraints.plant or [model for model in models if hasattr(model, "to_tf")]
     if not linear:
         raise SettingError(
             "--response: expected a linear model among those to tune on, as a response does not "
             "tell whether a loop is stable; add that of sewfast bode --model"
         )
     return replace(constraints, plant=[*linear, response])
+
+
+def _about(args: argparse.Namespace, constraints: Constraints, models: list[Any]) -> Constraints:
+    """Ms on every model, or every member of an ensemble, about the speed that is given.
+
+    Raises
+    ------
+    SettingError
+        For a speed without a limit of Ms.
+    """
+    if constraints.Ms is None:
+        raise SettingError(
+            "--speed: expected a limit of Ms to linearise for; give --constraint Ms=1.7"
+        )
+    plants = [plant for model in models for plant in (model.members or (model,))]
+    return replace(constraints, plant=plants, speed=args.speed)
 
 
 def _notches(given: list[str] | None) -> list[Biquad]:

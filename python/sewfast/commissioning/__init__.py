@@ -11,7 +11,7 @@ from .demands import Refusal
 from .fmu import FmuMachine, fmu_bench
 from .procedure import STAGES, commission
 from .result import Commissioning
-from .shaking import bode
+from .shaking import bode, unsmoothed
 from .training import Rival
 from .verification import Comparison
 
@@ -29,4 +29,5 @@ __all__ = [
     "bode",
     "commission",
     "fmu_bench",
+    "unsmoothed",
 ]

@@ -8,7 +8,8 @@ multiples of the turn, where the load over the turn would be taken for a respons
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from ..dataset import Dataset
 from ..errors import DataError, SettingError
 from ..frequency import FrequencyResponse, periodic, spectral
 from ..gains import real
+from ..readers import parse_source, read_table
 from ..recording import Recording
 from ..speed import speed_from_counts
 from .bench import bench_of
@@ -231,6 +233,36 @@ def _of_record(
         y_unit=on.output_unit, from_counts=on.counts is not None,
         provenance={"recording": one.name},
     )  # fmt: skip
+
+
+def unsmoothed(source: str | os.PathLike[str], data: Dataset) -> Dataset:
+    """The same record with the difference of counts as its speed, which `bode` can use.
+
+    A speed that is estimated with later counts hides the delay.
+
+    Parameters
+    ----------
+    source : path
+        The recording that the data were read from; columns after a colon as on the command line.
+    data : Dataset
+        With a speed from counts.
+
+    Raises
+    ------
+    DataError
+        For a record in pieces.
+    """
+    assert data.counts is not None
+    column, per_rev = data.counts
+    counts = read_table(parse_source(os.fspath(source))[0])[column]
+    one = data.experiments[0]
+    if len(data.experiments) > 1 or len(counts) != len(one.y):
+        raise DataError(
+            f"{source}: expected one even record without gaps, got {len(data.experiments)} pieces; "
+            "cut one out"
+        )
+    y = speed_from_counts(counts, data.Ts, per_rev, method="difference")
+    return replace(data, experiments=(replace(one, y=y),), looks_ahead=False)
 
 
 # --- A machine ------------------------------------------------------------------------------------

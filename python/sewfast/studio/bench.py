@@ -1,6 +1,6 @@
 """The process that owns the port: it runs what a page asks for, and stops when nobody answers.
 
-The server speaks to it by lines of JSON and hears frames (`server.packed`). It is a process of its
+The server speaks to it by lines of JSON and hears frames (`session.packed`). It is a process of its
 own so that no work of the server can hold up the heartbeats of a drive. The motor stops where
 
 - a page asks for it, at once, whatever else is under way;
@@ -347,7 +347,7 @@ def said(error: Exception) -> str:
 
 def main() -> None:
     """Serve the process at the other end of standard input and output."""
-    from .server import packed
+    from .session import packed
 
     # whatever else is printed must not get between two frames
     out = os.fdopen(os.dup(1), "wb")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,6 +86,7 @@ def carry_out(
     *,
     cancel: threading.Event | None = None,
     between: Callable[[str, Commissioning], object] | None = None,
+    writing: Callable[[], AbstractContextManager[None]] = nullcontext,
 ) -> dict[str, Any]:
     """Commission a machine or a drive into the folder `commissioned`, and say what came of it.
 
@@ -106,7 +108,8 @@ def carry_out(
         on, seed=asked.seed, members=asked.members, evaluations=asked.evaluations,
         progress=progress, cancel=cancel, between=between,
     )  # fmt: skip
-    found.save(place)
+    with writing():
+        found.save(place)
     return {
         "verdict": found.verdict,
         "text": str(found),

@@ -11,17 +11,35 @@ SEED = {"type": "integer", "minimum": 0, "maximum": 2**32 - 1}
 NAME = {"type": "string", "maxLength": 200}
 WORDS = {"type": "array", "items": NAME, "maxItems": 100}
 LIMIT = {"type": ["number", "null"], "exclusiveMinimum": 0}
-VALUES = {"type": "object", "additionalProperties": {"type": "number"}, "maxProperties": 20}
+VALUES = {"type": "object", "additionalProperties": {"type": "number"}, "maxProperties": 40}
 
 _STEP = {
     "file": NAME,
     "inputs": WORDS,
     "output": {**NAME, "type": ["string", "null"]},
     "resample": {"type": ["number", "null"]},
+    "Ts": {"type": ["number", "null"], "exclusiveMinimum": 0},
+    "counts": {**NAME, "type": ["string", "null"]},
+    "counts_per_rev": {"type": ["number", "null"], "exclusiveMinimum": 0},
     "model": NAME,
     "seed": {**SEED, "type": ["integer", "null"]},
 }
-_TUNE = {"model": NAME, "controller": {**NAME, "type": ["string", "null"]}, "values": VALUES}
+NUMBERS = {"type": "array", "items": {"type": "number"}, "maxItems": 3}
+WEIGHTS = (
+    "tracking", "chatter", "effort", "overshoot", "overshoot_limit", "rise", "lag", "saturation"
+)  # fmt: skip
+_TUNE = {
+    "model": NAME,
+    "controller": {**NAME, "type": ["string", "null"]},
+    "values": VALUES,
+    "notches": {"type": "array", "items": NUMBERS, "maxItems": 4},
+    "weights": {
+        "type": "object",
+        "additionalProperties": {"type": "number", "minimum": 0},
+        "propertyNames": {"enum": list(WEIGHTS)},
+        "maxProperties": len(WEIGHTS),
+    },
+}
 _EFFORT = {
     "seed": SEED,
     "members": {"type": "integer", "minimum": 1, "maximum": 16},
@@ -47,9 +65,28 @@ _MESSAGES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
             **_TUNE,
             "evaluations": {"type": "integer", "minimum": 10, "maximum": 20_000},
             "seed": SEED,
+            "seconds": {"type": ["number", "null"], "exclusiveMinimum": 0, "maximum": 3600},
+            "constraints": {
+                "type": "object",
+                "additionalProperties": {"type": "number", "exclusiveMinimum": 0},
+                "propertyNames": {"enum": ["Ms", "overshoot", "u"]},
+                "maxProperties": 3,
+            },
         },
         ("model", "values", "evaluations", "seed"),
     ),
+    "loop": ({**_TUNE, "response": {"type": ["integer", "null"]}}, ("model", "values")),
+    "bode": (
+        {
+            **_STEP,
+            "reference": {**NAME, "type": ["string", "null"]},
+            "segment": {"type": ["integer", "null"], "minimum": 8, "maximum": 10_000_000},
+        },
+        ("file",),
+    ),
+    "report": ({}, ()),
+    "upload": ({"file": NAME, "size": {"type": "integer", "minimum": 1}}, ("file", "size")),
+    "upload_end": ({}, ()),
     "tune_save": ({**_TUNE, "file": NAME}, ("model", "values", "file")),
     "tune_copy": ({**_TUNE, "file": NAME}, ("model", "values", "file")),
     "ports": ({}, ()),
@@ -145,7 +182,10 @@ def _check(field: str, value: Any, rule: dict[str, Any]) -> None:
     if isinstance(value, dict):
         if len(value) > rule["maxProperties"]:
             raise _refusal(field, f"at most {rule['maxProperties']} entries", value)
+        known = rule.get("propertyNames", {}).get("enum")
         for key, entry in value.items():
+            if known is not None and key not in known:
+                raise _refusal(field, f"names among {', '.join(known)}", key)
             _check(key, entry, rule["additionalProperties"])
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         low, high = rule.get("minimum", -math.inf), rule.get("maximum", math.inf)

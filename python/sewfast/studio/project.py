@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import DataError, SettingError
-from ..kinds import KINDS, Kind
-from .commissioning import COMMISSIONED, Commission, carry_out, envelope, require
+from ..errors import SettingError
+from .commissioning import COMMISSIONED, envelope, require
+from .step import MODEL, Step, commands, script
 
 if TYPE_CHECKING:
     from ..dataset import Dataset
+    from ..frequency import FrequencyResponse
     from .tuning import Tuning
 
 RECORDINGS = (".csv", ".npz", ".mat", ".parquet", ".mcap")
-MODEL = "model.json"
 LARGEST = 512 * 2**20
 """Bytes of a recording that the page opens."""
 
@@ -36,54 +35,6 @@ LARGEST_DOCUMENT = 16 * 2**20
 """Bytes of a JSON file that is looked into."""
 
 Progress = Callable[[int, int, float], None]
-
-
-@dataclass(frozen=True)
-class Step:
-    """What to read and how, as the page asked for it.
-
-    Parameters
-    ----------
-    file : str
-        Name of a recording in the project folder.
-    inputs : tuple of str
-    output : str or None
-        None: the speed from the encoder counts that the recording states.
-    resample : float or None
-        Sample time to work at [s]; None: the recording's own.
-    model : str
-        Kind of model to identify.
-    seed : int
-    """
-
-    file: str
-    inputs: tuple[str, ...] = ()
-    output: str | None = None
-    resample: float | None = None
-    model: Kind = "auto"
-    seed: int = 0
-
-    @classmethod
-    def parse(cls, asked: dict[str, Any]) -> Step:
-        """A step from a message; what has the wrong type is refused.
-
-        Raises
-        ------
-        SettingError
-        """
-        inputs, output = asked.get("inputs", []), asked.get("output")
-        resample, model, seed = asked.get("resample"), asked.get("model", "auto"), asked.get("seed")
-        require(isinstance(asked.get("file"), str), "file", "a name", asked.get("file"))
-        named = isinstance(inputs, list) and all(isinstance(name, str) for name in inputs)
-        require(named, "inputs", "a list of column names", inputs)
-        require(output is None or isinstance(output, str), "output", "a column or null", output)
-        number = isinstance(resample, (int, float)) and not isinstance(resample, bool)
-        require(resample is None or number, "resample", "seconds or null", resample)
-        require(model in KINDS, "model", f"one of {', '.join(KINDS)}", model)
-        seed = 0 if seed is None else seed
-        whole = isinstance(seed, int) and not isinstance(seed, bool) and 0 <= seed < 2**32
-        require(whole, "seed", "a whole number from 0", seed)
-        return cls(asked["file"], tuple(inputs), output or None, resample, model, seed)
 
 
 def make_demo(folder: str | os.PathLike[str]) -> None:
@@ -118,6 +69,8 @@ class Project:
         The folder, or one recording or model in it.
     demo : bool
         Whether the page begins with the model, as in the demo.
+    port : str, optional
+        Of a drive, with which the page begins then.
 
     Raises
     ------
@@ -125,13 +78,15 @@ class Project:
         Where there is no such folder or file.
     """
 
-    def __init__(self, place: str | os.PathLike[str] = ".", *, demo: bool = False) -> None:
+    def __init__(
+        self, place: str | os.PathLike[str] = ".", *, demo: bool = False, port: str | None = None
+    ) -> None:
         path = Path(place).resolve()
         if not path.exists():
             raise SettingError(f"{place}: expected a folder, a recording or a model, there is none")
         self.folder = path if path.is_dir() else path.parent
         self.first = None if path.is_dir() else path.name
-        self.demo = demo
+        self.demo, self.port = demo, port
         self._formats: dict[Path, tuple[int, str]] = {}
         self._tuning: tuple[object, Tuning] | None = None
         self._lock = threading.Lock()
@@ -146,7 +101,7 @@ class Project:
         """
         return sorted(
             entry.name
-            for entry in self.folder.iterdir()
+            for entry in _entries(self.folder)
             if entry.suffix.lower() in RECORDINGS
             and ":" not in entry.name
             and entry.name.isprintable()
@@ -160,8 +115,7 @@ class Project:
         return sorted(
             entry.relative_to(self.folder).as_posix()
             for place in places
-            if place.is_dir()
-            for entry in place.iterdir()
+            for entry in _entries(place)
             if entry.suffix == ".json"
             and entry.name.isprintable()
             and entry.is_file()
@@ -173,10 +127,13 @@ class Project:
         """What a file says it is, read again only where it has changed."""
         from .. import storage
 
-        changed = path.stat().st_mtime_ns
-        if self._formats.get(path, (0, ""))[0] != changed:
-            small = path.stat().st_size <= LARGEST_DOCUMENT
-            self._formats[path] = (changed, storage.format_of(path) if small else "")
+        try:
+            found = path.stat()
+        except OSError:  # it was removed meanwhile
+            return ""
+        if self._formats.get(path, (0, ""))[0] != found.st_mtime_ns:
+            small = found.st_size <= LARGEST_DOCUMENT
+            self._formats[path] = (found.st_mtime_ns, storage.format_of(path) if small else "")
         return self._formats[path][1]
 
     def document(self, name: Any, format: str) -> Path:
@@ -214,9 +171,11 @@ class Project:
 
         return {
             "folder": self.folder.name or str(self.folder),
+            "gone": not self.folder.is_dir(),
             "recordings": self.recordings(),
             "first": self.first,
             "demo": self.demo,
+            "port": self.port,
             "models": self.documents(MODEL_FORMAT),
             "controllers": self.documents(CONTROLLER_FORMAT),
             "excitations": list(signals.EXCITATIONS),
@@ -225,7 +184,9 @@ class Project:
 
     # --- Tuning -----------------------------------------------------------------------------------
 
-    def tuning(self, model: Any, controller: Any = None) -> Tuning:
+    def tuning(
+        self, model: Any, controller: Any = None, notches: Sequence[Sequence[float]] = ()
+    ) -> Tuning:
         """A model and the controller to begin with; the same as long as neither file has changed.
 
         Parameters
@@ -234,6 +195,8 @@ class Project:
             Name of a model file in the folder.
         controller : str, optional
             Name of a controller file; None for the first controller of `sewfast.tune`.
+        notches : sequence of (frequency [Hz], depth, width)
+            Added to that controller.
 
         Raises
         ------
@@ -246,11 +209,11 @@ class Project:
         paths = [self.document(model, MODEL_FORMAT)]
         if controller is not None:
             paths.append(self.document(controller, CONTROLLER_FORMAT))
-        key = [(path, path.stat().st_mtime_ns) for path in paths]
+        key = [*((path, path.stat().st_mtime_ns) for path in paths), notches]
         with self._lock:
             if self._tuning is None or self._tuning[0] != key:
                 start = load_pid(paths[1]) if controller is not None else None
-                self._tuning = (key, Tuning(load_model(paths[0]), str(model), start))
+                self._tuning = (key, Tuning(load_model(paths[0]), str(model), start, notches))
             return self._tuning[1]
 
     def save_controller(self, tuning: Tuning, values: dict[str, Any], file: str) -> None:
@@ -264,22 +227,6 @@ class Project:
         if path.is_symlink() or (path.exists() and file not in self.documents(CONTROLLER_FORMAT)):
             raise SettingError(f"{file}: expected a new name or that of a controller; choose one")
         tuning.controller(values).save(path)
-
-    # --- Commissioning ----------------------------------------------------------------------------
-
-    def commission(self, asked: Commission, progress: Callable[[int, int, str], None]) -> Any:
-        """A virtual machine from rest to a verified controller; fills the folder `commissioned`.
-
-        Raises
-        ------
-        Refusal
-            Where the evidence is not good enough.
-        SettingError
-            For a folder of that name with files of somebody else's.
-        """
-        from ..machine import VirtualMachine
-
-        return carry_out(asked, VirtualMachine.from_name(asked.machine), self.folder, progress)
 
     # --- Steps ------------------------------------------------------------------------------------
 
@@ -302,25 +249,21 @@ class Project:
 
     def look(self, step: Step) -> dict[str, Any]:
         """The signals, and what `sewfast look` says of them."""
-        data = self._read(step)
-        summary = data.summary()
-        experiment = data.experiments[0]
-        curves = [
-            {"name": name, "unit": unit, **envelope(np.asarray(values, dtype=float), data.Ts)}
-            for name, unit, values in [
-                *zip(data.input_names, data.input_units, experiment.u.T, strict=True),
-                (data.output_name, data.output_unit, experiment.y),
-            ]
-        ]
-        return {"text": str(summary), "advice": list(summary.advice), "curves": curves}
+        return looked_at(self._read(step))
 
-    def identify(self, step: Step, progress: Progress | None = None) -> dict[str, Any]:
+    def identify(
+        self,
+        step: Step,
+        progress: Progress | None = None,
+        writing: Callable[[], AbstractContextManager[None]] = nullcontext,
+    ) -> dict[str, Any]:
         """A model from the recording, written to `model.json`."""
         from ..identification import identify
 
         data = self._read(step)
         model = identify(data, model=step.model, seed=step.seed, progress=progress)
-        model.save(self.folder / MODEL)
+        with writing():
+            model.save(self.folder / MODEL)
         choice = model.training.get("choice", {})
         return {
             "text": str(model),
@@ -351,42 +294,40 @@ class Project:
             "free_run": curves,
         }
 
-    # --- Copies: the same calls, for a script and for a shell -------------------------------------
+    def bode(
+        self, step: Step, reference: str | None = None, segment: int | None = None
+    ) -> FrequencyResponse:
+        """The frequency response of a recording.
 
-    def python(self, step: Step, name: str) -> str:
+        Parameters
+        ----------
+        step : Step
+        reference : str, optional
+            Column that a controller followed: without it a record under feedback is biased.
+        segment : int, optional
+            Samples; see `sewfast.bode`.
+        """
+        from ..commissioning import bode, unsmoothed
+        from ..readers import read
+
+        columns = self._columns(step, reference)
+        data = read(self.path_of(step.file), **columns)
+        if "counts" in columns:
+            data = unsmoothed(self.folder / step.file, data)
+        data = data if step.resample is None else data.resample(step.resample)
+        return bode(data, reference=reference, segment=segment)
+
+    def python(
+        self, step: Step, name: str, reference: str | None = None, segment: int | None = None
+    ) -> str:
         """A script that does the step again, run in the project folder."""
-        lines = ["import sewfast", "", f"data = sewfast.read({self._arguments(step)})"]
-        if step.resample is not None:
-            lines.append(f"data = data.resample({step.resample!r})")
-        if name == "look":
-            lines.append("print(data.summary())")
-        elif name == "identify":
-            call = f"sewfast.identify(data, model={step.model!r}, seed={step.seed})"
-            lines += [f"model = {call}", f"model.save({MODEL!r})", "print(model)"]
-        else:
-            lines.append(f"model = sewfast.load_model({MODEL!r})")
-            lines += ["print(sewfast.validate(model, data))", "print(sewfast.check(model, data))"]
-        return "\n".join(lines) + "\n"
+        return script(step, name, self._columns(step, reference), reference, segment)
 
-    def commands(self, step: Step, name: str) -> str:
+    def commands(
+        self, step: Step, name: str, reference: str | None = None, segment: int | None = None
+    ) -> str:
         """The same for a shell in the project folder."""
-        file = f"./{step.file}" if step.file.startswith("-") else step.file
-        read = self._columns(step)
-        options = [f"--input={c}" for c in read["inputs"]]
-        if "counts" in read:
-            options.append(f"--counts={read['counts']}")
-            options.append(f"--counts-per-rev={read['counts_per_rev']!r}")
-        else:
-            options.append(f"--output={read['output']}")
-        if step.resample is not None:
-            options.append(f"--resample={step.resample!r}")
-        kind = [f"--model={step.model.replace('_', '-')}", f"--seed={step.seed}", "-o", MODEL]
-        rows = {
-            "look": [["look", file, *options]],
-            "identify": [["identify", file, *options, *kind]],
-            "validate": [[c, MODEL, file, *options] for c in ("validate", "check")],
-        }[name]
-        return "".join(shlex.join(["sewfast", *row]) + "\n" for row in rows)
+        return commands(step, name, self._columns(step), reference, segment)
 
     def _read(self, step: Step) -> Dataset:
         from ..readers import read
@@ -394,29 +335,32 @@ class Project:
         data = read(self.path_of(step.file), **self._columns(step))
         return data if step.resample is None else data.resample(step.resample)
 
-    def _arguments(self, step: Step) -> str:
-        return ", ".join([repr(step.file), *(f"{k}={v!r}" for k, v in self._columns(step).items())])
-
-    def _columns(self, step: Step) -> dict[str, Any]:
-        """Arguments of `sewfast.read`; the references go along, as they do on the command line."""
-        from ..dataset import is_reference
+    def _columns(self, step: Step, reference: str | None = None) -> dict[str, Any]:
         from ..readers import read_table
 
-        if not step.inputs:
-            raise SettingError(f"{step.file}: expected an input, received none; choose a column")
-        table = read_table(self.path_of(step.file))
-        columns: dict[str, Any] = {"inputs": list(step.inputs)}
-        if step.output is not None:
-            columns["output"] = step.output
-        elif table.counts_per_rev is not None:
-            columns |= {"counts": "counts", "counts_per_rev": table.counts_per_rev}
-        else:
-            raise DataError(f"{step.file}: expected an output, received none; choose a column")
-        used = {table.resolve(n) for n in (*step.inputs, step.output or "counts")}
-        references = [n for n in table.names if is_reference(n) and n not in used]
-        lengths = {len(table[n]) for n in used}
-        references = [n for n in references if {len(table[n])} == lengths]
-        return columns | ({"channels": references} if references else {})
+        return step.columns(read_table(self.path_of(step.file)), reference)
+
+
+def looked_at(data: Dataset) -> dict[str, Any]:
+    """The signals of a data set, to draw, and what `sewfast look` says of them."""
+    summary = data.summary()
+    experiment = data.experiments[0]
+    curves = [
+        {"name": name, "unit": unit, **envelope(np.asarray(values, dtype=float), data.Ts)}
+        for name, unit, values in [
+            *zip(data.input_names, data.input_units, experiment.u.T, strict=True),
+            (data.output_name, data.output_unit, experiment.y),
+        ]
+    ]
+    return {"text": str(summary), "advice": list(summary.advice), "curves": curves}
+
+
+def _entries(place: Path) -> list[Path]:
+    """What is in a folder; nothing where it was removed while the studio runs."""
+    try:
+        return list(place.iterdir())
+    except OSError:
+        return []
 
 
 def checked_name(file: Any) -> str:

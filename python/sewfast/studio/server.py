@@ -2,37 +2,35 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import errno
+import hashlib
 import hmac
 import json
 import logging
-import math
-import queue
 import secrets
-import struct
 import threading
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from importlib.resources import files
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from ..errors import Interrupted, SettingError
+from ..errors import SettingError
 from .bench import said
-from .commissioning import Commission
+from .commissioning import COMMISSIONED
 from .driving import checked_recording
+from .jobs import Jobs
 from .line import Line
 from .messages import checked
-from .project import CONTROLLER_FORMAT, Project, Step, checked_name
+from .project import CONTROLLER_FORMAT, Project
+from .session import PROMPT, ROW, Session, packed, to_text
+from .steps import Steps
+from .uploads import Upload
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response
     from websockets.sync.server import ServerConnection
-
-    from ..dataset import FloatArray
 
 ADDRESS = "127.0.0.1"
 LARGEST_MESSAGE = 64 * 1024
@@ -42,29 +40,28 @@ PATIENCE = 5.0
 FAREWELL = 1.0
 """Seconds that a page has to answer the end of its socket."""
 
-BETWEEN_REPORTS = 0.05
-"""Seconds between two messages of a job's progress."""
 WRITES = (
-    "identify", "commission", "cancel", "tune_search", "tune_save", "drive_connect",
+    "identify", "bode", "commission", "report", "cancel", "tune_search", "tune_save", "upload",
+    "upload_end", "drive_connect",
     "drive_disconnect", "drive_limits", "drive_arm", "drive_disarm", "drive_clear", "drive_go",
     "drive_record", "drive_run", "drive_commission",
 )  # fmt: skip
 """What only the page that holds the control can ask for; a stop may come from any."""
 
+RESULTS = ("identified", "responded", "searched", "commissioned", "reported", "driven")
+"""Events that a step has ended."""
+
 BEAT = 0.1
 """Seconds between two questions whether the page that holds the control is there."""
-
-PROMPT, ROW = 0.15, 10
-"""A drive is armed for a page that has answered so many times in a row within so many seconds."""
-
-MOST_UNANSWERED = 20
-"""Questions to a page that does not answer, which are then no longer put."""
 
 PAGE = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/studio.js": ("studio.js", "text/javascript; charset=utf-8"),
     "/curves.js": ("curves.js", "text/javascript; charset=utf-8"),
     "/commission.js": ("commission.js", "text/javascript; charset=utf-8"),
+    "/bode.js": ("bode.js", "text/javascript; charset=utf-8"),
+    "/data.js": ("data.js", "text/javascript; charset=utf-8"),
+    "/look.js": ("look.js", "text/javascript; charset=utf-8"),
     "/copies.js": ("copies.js", "text/javascript; charset=utf-8"),
     "/tune.js": ("tune.js", "text/javascript; charset=utf-8"),
     "/drive.js": ("drive.js", "text/javascript; charset=utf-8"),
@@ -85,74 +82,16 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 
+REPORT = "report.html"
+REPORT_POLICY = (
+    "default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{digest}'; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'; sandbox allow-scripts"
+)
+"""Of a report, a file that anybody may have written: its one script is the package's own, and in a
+sandbox it cannot reach the page's token."""
 
-class _Cancelled(KeyboardInterrupt):
-    """Raised out of a job's progress; a search then hands over its best so far."""
-
-
-class _Page:
-    """A page that has given its token.
-
-    What is said to it and what it asks for each have a thread of their own, so that a page that
-    takes nothing more holds up nobody, and a long question of a page not its STOP.
-    """
-
-    def __init__(
-        self, connection: ServerConnection, answer: Callable[[_Page, str | bytes], object]
-    ) -> None:
-        self.connection = connection
-        self._says: queue.SimpleQueue[str | bytes | None] = queue.SimpleQueue()
-        self._asks: queue.SimpleQueue[str | bytes | None] = queue.SimpleQueue()
-        self._answer = answer
-        self._beats: dict[int, float] = {}
-        self._beat = 0
-        #: Questions in a row that it has answered promptly.
-        self.prompt = 0
-        for run in (self._speak, self._work):
-            threading.Thread(target=run, daemon=True).start()
-
-    def say(self, message: str | bytes) -> None:
-        self._says.put(message)
-
-    def ask(self, message: str | bytes) -> None:
-        self._asks.put(message)
-
-    def end(self) -> None:
-        self._says.put(None)
-        self._asks.put(None)
-
-    def _speak(self) -> None:
-        from websockets.exceptions import ConnectionClosed
-
-        with contextlib.suppress(ConnectionClosed):
-            while (message := self._says.get()) is not None:
-                self.connection.send(message)
-
-    def _work(self) -> None:
-        while (message := self._asks.get()) is not None:
-            self._answer(self, message)
-
-    def beat(self) -> None:
-        """Ask whether it is there."""
-        now = time.monotonic()
-        if len(self._beats) >= MOST_UNANSWERED:
-            self.prompt = 0
-            oldest = min(self._beats)
-            if now - self._beats[oldest] > 10.0:  # it may have lost them, for all that is known
-                self._beats.clear()
-            return
-        self._beat += 1
-        self._beats[self._beat] = now
-        self.say(_text({"event": "beat", "n": self._beat, "prompt": self.prompt}))
-
-    def answered(self, n: int) -> float | None:
-        """Seconds that the answer to a beat took; None where that was not asked."""
-        sent = self._beats.pop(n, None)
-        if sent is None:
-            return None
-        took = time.monotonic() - sent
-        self.prompt = self.prompt + 1 if took <= PROMPT else 0
-        return took
+LARGEST_REPORT = 64 * 2**20
+"""Bytes."""
 
 
 class Studio:
@@ -186,13 +125,15 @@ class Studio:
         silent.addHandler(logging.NullHandler())
         self.project = project
         self.token = secrets.token_urlsafe(32)
-        self._pages: set[_Page] = set()
-        self._writer: _Page | None = None
+        self._pages: set[Session] = set()
+        self._writer: Session | None = None
+        self._uploads: dict[Session, Upload] = {}
         self._line = Line(project.folder, self._tell)
+        self._jobs = Jobs(project.folder, self._tell)
+        self._steps = Steps(project, self._jobs)
+        self._report = f"/report/{secrets.token_urlsafe(32)}"
         self._ended = threading.Event()
         self._lock = threading.RLock()
-        self._job: threading.Thread | None = None
-        self._cancel = threading.Event()
         try:
             self._server = serve(
                 self._talk, ADDRESS, port, process_request=self._admit, max_size=LARGEST_MESSAGE,
@@ -218,8 +159,8 @@ class Studio:
         self._server.serve_forever()
 
     def close(self) -> None:
-        """End a running job and every socket, also those of pages that no longer answer."""
-        self._cancel.set()
+        """End a running step and every socket, also those of pages that no longer answer."""
+        self._jobs.cancel()
         self._ended.set()
         self._line.close()
         with self._lock:
@@ -227,8 +168,9 @@ class Studio:
         for page in pages:
             page.connection.close(1001, "the studio has ended")
         self._server.shutdown()
-        if self._job is not None:
-            self._job.join()
+        for page in pages:
+            page.wait(PATIENCE)
+        self._jobs.close()
 
     def __enter__(self) -> Studio:
         self._thread = threading.Thread(target=self.serve, daemon=True)
@@ -258,10 +200,27 @@ class Studio:
             return _answer(connection, 403, b"refused\n")
         if request.path == "/socket":
             return None if len(origins) == 1 else _answer(connection, 403, b"refused\n")
+        if hmac.compare_digest(request.path.encode(), self._report.encode()):
+            return self._written_report(connection)
         if request.path not in PAGE:
             return _answer(connection, 404, b"not found\n")
         name, kind = PAGE[request.path]
         return _answer(connection, 200, (files(__package__) / "page" / name).read_bytes(), kind)
+
+    def _written_report(self, connection: ServerConnection) -> Response:
+        """The report of the project's commissioning; its address is as secret as the token."""
+        path = self.project.folder / COMMISSIONED / REPORT
+        try:
+            inside = path.resolve() == path and path.stat().st_size <= LARGEST_REPORT
+            body = path.read_bytes() if inside else b""
+        except OSError:
+            body = b""
+        if not body:
+            return _answer(connection, 404, b"not found\n")
+        script = (files("sewfast.report") / "templates" / "zoom.js").read_bytes()
+        digest = base64.b64encode(hashlib.sha256(script).digest()).decode()
+        policy = {"Content-Security-Policy": REPORT_POLICY.format(digest=digest)}
+        return _answer(connection, 200, body, "text/html; charset=utf-8", policy)
 
     def _talk(self, connection: ServerConnection) -> None:
         from websockets.exceptions import ConnectionClosed
@@ -270,23 +229,26 @@ class Studio:
             if not self._is_known(connection):
                 connection.close(1008, "wrong token")
                 return
-            page = _Page(connection, self._answer)
+            page = Session(connection, self._answer)
             with self._lock:
                 self._pages.add(page)
                 self._writer = self._writer or page
             try:
                 self._tell_all()
-                page.say(_text(self._line.state))
+                page.send(to_text(self._line.state))
                 for message in connection:
-                    if not self._is_done_at_once(page, message):
-                        page.ask(message)
+                    if isinstance(message, bytes) or not self._is_done_at_once(page, message):
+                        page.take(message)
             finally:
                 with self._lock:
                     self._pages.discard(page)
+                    upload = self._uploads.pop(page, None)
                     was_writer = self._writer is page
                     self._writer = None if was_writer else self._writer
                 if was_writer and self._line.may_move:
                     self._line.stop("the page that held the control was closed")
+                if upload is not None:
+                    upload.abandon()
                 page.end()
                 self._tell_all()
 
@@ -300,9 +262,9 @@ class Studio:
 
     # --- What a page asks for ---------------------------------------------------------------------
 
-    def _is_done_at_once(self, page: _Page, message: str | bytes) -> bool:
+    def _is_done_at_once(self, page: Session, message: str | bytes) -> bool:
         """Do what must not wait behind anything else; False for what may."""
-        # a stop is heard of every page, also where the rest of its message is nonsense
+        # a stop is taken from every page, also where the rest of its message is nonsense
         try:
             asked = json.loads(message)
             name = asked.get("do") if isinstance(asked, dict) else None
@@ -310,20 +272,22 @@ class Studio:
             return False
         if name == "stop":
             self._line.stop("STOP on the page")
-        elif name not in ("alive", "live"):
+        elif name not in ("alive", "live", "cancel"):
             return False
         number = asked.get("id") if isinstance(asked.get("id"), int) else None
         try:
-            fields = checked(asked)
+            fields = self._permitted(page, asked)
             if name == "alive":
                 took = page.answered(fields["n"])
                 if took is not None and page is self._writer:
                     self._line.alive(took)
                 return True
+            if name == "cancel":
+                self._jobs.cancel()
             found = self._line.live(**fields) if name == "live" else (None, {})
-            page.say(packed({"id": number, "found": found[0]}, found[1]))
+            page.send(packed({"id": number, "found": found[0]}, found[1]))
         except Exception as e:
-            page.say(_text({"id": number, "error": said(e)}))
+            page.send(to_text({"id": number, "error": said(e)}))
         return True
 
     def _beat(self) -> None:
@@ -333,27 +297,33 @@ class Studio:
             if page is not None and self._line.is_connected:
                 page.beat()
 
-    def _answer(self, page: _Page, message: str | bytes) -> None:
+    def _answer(self, page: Session, message: str | bytes) -> None:
         number: Any = None
         try:
+            if isinstance(message, bytes):
+                self._add_to_upload(page, message)
+                return
             asked = json.loads(message)
             if not isinstance(asked, dict):
                 raise SettingError("expected an object")
             number = asked.get("id") if isinstance(asked.get("id"), int) else None
             found = self._do(page, asked)
             if isinstance(found, tuple):
-                page.say(packed({"id": number, "found": found[0]}, found[1]))
+                page.send(packed({"id": number, "found": found[0]}, found[1]))
             else:
-                page.say(_text({"id": number, "found": found}))
+                page.send(to_text({"id": number, "found": found}))
         except Exception as e:
-            page.say(_text({"id": number, "error": said(e)}))
+            page.send(to_text({"id": number, "error": said(e)}))
 
-    def _do(self, page: _Page, asked: dict[str, Any]) -> Any:
-        name = asked.get("do")
-        if name in WRITES and self._writer is not page:
+    def _permitted(self, page: Session, asked: dict[str, Any]) -> dict[str, Any]:
+        """The fields of a message that keeps to its schema, of a page that may send it."""
+        if asked.get("do") in WRITES and self._writer is not page:
             raise SettingError("this page looks on; press 'take control' first")
-        fields = checked(asked)
-        name = str(name)
+        return checked(asked)
+
+    def _do(self, page: Session, asked: dict[str, Any]) -> Any:
+        fields = self._permitted(page, asked)
+        name = str(asked["do"])
         if name == "take":
             with self._lock:
                 before, self._writer = self._writer, page
@@ -361,33 +331,48 @@ class Studio:
                 self._line.stop("another page has taken the control")
             self._tell_all()
             return None
-        if name == "cancel":
-            self._cancel.set()
-            return None
         if name == "ports":
             return _ports()
+        if name.startswith("upload"):
+            return self._upload(page, name, fields)
         if name.startswith("drive_"):
             return self._drive(page, name.removeprefix("drive_"), fields)
-        if name.startswith("tune"):
-            return self._tune(name, asked)
-        if name == "commission":
-            wanted = Commission.parse(asked)
-            self._start("commissioned", lambda report: self.project.commission(wanted, report))
-            return None
-        step = Step.parse(asked)
-        if name == "columns":
-            return self.project.columns(step)
-        if name in ("look", "validate"):
-            return {**getattr(self.project, name)(step), **self._copies(step, name)}
-        if name == "identify":
-            copies = self._copies(step, "identify")  # refuses wrong columns before work is begun
-            self._start(
-                "identified", lambda progress: {**self.project.identify(step, progress), **copies}
-            )
-            return None
-        raise SettingError(f"expected a known step, received {str(name)[:40]!r}")
+        found = self._steps.do(name, fields)
+        if name == "tune_save":
+            self._tell_all()
+        return found
 
-    def _drive(self, page: _Page, name: str, fields: dict[str, Any]) -> Any:
+    # --- Uploads ----------------------------------------------------------------------------------
+
+    def _upload(self, page: Session, name: str, fields: dict[str, Any]) -> Any:
+        upload = self._uploads.pop(page, None)
+        if name == "upload_end":
+            if upload is None:
+                raise SettingError("expected a file under way, there is none; upload it again")
+            file = upload.finish()
+            self._tell_all()
+            return {"file": file}
+        if upload is not None:
+            upload.abandon()
+        self._uploads[page] = Upload(self.project.folder, **fields)
+        return None
+
+    def _add_to_upload(self, page: Session, piece: bytes) -> None:
+        upload = self._uploads.get(page)
+        try:
+            if upload is None or page is not self._writer:
+                raise SettingError("expected no bytes, as no file is under way; upload it again")
+            answer: dict[str, Any] = {"bytes": upload.add(piece)}
+        except SettingError as e:
+            self._uploads.pop(page, None)
+            if upload is not None:
+                upload.abandon()
+            answer = {"error": str(e)}
+        page.send(to_text({"event": "received", **answer}))
+
+    # --- The drive --------------------------------------------------------------------------------
+
+    def _drive(self, page: Session, name: str, fields: dict[str, Any]) -> Any:
         line = self._line
         if name == "arm" and page.prompt < ROW:
             raise SettingError(
@@ -409,69 +394,6 @@ class Studio:
             return None
         return getattr(line, name)(**fields)
 
-    def _tune(self, name: str, asked: dict[str, Any]) -> Any:
-        tuning = self.project.tuning(asked.get("model"), asked.get("controller"))
-        values = asked.get("values", {})
-        if not isinstance(values, dict):
-            raise SettingError("values: expected numbers by name")
-        if name == "tune_open":
-            return tuning.opened()
-        if name == "tune_move":
-            return tuning.move(values)
-        if name == "tune_costs":
-            return {"costs": tuning.costs([{}, values])}
-        if name == "tune_search":
-            n, seed = (asked.get(name, -1) for name in ("evaluations", "seed"))
-            tuning.check_search(n, seed)
-            self._start("searched", lambda progress: tuning.search(values, n, seed, progress))
-            return None
-        file = checked_name(asked.get("file"))
-        if name == "tune_save":
-            self.project.save_controller(tuning, values, file)
-            self._tell_all()
-        elif name != "tune_copy":
-            raise SettingError(f"expected a known step, received {name[:40]!r}")
-        return {"python": tuning.python(values, file), "commands": tuning.commands(values, file)}
-
-    def _copies(self, step: Step, name: str) -> dict[str, str]:
-        return {
-            "python": self.project.python(step, name),
-            "commands": self.project.commands(step, name),
-        }
-
-    def _start(self, event: str, work: Callable[[Any], dict[str, Any]]) -> None:
-        """Do something long; its result goes to every page as an event."""
-        with self._lock:
-            if self._job is not None and self._job.is_alive():
-                raise SettingError("something else is running; cancel it or wait for its end")
-            self._cancel.clear()
-            self._job = threading.Thread(target=self._work, args=(event, work))
-            self._job.start()
-
-    def _work(self, event: str, work: Callable[[Any], dict[str, Any]]) -> None:
-        heard, stage = -math.inf, ""
-
-        def progress(done: int, total: int, best: float | str) -> None:
-            nonlocal heard, stage
-            if self._cancel.is_set():
-                raise _Cancelled
-            before, stage = stage, str(best).split(" ")[0] if isinstance(best, str) else ""
-            if stage != before or time.monotonic() - heard > BETWEEN_REPORTS:
-                heard = time.monotonic()
-                self._tell(
-                    {"event": "progress", "of": event, "done": done, "total": total, "best": best}
-                )
-
-        found: dict[str, Any]
-        try:
-            found = {"found": work(progress)}
-        except (KeyboardInterrupt, Interrupted):  # whoever passes it on makes one of the two of it
-            found = {"error": "cancelled; nothing was written"}
-        except Exception as e:
-            found = {"error": said(e)}
-        self._tell({"event": event, **found})
-        self._tell_all()
-
     def _tell_all(self) -> None:
         """The state, to every page; each hears whether it holds the control."""
         state = self.project.state()
@@ -479,16 +401,19 @@ class Studio:
             pages, writer = list(self._pages), self._writer
         for page in pages:
             told = {**state, "writes": page is writer, "pages": len(pages)}
-            page.say(_text({"event": "state", **told}))
+            page.send(to_text({"event": "state", **told}))
 
     def _tell(self, event: dict[str, Any]) -> None:
+        """To every page; results of long steps, after which there may be other files."""
         with self._lock:
             pages = list(self._pages)
-        text = _text(event)
+        if event["event"] == "reported" and "found" in event:
+            event["found"]["address"] = self._report
+        text = to_text(event)
         for page in pages:
-            page.say(text)
-        if event["event"] == "driven":
-            self._tell_all()  # there may be another file
+            page.send(text)
+        if event["event"] in RESULTS:
+            self._tell_all()
 
 
 def _ports() -> list[dict[str, str]]:
@@ -502,41 +427,18 @@ def _ports() -> list[dict[str, str]]:
 
 
 def _answer(
-    connection: ServerConnection, status: int, body: bytes, kind: str = "text/plain"
+    connection: ServerConnection,
+    status: int,
+    body: bytes,
+    kind: str = "text/plain",
+    others: Mapping[str, str] | None = None,
 ) -> Response:
     response = connection.respond(status, "")
     response.body = body
     for name in ("Content-Type", "Content-Length"):
         del response.headers[name]
-    written = {"Content-Type": kind, "Content-Length": str(len(body)), **HEADERS}
+    written = {"Content-Type": kind, "Content-Length": str(len(body))}
+    written |= {**HEADERS, **(others or {})}
     for name, value in written.items():
         response.headers[name] = value
     return response
-
-
-def packed(head: dict[str, Any], curves: Mapping[str, FloatArray]) -> bytes:
-    """A message with curves: length of the head, head as JSON, then every curve in float32.
-
-    The head's `curves` are names and lengths in order; it is padded so that a browser can lay an
-    array over the rest.
-    """
-    names = [[name, len(values)] for name, values in curves.items()]
-    text = _text({**head, "curves": names}).encode()
-    text += b" " * (-len(text) % 4)
-    rows = [np.asarray(values, dtype="<f4").tobytes() for values in curves.values()]
-    return b"".join([struct.pack("<I", len(text)), text, *rows])
-
-
-def _text(value: Any) -> str:
-    return json.dumps(_finite(value), allow_nan=False)
-
-
-def _finite(value: Any) -> Any:
-    """JSON knows no NaN: null."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Mapping):
-        return {str(k): _finite(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in value]
-    return value

@@ -10,13 +10,14 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import FitError, Interrupted, SettingError
+from .search import Found, Search
 
 if TYPE_CHECKING:
     from ..analysis.points import LoopBode
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 MOST_MEMBERS = 16
 READABLE_DB = -60.0
 """Below it the phase is left out: it jumps at the zeros of a mean over samples."""
-MOST_EVALUATIONS = 20_000
 
 
 @dataclass(frozen=True)
@@ -53,17 +53,6 @@ class Knob:
     whole: bool = False
 
 
-@dataclass(frozen=True)
-class _Found:
-    """What a search found, with the call that finds it again."""
-
-    values: dict[str, float]
-    controller: Controller
-    start: Controller
-    evaluations: int
-    seed: int
-
-
 class Tuning:
     """A model, or an ensemble whose members are all looked at, and a controller that is changed.
 
@@ -75,6 +64,8 @@ class Tuning:
         The model's file, as the copies name it.
     start : Controller, optional
         With constant gains; by default the first controller of `sewfast.tune`.
+    notches : sequence of (frequency [Hz], depth, width)
+        Put after the biquads of the start, of which a controller has four at most.
 
     Raises
     ------
@@ -84,17 +75,27 @@ class Tuning:
         Where the model has no first controller.
     """
 
-    def __init__(self, model: Model, name: str, start: Controller | None = None) -> None:
+    def __init__(
+        self,
+        model: Model,
+        name: str,
+        start: Controller | None = None,
+        notches: Sequence[Sequence[float]] = (),
+    ) -> None:
         from ..analysis.analysis import slowest_time
         from ..analysis.points import plant_points
         from ..analysis.responses import default_steps
+        from ..control.biquad import Biquad
         from ..control.loop import check_fits, each_plant, titles
         from ..tuning import first_controller
 
         self.model, self.name = model, name
         start = first_controller(model) if start is None else start
         # one form for all: copies are written in it
-        self.start = replace(start, gains=start.gains.to("standard"))
+        added = tuple(Biquad.notch(*numbers) for numbers in notches)
+        self.start = replace(
+            start, gains=start.gains.to("standard"), biquads=(*start.biquads, *added)
+        )
         if self.start.schedule:
             raise SettingError(
                 "expected a controller with constant gains, received a gain schedule; tune it with "
@@ -111,7 +112,12 @@ class Tuning:
             self.start, self.points, self.slowest,
             level=None, step=None, disturbance=None, seconds=None,
         )  # fmt: skip
-        self._found: list[_Found] = []
+        self._found: list[Found] = []
+
+    @property
+    def level(self) -> float:
+        """The output about which the loop is linearised [y]."""
+        return float(self.points[0].y)
 
     @property
     def knobs(self) -> list[Knob]:
@@ -136,6 +142,20 @@ class Tuning:
         n, lag = self.start.filter_samples, self.start.filter_time
         knobs.append(Knob("filter_samples", "samples", n, 1, 64, whole=True))
         knobs.append(Knob("filter_time", "s", lag, 0.0, max(20.0 * Ts, lag)))
+        return knobs + self._notch_knobs()
+
+    def _notch_knobs(self) -> list[Knob]:
+        knobs = []
+        for k, biquad in enumerate(self.start.biquads):
+            if biquad.kind != "notch":
+                continue
+            f, depth, width = biquad.numbers
+            most = min(2.0 * f, 0.49 / self.start.Ts)
+            knobs += [
+                Knob(f"notch_frequency[{k}]", "Hz", f, 0.5 * f, most, log=True),
+                Knob(f"notch_depth[{k}]", "", depth, 0.0, 1.0),
+                Knob(f"notch_width[{k}]", "", width, 0.25 * width, 4.0 * width, log=True),
+            ]
         return knobs
 
     def opened(self) -> dict[str, Any]:
@@ -203,7 +223,7 @@ class Tuning:
 
         controller = self.controller(values)
         (bode,) = loop_bodes(controller, [self.points], self.slowest)
-        numbers, curves = _margins(bode), _bode_curves(bode)
+        numbers, curves = _margins(bode), bode_curves(bode)
         try:
             tracked, upset = responses(controller, self.members, self.titles, self.steps)
         except FitError:
@@ -212,98 +232,103 @@ class Tuning:
             numbers |= {name: _worst(found, name) for name in found.metrics()[0]}
             curves |= {f"{kind}_t": found.t, f"{kind}_r": found.r}
             for name in "yu":
-                curves |= _band(f"{kind}_{name}", getattr(found, name))
+                curves |= band(f"{kind}_{name}", getattr(found, name))
         inside = tracked.u[:, tracked.t >= 0.0]
         numbers["u_rms"] = float(np.sqrt(np.mean(inside**2, axis=1)).max())
+        numbers["u_peak"] = float(np.abs(inside).max())
         numbers["du_rms"] = float(np.sqrt(np.mean(np.diff(inside) ** 2, axis=1)).max())
         return {**numbers, "diverges": False}, curves
 
-    def costs(self, several: list[Mapping[str, Any]]) -> list[float]:
+    def costs(
+        self, several: list[Mapping[str, Any]], weights: Mapping[str, float] | None = None
+    ) -> list[float]:
         """What controllers cost on the model, as `sewfast.tune` counts it; inf if one diverges.
 
         Parameters
         ----------
         several : list of dict
             The values of each.
+        weights : mapping, optional
+            Fields of `sewfast.Cost` by name.
         """
-        from ..tuning import costs
+        from ..tuning import Cost, costs
 
         # one weight for all of them: that of the first
-        found = costs([self.controller(values) for values in several], self.model)
+        controllers = [self.controller(values) for values in several]
+        found = costs(controllers, self.model, cost=Cost(**(weights or {})))
         return [float(cost) for cost in found]
 
-    def search(
-        self,
-        values: Mapping[str, Any],
-        evaluations: int,
-        seed: int,
-        progress: Callable[[int, int, float], None],
-    ) -> dict[str, Any]:
-        """`sewfast.tune` from these values on; of one that is interrupted the best so far.
-
-        Parameters
-        ----------
-        values : dict
-        evaluations, seed : int
-        progress : callable
-            Called with (done, total, lowest cost); a KeyboardInterrupt out of it ends the search.
-
-        Returns
-        -------
-        dict
-            ``values`` by name and whether it was ``interrupted``.
-
-        Raises
-        ------
-        SettingError
-            For evaluations or a seed out of range.
-        FitError
-            Where every controller diverges.
-        """
-        from ..tuning import tune
-
-        self.check_search(evaluations, seed)
-        start = self.controller(values)
-        try:
-            result = tune(
-                self.model, start=start, evaluations=evaluations, seed=seed, progress=progress
-            )
-        except Interrupted as stopped:
-            # when it was stopped cannot be repeated: these are values like any that a hand has set
-            return {"values": self._values_of(stopped.best), "interrupted": True}
-        found = self._values_of(result.pid)
-        self._found.append(_Found(found, result.pid, start, evaluations, seed))
-        return {
-            "values": found,
-            "interrupted": False,
-            "cost": result.cost,
-            "start_cost": result.start_cost,
-        }
-
-    @staticmethod
-    def check_search(evaluations: Any, seed: Any) -> None:
+    def check(self, search: Search) -> None:
         """Refuse what a search cannot begin with.
 
         Raises
         ------
         SettingError
         """
-        for name, value, low, high in (
-            ("evaluations", evaluations, 10, MOST_EVALUATIONS),
-            ("seed", seed, 0, 2**32 - 1),
-        ):
-            whole = isinstance(value, int) and not isinstance(value, bool)
-            if not (whole and low <= value <= high):
-                raise SettingError(
-                    f"{name}: expected a whole number from {low} to {high}, received "
-                    f"{str(value)[:40]!r}"
-                )
+        search.cost()
+        search.limits(self.model, self.level)
+
+    def search(
+        self,
+        values: Mapping[str, Any],
+        search: Search,
+        progress: Callable[[int, int, float], None],
+    ) -> Found:
+        """`sewfast.tune` from these values on; of one that is interrupted the best so far.
+
+        Parameters
+        ----------
+        values : dict
+        search : Search
+        progress : callable
+            Called with (done, total, lowest cost); a KeyboardInterrupt out of it ends the search.
+
+        Raises
+        ------
+        SettingError
+            For values, weights or constraints out of range.
+        FitError
+            Where every controller diverges or breaks a constraint.
+        """
+        from ..tuning import tune
+
+        start = self.controller(values)
+        try:
+            result = tune(
+                self.model, start=start, cost=search.cost(),
+                constraints=search.limits(self.model, self.level),
+                evaluations=search.evaluations, time_budget=search.seconds, seed=search.seed,
+                progress=progress,
+            )  # fmt: skip
+        except Interrupted as stopped:
+            # when it was stopped cannot be repeated: these are values like any that a hand has set
+            return Found(self._values_of(stopped.best), stopped.best, start, None)
+        return Found(
+            self._values_of(result.pid), result.pid, start,
+            None if result.termination == "time" else replace(search, seconds=None),
+            result.cost, result.start_cost, result.termination,
+        )  # fmt: skip
+
+    def keep(self, found: Found) -> dict[str, Any]:
+        """Remember a search, so that its copy repeats it; what the page shows of it."""
+        if found.search is not None:
+            self._found.append(found)
+        return {
+            "values": found.values,
+            "interrupted": found.ended == "interrupted",
+            "ended": found.ended,
+            "cost": found.cost,
+            "start_cost": found.start_cost,
+        }
 
     def _values_of(self, controller: Controller) -> dict[str, float]:
         values = {**vars(controller), **controller.gains.to_dict()}
+        for k, biquad in enumerate(controller.biquads):
+            if biquad.kind == "notch":
+                values |= {f"notch_{name}[{k}]": x for name, x in biquad.named().items()}
         return {knob.name: float(values[knob.name]) for knob in self.knobs}
 
-    def _search_of(self, values: Mapping[str, Any]) -> _Found | None:
+    def _search_of(self, values: Mapping[str, Any]) -> Found | None:
         given = dict(values)
         return next((found for found in self._found if found.values == given), None)
 
@@ -318,8 +343,9 @@ class Tuning:
             lines.append(f"controller = {_call(self.controller(values))}")
         else:
             lines.append(f"start = {_call(found.start)}")
-            call = f"model, start=start, evaluations={found.evaluations}, seed={found.seed}"
-            lines.append(f"controller = sewfast.tune({call}).controller")
+            assert found.search is not None
+            options = found.search.python(self.model, self.level)
+            lines.append(f"controller = sewfast.tune(model, start=start, {options}).controller")
         lines += [f"controller.save({file!r})", "print(sewfast.analyse(controller, model))"]
         return "\n".join(lines) + "\n"
 
@@ -330,9 +356,10 @@ class Tuning:
         if found is None:
             written, lines = file, []
         else:
+            assert found.search is not None
             written = f"start-{file}"
-            search = f"--evaluations={found.evaluations} --seed={found.seed}"
-            lines = [f"sewfast tune {model} --start {written} {search} -o {file}"]
+            options = found.search.command(self.model, self.level)
+            lines = [f"sewfast tune {model} --start {written} {options} -o {file}"]
         first = self.controller(values) if found is None else found.start
         document = [f"cat > {written} <<'END'", _document(first), "END"]
         return "\n".join([*document, *lines, f"sewfast analyse {file} {model}"]) + "\n"
@@ -360,17 +387,17 @@ def _margins(bode: LoopBode) -> dict[str, Any]:
     }
 
 
-def _bode_curves(bode: LoopBode) -> dict[str, FloatArray]:
+def bode_curves(bode: LoopBode) -> dict[str, FloatArray]:
     curves = {"hertz": bode.hertz}
     for name in "LST":
         size = np.maximum(np.abs(getattr(bode, name)), 1e-300)
-        curves |= _band(f"{name}_db", 20.0 * np.log10(size))
+        curves |= band(f"{name}_db", 20.0 * np.log10(size))
     phase = np.degrees(np.unwrap(np.angle(bode.L), axis=1))
-    curves |= _band("L_deg", np.where(20.0 * np.log10(np.abs(bode.L)) > READABLE_DB, phase, np.nan))
+    curves |= band("L_deg", np.where(20.0 * np.log10(np.abs(bode.L)) > READABLE_DB, phase, np.nan))
     return curves
 
 
-def _band(name: str, rows: FloatArray) -> dict[str, FloatArray]:
+def band(name: str, rows: FloatArray) -> dict[str, FloatArray]:
     """Median, lowest and highest of the members; of one member its curve alone."""
     if len(rows) == 1:
         return {name: rows[0]}
@@ -401,6 +428,9 @@ def _call(controller: Controller) -> str:
 
 
 def _number(value: Any) -> str:
+    if isinstance(value, tuple):  # of biquads
+        parts = [f"sewfast.Biquad({b.kind!r}, {b.numbers!r})" for b in value]
+        return f"({', '.join(parts)},)"
     if isinstance(value, float) and math.isinf(value):
         return "math.inf" if value > 0 else "-math.inf"
     return repr(value)

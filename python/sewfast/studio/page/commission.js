@@ -7,7 +7,7 @@ const $ = id => document.getElementById(id);
 let writes = false, busy = false, stages = [];
 
 function tell(error) { $("commission-error").textContent = error ? error.message : ""; $("commission-error").hidden = !error; }
-function enable() { $("commission-start").disabled = busy || !writes; $("commission-cancel").disabled = !busy || !writes; }
+function enable() { $("commission-start").disabled = busy || !writes; $("commission-cancel").disabled = !busy || !writes; $("report").disabled = !writes; }
 
 $("commission-start").onclick = async () => {
   tell(null); stages = []; $("stages").replaceChildren(); $("commission-verdict").textContent = ""; $("loops").replaceChildren();
@@ -55,5 +55,15 @@ function ended(m) {
   $("commission-text").textContent = f.text; $("commission-text").hidden = false;
   copies($("commission-copy"), { ...f, ...(m.python ? m : {}) });
 }
+$("report").onclick = async () => {
+  $("report-error").hidden = true;
+  try { await ask("report"); $("report-state").textContent = "under way"; } catch (error) { failed(error); }
+};
+function failed(error) { $("report-error").textContent = error.message; $("report-error").hidden = false; $("report-state").textContent = ""; }
+on("reported", m => {
+  if (m.error) return failed(new Error(m.error));
+  $("report-state").textContent = `written: ${m.found.file}`; $("report-link").href = m.found.address; $("report-link").hidden = false;
+  copies($("report-copy"), m.found);
+});
 on("commissioned", ended);
 on("driven", m => { if (m.kind === "commission") ended(m); });

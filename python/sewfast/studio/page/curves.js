@@ -1,21 +1,31 @@
 // Curves on a canvas: axes, bands, gaps; colours that colour-blind people tell apart (Okabe-Ito), and dashes.
 const STYLES = [["#0072b2", []], ["#d55e00", [7, 4]], ["#009e73", [2, 3]], ["#cc79a7", [9, 3, 2, 3]], ["#e69f00", [12, 4]]];
+const CHARTS = new Set();
+let printing = false;
+
+// on paper every curve is black and distinct by its dashes, whatever the theme of the screen
+function ink(canvas) { return printing ? "#000" : getComputedStyle(canvas).color; }
+function colour(style) { return printing ? "#000" : STYLES[style][0]; }
+function print(on) { printing = on; for (const c of CHARTS) c.canvas.isConnected ? c.paint() : CHARTS.delete(c); }
+addEventListener("beforeprint", () => print(true));
+addEventListener("afterprint", () => print(false));
 
 /** A chart in a new canvas in `place`, painted again when its size changes. */
 export class Chart {
   /** `axes`: x and y (titles), log (of x), marks (levels of y that mean something), floor (least y that is shown). */
   constructor(place, axes) {
     this.axes = { x: "time [s]", y: "", log: false, marks: [], floor: -Infinity, ...axes };
-    this.series = [];
+    this.series = []; this.marks = [];
+    CHARTS.add(this);
     this.canvas = document.createElement("canvas");
-    this.canvas.setAttribute("role", "img");
+    this.canvas.setAttribute("role", "img"); this.canvas.setAttribute("aria-label", "no curve yet");
     place.append(this.canvas);
     new ResizeObserver(() => this.paint()).observe(this.canvas);
   }
 
-  /** Draws series {name, x, y, low, high, style}: arrays, NaN is a gap; low and high make a band. */
-  draw(series, says) {
-    this.series = series;
+  /** Draws series {name, x, y, low, high, style, dots}: arrays, NaN is a gap; low and high make a band; marks {x, y, label}. */
+  draw(series, says, marks = []) {
+    this.series = series; this.marks = marks;
     this.canvas.setAttribute("aria-label", says);
     this.paint();
   }
@@ -39,18 +49,18 @@ export class Chart {
     this.grid(g, { w, h, left, right, top, bottom, X, Y, low, high, from, to });
     g.save(); g.beginPath(); g.rect(left, top - 2, right - left, bottom - top + 4); g.clip();
     series.forEach((s, i) => {
-      const [colour, dash] = STYLES[s.style ?? i % STYLES.length];
-      g.strokeStyle = g.fillStyle = colour;
+      const style = s.style ?? i % STYLES.length;
+      g.strokeStyle = g.fillStyle = colour(style);
       if (s.low) { g.globalAlpha = .22; band(g, s, X, Y); g.globalAlpha = 1; }
-      g.lineWidth = 1.6; g.setLineDash(dash); trace(g, s, X, Y);
+      g.lineWidth = 1.6; g.setLineDash(STYLES[style][1]); s.dots ? dots(g, s, X, Y) : trace(g, s, X, Y);
     });
     g.restore();
+    this.point(g, { X, Y, low, high, from, to, right });
     this.legend(g, left);
   }
 
   grid(g, { w, h, left, right, top, bottom, X, Y, low, high, from, to }) {
-    const ink = getComputedStyle(this.canvas).color;
-    g.fillStyle = g.strokeStyle = ink; g.lineWidth = 1; g.textBaseline = "middle"; g.setLineDash([]);
+    g.fillStyle = g.strokeStyle = ink(this.canvas); g.lineWidth = 1; g.textBaseline = "middle"; g.setLineDash([]);
     g.textAlign = "right";
     for (const v of ticks(low, high, 5)) {
       g.globalAlpha = .2; line(g, left, Y(v), right, Y(v)); g.globalAlpha = 1;
@@ -65,6 +75,16 @@ export class Chart {
     g.fillText(this.axes.x, (left + right) / 2, h - 8);
   }
 
+  /** Circles with labels, to the left of those at the right edge. */
+  point(g, { X, Y, low, high, from, to, right }) {
+    g.strokeStyle = g.fillStyle = ink(this.canvas); g.lineWidth = 1.6; g.setLineDash([]); g.textBaseline = "middle";
+    for (const m of this.marks) if (m.x >= from && m.x <= to && m.y >= low && m.y <= high) {
+      const x = X(m.x), y = Y(m.y), room = g.measureText(m.label).width + 12 < right - x;
+      g.beginPath(); g.arc(x, y, 4.5, 0, 2 * Math.PI); g.stroke();
+      g.textAlign = room ? "left" : "right"; g.fillText(m.label, x + (room ? 9 : -9), y - 9);
+    }
+  }
+
   /** The title stands over the legend. */
   top() { return this.axes.y ? 40 : 24; }
 
@@ -74,12 +94,13 @@ export class Chart {
     g.textAlign = "left"; g.textBaseline = "middle"; g.lineWidth = 1.6;
     this.series.forEach((s, i) => {
       if (!s.name) return;
-      const [colour, dash] = STYLES[s.style ?? i % STYLES.length];
-      g.strokeStyle = colour; g.setLineDash(dash); line(g, at, y, at + 26, y); g.setLineDash([]);
-      g.fillStyle = getComputedStyle(this.canvas).color; g.fillText(s.name, at + 32, y);
+      const style = s.style ?? i % STYLES.length;
+      g.strokeStyle = g.fillStyle = colour(style); g.setLineDash(STYLES[style][1]);
+      if (s.dots) for (const k of [3, 13, 23]) g.fillRect(at + k - 1, y - 1, 3, 3); else line(g, at, y, at + 26, y);
+      g.setLineDash([]); g.fillStyle = ink(this.canvas); g.fillText(s.name, at + 32, y);
       at += 52 + g.measureText(s.name).width;
     });
-    if (this.axes.y) { g.fillStyle = getComputedStyle(this.canvas).color; g.fillText(this.axes.y, left, 10); }
+    if (this.axes.y) { g.fillStyle = ink(this.canvas); g.fillText(this.axes.y, left, 10); }
   }
 }
 
@@ -107,6 +128,10 @@ function trace(g, { x, y }, X, Y) {
     g[pen ? "lineTo" : "moveTo"](X(x[k]), Y(y[k])); pen = true;
   }
   g.stroke();
+}
+
+function dots(g, { x, y }, X, Y) {
+  for (let k = 0; k < y.length; k++) if (!Number.isNaN(y[k])) g.fillRect(X(x[k]) - 1, Y(y[k]) - 1, 2.5, 2.5);
 }
 
 function band(g, { x, low, high }, X, Y) {

@@ -20,6 +20,9 @@ export function ask(name, asked = {}, answered = true) {
   return new Promise((done, failed) => waiting.set(id, [done, failed]));
 }
 
+/** A piece of a file that is uploaded; its answer is the event `received`. */
+export function sendBytes(piece) { socket.send(piece); }
+
 socket.onopen = () => socket.send(sessionStorage.getItem("token") || "none");
 socket.onclose = () => (listeners.closed || []).forEach(f => f());
 socket.onmessage = ({ data }) => {

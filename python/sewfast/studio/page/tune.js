@@ -1,203 +1,245 @@
 // The Tune view: sliders whose every move is a question to the server, and at most one under way; the latest wins.
-import { ask, on } from "/server.js";
 import { Chart } from "/curves.js";
 
-const $ = id => document.getElementById(id);
-const PINS = ["A", "B"];
+const PINS = ["A", "B"], MOST_NOTCHES = 4;
+const WEIGHTS = [["tracking", "per y"], ["chatter", "per u"], ["effort", "per u"], ["overshoot", "per %"], ["rise", "per ms"], ["lag", "per ms"], ["saturation", "per share"]];
 const NUMBERS = [ // name, title, unit
   ["Ms", "Ms", ""], ["Mt", "Mt", ""], ["phase_margin_deg", "phase margin", "deg"], ["gain_margin", "gain margin", ""],
   ["delay_margin_ms", "delay margin", "ms"], ["crossover_hz", "crossover", "Hz"], ["noise_gain", "noise gain", "u/y"],
   ["rise_ms", "rise 10 to 90 %", "ms"], ["overshoot_percent", "overshoot", "%"], ["settling_ms", "settling, 2 %", "ms"],
   ["peak", "disturbance peak", "y"], ["recovery_ms", "recovery", "ms"], ["u_rms", "effort, rms u", "u"], ["du_rms", "chatter, rms du", "u"],
 ];
-const charts = {
-  step: new Chart($("step-plot"), {}), command: new Chart($("command-plot"), {}), load: new Chart($("load-plot"), {}),
-  loop: new Chart($("loop-plot"), { x: "frequency [Hz]", y: "|L| [dB]", log: true, marks: [0], floor: -60 }),
-  phase: new Chart($("phase-plot"), { x: "frequency [Hz]", y: "phase of L [deg]", log: true, marks: [-180] }),
-  sensitivity: new Chart($("sens-plot"), { x: "frequency [Hz]", y: "|S|, |T| [dB]", log: true, marks: [0], floor: -60 }),
-};
-let opened = null, values = {}, history = [], first = null, now = null, pins = {}, asking = false, again = null, resting = 0, knobs = [], busy = false, writes = false;
 
-const question = more => ({ model: $("tune-model").value, controller: $("tune-start").value || null, values, ...more });
-function tell(error) { $("tune-error").textContent = error ? error.message : ""; $("tune-error").hidden = !error; }
+/**
+ * Brings the view to life: `root` holds its elements, `ask` and `on` reach the steps (server.js).
+ * Returns how it is opened, its controller as a question has it, and how a notch is put in.
+ */
+export function mount(root, { ask, on }) {
+  const $ = id => root.querySelector(`[id="${id}"]`);
+  const charts = {
+    step: new Chart($("step-plot"), {}), command: new Chart($("command-plot"), {}), load: new Chart($("load-plot"), {}),
+    loop: new Chart($("loop-plot"), { x: "frequency [Hz]", y: "|L| [dB]", log: true, marks: [0], floor: -60 }),
+    phase: new Chart($("phase-plot"), { x: "frequency [Hz]", y: "phase of L [deg]", log: true, marks: [-180] }),
+    sensitivity: new Chart($("sens-plot"), { x: "frequency [Hz]", y: "|S|, |T| [dB]", log: true, marks: [0], floor: -60 }),
+  };
+  let opened = null, values = {}, history = [], first = null, now = null, pins = {}, asking = false, again = null, resting = 0, knobs = [], busy = false, writes = false, notches = [];
 
-async function open() {
-  tell(null);
-  if (!$("tune-model").value) return;
-  try {
-    opened = await ask("tune_open", question({ values: {} }));
-    values = Object.fromEntries(opened.knobs.map(k => [k.name, k.value]));
-    history = []; pins = {}; first = null; now = null;
-    $("tune-members").textContent = opened.members > 1 ? `${opened.members} members: median and band` : "one model";
-    sliders(); move();
-  } catch (error) { opened = null; $("knobs").replaceChildren(); tell(error); }
-}
+  const question = more => ({ model: $("tune-model").value, controller: $("tune-start").value || null, values, notches, ...more });
+  const given = pairs => Object.fromEntries(pairs.map(([name, id]) => [name, $(id).valueAsNumber]).filter(([, v]) => Number.isFinite(v)));
+  const weights = () => given(WEIGHTS.map(([name]) => [name, `weight-${name}`]));
+  function tell(error) { $("tune-error").textContent = error ? error.message : ""; $("tune-error").hidden = !error; }
 
-function sliders() {
-  knobs = opened.knobs.map(k => {
-    const label = document.createElement("label"), slider = document.createElement("input"), field = document.createElement("input");
-    label.textContent = k.name + (k.unit ? ` [${k.unit}]` : ""); label.htmlFor = `knob-${k.name}`;
-    const to = v => k.log ? Math.log(v / k.low) / Math.log(k.high / k.low) : (v - k.low) / (k.high - k.low);
-    const from = p => k.log ? k.low * (k.high / k.low) ** p : k.low + p * (k.high - k.low);
-    Object.assign(slider, { type: "range", id: label.htmlFor, min: 0, max: 1, step: k.whole ? 1 / (k.high - k.low) : .005 });
-    Object.assign(field, { type: "number", id: `${label.htmlFor}-value`, step: "any" }); field.setAttribute("aria-label", label.textContent);
-    const show = () => {
-      slider.value = to(values[k.name]); field.value = Number(values[k.name].toPrecision(5));
-      slider.setAttribute("aria-valuetext", `${field.value} ${k.unit}`);
-    };
-    let held = null;  // values when a drag began: a drag is one step back
-    slider.oninput = event => {
-      if (!held) { held = { ...values }; keep(held); }
-      const v = from(slider.valueAsNumber);
-      values = { ...values, [k.name]: k.whole ? Math.round(v) : Number(v.toPrecision(5)) }; show(); move(event.timeStamp);
-    };
-    slider.onchange = () => { held = null; };
-    field.onchange = () => { if (Number.isFinite(field.valueAsNumber)) { keep(values); values = { ...values, [k.name]: field.valueAsNumber }; show(); move(); } };
-    show();
-    return { show, nodes: [label, slider, field] };
+  async function open(kept = {}) {
+    tell(null);
+    if (!$("tune-model").value) return;
+    try {
+      opened = await ask("tune_open", question({ values: {} }));
+      const start = Object.fromEntries(opened.knobs.map(k => [k.name, k.value]));
+      values = { ...start, ...Object.fromEntries(Object.entries(kept).filter(([name]) => name in start)) };
+      history = []; pins = {}; first = null; now = null;
+      if (Object.keys(kept).length) first = { ...await ask("tune_move", question({ values: start })), values: start };
+      $("tune-members").textContent = opened.members > 1 ? `${opened.members} members: median and band` : "one model";
+      sliders(); move(); listNotches();
+    } catch (error) { opened = null; $("knobs").replaceChildren(); tell(error); }
+  }
+
+  function sliders() {
+    knobs = opened.knobs.map(k => {
+      const label = document.createElement("label"), slider = document.createElement("input"), field = document.createElement("input");
+      label.textContent = k.name + (k.unit ? ` [${k.unit}]` : ""); label.htmlFor = `knob-${k.name}`;
+      const to = v => k.log ? Math.log(v / k.low) / Math.log(k.high / k.low) : (v - k.low) / (k.high - k.low);
+      const from = p => k.log ? k.low * (k.high / k.low) ** p : k.low + p * (k.high - k.low);
+      Object.assign(slider, { type: "range", id: label.htmlFor, min: 0, max: 1, step: k.whole ? 1 / (k.high - k.low) : .005 });
+      Object.assign(field, { type: "number", id: `${label.htmlFor}-value`, step: "any" }); field.setAttribute("aria-label", label.textContent);
+      const show = () => {
+        slider.value = to(values[k.name]); field.value = Number(values[k.name].toPrecision(5));
+        slider.setAttribute("aria-valuetext", `${field.value} ${k.unit}`);
+      };
+      let held = null;  // values when a drag began: a drag is one step back
+      slider.oninput = event => {
+        if (!held) { held = { ...values }; keep(held); }
+        const v = from(slider.valueAsNumber);
+        values = { ...values, [k.name]: k.whole ? Math.round(v) : Number(v.toPrecision(5)) }; show(); move(event.timeStamp);
+      };
+      slider.onchange = () => { held = null; };
+      field.onchange = () => { if (Number.isFinite(field.valueAsNumber)) { keep(values); values = { ...values, [k.name]: field.valueAsNumber }; show(); move(); } };
+      show();
+      return { show, nodes: [label, slider, field] };
+    });
+    $("knobs").replaceChildren(...knobs.flatMap(k => k.nodes));
+  }
+
+  /** The notches that were put into the start, each with the way to take it out again. */
+  function listNotches() {
+    $("notches").replaceChildren(...notches.map(([f], k) => {
+      const li = document.createElement("li"), button = document.createElement("button");
+      button.textContent = `Remove the notch at ${Number(f.toPrecision(4))} Hz`;
+      button.onclick = () => { notches = notches.filter((_, j) => j !== k); open(withoutNotches(values)); };
+      li.append(button); return li;
+    }));
+    $("add-notch").disabled = !opened || notches.length >= MOST_NOTCHES;
+  }
+  // their numbers move up when one is removed, so that the others begin anew
+  function withoutNotches(v) { return Object.fromEntries(Object.entries(v).filter(([name]) => !name.startsWith("notch_"))); }
+
+  async function addNotch(numbers) {
+    const before = notches, kept = values;
+    notches = [...notches, numbers];
+    await open(kept);
+    if (!opened) { const said = $("tune-error").textContent; notches = before; await open(kept); tell(new Error(said)); }
+  }
+
+  function keep(v) { history.push({ ...v }); if (history.length > 200) history.shift(); enable(); }
+  function set(v) { keep(values); values = { ...v }; knobs.forEach(k => k.show()); move(); }
+  function undo() { if (history.length) { values = history.pop(); knobs.forEach(k => k.show()); move(); } }
+
+  /** Asks for the loop with the present values; while one question is under way only the latest waits. */
+  async function move(began = performance.now()) {
+    enable();
+    if (asking) { again = began; return; }
+    asking = true; clearTimeout(resting); $("cost").classList.add("old");
+    const asked = values;
+    try {
+      const found = await ask("tune_move", question());
+      now = { ...found, values: asked }; first ??= now; tell(null); paint();
+      requestAnimationFrame(() => setTimeout(() => document.dispatchEvent(new CustomEvent("drawn", { detail: performance.now() - began }))));
+    } catch (error) { tell(error); }
+    asking = false;
+    if (again !== null) { const since = again; again = null; move(since); } else resting = setTimeout(cost, 250);
+  }
+
+  /** What `tune` would count; it takes longer, so it waits for a rest. */
+  async function cost() {
+    if (asking || !opened) return;
+    const asked = values;
+    try {
+      const [start, here] = (await ask("tune_costs", question({ weights: weights() }))).costs;
+      if (asked !== values) return;
+      const said = c => c === null ? "diverges" : `${c.toPrecision(4)} ${opened.y_unit}`;
+      $("cost").textContent = `cost ${said(here)}, start ${said(start)}` + (here !== null && start ? ` (${(100 * (here / start - 1)).toFixed(1)} %)` : "");
+      $("cost").classList.remove("old");
+    } catch (error) { tell(error); }
+  }
+
+  const each = () => [["now", now], ...PINS.filter(p => pins[p]).map(p => [p, pins[p]]), ["start", first]].filter(([, f], i) => i === 0 || f !== now);
+
+  function series(x, name, f, label, style) {
+    const c = f.curves;
+    return c[name] ? [{ name: label, x: c[x], y: c[name], low: f === now ? c[`${name}_low`] : null, high: c[`${name}_high`], style }] : [];
+  }
+
+  function paint() {
+    const shown = each(), style = name => ({ now: 0, A: 1, B: 3, start: 2 })[name], y = opened.y_unit, u = opened.u_unit;
+    const all = (x, name) => shown.flatMap(([label, f]) => series(x, name, f, label, style(label)));
+    const says = now.diverges ? "the loop diverges" : `overshoot ${text(now.overshoot_percent)} %, rise ${text(now.rise_ms)} ms, Ms ${text(now.Ms)}`;
+    charts.step.axes.y = `step response [${y}]`; charts.command.axes.y = `command [${u}]`; charts.load.axes.y = `disturbance of ${text(opened.disturbance)} ${u} [${y}]`;
+    charts.step.draw(now.diverges ? [] : all("reference_t", "reference_y"), `step response, ${says}`);
+    charts.command.draw(now.diverges ? [] : all("reference_t", "reference_u"), "command of the step");
+    charts.load.draw(now.diverges ? [] : all("disturbance_t", "disturbance_y"), `disturbance response, recovery ${text(now.recovery_ms)} ms`);
+    charts.loop.draw(all("hertz", "L_db"), "size of L over frequency");
+    charts.phase.draw(all("hertz", "L_deg"), "phase of L over frequency");
+    charts.sensitivity.draw([...series("hertz", "S_db", now, "S", 0), ...series("hertz", "T_db", now, "T", 4),
+      ...shown.slice(1).flatMap(([label, f]) => series("hertz", "S_db", f, `S ${label}`, style(label)))], `sensitivity, peak ${text(now.Ms)}`);
+    numbers(shown); lights();
+  }
+
+  const text = v => v === null || v === undefined ? "none" : Number(v.toPrecision(3)).toString();
+
+  function numbers(shown) {
+    const table = $("numbers"), head = document.createElement("tr"), unit = { u: opened.u_unit, y: opened.y_unit, "u/y": `${opened.u_unit}/${opened.y_unit}` };
+    for (const title of ["", ...shown.map(([label]) => label), "unit"]) { const th = document.createElement("th"); th.scope = "col"; th.textContent = title; head.append(th); }
+    table.replaceChildren(head, ...NUMBERS.map(([name, title, of]) => {
+      const row = document.createElement("tr"), th = document.createElement("th"); th.scope = "row"; th.textContent = title; row.append(th);
+      for (const [, f] of shown) { const td = row.insertCell(); td.textContent = text(f[name]); td.className = "n"; }
+      row.insertCell().textContent = unit[of] ?? of;
+      return row;
+    }));
+  }
+
+  /** Limits as words and signs, never by colour alone. */
+  function lights() {
+    const limit = parseFloat($("limit-Ms").value) || 2, over = parseFloat($("limit-overshoot").value), most = parseFloat($("limit-u").value);
+    const rows = [["stable", now.stable && !now.diverges, now.stable ? "yes" : "no"], [`Ms at most ${limit}`, now.stable && now.Ms <= limit, text(now.Ms)]];
+    if (Number.isFinite(over)) rows.push([`overshoot at most ${over} %`, !now.diverges && now.overshoot_percent <= over, text(now.overshoot_percent)]);
+    if (Number.isFinite(most)) rows.push([`command at most ${most} ${opened.u_unit}`, !now.diverges && now.u_peak <= most, text(now.u_peak)]);
+    if (limit > 1) $("Ms-means").textContent = `Ms ${limit} leaves a gain margin of at least ${text(limit / (limit - 1))} and a phase margin of at least ${text(2 * Math.asin(.5 / limit) * 180 / Math.PI)} degrees.`;
+    $("lights").replaceChildren(...rows.map(([what, ok, found]) => {
+      const li = document.createElement("li"); li.textContent = `${ok ? "\u2713 kept" : "\u2717 broken"}: ${what} (${found})`; li.className = ok ? "kept" : "broken"; return li;
+    }));
+  }
+
+  function enable() {
+    $("undo").disabled = !history.length; $("reset").disabled = !opened;
+    $("search").disabled = !opened || busy || !writes; $("tune-cancel").disabled = !busy || !writes; $("tune-bar").hidden = !busy;
+    $("save").disabled = !opened || !writes; $("add-notch").disabled = !opened || notches.length >= MOST_NOTCHES;
+    for (const p of PINS) { $(`pin-${p}`).disabled = !opened; $(`take-${p}`).disabled = !pins[p]; }
+  }
+
+  async function copied(button, which) {
+    try {
+      const said = (await ask("tune_copy", question({ file: $("save-name").value })))[which], label = button.textContent;
+      $("tune-copy").textContent = said; $("tune-copy").hidden = false;
+      await navigator.clipboard.writeText(said).then(() => { button.textContent = "Copied"; setTimeout(() => { button.textContent = label; }, 1200); }, () => {});
+    } catch (error) { tell(error); }
+  }
+
+  for (const id of ["tune-model", "tune-start"]) $(id).onchange = () => { notches = []; open(); };
+  $("weights").replaceChildren(...WEIGHTS.map(([name, per]) => {
+    const label = document.createElement("label"), field = document.createElement("input");
+    label.textContent = `${name}, ${per} `; Object.assign(field, { type: "number", min: 0, step: "any", id: `weight-${name}`, placeholder: "usual" });
+    field.onchange = () => { if (opened) { $("cost").classList.add("old"); cost(); } };
+    label.append(field); return label;
+  }));
+  $("add-notch").onclick = () => {
+    const f = $("notch-hz").valueAsNumber;
+    f > 0 ? addNotch([f, .1, .5]) : tell(new Error("notch: expected a frequency in Hz; type it, or take the one that the view Bode proposes"));
+  };
+  $("undo").onclick = undo;
+  $("reset").onclick = () => set(Object.fromEntries(opened.knobs.map(k => [k.name, k.value])));
+  for (const p of PINS) {
+    $(`pin-${p}`).onclick = () => { pins[p] = now; enable(); paint(); };
+    $(`take-${p}`).onclick = () => set(pins[p].values);
+  }
+  for (const id of ["limit-Ms", "limit-overshoot", "limit-u"]) $(id).oninput = () => { if (now) lights(); };
+  $("search").onclick = async () => {
+    tell(null);
+    try { await ask("tune_search", question({ evaluations: $("evaluations").valueAsNumber, seed: $("tune-seed").valueAsNumber })); busy = true; enable(); } catch (error) { tell(error); }
+  };
+  $("tune-cancel").onclick = () => ask("cancel").catch(tell);
+  $("save").onclick = async () => {
+    tell(null);
+    try { await ask("tune_save", question({ file: $("save-name").value })); $("saved").textContent = `written: ${$("save-name").value}`; } catch (error) { tell(error); }
+  };
+  $("copy-python").onclick = event => copied(event.target, "python");
+  $("copy-commands").onclick = event => copied(event.target, "commands");
+  root.addEventListener("keydown", event => {
+    if ($("tune").hidden || event.target.type === "number" || event.target.type === "text") return;
+    if (event.key === "z" || event.key === "Z") { event.preventDefault(); undo(); }
   });
-  $("knobs").replaceChildren(...knobs.flatMap(k => k.nodes));
-}
+  on("progress", p => {
+    if (p.of !== "searched") return;
+    busy = true; $("tune-bar").value = p.done / Math.max(p.total, 1); $("tune-progress").textContent = `${p.done} of ${p.total}`; enable();
+  });
+  on("searched", m => {
+    busy = false; $("tune-progress").textContent = ""; enable();
+    if (m.error) return tell(new Error(m.error));
+    if (!opened) return;
+    $("tune-progress").textContent = m.found.interrupted ? "cancelled: the best so far" : `${m.found.ended === "time" ? "time is up; found" : "found"}: cost ${m.found.cost.toPrecision(4)}, began at ${m.found.start_cost.toPrecision(4)}`;
+    set(m.found.values);
+  });
+  on("state", s => {
+    writes = s.writes; enable();
+    fill($("tune-model"), s.models.map(n => [n, n]), s.first); fill($("tune-start"), [["", "first controller"], ...s.controllers.map(n => [n, n])], s.start ?? "");
+    $("no-model").hidden = s.models.length > 0;
+    if (!opened && !$("tune").hidden) open();
+  });
 
-function keep(v) { history.push({ ...v }); if (history.length > 200) history.shift(); enable(); }
-function set(v) { keep(values); values = { ...v }; knobs.forEach(k => k.show()); move(); }
-function undo() { if (history.length) { values = history.pop(); knobs.forEach(k => k.show()); move(); } }
+  function fill(select, pairs, chosen) {
+    const kept = select.options.length ? select.value : chosen;
+    select.replaceChildren(...pairs.map(([value, label]) => new Option(label, value)));
+    if (pairs.some(([value]) => value === kept)) select.value = kept;
+  }
 
-/** Asks for the loop with the present values; while one question is under way only the latest waits. */
-async function move(began = performance.now()) {
   enable();
-  if (asking) { again = began; return; }
-  asking = true; clearTimeout(resting); $("cost").classList.add("old");
-  const asked = values;
-  try {
-    const found = await ask("tune_move", question());
-    now = { ...found, values: asked }; first ??= now; tell(null); paint();
-    requestAnimationFrame(() => setTimeout(() => document.dispatchEvent(new CustomEvent("drawn", { detail: performance.now() - began }))));
-  } catch (error) { tell(error); }
-  asking = false;
-  if (again !== null) { const since = again; again = null; move(since); } else resting = setTimeout(cost, 250);
+  return { show: async () => { if (!opened) await open(); }, question, addNotch, unit: () => opened ? opened.y_unit : "" };
 }
-
-/** What `tune` would count; it takes longer, so it waits for a rest. */
-async function cost() {
-  if (asking || !opened) return;
-  const asked = values;
-  try {
-    const [start, here] = (await ask("tune_costs", question())).costs;
-    if (asked !== values) return;
-    const said = c => c === null ? "diverges" : `${c.toPrecision(4)} ${opened.y_unit}`;
-    $("cost").textContent = `cost ${said(here)}, start ${said(start)}` + (here !== null && start ? ` (${(100 * (here / start - 1)).toFixed(1)} %)` : "");
-    $("cost").classList.remove("old");
-  } catch (error) { tell(error); }
-}
-
-const each = () => [["now", now], ...PINS.filter(p => pins[p]).map(p => [p, pins[p]]), ["start", first]].filter(([, f], i) => i === 0 || f !== now);
-
-function series(x, name, f, label, style) {
-  const c = f.curves;
-  return c[name] ? [{ name: label, x: c[x], y: c[name], low: f === now ? c[`${name}_low`] : null, high: c[`${name}_high`], style }] : [];
-}
-
-function paint() {
-  const shown = each(), style = name => ({ now: 0, A: 1, B: 3, start: 2 })[name], y = opened.y_unit, u = opened.u_unit;
-  const all = (x, name) => shown.flatMap(([label, f]) => series(x, name, f, label, style(label)));
-  const says = now.diverges ? "the loop diverges" : `overshoot ${text(now.overshoot_percent)} %, rise ${text(now.rise_ms)} ms, Ms ${text(now.Ms)}`;
-  charts.step.axes.y = `step response [${y}]`; charts.command.axes.y = `command [${u}]`; charts.load.axes.y = `disturbance of ${text(opened.disturbance)} ${u} [${y}]`;
-  charts.step.draw(now.diverges ? [] : all("reference_t", "reference_y"), `step response, ${says}`);
-  charts.command.draw(now.diverges ? [] : all("reference_t", "reference_u"), "command of the step");
-  charts.load.draw(now.diverges ? [] : all("disturbance_t", "disturbance_y"), `disturbance response, recovery ${text(now.recovery_ms)} ms`);
-  charts.loop.draw(all("hertz", "L_db"), "size of L over frequency");
-  charts.phase.draw(all("hertz", "L_deg"), "phase of L over frequency");
-  charts.sensitivity.draw([...series("hertz", "S_db", now, "S", 0), ...series("hertz", "T_db", now, "T", 4),
-    ...shown.slice(1).flatMap(([label, f]) => series("hertz", "S_db", f, `S ${label}`, style(label)))], `sensitivity, peak ${text(now.Ms)}`);
-  numbers(shown); lights();
-}
-
-const text = v => v === null || v === undefined ? "none" : Number(v.toPrecision(3)).toString();
-
-function numbers(shown) {
-  const table = $("numbers"), head = document.createElement("tr"), unit = { u: opened.u_unit, y: opened.y_unit, "u/y": `${opened.u_unit}/${opened.y_unit}` };
-  for (const title of ["", ...shown.map(([label]) => label), "unit"]) { const th = document.createElement("th"); th.scope = "col"; th.textContent = title; head.append(th); }
-  table.replaceChildren(head, ...NUMBERS.map(([name, title, of]) => {
-    const row = document.createElement("tr"), th = document.createElement("th"); th.scope = "row"; th.textContent = title; row.append(th);
-    for (const [, f] of shown) { const td = row.insertCell(); td.textContent = text(f[name]); td.className = "n"; }
-    row.insertCell().textContent = unit[of] ?? of;
-    return row;
-  }));
-}
-
-/** Limits as words and signs, never by colour alone. */
-function lights() {
-  const limit = parseFloat($("limit-Ms").value) || 2, over = parseFloat($("limit-overshoot").value);
-  const rows = [["stable", now.stable && !now.diverges, now.stable ? "yes" : "no"], [`Ms at most ${limit}`, now.stable && now.Ms <= limit, text(now.Ms)]];
-  if (Number.isFinite(over)) rows.push([`overshoot at most ${over} %`, !now.diverges && now.overshoot_percent <= over, text(now.overshoot_percent)]);
-  $("lights").replaceChildren(...rows.map(([what, ok, found]) => {
-    const li = document.createElement("li"); li.textContent = `${ok ? "\u2713 kept" : "\u2717 broken"}: ${what} (${found})`; li.className = ok ? "kept" : "broken"; return li;
-  }));
-}
-
-function enable() {
-  $("undo").disabled = !history.length; $("reset").disabled = !opened;
-  $("search").disabled = !opened || busy || !writes; $("tune-cancel").disabled = !busy || !writes; $("tune-bar").hidden = !busy;
-  $("save").disabled = !opened || !writes;
-  for (const p of PINS) { $(`pin-${p}`).disabled = !opened; $(`take-${p}`).disabled = !pins[p]; }
-}
-
-async function copied(button, which) {
-  try {
-    const said = (await ask("tune_copy", question({ file: $("save-name").value })))[which], label = button.textContent;
-    $("tune-copy").textContent = said; $("tune-copy").hidden = false;
-    await navigator.clipboard.writeText(said).then(() => { button.textContent = "Copied"; setTimeout(() => { button.textContent = label; }, 1200); }, () => {});
-  } catch (error) { tell(error); }
-}
-
-$("tune-model").onchange = open;
-$("tune-start").onchange = open;
-$("undo").onclick = undo;
-$("reset").onclick = () => set(Object.fromEntries(opened.knobs.map(k => [k.name, k.value])));
-for (const p of PINS) {
-  $(`pin-${p}`).onclick = () => { pins[p] = now; enable(); paint(); };
-  $(`take-${p}`).onclick = () => set(pins[p].values);
-}
-$("limit-Ms").oninput = $("limit-overshoot").oninput = () => { if (now) lights(); };
-$("search").onclick = async () => {
-  tell(null);
-  try { await ask("tune_search", question({ evaluations: $("evaluations").valueAsNumber, seed: $("tune-seed").valueAsNumber })); busy = true; enable(); } catch (error) { tell(error); }
-};
-$("tune-cancel").onclick = () => ask("cancel").catch(tell);
-$("save").onclick = async () => {
-  tell(null);
-  try { await ask("tune_save", question({ file: $("save-name").value })); $("saved").textContent = `written: ${$("save-name").value}`; } catch (error) { tell(error); }
-};
-$("copy-python").onclick = event => copied(event.target, "python");
-$("copy-commands").onclick = event => copied(event.target, "commands");
-document.addEventListener("keydown", event => {
-  if ($("tune").hidden || event.target.type === "number" || event.target.type === "text") return;
-  if (event.key === "z" || event.key === "Z") { event.preventDefault(); undo(); }
-});
-on("progress", p => {
-  if (p.of !== "searched") return;
-  busy = true; $("tune-bar").value = p.done / Math.max(p.total, 1); $("tune-progress").textContent = `${p.done} of ${p.total}`; enable();
-});
-on("searched", m => {
-  busy = false; $("tune-progress").textContent = ""; enable();
-  if (m.error) return tell(new Error(m.error));
-  if (!opened) return;
-  $("tune-progress").textContent = m.found.interrupted ? "cancelled: the best so far" : `found: cost ${m.found.cost.toPrecision(4)}, began at ${m.found.start_cost.toPrecision(4)}`;
-  set(m.found.values);
-});
-on("state", s => {
-  writes = s.writes; enable();
-  fill($("tune-model"), s.models.map(n => [n, n]), s.first); fill($("tune-start"), [["", "first controller"], ...s.controllers.map(n => [n, n])], "");
-  $("no-model").hidden = s.models.length > 0;
-  if (!opened && !$("tune").hidden) open();
-});
-
-function fill(select, pairs, chosen) {
-  const kept = select.options.length ? select.value : chosen;
-  select.replaceChildren(...pairs.map(([value, label]) => new Option(label, value)));
-  if (pairs.some(([value]) => value === kept)) select.value = kept;
-}
-
-/** Opens the view, and the model that is chosen in it. */
-export function show() { if (!opened) open(); }

@@ -1,0 +1,217 @@
+"""Two views of the studio in a notebook: the sliders of a controller, and a look at a data set.
+
+Both are the page's own modules; the kernel's messages take the place of the page's socket, and the
+same steps answer them.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import SettingError
+from .bench import said
+from .jobs import Jobs
+from .messages import checked
+from .project import Project
+from .session import finite
+from .step import MODEL
+from .steps import Steps
+
+if TYPE_CHECKING:
+    from ..control.controller import Controller
+    from ..dataset import Dataset
+    from ..models import Model
+
+START = "start.json"
+ALLOWED = (
+    "tune_open",
+    "tune_move",
+    "tune_costs",
+    "tune_search",
+    "tune_save",
+    "tune_copy",
+    "cancel",
+)
+"""What a notebook's view may ask for."""
+
+_TUNE = """
+export default { render({ model, el }) {
+  const { root, ask, on } = connect(model, el, HTML, CSS);
+  root.getElementById("tune").hidden = false;
+  mount(root, { ask, on });
+  ask("state");
+} };
+"""
+_LOOK = """
+export default { render({ model, el }) {
+  const { root, on, ask } = connect(model, el, HTML, CSS);
+  on("look", m => showLook(root, m.found));
+  ask("look");
+} };
+"""
+
+
+def tune_view(model: Model | str | Path, start: Controller | None = None) -> Any:
+    """The studio's view Tune below a notebook's cell.
+
+    Parameters
+    ----------
+    model : Model or path
+        With a path, controllers are saved next to it and the copies name it; else both are in a
+        folder that is gone with the kernel.
+    start : Controller, optional
+        By default the first controller of `sewfast.tune`.
+
+    Returns
+    -------
+    anywidget.AnyWidget
+        Its method `controller()` returns the controller as the sliders stand.
+
+    Raises
+    ------
+    SettingError
+        Where anywidget is not installed, or for a model or controller that cannot be tuned.
+
+    Examples
+    --------
+    >>> view = tune_view(model)  # doctest: +SKIP
+    >>> view  # doctest: +SKIP
+    >>> view.controller().save("controller.json")  # doctest: +SKIP
+    """
+    folder: tempfile.TemporaryDirectory[str] | None = None
+    if isinstance(model, (str, Path)):
+        place = Path(model).resolve()
+    else:
+        folder = tempfile.TemporaryDirectory(prefix="sewfast-")
+        place = Path(folder.name).resolve() / MODEL
+        model.save(place)
+    project = Project(place)
+    if start is not None:
+        start.save(place.parent / START)
+    first = START if start is not None else None
+    project.tuning(place.name, first)  # refuses before anything is drawn
+
+    view = _widget(_source(("curves", "tune", "widget"), _TUNE, _fragment("tune")))
+    latest: dict[str, Any] = {"model": place.name, "controller": first}
+
+    def tell(event: dict[str, Any]) -> None:
+        view.send(finite(event))
+
+    steps = Steps(project, Jobs(project.folder, tell))
+
+    def answer(asked: dict[str, Any]) -> Any:
+        if asked.get("do") == "state":
+            state = project.state()
+            named = [START] if first else []
+            others = [name for name in state["controllers"] if name not in named]
+            tell({
+                "event": "state", **state, "writes": True, "pages": 1, "first": place.name,
+                "controllers": [*named, *others], "start": first,
+            })  # fmt: skip
+            return None
+        fields = checked(asked)
+        if asked["do"] not in ALLOWED:
+            raise SettingError(f"expected a step of the view, received {asked['do']!r}")
+        if asked["do"] == "tune_move":
+            latest.update(fields)
+        return steps.do(asked["do"], fields)
+
+    def controller() -> Controller:
+        tuning = project.tuning(
+            latest["model"], latest["controller"],
+            tuple(tuple(row) for row in latest.get("notches", ())),
+        )  # fmt: skip
+        return tuning.controller(latest.get("values", {}))
+
+    view.on_msg(lambda _, asked, __: _reply(view, asked, answer))
+    view.controller = controller
+    view.folder = folder  # kept for as long as the view
+    return view
+
+
+def look_view(data: Dataset) -> Any:
+    """The signals of a data set with what to improve, as the studio's view Data shows them.
+
+    Parameters
+    ----------
+    data : Dataset
+
+    Returns
+    -------
+    anywidget.AnyWidget
+
+    Raises
+    ------
+    SettingError
+        Where anywidget is not installed.
+    """
+    from .project import looked_at
+
+    html = '<div class="view"><section><div id="signals"></div><ul id="advice"></ul>'
+    html += '<pre id="summary" tabindex="0" hidden></pre></section></div>'
+    view = _widget(_source(("curves", "look", "widget"), _LOOK, html))
+    found = looked_at(data)
+
+    def answer(_: dict[str, Any]) -> None:
+        view.send(finite({"event": "look", "found": found}))
+
+    view.on_msg(lambda _, asked, __: _reply(view, asked, answer))
+    return view
+
+
+def _reply(view: Any, asked: Any, answer: Any) -> None:
+    number = asked.get("id") if isinstance(asked, dict) else None
+    try:
+        if not isinstance(asked, dict):
+            raise SettingError("expected an object")
+        found = answer(asked)
+    except Exception as e:
+        view.send({"id": number, "error": said(e)})
+        return
+    if not isinstance(found, tuple):
+        view.send(finite({"id": number, "found": found}))
+        return
+    head, curves = found
+    rows = [np.asarray(values, dtype="<f4") for values in curves.values()]
+    names = [[name, len(row)] for name, row in zip(curves, rows, strict=True)]
+    message = finite({"id": number, "found": head, "curves": names})
+    view.send(message, [np.concatenate(rows).tobytes()])
+
+
+def _widget(source: str) -> Any:
+    try:
+        import anywidget
+    except ImportError as e:
+        raise SettingError(
+            "a view in a notebook needs anywidget, which is not installed: "
+            'pip install "sewfast[notebook]"'
+        ) from e
+    return anywidget.AnyWidget(_esm=source)
+
+
+def _page(name: str) -> str:
+    return (files(__package__) / "page" / name).read_text(encoding="utf-8")
+
+
+def _fragment(view: str) -> str:
+    """The elements of a view, from the page."""
+    page = _page("index.html")
+    start = page.index(f'<div id="{view}" class="view"')
+    return page[start : page.index('\n<div id="', start + 1)]
+
+
+def _source(modules: tuple[str, ...], render: str, html: str) -> str:
+    """One module of several, as a notebook takes it: no imports, and the elements as text."""
+    import json
+
+    css = _page("studio.css").replace(":root", ":host")
+    parts = [re.sub(r"(?m)^import .*\n", "", _page(f"{name}.js")) for name in modules]
+    parts = [re.sub(r"(?m)^export ", "", part) for part in parts]
+    constants = f"const HTML = {json.dumps(html)}, CSS = {json.dumps(css)};"
+    return "\n".join([constants, *parts, render])

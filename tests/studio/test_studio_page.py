@@ -1,0 +1,379 @@
+"""The studio's page in a real browser: by clicks, by keys, at every width, on paper."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from moments import until
+from sewfast.errors import FitError
+from sewfast.studio import Studio
+from studio_page import EVIL
+
+
+@pytest.mark.alone
+def test_the_way_by_clicks(studio: Studio, browser: Any) -> None:
+    def at(name: str) -> Any:
+        return browser.find_element("id", name)
+
+    browser.get(studio.address)
+    until(lambda: "u" in at("inputs").text)
+    assert studio.token not in browser.current_url
+    assert EVIL in at("output").text  # shown as text, and not run
+    at("resample").send_keys("0.02")
+    at("look").click()
+    until(lambda: len(browser.find_elements("css selector", "#signals canvas")) == 2)
+    at("model").send_keys("oe")
+    at("identify").click()
+    until(lambda: "free run explains" in at("headline").text)
+    at("validate").click()
+    until(lambda: "Report card" in at("card").text)
+    if "STUDIO_PICTURES" in os.environ:
+        _take_pictures(browser, Path(os.environ["STUDIO_PICTURES"]))
+    for width in (1200, 600):  # 600: what 200 % zoom leaves of a window of 1200
+        browser.set_window_size(width, 900)
+        assert browser.execute_script(WIDE) <= 0
+    painted = "return [...document.querySelectorAll('#data canvas')].every(c => c.getContext('2d')"
+    painted += ".getImageData(0, 0, c.width, c.height).data.some(v => v))"
+    assert browser.execute_script(painted)
+    assert browser.title == "sewfast studio"
+    assert browser.get_log("browser") == []
+
+
+VIEWS = ("data", "bode", "tune", "drive", "commission")
+WIDE = "return document.documentElement.scrollWidth - innerWidth"
+NUMBER = """
+const row = [...document.querySelectorAll('#numbers tr')].find(r => r.cells[0].textContent === arguments[0]);
+return row && row.cells[1].textContent;
+"""  # noqa: E501
+
+
+@pytest.mark.alone
+def test_tuning_by_keyboard(tuned: Studio, browser: Any) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    def at(name: str) -> Any:
+        return browser.find_element("id", name)
+
+    def number(title: str) -> Any:
+        return browser.execute_script(NUMBER, title)
+
+    browser.set_window_size(1600, 1000)
+    browser.get(tuned.address)
+    until(lambda: number("Ms"))
+    until(lambda: "start" in at("cost").text)
+    before, first = number("Ms"), at("knob-Kp-value").get_attribute("value")
+    at("knob-Kp").send_keys(Keys.ARROW_RIGHT * 10)
+    until(lambda: number("Ms") != before)
+    until(lambda: "(" in at("cost").text and "old" not in at("cost").get_attribute("class"))
+    moved = {"Kp": float(at("knob-Kp-value").get_attribute("value"))}
+    shown, _ = tuned.project.tuning("drive.json").move(moved)
+    assert float(number("Ms")) == pytest.approx(shown["Ms"], rel=5e-3)
+    assert float(number("overshoot")) == pytest.approx(shown["overshoot_percent"], rel=5e-3)
+    at("pin-A").click()
+    at("view-tune").send_keys("z")
+    for _ in range(9):
+        at("undo").send_keys(Keys.ENTER)
+    until(lambda: number("Ms") == before)
+    assert at("knob-Kp-value").get_attribute("value") == first
+    at("take-A").click()
+    until(lambda: float(at("knob-Kp-value").get_attribute("value")) == moved["Kp"])
+    at("evaluations").clear()
+    at("evaluations").send_keys("40")
+    at("search").click()
+    until(lambda: "found" in at("tune-progress").text)
+    at("save").click()
+    until(lambda: "written" in at("saved").text)
+    at("copy-python").click()
+    until(lambda: "evaluations=40" in at("tune-copy").text)
+    script, place = at("tune-copy").text, tuned.project.folder / "controller.json"
+    written = place.read_bytes()
+    place.unlink()
+    subprocess.run([sys.executable, "-c", script], cwd=place.parent, check=True)
+    assert place.read_bytes() == written
+    if "STUDIO_PICTURES" in os.environ:
+        _take_pictures(browser, Path(os.environ["STUDIO_PICTURES"]), "tune", (2200, 1500, 700))
+    for width in (1600, 1000, 600):
+        browser.set_window_size(width, 900)
+        assert browser.execute_script(WIDE) <= 0
+    assert browser.get_log("browser") == []
+
+
+@pytest.mark.alone
+def test_from_the_demo_to_a_verified_controller(tuned: Studio, browser: Any) -> None:
+    def at(name: str) -> Any:
+        return browser.find_element("id", name)
+
+    browser.get(tuned.address)
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    at("view-commission").click()
+    for name, value in (("machine-seed", "1"), ("networks", "1"), ("commission-tries", "100")):
+        at(name).clear()
+        at(name).send_keys(value)
+    at("commission-start").click()
+    until(lambda: "verified" in at("commission-verdict").text, 300)
+    stages = at("stages").text
+    assert stages.startswith("first motion")
+    assert "verification" in stages
+    assert len(browser.find_elements("css selector", "#loops canvas")) == 4
+    if "STUDIO_PICTURES" in os.environ:
+        _take_pictures(browser, Path(os.environ["STUDIO_PICTURES"]), "commission", (1200,))
+    browser.set_window_size(600, 900)
+    assert browser.execute_script(WIDE) <= 0
+    assert browser.get_log("browser") == []
+
+
+@pytest.mark.alone
+def test_a_loop_that_diverges_leaves_no_old_curve(
+    tuned: Studio, browser: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def diverges(*_: object) -> None:
+        raise FitError("runs away")
+
+    painted = "return document.querySelector('#step-plot canvas').getContext('2d')"
+    painted += ".getImageData(0, 0, 900, 200).data.some(v => v)"
+    browser.get(tuned.address)
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    assert browser.execute_script(painted)
+    # a command with limits keeps the loop around a stable model finite
+    monkeypatch.setattr("sewfast.analysis.responses.responses", diverges)
+    browser.find_element("id", "knob-Kp").send_keys("\ue014")  # arrow right
+    until(lambda: "broken: stable" in browser.find_element("id", "lights").text)
+    assert "diverges" in browser.execute_script(
+        "return document.querySelector('#step-plot canvas').getAttribute('aria-label')"
+    )
+    assert not browser.execute_script(painted)
+
+
+@pytest.mark.alone
+def test_no_view_keeps_anybody_out(tuned: Studio, browser: Any) -> None:
+    """No violation that axe knows: names, contrast, landmarks."""
+    axe = pytest.importorskip("axe_selenium_python").Axe(browser)
+    browser.get(tuned.address)
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    browser.find_element("css selector", "#tune details summary").click()
+    axe.inject()
+    for view in VIEWS:
+        browser.find_element("id", f"view-{view}").click()
+        assert axe.run()["violations"] == [], view
+
+
+@pytest.mark.alone
+def test_the_page_finds_its_state_again(tuned: Studio, browser: Any) -> None:
+    browser.get(tuned.address)
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    browser.refresh()
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    assert "holds" in browser.find_element("id", "control").text
+
+
+def _take_pictures(
+    browser: Any, folder: Path, name: str = "look", widths: tuple[int, ...] = (1200, 600)
+) -> None:
+    browser.execute_script("scrollTo(0, 0)")
+    for width in widths:
+        height = 1000 if name == "tune" and width > 800 else 2600
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        time.sleep(0.3)
+        found = browser.execute_cdp_cmd("Page.captureScreenshot", {})
+        (folder / f"{name}-{width}.png").write_bytes(base64.b64decode(found["data"]))
+    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+class Keys:
+    """A person without a mouse: Tab, Enter, arrows and letters."""
+
+    def __init__(self, browser: Any) -> None:
+        self.browser = browser
+
+    def send(self, *keys: str) -> None:
+        from selenium.webdriver import ActionChains
+
+        # to the page and not to an element: a file field would take them for a path
+        ActionChains(self.browser).send_keys(*keys).perform()
+
+    def reach(self, name: str) -> None:
+        """By Tab alone, which goes round."""
+        from selenium.webdriver.common.keys import Keys as Key
+
+        for _ in range(150):
+            if self.browser.switch_to.active_element.get_attribute("id") == name:
+                return
+            self.send(Key.TAB)
+        raise AssertionError(f"{name} is not reached by Tab")
+
+    def press(self, name: str) -> None:
+        until(lambda: self.browser.find_element("id", name).is_enabled())
+        self.reach(name)
+        self.send("\ue007")
+
+    def write(self, name: str, text: str) -> None:
+        from selenium.webdriver import ActionChains
+
+        self.reach(name)
+        ActionChains(self.browser).key_down("\ue009").send_keys("a").key_up("\ue009").perform()
+        self.send(text)
+
+
+@pytest.mark.alone
+def test_the_whole_way_by_keyboard(studio: Studio, browser: Any) -> None:
+    """From a recording to a report; every view is opened and used."""
+
+    def text(name: str) -> str:
+        return str(browser.find_element("id", name).text)
+
+    keys = Keys(browser)
+    browser.get(studio.address)
+    until(lambda: browser.execute_script("return document.querySelector('#inputs').length > 0"))
+    keys.press("look")
+    until(lambda: browser.find_elements("css selector", "#signals canvas"))
+    keys.reach("model")
+    keys.send("oe")
+    keys.press("identify")
+    until(lambda: "free run explains" in text("headline"))
+    keys.press("validate")
+    until(lambda: "Report card" in text("card"))
+    keys.press("view-bode")
+    keys.press("bode-start")
+    until(lambda: text("bode-text") or text("bode-error"), 300.0)
+    assert text("bode-error") == ""
+    until(lambda: "measured: " in text("loop-text"))
+    keys.press("view-tune")
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    before = browser.execute_script(NUMBER, "Ms")
+    keys.reach("knob-Kp")
+    keys.send("\ue014" * 8)
+    until(lambda: browser.execute_script(NUMBER, "Ms") != before)
+    keys.reach("tune-within")
+    keys.send(" ")
+    keys.write("evaluations", "40")
+    keys.press("search")
+    until(lambda: "found: cost" in text("tune-progress"))
+    keys.press("save")
+    until(lambda: "written" in text("saved"))
+    keys.press("view-drive")
+    keys.press("connect")
+    keys.press("limits")
+    until(lambda: "set;" in text("limits-set"))
+    until(lambda: "in time" in text("prompt"))
+    keys.press("arm")
+    until(lambda: "ARMED" in text("drive-state"))
+    keys.press("record")
+    until(lambda: "RPM" in text("speed"))
+    keys.send("\ue00c")
+    until(lambda: "output off" in text("stopped"))
+    keys.press("disconnect")
+    keys.press("view-commission")
+    keys.write("machine-seed", "1")
+    keys.write("networks", "1")
+    keys.write("commission-tries", "100")
+    keys.press("commission-start")
+    until(lambda: "verified" in text("commission-verdict"), 300.0)
+    keys.press("report")
+    until(lambda: browser.find_element("id", "report-link").is_displayed(), 300.0)
+    keys.press("report-link")
+    until(lambda: len(browser.window_handles) == 2)
+    browser.switch_to.window(browser.window_handles[1])
+    until(lambda: "commissioning of" in browser.title)
+    assert [e for e in browser.get_log("browser") if e["level"] == "SEVERE"] == []
+
+
+@pytest.mark.alone
+def test_a_recording_is_added_by_a_file_picker_and_by_a_drop(studio: Studio, browser: Any) -> None:
+    place = studio.project.folder
+    other = place.parent / "other.csv"
+    other.write_bytes((place / "run.csv").read_bytes())
+    browser.get(studio.address)
+    until(lambda: browser.find_element("id", "upload").is_enabled())
+    browser.find_element("id", "upload").send_keys(str(other))
+    until(lambda: "other.csv is in" in browser.find_element("id", "uploaded").text)
+    assert (place / "other.csv").read_bytes() == other.read_bytes()
+    until(lambda: browser.find_element("id", "file").get_attribute("value") == "other.csv")
+    browser.execute_script(DROP, EVIL.replace("/", "") + ".csv", "t,u,y\n0,1,2\n")
+    until(lambda: "expected a plain name" in browser.find_element("id", "error").text)
+    browser.execute_script(DROP, "small.csv", "t,u,y\n0,1,2\n0.1,1,2\n0.2,1,2\n")
+    until(lambda: "small.csv is in" in browser.find_element("id", "uploaded").text)
+    assert browser.title == "sewfast studio"
+
+
+DROP = """
+const data = new DataTransfer(); data.items.add(new File([arguments[1]], arguments[0]));
+document.getElementById("look").dispatchEvent(new DragEvent("drop", { dataTransfer: data, bubbles: true, cancelable: true }));
+"""  # noqa: E501
+
+COLOURS = """
+const canvas = document.querySelector("#step-plot canvas"), data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+const found = new Set();
+for (let k = 0; k < data.length; k += 4) if (data[k + 3] > 200) found.add(Math.max(data[k], data[k + 1], data[k + 2]));
+return [...found];
+"""  # noqa: E501
+
+
+@pytest.mark.alone
+def test_on_paper_curves_are_black_on_white(tuned: Studio, browser: Any) -> None:
+    dark = [{"name": "prefers-color-scheme", "value": "dark"}]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": dark})
+    browser.get(tuned.address)
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    assert max(browser.execute_script(COLOURS)) > 150
+    browser.execute_script("dispatchEvent(new Event('beforeprint'))")
+    assert max(browser.execute_script(COLOURS)) < 60
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print", "features": dark})
+    style = "const s = getComputedStyle(document.body); return [s.backgroundColor, s.color]"
+    assert browser.execute_script(style) == ["rgb(255, 255, 255)", "rgb(0, 0, 0)"]
+    assert not browser.find_element("id", "stop").is_displayed()
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "", "features": dark})
+    browser.execute_script("dispatchEvent(new Event('afterprint'))")
+    assert max(browser.execute_script(COLOURS)) > 150
+    page = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", {})["data"])
+    assert page.startswith(b"%PDF")
+
+
+@pytest.mark.alone
+def test_a_notch_is_put_in_and_taken_out(tuned: Studio, browser: Any) -> None:
+    def at(name: str) -> Any:
+        return browser.find_element("id", name)
+
+    browser.set_window_size(1600, 1000)
+    browser.get(tuned.address)
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    before = browser.execute_script(NUMBER, "noise gain")
+    at("notch-hz").send_keys("60")
+    at("add-notch").click()
+    until(lambda: browser.find_elements("id", "knob-notch_frequency[0]"))
+    until(lambda: browser.execute_script(NUMBER, "noise gain") not in (None, before))
+    at("notch-hz").clear()
+    at("notch-hz").send_keys("6000")
+    at("add-notch").click()
+    until(lambda: at("tune-error").text)
+    assert len(browser.find_elements("css selector", "#notches li")) == 1
+    browser.find_element("css selector", "#notches button").click()
+    until(lambda: browser.execute_script(NUMBER, "noise gain") == before)
+
+
+@pytest.mark.alone
+def test_no_view_is_wider_than_the_window(tuned: Studio, browser: Any) -> None:
+    browser.get(tuned.address)
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    for width in (1600, 1000, 600):  # 600: what 200 % zoom leaves of a window of 1200
+        browser.set_window_size(width, 900)
+        for view in VIEWS:
+            browser.find_element("id", f"view-{view}").click()
+            assert browser.execute_script(WIDE) <= 0, (width, view)
+
+
+@pytest.mark.alone
+def test_a_page_without_the_token_is_told(studio: Studio, browser: Any) -> None:
+    browser.get(studio.address.split("#")[0])
+    with contextlib.suppress(AssertionError):
+        until(lambda: "not connected" in browser.find_element("id", "control").text, 10)
+    assert "not connected" in browser.find_element("id", "control").text
