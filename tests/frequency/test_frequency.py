@@ -77,6 +77,13 @@ def test_a_rigid_machine_has_no_shaft(seed: int | None) -> None:
     assert "resonance_hertz" not in fit.parameters
 
 
+@pytest.mark.parametrize(("signal", "seed"), [("random", 1), ("random", 2), ("prbs", 1)])
+def test_a_few_frequencies_of_an_ordinary_record_are_no_shaft(signal: str, seed: int) -> None:
+    u = sewfast.signals.excitation(signal, seed)
+    fit = fit_shaft(bode(sewfast.record(VirtualMachine(seed), u, name=signal)))
+    assert not fit.has_resonance
+
+
 def test_the_fit_is_a_model_like_any_other(compliant: FrequencyResponse) -> None:
     fit = fit_shaft(compliant)
     model = fit.to_model()
