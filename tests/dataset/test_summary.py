@@ -185,7 +185,8 @@ def test_look_draws(folder: Path) -> None:
     assert "written to look.png" in printed
     assert (folder / "look.png").read_bytes().startswith(b"\x89PNG")
     assert ".png" in refused(folder, "look", "run.csv:u:speed", "--plot", "look.doc")
-    assert "which column" in refused(folder, "look", "run.csv", "--plot", "look.png")
+    (folder / "other.csv").write_text("t,left,right\n" + "".join(f"{k},1,2\n" for k in range(50)))
+    assert "which column" in refused(folder, "look", "other.csv", "--plot", "other.png")
     with pytest.raises(SettingError, match="folder that exists"):
         Dataset.from_arrays(T, T, TS).summary().plot(file=folder / "nowhere" / "look.png")
 
