@@ -22,7 +22,7 @@ export function mount(root, { ask, on }) {
     phase: new Chart($("phase-plot"), { x: "frequency [Hz]", y: "phase of L [deg]", log: true, marks: [-180] }),
     sensitivity: new Chart($("sens-plot"), { x: "frequency [Hz]", y: "|S|, |T| [dB]", log: true, marks: [0], floor: -60 }),
   };
-  let opened = null, values = {}, history = [], first = null, now = null, pins = {}, asking = false, again = null, resting = 0, knobs = [], busy = false, writes = false, notches = [];
+  let opened = null, values = {}, history = [], first = null, now = null, pins = {}, asking = false, again = null, resting = 0, knobs = [], busy = false, writes = false, notches = [], failed = "";
 
   const question = more => ({ model: $("tune-model").value, controller: $("tune-start").value || null, values, notches, ...more });
   const given = pairs => Object.fromEntries(pairs.map(([name, id]) => [name, $(id).valueAsNumber]).filter(([, v]) => Number.isFinite(v)));
@@ -89,9 +89,9 @@ export function mount(root, { ask, on }) {
     if (!opened) { const said = $("tune-error").textContent; notches = before; await open(kept); tell(new Error(said)); }
   }
 
-  function keep(v) { history.push({ ...v }); if (history.length > 200) history.shift(); enable(); }
+  function keep(v) { tell(null); history.push({ ...v }); if (history.length > 200) history.shift(); enable(); }
   function set(v) { keep(values); values = { ...v }; knobs.forEach(k => k.show()); move(); }
-  function undo() { if (history.length) { values = history.pop(); knobs.forEach(k => k.show()); move(); } }
+  function undo() { tell(null); if (history.length) { values = history.pop(); knobs.forEach(k => k.show()); move(); } }
 
   /** Asks for the loop with the present values; while one question is under way only the latest waits. */
   async function move(began = performance.now()) {
@@ -101,9 +101,12 @@ export function mount(root, { ask, on }) {
     const asked = values;
     try {
       const found = await ask("tune_move", question());
-      now = { ...found, values: asked }; first ??= now; tell(null); paint();
+      now = { ...found, values: asked }; first ??= now; paint();
+      // what something else has said stays until a person goes on
+      if (failed && $("tune-error").textContent === failed) tell(null);
+      failed = "";
       requestAnimationFrame(() => setTimeout(() => document.dispatchEvent(new CustomEvent("drawn", { detail: performance.now() - began }))));
-    } catch (error) { tell(error); }
+    } catch (error) { failed = error.message; tell(error); }
     asking = false;
     if (again !== null) { const since = again; again = null; move(since); } else resting = setTimeout(cost, 250);
   }
