@@ -45,9 +45,10 @@ signals.excitation = lambda *a: np.resize(once(*a), {samples})
 COUNT = """
 window.frames = 0; window.slow = 0; let before = performance.now();
 document.addEventListener("frame", () => {
-  const now = performance.now(); window.frames++; window.slow = Math.max(window.slow, now - before); before = now;
+  const now = performance.now(); window.frames++;
+  window.slow = Math.max(window.slow, now - before); before = now;
 });
-"""  # noqa: E501
+"""
 
 
 def serve(folder: str, seconds: float) -> None:

@@ -51,9 +51,10 @@ def test_the_way_by_clicks(studio: Studio, browser: Any) -> None:
 VIEWS = ("data", "bode", "tune", "drive", "commission")
 WIDE = "return document.documentElement.scrollWidth - innerWidth"
 NUMBER = """
-const row = [...document.querySelectorAll('#numbers tr')].find(r => r.cells[0].textContent === arguments[0]);
+const rows = [...document.querySelectorAll('#numbers tr')];
+const row = rows.find(r => r.cells[0].textContent === arguments[0]);
 return row && row.cells[1].textContent;
-"""  # noqa: E501
+"""
 
 
 @pytest.mark.alone
@@ -307,15 +308,19 @@ def test_a_recording_is_added_by_a_file_picker_and_by_a_drop(studio: Studio, bro
 
 DROP = """
 const data = new DataTransfer(); data.items.add(new File([arguments[1]], arguments[0]));
-document.getElementById("look").dispatchEvent(new DragEvent("drop", { dataTransfer: data, bubbles: true, cancelable: true }));
-"""  # noqa: E501
+const how = { dataTransfer: data, bubbles: true, cancelable: true };
+document.getElementById("look").dispatchEvent(new DragEvent("drop", how));
+"""
 
 COLOURS = """
-const canvas = document.querySelector("#step-plot canvas"), data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
-const found = new Set();
-for (let k = 0; k < data.length; k += 4) if (data[k + 3] > 200) found.add(Math.max(data[k], data[k + 1], data[k + 2]));
+const { width, height } = document.querySelector("#step-plot canvas");
+const context = document.querySelector("#step-plot canvas").getContext("2d");
+const { data } = context.getImageData(0, 0, width, height), found = new Set();
+for (let k = 0; k < data.length; k += 4) {
+  if (data[k + 3] > 200) found.add(Math.max(data[k], data[k + 1], data[k + 2]));
+}
 return [...found];
-"""  # noqa: E501
+"""
 
 
 @pytest.mark.alone

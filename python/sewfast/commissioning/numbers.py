@@ -125,13 +125,13 @@ def _comparison(c: Comparison) -> dict[str, Any]:
 
 def run_numbers(found: ClosedLoopRun) -> dict[str, float | None]:
     """What a run's metrics are called in result files."""
-    told = found.metrics()
+    metrics = found.metrics()
     return {
-        "rmse_rpm": told["rmse"],
-        "max_abs_rpm": told["max_abs"],
-        "rise_time_ms": told["rise_time_ms"],
-        "overshoot_percent": told["overshoot_percent"],
-        "effort_v": told["u_rms"],
-        "chatter_v": told["du_rms"],
-        "saturated": told["saturated"],
+        "rmse_rpm": metrics["rmse"],
+        "max_abs_rpm": metrics["max_abs"],
+        "rise_time_ms": metrics["rise_time_ms"],
+        "overshoot_percent": metrics["overshoot_percent"],
+        "effort_v": metrics["u_rms"],
+        "chatter_v": metrics["du_rms"],
+        "saturated": metrics["saturated"],
     }

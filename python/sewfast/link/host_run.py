@@ -421,7 +421,7 @@ class HostLoopRun:
         return np.rint(self.samples["t"] / self.device.Ts).astype(np.intp)
 
     def __str__(self) -> str:
-        told, unit = self.metrics(), self.units
+        metrics, unit = self.metrics(), self.units
         lines = [f"{self.reference} on {self.plant}, loop on the host: {self.outcome}"]
         if self.outcome != "completed":
             lines.append(f"  {self.message}")
@@ -430,10 +430,10 @@ class HostLoopRun:
                 "  STOP was not answered: the device's watchdog stops the motor; make sure that "
                 "it is at rest"
             )
-        if told["rmse"] is not None:
+        if metrics["rmse"] is not None:
             lines.append(
-                f"  error     {told['rmse']:.4g} {unit['y']} rms, {told['max_abs']:.4g} at most "
-                "(measured)"
+                f"  error     {metrics['rmse']:.4g} {unit['y']} rms, {metrics['max_abs']:.4g} at "
+                "most (measured)"
             )
         of = "an unknown number" if self.taken is None else self.taken
         gaps = ", ".join(f"{n} from sample {k}" for k, n in self.gaps[:5]) or "none"

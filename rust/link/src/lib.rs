@@ -1,6 +1,8 @@
 //! The host's end of the link to a drive (docs/PROTOCOL.md), as parts without a port of their own.
 
 pub mod anomalies;
+#[cfg(test)]
+mod bench;
 pub mod bodies;
 pub mod client;
 pub mod host_loop;

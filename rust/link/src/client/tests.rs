@@ -2,11 +2,11 @@
 
 use proptest::prelude::*;
 use sewfast_control::link::{
-    Body, Device, Fields, Header, Identity, Limits, MAX_WIRE, Measurement, State, encode,
+    Body, Device, Fields, Header, Identity, MAX_WIRE, Measurement, State, capability, encode,
 };
-use sewfast_control::link::{Channel as Streamed, Encoding, Source, capability};
 
 use super::{Client, Event, PATIENCE, REPEAT, Reply, STOP_REPEAT, Unanswered, kind};
+use crate::bench;
 use crate::bodies::{self, Status};
 use crate::samples::Channel;
 
@@ -15,23 +15,6 @@ const UPLOAD: u8 = 0x08;
 /// The longest of the protocol, so that nothing but STOP ends a run.
 const WATCHDOG: u32 = 10_000_000;
 const COUNTS: i32 = 70_000;
-
-static CHANNELS: [Streamed; 2] = [
-    Streamed {
-        encoding: Encoding::Counts,
-        steps_per_unit: 1,
-        name: "counts",
-        unit: "1",
-        source: Source::Counts,
-    },
-    Streamed {
-        encoding: Encoding::Steps,
-        steps_per_unit: 1000,
-        name: "u",
-        unit: "V",
-        source: Source::Command,
-    },
-];
 
 /// What a line does to each frame, in so many of a thousand.
 #[derive(Clone, Copy, Debug)]
@@ -109,20 +92,9 @@ struct World {
 impl World {
     fn new(faults: Faults, seed: u64) -> Self {
         let identity = Identity {
-            boot_id: 3,
             entropy: 1,
-            name: "bench",
-            firmware: "1",
-            period: 1000,
-            counts_per_rev: 1572.0,
             capabilities: capability::DRIVE | capability::PROFILE,
-            ceilings: Limits {
-                volt: 20.0,
-                speed: 5000.0,
-                acceleration: f32::INFINITY,
-                current: f32::INFINITY,
-            },
-            channels: &CHANNELS,
+            ..bench::identity()
         };
         let line = |dice| Line {
             faults,

@@ -1,13 +1,13 @@
 //! The loop against the state machine of a real device and the virtual sewing machine, in computed time.
 
 use sewfast_control::link::{
-    Body, Deframer, Device, Header, Identity, Limits, MAX_WIRE, Measurement, Reason, Source, State,
+    Body, Deframer, Device, Header, MAX_WIRE, Measurement, Reason, State, encode,
 };
-use sewfast_control::link::{Channel as Streamed, Encoding, capability, encode};
 use sewfast_control::{Design, PidController, Settings as Pid, Standard};
 use sewfast_core::machine::{Machine, Parameters};
 
 use super::super::{HostLoop, Outcome, Settings};
+use crate::bench;
 use crate::client::Client;
 use crate::samples::Channel;
 
@@ -15,23 +15,6 @@ const RATIO: u32 = 20;
 const TS: f64 = 0.02;
 const COUNTS_PER_UNIT: f64 = 1572.0 / 60.0;
 const OFFSET: u64 = 7_654_321;
-
-static CHANNELS: [Streamed; 2] = [
-    Streamed {
-        encoding: Encoding::Counts,
-        steps_per_unit: 1,
-        name: "counts",
-        unit: "1",
-        source: Source::Counts,
-    },
-    Streamed {
-        encoding: Encoding::Steps,
-        steps_per_unit: 1000,
-        name: "u",
-        unit: "V",
-        source: Source::Command,
-    },
-];
 
 fn controller() -> PidController<f64> {
     let gains = Standard {
@@ -81,22 +64,7 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        let device = Device::new(Identity {
-            boot_id: 3,
-            entropy: 0,
-            name: "bench",
-            firmware: "1",
-            period: 1000,
-            counts_per_rev: 1572.0,
-            capabilities: capability::DRIVE,
-            ceilings: Limits {
-                volt: 20.0,
-                speed: 5000.0,
-                acceleration: f32::INFINITY,
-                current: f32::INFINITY,
-            },
-            channels: &CHANNELS,
-        });
+        let device = Device::new(bench::identity());
         let mut bench = Self {
             device: device.unwrap(),
             machine: Machine::new(Parameters::default()).unwrap(),
