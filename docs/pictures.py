@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 import sewfast
 from sewfast.plotting import Drawing, Trace, draw, loop_panels
@@ -31,8 +30,6 @@ PICTURES = {
 }
 LARGEST = 150_000
 """Bytes of a picture: a page has to load it."""
-COLOURS = 64
-"""That a picture of the gallery is stored with: lines on white need no more."""
 LABELS = {"model": "predicted (model)", "machine": "measured (virtual machine)"}
 RISE = (0.08, 0.36)
 """The window that is shown magnified [s]."""
@@ -121,10 +118,9 @@ def draw_all(results: Path, assets: Path) -> list[Path]:
     for path, plot in drawn.items():
         path.parent.mkdir(exist_ok=True)
         plot(path)
-    made = [*drawn, *(STUDIO["draw_studio"](assets / "studio") if STUDIO["can_draw"]() else [])]
-    for path in made:
-        Image.open(path).convert("RGB").quantize(COLOURS).save(path, optimize=True)
-    return [picture, *made]
+        STUDIO["shrink"](path)
+    studio = STUDIO["draw_studio"](assets / "studio") if STUDIO["can_draw"]() else []
+    return [picture, *drawn, *studio]
 
 
 def main() -> None:

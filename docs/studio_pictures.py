@@ -17,12 +17,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 PATIENCE = 180.0
 """Seconds for a part of the page."""
 WIDE, HIGH = 1500, 990
 """Pixels of the window."""
 SEARCHED = 400
 """Controllers."""
+COLOURS = 64
+"""That a picture is stored with: lines on white need no more."""
 
 
 def can_draw() -> bool:
@@ -86,7 +90,13 @@ def _taken(page: Any, file: Path, width: int, height: int) -> Path:
     found = page.execute_cdp_cmd("Page.captureScreenshot", {})
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(base64.b64decode(found["data"]))
+    shrink(file)
     return file
+
+
+def shrink(file: Path) -> None:
+    """Store a PNG with a palette: a page has to load it."""
+    Image.open(file).convert("RGB").quantize(COLOURS).save(file, optimize=True)
 
 
 def _text(page: Any, name: str) -> str:
