@@ -166,8 +166,12 @@ def spectral(
     by = len(signals) - 1 if r is not None else 0
     Suu, Syy, Srr = (power[j, j].real for j in (0, 1, by))
     Sru, Sry = power[by, 0], power[by, 1]
+    if not np.isfinite(power).all():
+        raise DataError("expected values with finite squares, got larger ones; change their units")
     if not np.any(Suu > 0.0):
         raise DataError("u: expected an input that moves, got a constant one")
+    if not np.any(Srr > 0.0):
+        raise DataError("r: expected a reference that moves, got a constant one; name another")
     # halves of Hann windows overlap: each segment counts 11/18 of an independent one
     blocks = max(len(starts) * 11.0 / 18.0, 2.0)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 from contextlib import suppress
@@ -109,9 +110,10 @@ class Upload:
             self._part.unlink()
 
     def _refusal(self, error: OSError) -> SettingError:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        remedy = "make room in the project folder" if full else "change the rights of the folder"
         return SettingError(
-            f"{self.file}: cannot be written ({error.strerror}); make room in the project folder, "
-            "then upload it again"
+            f"{self.file}: cannot be written ({error.strerror}); {remedy}, then upload it again"
         )
 
 
