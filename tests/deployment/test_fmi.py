@@ -328,7 +328,7 @@ def test_its_own_fmu_is_a_machine_as_well(tmp_path: Path) -> None:
         ({"angle_unit": "mile"}, "give angle_unit="),
         ({"Ts": 0.0}, "Ts: expected"),
         ({"timeout": float("nan")}, "timeout: expected"),
-        ({"input": "speed"}, "an input as input=, got 'speed'"),
+        ({"input": "speed"}, "an input as input=, received 'speed'"),
     ],
 )
 def test_variables_that_do_not_fit_are_refused(
@@ -481,15 +481,17 @@ def test_hostile_descriptions_are_refused(tmp_path: Path, motor: Path) -> None:
     # entities that a search for bytes does not see
     laughs = '<?xml version="1.0" encoding="UTF-16"?><!DOCTYPE x [<!ENTITY a "b">]>'
     refused((laughs + xml.decode().partition("?>")[2]).encode("utf-16"), "version 1.0, 2.0 or 3.0")
-    refused(xml.replace(b'fmiVersion="2.0"', b'fmiVersion="4.0"'), "3.0, got 4.0")
-    refused(xml.replace(b'fmiVersion="2.0"', b""), "3.0, got none")
-    refused(xml.replace(b'modelIdentifier="Motor"', b'modelIdentifier="../x"'), r"got '\.\./x'")
+    refused(xml.replace(b'fmiVersion="2.0"', b'fmiVersion="4.0"'), "3.0, received 4.0")
+    refused(xml.replace(b'fmiVersion="2.0"', b""), "3.0, received none")
+    refused(
+        xml.replace(b'modelIdentifier="Motor"', b'modelIdentifier="../x"'), r"received '\.\./x'"
+    )
     refused(b" " * (65 * 1024**2), "at most 67108864 bytes")
 
 
 def test_without_fmpy_its_name_is_said(motor: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fmpy", None)
-    with pytest.raises(SettingError, match=r"pip install 'sewfast\[fmi\]'"):
+    with pytest.raises(SettingError, match=r'pip install "sewfast\[fmi\]"'):
         fmu_bench(motor, **OF_MOTOR)
 
 

@@ -124,7 +124,7 @@ def test_an_address_without_its_scheme(text: str, capsys: pytest.CaptureFixture[
 
 def test_a_trip_names_the_limit_in_force(drive: Drive) -> None:
     drive.set_limits(speed_rpm=600.0)
-    with refuses(LinkError, received=r"trip .*: speed, the limit is 600 RPM, after"):
+    with refuses(LinkError, received=r"tripped: speed, the limit is 600 RPM, after"):
         record(drive, np.full(2000, 5.0))
     drive.clear()
     drive.set_limits(speed_rpm=6000.0, acceleration=1000.0)

@@ -316,7 +316,7 @@ class TestFaults:
         with VirtualDevice() as device:
             with pytest.raises(SettingError, match="expected a fault"):
                 device.cause("drip")
-            with pytest.raises(SettingError, match="expected a time"):
+            with pytest.raises(SettingError, match="seconds: expected"):
                 device.cause("stall", 0.0)
 
 

@@ -457,8 +457,8 @@ def _padded(values: FloatArray, n: int) -> FloatArray:
 def _not_finished(outcome: Outcome, n: int, drive: Drive) -> LinkError:
     why, remedy = f"one that the device ended ({outcome.reason})", ""
     if outcome.state == "tripped":
-        why = f"a trip of the device, whose output is safe: {_why(outcome.reason, drive)}"
-        remedy = "find out why, then clear it (sewfast clear PORT)"
+        why = f"one that tripped: {_why(outcome.reason, drive)}"
+        remedy = "the output is safe: find out why, then clear it (sewfast clear PORT)"
         remedy += _more_time(drive.watchdog) if outcome.reason == "watchdog" else ""
     return LinkError(
         expected="a run that finishes", received=f"{why}, after {outcome.received} of {n} samples",
