@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from ..errors import SettingError
+from ..errors import SettingError, unwritable
 from .commissioning import require
 from .project import LARGEST, RECORDINGS
 
@@ -112,9 +112,7 @@ class Upload:
     def _refusal(self, error: OSError) -> SettingError:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         remedy = "make room in the project folder" if full else "change the rights of the folder"
-        return SettingError(
-            f"{self.file}: cannot be written ({error.strerror}); {remedy}, then upload it again"
-        )
+        return unwritable(SettingError, self.file, error, f"{remedy}, then upload it again")
 
 
 def checked_recording_name(file: Any) -> str:
