@@ -152,9 +152,9 @@ def require_writable(folder: Path) -> None:
     """
     if not os.access(folder, os.W_OK | os.X_OK):
         raise SettingError(
-            f"{folder.name}: expected a folder that can be written to, it cannot; change its "
-            "rights or start sewfast studio in another one"
-        )
+            name=folder.name, expected="a folder that can be written to", received="a closed one",
+            remedy="change its rights, or start sewfast studio in another one",
+        )  # fmt: skip
 
 
 def envelope(values: FloatArray, Ts: float, columns: int = COLUMNS) -> dict[str, Any]:
