@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import SettingError
+from .errors import SettingError, not_installed, unwritable
 from .storage import replace_file
 
 if TYPE_CHECKING:
@@ -194,12 +194,12 @@ _STYLE: dict[str, Any] = {
 
 def require() -> None:
     """Refuse with a remedy where matplotlib or Jinja2 is not installed."""
-    _require("the report needs", "matplotlib", "jinja2")
+    _require("the report", "matplotlib", "jinja2")
 
 
 def require_matplotlib() -> None:
     """Refuse with a remedy where matplotlib is not installed."""
-    _require("figures need", "matplotlib")
+    _require("figures", "matplotlib")
 
 
 def _require(what: str, *modules: str) -> None:
@@ -207,9 +207,7 @@ def _require(what: str, *modules: str) -> None:
         try:
             import_module(name)
         except ImportError as e:
-            raise SettingError(
-                f'{what} {name}, which is not installed: pip install "sewfast[report]"'
-            ) from e
+            raise not_installed(name, what, "sewfast[report]") from e
 
 
 @contextlib.contextmanager
@@ -432,10 +430,7 @@ class Drawing:
         try:
             replace_file(path, buffer.getvalue())
         except OSError as e:
-            raise SettingError(
-                f"{path}: cannot be written ({e.strerror or e}); choose a folder that exists and "
-                "is writable"
-            ) from e
+            raise unwritable(SettingError, path, e) from e
         return np.array([ax for ax in figure.axes if ax.axison], dtype=object)
 
 

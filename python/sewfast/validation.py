@@ -419,19 +419,24 @@ def _target(experiment: Experiment, against: str | None, first: int) -> FloatArr
         return without_weightless(experiment).y
     if against not in experiment.channels:
         raise DataError(
-            f"{experiment.name}: no channel {against!r}; available: "
-            f"{', '.join(experiment.channels) or 'none'}"
-        )
+            name=experiment.name, expected=f"a channel {against!r}",
+            received=", ".join(experiment.channels) or "none", remedy="name one of its channels",
+        )  # fmt: skip
     if experiment.removed is not None:
         raise DataError(
-            f"{experiment.name}: channel {against!r} is as it was recorded, but an offset was "
-            "taken off the output: compare it with data.restore(model.simulate(data))"
-        )
+            name=f"{experiment.name}: channel {against!r}",
+            expected="the output without an offset taken off",
+            received="one with it off, unlike the channel",
+            remedy="compare it with data.restore(model.simulate(data))",
+        )  # fmt: skip
     target = experiment.channels[against]
     if experiment.weights is not None:
         target = np.where(experiment.weights == 0.0, np.nan, target)
     if np.isnan(target[first:]).all():
-        raise DataError(f"{experiment.name}: channel {against!r} is NaN at every scored sample")
+        raise DataError(
+            name=f"{experiment.name}: channel {against!r}", expected="a value at a scored sample",
+            received="NaN at all of them", remedy="score against another",
+        )  # fmt: skip
     return target
 
 

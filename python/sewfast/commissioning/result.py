@@ -218,9 +218,10 @@ class Commissioning:
         name = next(iter(found), None) if reference is None else reference
         if name not in found:
             raise SettingError(
-                f"expected one of the references {', '.join(found) or 'none, as it ended before'}"
-                f", got {reference!r}"
-            )
+                name="reference",
+                expected=f"one of the references {', '.join(found) or 'none, as it ended before'}",
+                received=repr(reference),
+            )  # fmt: skip
         shown = found[name]
         kinds = {"model": ("predicted", shown.predicted), "machine": ("measured", shown.measured)}
         traces = [
@@ -345,10 +346,11 @@ def _require_own_artefacts(folder: Path) -> None:
     place = first_taken(folder, (*_FOLDERS, NUMBERS, "results.json", "report.html"))
     if place is not None:
         raise SettingError(
-            f"{place}: expected a folder without such files, or one of a virtual machine's "
-            "commissioning, which can be repeated; choose another folder, or overwrite them "
-            "(--overwrite)"
-        )
+            name=str(place),
+            expected="a folder without such files, or one of a virtual machine's commissioning, "
+            "which can be repeated",
+            received="another", remedy="choose another folder, or overwrite them (--overwrite)",
+        )  # fmt: skip
 
 
 def first_taken(folder: Path, names: Iterable[str]) -> Path | None:
@@ -438,9 +440,10 @@ def _artefacts(found: Commissioning, folder: Path) -> None:
             failures.append(error)
     if failures:
         raise DataError(
-            f"{failures[0]}; {len(failures)} of {len(tables)} tables could not be written, the "
-            f"controllers and models are in {folder}: free some space and save again"
-        ) from failures[0]
+            name=str(folder), expected=f"room for {len(tables)} tables",
+            received=f"{failures[0]}, and so {len(failures)} are missing",
+            remedy="the controllers and models are there: free some space and save again",
+        ) from failures[0]  # fmt: skip
 
 
 def _analysis(found: Commissioning, folder: Path) -> None:

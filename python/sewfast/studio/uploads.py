@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from ..errors import SettingError
+from ..errors import SettingError, unwritable
 from .commissioning import require
 from .project import LARGEST, RECORDINGS
 
@@ -109,9 +109,8 @@ class Upload:
             self._part.unlink()
 
     def _refusal(self, error: OSError) -> SettingError:
-        return SettingError(
-            f"{self.file}: cannot be written ({error.strerror}); make room in the project folder, "
-            "then upload it again"
+        return unwritable(
+            SettingError, self.file, error, "make room in the project folder, then upload it again"
         )
 
 
