@@ -269,6 +269,14 @@ def test_a_record_is_taken_as_it_is_measured() -> None:
         bode(plain, reference="r")
 
 
+@pytest.mark.parametrize(("scale", "r", "match"), [(1.0, 1.0, "moves"), (1e300, None, "squares")])
+@pytest.mark.filterwarnings("ignore:.*encountered")
+def test_what_gives_no_response_is_refused(scale: float, r: float | None, match: str) -> None:
+    u = scale * np.random.default_rng(5).normal(size=5000)
+    with pytest.raises(DataError, match=match):
+        spectral(u, u, Ts=1e-3, r=None if r is None else np.full(5000, r))
+
+
 def test_a_reference_that_has_nothing_to_do_with_it_is_refused() -> None:
     rng = np.random.default_rng(4)
     u = rng.normal(size=5000)

@@ -172,8 +172,19 @@ def spectral(
     by = len(signals) - 1 if r is not None else 0
     Suu, Syy, Srr = (power[j, j].real for j in (0, 1, by))
     Sru, Sry = power[by, 0], power[by, 1]
+    if not np.isfinite(power).all():
+        raise DataError(
+            expected="values with finite squares",
+            received="larger ones",
+            remedy="change their units",
+        )
     if not np.any(Suu > 0.0):
         raise DataError(name="u", expected="an input that moves", received="a constant one")
+    if not np.any(Srr > 0.0):
+        raise DataError(
+            name="r", expected="a reference that moves", received="a constant one",
+            remedy="name the column that the controller follows",
+        )  # fmt: skip
     # halves of Hann windows overlap: each segment counts 11/18 of an independent one
     blocks = max(len(starts) * 11.0 / 18.0, 2.0)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -355,7 +355,12 @@ class Studio:
             return {"file": file}
         if upload is not None:
             upload.abandon()
-        self._uploads[page] = Upload(self.project.folder, **fields)
+        begun = Upload(self.project.folder, **fields)
+        with self._lock:
+            if is_open := page in self._pages:
+                self._uploads[page] = begun
+        if not is_open:  # it was closed meanwhile, and nobody would take the file away
+            begun.abandon()
         return None
 
     def _add_to_upload(self, page: Session, piece: bytes) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 from contextlib import suppress
@@ -109,9 +110,9 @@ class Upload:
             self._part.unlink()
 
     def _refusal(self, error: OSError) -> SettingError:
-        return unwritable(
-            SettingError, self.file, error, "make room in the project folder, then upload it again"
-        )
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        remedy = "make room in the project folder" if full else "change the rights of the folder"
+        return unwritable(SettingError, self.file, error, f"{remedy}, then upload it again")
 
 
 def checked_recording_name(file: Any) -> str:
