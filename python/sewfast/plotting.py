@@ -13,6 +13,7 @@ import itertools
 import math
 import os
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -432,6 +433,18 @@ class Drawing:
         except OSError as e:
             raise unwritable(SettingError, path, e) from e
         return np.array([ax for ax in figure.axes if ax.axison], dtype=object)
+
+
+class Plotted(ABC):
+    """A result that draws itself: what is in the figure, its `drawing` says."""
+
+    @abstractmethod
+    def drawing(self) -> Drawing:
+        """The figure as panels."""
+
+    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
+        """Draw it into axes, a file, or a new figure; arguments and result as `Drawing.plot`."""
+        return self.drawing().plot(ax, file)
 
 
 def require_file(path: Path) -> None:

@@ -196,23 +196,15 @@ class Commissioning:
 
         Parameters
         ----------
-        ax : Axes or sequence of Axes, optional
-            One shows the output, further ones the error and the command.
+        ax, file
+            As for `Drawing.plot`. One shows the output, further ones the error and the command.
         reference : str, optional
             One of `comparisons`; by default the first.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the three panels of a new figure.
 
         Raises
         ------
         SettingError
-            For another reference, or if it ended before any loop was predicted; if matplotlib
-            is not installed or the file cannot be written.
+            For another reference, if it ended before any loop was predicted, or as `Drawing.plot`.
         """
         found = {c.reference: c for c in self.comparisons}
         name = next(iter(found), None) if reference is None else reference

@@ -116,22 +116,10 @@ class ClosedLoopRun:
 
         Parameters
         ----------
-        ax : Axes or sequence of Axes, optional
-            One shows the output, further ones the error and the command.
+        ax, file
+            As for `Drawing.plot`. One shows the output, further ones the error and the command.
         others : sequence of ClosedLoopRun
             Other runs over the same reference, such as one predicted by a model.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the three panels of a new figure.
-
-        Raises
-        ------
-        SettingError
-            If matplotlib is not installed or the file cannot be written.
         """
         from ..plotting import Trace, loop_drawing
 

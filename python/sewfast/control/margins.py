@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +17,7 @@ from ..evidence.operating import OperatingPoint, operating_range, point_at_level
 from ..gains import Gains, real, vector
 from ..models import Model
 from ..models.conversion import from_state_space, polynomials_of, transfer_function
-from ..plotting import SHADE, html_of, legend, stacked
+from ..plotting import SHADE, Drawing, Plotted, html_of, legend, stacked
 from ..rules import Fopdt
 from .controller import Controller
 from .loop import plant_units, require_controller, require_units
@@ -221,7 +220,7 @@ def _require(inputs: int, of: float, Ts: float) -> None:
 
 
 @dataclass(frozen=True)
-class Margins:
+class Margins(Plotted):
     """Margins of the sampled loop, broken at the plant's input (docs/CONVENTIONS.md, Control).
 
     For an unstable loop the peaks and the noise gain are infinite and the other margins NaN.
@@ -271,28 +270,11 @@ class Margins:
         """Everything by name."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
-    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
-        """Draw the margins in the plane of the loop transfer L.
+    def drawing(self) -> Drawing:
+        """The margins in the plane of the loop transfer L.
 
         L stays outside the circle of radius 1/Ms about -1. Arrows show how far L can move on the
         real axis (gain) and on the unit circle (phase) before the loop is unstable.
-
-        Parameters
-        ----------
-        ax : Axes or sequence of Axes, optional
-            One panel.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the panels of a new figure.
-
-        Raises
-        ------
-        SettingError
-            If the loop is unstable, matplotlib is not installed, or the file cannot be written.
         """
         if not self.stable:
             raise SettingError(
@@ -300,7 +282,7 @@ class Margins:
                 received="those of an unstable one, which has none to draw",
                 remedy="lower the gains",
             )  # fmt: skip
-        return stacked([self._draw], (4.0,)).plot(ax, file)
+        return stacked([self._draw], (4.0,))
 
     def _draw(self, ax: Any) -> None:
         turn = np.linspace(0.0, 2.0 * np.pi, 361)
