@@ -55,6 +55,15 @@ def test_the_way_by_clicks(studio: Studio, browser: Any) -> None:
 
 VIEWS = ("data", "bode", "tune", "drive", "commission")
 WIDE = "return document.documentElement.scrollWidth - innerWidth"
+COVERED = """
+const header = document.querySelector('header');
+return [...document.querySelectorAll('#tune button, #tune input, #tune select')].reverse()
+  .filter(e => e.offsetParent && !e.disabled).filter(e => {
+    e.focus();
+    const below = header.getBoundingClientRect().bottom;
+    return e.getBoundingClientRect().top < below - 1;
+  }).map(e => e.id);
+"""
 NUMBER = """
 const rows = [...document.querySelectorAll('#numbers tr')];
 const row = rows.find(r => r.cells[0].textContent === arguments[0]);
@@ -341,6 +350,8 @@ def test_on_paper_curves_are_black_on_white(tuned: Studio, browser: Any) -> None
     style = "const s = getComputedStyle(document.body); return [s.backgroundColor, s.color]"
     assert browser.execute_script(style) == ["rgb(255, 255, 255)", "rgb(0, 0, 0)"]
     assert not browser.find_element("id", "stop").is_displayed()
+    shown = [v for v in VIEWS if browser.find_element("id", v).is_displayed()]
+    assert shown == ["tune"]  # and no pages of the other views, which are empty
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "", "features": dark})
     browser.execute_script("dispatchEvent(new Event('afterprint'))")
     assert max(browser.execute_script(COLOURS)) > 150
@@ -459,6 +470,9 @@ def test_no_view_is_wider_than_the_window(tuned: Studio, browser: Any) -> None:
         for view in VIEWS:
             browser.find_element("id", f"view-{view}").click()
             assert browser.execute_script(WIDE) <= 0, (width, view)
+    browser.set_window_size(640, 500)
+    browser.find_element("id", "view-tune").click()
+    until(lambda: browser.execute_script(COVERED) == [])
 
 
 @pytest.mark.alone

@@ -10,6 +10,10 @@ const { ask, on } = server, $ = id => document.getElementById(id), VIEWS = ["dat
 const tune = mount(document, server);
 let first = true;
 
+// what the focus goes to must not be left below the header, whose lines depend on the width
+const header = document.querySelector("header");
+new ResizeObserver(() => { document.documentElement.style.scrollPaddingTop = `${header.offsetHeight + 8}px`; }).observe(header);
+
 on("closed", () => { $("control").textContent = "not connected: reload this page; if it stays so, start sewfast studio again and open its whole address"; });
 
 function view(name) {
