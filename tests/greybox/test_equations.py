@@ -86,7 +86,7 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
         return (u - p["kv"] * x) / p["ka"]
 
     rng = np.random.default_rng(3)
-    u = np.repeat(rng.uniform(-8, 8, 8), 20)
+    u = np.repeat(rng.uniform(-8, 8, 12), 20)
     a = math.exp(-0.02 * 0.02 / 0.006)
     y = np.zeros(len(u))
     for k in range(1, len(u)):

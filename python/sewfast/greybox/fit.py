@@ -25,7 +25,7 @@ from .motor import Estimate, Motor, motor_of
 from .profile import Profile
 from .records import Records, records_of
 from .starts import started
-from .task import FINE, TERMS, State, Task, bounds_of, fitted
+from .task import FINE, NEAR, TERMS, State, Task, bounds_of, fitted
 
 Intervals: TypeAlias = Literal["wald", "profile"]
 
@@ -46,7 +46,7 @@ UNEXPLAINED = 0.005
 """Share of the speed's variance, from which a limit is looked for with all parameters free."""
 LIMITED = 0.9
 """Of the cost without, that a limit of the current has to fall below."""
-STRETCH = 20_000
+STRETCH = 10_000
 """Samples on which the way is found; all of them then have their say."""
 BUMPS = (0.02, 0.06)
 """Of the usual speed, at which Stribeck's friction is tried to fall off."""
@@ -189,7 +189,7 @@ def physics(
     state = _with_limit(first, fitted(first, state), terms)
     first.leave_out_spikes(state)
     state = _all_terms(first, state, terms)
-    task = Task(records, first.steps)
+    task = Task(records, first.steps, k_v=first.k_v)
     task.settle_starts(state)
     task.leave_out_spikes(state)
     state, shares = _shown_terms(task, state, terms)
@@ -299,12 +299,12 @@ def _shown_terms(
 ) -> tuple[State, dict[str, float]]:
     """All terms fitted together, then without those that are not shown; their statistics."""
     task.weigh(start)
-    state = fitted(task, start, FINE)
+    state = fitted(task, start, NEAR)
     if task.rmse(state) > WORSE * task.rmse(start):
         task.weigh(start, order=0)
-        state = fitted(task, start, FINE)
+        state = fitted(task, start, NEAR)
     _, fast = task.stribeck_speeds()
-    converged, explained = task.converged, dict[str, float]()
+    explained: dict[str, float] = {}
     whole = task.covariance(state)
     kept, out = list(state.terms), {t: 0.0 for t in terms if t not in state.terms}
     names, covariance, x = state.names(), whole, state.vector()
@@ -322,10 +322,7 @@ def _shown_terms(
         out[weakest] = shown[weakest]
         kept.remove(weakest)
         names, x, covariance = _without(TERMS[weakest], names, x, covariance)
-    task.converged = converged
-    if len(kept) < len(state.terms):
-        state = fitted(task, state.having(kept), FINE)
-    return state, out
+    return fitted(task, state.having(kept), FINE), out
 
 
 def _explained(task: Task, state: State, term: str, covariance: FloatArray) -> float:

@@ -52,6 +52,7 @@ def covariance_of(
     windows: Sequence[int],
     *,
     channels: int = 1,
+    known: FloatArray | None = None,
 ) -> FloatArray:
     """Of an estimate, (n, n); sums of scores over a window stand for their long-run covariance.
 
@@ -63,10 +64,15 @@ def covariance_of(
         Samples of each piece, and over how many scores hang together there.
     channels : int
         Rows that belong to one instant.
+    known : array, shape (k, k), optional
+        Inverse covariance of what is known of the first k parameters beforehand.
     """
     n = jacobian.shape[1]
-    inner, unknown = inverse(jacobian.T @ jacobian)
-    middle, at, total = np.zeros((n, n)), 0, 0.0
+    before = np.zeros((n, n))
+    if known is not None:
+        before[: len(known), : len(known)] = known
+    inner, unknown = inverse(jacobian.T @ jacobian + before)
+    middle, at, total = before, 0, 0.0
     for length, window in zip(lengths, windows, strict=True):
         rows = slice(at, at + channels * length)
         g = (jacobian[rows] * residuals[rows, None]).reshape(channels, length, n).sum(axis=0)
@@ -74,7 +80,7 @@ def covariance_of(
         sums = np.cumsum(np.concatenate([np.zeros((window, n)), g]), axis=0)
         sums = np.concatenate([sums, np.repeat(sums[-1:], window - 1, axis=0)])
         within = sums[window:] - sums[:-window]
-        middle += within.T @ within / window
+        middle = middle + within.T @ within / window
         total += 1.5 * length / window
     spread = (1.0 + 1.2 / max(total, 1.0)) ** 2  # Student's quantile over the normal one
     found: FloatArray = inner @ middle @ inner * spread + unknown

@@ -52,6 +52,7 @@ def started(task: Task, terms: tuple[str, ...]) -> State:
             "one; is the output a speed, and the input what drives the motor?"
         )
     alone = _Speeds(task.records, task.steps)
+    task.k_v = alone.k_v = max(float(best.theta[0]), 1e-12)
     best = fitted(alone, best)
     alone.settle_steps(best)
     explained = 1.0 - alone.cost(best) / max(float(np.sum((y - y.mean()) ** 2)), 1e-300)

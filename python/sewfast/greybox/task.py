@@ -31,9 +31,14 @@ TERMS: dict[str, tuple[str, ...]] = {
     "limit": ("limit",),
 }
 """Parts of a motor beside back-EMF and inertia, and the parameters of each."""
+VISCOUS = 0.05
+"""Of k_v: viscous friction that is expected where no current parts it from back-EMF, and how far
+from that it may well be. Nothing in its place would be a certainty: the dead zone sees the current
+that it takes, and dry friction would stand for what is missing."""
 ITERATIONS = 40
-COARSE, FINE = 1.0, 0.01
-"""Squared distances to the minimum in standard errors, on the way and of what is printed."""
+COARSE, NEAR, FINE = 1.0, 0.1, 0.01
+"""Squared distances to the minimum in standard errors: on the way, for tests, for what is printed.
+"""
 WHITE = 12
 """Order of the autoregression that says how what is left over hangs together."""
 CLIPPED = 5.0
@@ -49,7 +54,7 @@ class State:
     terms: tuple[str, ...]
 
     def names(self) -> list[str]:
-        free = ["k_e", "k_a", *(["k_b", "R"] if self.resistance is not None else [])]
+        free = ["k_e", "k_a", "k_b", *(["R"] if self.resistance is not None else [])]
         return free + [p for t in self.terms for p in TERMS[t]]
 
     def vector(self) -> FloatArray:
@@ -96,6 +101,8 @@ class Task:
     steps: int = 2
     converged: bool = False
     spikes: int = 0
+    k_v: float = math.nan
+    """From the start: the scale of what is expected of viscous friction."""
     speed_filter: FloatArray = field(default_factory=lambda: np.ones(1))
     current_filter: FloatArray = field(default_factory=lambda: np.ones(1))
 
@@ -155,7 +162,19 @@ class Task:
             order = [*inner, "R"]
             at = [order.index(n) for n in names]
             gradient, matrix = gradient[at], matrix[np.ix_(at, at)]
-        return cost, gradient, matrix
+        off, by, curvature = self._expected(state)
+        return cost + off, gradient + by, matrix + curvature
+
+    def _expected(self, state: State) -> Normal:
+        """What is known of viscous friction beforehand, as one more squared residual."""
+        names = state.names()
+        by, curvature = np.zeros(len(names)), np.zeros((len(names), len(names)))
+        if self.has_current or not math.isfinite(self.k_v):
+            return 0.0, by, curvature
+        at, scale = names.index("k_b"), VISCOUS * self.k_v
+        off = (state.value("k_b") - scale) / scale
+        by[at], curvature[at, at] = off / scale, 1.0 / scale**2
+        return off**2, by, curvature
 
     def cost(self, state: State) -> float:
         """Of the whitened residuals; infinite where nothing can be simulated."""
@@ -163,6 +182,7 @@ class Task:
             cost, _, _ = self._summed(state, ())
         except SettingError:
             return math.inf
+        cost += self._expected(state)[0]
         return cost if math.isfinite(cost) else math.inf
 
     def _summed(self, state: State, free: Sequence[str]) -> Normal:
@@ -238,8 +258,11 @@ class Task:
         if not moving:
             return
         J = np.concatenate([self.jacobian(state), columns], axis=1)
-        inner, _ = inverse(J.T @ J)
-        step = -(inner @ (J.T @ self.residuals(state)))[-len(moving) :]
+        matrix, slope, n = J.T @ J, J.T @ self.residuals(state), len(state.names())
+        _, by, curvature = self._expected(state)
+        matrix[:n, :n] += curvature
+        slope[:n] += by
+        step = -(inverse(matrix)[0] @ slope)[-len(moving) :]
         pieces = list(self.records.pieces)
         for j, by in zip(moving, step, strict=True):
             pieces[j] = replace(pieces[j], speed=pieces[j].speed + float(by))
@@ -290,7 +313,7 @@ class Task:
         windows = [int(np.clip(max(settling, math.sqrt(m)), 1, max(m // 15, 1))) for m in lengths]
         whole = covariance_of(
             np.concatenate(J, axis=1), self.residuals(state), lengths, windows,
-            channels=2 if self.has_current else 1,
+            channels=2 if self.has_current else 1, known=self._expected(state)[2],
         )  # fmt: skip
         return whole[:n, :n]
 
@@ -331,4 +354,5 @@ def _least(name: str, state: State) -> float:
     if name in _POSITIVE:
         value = state.value(name)
         return 1e-3 * value if math.isfinite(value) and value > 0 else 1e-9
-    return 0.0 if name in _NOT_NEGATIVE else -np.inf
+    unparted = name == "k_b" and state.resistance is None
+    return 0.0 if name in _NOT_NEGATIVE or unparted else -np.inf
