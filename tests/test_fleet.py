@@ -117,6 +117,46 @@ def test_workers_that_are_killed_cost_nothing(tmp_path: Path) -> None:
         assert set(client.run(os.getpid).values()) != set(pids)
 
 
+@pytest.mark.usefixtures("quiet")
+def test_recordings_that_share_a_task_do_not_share_its_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    distributed = pytest.importorskip("distributed", reason="needs dask")
+    from sewfast.fleets import running
+
+    many = made(tmp_path / "many", 40)
+    expected = fleet(many, workers=0).rows
+    real = running.row_of
+    sizes: list[int] = []
+
+    def broken(job: Any, *rest: Any) -> Any:
+        if job.file == "m8.npz":  # among the last, which are handed out together
+            raise RuntimeError("broken")
+        return real(job, *rest)
+
+    monkeypatch.setattr(running, "row_of", broken)
+    monkeypatch.setattr(running, "_RETRIES", 0)
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        submit = client.submit
+
+        def seen(work: Any, jobs: Any, *rest: Any, **options: Any) -> Any:
+            sizes.append(len(jobs))
+            return submit(work, jobs, *rest, **options)
+
+        monkeypatch.setattr(client, "submit", seen)
+        found = fleet(many, client=client).rows
+    assert max(sizes) > 1
+    assert [row.message for row in found if row.status == "failed"] == ["RuntimeError: broken"]
+    assert [repr(row) for row in found if row.file != "m8.npz"] == [
+        repr(row) for row in expected if row.file != "m8.npz"
+    ]
+
+
 def test_a_bad_recording_costs_its_own_row(tmp_path: Path) -> None:
     place = made(tmp_path / "mixed", 2)
     (place / "empty.csv").write_text("")

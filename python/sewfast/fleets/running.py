@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import json
+import math
 import os
 import signal
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -25,7 +27,9 @@ from .recordings import Job, jobs_of, row_of
 from .table import FORMAT, Fleet, Row, drifts, earlier_rows, require_ending
 
 _IN_FLIGHT = 4
-"""Recordings handed out at once for each worker: no more lie in the scheduler's memory."""
+"""Tasks handed out at once for each worker: no more lie in the scheduler's memory."""
+_TASK_SECONDS, _TASK_RECORDINGS = 1.0, 16
+"""How long a task takes, and its most recordings: handing one out costs 20 ms of processor."""
 _RETRIES = 50
 """Workers that may die over one recording before it is taken for the cause."""
 
@@ -152,7 +156,7 @@ def _is_whole(value: Any) -> bool:
 
 
 def _worked(
-    jobs: Sequence[Job],
+    recordings: Sequence[Job],
     settings: Mapping[str, Any],
     controller: Controller | None,
     client: Any,
@@ -162,44 +166,65 @@ def _worked(
 ) -> Iterator[tuple[Job, Row]]:
     """Rows as they are finished, in any order."""
     if workers == 0 and client is None and scheduler is None:
-        for job in jobs:
+        for job in recordings:
             yield job, row_of(job, settings, controller)
         return
-    if not jobs:
+    if not recordings:
         return
     with _connected(client, scheduler, workers, memory) as connected:
         as_completed = import_module("distributed").as_completed
         killed = import_module("distributed.scheduler").KilledWorker
 
-        waiting = iter(jobs)
-        submitted: dict[str, Job] = {}
+        waiting = deque(recordings)
+        submitted: dict[str, list[Job]] = {}
+        flying = _IN_FLIGHT * max(1, len(connected.scheduler_info(n_workers=-1)["workers"]))
+        done, took = 0, 0.0
 
-        def submit(job: Job) -> Any:
+        def submit(together: list[Job]) -> Any:
             future = connected.submit(
-                row_of, job, settings, controller, pure=False, retries=_RETRIES
+                _rows_of, together, settings, controller, pure=False, retries=_RETRIES
             )
-            submitted[future.key] = job
+            submitted[future.key] = together
             return future
 
-        count = max(1, len(connected.scheduler_info(n_workers=-1)["workers"]))
-        first = [submit(job) for job in itertools.islice(waiting, _IN_FLIGHT * count)]
-        running = as_completed(first)
+        def following() -> list[list[Job]]:
+            if not waiting:
+                return []
+            fit = int(_TASK_SECONDS * done / took) if done else 1
+            # towards the end in smaller portions, so that all workers end at about the same time
+            count = max(1, min(fit, _TASK_RECORDINGS, math.ceil(len(waiting) / flying)))
+            return [[waiting.popleft() for _ in range(count)]]
+
+        running = as_completed([submit(jobs) for _ in range(flying) for jobs in following()])
         for future in running:
-            job = submitted.pop(future.key)
+            together = submitted.pop(future.key)
+            alone: list[list[Job]] = []
             try:
-                row = future.result()
-            except killed:
-                row = Row(
-                    job.file, "failed", f"expected {memory} to suffice, but the worker died over "
-                    "it again and again; give more memory, or a shorter recording",
-                )  # fmt: skip
+                rows, seconds = future.result()
+                done, took = done + len(rows), took + seconds
             except Exception as error:
-                row = Row(job.file, "failed", f"{type(error).__name__}: {error}")
+                if len(together) > 1:  # whichever is the cause, it costs its own row only
+                    rows, alone = [], [[job] for job in together]
+                else:
+                    message = f"{type(error).__name__}: {error}"
+                    if isinstance(error, killed):
+                        message = (
+                            f"expected {memory} to suffice, but the worker died over it again "
+                            "and again; give more memory, or a shorter recording"
+                        )
+                    rows = [Row(together[0].file, "failed", message)]
             future.release()
-            following = next(waiting, None)
-            if following is not None:
-                running.add(submit(following))
-            yield job, row
+            for jobs in alone or following():
+                running.add(submit(jobs))
+            yield from zip(together, rows, strict=False)
+
+
+def _rows_of(
+    jobs: Sequence[Job], settings: Mapping[str, Any], controller: Controller | None
+) -> tuple[list[Row], float]:
+    """Rows of a task, and the seconds that they took."""
+    began = time.perf_counter()
+    return [row_of(job, settings, controller) for job in jobs], time.perf_counter() - began
 
 
 @contextmanager
