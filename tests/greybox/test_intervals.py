@@ -15,6 +15,8 @@ from sewfast.errors import SettingError
 from sewfast.greybox.intervals import CONFIDENCE, covariance_of
 from sewfast.greybox.marquardt import minimised
 from sewfast.greybox.profile import Profile
+from sewfast.greybox.records import records_of
+from sewfast.greybox.task import NOTHING, PLACE, State, Task
 
 FREE = (np.full(2, -np.inf), np.full(2, np.inf))
 T = np.linspace(0.0, 4.0, 25)
@@ -103,3 +105,37 @@ def test_a_motors_intervals_are_near_the_symmetric_ones_and_one_sided_at_nothing
     with pytest.raises(SettingError) as caught:
         physics(data, intervals="bootstrap")  # type: ignore[call-overload]
     assert caught.value.name == "intervals"
+
+
+def test_the_sums_of_the_core_are_those_of_residuals_and_jacobian() -> None:
+    """With gaps, a current and filters of several taps, over two pieces."""
+    rng = np.random.default_rng(5)
+    u, y = linear(600)
+    y[250:255] = np.nan
+    u[300] = np.nan
+    record = sewfast.Dataset.from_arrays(u, y, 0.02, output_unit="rad/s")
+    task = Task(records_of(record, rng.standard_normal(600), None))
+    task.speed_filter = np.array([0.9, -0.4, 0.2])
+    task.current_filter = np.array([1.5, -0.5])
+    theta = NOTHING.copy()
+    for name, value in {"k_e": 0.02, "k_a": 0.006, "tau": 0.01, "k_s": 0.3}.items():
+        theta[PLACE[name]] = value
+    state = State(theta, 0.7, ("lag", "coulomb", "load_1"))
+    cost, gradient, matrix = task.normal(state)
+    J, r = task.jacobian(state), task.residuals(state)
+    assert len(task.records.pieces) == 2
+    assert cost == pytest.approx(float(r @ r), rel=1e-12)
+    assert gradient == pytest.approx(J.T @ r, rel=1e-9, abs=1e-9 * np.abs(J.T @ r).max())
+    assert matrix == pytest.approx(J.T @ J, rel=1e-9, abs=1e-12 * float(np.max(J.T @ J)))
+
+
+def test_a_ramp_does_not_show_the_inertia() -> None:
+    u = np.linspace(0.0, 8.0, 1500)
+    y, w = np.empty(1500), 0.0
+    for k, command in enumerate(u):
+        y[k] = w
+        w += 0.02 / 0.006 * max(command - 0.02 * w - 0.3, 0.0)
+    y += np.random.default_rng(6).standard_normal(1500)
+    motor = physics(sewfast.Dataset.from_arrays(u, y, 0.02, output_unit="rad/s"))
+    assert "steps" in motor.undetermined["k_a"]
+    assert motor.value("k_v") == pytest.approx(0.02, rel=0.01)

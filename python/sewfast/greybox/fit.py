@@ -25,7 +25,7 @@ from .motor import Estimate, Motor, motor_of
 from .profile import Profile
 from .records import Records, records_of
 from .starts import started
-from .task import FINE, NEAR, TERMS, State, Task, bounds_of, fitted
+from .task import FINE, NEAR, TERMS, State, Task, bounds_of, fitted, least_inertia
 
 Intervals: TypeAlias = Literal["wald", "profile"]
 
@@ -197,6 +197,11 @@ def physics(
         t: f"not shown, if there is any (Wald's statistic {shares[t]:.2g}, it takes {SHOWN:g})"
         for t in shares
     }
+    if state.value("k_a") <= 1.01 * least_inertia(task, state) or task.is_slow(state):
+        reasons["inertia"] = (
+            "the record does not show how the motor speeds up; record steps, several samples in "
+            "each of its time constants"
+        )
     covariance = task.covariance(state)
     estimate = Estimate(
         state.theta, state.resistance, tuple(state.names()), covariance, tuple(state.terms)

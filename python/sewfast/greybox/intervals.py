@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray
+from ..errors import FitError
 
 CONFIDENCE = 1.96
 SINGULAR = 1e-11
@@ -93,6 +94,12 @@ def inverse(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     A step to a single speed, say, does not part friction from back-EMF: what is left in such a
     direction is rounding, whose inverse would be a lie and whose omission a certainty.
     """
+    if not np.isfinite(matrix).all():
+        raise FitError(
+            name="data", expected="a free run that changes with the parameters by finite amounts",
+            received="infinite ones", remedy="record changes of speed in both directions, faster "
+            "sampled than the motor settles",
+        )  # fmt: skip
     d = np.sqrt(np.diag(matrix))
     d[d == 0.0] = 1.0
     size, along = np.linalg.eigh(matrix / np.outer(d, d))

@@ -434,7 +434,10 @@ def motor_of(
     at = np.array([known[n] for n in estimate.names])
     parameters: dict[str, Parameter] = {}
     undetermined: dict[str, str] = {}
+    hidden = {name for term in reasons for name in _OF_TERM[term]}
     for name, unit, of in _quantities(estimate, records.u_unit, volts):
+        if name in hidden:
+            continue
         value = of(known)
         slope = np.zeros(len(at))
         sd = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
@@ -500,6 +503,7 @@ _MAY_BE_NOTHING = ("delay",)
 _SIGNED = ("offset", "k_b", "viscous_friction")
 
 _OF_TERM = {
+    "inertia": ("k_a", "time_constant", "inertia"),
     "lag": ("electrical_lag",),
     "delay": ("delay",),
     "coulomb": ("k_s",),

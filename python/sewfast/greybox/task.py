@@ -39,6 +39,10 @@ ITERATIONS = 40
 COARSE, NEAR, FINE = 1.0, 0.1, 0.01
 """Squared distances to the minimum in standard errors: on the way, for tests, for what is printed.
 """
+QUASISTATIC = 0.05
+"""Of the command's standard deviation: that of its accelerating part from which k_a is shown."""
+QUICKEST = 1.0 / 16.0
+"""Of a sample: a time constant that no record shows."""
 WHITE = 12
 """Order of the autoregression that says how what is left over hangs together."""
 CLIPPED = 5.0
@@ -287,6 +291,16 @@ class Task:
                 found.append(np.zeros((len(p.u), len(moving))))
         return np.concatenate(found), moving
 
+    def is_slow(self, state: State) -> bool:
+        """Whether the command that accelerates hardly changes beside the whole command.
+
+        A constant acceleration, as under a ramp, takes what dry friction takes.
+        """
+        rates = [np.diff(y) / self.records.Ts for y, *_ in self.simulated(state, ())]
+        u = np.concatenate([p.u for p in self.records.pieces])
+        effort = state.value("k_a") * float(np.std(np.concatenate(rates)))
+        return bool(effort < QUASISTATIC * float(np.std(u)))
+
     def stribeck_speeds(self) -> tuple[float, float]:
         """In which friction may fall off: below, there is hardly a sample to show it."""
         usual = float(np.quantile(np.abs(np.concatenate([p.y for p in self.records.pieces])), 0.9))
@@ -343,11 +357,18 @@ def bounds_of(task: Task, state: State) -> tuple[FloatArray, FloatArray]:
     low = np.array([_least(n, state) for n in names])
     high = np.full(len(names), np.inf)
     for j, n in enumerate(names):
+        if n == "k_a":
+            low[j] = max(low[j], least_inertia(task, state))
         if n == "delay":
             high[j] = 100.0 * task.records.Ts
         if n == "w_s":
             low[j], high[j] = task.stribeck_speeds()
     return low, high
+
+
+def least_inertia(task: Task, state: State) -> float:
+    """k_a of a motor that is too fast for the samples to show it, and for steps to follow it."""
+    return float(QUICKEST * task.records.Ts * max(state.theta[0] + state.theta[1], 0.0))
 
 
 def _least(name: str, state: State) -> float:
