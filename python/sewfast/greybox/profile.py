@@ -20,7 +20,7 @@ from ..arrays import FloatArray
 from .intervals import CONFIDENCE, inverse
 from .marquardt import Normal
 
-REFITS = 3
+REFITS = 8
 """Steps of the other parameters after the quantity."""
 TRIES = 6
 """Values of a quantity on each side."""
@@ -119,11 +119,13 @@ class Profile:
             inner, _ = inverse(matrix)
             across = inner @ slope
             step = -inner @ gradient + across * float(across @ gradient) / float(slope @ across)
-            trial = self._held(quantity, x + step, along, goal)
-            if trial is None or not (after := self.cost(trial)) < cost:
-                break
-            gained, x, cost = (cost - after) / self.variance, trial, after
-            if gained < 0.02:
+            before = cost
+            for share in (1.0, 0.4, 0.1, 0.03):  # on a broken line a whole step may miss
+                trial = self._held(quantity, x + share * step, along, goal)
+                if trial is not None and (after := self.cost(trial)) < cost:
+                    x, cost = trial, after
+                    break
+            if (before - cost) / self.variance < 0.02:
                 break
         return (cost - self.least) / self.variance
 
