@@ -3,7 +3,7 @@
     python benches/physics.py --count 40             virtual machines, 20 s at 1 kHz, 1,572 counts
     python benches/physics.py --mujoco 20            one hinge in MuJoCo, damped and rubbing
     python benches/physics.py --logs 200             logs at 20 ms with gaps, spikes, wrong signs
-    python benches/physics.py --coverage 200         how often intervals hold the truth, both kinds
+    python benches/physics.py --coverage 200         how often intervals hold the truth
     python benches/physics.py --race 3               one joint against mujoco.sysid, same optimum
     python benches/physics.py --tracked 24           followed online: false alarms, J +10 % seen
 
@@ -231,25 +231,21 @@ def logs(count: int) -> Iterator[str]:
 
 
 def coverage(count: int, seconds: float) -> None:
-    """How often intervals of both kinds hold the truth, with a current and without."""
+    """How often intervals hold the truth, with a current and without."""
     for with_current in (False, True):
-        tallies = {kind: Tally() for kind in ("wald", "profile")}
+        tally = Tally()
         for seed in range(1000, 1000 + count):
             machine = sewfast.VirtualMachine(seed)
             recording, current = recorded(machine, steps(seconds, 0.001, seed))
             known = {"current": current, "volts": machine.parameters["amplifier_gain"]}
-            for kind, tally in tallies.items():
-                start = time.process_time()
-                motor = sewfast.physics(
-                    recording, **(known if with_current else {}), intervals=kind
-                )
-                tally.seconds.append(time.process_time() - start)
-                tally.add(motor, truths(machine.parameters), machine.Ts)
-        for kind, tally in tallies.items():
-            what = "with" if with_current else "without"
-            tally.show(f"{kind}, {what} current, seeds 1000 to {999 + count}", count)
-            inside, told = sum(tally.inside.values()), sum(map(len, tally.errors.values()))
-            print(f"  all: inside {inside}/{told}, {100 * inside / told:.1f} %")
+            start = time.process_time()
+            motor = sewfast.physics(recording, **(known if with_current else {}))
+            tally.seconds.append(time.process_time() - start)
+            tally.add(motor, truths(machine.parameters), machine.Ts)
+        what = "with" if with_current else "without"
+        tally.show(f"{what} current, {seconds:g} s, seeds 1000 to {999 + count}", count)
+        inside, told = sum(tally.inside.values()), sum(map(len, tally.errors.values()))
+        print(f"  all: inside {inside}/{told}, {100 * inside / told:.1f} %")
 
 
 ROD = """<mujoco><option timestep="0.001" integrator="implicitfast" gravity="0 0 0"/>
@@ -375,7 +371,7 @@ def main() -> None:
     if args.tracked:
         tracked(args.tracked, 120.0)
     if args.coverage:
-        coverage(args.coverage, 5.0)
+        coverage(args.coverage, args.seconds)
     if args.race:
         race(args.race)
     if args.logs:

@@ -1,8 +1,7 @@
-"""Intervals by profile likelihood, and the descent that all of them start from."""
+"""The descent of a motor's fit, its sums, and the covariance that intervals come from."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,8 @@ from test_physics import linear
 
 import sewfast
 from sewfast import physics
-from sewfast.errors import SettingError
-from sewfast.greybox.intervals import CONFIDENCE, covariance_of
+from sewfast.greybox.intervals import covariance_of
 from sewfast.greybox.marquardt import minimised
-from sewfast.greybox.profile import Profile
 from sewfast.greybox.records import records_of
 from sewfast.greybox.task import NOTHING, PLACE, State, Task
 
@@ -55,29 +52,6 @@ def test_a_bound_holds_what_would_leave_it() -> None:
     assert found.x == pytest.approx([float(e @ y) / float(e @ e), 1.5], rel=1e-6)
 
 
-def test_the_ends_are_where_a_fit_with_the_value_held_is_that_much_worse() -> None:
-    normal, cost, y = decay(0.4)
-    x = minimised(normal, cost, np.array([1.0, 0.3]), FREE, len(T), enough=1e-10, iterations=50).x
-    least, _, matrix = normal(x)
-    variance = least / len(T)
-    profile = Profile(normal, cost, x, FREE, np.linalg.inv(matrix) * variance, len(T))
-    low, high = profile.interval(lambda x: float(x[1]), np.array([0.0, 1.0]))
-
-    def deviance(rate: float) -> float:
-        e = np.exp(-rate * T)
-        r = y - float(e @ y) / float(e @ e) * e
-        return (float(r @ r) - least) / variance
-
-    for end in (low, high):
-        assert math.sqrt(deviance(end)) == pytest.approx(CONFIDENCE, rel=0.04)
-    assert high - x[1] > 1.1 * (x[1] - low)  # a rate is known worse upwards
-    # a quantity of both: the time until it has fallen to 1
-    low, high = profile.interval(
-        lambda x: math.log(x[0]) / x[1], np.array([1 / (x[0] * x[1]), -math.log(x[0]) / x[1] ** 2])
-    )
-    assert low < math.log(x[0]) / x[1] < high
-
-
 def test_scores_that_hang_together_widen_the_covariance() -> None:
     rng = np.random.default_rng(4)
     e = rng.standard_normal(4000)
@@ -86,25 +60,6 @@ def test_scores_that_hang_together_widen_the_covariance() -> None:
     one, other = (float(covariance_of(J, r, [4000], [40])[0, 0]) for r in (e, alike))
     assert one == pytest.approx(1 / 4000, rel=0.4)
     assert other == pytest.approx(10 / 4000, rel=0.6)
-
-
-def test_a_motors_intervals_are_near_the_symmetric_ones_and_one_sided_at_nothing() -> None:
-    u, y = linear(800, noise=2.0)
-    data = sewfast.Dataset.from_arrays(u, y, 0.02, output_unit="rad/s")
-    wald, profile = (
-        physics(data, structure=["coulomb", "delay"], intervals=kind)  # type: ignore[arg-type]
-        for kind in ("wald", "profile")
-    )
-    assert profile.theta == pytest.approx(wald.theta)
-    for name in ("k_v", "k_a", "k_s"):
-        a, b = wald.parameters[name], profile.parameters[name]
-        assert b.low < b.value < b.high
-        assert b.high - b.low == pytest.approx(a.high - a.low, rel=0.35), name
-    delay = profile.parameters["delay"]
-    assert 0.0 <= delay.low <= delay.value < delay.high < 0.02
-    with pytest.raises(SettingError) as caught:
-        physics(data, intervals="bootstrap")  # type: ignore[call-overload]
-    assert caught.value.name == "intervals"
 
 
 def test_the_sums_of_the_core_are_those_of_residuals_and_jacobian() -> None:

@@ -55,10 +55,6 @@ def add(commands: Commands) -> None:
         "drop,stribeck,load_1,load_2,inertia_2,limit",
     )  # fmt: skip
     parser.add_argument(
-        "--intervals", choices=("wald", "profile"), default="wald",
-        help="symmetric (wald, the default), or by profile likelihood, which takes longer",
-    )  # fmt: skip
-    parser.add_argument(
         "--speed-unit", metavar="UNIT", help="of the output: rpm, rad/s, rev/s, deg/s"
     )
     parser.add_argument(
@@ -102,7 +98,6 @@ def command(args: argparse.Namespace) -> None:
         current=args.current,
         volts=args.volts,
         speed_unit=args.speed_unit,
-        intervals=args.intervals,
     )
     text = "" if target is None else motor.export(target, winding=args.winding)
     if args.out is not None:

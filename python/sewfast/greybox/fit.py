@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Literal, TypeAlias, get_args, overload
+from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,12 +22,9 @@ from ..recording import Recording
 from .equations import EquationFit, Equations, fit_equations
 from .intervals import inverse
 from .motor import Estimate, Motor, motor_of
-from .profile import Profile
 from .records import Records, records_of
 from .starts import started
-from .task import FINE, NEAR, TERMS, State, Task, bounds_of, fitted, least_inertia
-
-Intervals: TypeAlias = Literal["wald", "profile"]
+from .task import FINE, NEAR, TERMS, State, Task, fitted, least_inertia
 
 ORDERS = {"load_1": 1, "load_2": 2, "inertia_2": 2}
 """How often a term repeats in a turn."""
@@ -62,7 +59,6 @@ def physics(
     current: str | ArrayLike | None = None,
     volts: float | None = None,
     speed_unit: str | None = None,
-    intervals: Intervals = "wald",
 ) -> Motor: ...
 
 
@@ -85,7 +81,6 @@ def physics(
     current: str | ArrayLike | None = None,
     volts: float | None = None,
     speed_unit: str | None = None,
-    intervals: Intervals = "wald",
     equations: Equations | None = None,
     parameters: Mapping[str, float | Sequence[float]] | None = None,
     states: int = 1,
@@ -114,10 +109,6 @@ def physics(
         Volts on the winding per unit of command; 1 if the command is that voltage.
     speed_unit : str, optional
         rpm, rad/s, rev/s or deg/s, if the data set does not say.
-    intervals : "wald" or "profile"
-        Symmetric intervals from the curvature at the least squares, or profile likelihood: how far
-        each parameter can be moved while all others follow. The second takes a few times as long
-        and is one-sided where a parameter ends at nothing.
     equations : callable, optional
         Your own equations in place of the motor's: ``f(x, u, p)`` returns the derivatives of the
         state ``x``, shape (states,), under the command ``u``; ``p`` has the parameters by name. The
@@ -167,10 +158,6 @@ def physics(
         isinstance(volts, (int, float)) and math.isfinite(volts) and volts > 0
     ):
         raise SettingError(f"expected volts per unit of command above 0, received {volts!r}")
-    if intervals not in get_args(Intervals):
-        raise SettingError(
-            name="intervals", expected=" or ".join(get_args(Intervals)), received=repr(intervals)
-        )
     records = records_of(data, current, speed_unit)
     reasons = _too_fast(records, terms)
     terms = tuple(t for t in terms if t not in reasons)
@@ -207,13 +194,7 @@ def physics(
         state.theta, state.resistance, tuple(state.names()), covariance, tuple(state.terms)
     )
     records = replace(task.records, spikes=records.spikes + first.spikes + task.spikes)
-    profile = None
-    if intervals == "profile":
-        profile = Profile(
-            lambda x: task.normal(state.at(x)), lambda x: task.cost(state.at(x)), state.vector(),
-            bounds_of(task, state), covariance, task.count,
-        )  # fmt: skip
-    return motor_of(estimate, records, task.outcome(state), reasons, volts, task.converged, profile)
+    return motor_of(estimate, records, task.outcome(state), reasons, volts, task.converged)
 
 
 def _turns_both_ways(records: Records) -> bool:

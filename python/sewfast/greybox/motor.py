@@ -20,7 +20,6 @@ from ..models import LinearOE
 from ..plotting import LOOKS, Drawing, html_of
 from .exports import Target, Winding, export
 from .intervals import CONFIDENCE
-from .profile import Profile
 from .records import Records, rad_per_second
 
 if TYPE_CHECKING:
@@ -427,7 +426,6 @@ def motor_of(
     reasons: Mapping[str, str],
     volts: float | None,
     converged: bool,
-    profile: Profile | None = None,
 ) -> Motor:
     """What the estimate says, each parameter with its interval or the reason why it has none."""
     known = {**dict(zip(NAMES, estimate.theta, strict=True)), "R": estimate.resistance or math.nan}
@@ -456,17 +454,8 @@ def motor_of(
                 "as its value"
             )
             continue
-        low, high = value - half, value + half
-        if profile is not None:
-            low, high = profile.interval(
-                lambda x, of=of: of({**known, **dict(zip(estimate.names, x, strict=True))}),  # type: ignore[misc]
-                slope,
-            )
-            if not math.isfinite(high) or (name in _SIGNED and not math.isfinite(low)):
-                undetermined[name] = "its profile likelihood has no end; excite more strongly"
-                continue
-        low = low if name in _SIGNED else max(low, 0.0)
-        parameters[name] = Parameter(value, low, high, unit)
+        low = value - half if name in _SIGNED else max(value - half, 0.0)
+        parameters[name] = Parameter(value, low, value + half, unit)
     for term, why in reasons.items():
         for name in _OF_TERM[term]:
             undetermined.setdefault(name, why)
