@@ -1,4 +1,4 @@
-"""What the live view costs: `Feed.put` for ten samples, alone and beside a view; one frame."""
+"""What the live view costs: `Feed.put` for ten samples, alone and beside a view; one status."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sewfast.live import Feed, open_view
-from sewfast.live.terminal import Frame, Palette
+from sewfast.live.terminal import status
 
 UNITS = {"u": "V", "counts": "", "r": "RPM", "current": "A"}
 BATCH, SAMPLES, TS = 10, 30_000, 0.001
@@ -47,9 +47,8 @@ def _drain(terminal: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["none", "terminal", "plotjuggler", "foxglove:0"])
-def test_put(benchmark: Any, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+def test_put(benchmark: Any, kind: str) -> None:
     """Ten samples of four columns, as fast as they can be put: the view is as busy as it gets."""
-    monkeypatch.setenv("TERM", "xterm")
     feed = _feed()
     batch = {name: np.arange(BATCH, dtype=float) for name in UNITS}
     first = iter(range(0, 1 << 62, BATCH))
@@ -60,20 +59,10 @@ def test_put(benchmark: Any, monkeypatch: pytest.MonkeyPatch, kind: str) -> None
         print(f"\n{kind}: put {1e6 * found.median:.2f} us, worst {1e3 * found.max:.2f} ms")
 
 
-@pytest.mark.parametrize("size", [(80, 24), (200, 50)], ids=lambda s: f"{s[0]}x{s[1]}")
-def test_frame(benchmark: Any, size: tuple[int, int]) -> None:
-    """A frame of 30 s at 1 kHz, ten of which are drawn in a second."""
+def test_status(benchmark: Any) -> None:
+    """The line of 30 s at 1 kHz, ten of which are written in a second."""
     feed = _feed()
-    t = TS * np.arange(SAMPLES)
-    feed.put(
-        0,
-        {
-            "u": 10 * np.sin(t * t),
-            "counts": np.cumsum(50 * np.sin(t * t / 2)),
-            "r": np.where(t > 5, 1200.0, 0.0),
-            "current": np.cos(t),
-        },
-    )
-    benchmark(lambda: Frame.of(feed, *size, Palette(unicode=True, colour=True)))
+    feed.put(0, {name: np.arange(SAMPLES, dtype=float) for name in UNITS})
+    benchmark(lambda: status(feed, 79))
     if benchmark.stats is not None:
-        print(f"\n{size}: {1e3 * benchmark.stats.stats.median:.2f} ms a frame")
+        print(f"\n{1e6 * benchmark.stats.stats.median:.1f} us a line")

@@ -49,8 +49,8 @@ def test_it_is_the_same_after_a_copy(kind: type[SewfastError]) -> None:
     [
         ("u: expected a, got b; c", ("u", "a", "b", "c")),
         ("f.csv, line 3: expected a, received 'x; y'; c", ("f.csv, line 3", "a", "'x; y'", "c")),
-        ("udp://a:5: expected an open port, it vanished; c",
-         ("udp://a:5", "an open port", "it vanished", "c")),
+        ("udp://a:5: expected one thread, a second came; c",
+         ("udp://a:5", "one thread", "a second came", "c")),
         ("u: expected (5,), or (5, n), time first; received (3,); c",
          ("u", "(5,), or (5, n), time first", "(3,)", "c")),
         ("expected a", (None, "a", None, None)),
@@ -76,7 +76,7 @@ def test_what_users_meet_first_has_its_fields(tmp_path: Path) -> None:
     assert short.expected is not None
     assert "(5,)" in short.expected
     text = refused(lambda: sewfast.Gains.standard("fast", 1.0))
-    assert (text.expected, text.received) == ("a number for Kp", "'fast'")
+    assert (text.name, text.expected, text.received) == ("Kp", "a number", "'fast'")
     (tmp_path / "m.json").write_text("[]")
     damaged = refused(lambda: sewfast.load_model(tmp_path / "m.json"))
     assert damaged.name == str(tmp_path / "m.json")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from plants import OFFSET, A, B, linear_data
+from refusals import refuses
 from sewfast import _core
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError
@@ -68,7 +69,7 @@ def test_scores_against_a_channel() -> None:
     measured, true = validate(MODEL, data), validate(MODEL, data, against="truth")
     assert true.simulation.rmse < measured.simulation.rmse
     assert "truth" in str(true)
-    with pytest.raises(DataError, match="no channel 'position'; available: truth"):
+    with refuses(DataError, expected="a channel 'position'", received="truth"):
         validate(MODEL, data, against="position")
 
 

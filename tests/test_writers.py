@@ -7,6 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from refusals import refuses
 from sewfast.errors import DataError, SettingError
 from sewfast.readers import read, read_table
 from sewfast.writers import write_bytes, write_table
@@ -61,6 +62,6 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
         write_table(tmp_path / "a.mat", {"1u": [1.0]})
     with pytest.raises(DataError, match="folder that exists"):
         write_table(tmp_path / "nowhere" / "a.csv", {"u": [1.0]})
-    with pytest.raises(DataError, match="cannot be written"):
+    with refuses(DataError, expected="can be written"):
         write_bytes(tmp_path, b"")
     assert list(tmp_path.iterdir()) == []

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .dataset import Dataset, Experiment
-from .errors import DataError, SettingError
+from .errors import DataError, SettingError, not_installed
 
 PACKAGE = "nonlinear_benchmarks"
 TESTED_VERSION = "1.0.1"
@@ -94,9 +94,10 @@ def load(name: str, folder: str | os.PathLike[str] | None = None) -> Benchmark:
         train, test = read(dir_placement=place)
     except Exception as error:
         raise DataError(
-            f"benchmark {name}: the record could not be read ({error}); it is fetched from its "
-            f"authors' page: check the connection, or put the files into folder="
-        ) from error
+            name=f"benchmark {name}", expected="a record that can be read", received=str(error),
+            remedy="it is fetched from its authors' page: check the connection, or put the files "
+            "into folder=",
+        ) from error  # fmt: skip
     train, test = _each(train), _each(test)
     return Benchmark(_dataset(train), _dataset(test), _window(test), name, _version())
 
@@ -105,9 +106,7 @@ def _reader(function: str) -> Callable[..., Any]:
     try:
         module = importlib.import_module(PACKAGE)
     except ImportError as error:
-        raise SettingError(
-            f'benchmarks need the package {PACKAGE}; pip install "sewfast[benchmarks]"'
-        ) from error
+        raise not_installed(PACKAGE, "benchmarks", "sewfast[benchmarks]") from error
     found: Callable[..., Any] = getattr(module, function)
     return found
 

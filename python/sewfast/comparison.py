@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,14 +12,14 @@ from .arrays import labelled
 from .dataset import Dataset
 from .dynamic_model import INIT, DynamicModel
 from .errors import FitError, SettingError
-from .plotting import Table, fit_panels, percent, significant, stacked
+from .plotting import Drawing, Plotted, Table, fit_panels, percent, significant, stacked
 from .validation import Validation, validate
 
 ORDER = "compare(model, model, ..., data)"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Comparison:
+class Comparison(Plotted):
     """Models on the same data.
 
     Attributes
@@ -87,26 +86,8 @@ class Comparison:
             ],
         }
 
-    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
-        """Draw the measured output, every free run over it, and their errors below.
-
-        Parameters
-        ----------
-        ax : Axes or sequence of Axes, optional
-            One shows the outputs, a second one the errors.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the two panels of a new figure.
-
-        Raises
-        ------
-        SettingError
-            If matplotlib is not installed, the file cannot be written, or all models diverge.
-        """
+    def drawing(self) -> Drawing:
+        """The measured output, every free run over it, and their errors below."""
         if not self._scored:
             raise SettingError("expected a model that stays bounded on these data; all run away")
         found = {name: self[name] for name in self._scored}
@@ -119,7 +100,7 @@ class Comparison:
             label=labelled(first.against, self.unit),
             unit=self.unit,
         )
-        return stacked(panels, (2.6, 1.7)).plot(ax, file)
+        return stacked(panels, (2.6, 1.7))
 
     def __repr__(self) -> str:
         return f"Comparison({', '.join(self.names)}; best: {self.best or 'none'})"

@@ -378,9 +378,9 @@ class DynamicModel(ABC):
             )
         if abs(data.Ts - self.Ts) > 0.01 * self.Ts:
             raise DataError(
-                f"{data.source}: the model was identified at Ts = {self.Ts:g} s, the data have "
-                f"{data.Ts:g} s; resample the data or identify again"
-            )
+                name=str(data.source), expected=f"the model's sample time, Ts = {self.Ts:g} s",
+                received=f"{data.Ts:g} s", remedy="resample the data or identify again",
+            )  # fmt: skip
         require_same_units(self, data)
 
     def to_dict(self) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import unicodedata
-from typing import Any
+from typing import Any, TypeVar
 
 
 class SewfastError(Exception):
@@ -114,6 +114,47 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, best: Any) -> None:
         super().__init__("interrupted; the best result so far is kept")
         self.best = best
+
+
+Kind = TypeVar("Kind", bound=SewfastError)
+
+
+def located(kind: type[Kind], place: object, error: BaseException) -> Kind:
+    """The error of a part as one of the whole: the place stands before the part's name."""
+    if not isinstance(error, SewfastError) or error.expected is None:
+        return kind(f"{place}: {error}")
+    name = f"{place}: {error.name}" if error.name else f"{place}"
+    return kind(name=name, expected=error.expected, received=error.received, remedy=error.remedy)
+
+
+def unreadable(kind: type[Kind], path: object, error: BaseException) -> Kind:
+    """The refusal of a file that is not there or that the system does not give."""
+    received = getattr(error, "strerror", None) or str(error)
+    remedy = "check the name and the folder"
+    return kind(
+        name=f"{path}", expected="a file that can be read", received=received, remedy=remedy
+    )
+
+
+def unwritable(
+    kind: type[Kind],
+    path: object,
+    error: BaseException,
+    remedy: str = "choose a folder that exists and is writable",
+) -> Kind:
+    """The refusal of a file that the system does not let be written."""
+    received = getattr(error, "strerror", None) or str(error)
+    return kind(
+        name=f"{path}", expected="a file that can be written", received=received, remedy=remedy
+    )
+
+
+def not_installed(package: str, purpose: str, install: str = "") -> SettingError:
+    """The refusal where an optional package is missing: what it is for, how to install it."""
+    return SettingError(
+        name=package, expected=f"it installed for {purpose}", received="none",
+        remedy=f'pip install "{install or package}"',
+    )  # fmt: skip
 
 
 def printable(name: str) -> str:

@@ -28,7 +28,7 @@ def real(name: str, value: Any) -> float:
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if isinstance(value, (str, bytes)) or math.isnan(number):
-        raise SettingError(f"expected a number for {name}, got {value!r}")
+        raise SettingError(name=name, expected="a number", received=repr(value))
     return number
 
 
@@ -36,7 +36,7 @@ def whole(name: str, value: Any) -> int:
     """The value as an int of 0 to 2^63 - 1; fractions, booleans and text are refused by name."""
     number = math.nan if isinstance(value, bool) else real(name, value)
     if not (0 <= number < 2**63 and number.is_integer()):
-        raise SettingError(f"expected a whole number of 0 or more for {name}, got {value!r}")
+        raise SettingError(name=name, expected="a whole number of 0 or more", received=repr(value))
     return int(value)
 
 
@@ -53,9 +53,12 @@ def vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
             raise TypeError("complex ones; take their real part")
         array = np.ascontiguousarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"expected numbers in {name}, got {error}") from error
+        raise DataError(name=name, expected="numbers", received=str(error)) from error
     if np.ndim(values) != 1:
-        raise DataError(f"expected {name} of shape (N,), got {np.shape(values)}; give one column")
+        raise DataError(
+            name=name, expected="shape (N,)", received=f"{np.shape(values)}",
+            remedy="give one column",
+        )  # fmt: skip
     return array
 
 

@@ -112,9 +112,9 @@ class VirtualMachine:
         match = _NAME.fullmatch(name) if isinstance(name, str) else None
         if match is None:
             raise SettingError(
-                f"expected 'virtual' or 'virtual:SEED' with a whole number, got {name!r}; "
-                "for example 'virtual:1'"
-            )
+                name="name", expected="'virtual' or 'virtual:SEED' with a whole number",
+                received=repr(name), remedy="for example 'virtual:1'",
+            )  # fmt: skip
         seed = None if match[1] is None else int(match[1])
         return cls(seed, parameters=_parameters(match[2] or "", name))
 
@@ -230,17 +230,17 @@ def _parameters(query: str, name: str) -> dict[str, float]:
             found[key] = float(value)
         except ValueError:
             raise SettingError(
-                f"{name}: expected NAME=NUMBER between '?' and '&', got {part!r}; for example "
-                "'virtual?load_inertia=0.002'"
-            ) from None
+                name=name, expected="NAME=NUMBER between '?' and '&'", received=repr(part),
+                remedy="for example 'virtual?load_inertia=0.002'",
+            ) from None  # fmt: skip
     return found
 
 
 def _checked_seed(seed: int) -> int:
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
-        raise SettingError(f"expected a whole number or None as seed, got {seed!r}")
+        raise SettingError(name="seed", expected="a whole number or None", received=repr(seed))
     if not 0 <= seed <= _LARGEST_SEED:
-        raise SettingError(f"expected a seed from 0 to {_LARGEST_SEED}, got {seed}")
+        raise SettingError(name="seed", expected=f"0 to {_LARGEST_SEED}", received=str(seed))
     return int(seed)
 
 
@@ -250,9 +250,7 @@ def _checked_values(values: Mapping[str, float]) -> dict[str, float]:
         try:
             checked[name] = float(value)
         except (TypeError, ValueError):
-            raise SettingError(
-                f"expected a number for machine parameter {name!r}, got {value!r}"
-            ) from None
+            raise SettingError(name=name, expected="a number", received=repr(value)) from None
     return checked
 
 
@@ -260,9 +258,10 @@ def _commands(u: ArrayLike) -> NDArray[np.float64]:
     try:
         commands = np.ascontiguousarray(u, dtype=np.float64)
     except (TypeError, ValueError):
-        raise DataError(f"expected numbers as commands, got {type(u).__name__}") from None
+        raise DataError(name="u", expected="numbers", received=type(u).__name__) from None
     if np.ndim(u) != 1:
         raise DataError(
-            f"expected commands of shape (N,), got shape {np.shape(u)}; use u[:, 0] for one column"
-        )
+            name="u", expected="shape (N,)", received=str(np.shape(u)),
+            remedy="use u[:, 0] for one column",
+        )  # fmt: skip
     return commands

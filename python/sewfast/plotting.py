@@ -13,6 +13,7 @@ import itertools
 import math
 import os
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -23,7 +24,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import SettingError
+from .errors import SettingError, not_installed, unwritable
 from .storage import replace_file
 
 if TYPE_CHECKING:
@@ -194,12 +195,12 @@ _STYLE: dict[str, Any] = {
 
 def require() -> None:
     """Refuse with a remedy where matplotlib or Jinja2 is not installed."""
-    _require("the report needs", "matplotlib", "jinja2")
+    _require("the report", "matplotlib", "jinja2")
 
 
 def require_matplotlib() -> None:
     """Refuse with a remedy where matplotlib is not installed."""
-    _require("figures need", "matplotlib")
+    _require("figures", "matplotlib")
 
 
 def _require(what: str, *modules: str) -> None:
@@ -207,9 +208,7 @@ def _require(what: str, *modules: str) -> None:
         try:
             import_module(name)
         except ImportError as e:
-            raise SettingError(
-                f'{what} {name}, which is not installed: pip install "sewfast[report]"'
-            ) from e
+            raise not_installed(name, what, "sewfast[report]") from e
 
 
 @contextlib.contextmanager
@@ -432,11 +431,20 @@ class Drawing:
         try:
             replace_file(path, buffer.getvalue())
         except OSError as e:
-            raise SettingError(
-                f"{path}: cannot be written ({e.strerror or e}); choose a folder that exists and "
-                "is writable"
-            ) from e
+            raise unwritable(SettingError, path, e) from e
         return np.array([ax for ax in figure.axes if ax.axison], dtype=object)
+
+
+class Plotted(ABC):
+    """A result that draws itself: what is in the figure, its `drawing` says."""
+
+    @abstractmethod
+    def drawing(self) -> Drawing:
+        """The figure as panels."""
+
+    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
+        """Draw it into axes, a file, or a new figure; arguments and result as `Drawing.plot`."""
+        return self.drawing().plot(ax, file)
 
 
 def require_file(path: Path) -> None:

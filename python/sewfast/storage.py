@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from .arrays import FloatArray
-from .errors import ModelFileError
+from .errors import ModelFileError, unreadable, unwritable
 
 LOG = logging.getLogger(__package__)
 
@@ -123,10 +123,7 @@ def replace(path: str | os.PathLike[str], content: str | bytes) -> None:
     try:
         replace_file(path, content.encode() if isinstance(content, str) else content)
     except OSError as error:
-        raise ModelFileError(
-            f"{path}: cannot be written ({error.strerror}); "
-            "choose a folder that exists and is writable"
-        ) from error
+        raise unwritable(ModelFileError, path, error) from error
 
 
 def read(path: str | os.PathLike[str], format: str, versions: Collection[int]) -> dict[str, Any]:
@@ -178,8 +175,7 @@ def _text(path: str | os.PathLike[str]) -> str:
             data = file.read(LARGEST_FILE + 1)
     except (OSError, ValueError) as error:
         # a name with the character 0 is a ValueError
-        reason = getattr(error, "strerror", error)
-        raise ModelFileError(f"{path!s}: cannot be read ({reason}); check the name") from error
+        raise unreadable(ModelFileError, path, error) from error
     if len(data) > LARGEST_FILE:
         raise ModelFileError(f"{path}: expected a file of at most 16 MB, got a larger one")
     try:
@@ -253,8 +249,9 @@ class Fields:
     def any(self, name: str) -> Any:
         if name not in self.values:
             raise ModelFileError(
-                f"{self.path}: field {self.place + name!r} is missing; the file is damaged"
-            )
+                name=f"{self.path}: field {self.place + name!r}", expected="a value",
+                received="none", remedy="the file is damaged",
+            )  # fmt: skip
         return self.values[name]
 
     def text(self, name: str) -> str:

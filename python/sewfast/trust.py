@@ -526,12 +526,11 @@ def judge(
         disagreement(apart, limits, unit),
     )
     if refuse and lines[-1].verdict == "fail":
-        raise FitError(_refusal(lines[-1].shown, lines[-1].limit, lines[-1].meaning))
+        raise FitError(
+            name="plants", expected=f"some that agree in closed loop ({lines[-1].limit})",
+            received=f"{lines[-1].shown}: {lines[-1].meaning}",
+        )  # fmt: skip
     return Judgement(lines, found, apart, limits)
-
-
-def _refusal(shown: str, limit: str, meaning: str) -> str:
-    return f"expected plants that agree in closed loop ({limit}), received {shown}: {meaning}"
 
 
 _Run: TypeAlias = tuple[ClosedLoopRun, "Plant | None"]

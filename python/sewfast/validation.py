@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -16,6 +15,7 @@ from .dataset.experiment import in_effect, without_weightless
 from .dataset.outliers import white_noise
 from .dynamic_model import INIT, DynamicModel, require_init
 from .errors import DataError
+from .plotting import Drawing, Plotted, Table, fit_panels, percent, significant, stacked
 
 GOOD, FAIR, POOR = 90.0, 70.0, 30.0
 """Percent of the free run's fit from which a model is good, fair, poor; below it is useless."""
@@ -126,7 +126,7 @@ class ExperimentErrors:
 
 
 @dataclass(frozen=True, eq=False)
-class Validation:
+class Validation(Plotted):
     """Errors of a model on data, in free run (the main score) and one step ahead.
 
     Attributes
@@ -219,28 +219,8 @@ class Validation:
             "notes": list(self.notes),
         }
 
-    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
-        """Draw the measured output, the free run over it, and both errors below.
-
-        Parameters
-        ----------
-        ax : Axes or sequence of Axes, optional
-            One shows the outputs, a second one the errors.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the two panels of a new figure.
-
-        Raises
-        ------
-        SettingError
-            If matplotlib is not installed or the file cannot be written.
-        """
-        from .plotting import fit_panels, significant, stacked
-
+    def drawing(self) -> Drawing:
+        """The measured output, the free run over it, and both errors below."""
         s, unit = self.simulation, f" {self.unit}" if self.unit else ""
         fit = f"fit {s.fit_percent:.2f} %, " if math.isfinite(s.fit_percent) else ""
         panels = fit_panels(
@@ -255,12 +235,10 @@ class Validation:
             unit=self.unit,
             title=f"{fit}error {significant(s.rmse)}{unit} rms",
         )
-        return stacked(panels, (2.6, 1.7)).plot(ax, file)
+        return stacked(panels, (2.6, 1.7))
 
     def _repr_html_(self) -> str:
         """A table for a notebook."""
-        from .plotting import Table, percent, significant
-
         unit = f" [{self.unit}]" if self.unit else ""
         rows = [("free run", self.simulation), ("one step ahead", self.one_step)]
         if len(self.experiments) > 1:
@@ -419,19 +397,24 @@ def _target(experiment: Experiment, against: str | None, first: int) -> FloatArr
         return without_weightless(experiment).y
     if against not in experiment.channels:
         raise DataError(
-            f"{experiment.name}: no channel {against!r}; available: "
-            f"{', '.join(experiment.channels) or 'none'}"
-        )
+            name=experiment.name, expected=f"a channel {against!r}",
+            received=", ".join(experiment.channels) or "none", remedy="name one of its channels",
+        )  # fmt: skip
     if experiment.removed is not None:
         raise DataError(
-            f"{experiment.name}: channel {against!r} is as it was recorded, but an offset was "
-            "taken off the output: compare it with data.restore(model.simulate(data))"
-        )
+            name=f"{experiment.name}: channel {against!r}",
+            expected="the output without an offset taken off",
+            received="one with it off, unlike the channel",
+            remedy="compare it with data.restore(model.simulate(data))",
+        )  # fmt: skip
     target = experiment.channels[against]
     if experiment.weights is not None:
         target = np.where(experiment.weights == 0.0, np.nan, target)
     if np.isnan(target[first:]).all():
-        raise DataError(f"{experiment.name}: channel {against!r} is NaN at every scored sample")
+        raise DataError(
+            name=f"{experiment.name}: channel {against!r}", expected="a value at a scored sample",
+            received="NaN at all of them", remedy="score against another",
+        )  # fmt: skip
     return target
 
 

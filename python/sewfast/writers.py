@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arrays import labelled
-from .errors import DataError, SettingError
+from .errors import DataError, SettingError, not_installed, unwritable
 from .storage import replace_file
 
 _Columns = dict[str, NDArray[Any]]
@@ -65,9 +65,7 @@ def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
     try:
         replace_file(path, content)
     except OSError as e:
-        raise DataError(
-            f"{path}: cannot be written ({e.strerror}); choose a folder that exists and is writable"
-        ) from e
+        raise unwritable(DataError, path, e) from e
 
 
 def _checked(path: Path, columns: Mapping[str, ArrayLike]) -> _Columns:
@@ -99,15 +97,15 @@ def _mat(columns: _Columns, units: Mapping[str, str]) -> bytes:
     try:
         from scipy.io import savemat
     except ImportError as e:
-        raise SettingError(
-            'writing .mat needs scipy, which is not installed: pip install "sewfast[mat]"'
-        ) from e
+        raise not_installed("scipy", "writing .mat", "sewfast[mat]") from e
     for name in columns:
         if re.fullmatch(r"[A-Za-z]\w{0,30}", name, re.ASCII) is None:
             raise DataError(
-                f"column {name!r}: a MATLAB variable needs a name of letters, digits and _, at "
-                "most 31 long, that starts with a letter; rename it or write CSV"
-            )
+                name=f"column {name!r}",
+                expected="a name of letters, digits and _, at most 31 long, that starts with a "
+                "letter, as MATLAB has them",
+                received="another", remedy="rename it or write CSV",
+            )  # fmt: skip
     buffer = io.BytesIO()
     savemat(buffer, columns, oned_as="column")
     return buffer.getvalue()
@@ -118,9 +116,7 @@ def _parquet(columns: _Columns, units: Mapping[str, str]) -> bytes:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError as e:
-        raise SettingError(
-            'writing Parquet needs pyarrow, which is not installed: pip install "sewfast[parquet]"'
-        ) from e
+        raise not_installed("pyarrow", "writing Parquet", "sewfast[parquet]") from e
     buffer = io.BytesIO()
     pq.write_table(pa.table({labelled(n, units.get(n, "")): c for n, c in columns.items()}), buffer)
     return buffer.getvalue()

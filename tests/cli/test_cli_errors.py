@@ -104,7 +104,7 @@ def test_missing_file(folder: Path) -> None:
         folder, "identify", "nil.csv", "--input", "u", "--output", "y", "-o", "m.json"
     )
     assert "nil.csv" in message
-    assert "no such file" in message
+    assert "No such file" in message
 
 
 def test_wrong_column_names_what_there_is(folder: Path) -> None:
@@ -148,7 +148,7 @@ def test_counts_need_their_resolution(folder: Path) -> None:
         (("--train", "0:9999"), "0:9999"),
         (("--train", "x"), "A:B"),
         (("--train", "0:300", "--validate", "200:400"), "overlap"),
-        (("--validate", "0:400"), "nothing is left"),
+        (("--validate", "0:400"), "samples left to train on, received none"),
         (("--preset", "paper", "--hidden", 9), "paper"),
         (("--model", "oe", "--preset", "paper"), "paper"),
         (("--model", "tree"), "--model"),
@@ -272,7 +272,7 @@ def test_what_only_a_drive_keeps_to_is_refused_without_one(
     folder: Path, command: tuple[str, ...], option: tuple[str, object]
 ) -> None:
     said = refused(folder, *command, "--on", "virtual", *option)
-    assert f"{option[0]} belongs to a drive" in said
+    assert f"{option[0]}: expected a drive" in said
     assert "sewfast device" in said
 
 

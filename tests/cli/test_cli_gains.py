@@ -45,7 +45,9 @@ def test_a_step_recording_becomes_gains(tmp_path: Path) -> None:
 def test_what_does_not_belong_together_is_refused(tmp_path: Path) -> None:
     assert "either a recording" in refused(tmp_path, "gains")
     assert "--K, --T and --L" in refused(tmp_path, "gains", "--K", 1)
-    assert "belongs to" in refused(tmp_path, "gains", *PLANT, "--rule", "amigo", "--Ms", 2)
+    assert "--Ms: expected the rule" in refused(
+        tmp_path, "gains", *PLANT, "--rule", "amigo", "--Ms", 2
+    )
     assert "nearest" in refused(
         tmp_path, "gains", "--K", 1, "--T", 1, "--L", 0.01, "--rule", "table-1"
     )

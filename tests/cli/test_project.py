@@ -131,7 +131,7 @@ def test_units_in_names(name: str, unit: str) -> None:
 def test_in_doubt_it_asks(tmp_path: Path) -> None:
     stranger(tmp_path / "bench.csv", "time_ms;a;b")
     said = refused(tmp_path, "identify", "bench.csv")
-    assert "which column is the input?" in said
+    assert "expected the column of the input" in said
     assert "--input COL" in said
 
 
@@ -148,7 +148,7 @@ def test_quiet_and_verbose(tmp_path: Path) -> None:
     assert third.startswith("identify: done in ")
     assert f"{(tmp_path / 'm.json').resolve()}: written" in sewfast(tmp_path, *fit, "-vv").err
     # errors are not left out, and the two contradict each other
-    assert "no such file" in refused(tmp_path, "identify", "nix.csv", "-q")
+    assert "No such file" in refused(tmp_path, "identify", "nix.csv", "-q")
     assert "not allowed with" in refused(tmp_path, *fit, "-q", "-v")
 
 
@@ -174,7 +174,7 @@ def test_init_lays_out_a_folder_that_can_be_read(tmp_path: Path) -> None:
     assert [Path(f).name for f in done["files"]] == [NAME, "README.md"]
     assert (tmp_path / "spindle" / "recordings").is_dir()
     assert load(tmp_path / "spindle" / NAME).columns == {}
-    assert "there is one already" in refused(tmp_path, "init", "spindle")
+    assert "expected a new file" in refused(tmp_path, "init", "spindle")
 
 
 def test_every_line_that_init_comments_out_is_a_setting(tmp_path: Path) -> None:
@@ -230,7 +230,7 @@ def test_units_that_contradict_the_file_are_refused(tmp_path: Path) -> None:
     toml(tmp_path, '[units]\nspeed_rpm = "rad/s"\n')
     stranger(tmp_path / "bench.csv", "time_ms;voltage_V;speed_rpm")
     said = refused(tmp_path, "identify", "bench.csv")
-    assert "is in RPM, but sewfast.toml says rad/s" in said
+    assert "expected the unit of sewfast.toml, rad/s, received RPM" in said
 
 
 def test_the_range_of_the_command_is_for_tuning(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import pytest
 
 import sewfast
 from foreign_fmu import OF_MOTOR, motor_fmu
+from refusals import refuses
 from sewfast import Controller, Gains, Machine, Recording, VirtualMachine, record, run
 from sewfast.arrays import FloatArray
 from sewfast.commissioning import SteppedBench
@@ -184,7 +185,7 @@ def test_its_recording_goes_into_a_file(machine: Machine, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("u", [np.zeros((100, 1)), "step", [1.0, 2j], [[1.0], [2.0, 3.0]]])
 def test_it_refuses_what_is_no_command(machine: Machine, u: Any) -> None:
-    with pytest.raises(DataError, match="expected an excitation"):
+    with refuses(DataError, name="^u$"):
         record(machine, u)
 
 
@@ -208,11 +209,11 @@ def test_it_refuses_a_controller_of_another_sample_time(machine: Machine) -> Non
 
 @pytest.mark.parametrize("on", [None, 5, "virtual", Lag(), object()])
 def test_what_is_no_machine_is_refused_by_name(on: Any) -> None:
-    with pytest.raises(SettingError, match=f"got {type(on).__name__}"):
+    with refuses(SettingError, received=type(on).__name__):
         record(on, STEP)
-    with pytest.raises(SettingError, match=f"got {type(on).__name__}"):
+    with refuses(SettingError, received=type(on).__name__):
         run(CONTROLLER, on, STEP)
-    with pytest.raises(SettingError, match=f"got {type(on).__name__}"):
+    with refuses(SettingError, received=type(on).__name__):
         machine_of(on)
 
 

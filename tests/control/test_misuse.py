@@ -17,6 +17,7 @@ import pytest
 
 from cli import sewfast as command
 from loops import QUIET, drive
+from refusals import refuses
 from sewfast import (
     Constraints,
     Controller,
@@ -57,7 +58,7 @@ def wrong(value: Any) -> Any:
 
 
 CASES: dict[str, tuple[Callable[[], Any], str]] = {
-    "gains as a tuple": (lambda: Controller(wrong((0.1, 0.2, 0.3))), "expected Gains"),
+    "gains as a tuple": (lambda: Controller(wrong((0.1, 0.2, 0.3))), "gains: expected Gains"),
     "a unit as a number": (lambda: Gains.standard(1, 1, u_unit=wrong(5)), "u_unit"),
     "a form in a list": (lambda: QUIET.gains.to(wrong(["standard"])), "standard, parallel"),
     "MATLAB's form in a list": (lambda: to_matlab(QUIET, wrong(["pid"])), "pid2"),
@@ -71,9 +72,9 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "a rule for a number": (lambda: rules.simc(wrong(3)), "expected an Fopdt"),
     "margins in other units": (
         lambda: margins(QUIET, replace(PLANT, y_unit="rad/s")),
-        "unit 'RPM', got 'rad/s'",
+        "unit 'RPM', received 'rad/s'",
     ),
-    "margins on a model in other units": (lambda: margins(QUIET, IN_RADIANS), "got 'rad/s'"),
+    "margins on a model in other units": (lambda: margins(QUIET, IN_RADIANS), "received 'rad/s'"),
     "frequencies as text": (lambda: loop_response(QUIET, PLANT, wrong(["a"])), "omega"),
     "complex frequencies": (lambda: loop_response(QUIET, PLANT, wrong([1j])), "omega"),
     "the schedule of constant gains": (
@@ -97,7 +98,7 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "costs of nothing": (lambda: costs(wrong(None), drive(), EDGE), "controllers"),
     "costs at several sample times": (
         lambda: costs([QUIET, replace(QUIET, Ts=0.002)], drive(), EDGE),
-        "one sample time",
+        "sample time",
     ),
     "the cost of a number": (lambda: Cost().of(wrong(5)), "closed-loop runs"),
     "limits that are a number": (
@@ -106,7 +107,7 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "a run judged by a model in other units": (
         lambda: judge(run(QUIET, drive(), EDGE), IN_RADIANS),
-        "got 'rad/s'",
+        "received 'rad/s'",
     ),
     "one speed": (lambda: analyse(QUIET, drive(), speeds=wrong(500)), "speeds"),
     "no speed": (lambda: analyse(QUIET, drive(), speeds=[]), "speeds"),
@@ -136,8 +137,8 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: LinearLoop.of(QUIET, drive().to_ss()).to_control("G"),
         "tracking",
     ),
-    "a file named by a null": (lambda: load_controller("a\0b"), "cannot be read"),
-    "a file to a null": (lambda: QUIET.save("a\0b"), "cannot be written"),
+    "a file named by a null": (lambda: load_controller("a\0b"), "can be read"),
+    "a file to a null": (lambda: QUIET.save("a\0b"), "can be written"),
 }
 
 
@@ -223,7 +224,7 @@ def test_gains_on_the_command_line_names_the_option(tmp_path: Path) -> None:
 def test_a_front_needs_a_folder(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="needs the extra 'report'")
     front = pareto(drive(), EDGE, evaluations=40, size=4, threads=1)
-    with pytest.raises(SettingError, match="cannot be written"):
+    with refuses(SettingError, expected="can be written"):
         front.plot(file=tmp_path / "none" / "front.png")
 
 

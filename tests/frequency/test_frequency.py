@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from matplotlib import pyplot
 
 import sewfast
+from refusals import refuses
 from sewfast import VirtualMachine, bode, fit_shaft, load_response
 from sewfast.cli import main
 from sewfast.commissioning import SteppedBench
@@ -150,13 +151,13 @@ def test_a_seed_gives_the_same_bits() -> None:
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({}, "expected the working speed"),
+        ({}, "the working speed"),
         ({"speed": 0.0}, "other than 0"),
         ({"speed": math.nan}, "speed"),
         ({"speed": 1e6}, "steady command"),
         ({"speed": 1500.0, "amplitude": 19.0}, "amplitude: expected above 0"),
         ({"speed": 1500.0, "amplitude": -1.0}, "amplitude"),
-        ({"speed": 1500.0, "amplitude": 1e-6}, "none stands out"),
+        ({"speed": 1500.0, "amplitude": 1e-6}, "none that stands out"),
         ({"speed": 1500.0, "f_min": 600.0}, "f_min"),
         ({"speed": 1500.0, "period": 0.1}, "period"),
         ({"speed": 1500.0, "period": 1e9}, "period"),
@@ -262,10 +263,18 @@ def test_a_record_is_taken_as_it_is_measured() -> None:
         bode(recording.dataset())
     plain = sewfast.Dataset.from_arrays(recording.u, recording.speed("difference"), 1e-3)
     np.testing.assert_array_equal(bode(plain).value, found.value)
-    with pytest.raises(SettingError, match="belongs to a machine"):
+    with refuses(SettingError, name="speed", received="a record"):
         bode(recording, speed=1500.0)
     with pytest.raises(SettingError, match="reference"):
         bode(plain, reference="r")
+
+
+@pytest.mark.parametrize(("scale", "r", "match"), [(1.0, 1.0, "moves"), (1e300, None, "squares")])
+@pytest.mark.filterwarnings("ignore:.*encountered")
+def test_what_gives_no_response_is_refused(scale: float, r: float | None, match: str) -> None:
+    u = scale * np.random.default_rng(5).normal(size=5000)
+    with pytest.raises(DataError, match=match):
+        spectral(u, u, Ts=1e-3, r=None if r is None else np.full(5000, r))
 
 
 def test_a_reference_that_has_nothing_to_do_with_it_is_refused() -> None:
@@ -379,4 +388,4 @@ def test_the_command_shows_the_resonance(
     for wrong in (["bode"], ["bode", "run.csv", "--on", "virtual"], ["bode", "controller.json"]):
         assert main(wrong) == 2
     assert main(["bode", "run.csv", *counts, "--amplitude", "3"]) == 2
-    assert "belongs to a machine" in capsys.readouterr().err
+    assert "expected a machine" in capsys.readouterr().err

@@ -11,6 +11,7 @@ from test_link_drive import Kept
 import link_device as script
 from link_device import ScriptedDevice
 from link_simulated import Clock, SimulatedPort, driven, linked, simulated
+from refusals import refuses
 from sewfast.errors import LinkError
 from sewfast.link import Drive, Plan
 from sewfast.link.connection import RETRY
@@ -144,7 +145,7 @@ def test_a_port_that_comes_back_after_the_abort_is_given_the_stop():
         link = linked(port, watchdog=5.0)
         drive = Drive(link)
         drive.set_limits(volt=10.0)
-        with pytest.raises(LinkError, match="did not come back"):
+        with refuses(LinkError, expected="the port back"):
             drive.stream(Plan("commands", LONG), Kept())
         assert drive.outcome is not None
         assert drive.outcome.state == "idle"

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from link_device import TRIPPED, ScriptedDevice
+from refusals import refuses
 from sewfast.cli import main
 from sewfast.errors import SettingError
 from sewfast.link import Diagnosis, Finding, VirtualDevice, doctor, examine, wire
@@ -148,7 +149,7 @@ def test_a_silent_port_fails_at_the_device(silent: str) -> None:
     found = examine(silent, echoes=10)
     assert [f.name for f in found.findings] == ["port", "device"]
     assert found["device"].verdict == "fail"
-    assert "nothing came" in found["device"].measured
+    assert "received nothing" in found["device"].measured
     assert "supply" in found["device"].remedy
 
 
@@ -191,14 +192,14 @@ def test_what_is_not_there_fails_at_the_port(tmp_path: Path) -> None:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         refused = examine(f"socket://127.0.0.1:{listener.getsockname()[1]}")
-    assert "nobody does" in refused["port"].measured
+    assert "received nobody" in refused["port"].measured
     file = tmp_path / "file"
     file.touch()
     assert examine(str(file))["port"].verdict == "fail"
 
 
 def test_refuses_what_cannot_be_asked() -> None:
-    with pytest.raises(SettingError, match="10 or more echoes"):
+    with refuses(SettingError, name="echoes", expected="10 or more"):
         examine("/dev/null", echoes=0)
 
 

@@ -164,7 +164,7 @@ def test_whether_the_motor_rests_is_for_the_device_to_say(device, drive):
     assert drive.stream(Plan("commands", U), Kept()).is_complete
     assert sum(kind == script.ARM for kind, _ in device.executed) == 4
     device.creeping = 10**9
-    with pytest.raises(LinkError, match="refused: the motor is moving"):
+    with pytest.raises(LinkError, match="a refusal: the motor is moving"):
         drive.stream(Plan("commands", U), Kept())
     assert len(starts(device)) == 1
 

@@ -1,4 +1,4 @@
-"""The live view's pure parts: the feed between two threads, speed, axes, what a frame shows."""
+"""The live view's pure parts: the feed between two threads, speed, what the status line says."""
 
 from __future__ import annotations
 
@@ -15,20 +15,7 @@ from sewfast.cli.arguments import add_view
 from sewfast.errors import DataError, SettingError
 from sewfast.live import Feed, Kind
 from sewfast.live.feed import _MOST, speed_over_window
-from sewfast.live.terminal import (
-    Axis,
-    Frame,
-    Palette,
-    braille,
-    panels,
-    rows_to_climb,
-    spans,
-    status,
-    text,
-)
-
-FINE = Palette(unicode=True, colour=True)
-PLAIN = Palette(unicode=False, colour=False)
+from sewfast.live.terminal import fitted, status
 
 
 def feed(n: int | None = 5000, **settings: float) -> Feed:
@@ -232,59 +219,7 @@ def test_streamed_speed_is_taken_as_it_is() -> None:
     np.testing.assert_array_equal(f.read(0, 50)["speed"], 7.0)
 
 
-# axes and curves
-
-
-@given(
-    low=st.floats(-1e9, 1e9),
-    span=st.one_of(st.just(0.0), st.floats(1e-6, 1e9)),
-    ticks=st.integers(1, 12),
-)
-def test_axis_holds_its_data_and_its_ticks(low: float, span: float, ticks: int) -> None:
-    axis = Axis.around(low, low + span, ticks)
-    slack = 1e-6 * axis.step
-    assert axis.low - slack <= low
-    assert low + span <= axis.high + slack
-    assert axis.low < axis.high
-    assert len(axis.ticks()) > 1
-    assert all(axis.low - slack <= v <= axis.high + slack for v in axis.ticks())
-    assert all(0 <= axis.place(v, 40) < 40 for v in axis.ticks())
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "labels"),
-    [
-        (0.0, 10.0, ["0", "5", "10"]),
-        (-0.3, 0.4, ["-0.2", "0.0", "0.2", "0.4"]),
-        (0.0, 1500.0, ["0", "500", "1000", "1500"]),
-        (3.0, 3.0, ["2", "3", "4"]),
-    ],
-)
-def test_axis_labels(low: float, high: float, labels: list[str]) -> None:
-    axis = Axis.around(low, high, 3)
-    assert [axis.label(v) for v in axis.ticks()] == labels
-
-
-def test_braille_dots_are_where_they_belong() -> None:
-    dots = np.zeros((4, 6), dtype=bool)
-    dots[0, 0] = dots[3, 1] = True
-    dots[:, 4:] = True
-    assert text(braille(dots)[0]) == "⢁ ⣿"
-
-
-def test_spans_join_a_jump_and_leave_a_gap_open() -> None:
-    values = np.array([0.0, 0.0, 5.0, 5.0, np.nan, np.nan, 2.0, 2.0])
-    found = spans(values, np.array([0, 2, 4, 6, 8]))
-    np.testing.assert_array_equal(found.low, [0, 0, np.nan, 2])
-    np.testing.assert_array_equal(found.high, [0, 5, np.nan, 2])
-
-
-def test_spans_hold_a_sparse_sample_and_end_with_the_data() -> None:
-    found = spans(np.array([1.0, 3.0]), np.array([0, 0, 1, 1, 2, 2, 2]))
-    np.testing.assert_array_equal(found.low, [1, 1, 1, 1, np.nan, np.nan])
-
-
-# frames
+# the status line
 
 
 def full(n: int | None = 5000) -> Feed:
@@ -298,88 +233,36 @@ def full(n: int | None = 5000) -> Feed:
     return f
 
 
-def test_frame_says_what_a_user_needs() -> None:
-    f = full()
-    f.say("gap of 100 samples at 3.000 s")
-    lines = Frame.of(f, 100, 24, PLAIN).lines
-    page = "\n".join(lines)
-    for part in (
-        "run trapezoid", "** u   [V]", "** speed   .. r   [RPM]", "3.50 of 5.00 s",
-        "97.14 % received (100 missing, 1 gap)", "gap of 100 samples at 3.000 s", "u 0.39 V",
-    ):  # fmt: skip
-        assert part in page
-    assert page.isascii()
-    assert "\x1b" not in page
-
-
-def test_panels_put_the_reference_behind_the_speed() -> None:
-    upper, lower = panels(full().columns)
-    assert (upper.names, upper.unit) == (["u"], "V")
-    assert (lower.names, lower.unit) == (["speed", "r"], "RPM")
-
-
-@pytest.mark.parametrize(
-    ("columns", "expected"),
-    [
-        ({"u": "V", "counts": ""}, [["u"]]),
-        ({"u": "V", "current": "A", "y": "rad/s"}, [["u"], ["current"]]),
-        ({"t": "s", "u": "V", "r": "rad/s", "y": "rad/s"}, [["u"], ["y", "r"]]),
-        (
-            {"counts": "", "u": "V", "feedback": "RPM", "r": "RPM", "speed": "RPM"},
-            [["u"], ["speed", "r"]],
-        ),
-        ({"counts": ""}, [["counts"]]),
-        ({"u": "V", "y": "V"}, [["u", "y"]]),
-    ],
-)
-def test_panels_of_other_columns(columns: dict[str, str], expected: list[list[str]]) -> None:
-    assert [p.names for p in panels(columns)] == expected
+def test_status_says_what_a_user_needs() -> None:
+    line = status(full(), 100)
+    assert line.startswith("3.50 of 5.00 s   97.14 % received (100 missing, 1 gap)   speed ")
+    assert line.endswith("RPM   u 0.39 V")
 
 
 def test_missing_samples_never_read_as_all() -> None:
     f = feed(None)
     f.put(1, ramp(1, 99_999))
-    assert "99.99 % received" in status(f, 80, PLAIN)
+    assert "99.99 % received" in status(f, 80)
 
 
 @given(
-    columns=st.integers(1, 250),
-    rows=st.integers(1, 80),
+    width=st.integers(0, 250),
     values=st.lists(st.floats(width=32), min_size=1, max_size=60),
     said=st.text(max_size=300),
-    unicode=st.booleans(),
-    colour=st.booleans(),
 )
 @settings(max_examples=150, deadline=None)
-def test_frame_fits_whatever_is_in_it(
-    columns: int, rows: int, values: list[float], said: str, unicode: bool, colour: bool
-) -> None:
-    """Any size, any values, any text of others: no line too long, no sequence that is not ours."""
+def test_a_line_fits_whatever_is_in_it(width: int, values: list[float], said: str) -> None:
+    """Any width, any values, any text of others: never too long, and nothing that moves."""
     f = Feed({"u": "V", "r": "RPM"}, 0.5, 30, said, counts_per_rev=None)
+    before = status(f, width)
     f.put(3, {"u": np.array(values), "r": -np.array(values)})
-    f.say(said)
-    frame = Frame.of(f, columns, rows, Palette(unicode, colour))
-    assert len(frame.lines) <= max(rows - 1, 1)
-    assert all(w <= max(columns - 1, 1) for w in frame.widths)
-    page = "".join(frame.lines)
-    assert unicode or page.isascii()
-    ours = page.count("\x1b[0m") + sum(page.count(f"\x1b[{k}m") for k in (2, 32, 33, 35, 36))
-    assert page.count("\x1b") == ours
-    assert colour or ours == 0
-    assert all(c.isprintable() for c in page.replace("\x1b", ""))
+    for line in (before, status(f, width), fitted(said, width)):
+        assert len(line) <= max(width, 1)
+        assert all(c.isprintable() for c in line)
 
 
-def test_frame_before_the_first_sample_is_one_line() -> None:
-    lines = Frame.of(feed(), 80, 24, FINE).lines
-    assert lines == ("record step on virtual: waiting for the first sample",)
-
-
-def test_narrower_terminal_has_broken_the_lines() -> None:
-    drawn = Frame(("a" * 79, "", "b" * 40), (79, 0, 40))
-    assert rows_to_climb(None, 80, 24) == 0
-    assert rows_to_climb(drawn, 80, 24) == 3
-    assert rows_to_climb(drawn, 39, 24) == 3 + 1 + 2
-    assert rows_to_climb(drawn, 39, 4) == 3
+def test_status_before_the_first_sample() -> None:
+    assert status(feed(), 79) == "record step on virtual: waiting for the first sample"
 
 
 # its name on the command line

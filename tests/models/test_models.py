@@ -131,7 +131,7 @@ def test_what_does_not_fit_the_model_is_refused(model: Model) -> None:
     with pytest.raises(DataError, match=r"expected 1 inputs.*received 2"):
         model.simulate(linear_data(inputs=2))
     slow = Dataset.from_arrays(np.ones(30), np.ones(30), 0.02)
-    with pytest.raises(DataError, match=r"Ts = 0\.01 s, the data have 0\.02"):
+    with pytest.raises(DataError, match=r"Ts = 0\.01 s, received 0\.02"):
         model.simulate(slow)
     metric = Dataset.from_arrays(np.ones(30), np.ones(30), 0.01, output_unit="rad/s")
     with pytest.raises(DataError, match=r"'RPM'.*'rad/s'"):

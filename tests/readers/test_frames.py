@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import sewfast
+from refusals import refuses
 from sewfast import DataError, Dataset, SettingError
 
 TS = 0.01
@@ -245,7 +246,7 @@ def test_a_stream_without_pyarrow_is_refused(monkeypatch: pytest.MonkeyPatch) ->
             raise AssertionError
 
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(SettingError, match=r"Stream needs pyarrow.*sewfast\[parquet\]"):
+    with refuses(SettingError, name="pyarrow", expected="Stream", remedy=r"sewfast\[parquet\]"):
         sewfast.read(Stream(), inputs="u")
 
 

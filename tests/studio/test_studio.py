@@ -19,6 +19,7 @@ import pytest
 
 import sewfast
 from cli import PROGRAM, environment
+from moments import until
 from sewfast.errors import SettingError
 from sewfast.studio import Project, Step, Studio
 from sewfast.studio.commissioning import envelope
@@ -448,6 +449,27 @@ def test_a_missing_extra_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(sys.modules, "websockets.sync.server", None)
     with pytest.raises(SettingError, match=r"sewfast\[studio\]"):
         Studio(Project(folder))
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="needs the signals of POSIX")
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_closed_terminal_leaves_as_little_as_ctrl_c(folder: Path, name: str) -> None:
+    command = [*PROGRAM, "studio", str(folder), "--no-browser"]
+    with subprocess.Popen(
+        command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        address, _, token = process.stdout.readline().rstrip().partition("/#")
+        place = address.replace("http", "ws") + "/socket"
+        with websockets.connect(place, origin=address) as page:
+            page.send(token)
+            page.send(json.dumps({"do": "upload", "file": "half.csv", "size": 10}))
+            until(lambda: list(folder.glob(".*.part")))
+            for _ in range(2):  # as a shell does
+                process.send_signal(getattr(signal, name))
+            _, err = process.communicate(timeout=20)
+    assert (process.returncode, err) == (0, "")
+    assert not list(folder.glob(".*.part"))
 
 
 def test_ctrl_c_ends_it_cleanly(folder: Path) -> None:

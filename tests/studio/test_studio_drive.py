@@ -506,6 +506,9 @@ def _passes(asked: dict[str, Any]) -> bool:
         {"do": "live", "seconds": 1e9, "columns": 10},
         {"do": "live", "seconds": 1, "columns": 10**9},
         {"do": "alive", "n": -1},
+        {"do": "alive", "n": 10**400},
+        {"do": "live", "seconds": 1, "columns": 10**400},
+        {"do": "upload", "file": "a.csv", "size": 10**400},
         {"do": "stop", "why": "x"},
     ],
 )

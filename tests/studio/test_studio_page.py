@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+import sewfast
 from moments import until
 from sewfast.errors import FitError
 from sewfast.studio import Studio
@@ -363,6 +364,86 @@ def test_a_notch_is_put_in_and_taken_out(tuned: Studio, browser: Any) -> None:
     assert len(browser.find_elements("css selector", "#notches li")) == 1
     browser.find_element("css selector", "#notches button").click()
     until(lambda: browser.execute_script(NUMBER, "noise gain") == before)
+
+
+@pytest.mark.alone
+def test_a_search_has_the_limits_weights_and_seconds_of_the_page(
+    tuned: Studio, browser: Any
+) -> None:
+    def at(name: str) -> Any:
+        return browser.find_element("id", name)
+
+    def write(name: str, value: str) -> None:
+        at(name).clear()
+        at(name).send_keys(value)
+
+    browser.get(tuned.address)
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    at("tune-within").click()
+    write("limit-Ms", "1.9")
+    write("limit-overshoot", "70")
+    browser.execute_script("document.querySelector('#weights').parentElement.open = true")
+    write("weight-chatter", "3.5")
+    write("evaluations", "20")
+    at("search").click()
+    until(lambda: "found: cost" in at("tune-progress").text)
+    at("copy-python").click()
+    until(lambda: "tune(" in at("tune-copy").text)
+    limits = "constraints=sewfast.Constraints(Ms=1.9, overshoot=70)"
+    for part in (limits, "cost=sewfast.Cost(chatter=3.5)", "evaluations=20"):
+        assert part in at("tune-copy").text
+    write("evaluations", "20000")
+    write("tune-seconds", "0.5")
+    at("search").click()
+    until(lambda: "time is up" in at("tune-progress").text)
+
+
+@pytest.mark.alone
+def test_what_is_shown_follows_its_files(tuned: Studio, browser: Any) -> None:
+    """A start that is saved over keeps its notch once; another model of the name is noticed."""
+
+    def at(name: str) -> Any:
+        return browser.find_element("id", name)
+
+    def notches() -> list[Any]:
+        return list(browser.find_elements("css selector", "input[type=range][id^=knob-notch_f]"))
+
+    folder = tuned.project.folder
+    browser.set_window_size(1600, 1000)
+    browser.get(tuned.address)
+    until(lambda: browser.execute_script(NUMBER, "Ms"))
+    at("save").click()
+    until(lambda: len(at("tune-start").find_elements("tag name", "option")) == 2)
+    at("tune-start").send_keys("controller.json")
+    until(lambda: "start" in at("cost").text and not at("cost").get_attribute("class").count("old"))
+    at("notch-hz").send_keys("60")
+    at("add-notch").click()
+    until(lambda: len(notches()) == 1)
+    for _ in range(2):  # the second would add the notch of the file to that of the page
+        browser.execute_script("document.getElementById('saved').textContent = ''")
+        at("save").click()
+        until(lambda: "written" in at("saved").text)
+        until(lambda: not browser.find_elements("css selector", "#notches li"))
+        assert len(sewfast.load_controller(folder / "controller.json").biquads) == 1
+        assert len(notches()) == 1
+    assert at("tune-error").text == ""
+    first = browser.execute_script(NUMBER, "Ms")
+    model = sewfast.load_model(folder / "drive.json").members[0]
+    model.save(folder / "drive.json")
+    at("knob-Kp").send_keys("\ue014")
+    until(lambda: "has changed" in at("tune-error").text)
+    until(lambda: at("tune-members").text == "one model")
+    until(lambda: browser.execute_script(NUMBER, "Ms") != first)
+
+
+@pytest.mark.alone
+def test_a_question_that_is_cut_off_is_said_to_be(studio: Studio, browser: Any) -> None:
+    browser.get(studio.address)
+    until(lambda: browser.execute_script("return document.querySelector('#inputs').length > 0"))
+    browser.find_element("id", "look").click()
+    studio.close()
+    until(lambda: "reload" in browser.find_element("id", "control").text)
+    until(lambda: browser.find_element("id", "look").is_enabled())
 
 
 @pytest.mark.alone

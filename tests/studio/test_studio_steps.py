@@ -17,7 +17,8 @@ import sewfast
 from cli import environment
 from moments import until
 from sewfast.frequency import load_response
-from sewfast.studio import Project, Step, Studio
+from sewfast.studio import Commission, Project, Step, Studio
+from sewfast.studio.commissioning import carry_out
 from sewfast.studio.loops import shown_loop, shown_response
 from sewfast.studio.uploads import Upload
 from studio_page import Page
@@ -337,6 +338,64 @@ def test_a_full_disk_is_said_so(folder: Path) -> None:
 
 
 # --- The rest -------------------------------------------------------------------------------------
+
+
+def test_files_of_pages_that_go_at_once_are_not_kept(folder: Path) -> None:
+    with Studio(Project(folder)) as studio:
+        for k in range(12):
+            with Page(studio) as page:
+                page.socket.send(json.dumps({"do": "take"}))
+                page.socket.send(json.dumps({"do": "upload", "file": f"{k}.csv", "size": 10}))
+        until(lambda: not studio._pages and not list(folder.glob(".*.part")))
+        assert not studio._uploads
+
+
+def test_a_folder_without_rights_is_said_so_before_anything_takes_long(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # root may write everywhere, so that rights alone do not show it
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    step = Step("run.csv", ("u",), "y")
+    with pytest.raises(sewfast.SettingError, match="can be written to"):
+        Project(folder).identify(step)
+    with pytest.raises(sewfast.SettingError, match="can be written to"):
+        carry_out(Commission(), sewfast.VirtualMachine(), folder, lambda *_: None)
+
+
+def test_a_link_to_a_closed_place_hides_nothing_else(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = Path.is_file
+
+    def refuse(path: Path) -> bool:
+        if path.name == "closed.csv":
+            raise PermissionError(13, "Permission denied")
+        return usual(path)
+
+    (folder / "closed.csv").symlink_to(folder / "elsewhere" / "closed.csv")
+    monkeypatch.setattr(Path, "is_file", refuse)
+    assert Project(folder).recordings() == ["run.csv", "run2.csv"]
+    assert Project(folder).documents("sewfast.model") == []
+
+
+def test_pages_with_different_starts_keep_their_searches(tuned: Studio) -> None:
+    project = tuned.project
+    first = project.tuning("drive.json")
+    first.controller({}).save(project.folder / "c.json")
+    other = project.tuning("drive.json", "c.json")
+    assert project.tuning("drive.json") is first
+    assert project.tuning("drive.json", "c.json") is other
+    first.controller({"Kp": 0.02}).save(project.folder / "c.json")
+    later = project.tuning("drive.json", "c.json")
+    assert later.start.gains.Kp == 0.02
+    assert later.move({})[0]["stamp"] == later.opened()["stamp"] != other.stamp
+
+
+def test_no_gain_at_all_is_shown_without_a_warning(tuned: Studio) -> None:
+    with np.errstate(all="raise", under="ignore"):
+        numbers, curves = tuned.project.tuning("drive.json").move({"Kp": 0.0})
+    assert numbers["stable"]
+    assert np.isnan(curves["L_deg"]).all()
 
 
 def test_a_folder_that_is_gone_is_said_so(folder: Path) -> None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import sewfast
 from documents import Command
+from refusals import refuses
 from sewfast.control import Controller, Gains, load_controller
 from sewfast.control.defaults import (
     catalogue_fits,
@@ -205,7 +206,7 @@ def test_what_does_not_settle_needs_a_start_and_then_runs() -> None:
 
 def test_a_drive_is_not_moved_without_a_reference() -> None:
     controller = first_controller(drive(0.01, 0.2, 10.0, (-3.0, 3.0)))
-    with pytest.raises(SettingError, match="reference for a drive"):
+    with refuses(SettingError, name="reference", expected="for a drive"):
         sewfast.run(controller, object())  # type: ignore[arg-type]
 
 

@@ -108,7 +108,7 @@ def test_recovery_may_be_an_objective() -> None:
         ({"disturbance": 0.0}, "disturbance of a load step other than 0"),
         ({"band": 0.0}, "band of a load step other than 0"),
         ({"look": 0.0}, "look of a load step other than 0"),
-        ({"level": float("nan")}, "a number for level"),
+        ({"level": float("nan")}, "level: expected a number"),
         ({"settle": -1.0}, "settle of a load step of 0 or more"),
         ({"band": "wide"}, "band"),
     ],

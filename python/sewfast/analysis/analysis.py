@@ -133,23 +133,16 @@ class Analysis:
 
         Parameters
         ----------
-        ax : Axes or sequence of Axes, optional
-            One gets the figure's first panel; several get as many panels, in reading order: output
-            and command after both steps; |L|, |S|, phase of L and |T|; cost and Ms.
+        ax, file
+            As for `Drawing.plot`. The panels in reading order are output and command after both
+            steps; |L|, |S|, phase of L and |T|; cost and Ms.
         figure : str, optional
             `responses`, `bode`, `sensitivity` or `what_if`.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the panels of a new figure, shape (panels,).
 
         Raises
         ------
         SettingError
-            For another figure, if matplotlib is not installed, or the file cannot be written.
+            For another figure, or as `Drawing.plot`.
         """
         from .figures import drawing
 

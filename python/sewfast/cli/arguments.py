@@ -86,7 +86,7 @@ def add_view(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--live", metavar="KIND", type=_kind, default="auto",
         help="watch it run: terminal, none, plotjuggler[:HOST:PORT], foxglove[:PORT]; auto (the "
-        "default) is a plot on standard error where that is a terminal",
+        "default) is a status line where standard error is a terminal",
     )  # fmt: skip
 
 
@@ -171,6 +171,9 @@ def require_place(path: Path | None, suffixes: tuple[str, ...], *, option: str =
             f"{path.suffix or 'none'!r}"
         )
     if not path.parent.is_dir():
-        raise SettingError(f"{option} {path}: the folder {path.parent} does not exist; create it")
+        raise SettingError(
+            name=f"{option} {path}", expected="a folder that exists", received="none",
+            remedy=f"create {path.parent}",
+        )  # fmt: skip
     if path.is_dir():
         raise SettingError(f"{option} {path}: expected a file, received a folder")

@@ -120,8 +120,9 @@ def command(args: argparse.Namespace) -> None:
     for name in ("Ms", "u_max"):
         if getattr(args, name) is not None and args.propose is None:
             raise SettingError(
-                f"--{name.replace('_', '-')}: belongs to --propose FILE.json; give that as well"
-            )
+                name=f"--{name.replace('_', '-')}", expected="--propose FILE.json with it",
+                received="none", remedy="give that as well",
+            )  # fmt: skip
     if (args.on is None) == (args.data is None):
         received = "neither" if args.on is None else "both"
         raise SettingError(
@@ -214,9 +215,9 @@ def _of_record(args: argparse.Namespace) -> FrequencyResponse:
     for name in _ON_A_MACHINE:
         if name != "speed" and getattr(args, name) is not None:
             raise SettingError(
-                f"--{name.replace('_', '-')}: belongs to a machine, --on, received a record; leave "
-                "it out"
-            )
+                name=f"--{name.replace('_', '-')}", expected="a machine, --on", received="a record",
+                remedy="leave it out",
+            )  # fmt: skip
     if args.data.endswith(".json"):
         if storage.format_of(args.data) != FORMAT:
             raise SettingError(

@@ -231,8 +231,9 @@ def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
     data.require_inputs()
     if abs(data.Ts - Ts) > 0.01 * Ts:
         raise DataError(
-            f"{text}: sampled every {data.Ts:g} s, the loop every {Ts:g} s; resample the reference"
-        )
+            name=text, expected=f"the loop's sample time of {Ts:g} s", received=f"{data.Ts:g} s",
+            remedy="resample the reference",
+        )  # fmt: skip
     given = data.input_units[0]
     speeds = {given.lower(), unit.lower()}
     if len(speeds) > 1 and speeds <= REVOLUTIONS_PER_SECOND.keys():

@@ -84,9 +84,9 @@ def _of_recording(
 
 def _unnamed(table: Table, what: str, remedy: str) -> SettingError:
     return SettingError(
-        f"{table.path}: which column is the {what}? available: {', '.join(table.names)}; "
-        f"name it: {remedy}"
-    )
+        name=str(table.path), expected=f"the column of the {what} by its name", received="none",
+        remedy=f"available: {', '.join(table.names)}; name it: {remedy}",
+    )  # fmt: skip
 
 
 def read_for_model(
@@ -179,9 +179,9 @@ def _without(data: Dataset, held: Dataset) -> Dataset:
         pieces += [whole.cut(after, len(whole))] if after < len(whole) else []
     if not pieces:
         raise SettingError(
-            "--validate: the range covers every sample, so nothing is left to train on; give a "
-            "smaller one, or --train A:B"
-        )
+            name="--validate", expected="samples left to train on", received="none",
+            remedy="give a smaller range, or --train A:B",
+        )  # fmt: skip
     return replace(data, experiments=tuple(pieces))
 
 
@@ -189,9 +189,12 @@ def _require_apart(train: Dataset, held: Dataset) -> None:
     for a, b in zip(train.experiments, held.experiments, strict=True):
         if a.start < b.start + len(b) and b.start < a.start + len(a):
             raise SettingError(
-                f"--train {a.range_text} and --validate {b.range_text} overlap in {a.name}; what a "
-                "model was trained on says nothing about it: give ranges that do not overlap"
-            )
+                name="--train, --validate",
+                expected="ranges that do not overlap, as what a model was trained on says "
+                "nothing about it",
+                received=f"{a.range_text} and {b.range_text} of {a.name}",
+                remedy="change one of them",
+            )  # fmt: skip
 
 
 # --- Options that prepare data before they are used, in the order in which they act ---------------
@@ -347,9 +350,9 @@ def _unnamed_columns(args: argparse.Namespace) -> list[Table]:
 def _show_columns(tables: list[Table], args: argparse.Namespace) -> None:
     if args.plot is not None:
         raise SettingError(
-            f"--plot: which column is the input, which the output? available: "
-            f"{', '.join(tables[0].names)}; name them: --input COL --output COL"
-        )
+            name="--plot", expected="which column is the input, which the output", received="none",
+            remedy=f"name them of {', '.join(tables[0].names)}: --input COL --output COL",
+        )  # fmt: skip
     columns = {str(t.path): _columns(t) for t in tables}
     if args.json:
         print_json({path: [vars(c) for c in found] for path, found in columns.items()})

@@ -229,10 +229,10 @@ def require_no_drive_options(args: argparse.Namespace) -> None:
     for name, is_given in given.items():
         if is_given:
             raise SettingError(
-                f"{name} belongs to a drive behind a port, received --on {args.on}; leave it out, "
-                "or serve a virtual machine as a drive, which keeps to limits: "
-                "`sewfast device --link DRIVE --fast`, then --on DRIVE"
-            )
+                name=name, expected="a drive behind a port", received=f"--on {args.on}",
+                remedy="leave it out, or serve a virtual machine as a drive, which keeps to "
+                "limits: `sewfast device --link DRIVE --fast`, then --on DRIVE",
+            )  # fmt: skip
 
 
 @contextmanager

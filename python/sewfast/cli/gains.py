@@ -129,7 +129,9 @@ def _rule(args: argparse.Namespace, plant: Fopdt) -> Rule:
         ("--nearest", args.nearest or None, "table-1"),
     ):  # fmt: skip
         if value is not None and not args.rule.startswith(rule):
-            raise SettingError(f"{option} belongs to the rule {rule}, received {args.rule}")
+            raise SettingError(
+                name=option, expected=f"the rule {rule}", received=args.rule, remedy="leave it out"
+            )
     if args.rule == "eq-12":
         return rules.eq_12(plant, Ms=2.0 if args.Ms is None else args.Ms)
     if args.rule == "table-1":

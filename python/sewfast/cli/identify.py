@@ -263,9 +263,9 @@ def _identify(
 
     if args.further is not None and args.model != "auto":
         raise SettingError(
-            f"--further: the model in {args.further} keeps its kind, received --model "
-            f"{args.model}; leave one of them out"
-        )
+            name="--further", expected="no --model with it, as a model keeps its kind",
+            received=f"--model {args.model}", remedy="leave one of them out",
+        )  # fmt: skip
     return identify(
         train,
         model=args.model if args.further is None else load_model(args.further),

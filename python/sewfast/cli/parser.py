@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from ..errors import SettingError
+from ..errors import not_installed
 from . import (
     bode,
     check,
@@ -189,9 +189,7 @@ def completion_command(args: argparse.Namespace) -> None:
     try:
         import shtab
     except ImportError as e:
-        raise SettingError(
-            'completion needs shtab, which is not installed: pip install "sewfast[completion]"'
-        ) from e
+        raise not_installed("shtab", "completion", "sewfast[completion]") from e
 
     parser = build_parser()
     _complete_files(parser, shtab.FILE)

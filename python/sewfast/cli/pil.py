@@ -88,7 +88,10 @@ def command(args: argparse.Namespace) -> int:
         note("compiling the firmware")
         firmware = build_firmware(args.source, board=args.board or "mps2-an386")
     elif args.board is not None:
-        raise SettingError("--board: leave it out with --firmware, which states the board")
+        raise SettingError(
+            name="--board", expected="none with --firmware, which states the board", received="one",
+            remedy="leave it out",
+        )  # fmt: skip
     with EmulatedBoard(firmware, clock=args.clock, boot_id=args.seed + 1) as board:
         _prepare(args.out, args.overwrite, make=True)
         first = Controller(

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import SettingError, printable
+from ..errors import SettingError, not_installed, printable, unreadable, unwritable
 from .arguments import Commands, add_command
 from .drive import LIMITS, is_port
 from .output import note, print_json
@@ -197,14 +197,11 @@ def _parsed(path: Path) -> dict[str, Any]:
     try:
         toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     except ModuleNotFoundError:
-        raise SettingError(
-            f"{path}: reading it on Python 3.10 needs tomli, which is not installed: "
-            "pip install tomli, or use Python 3.11 or newer"
-        ) from None
+        raise not_installed("tomli", f"{path} on Python 3.10") from None
     try:
         raw = path.read_bytes()
     except OSError as e:
-        raise SettingError(f"{path}: cannot be read: {e.strerror}") from e
+        raise unreadable(SettingError, path, e) from e
     if len(raw) > _LARGEST:
         raise SettingError(f"{path}: expected a few lines of settings, received {len(raw)} bytes")
     try:
@@ -278,9 +275,9 @@ def with_units(table: Table, args: argparse.Namespace) -> Table:
         stated = table.units.get(name, "")
         if stated and stated != unit:
             raise SettingError(
-                f"{table.path}: column {name!r} is in {stated}, but {NAME} says {unit}; correct "
-                "one of them"
-            )
+                name=f"{table.path}: column {name!r}", expected=f"the unit of {NAME}, {unit}",
+                received=f"{stated}", remedy="correct one of them",
+            )  # fmt: skip
     return replace(table, units={**table.units, **known})
 
 
@@ -371,7 +368,10 @@ def init_command(args: argparse.Namespace) -> None:
         raise SettingError(f"{folder}: expected a folder, received a file; name another one")
     place = folder / NAME
     if place.exists():
-        raise SettingError(f"{place}: there is one already; change it, or take it away first")
+        raise SettingError(
+            name=str(place), expected="a new file", received="one that exists",
+            remedy="change it, or take it away first",
+        )  # fmt: skip
     texts = {
         place: _TOML.format(columns=columns, units=units),
         folder / "README.md": _README.format(name=folder.resolve().name),
@@ -382,7 +382,7 @@ def init_command(args: argparse.Namespace) -> None:
         for path in made:
             path.write_text(texts[path], encoding="utf-8")
     except OSError as e:
-        raise SettingError(f"{folder}: cannot be written to: {e.strerror}") from e
+        raise unwritable(SettingError, folder, e) from e
     load(place)  # what is written here can be read here
     if args.json:
         print_json({"folder": str(folder), "files": [str(path) for path in made]})

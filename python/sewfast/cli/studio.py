@@ -49,6 +49,7 @@ def add(commands: Commands) -> None:
 
 def studio_command(args: argparse.Namespace) -> None:
     import contextlib
+    import signal
     import tempfile
     import threading
     import webbrowser
@@ -59,6 +60,12 @@ def studio_command(args: argparse.Namespace) -> None:
     if args.demo and args.place is not None:
         raise SettingError(f"--demo: expected no folder, received {args.place}; leave one out")
     with contextlib.ExitStack() as left, contextlib.suppress(KeyboardInterrupt):
+        # a closed terminal or a shutdown leaves as little behind as Ctrl-C
+        for name in ("SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) == signal.SIG_DFL:
+                signal.signal(number, _end)
+                left.callback(signal.signal, number, signal.SIG_DFL)
         port = args.place if args.place is not None and is_port(args.place) else None
         place = "." if port is not None else args.place or "."
         if args.demo:
@@ -72,3 +79,11 @@ def studio_command(args: argparse.Namespace) -> None:
         if args.browser:
             webbrowser.open(studio.address)
         threading.Event().wait()
+
+
+def _end(number: int, _: object) -> None:
+    """Take a signal as Ctrl-C; the second that a shell sends must not end the clearing up."""
+    import signal
+
+    signal.signal(number, signal.SIG_IGN)
+    raise KeyboardInterrupt

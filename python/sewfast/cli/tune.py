@@ -191,16 +191,19 @@ def tune_command(args: argparse.Namespace) -> int | None:
         raise SettingError("--front: expected --pareto with the objectives of the front as well")
     if args.pareto is not None and args.time_budget is not None:
         raise SettingError(
-            "--time-budget: a front has no best so far to end with; leave it or --pareto out"
-        )
+            name="--time-budget", expected="no --pareto, as a front has no best so far to end with",
+            received="both", remedy="leave one of them out",
+        )  # fmt: skip
     if args.pareto is not None and args.method != "genetic":
         raise SettingError(
-            "--method: a front is searched by NSGA-II; leave --method or --pareto out"
-        )
+            name="--method", expected="no --pareto, as a front is searched by NSGA-II",
+            received="both", remedy="leave one of them out",
+        )  # fmt: skip
     if args.pareto is not None and args.rival is not None:
         raise SettingError(
-            "--rival: a second opinion is on one controller; leave --rival or --pareto out"
-        )
+            name="--rival", expected="no --pareto, as it is a second opinion on one controller",
+            received="both", remedy="leave one of them out",
+        )  # fmt: skip
     require_place(args.front, (*TABLES, *FIGURES), option="--front")
     models = [load_model(path) for path in args.model]
     first = models[0]
@@ -356,8 +359,10 @@ def _first(args: argparse.Namespace) -> dict[str, Any]:
 
     if args.controller != "pid":
         raise SettingError(
-            "--start: the file says of which kind its controller is; leave out --controller"
-        )
+            name="--start",
+            expected="no --controller, as the file says of which kind its controller is",
+            received="both", remedy="leave out --controller",
+        )  # fmt: skip
     given = [
         "--" + option.replace("_", "-")
         for option in ("u_min", "u_max", "limits_of", "counts_per_rev", "filter", "unit")
@@ -365,9 +370,9 @@ def _first(args: argparse.Namespace) -> dict[str, Any]:
     ]
     if given:
         raise SettingError(
-            "--start: the controller brings its own limits, encoder and filters; leave out "
-            f"{', '.join(given)}, or change them in {args.start}"
-        )
+            name="--start", expected="the controller's own limits, encoder and filters",
+            received=", ".join(given), remedy=f"leave them out, or change them in {args.start}",
+        )  # fmt: skip
     return {"start": load_controller(args.start)}
 
 

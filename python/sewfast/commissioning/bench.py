@@ -134,9 +134,10 @@ class DriveBench(Around):
     def _require_whole(self, name: str) -> None:
         if not self._is_whole:
             raise LinkError(
-                f"{name}: expected every sample of the run, received twice not all, at last: "
-                f"{self.drive.outcome}; mend the link (sewfast doctor PORT), then commission again"
-            )
+                name=name, expected="every sample of the run",
+                received=f"twice not all, at last: {self.drive.outcome}",
+                remedy="mend the link (sewfast doctor PORT), then commission again",
+            )  # fmt: skip
 
 
 @dataclass

@@ -71,9 +71,10 @@ class Taken:
                 clear(self.folder)
         except OSError as error:
             raise DataError(
-                f"{self.folder / FOLDER}: recordings of an earlier commissioning cannot be taken "
-                f"away ({error.strerror}); choose another folder"
-            ) from error
+                name=str(self.folder / FOLDER),
+                expected="recordings of an earlier commissioning that can be taken away",
+                received=error.strerror, remedy="choose another folder",
+            ) from error  # fmt: skip
         prepare(self.folder / FOLDER)
 
     def keep(
@@ -158,8 +159,9 @@ def prepare(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(
-            f"{folder}: cannot be made ({error.strerror}); choose a folder that is writable"
-        ) from error
+            name=str(folder), expected="a folder that can be made", received=error.strerror,
+            remedy="choose one that is writable",
+        ) from error  # fmt: skip
 
 
 def clear(folder: Path) -> None:
@@ -183,9 +185,10 @@ def require_repeatable(folder: Path) -> None:
     for file in _inside(folder / FOLDER):
         if not _is_own(file):
             raise SettingError(
-                f"{file}: expected nothing but recordings of a commissioning in this folder; "
-                "choose another folder, or overwrite them (--overwrite)"
-            )
+                name=str(file), expected="a folder with recordings of a commissioning alone",
+                received="another file",
+                remedy="choose another folder, or overwrite them (--overwrite)",
+            )  # fmt: skip
         require_replaceable(file, overwrite=False)
 
 

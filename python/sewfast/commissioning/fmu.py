@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ..control.machine import SteppedBench
-from ..errors import ModelFileError, SettingError
+from ..errors import ModelFileError, SettingError, not_installed
 from .fmu_process import FmuProcess
 
 MOST_BYTES = 2 * 1024**3
@@ -82,11 +82,14 @@ class FmuMachine:
         self.path, self.timeout = Path(path), float(timeout)
         self.Ts, self.counts_per_rev = float(Ts), float(counts_per_rev)
         if not (self.Ts > 0.0 and math.isfinite(self.Ts)):
-            raise SettingError(f"Ts: expected a time above 0 s, received {Ts!r}; 0.001 is usual")
+            raise SettingError(
+                name="Ts", expected="a time above 0 s", received=repr(Ts), remedy="0.001 is usual"
+            )
         if not self.timeout > 0.0:
             raise SettingError(
-                f"timeout: expected a time above 0 s, received {timeout!r}; 60 is usual"
-            )
+                name="timeout", expected="a time above 0 s", received=repr(timeout),
+                remedy="60 is usual",
+            )  # fmt: skip
         _require_fmu(self.path)
         self._fmpy = _library()
         self._folder = tempfile.mkdtemp(prefix="sewfast-fmu-")
@@ -99,9 +102,9 @@ class FmuMachine:
         self._input = self._reference(input)
         if self._variables[input].causality != "input":
             raise SettingError(
-                f"{self.path}: expected an input as input=, got {input!r}; it has inputs "
-                f"{self._names('input')}"
-            )
+                name=str(self.path), expected="an input as input=", received=repr(input),
+                remedy=f"it has inputs {self._names('input')}",
+            )  # fmt: skip
         self._counts = None if counts is None else self._reference(counts)
         self._angle = None if angle is None else self._reference(angle)
         self._speed = None if speed is None else self._reference(speed)
@@ -127,37 +130,38 @@ class FmuMachine:
         except Exception as error:
             said = str(error).strip().splitlines()
             raise ModelFileError(
-                f"{self.path}: expected an FMU whose model description is valid, got "
-                f"{' '.join(said[:2])[:300] or type(error).__name__}; export it again"
-            ) from error
+                name=str(self.path), expected="an FMU whose model description is valid",
+                received=" ".join(said[:2])[:300] or type(error).__name__, remedy="export it again",
+            ) from error  # fmt: skip
         if found.coSimulation is None:
             raise ModelFileError(
-                f"{self.path}: expected an FMU for co-simulation, got one for model exchange only; "
-                "export it for co-simulation, with its solver"
-            )
+                name=str(self.path), expected="an FMU for co-simulation",
+                received="one for model exchange only",
+                remedy="export it for co-simulation, with its solver",
+            )  # fmt: skip
         name = found.coSimulation.modelIdentifier
         if not re.fullmatch(r"\w+", name):
             raise ModelFileError(
-                f"{self.path}: expected a name of letters, digits and _ as modelIdentifier, got "
-                f"{name[:80]!r}; do not use it"
-            )
+                name=str(self.path), expected="a name of letters, digits and _ as modelIdentifier",
+                received=repr(name[:80]), remedy="do not use it",
+            )  # fmt: skip
         own, present = self._fmpy.platform, self._fmpy.supported_platforms(self._folder)
         tuple_name = getattr(self._fmpy, "platform_tuple", own)
         if not {own, tuple_name} & set(present):
             got = ", ".join(present) or "none"
             raise ModelFileError(
-                f"{self.path}: expected a binary for {tuple_name}, got {got}; export it for this "
-                "platform, or compile its sources"
-            )
+                name=str(self.path), expected=f"a binary for {tuple_name}", received=str(got),
+                remedy="export it for this platform, or compile its sources",
+            )  # fmt: skip
         return found
 
     def _only(self, causality: str, options: str) -> str:
         names = [v.name for v in self._variables.values() if v.causality == causality]
         if len(names) != 1:
             raise SettingError(
-                f"{self.path}: expected {options} among {len(names)} {causality}s, received none; "
-                f"name one of {self._names(causality)}"
-            )
+                name=str(self.path), expected=f"{options} among {len(names)} {causality}s",
+                received="none", remedy=f"name one of {self._names(causality)}",
+            )  # fmt: skip
         return str(names[0])
 
     def _names(self, causality: str) -> str:
@@ -170,9 +174,9 @@ class FmuMachine:
         if found is None or found.type not in ("Real", "Float64"):
             got = "none" if found is None else f"one of type {found.type}"
             raise SettingError(
-                f"{self.path}: expected a real variable {name!r}, got {got}; it has inputs "
-                f"{self._names('input')} and outputs {self._names('output')}"
-            )
+                name=str(self.path), expected=f"a real variable {name!r}", received=str(got),
+                remedy=f"it has inputs {self._names('input')} and outputs {self._names('output')}",
+            )  # fmt: skip
         return int(found.valueReference)
 
     def _factor(
@@ -183,9 +187,9 @@ class FmuMachine:
         unit = unit or self._variables[name].unit
         if unit not in known:
             raise SettingError(
-                f"{self.path}: expected the unit of {name} as one of {', '.join(known)}, got "
-                f"{unit or 'none'}; give {option}="
-            )
+                name=str(self.path), expected=f"the unit of {name} as one of {', '.join(known)}",
+                received=unit or "none", remedy=f"give {option}=",
+            )  # fmt: skip
         return known[unit]
 
     def reset(self) -> None:
@@ -304,17 +308,20 @@ def fmu_of(text: str) -> SteppedBench:
         name, _, value = part.partition("=")
         if name not in (*_NUMBERS, *_NAMES):
             raise SettingError(
-                f"{path}: expected arguments among {', '.join((*_NUMBERS, *_NAMES))}, received "
-                f"{name!r}; as in {path}?volt=24&speed=w"
-            )
+                name=str(path), expected=f"arguments among {', '.join((*_NUMBERS, *_NAMES))}",
+                received=repr(name), remedy=f"as in {path}?volt=24&speed=w",
+            )  # fmt: skip
         try:
             given[name] = float(value) if name in _NUMBERS else value
         except ValueError:
-            raise SettingError(f"{path}: expected {name} as a number, received {value!r}") from None
+            raise SettingError(
+                name=str(path), expected=f"{name} as a number", received=repr(value)
+            ) from None
     if "volt" not in given:
         raise SettingError(
-            f"{path}: expected the largest command that it takes, received none; add ?volt=24"
-        )
+            name=str(path), expected="the largest command that it takes", received="none",
+            remedy="add ?volt=24",
+        )  # fmt: skip
     return fmu_bench(path, **given)
 
 
@@ -322,9 +329,7 @@ def _library() -> Any:
     try:
         import fmpy
     except ImportError as error:
-        raise SettingError(
-            "expected the FMPy package to run an FMU, got none; pip install 'sewfast[fmi]'"
-        ) from error
+        raise not_installed("fmpy", "an FMU", "sewfast[fmi]") from error
     return fmpy
 
 
@@ -336,48 +341,53 @@ def _require_fmu(path: Path) -> None:
             described = [e for e in entries if e.filename == "modelDescription.xml"]
             if len(described) != 1:
                 raise ModelFileError(
-                    f"{path}: expected an FMU with one modelDescription.xml, got {len(described)}; "
-                    "export it again"
-                )
+                    name=str(path), expected="an FMU with one modelDescription.xml",
+                    received=str(len(described)), remedy="export it again",
+                )  # fmt: skip
             if described[0].file_size > MOST_XML:
                 raise ModelFileError(
-                    f"{path}: expected a modelDescription.xml of at most {MOST_XML} bytes, got "
-                    f"{described[0].file_size}; export it without what is not needed"
-                )
+                    name=str(path), expected=f"a modelDescription.xml of at most {MOST_XML} bytes",
+                    received=str(described[0].file_size),
+                    remedy="export it without what is not needed",
+                )  # fmt: skip
             with archive.open(described[0]) as file:
                 text = file.read(MOST_XML)
     except ModelFileError:
         raise
     except OSError as error:
         raise ModelFileError(
-            f"{path}: cannot be read ({error.strerror or error}); check the name"
-        ) from error
+            name=str(path), expected="a file that can be read",
+            received=str(error.strerror or error), remedy="check the name",
+        ) from error  # fmt: skip
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError, EOFError) as error:
         raise ModelFileError(
-            f"{path}: expected an FMU, which is a zip file, got {error}; export it again"
-        ) from error
+            name=str(path), expected="an FMU, which is a zip file", received=str(error),
+            remedy="export it again",
+        ) from error  # fmt: skip
     if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
         raise ModelFileError(
-            f"{path}: expected a model description without entities, got some; an FMU needs none"
-        )
+            name=str(path), expected="a model description without entities", received="some",
+            remedy="an FMU needs none",
+        )  # fmt: skip
     # FMI asks for UTF-8: in another encoding, which could hide entities, no version is found
     version = re.search(rb"""\bfmiVersion\s*=\s*["']([^"']{0,20})""", text)
     if version is None or not re.fullmatch(rb"[12]\.0|3\..*", version[1]):
         raise ModelFileError(
-            f"{path}: expected an FMU of version 1.0, 2.0 or 3.0, got "
-            f"{'none' if version is None else version[1].decode(errors='replace')}; export it as "
-            "2.0 or 3.0"
-        )
+            name=str(path), expected="an FMU of version 1.0, 2.0 or 3.0",
+            received="none" if version is None else version[1].decode(errors="replace"),
+            remedy="export it as 2.0 or 3.0",
+        )  # fmt: skip
     size = sum(e.file_size for e in entries)
     if size > MOST_BYTES or len(entries) > MOST_FILES:
         raise ModelFileError(
-            f"{path}: expected at most {MOST_FILES} files of {MOST_BYTES} bytes, got "
-            f"{len(entries)} of {size}; export it without what is not needed"
-        )
+            name=str(path), expected=f"at most {MOST_FILES} files of {MOST_BYTES} bytes",
+            received=f"{len(entries)} of {size}", remedy="export it without what is not needed",
+        )  # fmt: skip
     for entry in entries:
         place = PurePosixPath(entry.filename.replace("\\", "/"))
         link = entry.external_attr >> 28 == 0xA
         if place.is_absolute() or ".." in place.parts or ":" in entry.filename or link:
             raise ModelFileError(
-                f"{path}: expected files within the FMU, got {entry.filename[:80]!r}; do not use it"
-            )
+                name=str(path), expected="files within the FMU", received=repr(entry.filename[:80]),
+                remedy="do not use it",
+            )  # fmt: skip

@@ -196,31 +196,24 @@ class Commissioning:
 
         Parameters
         ----------
-        ax : Axes or sequence of Axes, optional
-            One shows the output, further ones the error and the command.
+        ax, file
+            As for `Drawing.plot`. One shows the output, further ones the error and the command.
         reference : str, optional
             One of `comparisons`; by default the first.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the three panels of a new figure.
 
         Raises
         ------
         SettingError
-            For another reference, or if it ended before any loop was predicted; if matplotlib
-            is not installed or the file cannot be written.
+            For another reference, if it ended before any loop was predicted, or as `Drawing.plot`.
         """
         found = {c.reference: c for c in self.comparisons}
         name = next(iter(found), None) if reference is None else reference
         if name not in found:
             raise SettingError(
-                f"expected one of the references {', '.join(found) or 'none, as it ended before'}"
-                f", got {reference!r}"
-            )
+                name="reference",
+                expected=f"one of the references {', '.join(found) or 'none, as it ended before'}",
+                received=repr(reference),
+            )  # fmt: skip
         shown = found[name]
         kinds = {"model": ("predicted", shown.predicted), "machine": ("measured", shown.measured)}
         traces = [
@@ -345,10 +338,11 @@ def _require_own_artefacts(folder: Path) -> None:
     place = first_taken(folder, (*_FOLDERS, NUMBERS, "results.json", "report.html"))
     if place is not None:
         raise SettingError(
-            f"{place}: expected a folder without such files, or one of a virtual machine's "
-            "commissioning, which can be repeated; choose another folder, or overwrite them "
-            "(--overwrite)"
-        )
+            name=str(place),
+            expected="a folder without such files, or one of a virtual machine's commissioning, "
+            "which can be repeated",
+            received="another", remedy="choose another folder, or overwrite them (--overwrite)",
+        )  # fmt: skip
 
 
 def first_taken(folder: Path, names: Iterable[str]) -> Path | None:
@@ -438,9 +432,10 @@ def _artefacts(found: Commissioning, folder: Path) -> None:
             failures.append(error)
     if failures:
         raise DataError(
-            f"{failures[0]}; {len(failures)} of {len(tables)} tables could not be written, the "
-            f"controllers and models are in {folder}: free some space and save again"
-        ) from failures[0]
+            name=str(folder), expected=f"room for {len(tables)} tables",
+            received=f"{failures[0]}, and so {len(failures)} are missing",
+            remedy="the controllers and models are there: free some space and save again",
+        ) from failures[0]  # fmt: skip
 
 
 def _analysis(found: Commissioning, folder: Path) -> None:

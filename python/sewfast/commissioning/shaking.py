@@ -127,18 +127,20 @@ def bode(
         for name, value in given.items():
             if value is not None:
                 raise SettingError(
-                    f"{name}: belongs to a machine that is shaken, received a record; leave it out"
-                )
+                    name=name, expected="a machine that is shaken", received="a record",
+                    remedy="leave it out",
+                )  # fmt: skip
         return _of_record(on, reference, segment)
     if reference is not None or segment is not None:
         raise SettingError(
-            "reference, segment: belong to a record, received a machine; leave them out"
-        )
+            name="reference, segment", expected="neither for a machine", received="one of them",
+            remedy="they belong to a record; leave them out",
+        )  # fmt: skip
     if speed is None:
         raise SettingError(
-            "speed: expected the working speed to shake the machine about [RPM], received none; "
-            "for example speed=1500"
-        )
+            name="speed", expected="the working speed to shake the machine about [RPM]",
+            received="none", remedy="for example speed=1500",
+        )  # fmt: skip
     with bench_of(on, None) as bench:
         plan = _Plan.of(
             bench, real("speed", speed), period, realisations, periods, f_min, f_max, seed
@@ -201,32 +203,33 @@ def _of_record(
         y = speed_from_counts(on.counts, on.Ts, on.counts_per_rev, method="difference")
         if reference is not None:
             raise SettingError(
-                f"reference: expected none for a recording of a command, got {reference!r}; a data "
-                "set names its columns"
-            )
+                name="reference", expected="none for a recording of a command",
+                received=repr(reference), remedy="a data set names its columns",
+            )  # fmt: skip
         return spectral(
             on.u, y, Ts=on.Ts, segment=segment, u_unit="V", y_unit="RPM", from_counts=True,
             provenance={"recording": on.name},
         )  # fmt: skip
     if len(on.experiments) != 1 or len(on.input_names) != 1:
         raise DataError(
-            f"expected one record with one input, got {len(on.experiments)} with "
-            f"{len(on.input_names)}; take one by data[k] and data.select(input)"
-        )
+            name="data", expected="one record with one input",
+            received=f"{len(on.experiments)} with {len(on.input_names)}",
+            remedy="take one by data[k] and data.select(input)",
+        )  # fmt: skip
     if on.looks_ahead:
         raise DataError(
-            "expected an output as it was measured, got a speed that was smoothed with samples "
-            "after it, which hides the delay; take bode(recording), or a speed by "
-            'method="difference"'
-        )
+            name="data", expected="an output as it was measured",
+            received="a speed that was smoothed with samples after it, which hides the delay",
+            remedy="take bode(recording), or a speed by method=\"difference\"",
+        )  # fmt: skip
     one = on.experiments[0]
     r = None
     if reference is not None:
         if reference not in one.channels:
             raise SettingError(
-                f"reference: expected one of {', '.join(one.channels) or 'no columns'}, got "
-                f"{reference!r}"
-            )
+                name="reference", expected=f"one of {', '.join(one.channels) or 'no columns'}",
+                received=repr(reference),
+            )  # fmt: skip
         r = one.channels[reference]
     return spectral(
         one.u[:, 0], one.y, Ts=on.Ts, r=r, segment=segment, u_unit=on.input_units[0],
@@ -258,9 +261,9 @@ def unsmoothed(source: str | os.PathLike[str], data: Dataset) -> Dataset:
     one = data.experiments[0]
     if len(data.experiments) > 1 or len(counts) != len(one.y):
         raise DataError(
-            f"{source}: expected one even record without gaps, got {len(data.experiments)} pieces; "
-            "cut one out"
-        )
+            name=str(source), expected="one even record without gaps",
+            received=f"{len(data.experiments)} pieces", remedy="cut one out",
+        )  # fmt: skip
     y = speed_from_counts(counts, data.Ts, per_rev, method="difference")
     return replace(data, experiments=(replace(one, y=y),), looks_ahead=False)
 
@@ -295,27 +298,34 @@ class _Plan:
         Ts = bench.Ts
         if speed == 0.0 or not abs(speed) < bench.speed:
             raise SettingError(
-                f"speed: expected a working speed other than 0 and below {bench.speed:g} RPM, got "
-                f"{speed:g}"
-            )
+                name="speed",
+                expected=f"a working speed other than 0 and below {bench.speed:g} RPM",
+                received=f"{speed:g}",
+            )  # fmt: skip
         for name, count, least in (("realisations", realisations, 1), ("periods", periods, 1)):
             if isinstance(count, bool) or not isinstance(count, int) or not least <= count <= 1000:
-                raise SettingError(f"{name}: expected a whole number from 1 to 1000, got {count!r}")
+                raise SettingError(
+                    name=name, expected="a whole number from 1 to 1000", received=repr(count)
+                )
         if realisations * periods < 2:
             raise SettingError(
-                "periods: expected at least two in all, got one; nothing tells noise"
-            )
+                name="periods", expected="at least two in all", received="one",
+                remedy="nothing tells noise",
+            )  # fmt: skip
         highest = HIGHEST / Ts if f_max is None else real("f_max", f_max)
         if not 0.0 < real("f_min", f_min) < highest <= 0.5 / Ts:
             raise SettingError(
-                f"f_min, f_max: expected 0 < f_min < f_max <= {0.5 / Ts:g} Hz, half the sampling, "
-                f"got {f_min!r} and {highest!r}"
-            )
+                name="f_min, f_max",
+                expected=f"0 < f_min < f_max <= {0.5 / Ts:g} Hz, half the sampling",
+                received=f"{f_min!r} and {highest!r}",
+            )  # fmt: skip
         if not 2.0 / f_min <= 2.0 * real("period", period) <= 1e7 * Ts:
             raise SettingError(
-                f"period: expected at least one of f_min, {1.0 / f_min:g} s, and at most "
-                f"{5e6 * Ts:g} s, got {period!r}"
-            )
+                name="period",
+                expected=f"at least one of f_min, {1.0 / f_min:g} s, and at most "
+                f"{5000000.0 * Ts:g} s",
+                received=repr(period),
+            )  # fmt: skip
         samples = 2 * round(0.5 * period / Ts)
         k = np.arange(1, samples // 2, 2)
         hertz = k / (samples * Ts)
@@ -325,9 +335,9 @@ class _Plan:
         k = k[off & (hertz >= f_min) & (hertz <= highest)]
         if len(k) < 3:
             raise SettingError(
-                f"expected at least 3 lines between {f_min:g} and {highest:g} Hz, got {len(k)}; "
-                "lengthen the period or widen the band"
-            )
+                name="period", expected=f"at least 3 lines between {f_min:g} and {highest:g} Hz",
+                received=str(len(k)), remedy="lengthen the period or widen the band",
+            )  # fmt: skip
         return cls(speed, samples, realisations, periods, k, seed, Ts)
 
     def multisine(self, realisation: int) -> FloatArray:
@@ -366,11 +376,12 @@ def _in_open_loop(bench: Machine, plan: _Plan, amplitude: float | None) -> Frequ
         most = min(left, MOST * room / swing)
         if not 0.0 < peak <= most:
             raise SettingError(
-                f"amplitude: expected above 0 and up to {most:.4g} V, got {peak:.4g} V; more than "
-                f"{left:.4g} V would be clipped beside the {level:.4g} V that {plan.speed:g} RPM "
-                f"take, and each V swings the speed by some {swing:.3g} RPM, less with a higher "
-                "f_min"
-            )
+                name="amplitude", expected=f"above 0 and up to {most:.4g} V",
+                received=f"{peak:.4g} V",
+                remedy=f"more than {left:.4g} V would be clipped beside the {level:.4g} V that "
+                f"{plan.speed:g} RPM take, and each V swings the speed by some {swing:.3g} "
+                "RPM, less with a higher f_min",
+            )  # fmt: skip
     u = np.concatenate([np.full(lead, level), level + peak * plan.signal()])
     recording = bench.excite(u, "multisine")
     return _response(bench, plan, recording, lead, None, {"level": level, "amplitude": peak})
@@ -392,9 +403,10 @@ def _under_feedback(
     peak = STEPS * abs(plan.speed) if amplitude is None else real("amplitude", amplitude)
     if not 0.0 < peak <= MOST * abs(plan.speed):
         raise SettingError(
-            f"amplitude: expected above 0 and up to {MOST * abs(plan.speed):g} RPM about "
-            f"{plan.speed:g} RPM, got {peak!r}"
-        )
+            name="amplitude",
+            expected=f"above 0 and up to {MOST * abs(plan.speed):g} RPM about {plan.speed:g} RPM",
+            received=repr(peak),
+        )  # fmt: skip
     lead = round(HOLD / plan.Ts)
     ramp = np.minimum(np.arange(lead) / (0.5 * lead), 1.0) * plan.speed
     r = np.concatenate([ramp, plan.speed + peak * plan.signal()])
@@ -403,10 +415,12 @@ def _under_feedback(
     limited = np.isin(followed.u[lead:], limits)
     if limited.any():
         raise DataError(
-            f"expected a command within its limits, got {limited.sum()} samples at one, the first "
-            f"at {(lead + int(limited.argmax())) * plan.Ts:.4g} s: the response would be that of "
-            "the limit; lower the amplitude"
-        )
+            name="amplitude", expected="a command within its limits",
+            received=f"{limited.sum()} samples at one, the first at "
+            f"{(lead + int(limited.argmax())) * plan.Ts:.4g} s: the response would be "
+            "that of the limit",
+            remedy="the response would be that of the limit; lower the amplitude",
+        )  # fmt: skip
     return _response(
         bench, plan, followed.recording, lead, r, {"amplitude": peak, "feedback": True}
     )
@@ -426,9 +440,10 @@ def _response(
     slowest = (recording.y[lead:] * math.copysign(1.0, plan.speed)).min()
     if not slowest > 0.0:
         raise DataError(
-            f"expected the speed to keep its sign, it came to {slowest:.4g} RPM: at a reversal "
-            "friction acts like a step; lower the amplitude or raise the speed or f_min"
-        )
+            name="amplitude", expected="one at which the speed keeps its sign",
+            received=f"a speed down to {slowest:.4g} RPM",
+            remedy="at a reversal friction acts like a step: lower it, or raise the speed or f_min",
+        )  # fmt: skip
     found = periodic(
         plan.blocks(recording.u, lead), plan.blocks(y, lead), Ts=plan.Ts, lines=plan.lines,
         r=None if r is None else plan.blocks(r, lead), u_unit="V", y_unit="RPM", from_counts=True,
@@ -439,9 +454,10 @@ def _response(
     )  # fmt: skip
     if found.coherence.max() < 0.5:
         raise DataError(
-            "expected an answer to the multisine in the counts, none stands out of their rounding "
-            "and of the load; raise the amplitude, or periods"
-        )
+            name="amplitude", expected="an answer to the multisine in the counts",
+            received="none that stands out of their rounding and of the load",
+            remedy="raise amplitude or periods",
+        )  # fmt: skip
     return found
 
 
@@ -470,9 +486,10 @@ def _working_point(bench: Machine, speed: float) -> tuple[float, int, float]:
         if not abs(u) < bench.volt:
             break
     raise SettingError(
-        f"speed: expected one that a steady command of up to {bench.volt:g} V holds, got "
-        f"{speed:g} RPM; the nearest was {min(tried, key=lambda p: abs(p[1] - speed))[1]:.4g} RPM"
-    )
+        name="speed", expected=f"one that a steady command of up to {bench.volt:g} V holds",
+        received=f"{speed:g} RPM",
+        remedy=f"the nearest was {min(tried, key=lambda p: abs(p[1] - speed))[1]:.4g} RPM",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -491,7 +508,10 @@ def _held(bench: Machine, u: float, hold: float) -> _Held:
     counts = recording.counts
     at = [counts[n // 2], counts[3 * n // 4], counts[-1]]
     if not np.isfinite(at).all():
-        raise DataError("expected every sample of the run, received gaps; see `sewfast doctor`")
+        raise DataError(
+            name="u", expected="every sample of the run", received="gaps",
+            remedy="see `sewfast doctor`",
+        )  # fmt: skip
     before, last = np.diff(at) / np.diff([n // 2, 3 * n // 4, n - 1])
     speed = float(last * 60.0 / (bench.counts_per_rev * bench.Ts))
     reached = np.flatnonzero(np.abs(recording.y) >= 0.63 * abs(speed))

@@ -56,12 +56,14 @@ class Biquad:
     def __post_init__(self) -> None:
         names = NUMBERS.get(self.kind) if isinstance(self.kind, str) else None
         if names is None:
-            raise SettingError(f"expected a biquad of kind {', '.join(NUMBERS)}, got {self.kind!r}")
+            raise SettingError(
+                name="kind", expected=f"one of {', '.join(NUMBERS)}", received=repr(self.kind)
+            )
         if not isinstance(self.numbers, (tuple, list)) or len(self.numbers) != len(names):
             raise SettingError(
-                f"expected {', '.join(names)} of a {self.kind}, got {self.numbers!r}; make it with "
-                f"Biquad.{self.kind}(...)"
-            )
+                name="numbers", expected=f"{', '.join(names)} of a {self.kind}",
+                received=repr(self.numbers), remedy=f"make it with Biquad.{self.kind}(...)",
+            )  # fmt: skip
         numbers = tuple(real(name, x) for name, x in zip(names, self.numbers, strict=True))
         object.__setattr__(self, "numbers", numbers)
 

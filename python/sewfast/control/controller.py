@@ -214,9 +214,9 @@ class Controller(SampledController):
             object.__setattr__(self, name, real(name, getattr(self, name)))
         if not isinstance(self.gains, Gains):
             raise SettingError(
-                f"expected Gains, got {self.gains!r}; make them with Gains.standard, "
-                "Gains.parallel or Gains.per_sample"
-            )
+                name="gains", expected="Gains", received=repr(self.gains),
+                remedy="make them with Gains.standard, Gains.parallel or Gains.per_sample",
+            )  # fmt: skip
         object.__setattr__(self, "schedule", _points(self.schedule))
         object.__setattr__(self, "biquads", _sections(self.biquads))
         self._check_gains(self.gains)
@@ -226,21 +226,22 @@ class Controller(SampledController):
         if self.counts_per_rev is not None:
             object.__setattr__(self, "counts_per_rev", real("counts_per_rev", self.counts_per_rev))
         if not isinstance(self.notes, str):
-            raise SettingError(f"expected text for notes, got {self.notes!r}")
+            raise SettingError(name="notes", expected="text", received=repr(self.notes))
         _ = (self.core(), self.counts_per_unit)
 
     def _check_gains(self, gains: Gains) -> None:
         if gains.Ts is not None and not math.isclose(gains.Ts, self.Ts, rel_tol=1e-9):
             raise SettingError(
-                f"expected gains for the controller's sample time of {self.Ts} s, got per-sample "
-                f"gains at {gains.Ts} s; convert them with gains.to('standard')"
-            )
+                name="gains", expected=f"some for the controller's sample time of {self.Ts} s",
+                received=f"per-sample gains at {gains.Ts} s",
+                remedy="convert them with gains.to('standard')",
+            )  # fmt: skip
         units, others = (gains.u_unit, gains.y_unit), (self.gains.u_unit, self.gains.y_unit)
         if units != others:
             raise SettingError(
-                f"expected a schedule in the gains' units {others[0]} and {others[1]}, got "
-                f"{units[0]} and {units[1]}; convert one of them"
-            )
+                name="schedule", expected=f"one in the gains' units {others[0]} and {others[1]}",
+                received=f"{units[0]} and {units[1]}", remedy="convert one of them",
+            )  # fmt: skip
 
     @property
     def u_unit(self) -> str:
@@ -431,15 +432,15 @@ def _points(schedule: Any) -> tuple[tuple[float, Gains], ...]:
         points = [(speed, gains) for speed, gains in schedule]
     except (TypeError, ValueError) as error:
         raise SettingError(
-            f"expected a schedule of (speed, Gains) pairs, got {schedule!r}; give () for constant "
-            "gains"
-        ) from error
+            name="schedule", expected="(speed, Gains) pairs", received=repr(schedule),
+            remedy="give () for constant gains",
+        ) from error  # fmt: skip
     for _, gains in points:
         if not isinstance(gains, Gains):
             raise SettingError(
-                f"expected Gains beside each speed of the schedule, got {gains!r}; make them with "
-                "Gains.standard, Gains.parallel or Gains.per_sample"
-            )
+                name="schedule", expected="Gains beside each speed", received=repr(gains),
+                remedy="make them with Gains.standard, Gains.parallel or Gains.per_sample",
+            )  # fmt: skip
     return tuple((real("speed", speed), gains) for speed, gains in points)
 
 
@@ -448,10 +449,11 @@ def _sections(biquads: Any) -> tuple[Biquad, ...]:
     given = (biquads,) if isinstance(biquads, Biquad) else biquads
     if not isinstance(given, (tuple, list)) or not all(isinstance(b, Biquad) for b in given):
         raise SettingError(
-            f"expected a list of biquads, got {biquads!r}; for example biquads=[Biquad.notch(60.0)]"
-        )
+            name="biquads", expected="a list of them", received=repr(biquads),
+            remedy="for example biquads=[Biquad.notch(60.0)]",
+        )  # fmt: skip
     if len(given) > MOST:
-        raise SettingError(f"expected at most {MOST} biquads, got {len(given)}")
+        raise SettingError(name="biquads", expected=f"at most {MOST}", received=str(len(given)))
     return tuple(given)
 
 

@@ -93,10 +93,11 @@ def command_limits(
     missing = [name for name, value in (("u_min", u_min), ("u_max", u_max)) if value is None]
     if missing and recorded is None:
         raise SettingError(
-            f"expected {' and '.join(missing)}, as the model does not store the range of its "
-            "training inputs; give the limits of the command that the drive can take (--u-min, "
-            "--u-max)"
-        )
+            name=" and ".join(missing),
+            expected="the limits of the command that the drive can take (--u-min, --u-max)",
+            received="none, and the model does not store the range of its training inputs",
+            remedy="give them",
+        )  # fmt: skip
     low = recorded[0] if u_min is None and recorded else real("u_min", u_min)
     high = recorded[1] if u_max is None and recorded else real("u_max", u_max)
     if missing:
@@ -148,9 +149,9 @@ def require_one_input(model: Model) -> None:
     """Refuse a model with several inputs."""
     if len(model.input_names) != 1:
         raise SettingError(
-            f"expected a model with one input to tune on, got {len(model.input_names)}; identify "
-            "it from the command alone"
-        )
+            name="model", expected="one input to tune on", received=str(len(model.input_names)),
+            remedy="identify it from the command alone",
+        )  # fmt: skip
 
 
 def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
@@ -167,9 +168,10 @@ def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
     size = u_max if u_max >= -u_min else u_min
     if not np.isfinite(size) or size == 0.0:
         raise SettingError(
-            f"expected finite limits of the command, not both 0, to size a step by, got u_min = "
-            f"{u_min} and u_max = {u_max}; give the amplifier's limits"
-        )
+            name="u_min, u_max",
+            expected="finite limits of the command, not both 0, to size a step by",
+            received=f"{u_min} and {u_max}", remedy="give the amplifier's limits",
+        )  # fmt: skip
     reason: Exception | None = None
     for share in _STEP_SHARES:
         for samples in _STEP_SAMPLES:
@@ -185,14 +187,16 @@ def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
             return DriveStep(fopdt, float(y[at - 1]), _slowest(fopdt, y[at:], model.Ts))
     if _integrates(model):
         raise FitError(
-            "expected a model whose step response settles, received one that integrates its input, "
-            "as a position does; give a controller to start from, or identify the rate: "
-            "differentiate the recorded output"
-        ) from reason
+            name="model", expected="one whose step response settles",
+            received="one that integrates its input, as a position does",
+            remedy="give a controller to start from, or identify the rate: differentiate the "
+            "recorded output",
+        ) from reason  # fmt: skip
     raise FitError(
-        f"expected a model whose step response settles, got none up to u = {0.5 * size:g} "
-        f"({reason}); give a controller to start from"
-    ) from reason
+        name="model", expected="one whose step response settles",
+        received=f"none up to u = {0.5 * size:g} ({reason})",
+        remedy="give a controller to start from",
+    ) from reason  # fmt: skip
 
 
 def _slowest(fopdt: Fopdt, y: FloatArray, Ts: float) -> float:
@@ -294,9 +298,10 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
     sign, x, other = (1.0, up, down) if up >= down else (-1.0, down, up)
     if x == 0.0:
         raise SettingError(
-            "expected limits of the command that move the drive within its recorded range, got "
-            f"{u_min:g} to {u_max:g}; give wider ones, or the references as samples"
-        )
+            name="u_min, u_max", expected="limits that move the drive within its recorded range",
+            received=f"{u_min:g} to {u_max:g}",
+            remedy="give wider ones, or the references as samples",
+        )  # fmt: skip
     strong, weak = (max(reach), -min(reach)) if sign > 0 else (-min(reach), max(reach))
     slow = 0.0 if weak > 0.25 * x else _SLOW_RUN * x
     # a record that never came near rest: no lower than it went
@@ -321,9 +326,11 @@ def _finite_limits(model: Model, u_min: float, u_max: float) -> tuple[float, flo
     high = u_max if math.isfinite(u_max) else recorded[1]
     if not (math.isfinite(low) and math.isfinite(high)):
         raise SettingError(
-            "expected a controller with limits, or a model that stores the range of its training "
-            "inputs, to size a reference by, got neither; give the reference as samples"
-        )
+            name="reference",
+            expected="a controller with limits, or a model with the range of its training "
+            "inputs, to size it by",
+            received="neither", remedy="give the reference as samples",
+        )  # fmt: skip
     return low, high
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 from .. import storage
-from ..errors import ModelFileError, SewfastError
+from ..errors import ModelFileError, SewfastError, located
 from ..storage import Fields
 from .controller import FORMAT, Controller, SampledController
 from .state_feedback import StateFeedback
@@ -35,7 +35,7 @@ def load_controller(path: str | os.PathLike[str]) -> SampledController:
     except ModelFileError:
         raise
     except SewfastError as error:
-        raise ModelFileError(f"{path}: {error}") from error
+        raise located(ModelFileError, path, error) from error
 
 
 def load_pid(path: str | os.PathLike[str]) -> Controller:

@@ -74,9 +74,9 @@ def from_control(
     control = require_control()
     if not isinstance(system, (control.TransferFunction, control.StateSpace)):
         raise SettingError(
-            "expected a TransferFunction or a StateSpace of python-control, received "
-            f"{type(system).__name__}"
-        )
+            name="system", expected="a TransferFunction or a StateSpace of python-control",
+            received=type(system).__name__,
+        )  # fmt: skip
     dt = _sample_time(system, Ts)
     terms = [_terms(*fraction) for fraction in _fractions(system, dt)]
     if len(terms) == 1:
@@ -91,20 +91,24 @@ def _sample_time(system: Any, Ts: float | None) -> float:
     given = None if Ts is None else real("Ts", Ts)
     if system.dt == 0 and not isinstance(system.dt, bool):
         raise SettingError(
-            "expected a PID in discrete time, received one in continuous time; give its gains to "
-            "Gains.parallel or Gains.standard: Controller samples them with backward differences"
-        )
+            name="system", expected="a PID in discrete time", received="one in continuous time",
+            remedy="give its gains to Gains.parallel or Gains.standard: Controller samples them "
+            "with backward differences",
+        )  # fmt: skip
     stated = None if system.dt is None or isinstance(system.dt, bool) else float(system.dt)
     if stated is None and given is None:
-        raise SettingError(f"expected a sample time, received dt = {system.dt}; give Ts [s]")
+        raise SettingError(
+            name="Ts", expected="a sample time", received=f"dt = {system.dt}", remedy="give Ts [s]"
+        )
     if stated is not None and given is not None and not math.isclose(stated, given, rel_tol=_SAME):
         raise SettingError(
-            f"Ts: the system has dt = {stated:g} s, received {given:g}; leave it out"
-        )
+            name="Ts", expected=f"that of the system, dt = {stated:g} s", received=f"{given:g}",
+            remedy="leave it out",
+        )  # fmt: skip
     dt = given if stated is None else stated
     assert dt is not None
     if not 0.0 < dt < math.inf:
-        raise SettingError(f"expected a finite sample time above 0 s, received {dt:g}")
+        raise SettingError(name="Ts", expected="finite and above 0 s", received=f"{dt:g}")
     return dt
 
 
@@ -112,9 +116,9 @@ def _fractions(system: Any, dt: float) -> list[tuple[FloatArray, FloatArray]]:
     """Numerator and denominator of each input in descending powers of z, of one length."""
     if system.noutputs != 1 or system.ninputs not in (1, 2):
         raise SettingError(
-            "expected a PID from the error, or from r and y, to one command; received "
-            f"{system.ninputs} inputs and {system.noutputs} outputs"
-        )
+            name="system", expected="a PID from the error, or from r and y, to one command",
+            received=f"{system.ninputs} inputs and {system.noutputs} outputs",
+        )  # fmt: skip
     if hasattr(system, "A"):
         # powers of z^-1 up to one order are those of z, from the highest down
         timed = require_control().ss(system.A, system.B, system.C, system.D, dt)
@@ -124,7 +128,9 @@ def _fractions(system: Any, dt: float) -> list[tuple[FloatArray, FloatArray]]:
         inputs = range(system.ninputs)
         pairs = [(np.asarray(system.num[0][i]), np.asarray(system.den[0][i])) for i in inputs]
         if any(len(num) > len(den) for num, den in pairs):
-            raise SettingError("expected a PID that is causal, received more zeros than poles")
+            raise SettingError(
+                name="system", expected="a PID that is causal", received="more zeros than poles"
+            )
         pairs = [(np.pad(num, (len(den) - len(num), 0)), den) for num, den in pairs]
     return [_levelled(np.asarray(n, float), np.asarray(d, float)) for n, d in pairs]
 
@@ -167,10 +173,11 @@ def _terms(num: FloatArray, den: FloatArray) -> _Terms:
 def _other(den: FloatArray) -> SettingError:
     poles = ", ".join(f"{p:.6g}" for p in np.roots(den))
     return SettingError(
-        f"expected the poles of a PID, 1 and one from 0 to below 1, received {poles}; take "
-        "feedback filters out and set them by dataclasses.replace, cancel poles with "
-        "control.minreal, and use the backward difference for integral and derivative"
-    )
+        name="system", expected="the poles of a PID, 1 and one from 0 to below 1",
+        received=str(poles),
+        remedy="take feedback filters out and set them by dataclasses.replace, cancel poles with "
+        "control.minreal, and use the backward difference for integral and derivative",
+    )  # fmt: skip
 
 
 def _weights(of_r: _Terms, own: _Terms) -> tuple[float, float]:
@@ -179,16 +186,18 @@ def _weights(of_r: _Terms, own: _Terms) -> tuple[float, float]:
     same_pole = not (of_r.kd and own.kd) or abs(of_r.pole - own.pole) <= _SAME
     if abs(of_r.Ki - own.Ki) > _SAME * size or not same_pole:
         raise SettingError(
-            "expected r and -y to go through one integral and one derivative filter, received "
-            f"integral gains of {of_r.Ki:.6g} and {own.Ki:.6g} per sample, filter poles at "
-            f"{of_r.pole:.6g} and {own.pole:.6g}; the inputs are r and y, in this order"
-        )
+            name="system", expected="r and -y to go through one integral and one derivative filter",
+            received=f"integral gains of {of_r.Ki:.6g} and {own.Ki:.6g} per sample, filter poles "
+            f"at {of_r.pole:.6g} and {own.pole:.6g}",
+            remedy="the inputs are r and y, in this order",
+        )  # fmt: skip
     for name, theirs, ours in (("Kp", of_r.Kp, own.Kp), ("Kd", of_r.kd, own.kd)):
         if not ours and abs(theirs) > _SAME * size:
             raise SettingError(
-                f"expected {name} to act on the output where it acts on the reference, received 0 "
-                f"and {theirs:.6g}; that part is a feedforward"
-            )
+                name="system",
+                expected=f"{name} to act on the output where it acts on the reference",
+                received=f"0 and {theirs:.6g}", remedy="that part is a feedforward",
+            )  # fmt: skip
     alpha = 1.0 - of_r.Kp / own.Kp if own.Kp else 0.0
     return alpha, 1.0 - of_r.kd / own.kd if own.kd else 0.0
 
@@ -241,18 +250,22 @@ def to_matlab(controller: Controller, form: Object = "pid2") -> dict[str, Any]:
     _require_form(form)
     if controller.schedule:
         raise SettingError(
-            "expected constant gains, received a gain schedule; convert its points one by one"
-        )
+            name="controller", expected="constant gains", received="a gain schedule",
+            remedy="convert its points one by one",
+        )  # fmt: skip
     if controller.biquads:
         raise SettingError(
-            "expected a controller without biquads, which MATLAB's PID objects have no place for, "
-            f"got {len(controller.biquads)}; take them out and put them in series: Biquad.to_tf(Ts)"
-        )
+            name="controller",
+            expected="none with biquads, which MATLAB's PID objects have no place for",
+            received=str(len(controller.biquads)),
+            remedy="take them out and put them in series: Biquad.to_tf(Ts)",
+        )  # fmt: skip
     if not form.endswith("2") and (controller.alpha or controller.beta):
         raise SettingError(
-            f"expected alpha = beta = 0 for {form}, received {controller.alpha:g} and "
-            f"{controller.beta:g}; take {form}2, which has the weights b and c"
-        )
+            name="form", expected=f"alpha = beta = 0 for {form}",
+            received=f"{controller.alpha:g} and {controller.beta:g}",
+            remedy=f"take {form}2, which has the weights b and c",
+        )  # fmt: skip
     standard, parallel = controller.gains.to("standard"), controller.gains.to("parallel")
     values = {
         "Kp": standard.Kp,
@@ -315,19 +328,22 @@ def from_matlab(
     _require_form(form)
     if not (real("Ts", Ts) > 0.0):
         raise SettingError(
-            f"expected a sample time above 0 s, received Ts = {Ts}; a continuous-time object is "
-            "made discrete in MATLAB, with both formulas BackwardEuler"
-        )
+            name="Ts", expected="above 0 s", received=f"{Ts}",
+            remedy="a continuous-time object is made discrete in MATLAB, with both formulas "
+            "BackwardEuler",
+        )  # fmt: skip
     for name, formula in (("IFormula", IFormula), ("DFormula", DFormula)):
         if formula != FORMULA:
             raise SettingError(
-                f"{name}: expected 'BackwardEuler', received {formula!r}; set it in MATLAB "
-                f"(C.{name} = 'BackwardEuler') and check the loop there: it is another controller"
-            )
+                name=name, expected="'BackwardEuler'", received=repr(formula),
+                remedy=f"set it in MATLAB (C.{name} = 'BackwardEuler') and check the loop there: "
+                "it is another controller",
+            )  # fmt: skip
     if set(numbers) != set(_NAMES[form]):
         raise SettingError(
-            f"expected {', '.join(_NAMES[form])} of {form}, received {', '.join(numbers) or 'none'}"
-        )
+            name="numbers", expected=f"{', '.join(_NAMES[form])} of {form}",
+            received=", ".join(numbers) or "none",
+        )  # fmt: skip
     n = {name: real(name, value) for name, value in numbers.items()}
     units = {"u_unit": u_unit, "y_unit": y_unit}
     if form.startswith("pidstd"):
@@ -336,7 +352,7 @@ def from_matlab(
         gains = Gains.parallel(n["Kp"], n["Ki"], n["Kd"], **units)
         N = gains.to("standard").Td / n["Tf"] if n["Tf"] > 0.0 and n["Kd"] != 0.0 else math.inf
         if n["Tf"] < 0.0:
-            raise SettingError(f"expected Tf of 0 s or more, received {n['Tf']}")
+            raise SettingError(name="Tf", expected="0 s or more", received=str(n["Tf"]))
     alpha, beta = 1.0 - n.get("b", 1.0), 1.0 - n.get("c", 1.0)
     return Controller(gains, Ts, alpha=alpha, beta=beta, N=N, notes=f"from MATLAB's {form}")
 
@@ -355,7 +371,10 @@ def to_control(controller: Controller) -> Any:
     """
     require_controller(controller, None, "to_control(controller)")
     if controller.schedule:
-        raise SettingError("expected constant gains, received a gain schedule: it is not linear")
+        raise SettingError(
+            name="controller", expected="constant gains",
+            received="a gain schedule, which is not linear",
+        )  # fmt: skip
     inputs = beside(gain(1.0), measurement(controller, encoder=False))
     system = series(inputs, pid(controller))
     return require_control().ss(*system, controller.Ts, inputs=["r", "y"], outputs=["u"])
@@ -363,7 +382,7 @@ def to_control(controller: Controller) -> Any:
 
 def _require_form(form: str) -> None:
     if not (isinstance(form, str) and form in _NAMES):
-        raise SettingError(f"expected a form out of {', '.join(_NAMES)}, received {form!r}")
+        raise SettingError(name="form", expected=f"one of {', '.join(_NAMES)}", received=repr(form))
 
 
 def _number(value: float) -> str:

@@ -116,22 +116,10 @@ class ClosedLoopRun:
 
         Parameters
         ----------
-        ax : Axes or sequence of Axes, optional
-            One shows the output, further ones the error and the command.
+        ax, file
+            As for `Drawing.plot`. One shows the output, further ones the error and the command.
         others : sequence of ClosedLoopRun
             Other runs over the same reference, such as one predicted by a model.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the three panels of a new figure.
-
-        Raises
-        ------
-        SettingError
-            If matplotlib is not installed or the file cannot be written.
         """
         from ..plotting import Trace, loop_drawing
 
@@ -302,8 +290,9 @@ def _usual_reference(on: Any, controller: SampledController) -> str | FloatArray
     """A trapezoid for a plant whose range is known; a motor does not move without being asked."""
     if not isinstance(on, (Model, VirtualMachine)):
         raise SettingError(
-            "expected a reference for a drive, got none; give its name or its samples"
-        )
+            name="reference", expected="one for a drive", received="none",
+            remedy="give its name or its samples",
+        )  # fmt: skip
     (usual,) = default_references(on, controller, ("trapezoid",))
     return usual
 
@@ -316,13 +305,14 @@ def _given(
     signals = {name: vector(name, v) for name, v in given.items() if v is not None}
     if "disturbance" in signals and not isinstance(on, Model):
         raise SettingError(
-            "expected a disturbance on a model only; load a virtual machine by its set_load"
-        )
+            name="disturbance", expected="one on a model only", received="one on a machine",
+            remedy="load a virtual machine by its set_load",
+        )  # fmt: skip
     if signals and not isinstance(on, (Model, VirtualMachine)):
         raise SettingError(
-            "expected no feedforward on a drive, whose device takes a reference only; run it on a "
-            "model or a virtual machine"
-        )
+            name="feedforward", expected="none on a drive, whose device takes a reference only",
+            received="one", remedy="run it on a model or a virtual machine",
+        )  # fmt: skip
     return signals
 
 
@@ -339,12 +329,11 @@ def require_controller(
         return
     if isinstance(controller, SampledController):
         pid_of(controller, call)
-    swapped = isinstance(plant, SampledController)
+    swapped = " and the Controller in another place" * isinstance(plant, SampledController)
     raise SettingError(
-        f"expected a Controller, got {type(controller).__name__}"
-        + (" and the Controller in another place" if swapped else "")
-        + f"; the order is {call}"
-    )
+        name="controller", expected="a Controller",
+        received=f"{type(controller).__name__}{swapped}", remedy=f"the order is {call}",
+    )  # fmt: skip
 
 
 def _on_machine(
@@ -359,9 +348,9 @@ def _on_machine(
 
     if not hasattr(on, "follow"):
         raise SettingError(
-            "expected a Model, a VirtualMachine or a Drive to run on, got "
-            f"{type(on).__name__}; load a model with load_model, or connect to a drive"
-        )
+            name="on", expected="a Model, a VirtualMachine or a Drive", received=type(on).__name__,
+            remedy="load a model with load_model, or connect to a drive",
+        )  # fmt: skip
     if is_streaming(on):
         return on.follow(controller, r, name, **options, **cancelled_by(cancel))
     return on.follow(controller, r, name)
@@ -395,10 +384,11 @@ def reference_samples(
         )
         return made[reference.replace("-", "_").lower()]
     raise SettingError(
-        f"expected a controller in RPM at {signals.TS} s for the reference {reference!r}, "
-        f"got {unit or 'an unknown unit'!r} at {Ts} s; give the reference as samples, such as the "
-        "column r of a run on the drive's model (run --on MODEL.json -o FILE, --reference FILE)"
-    )
+        name="reference", expected=f"a controller in RPM at {signals.TS} s for {reference!r}",
+        received=f"{unit or 'an unknown unit'!r} at {Ts} s",
+        remedy="give the reference as samples, such as the column r of a run on the drive's "
+        "model (run --on MODEL.json -o FILE, --reference FILE)",
+    )  # fmt: skip
 
 
 def check_fits(controller: SampledController, plant: Any) -> None:
@@ -411,14 +401,14 @@ def check_fits(controller: SampledController, plant: Any) -> None:
     """
     if not isinstance(plant, (Model, VirtualMachine)):
         raise SettingError(
-            f"expected a Model or a VirtualMachine to run on, got {type(plant).__name__}; "
-            "load a model with load_model"
-        )
+            name="plant", expected="a Model or a VirtualMachine", received=type(plant).__name__,
+            remedy="load a model with load_model",
+        )  # fmt: skip
     if not math.isclose(plant.Ts, controller.Ts, rel_tol=0.01):
         raise SettingError(
-            f"expected plant and controller at one sample time, got {plant.Ts} s and "
-            f"{controller.Ts} s; tune a controller for this plant"
-        )
+            name="controller", expected=f"the plant's sample time of {plant.Ts} s",
+            received=f"{controller.Ts} s", remedy="tune a controller for this plant",
+        )  # fmt: skip
     require_units(controller, plant_units(plant))
 
 
@@ -434,9 +424,9 @@ def require_units(gains: Gains | SampledController, units: tuple[str, str]) -> N
     for what, theirs, ours in zip(("input", "output"), units, own, strict=True):
         if theirs and ours and theirs.lower() != ours.lower():
             raise SettingError(
-                f"expected the plant's {what} in the controller's unit {ours!r}, got {theirs!r}; "
-                "give the gains in the plant's units"
-            )
+                name="plant", expected=f"its {what} in the controller's unit {ours!r}",
+                received=repr(theirs), remedy="give the gains in the plant's units",
+            )  # fmt: skip
 
 
 def plant_units(plant: Plant) -> tuple[str, str]:
@@ -479,9 +469,9 @@ def each_plant(on: Plants | None) -> list[Plant]:
     for plant in given:
         if not isinstance(plant, (Model, VirtualMachine)):
             raise SettingError(
-                f"on: expected models or virtual machines, got {type(plant).__name__}; load a "
-                "model with load_model"
-            )
+                name="on", expected="models or virtual machines", received=type(plant).__name__,
+                remedy="load a model with load_model",
+            )  # fmt: skip
     return [m for plant in given for m in _singles(plant)]
 
 
@@ -522,8 +512,9 @@ def each_reference(references: Any, default: Sequence[str]) -> list[Any]:
         iter(references)
     except TypeError:
         raise SettingError(
-            f"expected references as names or samples, got {references!r}; for example 'trapezoid'"
-        ) from None
+            name="references", expected="names or samples", received=repr(references),
+            remedy="for example 'trapezoid'",
+        ) from None  # fmt: skip
     several = not isinstance(references, np.ndarray) and any(
         isinstance(r, str) or np.ndim(r) for r in references
     )
@@ -545,6 +536,6 @@ def trial(
     except FitError as e:
         named = reference if isinstance(reference, str) else "reference"
         raise FitError(
-            f"expected a loop that stays bounded, received one that runs away on {title}, "
-            f"{named}: {e}"
-        ) from e
+            name="controller", expected="a loop that stays bounded",
+            received=f"one that runs away on {title}, {named}: {e}",
+        ) from e  # fmt: skip

@@ -146,10 +146,11 @@ def machine_of(on: object) -> Machine:
     if missing:
         lacking = "" if len(missing) == len(MEMBERS) else f" without {', '.join(missing)}"
         raise SettingError(
-            "expected a VirtualMachine, a Drive or a Machine to commission, got "
-            f"{type(on).__name__}{lacking}; sewfast.VirtualMachine(), connect to a drive, or give "
-            "yours the members of sewfast.Machine"
-        )
+            name="on", expected="a VirtualMachine, a Drive or a Machine to commission",
+            received=f"{type(on).__name__}{lacking}",
+            remedy="sewfast.VirtualMachine(), connect to a drive, or give yours the members of "
+            "sewfast.Machine",
+        )  # fmt: skip
     return cast(Machine, on)
 
 
@@ -216,9 +217,9 @@ def record(
     """
     if not isinstance(machine, VirtualMachine) and not hasattr(machine, "excite"):
         raise SettingError(
-            f"expected a VirtualMachine or a Drive to record, got {type(machine).__name__}; the "
-            "machine comes first: record(machine, u)"
-        )
+            name="machine", expected="a VirtualMachine or a Drive", received=type(machine).__name__,
+            remedy="the machine comes first: record(machine, u)",
+        )  # fmt: skip
     command = _command(u)
     if is_streaming(machine):
         return machine.excite(
@@ -248,12 +249,12 @@ def _command(u: ArrayLike) -> FloatArray:
         command = np.array(u, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as e:
         raise DataError(
-            f"expected an excitation as numbers, got {str(u)[:60]!r}; a named one is "
-            "sewfast.signals.excitation('step')"
-        ) from e
+            name="u", expected="numbers", received=repr(str(u)[:60]),
+            remedy="a named one is sewfast.signals.excitation('step')",
+        ) from e  # fmt: skip
     if command.ndim != 1:
         raise DataError(
-            f"expected an excitation of shape (N,), received {command.shape}; pass one column"
+            name="u", expected="shape (N,)", received=str(command.shape), remedy="pass one column"
         )
     return command
 
@@ -382,9 +383,9 @@ class SteppedBench:
     ) -> RecordedRun:
         if not math.isclose(controller.Ts, self.Ts, rel_tol=0.01):
             raise SettingError(
-                f"expected machine and controller at one sample time, got {self.Ts} s and "
-                f"{controller.Ts} s; tune a controller for this machine"
-            )
+                name="controller", expected=f"the machine's sample time of {self.Ts} s",
+                received=f"{controller.Ts} s", remedy="tune a controller for this machine",
+            )  # fmt: skip
         _require_finite("reference", r)
         core = controller.core()
         per_count = 60.0 / (self.counts_per_rev * self.Ts)

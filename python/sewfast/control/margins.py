@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +17,7 @@ from ..evidence.operating import OperatingPoint, operating_range, point_at_level
 from ..gains import Gains, real, vector
 from ..models import Model
 from ..models.conversion import from_state_space, polynomials_of, transfer_function
-from ..plotting import SHADE, html_of, legend, stacked
+from ..plotting import SHADE, Drawing, Plotted, html_of, legend, stacked
 from ..rules import Fopdt
 from .controller import Controller
 from .loop import plant_units, require_controller, require_units
@@ -62,14 +61,16 @@ def _of_model(model: Any, Ts: float, speed: float | None) -> tuple[FloatArray, F
         return num[0].copy(), den
     if model.members:
         raise SettingError(
-            "expected one plant, received an ensemble; take the margins of each of its members, or "
-            "analyse the controller on all of them"
-        )
+            name="plant", expected="one model", received="an ensemble",
+            remedy="take the margins of each of its members, or analyse the controller on all of "
+            "them",
+        )  # fmt: skip
     if speed is None:
         raise SettingError(
-            "expected the speed at which the nonlinear model is linearised, received none; give "
-            "speed, or the linear model about a command: model.linearise(u)"
-        )
+            name="speed", expected="that at which the nonlinear model is linearised",
+            received="none",
+            remedy="give speed, or the linear model about a command: model.linearise(u)",
+        )  # fmt: skip
     return _of_point(operating_point(model, speed), Ts)
 
 
@@ -98,9 +99,9 @@ def operating_point(model: Any, speed: float) -> OperatingPoint:
     """
     if model.members:
         raise SettingError(
-            "expected one plant, received an ensemble; take the operating point of each of its "
-            "members"
-        )
+            name="plant", expected="one model", received="an ensemble",
+            remedy="take the operating point of each of its members",
+        )  # fmt: skip
     speed = real("speed", speed)
     low, high = model.training.get("input_range", [[-1.0, 1.0]])[0]
     grid = operating_range(model, [np.array([u]) for u in np.linspace(low, high, _GRID)]).points
@@ -110,9 +111,11 @@ def operating_point(model: Any, speed: float) -> OperatingPoint:
     if not pairs:
         reached = [p.y for p in grid]
         raise SettingError(
-            f"expected a speed that the model holds at a constant command, received {speed:g}; "
-            f"from {low:.4g} to {high:.4g} it reaches {min(reached):.4g} to {max(reached):.4g}"
-        )
+            name="speed", expected="one that the model holds at a constant command",
+            received=f"{speed:g}",
+            remedy=f"from {low:.4g} to {high:.4g} it reaches {min(reached):.4g} to "
+            f"{max(reached):.4g}",
+        )  # fmt: skip
     below, above = pairs[0]
     # halves, as steady outputs may jump where friction lets go
     for _ in range(_HALVINGS):
@@ -129,10 +132,11 @@ def _integrating_point(model: Any, grid: Any, level: float) -> OperatingPoint:
     pairs = [p for p in itertools.pairwise(grid) if p[0].drift * p[1].drift <= 0.0]
     if not pairs:
         raise SettingError(
-            "expected a command at which the integrating model keeps its output, received none: "
-            f"from {grid[0].u[0]:.4g} to {grid[-1].u[0]:.4g} it always moves the same way; record "
-            "both ways and identify again"
-        )
+            name="plant", expected="a command at which the integrating model keeps its output",
+            received=f"none: from {grid[0].u[0]:.4g} to {grid[-1].u[0]:.4g} it always moves the "
+            "same way",
+            remedy="record both ways and identify again",
+        )  # fmt: skip
     below, above = pairs[0]
     for _ in range(_HALVINGS):
         found = operating_range(model, [0.5 * (below.u + above.u)]).points[0]
@@ -146,10 +150,11 @@ def _integrating_point(model: Any, grid: Any, level: float) -> OperatingPoint:
 def _require_steady(point: OperatingPoint, speed: float) -> OperatingPoint:
     if not point.settled or point.saturated:
         raise SettingError(
-            f"expected a steady state at {speed:g}, received one that "
-            f"{'lies on a limit of the output' if point.saturated else 'does not settle'}; take "
-            "another speed"
-        )
+            name="speed", expected=f"a steady state at {speed:g}",
+            received="one that "
+            f"{('lies on a limit of the output' if point.saturated else 'does not settle')}",
+            remedy="take another speed",
+        )  # fmt: skip
     return point
 
 
@@ -162,19 +167,24 @@ def _of_point(point: Any, Ts: float) -> tuple[FloatArray, FloatArray]:
 def _of_system(system: Any, Ts: float) -> tuple[FloatArray, FloatArray]:
     if not any(hasattr(system, name) for name in ("num", "A", "zeros")):
         raise SettingError(
-            "expected an Fopdt, a model, an operating point or a system of python-control or "
-            f"scipy.signal, received {type(system).__name__}"
-        )
+            name="system",
+            expected="an Fopdt, a model, an operating point or a system of python-control or "
+            "scipy.signal",
+            received=type(system).__name__,
+        )  # fmt: skip
     inputs, outputs = (getattr(system, name, 1) for name in ("ninputs", "noutputs"))
     _require(inputs or 1, Ts, Ts)
     if (outputs or 1) != 1:
-        raise SettingError(f"expected one output, received {outputs}; take one of them")
+        raise SettingError(
+            name="system", expected="one output", received=str(outputs), remedy="take one of them"
+        )
     try:
         discrete = _discrete(system, Ts)
     except (ValueError, NotImplementedError) as error:
         raise SettingError(
-            f"expected a proper linear system to sample under a zero-order hold, received {error}"
-        ) from error
+            name="system", expected="a proper linear system to sample under a zero-order hold",
+            received=str(error),
+        ) from error  # fmt: skip
     num, den, _ = polynomials_of(discrete, Ts)
     _require(len(num), Ts, Ts)
     return np.ascontiguousarray(num[0]), np.ascontiguousarray(den)
@@ -196,19 +206,21 @@ def _discrete(system: Any, Ts: float) -> Any:
 
 def _require(inputs: int, of: float, Ts: float) -> None:
     if inputs != 1:
-        raise SettingError(f"expected a plant with one input, received {inputs}; take one of them")
+        raise SettingError(
+            name="plant", expected="one input", received=str(inputs), remedy="take one of them"
+        )
     if not math.isclose(of, Ts, rel_tol=1e-9):
         raise SettingError(
-            f"expected a plant at the controller's sample time of {Ts:g} s, received one at "
-            f"{of:g} s; resample one of them"
-        )
+            name="plant", expected=f"the controller's sample time of {Ts:g} s",
+            received=f"{of:g} s", remedy="resample one of them",
+        )  # fmt: skip
 
 
 # --- `margins`: how far a controller on a linear plant is from instability ------------------------
 
 
 @dataclass(frozen=True)
-class Margins:
+class Margins(Plotted):
     """Margins of the sampled loop, broken at the plant's input (docs/CONVENTIONS.md, Control).
 
     For an unstable loop the peaks and the noise gain are infinite and the other margins NaN.
@@ -258,35 +270,19 @@ class Margins:
         """Everything by name."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
-    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
-        """Draw the margins in the plane of the loop transfer L.
+    def drawing(self) -> Drawing:
+        """The margins in the plane of the loop transfer L.
 
         L stays outside the circle of radius 1/Ms about -1. Arrows show how far L can move on the
         real axis (gain) and on the unit circle (phase) before the loop is unstable.
-
-        Parameters
-        ----------
-        ax : Axes or sequence of Axes, optional
-            One panel.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the panels of a new figure.
-
-        Raises
-        ------
-        SettingError
-            If the loop is unstable, matplotlib is not installed, or the file cannot be written.
         """
         if not self.stable:
             raise SettingError(
-                "expected the margins of a stable loop, received those of an unstable one, which "
-                "has none to draw; lower the gains"
-            )
-        return stacked([self._draw], (4.0,)).plot(ax, file)
+                name="margins", expected="those of a stable loop",
+                received="those of an unstable one, which has none to draw",
+                remedy="lower the gains",
+            )  # fmt: skip
+        return stacked([self._draw], (4.0,))
 
     def _draw(self, ax: Any) -> None:
         turn = np.linspace(0.0, 2.0 * np.pi, 361)
@@ -378,9 +374,10 @@ def loop_response(
     nyquist = math.pi / controller.Ts
     if not np.all((w > 0.0) & (w <= nyquist * (1 + 1e-12))):
         raise SettingError(
-            f"omega: expected frequencies above 0 and up to half the sample rate, {nyquist:.6g} "
-            f"rad/s, received {omega!r}"
-        )
+            name="omega",
+            expected=f"frequencies above 0 and up to half the sample rate, {nyquist:.6g} rad/s",
+            received=repr(omega),
+        )  # fmt: skip
     path = loop_path(controller, speed=speed)
     return _core.loop_response(path, *sampled(plant, controller.Ts, speed), w)
 
@@ -439,8 +436,9 @@ def scheduled_gains(controller: Controller, speed: float | None) -> tuple[Gains,
         return controller.gains.to("standard"), 0.0
     if speed is None:
         raise SettingError(
-            "expected the speed at which the gain schedule is taken, received none; give speed"
-        )
+            name="speed", expected="that at which the gain schedule is taken", received="none",
+            remedy="give speed",
+        )  # fmt: skip
     at = np.array([point[0] for point in controller.schedule])
     rows = [point[1].to("parallel") for point in controller.schedule]
     size = abs(real("speed", speed))

@@ -188,9 +188,9 @@ class LinearLoop:
         require_controller(controller, plant, "LinearLoop.of(controller, plant)")
         if not isinstance(plant, StateSpace):
             raise SettingError(
-                f"expected the plant as a StateSpace, got {type(plant).__name__}; a linear model "
-                "has to_ss()"
-            )
+                name="plant", expected="a StateSpace", received=type(plant).__name__,
+                remedy="a linear model has to_ss()",
+            )  # fmt: skip
         if encoder is None:
             encoder = controller.counts_per_rev is not None
         return cls(
@@ -272,7 +272,9 @@ class LinearLoop:
 
     def _named(self, name: str) -> StateSpace:
         if name not in SYSTEMS:
-            raise SettingError(f"expected one of {', '.join(SYSTEMS)}, got {name!r}")
+            raise SettingError(
+                name="name", expected=f"one of {', '.join(SYSTEMS)}", received=repr(name)
+            )
         found: StateSpace = getattr(self, name)
         return found
 
@@ -298,7 +300,7 @@ def simulate(system: StateSpace, u: FloatArray) -> FloatArray:
     A, B, C, D = system
     u = np.asarray(u, dtype=np.float64)
     if u.ndim != 2 or u.shape[1] != B.shape[1]:
-        raise DataError(f"expected inputs of shape (N, {B.shape[1]}), got {u.shape}")
+        raise DataError(name="u", expected=f"shape (N, {B.shape[1]})", received=str(u.shape))
     x, found = np.zeros(len(A)), np.empty((len(u), len(C)))
     for k, v in enumerate(u):
         found[k] = C @ x + D @ v

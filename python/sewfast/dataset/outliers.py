@@ -265,9 +265,9 @@ def _series(data: Dataset, model: Simulates | None) -> list[FloatArray]:
         return [e.y for e in data.experiments]
     if data.n_inputs != len(model.input_names):
         raise DataError(
-            f"mark_outliers: the model has {len(model.input_names)} inputs, the data have "
-            f"{data.n_inputs}"
-        )
+            name="model", expected=f"the inputs of the data, {data.n_inputs}",
+            received=f"{len(model.input_names)}", remedy="give a model of these data",
+        )  # fmt: skip
     runs = model.simulate(data)
     return [e.y - run for e, run in zip(data.experiments, runs, strict=True)]
 

@@ -451,9 +451,11 @@ def _held(
         for start, length in gaps:
             if start == 0:
                 raise DataError(
-                    f"{e.name}: input {name!r} is not known at its first {length} samples, so "
-                    f"there is nothing to hold; begin later: data[{length}:]"
-                )
+                    name=f"{e.name}: input {name!r}",
+                    expected="a value before the first gap to hold",
+                    received=f"none in the first {length} samples",
+                    remedy=f"begin later: data[{length}:]",
+                )  # fmt: skip
             column[start : start + length] = column[start - 1]
         if gaps:
             notes.append(

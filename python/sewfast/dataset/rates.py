@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .. import _core
 from ..arrays import FloatArray, frozen, runs
-from ..errors import DataError, SettingError
+from ..errors import DataError, SettingError, located
 from .experiment import without_weightless
 from .outliers import quantum, white_noise
 from .pieces import interpolated, require_sane
@@ -349,8 +349,8 @@ def _differentiated(e: Experiment, data: Dataset, method: Method) -> Experiment:
         try:
             rate[first : first + count] = _rate(piece - piece[0], data.Ts, method)
         except DataError as error:
-            raise DataError(
-                f"{e.name} [{e.range_text}], output {data.output_name!r}: {error}"
+            raise located(
+                DataError, f"{e.name} [{e.range_text}], output {data.output_name!r}", error
             ) from error
     rate[~known] = np.nan
     return replace(e, y=frozen(rate), removed=_removed(e, data.Ts))

@@ -448,20 +448,8 @@ def plot(data: Dataset, ax: Any = None, *, file: str | os.PathLike[str] | None =
 
     Parameters
     ----------
-    ax : Axes or sequence of Axes, optional
-        One shows the output over time; several are filled in reading order.
-    file : path, optional
-        Where to write the figure: PNG, SVG or PDF by its ending.
-
-    Returns
-    -------
-    Axes or array of Axes
-        `ax`, or the panels of a new figure: time and spectrum of each input, then of the output.
-
-    Raises
-    ------
-    SettingError
-        If matplotlib is not installed or the file cannot be written.
+    ax, file
+        As for `Drawing.plot`. One shows the output over time; several are filled in reading order.
     """
     return drawing(data).plot(ax, file)
 

@@ -148,7 +148,10 @@ def _mean(data: Dataset) -> Trend:
     ):
         known = column[np.isfinite(column)]
         if len(known) == 0:
-            raise DataError(f"{data.source}: {name!r} has no value to take a mean of")
+            raise DataError(
+                name=f"{data.source}: {name!r}", expected="a value to take a mean of",
+                received="none", remedy="leave this column out",
+            )  # fmt: skip
         level.append(known.mean())
     return Trend(frozen(np.array(level)), frozen(np.zeros(len(level))))
 

@@ -102,24 +102,27 @@ def deploy(
         what = pid_of(what, "deploy")
     if not isinstance(what, Model | Controller):
         raise SettingError(
-            f"expected a model or a controller, got {type(what).__name__}; load it with "
-            "sewfast.load_model or sewfast.load_controller"
-        )
+            name="what", expected="a model or a controller", received=type(what).__name__,
+            remedy="load it with sewfast.load_model or sewfast.load_controller",
+        )  # fmt: skip
     if to not in TARGETS:
-        raise SettingError(f"to: expected one of {', '.join(TARGETS)}, received {to!r}")
+        raise SettingError(name="to", expected=f"one of {', '.join(TARGETS)}", received=repr(to))
     if precision is None:
         precision = "f64" if to in ("fmi", "onnx") else "f32"
     if precision not in PRECISIONS:
-        raise SettingError(f"precision: expected {' or '.join(PRECISIONS)}, received {precision!r}")
+        raise SettingError(
+            name="precision", expected=" or ".join(PRECISIONS), received=repr(precision)
+        )
     if name is None:
         name = "controller" if isinstance(what, Controller) else "model"
     taken = name in c99.KEYWORDS or name.endswith("_test")
     if taken or not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name):
         raise SettingError(
-            f"name: expected lower-case letters, digits and underscores that are no word of the "
-            f"language and no name of another file (_test, fmi3), received {name!r}; for example "
-            "drive"
-        )
+            name="name",
+            expected="lower-case letters, digits and underscores that are no word of the "
+            "language and no name of another file (_test, fmi3)",
+            received=repr(name), remedy="for example drive",
+        )  # fmt: skip
     writer = _WRITERS[to]
     if changeable:
         _require_changeable(what, to)
@@ -139,7 +142,10 @@ def _write(target: Path, contents: Mapping[Path, bytes]) -> None:
     made: list[Path] = []
     try:
         if target.exists() and not target.is_dir():
-            raise SettingError(f"expected a folder, got the file {target}; name another one")
+            raise SettingError(
+                name="folder", expected="a folder", received=f"the file {target}",
+                remedy="name another one",
+            )  # fmt: skip
         for folder in dict.fromkeys(path.parent for path in contents):
             made += [place for place in (folder, *folder.parents) if not place.exists()]
             folder.mkdir(parents=True, exist_ok=True)

@@ -85,7 +85,10 @@ class Code:
     def literal(self, value: float) -> str:
         """The shortest decimal that a compiler reads as this number."""
         if math.isnan(value):
-            raise SettingError("expected numbers to write, got NaN; identify the model again")
+            raise SettingError(
+                name="model", expected="numbers to write", received="NaN",
+                remedy="identify the model again",
+            )  # fmt: skip
         if math.isinf(value):
             largest = "3.40282347e+38f" if self.single else "1.7976931348623157e+308"
             return largest if value > 0 else f"-{largest}"

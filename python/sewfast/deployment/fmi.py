@@ -62,7 +62,10 @@ def files(
 ) -> tuple[dict[str, bytes], list[str]]:
     """The FMU by its file's name, and what is to be said of it."""
     if precision != "f64":
-        raise SettingError(f"precision: expected f64 for fmi, received {precision!r}; leave it out")
+        raise SettingError(
+            name="precision", expected="f64 for fmi", received=repr(precision),
+            remedy="leave it out",
+        )  # fmt: skip
     code, _ = c99.files(what, name, "f64")
     system = _of(what, name)
     sources = {f"{name}.{end}": code[f"{name}.{end}"] for end in ("c", "h")}
@@ -95,9 +98,9 @@ def _of(what: Model | Controller, name: str) -> _System:
     names = [*what.input_names, what.output_name, "time"]
     if len(set(names)) < len(names):
         raise SettingError(
-            f"expected names of inputs and output that differ and are not time, got "
-            f"{', '.join(names[:-1])}; rename the columns and identify again"
-        )
+            name="model", expected="names of inputs and output that differ and are not time",
+            received=", ".join(names[:-1]), remedy="rename the columns and identify again",
+        )  # fmt: skip
     direct = any(e.orders["nk"] == 0 for e in embedded_members(what, "f64")[1])
     return _System(
         name, what.title, what.Ts, inputs, (what.output_name, what.output_unit), direct,
@@ -201,9 +204,9 @@ def _compiled(name: str, sources: dict[str, str]) -> bytes:
     compiler = next((c for c in map(shutil.which, ("cc", "gcc", "clang")) if c), None)
     if compiler is None or not sys.platform.startswith("linux"):
         raise SettingError(
-            "expected Linux and a C compiler to build an FMU, got none; install gcc or clang, or "
-            "deploy to c99"
-        )
+            name="to", expected="Linux and a C compiler to build an FMU", received="none",
+            remedy="install gcc or clang, or deploy to c99",
+        )  # fmt: skip
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         for file, text in sources.items():
@@ -216,7 +219,9 @@ def _compiled(name: str, sources: dict[str, str]) -> bytes:
         )
         if done.returncode:
             said = done.stderr.strip().splitlines() or ["nothing was said"]
-            raise SettingError(f"expected {compiler} to compile the FMU, got: {said[0][:300]}")
+            raise SettingError(
+                name="to", expected=f"{compiler} to compile the FMU", received=said[0][:300]
+            )
         return made.read_bytes()
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from .. import __version__, _core
 from ..control import Controller
 from ..dataset import FloatArray
-from ..errors import SettingError
+from ..errors import SettingError, not_installed
 from ..models import Model
 from .precision import embedded_members
 
@@ -30,12 +30,14 @@ def files(
     """Both graphs by their files' names, and what is to be said of them."""
     if isinstance(what, Controller):
         raise SettingError(
-            "to: expected a model for onnx, received a controller; deploy controllers to c99 or st"
-        )
+            name="to", expected="a model for onnx", received="a controller",
+            remedy="deploy controllers to c99 or st",
+        )  # fmt: skip
     if precision != "f64":
         raise SettingError(
-            f"precision: expected f64 for onnx, received {precision!r}; leave it out"
-        )
+            name="precision", expected="f64 for onnx", received=repr(precision),
+            remedy="leave it out",
+        )  # fmt: skip
     onnx = _library()
     step = _step_graph(onnx, what, f"{name}_step")
     simulate = _simulate_graph(onnx, what, f"{name}_simulate")
@@ -98,9 +100,7 @@ def _library() -> ModuleType:
         import onnx.checker
         import onnx.helper
     except ImportError as error:
-        raise SettingError(
-            "expected the onnx package to write ONNX, got none; pip install 'sewfast[onnx]'"
-        ) from error
+        raise not_installed("onnx", "ONNX", "sewfast[onnx]") from error
     found: ModuleType = onnx
     return found
 

@@ -37,9 +37,10 @@ def embedded_members(
     members = list(model.members) if isinstance(model, Ensemble) else [model]
     if len(members) > _MOST_MEMBERS:
         raise SettingError(
-            f"expected at most {_MOST_MEMBERS} members for a processor, got {len(members)}; deploy "
-            "some of them with Ensemble.of(model.members[:3])"
-        )
+            name="model", expected=f"at most {_MOST_MEMBERS} members for a processor",
+            received=str(len(members)),
+            remedy="deploy some of them with Ensemble.of(model.members[:3])",
+        )  # fmt: skip
     scaled = {"scaled": precision == "f32"}
     embedded = [m.core.embedded(**(scaled if m.kind == "neural_oe" else {})) for m in members]
     return members, embedded, model.combine if isinstance(model, Ensemble) else "median"
@@ -99,18 +100,20 @@ def model_loss(
         loss = float(np.max(np.abs(single - double))) / span
     if not np.isfinite(double).all():
         raise FitError(
-            "expected a model whose free run stays finite over its own input range, got one that "
-            "leaves it; identify a stable model"
-        )
+            name="model", expected="a free run that stays finite over its own input range",
+            received="one that leaves it", remedy="identify a stable model",
+        )  # fmt: skip
     if not loss <= MOST_LOSS:
         poles = [abs(p) for m in members if m.kind in ("arx", "oe", "iv") for p in m.poles]  # type: ignore[attr-defined]
         slow = f" (its slowest pole is {max(poles):.9g})" if poles else ""
         got = f"{loss:.3%}" if math.isfinite(loss) else "an overflow"
         raise SettingError(
-            f"expected a model that single precision changes by at most {MOST_LOSS:.0%} of its "
-            f"span, got {got}{slow}; deploy it with precision f64, or identify it at a longer "
-            "sample time"
-        )
+            name="precision",
+            expected=f"a model that single precision changes by at most {MOST_LOSS:.0%} of its "
+            "span",
+            received=f"{got}{slow}",
+            remedy="deploy it with precision f64, or identify it at a longer sample time",
+        )  # fmt: skip
     return f"single precision changes a free run of {_SAMPLES} samples by {loss:.1e} of its span"
 
 

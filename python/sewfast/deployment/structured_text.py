@@ -20,8 +20,9 @@ def files(what: Model | Controller, name: str, precision: str) -> tuple[dict[str
     """The function block by its file's name, and what is to be said of it."""
     if not isinstance(what, Controller):
         raise SettingError(
-            "to: expected a controller for structured text, received a model; deploy models to c99"
-        )
+            name="to", expected="a controller for structured text", received="a model",
+            remedy="deploy models to c99",
+        )  # fmt: skip
     core, loss = controller_step(what, precision)
     block = _block(what, name, _Type("REAL" if precision == "f32" else "LREAL"), core.numbers)
     note = f"PID as structured text: FUNCTION_BLOCK {name.upper()}, call it every {what.Ts:g} s"

@@ -321,22 +321,15 @@ class ReportCard(Judged):
 
         Parameters
         ----------
-        ax : Axes or sequence of Axes, optional
-            One gets the figure's first panel; several get as many panels, in reading order.
+        ax, file
+            As for `Drawing.plot`; one gets the figure's first panel.
         figure : str, optional
             `bands`, `residuals`, `bode`, `poles` or `region`: whichever the card has data for.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the panels of a new figure, shape (panels,).
 
         Raises
         ------
         SettingError
-            For another figure, if matplotlib is not installed, or the file cannot be written.
+            For another figure, or as `Drawing.plot`.
         """
         from .figures import drawing
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..dataset import FloatArray
 from ..dynamic_model import DynamicModel
-from ..errors import DataError, SettingError, SewfastError
+from ..errors import DataError, SettingError, SewfastError, not_installed
 from .region import TrainingRegion, stored_region
 from .residuals import representative
 
@@ -318,9 +318,7 @@ class OperatingPoint:
         try:
             import control
         except ImportError as e:
-            raise SettingError(
-                "to_control needs python-control, which is not installed: pip install control"
-            ) from e
+            raise not_installed("control", "to_control", "sewfast[control]") from e
         A, B, C, D = self.delayed()
         return control.ss(A, B, C, D, self.Ts)
 

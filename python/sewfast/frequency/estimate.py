@@ -57,18 +57,23 @@ def periodic(
     """
     u, y = _blocks("u", u), _blocks("y", y)
     if u.shape != y.shape:
-        raise DataError(f"expected u and y of one shape (M, P, N), got {u.shape} and {y.shape}")
+        raise DataError(
+            name="u, y", expected="one shape (M, P, N)", received=f"{u.shape} and {y.shape}"
+        )
     realisations, periods, n = u.shape
     if realisations * periods < 2:
         raise DataError(
-            "expected at least two periods or realisations, got one: nothing tells how sure it is"
-        )
+            name="y", expected="at least two periods or realisations", received="one",
+            remedy="nothing tells how sure it is",
+        )  # fmt: skip
     k = _lines(lines, n)
     U, Y = (np.fft.rfft(x, axis=-1)[..., k] / n for x in (u, y))
     if r is not None:
         reference = _blocks("r", r)
         if reference.shape != u.shape:
-            raise DataError(f"expected r as u, {u.shape}, got {reference.shape}")
+            raise DataError(
+                name="r", expected=f"the shape of u, {u.shape}", received=str(reference.shape)
+            )
         R = np.fft.rfft(reference, axis=-1)[..., k] / n
         _require_excited(R, "r")
         turn = np.conj(R) / np.abs(R)
@@ -146,15 +151,16 @@ def spectral(
         signals.append(_signal("r", r))
     lengths = [len(s) for s in signals]
     if len(set(lengths)) > 1:
-        raise DataError(f"expected signals of one length, got {lengths}")
+        raise DataError(name="r, u, y", expected="one length", received=str(lengths))
     n = lengths[0]
     size = _segment(segment, n)
     starts = range(0, n - size + 1, size // 2)
     if len(starts) < 3:
         raise DataError(
-            f"expected at least three segments of {size} samples, which overlap by half, got {n} "
-            "samples; record longer, or choose a shorter segment"
-        )
+            name="segment",
+            expected=f"at least three segments of {size} samples, which overlap by half",
+            received=f"{n} samples", remedy="record longer, or choose a shorter segment",
+        )  # fmt: skip
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(size) / size)
     power = np.zeros((len(signals), len(signals), size // 2 + 1), dtype=np.complex128)
     for start in starts:
@@ -166,8 +172,19 @@ def spectral(
     by = len(signals) - 1 if r is not None else 0
     Suu, Syy, Srr = (power[j, j].real for j in (0, 1, by))
     Sru, Sry = power[by, 0], power[by, 1]
+    if not np.isfinite(power).all():
+        raise DataError(
+            expected="values with finite squares",
+            received="larger ones",
+            remedy="change their units",
+        )
     if not np.any(Suu > 0.0):
-        raise DataError("u: expected an input that moves, got a constant one")
+        raise DataError(name="u", expected="an input that moves", received="a constant one")
+    if not np.any(Srr > 0.0):
+        raise DataError(
+            name="r", expected="a reference that moves", received="a constant one",
+            remedy="name the column that the controller follows",
+        )  # fmt: skip
     # halves of Hann windows overlap: each segment counts 11/18 of an independent one
     blocks = max(len(starts) * 11.0 / 18.0, 2.0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -180,9 +197,10 @@ def spectral(
         )  # fmt: skip
     if r is not None and np.nanmedian(related) < 2.0 / blocks:
         raise DataError(
-            "r: expected a reference that moves u, got one that has nothing to do with it; name "
-            "the column that the controller follows"
-        )
+            name="r", expected="a reference that moves u",
+            received="one that has nothing to do with it",
+            remedy="name the column that the controller follows",
+        )  # fmt: skip
     known = np.isfinite(value) & np.isfinite(variance)
     hertz = np.arange(1, size // 2 + 1) / (size * Ts)
     return FrequencyResponse(
@@ -202,14 +220,16 @@ def _segment(segment: int | None, n: int) -> int:
     if segment is None:
         return max(2 * (n // (SEGMENTS + 1)), LEAST)
     if not isinstance(segment, (int, np.integer)) or isinstance(segment, bool) or segment < LEAST:
-        raise SettingError(f"segment: expected at least {LEAST} samples, got {segment!r}")
+        raise SettingError(
+            name="segment", expected=f"at least {LEAST} samples", received=repr(segment)
+        )
     return int(segment) // 2 * 2
 
 
 def _signal(name: str, values: ArrayLike) -> FloatArray:
     found = _numbers(name, values)
     if found.ndim != 1:
-        raise DataError(f"{name}: expected shape (N,), got {found.shape}")
+        raise DataError(name=name, expected="shape (N,)", received=str(found.shape))
     return found
 
 
@@ -217,9 +237,10 @@ def _blocks(name: str, values: ArrayLike) -> FloatArray:
     found = _numbers(name, values)
     if found.ndim != 3 or found.shape[2] < LEAST or 0 in found.shape:
         raise DataError(
-            f"{name}: expected shape (realisations, periods, samples) with at least {LEAST} "
-            f"samples, got {found.shape}"
-        )
+            name=name,
+            expected=f"shape (realisations, periods, samples) with at least {LEAST} samples",
+            received=str(found.shape),
+        )  # fmt: skip
     return found
 
 
@@ -227,26 +248,28 @@ def _numbers(name: str, values: ArrayLike) -> FloatArray:
     try:
         found = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as e:
-        raise DataError(f"{name}: expected numbers, got {str(values)[:40]!r}") from e
+        raise DataError(name=name, expected="numbers", received=repr(str(values)[:40])) from e
     bad = np.flatnonzero(~np.isfinite(found.ravel()))
     if len(bad):
         raise DataError(
-            f"{name}: expected finite values, got {found.ravel()[bad[0]]} at sample {bad[0]}; cut "
-            "the record there"
-        )
+            name=name, expected="finite values",
+            received=f"{found.ravel()[bad[0]]} at sample {bad[0]}", remedy="cut the record there",
+        )  # fmt: skip
     return found
 
 
 def _lines(lines: ArrayLike, n: int) -> np.ndarray:
     k = np.asarray(lines)
     if k.ndim != 1 or not len(k) or not np.issubdtype(k.dtype, np.integer):
-        raise DataError(f"lines: expected whole numbers, shape (n,), got {lines!r}")
+        raise DataError(name="lines", expected="whole numbers, shape (n,)", received=repr(lines))
     if k[0] < 1 or k[-1] > n // 2 or np.any(np.diff(k) <= 0):
-        raise DataError(f"lines: expected rising numbers from 1 to {n // 2}, got {lines!r}")
+        raise DataError(
+            name="lines", expected=f"rising numbers from 1 to {n // 2}", received=repr(lines)
+        )
     return k
 
 
 def _require_excited(spectrum: Complex, name: str) -> None:
     size = np.abs(spectrum).mean(axis=(0, 1))
     if not np.all(size > 1e-9 * max(float(size.max()), 1e-300)):
-        raise DataError(f"{name}: expected power at every line, got none at some of them")
+        raise DataError(name=name, expected="power at every line", received="none at some of them")

@@ -119,7 +119,7 @@ def propose(
     """
     Ms = real("Ms", Ms)
     if not 1.0 < Ms < math.inf:
-        raise SettingError(f"expected a finite Ms above 1, got {Ms:g}")
+        raise SettingError(name="Ms", expected="finite and above 1", received=f"{Ms:g}")
     of = fit.response
     if like is None:
         own = of.provenance.get("counts_per_rev")
@@ -140,9 +140,9 @@ def propose(
         best = found if found[0] - plain[0] > math.log(WORTH) else plain
     if not math.isfinite(best[0]):
         raise FitError(
-            f"expected gains under which the loop is stable with an Ms of at most {Ms:g}, found "
-            "none; look at the response, or allow a larger Ms"
-        )
+            name="Ms", expected=f"gains under which the loop is stable with at most {Ms:g}",
+            received="none", remedy="look at the response, or allow a larger Ms",
+        )  # fmt: skip
     without = None if best is plain else _proposal(task, plain[1])
     return replace(_proposal(task, best[1]), without=without)
 

@@ -103,7 +103,9 @@ class FrequencyResponse:
         variance follows F(2, 2 nu) (Pintelon and Schoukens 2012, section 2.4).
         """
         if not 0.0 < level < 1.0:
-            raise SettingError(f"level: expected a share between 0 and 1, got {level!r}")
+            raise SettingError(
+                name="level", expected="a share between 0 and 1", received=repr(level)
+            )
         nu = max(self.blocks - 1.0, 1.0)
         quantile = nu * ((1.0 - level) ** (-1.0 / nu) - 1.0)
         found: FloatArray = np.sqrt(self.variance * quantile)
@@ -119,9 +121,11 @@ class FrequencyResponse:
         """
         if not self.hertz[0] <= hertz <= self.hertz[-1]:
             raise SettingError(
-                f"expected a frequency from {self.hertz[0]:.4g} to {self.hertz[-1]:.4g} Hz, which "
-                f"were measured, got {hertz!r}"
-            )
+                name="hertz",
+                expected=f"a frequency from {self.hertz[0]:.4g} to {self.hertz[-1]:.4g} Hz, which "
+                "were measured",
+                received=repr(hertz),
+            )  # fmt: skip
         size = np.interp(hertz, self.hertz, np.log(np.abs(self.value)))
         turn = np.interp(hertz, self.hertz, np.unwrap(np.angle(self.value)))
         return complex(np.exp(size + 1j * turn))
@@ -142,9 +146,9 @@ class FrequencyResponse:
         """From the measured output to the command, with its sign turned."""
         if not math.isclose(controller.Ts, self.Ts, rel_tol=1e-9):
             raise SettingError(
-                f"expected a controller at the response's sample time, {self.Ts:g} s, got one at "
-                f"{controller.Ts:g} s"
-            )
+                name="controller", expected=f"the response's sample time, {self.Ts:g} s",
+                received=f"{controller.Ts:g} s",
+            )  # fmt: skip
         gains = controller.gains
         for name, mine, theirs in (
             ("u", self.u_unit, gains.u_unit),
@@ -152,8 +156,9 @@ class FrequencyResponse:
         ):
             if mine and mine != theirs:
                 raise SettingError(
-                    f"expected a controller whose {name} is in {mine}, got {theirs}; convert it"
-                )
+                    name="controller", expected=f"its {name} in {mine}", received=str(theirs),
+                    remedy="convert it",
+                )  # fmt: skip
         path = loop_path(controller, speed=speed)
         omega = 2.0 * np.pi * self.hertz
         # the plant is a delay of one sample, which is taken out again
@@ -175,9 +180,10 @@ class FrequencyResponse:
         seen = self.coherence > 0.5
         if seen.sum() < LEAST_LINES:
             raise DataError(
-                f"expected at least {LEAST_LINES} frequencies with a coherence above .5, got "
-                f"{seen.sum()}; excite more, or longer"
-            )
+                name="response",
+                expected=f"at least {LEAST_LINES} frequencies with a coherence above .5",
+                received=str(seen.sum()), remedy="excite more, or longer",
+            )  # fmt: skip
         hertz, value, radius = self.hertz[seen], self.value[seen], self.radius()[seen]
         n = len(hertz)
         fine = np.interp(np.arange(0, n - 1 + 1e-9, 1.0 / BETWEEN), np.arange(n), hertz)
@@ -376,8 +382,9 @@ class LoopMargins:
         """From L at rising frequencies and the radius of its uncertainty, all of shape (n,)."""
         if len(hertz) < LEAST_LINES:
             raise DataError(
-                f"expected at least {LEAST_LINES} frequencies for margins, got {len(hertz)}"
-            )
+                name="response", expected=f"at least {LEAST_LINES} frequencies for margins",
+                received=str(len(hertz)),
+            )  # fmt: skip
         # between two lines L is a straight line in log magnitude and phase
         fine = np.interp(np.arange(0, len(hertz) - 1 + 1e-9, 0.1), np.arange(len(hertz)), hertz)
         size = np.interp(fine, hertz, np.log(np.maximum(np.abs(L), 1e-300)))

@@ -114,16 +114,16 @@ class ShaftFit:
         """
         if not self.has_resonance:
             raise FitError(
-                "expected a machine with a resonance for a notch, the fit found a rigid one; leave "
-                "the notch out, or give Biquad.notch(frequency)"
-            )
+                name="notch", expected="a machine with a resonance", received="a rigid one",
+                remedy="leave the notch out, or give Biquad.notch(frequency)",
+            )  # fmt: skip
         p = {name: found.value for name, found in self.parameters.items()}
         fr, fa, zr = p["resonance_hertz"], p["antiresonance_hertz"], p["resonance_damping"]
         if fr * self.response.Ts >= 0.5:
             raise FitError(
-                f"expected a resonance below half the sample rate for a notch, it lies at {fr:.4g} "
-                "Hz; sample faster"
-            )
+                name="notch", expected="a resonance below half the sample rate",
+                received=f"one at {fr:.4g} Hz", remedy="sample faster",
+            )  # fmt: skip
         ratio = fa / fr
         rises = abs(ratio**2 - 1.0 + 2j * p["antiresonance_damping"] * ratio) / (
             2.0 * zr * ratio**2
@@ -173,9 +173,9 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
     usable = response.coherence > 0.5
     if usable.sum() < LEAST:
         raise DataError(
-            f"expected at least {LEAST} frequencies with a coherence above .5, got {usable.sum()}; "
-            "excite more, or longer"
-        )
+            name="response", expected=f"at least {LEAST} frequencies with a coherence above .5",
+            received=str(usable.sum()), remedy="excite more, or longer",
+        )  # fmt: skip
     f, g = response.hertz[usable], response.value[usable]
     sigma = np.sqrt(0.5 * _smoothed(response.variance[usable]) + (FLOOR * np.abs(g)) ** 2)
     task = _Task(f, g, sigma, response.Ts, response.from_counts)
@@ -186,16 +186,17 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
         shaft = min((s for s in found if _is_shaft(s[1], f)), key=lambda s: s[0], default=None)
         if shaft is None and resonance:
             raise FitError(
-                "expected a resonance within the measured frequencies, none was found; leave "
-                "resonance=None, or measure to higher frequencies"
-            )
+                name="resonance", expected="one within the measured frequencies", received="none",
+                remedy="leave resonance=None, or measure to higher frequencies",
+            )  # fmt: skip
         if shaft is not None and (resonance or _is_better(task, shaft[0], rigid[0])):
             best = shaft
     cost, theta, covariance = best
     if not math.isfinite(cost):
         raise FitError(
-            "expected a fit that converges, none did; look at the response: is it a speed?"
-        )
+            name="response", expected="a fit that converges", received="none",
+            remedy="look at it: is it a speed?",
+        )  # fmt: skip
     freedom = max(2 * len(f) - len(theta), 1)
     scale = max(1.0, cost / freedom)
     parameters = _parameters(theta, covariance * scale, response)

@@ -202,9 +202,11 @@ class Connection(Unique):
         """
         if not self._owner.acquire(blocking=False):
             raise SettingError(
-                "expected one thread to use a drive, a second one used it at the same time; to "
-                "end a run from another thread, set the event that `stream` takes as cancel"
-            )
+                name="drive", expected="one thread that uses it",
+                received="a second one at the same time",
+                remedy="to end a run from another thread, set the event that `stream` takes as "
+                "cancel",
+            )  # fmt: skip
         try:
             yield
         finally:
@@ -284,16 +286,15 @@ class Connection(Unique):
             self.halted = False
 
     def _unanswered(self, kind: int, attempts: int, waited_us: int, others: int) -> LinkError:
-        heard = "nor anything else; check cable and device"
+        heard, remedy = "nothing at all", "check cable and device"
         if others > 0:
-            heard = (
-                f"but {others} other frames: it receives nothing, or is too busy to answer; "
-                "see `sewfast doctor`"
-            )
+            heard = f"{others} other frames"
+            remedy = "the device hears nothing or is too busy: see `sewfast doctor`"
         return LinkError(
-            f"{self.port.url}: expected an answer to {Kind(kind).name}, none came within "
-            f"{1e-6 * waited_us:.2g} s to {attempts} attempts, {heard}, then connect again"
-        )
+            name=self.port.url, expected=f"an answer to {Kind(kind).name}",
+            received=f"{heard} within {1e-6 * waited_us:.2g} s of {attempts} attempts",
+            remedy=f"{remedy}, then connect again",
+        )  # fmt: skip
 
     # --- heartbeats -----------------------------------------------------------------------------
 
@@ -368,18 +369,18 @@ class Connection(Unique):
         return wire.identity(self._greeting.checked())
 
     def _nobody(self, patience: float) -> LinkError:
-        heard = "nothing came"
+        heard = "nothing"
         remedy = "check cable, supply and that the firmware speaks this protocol (docs/PROTOCOL.md)"
         if self._client.counters["echoed"]:
-            heard = "only what was sent came back"
+            heard = "only what was sent"
             remedy = "check whether transmit and receive are connected to each other"
         elif self._bytes:
-            heard = f"{self._bytes} bytes arrived that are not frames for this host"
+            heard = f"{self._bytes} bytes that are not frames for this host"
             remedy = f"check the baud rate ({self.port.baud}) and what runs on the device"
         return LinkError(
-            f"{self.port.url}: expected a device to answer HELLO within {patience:g} s, {heard}; "
-            f"{remedy}"
-        )
+            name=self.port.url, expected=f"a device that answers HELLO within {patience:g} s",
+            received=heard, remedy=remedy,
+        )  # fmt: skip
 
     def _recover(self, error: LinkError) -> None:
         """Open the port again and confirm the session; the device may have gone on meanwhile."""
@@ -390,9 +391,10 @@ class Connection(Unique):
         identity = self._return(lost, error)
         if identity.boot != self.identity.boot:
             self._failed = DeviceReset(
-                f"{error}; it came back, but the device has been reset meanwhile: connect again, "
-                "set the limits and start anew"
-            )
+                name=self.port.url, expected="the device as it was",
+                received=f"one that has been reset meanwhile ({error})",
+                remedy="connect again, set the limits and start anew",
+            )  # fmt: skip
             raise self._failed
         self.outages.append(time.monotonic() - lost)
 
@@ -406,9 +408,11 @@ class Connection(Unique):
             except LinkError as failed:
                 if time.monotonic() - lost + RETRY > self.resume:
                     raise LinkError(
-                        f"{error}; it did not come back within {self.resume:g} s: the device stops "
-                        f"its motor {self.watchdog:g} s after the last heartbeat"
-                    ) from failed
+                        name=self.port.url, expected=f"the port back within {self.resume:g} s",
+                        received=str(error),
+                        remedy=f"the device stops its motor {self.watchdog:g} s after the last "
+                        "heartbeat",
+                    ) from failed  # fmt: skip
             time.sleep(RETRY)
         raise error
 

@@ -15,7 +15,7 @@ from . import wire
 from .access import access, holders, latency_timer, permission_remedy
 from .connection import Connection
 from .drive import PATIENCE, Drive
-from .ports import CONNECT_TIMEOUT, NO_PORT, Port, list_ports, open_port, transport_of
+from .ports import A_PORT, CONNECT_TIMEOUT, Port, list_ports, open_port, transport_of
 
 # --- Diagnosis: what was found wrong with a port and the device behind it, and what to do ---------
 
@@ -399,7 +399,10 @@ def examine(url: str, *, baud: int = 115_200, echoes: int = ECHOES) -> Diagnosis
         For a url, baud or count that cannot be; whatever is wrong with port or device is a finding.
     """
     if isinstance(echoes, bool) or not isinstance(echoes, int) or echoes < 10:
-        raise SettingError(f"expected 10 or more echoes, got {echoes!r}; {ECHOES} suits most")
+        raise SettingError(
+            name="echoes", expected="10 or more", received=repr(echoes),
+            remedy=f"{ECHOES} suits most",
+        )  # fmt: skip
     return Diagnosis(url, tuple(_findings(url, baud, echoes)))
 
 
@@ -425,8 +428,8 @@ def _findings(url: str, baud: int, echoes: int) -> Iterator[Finding]:
 
 
 def _failure(name: str, error: LinkError) -> Finding:
-    found, _, remedy = str(error).rpartition("; ")
-    return Finding(name, "fail", found or remedy, remedy if found else "")
+    found, _, _ = str(error).partition(f"; {error.remedy}")
+    return Finding(name, "fail", found, error.remedy or "")
 
 
 def _unopened(url: str, error: LinkError) -> Finding:
@@ -444,7 +447,7 @@ def _unopened(url: str, error: LinkError) -> Finding:
         remedy = permission_remedy(found, vid, pid)
         measured = f"{url} belongs to {found.owner} with mode {found.mode}; you may not open it"
         return Finding("port", "fail", measured, remedy, {"group": found.group})
-    if NO_PORT in str(error):
+    if error.expected == A_PORT:
         return finding  # who has /dev/null open is every program there is
     if held := holders(url):
         return _with(finding, f"end {_named(held)}, which has it open", holders=held)

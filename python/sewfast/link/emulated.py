@@ -99,30 +99,34 @@ def build_firmware(source: str | os.PathLike[str] = ".", *, board: str = "mps2-a
         Another board; no source checkout; a compiler is missing; it does not compile.
     """
     if board not in BOARDS:
-        raise SettingError(f"board: expected {' or '.join(BOARDS)}, got {board!r}")
+        raise SettingError(name="board", expected=" or ".join(BOARDS), received=repr(board))
     start = Path(source).resolve()
     places = (start, *start.parents)
     root = next((p for p in places if (p / "examples/firmware/mps2/board.c").is_file()), None)
     if root is None:
         raise SettingError(
-            f"firmware: expected a source checkout of sewfast, got {start}; name one by --source, "
-            "or a firmware that is built already by --firmware FILE.elf"
-        )
+            name="firmware", expected="a source checkout of sewfast", received=str(start),
+            remedy="name one by --source, or a firmware that is built already by --firmware "
+            "FILE.elf",
+        )  # fmt: skip
     missing = [t for t in ("make", "cargo", "arm-none-eabi-gcc") if shutil.which(t) is None]
     if not Path("/usr/bin/rustc").exists():
         missing.append("/usr/bin/rustc")
     if missing:
         raise SettingError(
-            f"firmware: expected {', '.join(missing)}, which is missing; on Debian: apt-get "
-            f"install make cargo-web {PACKAGES}"
-        )
+            name="firmware", expected=" and ".join(missing), received="none",
+            remedy=f"on Debian: apt-get install make cargo-web {PACKAGES}",
+        )  # fmt: skip
     made = subprocess.run(
         ["make", "--no-print-directory", "-C", str(root), "firmware"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     if made.returncode != 0:
         last = (made.stderr or made.stdout).strip().splitlines()[-8:]
-        raise SettingError("firmware: it does not compile; make says:\n  " + "\n  ".join(last))
+        raise SettingError(
+            name="firmware", expected="sources that compile",
+            received="what make says:\n  " + "\n  ".join(last),
+        )  # fmt: skip
     return root / "target" / "bare" / f"{board}.elf"
 
 
@@ -162,14 +166,14 @@ class EmulatedBoard:
         boot_id: int | None = None,
     ) -> None:
         if clock not in ("credit", "real"):
-            raise SettingError(f"clock: expected 'credit' or 'real', got {clock!r}")
+            raise SettingError(name="clock", expected="'credit' or 'real'", received=repr(clock))
         #: QEMU's name of the board.
         self.board, self._code, self._static = _examined(Path(firmware))
         if shutil.which(EMULATOR) is None:
             raise SettingError(
-                f"expected the emulator {EMULATOR}, which is missing; on Debian: apt-get install "
-                f"{EMULATOR}"
-            )
+                name="board", expected=f"the emulator {EMULATOR}", received="none",
+                remedy=f"on Debian: apt-get install {EMULATOR}",
+            )  # fmt: skip
         self._counts = clock == "credit"
         drawn = secrets.randbits(32) if boot_id is None else boot_id & 0xFFFFFFFF
         with ExitStack() as opened:
@@ -217,9 +221,9 @@ class EmulatedBoard:
         self._log.seek(0)
         said = self._log.read().decode(errors="replace").strip().splitlines()[-3:]
         raise LinkError(
-            f"expected the emulated board to open its port within {_START:g} s, it did not; "
-            f"{EMULATOR} says: {' '.join(said) or 'nothing'}"
-        )
+            name="firmware", expected=f"the emulated board to open its port within {_START:g} s",
+            received="none", remedy=f"{EMULATOR} says: {' '.join(said) or 'nothing'}",
+        )  # fmt: skip
 
     def figures(self) -> BoardFigures:
         """Instructions, stack and size, as they are now."""
@@ -282,11 +286,14 @@ def _examined(firmware: Path) -> tuple[str, int, int]:
     try:
         raw = firmware.read_bytes()
     except OSError as e:
-        raise SettingError(f"{firmware}: expected a firmware, got {e.strerror!r}") from e
+        raise SettingError(
+            name=str(firmware), expected="a firmware", received=repr(e.strerror)
+        ) from e
     if len(raw) < 52 or raw[:6] != b"\x7fELF\x01\x01" or raw[18:20] != b"\x28\x00":
         raise SettingError(
-            f"{firmware}: expected a firmware for ARM (ELF), got another file; {remedy}"
-        )
+            name=str(firmware), expected="a firmware for ARM (ELF)", received="another file",
+            remedy=remedy,
+        )  # fmt: skip
     start, size, count = struct.unpack_from("<I10xHH", raw, 28)
     code = static = 0
     board = None
@@ -303,7 +310,7 @@ def _examined(firmware: Path) -> tuple[str, int, int]:
         board = next((name for name, place in BOARDS.items() if place == address), board)
     if board is None:
         raise SettingError(
-            f"{firmware}: expected a firmware for {' or '.join(BOARDS)}, got one for another "
-            f"board; {remedy}"
-        )
+            name=str(firmware), expected=f"a firmware for {' or '.join(BOARDS)}",
+            received="one for another board", remedy=remedy,
+        )  # fmt: skip
     return board, code, static

@@ -229,8 +229,7 @@ def _scheduling(wanted: bool) -> Iterator[list[str]]:
 
 def _raise_where_it_never_ran(outcome: Mapping[str, Any]) -> None:
     if outcome["name"] == "refused":
-        told = refusal(outcome["command"], outcome["result"], outcome["detail"])
-        raise LinkError(told)
+        raise refusal(outcome["command"], outcome["result"], outcome["detail"])
     if outcome["name"] == "unanswered":
         raise LinkError(
             expected=f"an answer to {wire.Kind(outcome['command']).name}", received="none",

@@ -17,6 +17,7 @@ from ..arrays import FloatArray
 from ..control.controller import Controller
 from ..control.loop import SMOOTHING, run_html
 from ..errors import DataError
+from ..plotting import Drawing, Plotted, Trace, loop_panels, stacked
 from ..recordfile import Header, RecordWriter
 from ..recordfile.filing import replacing
 from ..recordfile.writer import require_replaceable
@@ -33,7 +34,7 @@ BAR = 30
 
 
 @dataclass(frozen=True, eq=False)
-class Jitter:
+class Jitter(Plotted):
     """How late a loop awoke, how old its measurements were, and what it missed.
 
     These are measurements of one run on one computer under its load then: no operating system that
@@ -119,28 +120,9 @@ class Jitter:
         lines.append(f"  scheduling: {self.real_time}")
         return "\n".join(lines + _bars(self.histogram()))
 
-    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
-        """Draw both histograms.
-
-        Parameters
-        ----------
-        ax : Axes, optional
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the one panel of a new figure.
-
-        Raises
-        ------
-        SettingError
-            Where matplotlib is not installed or the file cannot be written.
-        """
-        from ..plotting import stacked
-
-        return stacked((self.panel,), (3.4,)).plot(ax, file)
+    def drawing(self) -> Drawing:
+        """Both histograms."""
+        return stacked((self.panel,), (3.4,))
 
     def panel(self, ax: Axes) -> None:
         """Draw both histograms into axes."""
@@ -220,7 +202,7 @@ def _bar(count: int, largest: int) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class HostLoopRun:
+class HostLoopRun(Plotted):
     """What a controller on the host did; entry k belongs to tick k, `t[k]` after the first.
 
     Attributes
@@ -334,34 +316,12 @@ class HostLoopRun:
             return dict.fromkeys(names)
         return {name: None if math.isnan(value) else value for name, value in found.items()}
 
-    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
-        """Draw output over reference, error, command, and how late each tick was.
-
-        Parameters
-        ----------
-        ax : Axes or sequence of Axes, optional
-            One shows the output, further ones error, command and histograms (`Jitter.plot`).
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the four panels of a new figure.
-
-        Raises
-        ------
-        SettingError
-            Where matplotlib is not installed or the file cannot be written.
-        """
-        from ..plotting import Trace, loop_panels, stacked
-
+    def drawing(self) -> Drawing:
+        """Output over reference, error, command, and how late each tick was."""
         trace = Trace.of(self.columns(), "measured", self.plant)
         limits = (self.controller.u_min, self.controller.u_max)
         panels = loop_panels([trace], self.units["y"], self.units["u"], limits)
-        return stacked((*panels, self.jitter.panel), (2.2, 1.3, 1.3, 2.4), share_x=False).plot(
-            ax, file
-        )
+        return stacked((*panels, self.jitter.panel), (2.2, 1.3, 1.3, 2.4), share_x=False)
 
     def _repr_html_(self) -> str:
         """A table for a notebook."""

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, NoReturn, SupportsIndex, TypeAlias
 from urllib.parse import urlsplit
 
-from ..errors import LinkError, SettingError
+from ..errors import LinkError, SettingError, not_installed
 
 try:
     import termios
@@ -45,18 +45,22 @@ _UNREACHABLE = {errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.EN
 Texts: TypeAlias = tuple[str, str, str]
 """Of a failure: expected, received, remedy."""
 
-NO_PORT = "expected a serial port, it is something else"
-"""In the message about a file, a folder or a device of another kind."""
+A_PORT = "a serial port"
+"""What is expected instead of a file, a folder or a device of another kind."""
 
 
 def explain(url: str, doing: Literal["open", "read", "write"], error: BaseException) -> LinkError:
     """The error as it is raised: expected, received, remedy."""
     if isinstance(error, LinkError):
-        return LinkError(f"{url}: expected an open port, {error}; connect again")
+        return LinkError(
+            name=url, expected="an open port", received=str(error), remedy="connect again"
+        )
     number, kind = _number(error), transport_of(url) or SerialPort
     meant = kind.opening if doing == "open" else kind.losing
     expected, received, remedy = meant(url, number, error)
-    return LinkError(f"{url}: expected {expected}, {received} ({_plain(error)}); {remedy}")
+    return LinkError(
+        name=url, expected=expected, received=f"{received} ({_plain(error)})", remedy=remedy
+    )
 
 
 def _number(error: BaseException) -> int | None:
@@ -94,9 +98,9 @@ class Unique:
 def _refusal(owner: Any) -> SettingError:
     name = type(owner).__name__
     return SettingError(
-        f"expected one owner of a port, got a copy of a {name}; pass the {name} itself on, or "
-        "connect in the process that uses it"
-    )
+        name="port", expected="one owner", received=f"a copy of a {name}",
+        remedy=f"pass the {name} itself on, or connect in the process that uses it",
+    )  # fmt: skip
 
 
 # --- Ports ----------------------------------------------------------------------------------------
@@ -189,18 +193,18 @@ class Port(Unique, ABC):
             The operating system's number of the error.
         error : BaseException
         """
-        return "a port that opens", "it did not", "`sewfast ports` lists what is connected"
+        return "a port that opens", "one that does not", "`sewfast ports` lists what is connected"
 
     @staticmethod
     def losing(url: str, number: int | None, error: BaseException) -> Texts:
         """The same of one that was open."""
         if isinstance(error, TimeoutError) or "timeout" in str(error).lower():
             remedy = "check that the device runs; unplug it if it hangs"
-            return "the port to take bytes", f"it took none within {WRITE_TIMEOUT:g} s", remedy
+            return "the port to take bytes", f"none taken within {WRITE_TIMEOUT:g} s", remedy
         if number in (errno.ECONNRESET, errno.EPIPE) or isinstance(error, ConnectionError):
             remedy = "see why it ended, then connect again"
-            return "an open connection", "the other side ended it", remedy
-        return "an open port", "it vanished", "check cable and supply, then connect again"
+            return "an open connection", "one that the other side ended", remedy
+        return "an open port", "one that vanished", "check cable and supply, then connect again"
 
     def reopen(self, timeout: float = CONNECT_TIMEOUT) -> None:
         """Close it and open the same again.
@@ -244,21 +248,22 @@ class SerialPort(Port):
     def opening(url: str, number: int | None, error: BaseException) -> Texts:
         if number in _BUSY or (os.name == "nt" and number in _DENIED):
             remedy = "close the other program (a serial monitor, ModemManager, another sewfast)"
-            return "a port that nobody else uses", "it is in use", remedy
+            return "a port that nobody else uses", "one in use", remedy
         if number in _MISSING:
             remedy = "plug the cable in and see `sewfast ports`"
             if re.fullmatch(r"[^/\\]+:\d+", url):
                 remedy = f"an address is written socket://{url}"
-            return "a serial port of this name", "there is none", remedy
+            return "a serial port of this name", "none", remedy
         if number in _DENIED:
-            return "a port that you may open", "permission was denied", _permission(url)
+            return "a port that you may open", "no permission", _permission(url)
         if number in _NO_TERMINAL:
             remedy = "`sewfast ports` lists what is connected"
-            return "a serial port", "it is something else", remedy
+            return A_PORT, "something else", remedy
         if isinstance(error, ValueError):
             remedy = "give a rate that the adapter offers, such as 115200"
-            return "a baud rate of this port", "it takes another", remedy
-        return "a serial port that opens", "it did not", "unplug it, plug it in again and retry"
+            return "a baud rate of this port", "another", remedy
+        remedy = "unplug it, plug it in again and retry"
+        return "a serial port that opens", "one that does not", remedy
 
     def _open(self) -> None:
         module = _pyserial()
@@ -359,10 +364,10 @@ class NetworkPort(Port):
     def opening(url: str, number: int | None, error: BaseException) -> Texts:
         server = "a device that listens there"
         if number == errno.ECONNREFUSED:
-            return server, "nobody does", "start it (`sewfast device` for a virtual one)"
+            return server, "nobody", "start it (`sewfast device` for a virtual one)"
         if isinstance(error, TimeoutError) or number in _UNREACHABLE:
-            return server, "nothing answered", "check the address, the network and the firewall"
-        return server, "there is no such way", "check host and port"
+            return server, "no answer", "check the address, the network and the firewall"
+        return server, "no such way", "check host and port"
 
 
 class SocketPort(NetworkPort):
@@ -486,19 +491,21 @@ def open_port(url: str, baud: int = 115_200) -> Port:
         For a name of another kind, or where pyserial is not installed.
     """
     if not isinstance(baud, int) or isinstance(baud, bool) or baud <= 0:
-        raise SettingError(f"expected baud as a whole number above 0, got {baud!r}; try 115200")
+        raise SettingError(
+            name="baud", expected="a whole number above 0", received=repr(baud), remedy="try 115200"
+        )
     if not isinstance(url, str):
         raise SettingError(
-            f"expected a port's name as text, got {url!r}; as in '/dev/ttyUSB0' or "
-            "'socket://localhost:5000'"
-        )
+            name="port", expected="its name as text", received=repr(url),
+            remedy="as in '/dev/ttyUSB0' or 'socket://localhost:5000'",
+        )  # fmt: skip
     kind = transport_of(url)
     if kind is None:
         *others, last = (transport.form for transport in TRANSPORTS.values())
         raise SettingError(
-            f"expected {', '.join(others)} or {last}, got {url!r}; `sewfast ports` lists the "
-            "serial ports"
-        )
+            name="port", expected=f"{', '.join(others)} or {last}", received=repr(url),
+            remedy="`sewfast ports` lists the serial ports",
+        )  # fmt: skip
     return kind(url, baud)
 
 
@@ -563,10 +570,8 @@ def _pyserial() -> Any:
     try:
         import serial
     except ImportError as error:
-        raise SettingError(
-            'serial ports need pyserial, which is not installed: pip install "sewfast[link]"; '
-            "socket://HOST:PORT works without"
-        ) from error
+        purpose = "a serial port (socket://HOST:PORT works without)"
+        raise not_installed("pyserial", purpose, "sewfast[link]") from error
     return serial
 
 
@@ -593,9 +598,9 @@ def _address(url: str) -> tuple[str, int]:
         host = port = None
     if not host or not port or parts.path not in ("", "/"):
         raise SettingError(
-            f"expected {scheme}://HOST:PORT with a port of 1 to 65535, got {url!r}; "
-            f"as in {scheme}://localhost:5000"
-        )
+            name="port", expected=f"{scheme}://HOST:PORT with a port of 1 to 65535",
+            received=repr(url), remedy=f"as in {scheme}://localhost:5000",
+        )  # fmt: skip
     return host, port
 
 
@@ -617,5 +622,7 @@ def _read(port: Any, timeout: float) -> bytes | None:
 
 def _require(port: Any) -> Any:
     if port is None:
-        raise LinkError("it is closed")
+        raise LinkError(
+            name="port", expected="an open one", received="a closed one", remedy="connect again"
+        )
     return port

@@ -236,7 +236,7 @@ def play(
     if file is not None:
         require_replaceable(require_ending(file), overwrite=overwrite)
     if settings is not None and not isinstance(settings, Mapping):
-        raise SettingError(f"expected settings as a mapping, got {settings!r}")
+        raise SettingError(name="settings", expected="a mapping", received=repr(settings))
     columns = drive.columns(plan)
     n = len(plan.values)
     feed = Feed(columns, drive.identity.Ts, n, name, counts_per_rev=_counts_per_rev(drive))
@@ -247,7 +247,7 @@ def play(
     if played.outcome.reason == "cancelled" and cancel is not None and cancel.is_set():
         raise Stopped(played, KeyboardInterrupt())
     if played.outcome.reason != "finished":
-        raise Stopped(played, LinkError(_not_finished(played.outcome, n, drive)))
+        raise Stopped(played, _not_finished(played.outcome, n, drive))
     return played
 
 
@@ -454,12 +454,13 @@ def _padded(values: FloatArray, n: int) -> FloatArray:
     return padded
 
 
-def _not_finished(outcome: Outcome, n: int, drive: Drive) -> str:
-    came = f"{outcome.received} of {n} samples came"
+def _not_finished(outcome: Outcome, n: int, drive: Drive) -> LinkError:
+    why, remedy = f"one that the device ended ({outcome.reason})", ""
     if outcome.state == "tripped":
-        return (
-            f"expected the run to finish, the device tripped: {_why(outcome.reason, drive)}; its "
-            f"output is safe and {came}; find out why, then clear it (sewfast clear PORT)"
-            + (_more_time(drive.watchdog) if outcome.reason == "watchdog" else "")
-        )
-    return f"expected the run to finish, the device ended it ({outcome.reason}); {came}"
+        why = f"one that tripped: {_why(outcome.reason, drive)}"
+        remedy = "the output is safe: find out why, then clear it (sewfast clear PORT)"
+        remedy += _more_time(drive.watchdog) if outcome.reason == "watchdog" else ""
+    return LinkError(
+        expected="a run that finishes", received=f"{why}, after {outcome.received} of {n} samples",
+        remedy=remedy,
+    )  # fmt: skip

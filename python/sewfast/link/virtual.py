@@ -103,10 +103,12 @@ class VirtualDevice(Unique):
         if baud is not None:
             _check_range("baud", baud, *_BAUD)
         if duration is not None and not 0.0 < real("duration", duration) < 1e9:
-            raise SettingError(f"expected a duration above 0 s, got {duration!r}")
+            raise SettingError(name="duration", expected="above 0 s", received=repr(duration))
         _require_switches(fast=fast, once=once, anyone=anyone)
         if not isinstance(address, str):
-            raise SettingError(f"expected HOST:PORT as address, got {address!r}; port 0 is any")
+            raise SettingError(
+                name="address", expected="HOST:PORT", received=repr(address), remedy="port 0 is any"
+            )
         for name, place in (("link", link), ("fault_log", fault_log), ("trace", trace)):
             _require_place(name, place)
         if pty and link is not None:
@@ -180,9 +182,13 @@ class VirtualDevice(Unique):
             For an unknown kind or an unusable time.
         """
         if not isinstance(fault, str):
-            raise SettingError(f"expected a fault by its name, got {fault!r}; as in 'unplug'")
+            raise SettingError(
+                name="fault", expected="its name", received=repr(fault), remedy="as in 'unplug'"
+            )
         if seconds is not None and not 0.0 < real("seconds", seconds) <= 60.0:
-            raise SettingError(f"expected a time above 0 and at most 60 s, got {seconds!r}")
+            raise SettingError(
+                name="seconds", expected="above 0 and at most 60 s", received=repr(seconds)
+            )
         self._server.cause(fault, seconds)
 
     @property
@@ -253,7 +259,7 @@ def _path(path: str | os.PathLike[str] | None) -> Path | None:
 def _require_switches(**values: object) -> None:
     for name, value in values.items():
         if not isinstance(value, bool):
-            raise SettingError(f"expected True or False as {name}, got {value!r}")
+            raise SettingError(name=name, expected="True or False", received=repr(value))
 
 
 def _require_place(name: str, place: object) -> None:
@@ -269,12 +275,12 @@ def _require_place(name: str, place: object) -> None:
     if place is None:
         return
     if not isinstance(place, (str, os.PathLike)) or not os.fspath(place):
-        raise SettingError(f"expected a file's name as {name}, got {place!r}")
+        raise SettingError(name=name, expected="a file's name", received=repr(place))
     if not Path(place).parent.is_dir():
         raise LinkError(
-            f"{os.fspath(place)}: expected a folder that exists for {name}, there is no "
-            f"{Path(place).parent}; create it, or name another one"
-        )
+            name=os.fspath(place), expected=f"a folder that exists for {name}",
+            received=f"none at {Path(place).parent}", remedy="create it, or name another one",
+        )  # fmt: skip
 
 
 def _require_free(link: Path) -> None:
@@ -287,24 +293,29 @@ def _require_free(link: Path) -> None:
     """
     if link.is_symlink() and link.exists():
         raise LinkError(
-            f"{link}: expected a free name, it is a link to {os.readlink(link)}, which exists; "
-            "choose another name, end the device that has this one, or remove the link"
-        )
+            name=str(link), expected="a free name",
+            received=f"a link to {os.readlink(link)}, which exists",
+            remedy="choose another name, end the device that has this one, or remove the link",
+        )  # fmt: skip
 
 
 def _checked_endpoint(endpoint: str | None, link: object) -> str:
     endpoint = endpoint or ("pty" if os.name == "posix" else "tcp")
     if endpoint not in ("pty", "tcp"):
-        raise SettingError(f"expected 'pty' or 'tcp' as endpoint, got {endpoint!r}")
+        raise SettingError(name="endpoint", expected="'pty' or 'tcp'", received=repr(endpoint))
     if link is not None and endpoint != "pty":
-        raise SettingError(f"expected a link only to a pty, got {link!r} with endpoint 'tcp'")
+        raise SettingError(
+            name="link", expected="one only to a pty", received=f"{link!r} with endpoint 'tcp'"
+        )
     return endpoint
 
 
 def _check_range(name: str, value: int, low: int, high: int) -> None:
     whole = isinstance(value, int) and not isinstance(value, bool)
     if not whole or not low <= value <= high:
-        raise SettingError(f"expected a whole number from {low} to {high} as {name}, got {value!r}")
+        raise SettingError(
+            name=name, expected=f"a whole number from {low} to {high}", received=repr(value)
+        )
 
 
 def _faults_text(faults: Faults) -> str:
@@ -312,9 +323,9 @@ def _faults_text(faults: Faults) -> str:
         return faults
     if not isinstance(faults, Mapping):
         raise SettingError(
-            f"expected faults as text or as a mapping, got {faults!r}; as in 'drop=.001' or "
-            "{'drop': 0.001}"
-        )
+            name="faults", expected="text or a mapping", received=repr(faults),
+            remedy="as in 'drop=.001' or {'drop': 0.001}",
+        )  # fmt: skip
     items = []
     for kind, value in faults.items():
         rate, *seconds = value if isinstance(value, tuple) else (value,)

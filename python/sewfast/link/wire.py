@@ -223,9 +223,7 @@ class Reply:
             Where the device refused the command; the message says why and what to do.
         """
         if self.result:
-            # the names of the fields lie beside the messages, which need the kinds from here
-
-            raise LinkError(refusal(self.kind, self.result, self.detail))
+            raise refusal(self.kind, self.result, self.detail)
         return self.body
 
 
@@ -238,9 +236,10 @@ def identity(body: bytes) -> Identity:
     ) = told  # fmt: skip
     if not 2 <= channels <= 16 or period == 0 or not (math.isfinite(counts) and counts >= 0):
         raise LinkError(
-            "expected a device with 2 to 16 channels, a control period and counts per turn, got "
-            f"{channels}, {period} us and {counts}; fix the firmware"
-        )
+            name="HELLO",
+            expected="a device with 2 to 16 channels, a control period and counts per turn",
+            received=f"{channels}, {period} us and {counts}", remedy="fix the firmware",
+        )  # fmt: skip
     return Identity(
         _shown(name), _shown(firmware), version, boot, schema, name_of(STATES, state), channels,
         period, capabilities, capacity, counts, session, key,
@@ -253,9 +252,9 @@ def channel(body: bytes) -> Channel:
     number, encoding, steps, name, unit = told
     if encoding > 2 or (encoding == 1 and steps == 0):
         raise LinkError(
-            f"expected channel {number} in encoding 0, 1 (with steps per unit) or 2, got "
-            f"{encoding} with {steps} steps; update sewfast or fix the firmware"
-        )
+            name=f"DESCRIBE: channel {number}", expected="encoding 0, 1 (with steps per unit) or 2",
+            received=f"{encoding} with {steps} steps", remedy="update sewfast or fix the firmware",
+        )  # fmt: skip
     return Channel(number, encoding, steps, _shown(name), _shown(unit))
 
 
@@ -308,9 +307,9 @@ T = TypeVar("T")
 def _whole(told: T | None, body: bytes, name: str) -> T:
     if told is None:
         raise LinkError(
-            f"expected a whole reply to {name}, got {len(body)} bytes; fix the firmware "
-            "(docs/PROTOCOL.md)"
-        )
+            name=name, expected="a whole reply", received=f"{len(body)} bytes",
+            remedy="fix the firmware (docs/PROTOCOL.md)",
+        )  # fmt: skip
     return told
 
 
@@ -356,10 +355,13 @@ _FIELDS: dict[int, tuple[str, ...]] = {
 }  # fmt: skip
 
 
-def refusal(kind: int, result: int, detail: int) -> str:
+def refusal(kind: int, result: int, detail: int) -> LinkError:
     """What a device's refusal means and what to do."""
     name = Kind(kind).name if kind in Kind._value2member_map_ else f"command {kind:#04x}"
-    return f"expected the device to take {name}, it refused: {_refused(kind, result, detail)}"
+    reason, _, remedy = _refused(kind, result, detail).partition("; ")
+    return LinkError(
+        name=name, expected="a device that takes it", received=f"a refusal: {reason}", remedy=remedy
+    )
 
 
 def _without(kind: int) -> str:

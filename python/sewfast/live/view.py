@@ -163,12 +163,12 @@ def open_view(kind: str | Kind, feed: Feed, *, own_process: bool = True) -> Iter
 
     The view is a process of its own with a lower priority, so that it shares neither Python's
     interpreter lock with the link nor, where both want it, the processor. Leaving the `with`
-    closes the feed and waits for the last frame, half a second at most: stop the drive before.
+    closes the feed and waits for the last line, half a second at most: stop the drive before.
 
     Parameters
     ----------
     kind : str or Kind
-        `auto` (a terminal plot where standard error is a terminal, else nothing), `terminal`,
+        `auto` (a status line where standard error is a terminal, else nothing), `terminal`,
         `none`, `plotjuggler[:HOST:PORT]`, `foxglove[:PORT]`.
     feed : Feed
         Nothing may be put into it before the view is there.
@@ -262,7 +262,7 @@ def _answer(program: subprocess.Popen[bytes]) -> Shown:
     with program.stdout as pipe:
         ready, _, _ = select.select([pipe], [], [], START_S)
         line = pipe.readline() if ready else b""
-    refusal = "expected the live view to start, received nothing from it; use --live none"
+    refusal = "live: expected a view that starts, received none; use --live none"
     said: dict[str, Any] = json.loads(line) if line else {"error": refusal}
     if "error" in said:
         raise SettingError(said["error"])

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .. import _core
 from ..dataset import FloatArray
-from ..errors import SettingError
+from ..errors import SettingError, not_installed
 
 # --- ContinuousModel: the differential equation that a zero-order hold turns into a linear model --
 
@@ -335,15 +335,15 @@ def _product(factors: list[FloatArray]) -> FloatArray:
 # --- python-control and scipy.signal: objects of theirs from arrays, and arrays from their objects
 
 
+_PURPOSE = "its linear systems (to_tf and to_ss give plain arrays)"
+
+
 def require_control() -> Any:
     """python-control, or a `SettingError` that says how to install it."""
     try:
         import control
     except ImportError as e:
-        raise SettingError(
-            "this needs python-control, which is not installed: "
-            'pip install "sewfast[control]"; to_tf and to_ss give plain arrays'
-        ) from e
+        raise not_installed("control", _PURPOSE, "sewfast[control]") from e
     return control
 
 
@@ -352,10 +352,7 @@ def require_scipy_signal() -> Any:
     try:
         from scipy import signal
     except ImportError as e:
-        raise SettingError(
-            'this needs scipy, which is not installed: pip install "sewfast[control]"; '
-            "to_tf and to_ss give plain arrays"
-        ) from e
+        raise not_installed("scipy", _PURPOSE, "sewfast[control]") from e
     return signal
 
 
@@ -422,7 +419,10 @@ def _sample_time(dt: Any, Ts: float | None) -> float:
     """Of the system; `Ts` where that has none (`dt` True or None: unspecified)."""
     if dt is not None and not isinstance(dt, bool) and dt > 0:
         if Ts is not None and abs(dt - Ts) > 1e-9 * Ts:
-            raise SettingError(f"Ts: the system has dt = {dt:g} s, received {Ts:g}; leave Ts out")
+            raise SettingError(
+                name="Ts", expected=f"that of the system, dt = {dt:g} s", received=f"{Ts:g} s",
+                remedy="leave Ts out",
+            )  # fmt: skip
         return float(dt)
     if dt is True and Ts is not None:
         return Ts

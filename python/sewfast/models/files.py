@@ -11,7 +11,7 @@ from typing import Any
 
 from .. import storage
 from ..dynamic_model import FORMAT, VERSION
-from ..errors import ModelFileError, SewfastError
+from ..errors import ModelFileError, SewfastError, located
 from ..storage import Fields
 from .base import COMBINATIONS, MOST_MEMBERS, Ensemble, Model, SingleModel, StructuredModel
 from .hammerstein import HammersteinWiener
@@ -134,9 +134,7 @@ def _core(parameters: Fields, cls: type[SingleModel]) -> object:
     except ModelFileError:
         raise
     except (SewfastError, ValueError, OverflowError, MemoryError) as e:
-        raise ModelFileError(
-            f"{parameters.path}: field 'parameters': {e}; the file is damaged or was edited"
-        ) from e
+        raise located(ModelFileError, f"{parameters.path}: field 'parameters'", e) from e
 
 
 def _require_width(fields: Fields, parameters: Fields, inputs: int) -> None:

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..dataset import FloatArray
-from ..errors import DataError, SettingError, printable
+from ..errors import DataError, SettingError, not_installed, printable
 
 # --- Table: the named columns of one file, and why others cannot be used --------------------------
 
@@ -86,7 +86,10 @@ class Table:
                 return candidate
             if candidate in self.unusable:
                 raise DataError(f"{self.path}: {self.unusable[candidate]}")
-        raise DataError(f"{self.path}: no column {name!r}; {self._hint(name)}")
+        raise DataError(
+            name=str(self.path), expected=f"a column {name!r}", received="none",
+            remedy=self._hint(name),
+        )  # fmt: skip
 
     def _hint(self, name: str) -> str:
         shown = ", ".join(self.names[:30]) + (", ..." if len(self) > 30 else "")
@@ -290,9 +293,7 @@ def _struct(fields: dict[str, Value]) -> Value:
 
 
 def _missing_extra(module: str) -> SettingError:
-    return SettingError(
-        f'reading this .mat file needs {module}, which is not installed: pip install "sewfast[mat]"'
-    )
+    return not_installed(module, "this .mat file", "sewfast[mat]")
 
 
 def _table(path: Path, values: Mapping[str, Value]) -> Table:

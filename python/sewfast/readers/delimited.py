@@ -120,7 +120,11 @@ def _layout(path: Path, text: str) -> _Layout:
     comment = ""
     for skipped, (offset, line) in enumerate(_lines(text)):
         if len(line) > MAX_LINE:
-            raise DataError(f"{path}: line {skipped + 1} has {len(line)} characters; not a table")
+            raise DataError(
+                name=f"{path}: line {skipped + 1}",
+                expected=f"a table with lines of up to {MAX_LINE} characters",
+                received=f"{len(line)}", remedy="export the table as CSV",
+            )  # fmt: skip
         if not line.strip():
             continue
         if line.lstrip().startswith("#"):

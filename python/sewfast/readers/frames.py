@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray
-from ..errors import DataError, SettingError
+from ..errors import DataError, SettingError, not_installed
 from .containers import Table, from_headers
 
 _NUMBER = (int, float, np.number, Decimal)
@@ -118,10 +118,7 @@ def _arrow(frame: Any) -> Any:
     try:
         import pyarrow as pa
     except ImportError as e:
-        raise SettingError(
-            f"reading {type(frame).__name__} needs pyarrow, which is not installed: "
-            'pip install "sewfast[parquet]"'
-        ) from e
+        raise not_installed("pyarrow", f"reading {type(frame).__name__}", "sewfast[parquet]") from e
     try:
         return pa.table(frame)
     except pa.ArrowException as e:

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import FloatArray
-from ..errors import DataError, SettingError, printable
+from ..errors import DataError, not_installed, printable
 from ..recordfile.format import MAGIC
 from .blackbox import BLACKBOX, SALEAE, blackbox_series, saleae_series
 from .containers import MAX_COLUMNS, Table, freeze
@@ -76,10 +76,7 @@ def read_log(path: Path, raw: bytes) -> Table:
             raise DataError(f"{path}: expected {kind.title}, but it cannot be read: {e}") from e
         return joined(path, found, kind.title)
     if importlib.util.find_spec(kind.module) is None:
-        raise SettingError(
-            f"reading {kind.title} needs {kind.module}, which is not installed: "
-            'pip install "sewfast[logs]"'
-        )
+        raise not_installed(kind.module, f"reading {kind.title}", "sewfast[logs]")
     return joined(path, _from_a_process(path, raw, name), kind.title)
 
 

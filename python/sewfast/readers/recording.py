@@ -14,7 +14,7 @@ import numpy as np
 
 from ..dataset import Dataset, Experiment, FloatArray
 from ..dataset.experiment import as_weights, require_some_weight
-from ..errors import DataError, SettingError, printable
+from ..errors import DataError, SettingError, located, not_installed, printable, unreadable
 from ..recordfile.format import MAGIC
 from ..recordfile.reader import decode_recording
 from ..speed import speed_between_gaps
@@ -42,9 +42,7 @@ def read_parquet(path: Path, raw: bytes) -> Table:
     try:
         import pyarrow.parquet as pq
     except ImportError as e:
-        raise SettingError(
-            'reading Parquet needs pyarrow, which is not installed: pip install "sewfast[parquet]"'
-        ) from e
+        raise not_installed("pyarrow", "reading Parquet", "sewfast[parquet]") from e
     try:
         found = pq.read_table(io.BytesIO(raw))
     except Exception as e:
@@ -133,7 +131,10 @@ def _table(path: Path, raw: bytes) -> Table:
 
 def _zipped(path: Path, raw: bytes) -> Table:
     if b"xl/" in raw[:4096] or path.suffix.lower().startswith(".xls"):
-        raise DataError(f"{path}: an Excel workbook; save the sheet as CSV")
+        raise DataError(
+            name=str(path), expected="a table", received="an Excel workbook",
+            remedy="save the sheet as CSV",
+        )  # fmt: skip
     return read_npz(path, raw)
 
 
@@ -142,12 +143,12 @@ def _bytes(path: Path) -> bytes:
         raise DataError(f"{path}: expected a file, received a folder")
     try:
         raw = path.read_bytes()
-    except FileNotFoundError as e:
-        raise DataError(f"{path}: no such file; check the name and the folder") from e
     except (OSError, ValueError) as e:
-        raise DataError(f"{path}: cannot be read: {e}") from e
+        raise unreadable(DataError, path, e) from e
     if not raw:
-        raise DataError(f"{path}: the file is empty; expected a header and rows of numbers")
+        raise DataError(
+            name=str(path), expected="a header and rows of numbers", received="an empty file"
+        )
     return raw
 
 
@@ -228,9 +229,10 @@ def read(
         counts_per_rev = table.counts_per_rev
     if (counts is None) != (counts_per_rev is None):
         raise SettingError(
-            "counts and counts_per_rev belong together: the column of encoder counts and the "
-            f"counts of one turn; received {counts!r} and {counts_per_rev!r}"
-        )
+            name="counts, counts_per_rev",
+            expected="both, the column of encoder counts and the counts of one turn",
+            received=f"{counts!r} and {counts_per_rev!r}", remedy="give both or neither",
+        )  # fmt: skip
     names = tuple(table.resolve(n) for n in names)
     _require_distinct(names, None if output is None or counts else table.resolve(output))
     base = time_base(table, Ts, time)
@@ -277,7 +279,7 @@ def _weights(table: Table, name: str, other: str) -> FloatArray:
     try:
         return as_weights(column, len(column))
     except DataError as e:
-        raise DataError(f"{table.path}: column {name!r}: {e}") from e
+        raise located(DataError, f"{table.path}: column {name!r}", e) from e
 
 
 def _without_weightless(table: Table, output: str, weights: FloatArray) -> Table:
@@ -337,7 +339,7 @@ def _speed(table: Table, column: str, counts_per_rev: float, Ts: float) -> Float
     try:
         return speed_between_gaps(counts, Ts, counts_per_rev)
     except DataError as e:
-        raise DataError(f"{table.path}: column {column!r}: {e}") from e
+        raise located(DataError, f"{table.path}: column {column!r}", e) from e
 
 
 def parse_source(text: str) -> tuple[str, tuple[str, ...] | None, str | None]:

@@ -197,9 +197,10 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
             for spoiled in filter(_is_time, table.unusable):
                 table.resolve(spoiled)  # says why it cannot be used
             raise SettingError(
-                f"{table.path}: no column t or time; state the sample time in seconds (Ts, --ts), "
-                f"or name the column (time=...); available: {', '.join(table.names[:30])}"
-            )
+                name=str(table.path), expected="a column t or time",
+                received=f"{', '.join(table.names[:30])}",
+                remedy="state the sample time in seconds (Ts, --ts), or name the column (time=...)",
+            )  # fmt: skip
         return TimeBase(float(given))
     t = _seconds(table, name)
     steps = np.diff(t)
@@ -216,9 +217,9 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
 def _agreed(table: Table, source: str, found: float, given: float) -> float:
     if abs(found - given) > TOLERANCE * given:
         raise DataError(
-            f"{table.path}: {source} says Ts = {found:.6g} s, but {given:.6g} s was given; "
-            "they must agree within 1 %; for another sample time resample (--resample)"
-        )
+            name=str(table.path), expected=f"Ts within 1 % of {found:.6g} s, as {source} says",
+            received=f"{given:.6g} s", remedy="for another sample time resample (--resample)",
+        )  # fmt: skip
     return float(given)
 
 

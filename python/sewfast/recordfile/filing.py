@@ -14,7 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from ..errors import DataError, SettingError, SewfastError
+from ..errors import DataError, SettingError, SewfastError, unwritable
 from . import format
 from .format import Assembler, Header, Message, Topic, bearable, opening
 
@@ -68,7 +68,7 @@ def _try(path: Path, opened: Path, flags: int) -> None:
     try:
         file = os.open(opened, flags, 0o666)
     except OSError as e:
-        raise _unwritable(path, e) from e
+        raise unwritable(DataError, path, e) from e
     try:
         _own(path, file)
     finally:
@@ -87,9 +87,10 @@ def _own(path: Path, file: int) -> None:
         _lock(file)
     except BlockingIOError:
         raise SettingError(
-            f"{path}: expected a file that nobody else writes, a recording is being made in it; it "
-            "is kept: choose another name"
-        ) from None
+            name=str(path), expected="a file that nobody else writes",
+            received="one in which a recording is being made, which is kept",
+            remedy="choose another name",
+        ) from None  # fmt: skip
     except (ImportError, OSError):
         # a file system or a Python without locks
         pass
@@ -130,18 +131,13 @@ def _give_back(file: int) -> None:
 def exists(path: Path) -> SettingError:
     """The refusal to write over a file."""
     return SettingError(
-        f"{path}: the file exists and is kept; choose another name, or overwrite=True (--overwrite)"
-    )
+        name=str(path), expected="a new name", received="a file, which is kept",
+        remedy="choose another name, or overwrite=True (--overwrite)",
+    )  # fmt: skip
 
 
 def _folder(path: Path) -> DataError:
-    return DataError(f"{path}: expected a file to write, received a folder")
-
-
-def _unwritable(path: Path, error: OSError) -> DataError:
-    return DataError(
-        f"{path}: cannot be written ({error.strerror}); choose a folder that exists and is writable"
-    )
+    return DataError(name=str(path), expected="a file to write", received="a folder")
 
 
 class Sink:
@@ -172,14 +168,14 @@ class Sink:
         except FileExistsError as e:
             raise (_folder(path) if path.is_dir() else exists(path)) from e
         except OSError as e:
-            raise _unwritable(path, e) from e
+            raise unwritable(DataError, path, e) from e
         try:
             _own(path, self._file)
             # nothing is lost before it is certain that the file is this one's
             os.ftruncate(self._file, 0)
         except OSError as e:
             self.close()
-            raise _unwritable(path, e) from e
+            raise unwritable(DataError, path, e) from e
         except BaseException:
             self.close()
             raise
@@ -239,9 +235,7 @@ def replacing(target: Path) -> Iterator[Path]:
         yield temporary
         temporary.replace(target)
     except OSError as e:
-        raise DataError(
-            f"{target}: cannot be written ({e.strerror}); choose a folder that exists and has room"
-        ) from e
+        raise unwritable(DataError, target, e, "choose a folder that exists and has room") from e
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -332,10 +326,10 @@ class Filing:
             return error
         reason = getattr(error, "strerror", None) or repr(error)
         return DataError(
-            f"{self._path}: expected room for the recording, received {reason!r}; the "
-            f"file is whole up to sample {self._first} (end excluded, {self._sink.size} bytes); "
-            "free some space and record again"
-        )
+            name=str(self._path), expected="room for the recording", received=reason,
+            remedy=f"the file is whole up to sample {self._first} (end excluded, "
+            f"{self._sink.size} bytes); free some space and record again",
+        )  # fmt: skip
 
     @property
     def _sink(self) -> Sink:
@@ -361,10 +355,7 @@ class Filing:
             self._sink.close()
             self._path.unlink(missing_ok=True)
             self._opened = None
-            raise DataError(
-                f"{self._path}: cannot be written ({e.strerror}); free some space or write "
-                "elsewhere"
-            ) from e
+            raise unwritable(DataError, self._path, e, "free some space or write elsewhere") from e
 
     def _run(self) -> None:
         try:

@@ -124,9 +124,9 @@ def numbers(name: str, values: object) -> list[Any]:
     array = np.asarray(values)
     if array.ndim != 1 or array.dtype.kind not in "biuf":
         raise DataError(
-            f"{name}: expected real numbers of shape (N,), received {array.dtype} of shape "
-            f"{array.shape}; pass one column of numbers"
-        )
+            name=name, expected="real numbers of shape (N,)",
+            received=f"{array.dtype} of shape {array.shape}", remedy="pass one column of numbers",
+        )  # fmt: skip
     if array.dtype.kind != "f":
         return _whole(name, array)
     return _real(name, array)
@@ -135,9 +135,9 @@ def numbers(name: str, values: object) -> list[Any]:
 def _whole(name: str, array: NDArray[Any]) -> list[int]:
     if len(array) and max(-int(array.min()), int(array.max())) > EXACT:
         raise DataError(
-            f"{name}: expected whole numbers of at most 2^53, received {array.min()} to "
-            f"{array.max()}; subtract the first one"
-        )
+            name=name, expected="whole numbers of at most 2^53",
+            received=f"{array.min()} to {array.max()}", remedy="subtract the first one",
+        )  # fmt: skip
     whole: list[int] = array.astype(np.int64).tolist()
     return whole
 
@@ -149,9 +149,9 @@ def _real(name: str, array: NDArray[Any]) -> list[Any]:
     if np.isinf(array).any():
         k = int(np.argmax(np.isinf(array)))
         raise DataError(
-            f"{name}: expected finite numbers, or NaN where nothing was measured, received "
-            f"{array[k]} at row {k}"
-        )
+            name=name, expected="finite numbers, or NaN where nothing was measured",
+            received=f"{array[k]} at row {k}",
+        )  # fmt: skip
     negative_zero = (array == 0) & np.signbit(array)
     if np.all((np.rint(array) == array) & (np.abs(array) <= EXACT) & ~negative_zero):
         return array.astype(np.int64).tolist()  # type: ignore[no-any-return]
@@ -457,11 +457,11 @@ class Header:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
-            raise SettingError(f"name: expected text, received {self.name!r}")
+            raise SettingError(name="name", expected="text", received=repr(self.name))
         object.__setattr__(self, "Ts", _positive("Ts", self.Ts))
         if not SHORTEST_TS <= self.Ts <= LONGEST_TS:
             raise SettingError(
-                f"Ts: expected {SHORTEST_TS:g} to {LONGEST_TS:g} s, received {self.Ts:g}"
+                name="Ts", expected=f"{SHORTEST_TS:g} to {LONGEST_TS:g} s", received=f"{self.Ts:g}"
             )
         object.__setattr__(self, "columns", _columns(self.columns))
         if self.n is not None:
@@ -474,9 +474,9 @@ class Header:
         plain("header", {"texts": [self.name, *self.columns, *self.columns.values()]})
         if len(self.encode()) > LARGEST_HEADER:
             raise SettingError(
-                f"expected a header of at most {LARGEST_HEADER} bytes, received "
-                f"{len(self.encode())}; leave long settings out"
-            )
+                name="header", expected=f"at most {LARGEST_HEADER} bytes",
+                received=str(len(self.encode())), remedy="leave long settings out",
+            )  # fmt: skip
         self.start_ns()
 
     def start_ns(self) -> int:
@@ -488,9 +488,10 @@ class Header:
             at = None
         if at is None or at.tzinfo is None or not 1970 < at.year < 2500:
             raise SettingError(
-                "started: expected a time such as 2026-01-31T12:00:00+00:00, with its offset from "
-                f"UTC; received {self.started!r}"
-            )
+                name="started",
+                expected="a time such as 2026-01-31T12:00:00+00:00, with its offset from UTC",
+                received=repr(self.started),
+            )  # fmt: skip
         since = at - datetime(1970, 1, 1, tzinfo=timezone.utc)
         return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
 
@@ -528,16 +529,17 @@ class Header:
         """
         if content.get("format") != FORMAT:
             raise SettingError(
-                f"expected format {FORMAT!r}, received {str(content.get('format'))[:60]!r}"
+                name="format", expected=repr(FORMAT), received=repr(str(content.get("format"))[:60])
             )
         if content.get("version") != VERSION or isinstance(content["version"], bool):
             raise SettingError(
-                f"expected version {VERSION} of {FORMAT!r}, received "
-                f"{str(content.get('version'))[:60]}; a newer sewfast may be able to read it"
-            )
+                name="version", expected=f"{VERSION} of {FORMAT!r}",
+                received=str(content.get("version"))[:60],
+                remedy="a newer sewfast may be able to read it",
+            )  # fmt: skip
         names = ("name", "Ts", "columns", "n", "counts_per_rev", "device", "settings", "started")
         if missing := [name for name in names if name not in content]:
-            raise SettingError(f"the header lacks {', '.join(missing)}")
+            raise SettingError(name="header", expected=" and ".join(missing), received="none")
         return cls(**{name: content[name] for name in names})
 
 
@@ -548,37 +550,40 @@ def _positive(what: str, value: object) -> float:
     except OverflowError:
         found = math.inf
     if not (math.isfinite(found) and found > 0):
-        raise SettingError(f"{what}: expected a positive number, received {str(value)[:60]}")
+        raise SettingError(name=what, expected="a positive number", received=str(value)[:60])
     return found
 
 
 def _whole_number(value: object) -> int:
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not whole or not 0 <= value <= 2**53:  # type: ignore[operator]
-        raise SettingError(f"n: expected a whole number of samples or None, received {value!r}")
+        raise SettingError(
+            name="n", expected="a whole number of samples or None", received=repr(value)
+        )
     return int(value)  # type: ignore[call-overload, no-any-return]
 
 
 def _columns(columns: object) -> Mapping[str, str]:
     if not isinstance(columns, Mapping) or not 0 < len(columns) <= MOST_COLUMNS:
         raise SettingError(
-            f"columns: expected 1 to {MOST_COLUMNS} names with their units, received "
-            f"{str(columns)[:200]}"
-        )
+            name="columns", expected=f"1 to {MOST_COLUMNS} names with their units",
+            received=str(columns)[:200],
+        )  # fmt: skip
     for name, unit in columns.items():
         text = isinstance(name, str) and isinstance(unit, str)
         if not text or not name.strip() or name in _TAKEN:
             raise SettingError(
-                f"columns: expected a name other than {' and '.join(_TAKEN)} with its unit as "
-                f"text, received {name!r}: {unit!r}"
-            )
+                name="columns",
+                expected=f"a name other than {' and '.join(_TAKEN)} with its unit as text",
+                received=f"{name!r}: {unit!r}",
+            )  # fmt: skip
     return MappingProxyType(dict(columns))
 
 
 def _plain(what: str, content: object) -> Mapping[str, Any]:
     """A copy that JSON gives back as it is."""
     if not isinstance(content, Mapping):
-        raise SettingError(f"{what}: expected a mapping, received {type(content).__name__}")
+        raise SettingError(name=what, expected="a mapping", received=type(content).__name__)
     return MappingProxyType(plain(what, content))
 
 
@@ -596,9 +601,9 @@ def plain(what: str, content: Mapping[str, Any]) -> dict[str, Any]:
         text.encode()
     except (TypeError, ValueError, RecursionError) as e:
         raise SettingError(
-            f"{what}: expected finite numbers, text, lists and dicts, received {e}; infinity "
-            "is written as None"
-        ) from e
+            name=what, expected="finite numbers, text, lists and dicts", received=str(e),
+            remedy="infinity is written as None",
+        ) from e  # fmt: skip
     copy: dict[str, Any] = json.loads(text)
     return copy
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import FloatArray, labelled, runs
-from ..errors import DataError, printable
+from ..errors import DataError, located, printable, unreadable
 from .format import (
     CHANNEL,
     CHUNK,
@@ -81,9 +81,10 @@ def chunks(raw: bytes) -> Iterator[Chunk]:
             left -= size
             if left < 0:
                 raise DataError(
-                    "expected heads of chunks with their chunks, received "
-                    f"{at} bytes with heads alone; the file is no recording that was damaged"
-                )
+                    name="chunks", expected="heads of chunks with their chunks",
+                    received=f"{at} bytes with heads alone",
+                    remedy="the file is no recording that was damaged",
+                )  # fmt: skip
         at = at + 1 if chunk is None else chunk.stop
 
 
@@ -365,25 +366,25 @@ def read_header(path: str | os.PathLike[str]) -> Header:
 def _named(path: object) -> Path:
     if isinstance(path, (str, os.PathLike)):
         return Path(path)
-    raise DataError(f"expected a recording's name, got {path!r}; as in 'run.mcap'")
+    raise DataError(
+        name="path", expected="a recording's name", received=repr(path), remedy="as in 'run.mcap'"
+    )
 
 
 def _bytes(path: Path, most: int = -1) -> bytes:
     if path.is_dir():
-        raise DataError(f"{path}: expected a file, received a folder")
+        raise DataError(name=str(path), expected="a file", received="a folder")
     try:
         size = path.stat().st_size
         if size > LARGEST_FILE:
             raise DataError(
-                f"{path}: expected a recording of at most {LARGEST_FILE >> 30} GiB, received "
-                f"{size} bytes; record in parts"
-            )
+                name=str(path), expected=f"a recording of at most {LARGEST_FILE >> 30} GiB",
+                received=f"{size} bytes", remedy="record in parts",
+            )  # fmt: skip
         with path.open("rb") as file:
             return file.read(most)
-    except FileNotFoundError as e:
-        raise DataError(f"{path}: no such file; check the name and the folder") from e
     except (OSError, ValueError) as e:
-        raise DataError(f"{path}: cannot be read: {e}") from e
+        raise unreadable(DataError, path, e) from e
 
 
 def decode_recording(path: Path, raw: bytes) -> RecordedFile:
@@ -408,21 +409,22 @@ def _chunks(path: Path, raw: bytes) -> Iterator[Chunk]:
     try:
         yield from chunks(raw)
     except DataError as e:
-        raise DataError(f"{path}: {e}") from e
+        raise located(DataError, path, e) from e
 
 
 def _headless(path: Path, raw: bytes, damage: list[str]) -> DataError:
     if not raw.startswith(MAGIC):
         return DataError(
-            f"{path}: expected a recording (MCAP), received a file of another kind or one damaged "
-            "from its first bytes on"
-        )
+            name=str(path), expected="a recording (MCAP)",
+            received="a file of another kind or one damaged from its first bytes on",
+        )  # fmt: skip
     reason = next((text for text in damage if Topic.HEADER.path in text), "none is whole")
     return DataError(
-        f"{path}: expected an MCAP file with the message {Topic.HEADER.path} of sewfast: {reason}; "
-        "a file of another program, one that a program has compressed, or one damaged from its "
-        "start on cannot be read as a recording"
-    )
+        name=str(path), expected=f"an MCAP file with the message {Topic.HEADER.path} of sewfast",
+        received=reason,
+        remedy="a file of another program, one that a program has compressed, or one damaged "
+        "from its start on cannot be read as a recording",
+    )  # fmt: skip
 
 
 class _Contents:

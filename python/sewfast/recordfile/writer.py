@@ -38,14 +38,17 @@ def require_ending(path: str | os.PathLike[str]) -> Path:
         For another ending.
     """
     if not isinstance(path, (str, os.PathLike)) or "\0" in str(path):
-        raise SettingError(f"expected a file's name, got {path!r}; as in file='run{ENDING}'")
+        raise SettingError(
+            name="file", expected="a file's name", received=repr(path),
+            remedy=f"as in file='run{ENDING}'",
+        )  # fmt: skip
     found = Path(path)
     if found.suffix.lower() != ENDING:
         raise SettingError(
-            f"{found}: expected a recording's name, which ends in {ENDING}, got "
-            f"{found.suffix or 'none'!r}; rename it, and `sewfast.recordfile.export` makes other "
-            "formats of it"
-        )
+            name=str(found), expected=f"a recording's name, which ends in {ENDING}",
+            received=found.suffix or "none",
+            remedy="rename it, and `sewfast.recordfile.export` makes other formats of it",
+        )  # fmt: skip
     return found
 
 
@@ -90,9 +93,10 @@ def require_free(paths: Iterable[str | os.PathLike[str] | None], *, overwrite: b
     for path in paths:
         if path is not None and not overwrite and _is_there(Path(path)):
             raise SettingError(
-                f"{path}: expected a free name for what a drive did, there is a file; it is kept: "
-                "choose another name, or overwrite it (--overwrite, overwrite=True)"
-            )
+                name=str(path), expected="a free name for what a drive did",
+                received="a file, which is kept",
+                remedy="choose another name, or overwrite it (--overwrite, overwrite=True)",
+            )  # fmt: skip
 
 
 def _is_there(path: Path) -> bool:
@@ -111,9 +115,10 @@ def _is_computed(header: Header) -> bool:
 
 def _kept(path: Path, what: str) -> SettingError:
     return SettingError(
-        f"{path}: expected no recording that cannot be had again, there is {what}; it is kept: "
-        "choose another name, or overwrite it (--overwrite, overwrite=True)"
-    )
+        name=str(path), expected="no recording that cannot be had again",
+        received=f"{what}, which is kept",
+        remedy="choose another name, or overwrite it (--overwrite, overwrite=True)",
+    )  # fmt: skip
 
 
 # --- RecordWriter: samples and events into an MCAP file while the drive runs ----------------------
@@ -236,29 +241,31 @@ class RecordWriter:
     def _matching(self, columns: Mapping[str, ArrayLike]) -> dict[str, list[Any]]:
         if set(columns) != set(self.header.columns):
             raise DataError(
-                f"{self.path}: expected the columns {', '.join(self.header.columns)}, received "
-                f"{', '.join(map(str, columns)) or 'none'}; give every column of the header"
-            )
+                name=str(self.path), expected=f"the columns {', '.join(self.header.columns)}",
+                received=", ".join(map(str, columns)) or "none",
+                remedy="give every column of the header",
+            )  # fmt: skip
         values = {name: format.numbers(name, columns[name]) for name in self.header.columns}
         if len({len(v) for v in values.values()}) > 1:
             raise DataError(
-                f"{self.path}: expected columns of one length, received "
-                f"{ {name: len(v) for name, v in values.items()} }"
-            )
+                name=str(self.path), expected="columns of one length",
+                received=str({name: len(v) for name, v in values.items()}),
+            )  # fmt: skip
         return values
 
     def _require_new(self, first: int, count: int) -> None:
         if first < self._next:
             raise DataError(
-                f"{self.path}: expected samples from {self._next} on, received {first} to "
-                f"{first + count - 1}; a sample is written once"
-            )
+                name=str(self.path), expected=f"samples from {self._next} on",
+                received=f"{first} to {first + count - 1}", remedy="a sample is written once",
+            )  # fmt: skip
         missing = first - self._received
         if not bearable(missing, len(self.header.columns)) or first + count > format.EXACT:
             raise DataError(
-                f"{self.path}: expected gaps of at most {MOST_MISSING} values altogether, received "
-                f"sample {first} after {self._received} samples; start a new recording"
-            )
+                name=str(self.path), expected=f"gaps of at most {MOST_MISSING} values altogether",
+                received=f"sample {first} after {self._received} samples",
+                remedy="start a new recording",
+            )  # fmt: skip
 
     def event(self, kind: str, index: int | None = None, **detail: Any) -> None:
         """Write down that something happened, at once.
@@ -320,13 +327,18 @@ class RecordWriter:
         if self._filing.failure is not None:
             raise self._filing.refusal(self._filing.failure)
         if self._closed:
-            raise DataError(f"{self.path}: the recording is closed; start a new one")
+            raise DataError(
+                name=str(self.path), expected="a recording that is open", received="a closed one",
+                remedy="start a new one",
+            )  # fmt: skip
 
 
 def _index(what: str, value: object) -> int:
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not whole or not 0 <= value <= format.EXACT:  # type: ignore[operator]
-        raise DataError(f"{what}: expected the number of a sample, 0 or more, received {value!r}")
+        raise DataError(
+            name=what, expected="the number of a sample, 0 or more", received=repr(value)
+        )
     return int(value)  # type: ignore[call-overload, no-any-return]
 
 
@@ -475,9 +487,9 @@ def export(
     recording = read_recording(path)
     if Path(out).exists() and Path(out).samefile(path):
         raise SettingError(
-            f"{out}: expected another file than the recording, which cannot be had again, got the "
-            "same; choose another name"
-        )
+            name=str(out), expected="another file than the recording, which cannot be had again",
+            received="the same", remedy="choose another name",
+        )  # fmt: skip
     require_replaceable(out, overwrite=overwrite or _is_earlier(Path(out), recording))
     if Path(out).suffix.lower() == ".mcap":
         save_curves(out, recording)

@@ -363,7 +363,8 @@ def main() -> None:
     bench = Bench(send)
     for run in (lambda: bench.listen(sys.stdin.buffer), bench.watch, bench.show_always):
         threading.Thread(target=run, daemon=True).start()
-    bench.serve()
+    with suppress(BrokenPipeError):  # the server was killed: nobody is left to hear of it
+        bench.serve()
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import threading
 from collections.abc import Callable, Iterable
@@ -104,6 +105,7 @@ def carry_out(
     if place.is_symlink():
         raise SettingError(f"{COMMISSIONED}: expected a folder, received a link; remove it")
     require_own(place, overwrite=False)
+    require_writable(folder)
     found = commission(
         on, seed=asked.seed, members=asked.members, evaluations=asked.evaluations,
         progress=progress, cancel=cancel, between=between,
@@ -139,6 +141,20 @@ def drawn(comparisons: Iterable[Comparison]) -> list[dict[str, Any]]:
 def require(ok: bool, name: str, expected: str, received: object) -> None:
     if not ok:
         raise SettingError(f"{name}: expected {expected}, received {str(received)[:80]!r}")
+
+
+def require_writable(folder: Path) -> None:
+    """Refuse work of minutes whose result could not be kept.
+
+    Raises
+    ------
+    SettingError
+    """
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise SettingError(
+            name=folder.name, expected="a folder that can be written to", received="a closed one",
+            remedy="change its rights, or start sewfast studio in another one",
+        )  # fmt: skip
 
 
 def envelope(values: FloatArray, Ts: float, columns: int = COLUMNS) -> dict[str, Any]:

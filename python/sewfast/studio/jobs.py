@@ -80,7 +80,10 @@ class Jobs:
         """
         with self._lock:
             if self._ear is not None and self._ear.is_alive():
-                raise SettingError("something else is running; cancel it or wait for its end")
+                raise SettingError(
+                    expected="nothing else under way", received="a job that runs",
+                    remedy="cancel it or wait for its end",
+                )  # fmt: skip
             self._cancelled = self._writes = self._wrote = False
             program = self._program = subprocess.Popen(
                 [sys.executable, "-c", _PROGRAM.format(path=sys.path)],

@@ -264,7 +264,10 @@ class Line:
             if not self.state["armed"]:
                 raise SettingError("expected an armed drive, it is not; press Arm first")
             if self._work is not None:
-                raise SettingError("the drive is at work; stop it or wait for its end")
+                raise SettingError(
+                    name="drive", expected="one at rest", received="one at work",
+                    remedy="stop it or wait for its end",
+                )  # fmt: skip
             self._work = (kind, asked)
         place = {"kind": kind, "folder": str(self.folder)}
         self._write({"do": "work", "id": next(self._numbers), **place, **asked})

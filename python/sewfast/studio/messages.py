@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from typing import Any
 
 from ..errors import SettingError
@@ -190,8 +191,12 @@ def _check(field: str, value: Any, rule: dict[str, Any]) -> None:
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         low, high = rule.get("minimum", -math.inf), rule.get("maximum", math.inf)
         above = rule.get("exclusiveMinimum", -math.inf)
-        if not (math.isfinite(value) and low <= value <= high and value > above):
-            raise _refusal(field, f"a number from {max(low, above):g} to {high:g}", value)
+        # a whole number of JSON may have thousands of digits, which no float holds
+        finite = -sys.float_info.max <= value <= sys.float_info.max
+        if not (finite and low <= value <= high and value > above):
+            least, most = max(low, above), high
+            bounds = f" from {least:g} to {most:g}" if math.isfinite(least) else ""
+            raise _refusal(field, f"a finite number{bounds}", value)
 
 
 def _is(value: Any, kind: str) -> bool:

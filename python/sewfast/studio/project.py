@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import SettingError
-from .commissioning import COMMISSIONED, envelope, require
+from .commissioning import COMMISSIONED, envelope, require, require_writable
 from .step import MODEL, Step, commands, script
 
 if TYPE_CHECKING:
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 RECORDINGS = (".csv", ".npz", ".mat", ".parquet", ".mcap")
 LARGEST = 512 * 2**20
 """Bytes of a recording that the page opens."""
+
+KEPT = 4
+"""Models with their starts that are kept ready, for pages that look at different ones."""
 
 _ARTEFACTS = ("controllers", "models")
 """Where the documents are in the folder of a commissioning."""
@@ -88,7 +91,7 @@ class Project:
         self.first = None if path.is_dir() else path.name
         self.demo, self.port = demo, port
         self._formats: dict[Path, tuple[int, str]] = {}
-        self._tuning: tuple[object, Tuning] | None = None
+        self._tunings: dict[object, Tuning] = {}
         self._lock = threading.Lock()
         if self.first is not None and self.first not in self.documents(MODEL_FORMAT):
             self.path_of(self.first)
@@ -101,12 +104,8 @@ class Project:
         """
         return sorted(
             entry.name
-            for entry in _entries(self.folder)
-            if entry.suffix.lower() in RECORDINGS
-            and ":" not in entry.name
-            and entry.name.isprintable()
-            and entry.is_file()
-            and entry.resolve().parent == self.folder
+            for entry in _files(self.folder)
+            if entry.suffix.lower() in RECORDINGS and ":" not in entry.name
         )
 
     def documents(self, format: str) -> list[str]:
@@ -115,12 +114,8 @@ class Project:
         return sorted(
             entry.relative_to(self.folder).as_posix()
             for place in places
-            for entry in _entries(place)
-            if entry.suffix == ".json"
-            and entry.name.isprintable()
-            and entry.is_file()
-            and entry.resolve().parent == place
-            and self._format_of(entry) == format
+            for entry in _files(place)
+            if entry.suffix == ".json" and self._format_of(entry) == format
         )
 
     def _format_of(self, path: Path) -> str:
@@ -209,12 +204,17 @@ class Project:
         paths = [self.document(model, MODEL_FORMAT)]
         if controller is not None:
             paths.append(self.document(controller, CONTROLLER_FORMAT))
-        key = [*((path, path.stat().st_mtime_ns) for path in paths), notches]
+        stamp = " ".join(f"{path.name} {path.stat().st_mtime_ns}" for path in paths)
+        key = (*paths, stamp, *map(tuple, notches))
         with self._lock:
-            if self._tuning is None or self._tuning[0] != key:
+            found = self._tunings.pop(key, None)
+            if found is None:
                 start = load_pid(paths[1]) if controller is not None else None
-                self._tuning = (key, Tuning(load_model(paths[0]), str(model), start, notches))
-            return self._tuning[1]
+                found = Tuning(load_model(paths[0]), str(model), start, notches, stamp)
+            self._tunings[key] = found
+            if len(self._tunings) > KEPT:
+                del self._tunings[next(iter(self._tunings))]
+            return found
 
     def save_controller(self, tuning: Tuning, values: dict[str, Any], file: str) -> None:
         """Write a controller into the folder; only another controller is replaced.
@@ -260,6 +260,7 @@ class Project:
         """A model from the recording, written to `model.json`."""
         from ..identification import identify
 
+        require_writable(self.folder)
         data = self._read(step)
         model = identify(data, model=step.model, seed=step.seed, progress=progress)
         with writing():
@@ -355,10 +356,17 @@ def looked_at(data: Dataset) -> dict[str, Any]:
     return {"text": str(summary), "advice": list(summary.advice), "curves": curves}
 
 
-def _entries(place: Path) -> list[Path]:
-    """What is in a folder; nothing where it was removed while the studio runs."""
+def _files(place: Path) -> list[Path]:
+    """Files of a folder that are in it and not only linked there; none where it was removed."""
+
+    def is_own(entry: Path) -> bool:
+        try:
+            return entry.name.isprintable() and entry.is_file() and entry.resolve().parent == place
+        except OSError:  # of a link into a folder that is closed to this user
+            return False
+
     try:
-        return list(place.iterdir())
+        return [entry for entry in place.iterdir() if is_own(entry)]
     except OSError:
         return []
 

@@ -16,7 +16,7 @@ from importlib.resources import files
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from ..errors import SettingError
+from ..errors import SettingError, not_installed
 from .bench import said
 from .commissioning import COMMISSIONED
 from .driving import checked_recording
@@ -116,9 +116,7 @@ class Studio:
         try:
             from websockets.sync.server import serve
         except ImportError as e:
-            raise SettingError(
-                'the studio needs websockets, which is not installed: pip install "sewfast[studio]"'
-            ) from e
+            raise not_installed("websockets", "the studio", "sewfast[studio]") from e
         if not 0 <= port < 65536:
             raise SettingError(f"port: expected 0 to 65535, received {port}")
         silent = logging.Logger("sewfast.studio")
@@ -318,7 +316,10 @@ class Studio:
     def _permitted(self, page: Session, asked: dict[str, Any]) -> dict[str, Any]:
         """The fields of a message that keeps to its schema, of a page that may send it."""
         if asked.get("do") in WRITES and self._writer is not page:
-            raise SettingError("this page looks on; press 'take control' first")
+            raise SettingError(
+                name="page", expected="one in control", received="one that looks on",
+                remedy="press 'take control' first",
+            )  # fmt: skip
         return checked(asked)
 
     def _do(self, page: Session, asked: dict[str, Any]) -> Any:
@@ -354,7 +355,12 @@ class Studio:
             return {"file": file}
         if upload is not None:
             upload.abandon()
-        self._uploads[page] = Upload(self.project.folder, **fields)
+        begun = Upload(self.project.folder, **fields)
+        with self._lock:
+            if is_open := page in self._pages:
+                self._uploads[page] = begun
+        if not is_open:  # it was closed meanwhile, and nobody would take the file away
+            begun.abandon()
         return None
 
     def _add_to_upload(self, page: Session, piece: bytes) -> None:

@@ -66,6 +66,8 @@ class Tuning:
         With constant gains; by default the first controller of `sewfast.tune`.
     notches : sequence of (frequency [Hz], depth, width)
         Put after the biquads of the start, of which a controller has four at most.
+    stamp : str
+        What tells these files from later ones of the same names.
 
     Raises
     ------
@@ -81,6 +83,7 @@ class Tuning:
         name: str,
         start: Controller | None = None,
         notches: Sequence[Sequence[float]] = (),
+        stamp: str = "",
     ) -> None:
         from ..analysis.analysis import slowest_time
         from ..analysis.points import plant_points
@@ -89,7 +92,7 @@ class Tuning:
         from ..control.loop import check_fits, each_plant, titles
         from ..tuning import first_controller
 
-        self.model, self.name = model, name
+        self.model, self.name, self.stamp = model, name, stamp
         start = first_controller(model) if start is None else start
         # one form for all: copies are written in it
         added = tuple(Biquad.notch(*numbers) for numbers in notches)
@@ -163,6 +166,7 @@ class Tuning:
         gains = self.start.gains
         return {
             "model": self.name,
+            "stamp": self.stamp,
             "members": len(self.members),
             "knobs": [vars(knob) for knob in self.knobs],
             "level": self.steps.level,
@@ -223,7 +227,7 @@ class Tuning:
 
         controller = self.controller(values)
         (bode,) = loop_bodes(controller, [self.points], self.slowest)
-        numbers, curves = _margins(bode), bode_curves(bode)
+        numbers, curves = {**_margins(bode), "stamp": self.stamp}, bode_curves(bode)
         try:
             tracked, upset = responses(controller, self.members, self.titles, self.steps)
         except FitError:
@@ -393,7 +397,8 @@ def bode_curves(bode: LoopBode) -> dict[str, FloatArray]:
         size = np.maximum(np.abs(getattr(bode, name)), 1e-300)
         curves |= band(f"{name}_db", 20.0 * np.log10(size))
     phase = np.degrees(np.unwrap(np.angle(bode.L), axis=1))
-    curves |= band("L_deg", np.where(20.0 * np.log10(np.abs(bode.L)) > READABLE_DB, phase, np.nan))
+    readable = np.abs(bode.L) > 10.0 ** (READABLE_DB / 20.0)
+    curves |= band("L_deg", np.where(readable, phase, np.nan))
     return curves
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from ..errors import SettingError
+from ..errors import SettingError, unwritable
 from .commissioning import require
 from .project import LARGEST, RECORDINGS
 
@@ -109,10 +110,9 @@ class Upload:
             self._part.unlink()
 
     def _refusal(self, error: OSError) -> SettingError:
-        return SettingError(
-            f"{self.file}: cannot be written ({error.strerror}); make room in the project folder, "
-            "then upload it again"
-        )
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        remedy = "make room in the project folder" if full else "change the rights of the folder"
+        return unwritable(SettingError, self.file, error, f"{remedy}, then upload it again")
 
 
 def checked_recording_name(file: Any) -> str:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import SettingError
+from ..errors import SettingError, not_installed
 from .bench import said
 from .jobs import Jobs
 from .messages import checked
@@ -188,10 +188,7 @@ def _widget(source: str) -> Any:
     try:
         import anywidget
     except ImportError as e:
-        raise SettingError(
-            "a view in a notebook needs anywidget, which is not installed: "
-            'pip install "sewfast[notebook]"'
-        ) from e
+        raise not_installed("anywidget", "a view in a notebook", "sewfast[notebook]") from e
     return anywidget.AnyWidget(_esm=source)
 
 

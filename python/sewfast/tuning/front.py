@@ -17,7 +17,7 @@ from ..control.controller import Controller, pid_of
 from ..control.loop import Plants, References
 from ..errors import Interrupted, SettingError
 from ..gains import whole
-from ..plotting import Drawing, Panel, Table, lettered, significant
+from ..plotting import Drawing, Panel, Plotted, Table, lettered, significant
 from ..progress import shown_in_notebooks
 from ..writers import write_table
 from .objective import Constraints, Cost, LoadStep
@@ -35,7 +35,7 @@ _TUNED = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class ParetoFront:
+class ParetoFront(Plotted):
     """Controllers of which none is better than another in every objective.
 
     Attributes
@@ -114,27 +114,9 @@ class ParetoFront:
         units = {**self.units, "Kp": f"{gains.u_unit}/{gains.y_unit}", "Ti": "s", "Td": "s"}
         write_table(path, self.table(), units=units)
 
-    def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
-        """Draw the front, every pair of objectives in a panel, the knee marked.
-
-        Parameters
-        ----------
-        ax : Axes or sequence of Axes, optional
-            One shows the first two objectives.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the panels of a new figure, shape (pairs,).
-
-        Raises
-        ------
-        SettingError
-            If matplotlib is not installed or the file cannot be written.
-        """
-        return drawing(self).plot(ax, file)
+    def drawing(self) -> Drawing:
+        """The front, every pair of objectives in a panel, the knee marked."""
+        return drawing(self)
 
     def _repr_html_(self) -> str:
         """A table for a notebook."""

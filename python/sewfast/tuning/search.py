@@ -125,20 +125,13 @@ class TuningResult:
         on : Model or VirtualMachine
         reference : str or array, shape (N,), optional
             As for `sewfast.run`; by default a trapezoid that suits the plant.
-        ax : Axes or sequence of Axes, optional
-            One shows the output, further ones the error and the command.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the three panels of a new figure.
+        ax, file
+            As for `Drawing.plot`. One shows the output, further ones the error and the command.
 
         Raises
         ------
         SettingError
-            If matplotlib is not installed, the file cannot be written, or as `sewfast.run`.
+            As `Drawing.plot` and `sewfast.run`.
         FitError
             If the tuned loop diverges on this plant; a start that does is left out.
         """

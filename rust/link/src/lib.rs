@@ -6,6 +6,7 @@ mod bench;
 pub mod bodies;
 pub mod client;
 pub mod host_loop;
+mod ready;
 pub mod receiver;
 pub mod samples;
 pub mod sequence;

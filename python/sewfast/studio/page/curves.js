@@ -150,7 +150,8 @@ function line(g, x, y, x2, y2) { g.beginPath(); g.moveTo(x, y); g.lineTo(x2, y2)
 function ticks(low, high, about) {
   const raw = (high - low) / about, ten = 10 ** Math.floor(Math.log10(raw));
   const step = [1, 2, 5, 10].map(k => k * ten).find(s => s >= raw), found = [];
-  for (let k = Math.ceil(low / step); k * step <= high; k++) found.push(Number((k * step).toPrecision(6)));
+  // a whole number beyond 2^53 does not grow by one
+  for (let k = Math.ceil(low / step); k * step <= high && found.length < 4 * about; k++) found.push(Number((k * step).toPrecision(6)));
   return found;
 }
 

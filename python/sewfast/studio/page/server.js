@@ -24,7 +24,10 @@ export function ask(name, asked = {}, answered = true) {
 export function sendBytes(piece) { socket.send(piece); }
 
 socket.onopen = () => socket.send(sessionStorage.getItem("token") || "none");
-socket.onclose = () => (listeners.closed || []).forEach(f => f());
+socket.onclose = () => {
+  for (const [, failed] of waiting.values()) failed(new Error("the connection to the studio has ended"));
+  waiting.clear(); (listeners.closed || []).forEach(f => f());
+};
 socket.onmessage = ({ data }) => {
   const message = typeof data === "string" ? JSON.parse(data) : unpacked(data);
   if (message.event) return (listeners[message.event] || []).forEach(f => f(message));

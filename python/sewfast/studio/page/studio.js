@@ -10,7 +10,7 @@ const { ask, on } = server, $ = id => document.getElementById(id), VIEWS = ["dat
 const tune = mount(document, server);
 let first = true;
 
-on("closed", () => { $("control").textContent = "not connected: start sewfast studio again, or open its whole address"; });
+on("closed", () => { $("control").textContent = "not connected: reload this page; if it stays so, start sewfast studio again and open its whole address"; });
 
 function view(name) {
   for (const v of VIEWS) { $(v).hidden = v !== name; $(`view-${v}`).setAttribute("aria-pressed", v === name); }

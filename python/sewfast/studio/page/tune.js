@@ -22,7 +22,7 @@ export function mount(root, { ask, on }) {
     phase: new Chart($("phase-plot"), { x: "frequency [Hz]", y: "phase of L [deg]", log: true, marks: [-180] }),
     sensitivity: new Chart($("sens-plot"), { x: "frequency [Hz]", y: "|S|, |T| [dB]", log: true, marks: [0], floor: -60 }),
   };
-  let opened = null, values = {}, history = [], first = null, now = null, pins = {}, asking = false, again = null, resting = 0, knobs = [], busy = false, writes = false, notches = [], failed = "";
+  let opened = null, values = {}, history = [], first = null, now = null, pins = {}, asking = false, again = null, resting = 0, knobs = [], busy = false, writes = false, saving = false, notches = [], failed = "";
 
   const question = more => ({ model: $("tune-model").value, controller: $("tune-start").value || null, values, notches, ...more });
   const given = pairs => Object.fromEntries(pairs.map(([name, id]) => [name, $(id).valueAsNumber]).filter(([, v]) => Number.isFinite(v)));
@@ -101,6 +101,7 @@ export function mount(root, { ask, on }) {
     const asked = values;
     try {
       const found = await ask("tune_move", question());
+      if (found.stamp !== opened.stamp) return await anew();
       now = { ...found, values: asked }; first ??= now; paint();
       // what something else has said stays until a person goes on
       if (failed && $("tune-error").textContent === failed) tell(null);
@@ -109,6 +110,13 @@ export function mount(root, { ask, on }) {
     } catch (error) { failed = error.message; tell(error); }
     asking = false;
     if (again !== null) { const since = again; again = null; move(since); } else resting = setTimeout(cost, 250);
+  }
+
+  /** A file of this name is another one now: what is shown of it begins again, with the numbers as they stand. */
+  async function anew() {
+    asking = false; again = null;
+    await open(values);
+    if (opened) tell(new Error("the model or the controller in the folder has changed: the start was computed again"));
   }
 
   /** What `tune` would count; it takes longer, so it waits for a rest. */
@@ -206,12 +214,21 @@ export function mount(root, { ask, on }) {
   for (const id of ["limit-Ms", "limit-overshoot", "limit-u"]) $(id).oninput = () => { if (now) lights(); };
   $("search").onclick = async () => {
     tell(null);
-    try { await ask("tune_search", question({ evaluations: $("evaluations").valueAsNumber, seed: $("tune-seed").valueAsNumber })); busy = true; enable(); } catch (error) { tell(error); }
+    const constraints = $("tune-within").checked ? given([["Ms", "limit-Ms"], ["overshoot", "limit-overshoot"], ["u", "limit-u"]]) : {};
+    const seconds = $("tune-seconds").valueAsNumber, effort = { evaluations: $("evaluations").valueAsNumber, seed: $("tune-seed").valueAsNumber, seconds: seconds > 0 ? seconds : null };
+    try { await ask("tune_search", question({ ...effort, weights: weights(), constraints })); busy = true; enable(); } catch (error) { tell(error); }
   };
   $("tune-cancel").onclick = () => ask("cancel").catch(tell);
   $("save").onclick = async () => {
     tell(null);
-    try { await ask("tune_save", question({ file: $("save-name").value })); $("saved").textContent = `written: ${$("save-name").value}`; } catch (error) { tell(error); }
+    const file = $("save-name").value;
+    saving = true;
+    try {
+      await ask("tune_save", question({ file })); $("saved").textContent = `written: ${file}`;
+      // the start is this controller now, and has the notches that were put into it
+      if (file === $("tune-start").value) { notches = []; await open(values); }
+    } catch (error) { tell(error); }
+    saving = false;
   };
   $("copy-python").onclick = event => copied(event.target, "python");
   $("copy-commands").onclick = event => copied(event.target, "commands");
@@ -234,7 +251,7 @@ export function mount(root, { ask, on }) {
     writes = s.writes; enable();
     fill($("tune-model"), s.models.map(n => [n, n]), s.first); fill($("tune-start"), [["", "first controller"], ...s.controllers.map(n => [n, n])], s.start ?? "");
     $("no-model").hidden = s.models.length > 0;
-    if (!opened && !$("tune").hidden) open();
+    if (!$("tune").hidden && !saving) opened ? move() : open();
   });
 
   function fill(select, pairs, chosen) {
@@ -244,5 +261,5 @@ export function mount(root, { ask, on }) {
   }
 
   enable();
-  return { show: async () => { if (!opened) await open(); }, question, addNotch, unit: () => opened ? opened.y_unit : "" };
+  return { show: async () => { await (opened ? move() : open()); }, question, addNotch, unit: () => opened ? opened.y_unit : "" };
 }

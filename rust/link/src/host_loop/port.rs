@@ -1,8 +1,8 @@
 //! The thread that owns the port and the deadline.
 
 use std::os::fd::BorrowedFd;
+use std::time::Duration;
 
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
 use rustix::io::{Errno, read, write};
 use rustix::time::{ClockId, clock_gettime};
@@ -10,6 +10,7 @@ use sewfast_core::Monitor;
 
 use super::outcome::Outcome;
 use super::tick::HostLoop;
+use crate::ready::{Interest, wait};
 
 /// The longest time between two looks at a stop request \[us\].
 const LOOK: u64 = 20_000;
@@ -20,7 +21,7 @@ const CHUNK: usize = 8192;
 
 /// Runs the loop on an open port until it is done; every failure of the port is an outcome.
 ///
-/// Between deadlines the thread sleeps in `poll`; it never spins. Deadlines are instants of the monotonic clock, so that a
+/// Between deadlines the thread sleeps; it never spins. Deadlines are instants of the monotonic clock, so that a
 /// late one does not move the next.
 pub fn run(port: BorrowedFd<'_>, host_loop: &mut HostLoop, monitor: &Monitor) {
     let outcome = Port::new(port).and_then(|mut port| port.serve(host_loop, monitor));
@@ -100,22 +101,13 @@ impl<'a> Port<'a> {
 
     /// Sleeps until bytes come, but at most until `wake`; how many bytes those are.
     fn wait(&self, wake: u64, chunk: &mut [u8]) -> Result<usize, Errno> {
-        let mut asked = PollFlags::IN;
-        if !self.unsent.is_empty() {
-            asked |= PollFlags::OUT;
-        }
-        let mut fds = [PollFd::from_borrowed_fd(self.port, asked)];
-        let micros = wake.saturating_sub(now()).min(LOOK);
-        let span = Timespec {
-            tv_sec: 0,
-            tv_nsec: i64::try_from(micros * 1000).unwrap_or(0),
+        let interest = Interest {
+            read: true,
+            write: !self.unsent.is_empty(),
         };
-        match poll(&mut fds, Some(&span)) {
-            Ok(_) | Err(Errno::INTR) => {}
-            Err(lost) => return Err(lost),
-        }
-        let found = fds[0].revents();
-        if found.intersects(PollFlags::IN | PollFlags::HUP | PollFlags::ERR | PollFlags::NVAL) {
+        let span = Duration::from_micros(wake.saturating_sub(now()).min(LOOK));
+        let [found] = wait([(self.port, interest)], span)?;
+        if found.read || found.gone {
             return self.read(chunk);
         }
         Ok(0)

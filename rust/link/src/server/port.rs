@@ -4,14 +4,7 @@ use std::fmt::Debug;
 use std::io;
 use std::time::Duration;
 
-/// What to wait for.
-#[derive(Clone, Copy, Debug)]
-pub struct Interest {
-    /// Bytes from the host can be taken.
-    pub read: bool,
-    /// Bytes for the host are there.
-    pub write: bool,
-}
+use crate::ready::Interest;
 
 /// A port with at most one host; nothing in it blocks but [`Port::wait`].
 pub trait Port: Debug + Send {

@@ -2,19 +2,19 @@
 
 use std::fs;
 use std::io;
-use std::os::fd::OwnedFd;
+use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::ffi::OsStringExt;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::Duration;
 
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{Mode, OFlags};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, QueueSelector, tcflush, tcgetattr, tcsetattr};
 
-use super::port::{Interest, Port, explained};
+use super::port::{Port, explained};
+use crate::ready::{Interest, Ready, wait};
 
 /// The master's side. The server keeps no slave open, so that it sees a host hang up.
 #[derive(Debug)]
@@ -41,16 +41,15 @@ impl Pty {
         Ok(pty)
     }
 
-    fn flags(&self) -> PollFlags {
-        let Some(master) = &self.master else {
-            return PollFlags::HUP;
+    fn state(&self) -> Ready {
+        let gone = Ready {
+            gone: true,
+            ..Ready::default()
         };
-        let mut fds = [PollFd::new(master, PollFlags::IN)];
-        let now = Timespec::default();
-        match poll(&mut fds, Some(&now)) {
-            Ok(_) => fds[0].revents(),
-            Err(_) => PollFlags::empty(),
-        }
+        self.master.as_ref().map_or(gone, |master| {
+            wait([(master.as_fd(), Interest::READ)], Duration::ZERO)
+                .map_or(Ready::default(), |[found]| found)
+        })
     }
 
     /// A host that comes later must not read what was meant for this one.
@@ -111,9 +110,9 @@ impl Port for Pty {
 
     fn connected(&mut self) -> bool {
         if !self.connected {
-            let flags = self.flags();
+            let state = self.state();
             // bytes without a host are those of one that was there for a moment
-            self.connected = !flags.contains(PollFlags::HUP) || flags.contains(PollFlags::IN);
+            self.connected = !state.gone || state.read;
         }
         self.connected
     }
@@ -141,12 +140,8 @@ impl Port for Pty {
             // a hung-up terminal is always ready, so that waiting for it would be no waiting
             return thread::sleep(timeout);
         };
-        let mut wanted = PollFlags::empty();
-        wanted.set(PollFlags::IN, interest.read);
-        wanted.set(PollFlags::OUT, interest.write);
-        let mut fds = [PollFd::new(master, wanted)];
-        let timeout = Timespec::try_from(timeout).unwrap_or_default();
-        let _ = poll(&mut fds, Some(&timeout));
+        // a failure is seen when bytes are read
+        let _ = wait([(master.as_fd(), interest)], timeout);
     }
 
     fn unplug(&mut self) {

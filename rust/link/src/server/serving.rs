@@ -9,10 +9,11 @@ use super::faults::{Fault, Faults};
 use super::gate::Gate;
 use super::line::{Direction, Line};
 use super::log::FaultLog;
-use super::port::{Interest, Port};
+use super::port::Port;
 use super::rig::{PERIOD, Rig};
 use super::shared::{Order, Shared, Statistics};
 use super::trace::{Happening, Trace};
+use crate::ready::Interest;
 
 /// How long a stop request may go unheard.
 const ATTENTION: Duration = Duration::from_millis(20);

@@ -4,7 +4,8 @@ use std::io::{self, ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream, ToSocketAddrs};
 use std::time::Duration;
 
-use super::port::{Interest, Port, explained};
+use super::port::{Port, explained};
+use crate::ready::Interest;
 
 /// A listener and the client that is there.
 #[derive(Debug)]
@@ -130,17 +131,24 @@ impl Port for Tcp {
 
     #[cfg(unix)]
     fn wait(&mut self, interest: Interest, timeout: Duration) {
-        use rustix::event::{PollFd, PollFlags, Timespec, poll};
-        let mut wanted = PollFlags::empty();
-        wanted.set(PollFlags::IN, interest.read);
-        wanted.set(PollFlags::OUT, interest.write);
-        let client = self.client.as_ref().filter(|_| !wanted.is_empty());
-        let client = client.map(|client| PollFd::new(client, wanted));
-        let listener = self.listener.as_ref();
-        let listener = listener.map(|listener| PollFd::new(listener, PollFlags::IN));
-        let mut fds: Vec<_> = client.into_iter().chain(listener).collect();
-        let timeout = Timespec::try_from(timeout).unwrap_or_default();
-        let _ = poll(&mut fds, Some(&timeout));
+        use std::os::fd::AsFd;
+
+        use crate::ready::wait;
+        let client = self
+            .client
+            .as_ref()
+            .filter(|_| interest.read || interest.write);
+        let client = client.map(|client| (client.as_fd(), interest));
+        let listener = self
+            .listener
+            .as_ref()
+            .map(|listener| (listener.as_fd(), Interest::READ));
+        // a failure is seen when bytes are read
+        match (client, listener) {
+            (Some(client), Some(listener)) => drop(wait([client, listener], timeout)),
+            (Some(port), None) | (None, Some(port)) => drop(wait([port], timeout)),
+            (None, None) => std::thread::sleep(timeout),
+        }
     }
 
     #[cfg(not(unix))]
