@@ -181,7 +181,7 @@ def test_what_tune_found_is_judged_in_one_call() -> None:
         (lambda: judge(QUIET), "judge\\(controller, models\\)"),
         (lambda: judge(3), "got int"),  # type: ignore[arg-type]
         (lambda: judge([]), "got list"),
-        (lambda: judge(QUIET, 3), "got int"),  # type: ignore[arg-type]
+        (lambda: judge(QUIET, 3), "received int"),  # type: ignore[arg-type]
         (lambda: Limits(swing=-1.0), "swing"),
         (lambda: Limits(outside=math.nan), "outside"),
     ],

@@ -85,7 +85,9 @@ class Outcome:
         return float(np.median([r.error for r in self.runs]))
 
     def over_oracle(self) -> list[float]:
-        return [r.error / self.references.oracle for r in self.runs]
+        """Infinite where the oracle is the truth itself: no other parameters fit better."""
+        oracle = self.references.oracle
+        return [r.error / oracle if oracle else math.inf for r in self.runs]
 
     def as_measured(self) -> list[float]:
         s = self.references.noise

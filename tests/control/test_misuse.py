@@ -66,8 +66,8 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "gains for python-control": (lambda: to_control(wrong(QUIET.gains)), "expected a Controller"),
     "T of 0": (lambda: Fopdt(1.0, 0.0, 0.1), "T above 0 s"),
     "L below 0": (lambda: Fopdt(1.0, 1.0, -0.1), "L of 0 s or more"),
-    "K as text": (lambda: Fopdt(wrong("a"), 1.0, 0.1), "for K"),
-    "K of NaN": (lambda: Fopdt(math.nan, 1.0, 0.1), "for K"),
+    "K as text": (lambda: Fopdt(wrong("a"), 1.0, 0.1), "K: expected a number"),
+    "K of NaN": (lambda: Fopdt(math.nan, 1.0, 0.1), "K: expected a number"),
     "a rule for gains": (lambda: rules.eq_12(wrong(QUIET.gains)), "expected an Fopdt"),
     "a rule for a number": (lambda: rules.simc(wrong(3)), "expected an Fopdt"),
     "margins in other units": (

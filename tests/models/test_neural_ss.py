@@ -331,8 +331,9 @@ def test_an_integrator_stays_one() -> None:
     assert percent(angle, found.model.simulate(u, found.initial_states[0])) > 95
 
 
+@pytest.mark.parametrize("hidden", [2, 4])
 @pytest.mark.parametrize("friction", [0.15, 0.25, 0.35])
-def test_an_integrator_finds_dry_friction(friction: float) -> None:
+def test_an_integrator_finds_dry_friction(friction: float, hidden: int) -> None:
     """A carriage of 1 kg between places 1 s apart, under a controller of position and speed [mm, N,
     ms]: from smooth random units alone the error is two to three times larger."""
     rng = np.random.default_rng(3)
@@ -350,7 +351,7 @@ def test_an_integrator_finds_dry_friction(friction: float) -> None:
         q += v
     pair = (u[:, None], y)
     linear = _core.fit_oe([pair], na=2, nb=3, nk=1).model
-    found = fit([pair], hidden=2, linear=linear, integrator=True, starts=6, max_iterations=100)
+    found = fit([pair], hidden=hidden, linear=linear, integrator=True, starts=6, max_iterations=100)
     run = found.model.simulate(pair[0], found.initial_states[0])
     assert percent(y, run) > 99.75
 

@@ -202,6 +202,9 @@ def test_ratios_and_summary() -> None:
     assert found.over_noise() == [1.0, 2.0, 3.0]
     assert found.as_measured()[0] == pytest.approx(math.sqrt(2 / 1.25))
     assert found.spread == 1.5
+    # an oracle that is the truth itself has no error to divide by
+    exact = replace(found, references=replace(found.references, oracle=0.0))
+    assert exact.over_oracle() == 3 * [math.inf]
     network = outcome("dead_time", [1.0], kind="neural_oe+neural_ss")
     held = outcome("wiener", [1.0, math.inf], kind="neural_ss")
     summary = scoring.summary([found, network, held])

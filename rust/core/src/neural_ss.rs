@@ -4,6 +4,7 @@ mod draw;
 mod free_run;
 mod friction;
 mod growth;
+mod integrated;
 mod kalman;
 mod leak;
 mod network;

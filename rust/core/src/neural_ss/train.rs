@@ -2,6 +2,7 @@
 
 use super::free_run::Trajectory;
 use super::friction::{self, Friction};
+use super::integrated::Speed;
 use super::leak::Leak;
 use super::network::Network;
 use super::output::OutputFunction;
@@ -96,10 +97,12 @@ const NO_REDUCTION: f64 = 1e-7;
 /// Growth of the sensitivities' squares from one step to the next that counts as an explosion. Asked of positions, where
 /// it has been measured: friction that overshoots the standstill is what explodes.
 const MOST_GROWTH: f64 = 1e3;
-/// Share of a position's starts that begin with an estimate of its friction, where one shows.
+/// Share of a position's starts that train a network of its speed first.
+const BY_SPEED: f64 = 0.6;
+/// Share of its other starts that begin with an estimate of its friction, where one shows.
 const WITH_FRICTION: f64 = 0.7;
-/// One of so many iterations of a position is for its recent motion.
-const RECENT_MOTION: usize = 3;
+/// One of so many iterations of a position is for its speed, or for its recent motion.
+const FIRST_PART: usize = 3;
 /// Samples of an experiment that its state is first estimated from.
 const STATE_SAMPLES: usize = 2_000;
 /// Share of the output's variance that a linear model is taken to miss while it is.
@@ -213,6 +216,9 @@ impl<'a> Task<'a> {
             let decay = self.settings.weight_decay;
             let mut problem =
                 problem::Training::new(&self.experiments, network, decay, &attempts, self.monitor);
+            if let Some((theta, taken)) = self.by_speed(&mut problem, &mut random, &attempts) {
+                return Some((self.train(&mut problem, theta, &attempts, taken)?, 0));
+            }
             let (theta, dead) = self.drawn(&mut problem, start, &mut random)?;
             let (theta, taken) = self.by_recent_motion(&mut problem, theta, &attempts);
             Some((self.train(&mut problem, theta, &attempts, taken)?, dead))
@@ -267,7 +273,40 @@ impl<'a> Task<'a> {
         let found = Friction::estimated(self.shape, &self.experiments, random)?;
         let theta = found.theta(self.shape, self.settings.hidden_scale, random);
         let network = Network::new(self.shape, self.settings.output, &theta);
-        Some(self.with_states(theta, &network, &self.unit_prior()))
+        Some(with_states(
+            theta,
+            &network,
+            &unit_prior(self.shape),
+            &self.experiments,
+        ))
+    }
+
+    /// Many starts of a position train a network of its speed first: the parameters from which they go on, and the
+    /// iterations taken; none where it is not their turn, or where nothing comes of it.
+    fn by_speed(
+        &self,
+        problem: &mut problem::Training,
+        random: &mut Random,
+        attempts: &Attempts,
+    ) -> Option<(Vec<f64>, usize)> {
+        let is_position = self.shape.integrator && self.shape.outputs == 1;
+        let is_linear = self.settings.output == OutputFunction::Linear;
+        if !is_position || !is_linear || !self.settings.initial.is_empty() {
+            return None;
+        }
+        let speed = Speed::new(&self.experiments, self.shape)?;
+        if random.between(0.0, 1.0) >= BY_SPEED {
+            return None;
+        }
+        let linear = draw::small(speed.shape, &speed.experiments, random)?;
+        let theta = draw::beside(&linear, speed.shape, self.settings.hidden_scale, random);
+        let prior = unit_prior(speed.shape);
+        let network = Network::new(speed.shape, OutputFunction::Linear, &theta);
+        let theta = with_states(theta, &network, &prior, &speed.experiments);
+        let iterations = self.settings.max_iterations / FIRST_PART;
+        let theta = self.descended(&speed.experiments, network, theta, iterations)?;
+        let theta = self.with_positions(problem, speed.integrated(&theta, self.shape), attempts)?;
+        Some((theta, iterations))
     }
 
     /// A position is trained by its recent motion first; the parameters from which it goes on, and the iterations taken.
@@ -281,7 +320,7 @@ impl<'a> Task<'a> {
         if !is_position || !self.settings.initial.is_empty() {
             return (theta, 0);
         }
-        let iterations = self.settings.max_iterations / RECENT_MOTION;
+        let iterations = self.settings.max_iterations / FIRST_PART;
         let found = self.leaking(theta.clone(), iterations);
         let found = found.and_then(|theta| self.with_positions(problem, theta, attempts));
         (found.unwrap_or(theta), iterations)
@@ -293,17 +332,28 @@ impl<'a> Task<'a> {
         leak.entered(&mut theta, self.shape);
         let own = self.shape.parameters();
         let network = Network::new(self.shape, self.settings.output, &theta[..own]);
-        let attempts = Attempts::new(&network, &leak.experiments);
+        let mut theta = self.descended(&leak.experiments, network, theta, iterations)?;
+        leak.left(&mut theta, self.shape);
+        Some(theta)
+    }
+
+    /// The parameters after so many iterations on these experiments; none where no free run is finite.
+    fn descended(
+        &self,
+        experiments: &[Experiment],
+        network: Network,
+        theta: Vec<f64>,
+        iterations: usize,
+    ) -> Option<Vec<f64>> {
+        let attempts = Attempts::new(&network, experiments);
         let decay = self.settings.weight_decay;
         let mut problem =
-            problem::Training::new(&leak.experiments, network, decay, &attempts, self.monitor);
+            problem::Training::new(experiments, network, decay, &attempts, self.monitor);
         let settings = self.descent(iterations);
         let outcome = lm::minimize(&mut problem, theta, &settings, self.monitor, |_, _| ());
         self.monitor
             .advance((iterations - outcome.iterations) as u64);
-        let mut theta = outcome.theta;
-        leak.left(&mut theta, self.shape);
-        outcome.cost.is_finite().then_some(theta)
+        outcome.cost.is_finite().then_some(outcome.theta)
     }
 
     /// With positions at which the free run has no mean error; none where it diverges.
@@ -337,40 +387,18 @@ impl<'a> Task<'a> {
     fn begun(&self, linear: &Realisation, random: &mut Random) -> Vec<f64> {
         let network = Network::new(self.shape, self.settings.output, &linear.theta(self.shape));
         let theta = draw::beside(linear, self.shape, self.settings.hidden_scale, random);
-        self.with_states(theta, &network, &self.unit_prior())
-    }
-
-    /// What is known of states before there is a run: they are scaled to unit variance.
-    fn unit_prior(&self) -> Statistics {
-        let Shape { nx, outputs, .. } = self.shape;
-        let unit = (0..nx * nx).map(|i| f64::from(u8::from(i % (nx + 1) == 0)));
-        Statistics {
-            state_mean: vec![0.0; nx],
-            state_covariance: unit.collect(),
-            residual_variance: vec![LINEAR_RESIDUAL; outputs],
-            process_noise: 0.0,
-        }
+        with_states(theta, &network, &unit_prior(self.shape), &self.experiments)
     }
 
     /// A model that is trained further, and its states on the experiments.
     fn resumed(&self, model: &NeuralSS) -> Vec<f64> {
         let network = Network::new(self.shape, self.settings.output, model.theta());
-        self.with_states(model.theta().to_vec(), &network, model.statistics())
-    }
-
-    /// The parameters, and after them the states at which `network` comes nearest to the experiments.
-    fn with_states(&self, mut theta: Vec<f64>, network: &Network, prior: &Statistics) -> Vec<f64> {
-        let Shape {
-            inputs, outputs, ..
-        } = self.shape;
-        for Experiment { v, y, .. } in &self.experiments {
-            let samples = STATE_SAMPLES.min(y.len() / outputs);
-            let (v, y) = (&v[..samples * inputs], &y[..samples * outputs]);
-            let mean = std::slice::from_ref(&prior.state_mean);
-            let state = state::update(network, prior, v, y, mean);
-            theta.extend(state.unwrap_or_else(|| prior.state_mean.clone()));
-        }
-        theta
+        with_states(
+            model.theta().to_vec(),
+            &network,
+            model.statistics(),
+            &self.experiments,
+        )
     }
 
     fn train(
@@ -511,6 +539,38 @@ impl<'a> Task<'a> {
             initial_states: best.states,
         })
     }
+}
+
+/// What is known of states before there is a run: they are scaled to unit variance.
+fn unit_prior(shape: Shape) -> Statistics {
+    let Shape { nx, outputs, .. } = shape;
+    let unit = (0..nx * nx).map(|i| f64::from(u8::from(i % (nx + 1) == 0)));
+    Statistics {
+        state_mean: vec![0.0; nx],
+        state_covariance: unit.collect(),
+        residual_variance: vec![LINEAR_RESIDUAL; outputs],
+        process_noise: 0.0,
+    }
+}
+
+/// The parameters, and after them the states at which `network` comes nearest to the experiments.
+fn with_states(
+    mut theta: Vec<f64>,
+    network: &Network,
+    prior: &Statistics,
+    experiments: &[Experiment],
+) -> Vec<f64> {
+    let Shape {
+        inputs, outputs, ..
+    } = network.shape;
+    for Experiment { v, y, .. } in experiments {
+        let samples = STATE_SAMPLES.min(y.len() / outputs);
+        let (v, y) = (&v[..samples * inputs], &y[..samples * outputs]);
+        let mean = std::slice::from_ref(&prior.state_mean);
+        let state = state::update(network, prior, v, y, mean);
+        theta.extend(state.unwrap_or_else(|| prior.state_mean.clone()));
+    }
+    theta
 }
 
 fn check(settings: &Settings) -> Result<()> {

@@ -1,0 +1,186 @@
+//! Training of a position by its speed first: a network of the differences of the outputs, behind which the integrator is set.
+//!
+//! The free run of an integrator sums up what its speed is wrong by, and a small error of the friction moves all that
+//! follows; the cost has many valleys. The free run of the speed does not drift, and dry friction shows in it. Differences
+//! of noisy positions are noisy, `sqrt(2)` times as much in every sample, but there are many; the training that follows, on
+//! the positions as they are, takes the noise for what it is.
+
+use super::problem::Experiment;
+use super::scaling::root_mean_square;
+use super::shape::Shape;
+
+/// Recordings of the speed, and the shape of a network of it.
+pub(super) struct Speed {
+    pub experiments: Vec<Experiment>,
+    pub shape: Shape,
+    /// Root mean square of the speed in units of the position, a sample.
+    pub scale: f64,
+}
+
+impl Speed {
+    /// The speed of these positions; none where nothing moves, where the position is the only state, or where less than
+    /// two hidden units are left beside the one that stands for a constant: with one unit, random starts find no friction.
+    pub fn new(experiments: &[Experiment], position: Shape) -> Option<Self> {
+        if position.nx < 2 || position.hidden < 3 {
+            return None;
+        }
+        let shape = Shape {
+            nx: position.nx - 1,
+            hidden: position.hidden - 1,
+            integrator: false,
+            ..position
+        };
+        let mut experiments: Vec<Experiment> = experiments.iter().map(differences).collect();
+        let scale = root_mean_square(experiments.iter().flat_map(|e| e.y.iter().copied()));
+        if scale <= 0.0 {
+            return None;
+        }
+        for y in experiments.iter_mut().flat_map(|e| &mut e.y) {
+            *y /= scale;
+        }
+        Some(Self {
+            experiments,
+            shape,
+            scale,
+        })
+    }
+
+    /// Parameters and first states of the position whose speed has these ones; positions begin at 0.
+    ///
+    /// With `w` the speed, `p+ = p + w` and `y = p + w`. The last hidden unit becomes the constant part of the speed, as
+    /// state equations have none.
+    pub fn integrated(&self, speed: &[f64], position: Shape) -> Vec<f64> {
+        let (nx, hidden, inputs) = (self.shape.nx, self.shape.hidden, self.shape.inputs);
+        let (from, to) = (self.shape.parts(), position.parts());
+        let mut theta = vec![0.0; position.parameters()];
+        let mut copy = |from: usize, to: usize, count: usize, factor: f64| {
+            let values = theta[to..][..count].iter_mut().zip(&speed[from..][..count]);
+            values.for_each(|(to, from)| *to = factor * from);
+        };
+        for i in 0..nx {
+            copy(from.a.start + i * nx, to.a.start + i * (nx + 1), nx, 1.0);
+            copy(
+                from.b.start + i * inputs,
+                to.b.start + i * inputs,
+                inputs,
+                1.0,
+            );
+            let (e, own) = (from.e.start + i * hidden, to.e.start + i * position.hidden);
+            copy(e, own, hidden, 1.0);
+        }
+        for i in 0..hidden {
+            copy(from.wx.start + i * nx, to.wx.start + i * (nx + 1), nx, 1.0);
+        }
+        copy(from.wu.start, to.wu.start, hidden * inputs, 1.0);
+        copy(from.bh.start, to.bh.start, hidden, 1.0);
+        // the speed moves the position and, in the same sample, the output
+        let rows = [
+            (from.c.start, to.a.start + nx * (nx + 1), to.c.start, nx),
+            (from.d.start, to.b.start + nx * inputs, to.d.start, inputs),
+            (
+                from.g.start,
+                to.e.start + nx * position.hidden,
+                to.g.start,
+                hidden,
+            ),
+        ];
+        for (from, state, output, count) in rows {
+            copy(from, state, count, self.scale);
+            copy(from, output, count, self.scale);
+        }
+        theta[to.c.end - 1] = 1.0;
+        let constant = self.scale * speed[from.constant.start] / f64::tanh(1.0);
+        theta[to.bh.end - 1] = 1.0;
+        theta[to.e.end - 1] = constant;
+        theta[to.g.end - 1] = constant;
+        position.hold(&mut theta);
+        for state in speed[from.g.end..].chunks_exact(nx) {
+            theta.extend(state.iter().chain([&0.0]));
+        }
+        theta
+    }
+}
+
+/// Each output less the one before; not known where one of them is not.
+fn differences(experiment: &Experiment) -> Experiment {
+    let y = &experiment.y;
+    let steps = y.iter().zip(y.iter().skip(1)).map(|(y, next)| next - y);
+    Experiment {
+        y: [f64::NAN].into_iter().take(y.len()).chain(steps).collect(),
+        ..experiment.clone()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::network::Network;
+    use super::super::output::OutputFunction;
+    use super::super::problem::{Attempts, Training};
+    use super::super::tests::noise;
+    use super::*;
+    use crate::Monitor;
+    use crate::lm::Problem;
+
+    fn position(nx: usize, hidden: usize) -> Shape {
+        Shape {
+            nx,
+            nk: 1,
+            inputs: 2,
+            outputs: 1,
+            hidden,
+            integrator: true,
+        }
+    }
+
+    fn run(shape: Shape, theta: &[f64], experiments: &[Experiment]) -> Vec<f64> {
+        let network = Network::new(shape, OutputFunction::Linear, &theta[..shape.parameters()]);
+        let attempts = Attempts::new(&network, experiments);
+        let monitor = Monitor::default();
+        let mut problem = Training::new(experiments, network, 0.0, &attempts, &monitor);
+        assert!(problem.cost(theta).is_some());
+        attempts.at(theta)[0].sums.clone()
+    }
+
+    #[test]
+    fn the_position_is_the_sum_of_the_speed() {
+        for (nx, hidden) in [(2, 3), (3, 4), (4, 9)] {
+            let shape = position(nx, hidden);
+            let experiments = [Experiment {
+                v: noise(400, 1),
+                y: noise(200, 2),
+                weights: Vec::new(),
+            }];
+            let speed = Speed::new(&experiments, shape).unwrap();
+            let count = speed.shape.parameters() + speed.shape.nx;
+            let theta: Vec<f64> = noise(count, 3).iter().map(|t| 0.2 * t).collect();
+            let speeds = run(speed.shape, &theta, &speed.experiments);
+            let found = run(shape, &speed.integrated(&theta, shape), &experiments);
+            let mut sum = 0.0;
+            for (w, y) in speeds.iter().zip(found) {
+                sum += speed.scale * w;
+                assert!((y - sum).abs() < 1e-9, "{y} {sum}");
+            }
+        }
+    }
+
+    #[test]
+    fn keeps_gaps_and_is_none_where_nothing_moves() {
+        let experiment = |y: Vec<f64>| Experiment {
+            v: vec![0.0; 2 * y.len()],
+            y,
+            weights: Vec::new(),
+        };
+        let found = Speed::new(
+            &[experiment(vec![0.0, 2.0, f64::NAN, 5.0, 3.0])],
+            position(2, 3),
+        )
+        .unwrap();
+        let y = &found.experiments[0].y;
+        assert!(y[0].is_nan() && y[2].is_nan() && y[3].is_nan());
+        assert_eq!((y[1], y[4], found.scale), (1.0, -1.0, 2.0));
+        assert!(Speed::new(&[experiment(vec![2.0; 9])], position(2, 3)).is_none());
+        for (nx, hidden) in [(1, 3), (2, 2)] {
+            assert!(Speed::new(&[experiment(vec![0.0, 1.0])], position(nx, hidden)).is_none());
+        }
+    }
+}
