@@ -121,6 +121,7 @@ def test_a_drive_by_clicks(studio: Studio, device: VirtualDevice, browser: Any) 
     until(lambda: not _is_on(device))
     until(lambda: "output off, confirmed after" in at("stopped").text)
     until(lambda: "not armed" in at("drive-state").text)
+    until(lambda: "idle" in at("speed").text)  # and not the last sample of the run
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
 
 

@@ -46,6 +46,10 @@ def test_the_way_by_clicks(studio: Studio, browser: Any) -> None:
     painted += ".getImageData(0, 0, c.width, c.height).data.some(v => v))"
     assert browser.execute_script(painted)
     assert browser.title == "sewfast studio"
+    # what was found on one recording does not stand below another
+    at("file").send_keys("run2.csv")
+    until(lambda: not at("card").text and not at("summary").text)
+    assert "free run explains" in at("headline").text
     assert browser.get_log("browser") == []
 
 

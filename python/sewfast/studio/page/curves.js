@@ -70,7 +70,7 @@ export class Chart {
     g.textAlign = "center";
     for (const v of this.axes.log ? decades(from, to) : ticks(from, to, Math.max(2, w / 130))) {
       g.globalAlpha = .2; line(g, X(v), top, X(v), bottom); g.globalAlpha = 1;
-      g.fillText(String(v), X(v), bottom + 12);
+      g.fillText(String(v), Math.min(X(v), w - g.measureText(String(v)).width / 2), bottom + 12);
     }
     g.fillText(this.axes.x, (left + right) / 2, h - 8);
   }

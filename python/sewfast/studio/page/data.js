@@ -58,6 +58,7 @@ on("identified", m => {
   busy = false; $("progress").textContent = ""; enable();
   if (m.error) return tell(new Error(m.error));
   const f = m.found;
+  clearValidation();  // it was that of the model before
   $("headline").textContent = `free run explains ${f.fit.toFixed(1)} % of the training data (rmse ${`${f.rmse.toPrecision(4)} ${f.unit}`.trim()})`;
   panels($("fit"), [f.free_run]); candidates(f.candidates); text("modeltext", f.text); copies($("identify-copy"), f);
 });
@@ -72,6 +73,8 @@ function fill(select, pairs, kept) {
 export async function open() {
   if (!stale || !$("file").value) return;
   stale = false; tell(null);
+  // what was found on another recording would pass for this one's
+  clear(["signals", "advice", "summary", "look-copy"]); clearValidation();
   try {
     const c = await ask("columns"), names = c.names.map(n => [n, n]);
     fill($("inputs"), names, c.inputs);
@@ -80,6 +83,11 @@ export async function open() {
     document.dispatchEvent(new CustomEvent("columns"));
   } catch (error) { tell(error); }
 }
+
+function clear(ids) {
+  for (const id of ids) { $(id).replaceChildren(); if ($(id).tagName === "PRE") $(id).hidden = true; }
+}
+function clearValidation() { clear(["verdict", "free", "card", "validate-copy"]); }
 
 function text(id, value) { $(id).textContent = value; $(id).hidden = false; }
 

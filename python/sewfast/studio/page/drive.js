@@ -50,8 +50,8 @@ function state() {
   const said = !d.connected ? "no drive" : `${d.name}: ${d.job ? "running" : d.state}${d.state === "tripped" ? ` (${d.reason})` : ""}, ${d.armed ? "ARMED" : "not armed"}${d.job ? `, ${d.job}` : ""}`;
   if ($("drive-state").textContent !== said) $("drive-state").textContent = said;
   $("prompt").textContent = d.connected && writes && !d.armed ? (prompt < 10 ? `this page has answered ${prompt} of 10 times in a row` : "this page answers in time") : "";
-  $("speed").classList.toggle("stale", !d.job);
-  if (d.connected && !d.job && run < 1) $("speed").textContent = `at rest${speed}`;
+  // the last sample of a run is no speed of the drive any more
+  if (!d.job) $("speed").textContent = d.connected ? `${d.state}${speed}` : "no drive";
 }
 
 function table() {
@@ -82,7 +82,7 @@ $("connect").onclick = async () => {
   $("connect").disabled = true;
   await act("drive_connect", { port: $("port").value.trim(), baud: $("baud").valueAsNumber || 115200, watchdog: $("watchdog").valueAsNumber / 1000 || null }); enable();
 };
-$("disconnect").onclick = () => act("drive_disconnect");
+$("disconnect").onclick = () => { $("stopped").textContent = $("limits-set").textContent = ""; act("drive_disconnect"); };
 $("limits").onclick = async () => {
   const asked = Object.fromEntries(LIMITS.map(name => [name, $(`limit-${name}`).valueAsNumber || null]));
   $("limits-set").textContent = await act("drive_limits", asked) ? "set; an empty field is the drive's own ceiling" : "";
@@ -130,7 +130,7 @@ function paint(f) {
     charts.get(unit).draw(series, `${names.join(" and ")} over the last ${seconds($("live-seconds").valueAsNumber)} seconds`);
   }
   const speed = f.curves.speed_high || f.curves.speed_true_high;
-  if (speed) $("speed").textContent = Number.isNaN(speed[n - 1]) ? "speed unknown" : `${speed[n - 1].toFixed(0)} RPM`;
+  if (speed && drive.job) $("speed").textContent = Number.isNaN(speed[n - 1]) ? "speed unknown" : `${speed[n - 1].toFixed(0)} RPM`;
   $("live-state").textContent = `${f.title}: ${f.end}${f.n ? ` of ${f.n}` : ""} samples` + (f.missing ? `, ${f.missing} missing` : "") + (drive.job ? "" : " (ended)");
   document.dispatchEvent(new CustomEvent("frame", { detail: f.end }));
 }
