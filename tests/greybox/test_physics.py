@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -46,13 +47,12 @@ def linear(n: int = 1500, Ts: float = 0.02, seed: int = 0, noise: float = 1.0) -
     """A motor by its difference equation: kV .02 V s/rad, kA .006 V s^2/rad, kS .3 V."""
     rng = np.random.default_rng(seed)
     u = np.repeat(rng.uniform(-8, 8, n // 25 + 1), 25)[:n]
-    w, y = 0.0, np.empty(n)
+    w, y, kept = 0.0, np.empty(n), math.exp(-Ts / 50 * 0.02 / 0.006)
     for k in range(n):
         y[k] = w
-        for _ in range(50):
-            drive = u[k] - 0.02 * w
-            moved = w + Ts / 50 * drive / 0.006
-            w = np.sign(moved) * max(abs(moved) - Ts / 50 * 0.3 / 0.006, 0.0)
+        for _ in range(50):  # exact while it turns one way
+            free = kept * w + (1 - kept) * u[k] / 0.02
+            w = math.copysign(max(abs(free) - (1 - kept) * 0.3 / 0.02, 0.0), free)
     return u, y + noise * rng.standard_normal(n)
 
 

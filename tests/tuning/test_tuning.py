@@ -40,7 +40,7 @@ SHORT = signals.reference("trapezoid")[:900]
 def test_a_model_with_two_inputs_is_refused_by_name() -> None:
     core = _core.LinearModel(np.array([-0.9]), np.array([[0.1], [0.2]]), 1, 0.0)
     two = LinearOE(core, 0.001, ("u", "load"), "y", ("V", "N m"), "RPM")
-    with pytest.raises(SettingError, match=r"one input.*got 2"):
+    with pytest.raises(SettingError, match=r"one input.*received 2"):
         tune(two, [SHORT])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from ..errors import SettingError
 from .arguments import (
@@ -59,7 +59,12 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--export", nargs=2, metavar=("TARGET", "FILE"),
-        help="write settings for wpilib, mujoco or urdf",
+        help="write settings for wpilib, mujoco, urdf, odrive, moteus or simplefoc",
+    )  # fmt: skip
+    parser.add_argument(
+        "--winding", choices=("line", "q"),
+        help="for --export: volts and amperes between two terminals (line), or amplitudes along "
+        "the q axis, as boards log them (q)",
     )  # fmt: skip
     parser.add_argument(
         "--model", metavar="FILE.json", type=Path,
@@ -72,13 +77,20 @@ def add(commands: Commands) -> None:
 
 def command(args: argparse.Namespace) -> None:
     from ..greybox import physics
+    from ..greybox.exports import BOARDS, Target
 
     require_place(args.out, (".json",))
     require_place(args.model, (".json",), option="--model")
     require_plot(args.plot)
     target, place = args.export or (None, "")
-    if target not in (None, "wpilib", "mujoco", "urdf"):
-        raise SettingError(f"--export: expected wpilib, mujoco or urdf, received {target!r}")
+    if target not in (None, *get_args(Target)):
+        names = ", ".join(get_args(Target))
+        raise SettingError(f"--export: expected one of {names}, received {target!r}")
+    if target in BOARDS and args.winding is None:
+        raise SettingError(
+            name="--winding", expected=f"line or q with --export {target}", received="nothing",
+            remedy="line: volts and amperes between two terminals; q: amplitudes along the q axis",
+        )  # fmt: skip
     structure = args.structure
     motor = physics(
         _data(args),
@@ -87,7 +99,7 @@ def command(args: argparse.Namespace) -> None:
         volts=args.volts,
         speed_unit=args.speed_unit,
     )
-    text = "" if target is None else motor.export(target)
+    text = "" if target is None else motor.export(target, winding=args.winding)
     if args.out is not None:
         motor.save(args.out)
     if text:

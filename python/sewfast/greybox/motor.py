@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +18,8 @@ from ..frequency.shaft import Parameter, sampled_model
 from ..machine import VirtualMachine
 from ..models import LinearOE
 from ..plotting import LOOKS, Drawing, html_of
+from .exports import Target, Winding, export
+from .intervals import CONFIDENCE
 from .records import Records, rad_per_second
 
 if TYPE_CHECKING:
@@ -28,14 +29,12 @@ FORMAT = "sewfast-motor"
 VERSION = 2
 """Version 1 has `untold` for `undetermined`, and is read."""
 NAMES = tuple(_core.GREYBOX_PARAMETERS)
-CONFIDENCE = 1.96
 VAGUE = 1.0
 """Of its value: the half-width of an interval from which a parameter is not printed."""
 
 APART = 10.0
 """Of its value: the half-width from which others can stand for it."""
 
-Target: TypeAlias = Literal["wpilib", "mujoco", "urdf"]
 Values: TypeAlias = Mapping[str, float]
 
 _SI = ("resistance", "motor_constant", "inertia", "viscous_friction", "coulomb_torque")
@@ -142,7 +141,7 @@ class Motor:
 
     def to_model(self) -> LinearOE:
         """The turning motor as a linear model at the samples, without dry friction and loads."""
-        of = dict(zip(NAMES, self.theta, strict=True))
+        of = self.of
         k_v, tau = of["k_e"] + of["k_b"], max(of["tau"], 1e-3 * self.Ts)
         gain = 1.0 / (k_v * rad_per_second(self.speed_unit))
         lags = (of["k_a"] + tau * of["k_b"]) / k_v, tau * of["k_a"] / k_v
@@ -178,7 +177,7 @@ class Motor:
         raise SettingError(f"this motor lies outside virtual machines: {refused}")
 
     def _twin(self, volts: float, ohms: float, u_limit: float | None) -> VirtualMachine:
-        of = dict(zip(NAMES, self.theta, strict=True))
+        of = self.of
         constant = of["k_e"] * volts  # V s/rad, which is N m/A
         torque = constant * volts / ohms  # N m per unit of command
         drop, pwm, bus = of["drop"] * volts, 1e4, 2000.0
@@ -216,47 +215,34 @@ class Motor:
         machine.set_load(of["offset"] * torque)
         return machine
 
-    def export(self, target: Target) -> str:
+    def export(self, target: Target, *, winding: Winding | None = None) -> str:
         """Settings of another tool, as text.
 
         Parameters
         ----------
-        target : "wpilib", "mujoco" or "urdf"
+        target : "wpilib", "mujoco", "urdf", "odrive", "moteus" or "simplefoc"
             `wpilib`: kS, kV, kA as JSON, kV and kA per rad/s and per rad/s^2. `mujoco`: joint and
-            actuator elements; `urdf`: the joint's dynamics. Those two take SI units.
+            actuator elements; `urdf`: the joint's dynamics. Boards: resistance and inductance of a
+            phase, KV or torque constant per amplitude along q, inertia; what the record cannot
+            tell is named in the text. All but `wpilib` take SI units.
+        winding : "line" or "q"
+            What the record's volts and amperes are: those between two terminals, as of a DC motor,
+            or amplitudes along the q axis, as boards log them. Boards need it; without it, a
+            simulator gets a DC motor. With "q", torques and inertia are 3/2 of those printed.
 
         Raises
         ------
         SettingError
-            For another target.
+            For another target, or a board without `winding`.
         DataError
             If the record does not determine what the target needs.
         """
-        if target not in get_args(Target):
-            raise SettingError(
-                f"expected {', '.join(get_args(Target))} as target, received {target!r}"
-            )
-        if target == "wpilib":
-            gains = {"kS": self.theta[NAMES.index("k_s")]}
-            gains |= {"kV": self.value("k_v"), "kA": self.value("k_a")}
-            units = {"kS": self.u_unit, "kV": f"{self.u_unit}/(rad/s)"}
-            units["kA"] = f"{self.u_unit}/(rad/s^2)"
-            return json.dumps({"feedforward": gains, "units": units}, indent=1) + "\n"
-        viscous, dry = self._torques("k_b"), self._torques("k_s")
-        if target == "urdf":
-            return f'<dynamics damping="{viscous:.6g}" friction="{dry:.6g}"/>\n'
-        K, R, G = (self.value(n) for n in ("motor_constant", "resistance_ohm", "volts"))
-        return (
-            f'<joint type="hinge" armature="{self.value("inertia"):.6g}" '
-            f'damping="{viscous:.6g}" frictionloss="{dry:.6g}"/>\n'
-            f'<general gainprm="{K * G / R:.6g}" biastype="affine" '
-            f'biasprm="0 0 {-K * K / R:.6g}"/>\n'
-        )
+        return export(self, target, winding)
 
-    def _torques(self, name: str) -> float:
-        """A term in N m, nothing where it is not shown."""
-        K, R = self.value("motor_constant"), self.value("resistance_ohm")
-        return float(self.theta[NAMES.index(name)]) * K * self.value("volts") / R
+    @property
+    def of(self) -> dict[str, float]:
+        """What the fit has, by the names of the equations; nothing where a term is not shown."""
+        return dict(zip(NAMES, self.theta.tolist(), strict=True))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write it as JSON, whole or not at all.
@@ -306,7 +292,7 @@ class Motor:
             ax.legend(loc="upper right")
 
         def friction_panel(ax: Axes) -> None:
-            of = dict(zip(NAMES, self.theta, strict=True))
+            of = self.of
             usual = 100.0 if self.shown is None else float(np.abs(self.shown[0]).max())
             top = min(usual, 15.0 * of["w_s"]) if of["k_t"] else usual
             half = np.linspace(1e-4 * top, top, 400)
@@ -446,7 +432,10 @@ def motor_of(
     at = np.array([known[n] for n in estimate.names])
     parameters: dict[str, Parameter] = {}
     undetermined: dict[str, str] = {}
+    hidden = {name for term in reasons for name in _OF_TERM[term]}
     for name, unit, of in _quantities(estimate, records.u_unit, volts):
+        if name in hidden:
+            continue
         value = of(known)
         slope = np.zeros(len(at))
         sd = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
@@ -503,6 +492,7 @@ _MAY_BE_NOTHING = ("delay",)
 _SIGNED = ("offset", "k_b", "viscous_friction")
 
 _OF_TERM = {
+    "inertia": ("k_a", "time_constant", "inertia"),
     "lag": ("electrical_lag",),
     "delay": ("delay",),
     "coulomb": ("k_s",),

@@ -16,6 +16,10 @@
 //! `k_a = J R/K`, `k_b = B R/K`, `k_s = T R/K`. Derivatives are carried along with the values, as dual numbers
 //! (Griewank and Walther 2008, chapter 3): one more parameter costs one more column and no more code.
 
+mod normal;
+
+pub use normal::{Current, Measured, Normal, normal};
+
 use crate::simd::{self, F64x8, Kernel};
 use crate::{Error, Monitor, Result};
 
@@ -44,8 +48,11 @@ pub const PARAMETERS: [&str; 18] = [
 const FIRST_OVER_THE_TURN: usize = 10;
 const LAST_OVER_THE_TURN: usize = 15;
 
-/// Newton's steps for the voltage drop; the function is monotone and its start is the value before.
+/// Newton's steps for the voltage drop at most; the function is monotone and its start is the value before.
 const NEWTON: usize = 3;
+
+/// Of the ripple: the step below which one more, which is quadratic, has all digits.
+const NEWTON_TOLERANCE: f64 = 1e-7;
 
 /// A value with its derivatives by `N` parameters.
 #[derive(Clone, Copy, Debug)]
@@ -244,7 +251,7 @@ struct Equations<const N: usize> {
     k_s: Dual<N>,
     offset: Dual<N>,
     k_t: Dual<N>,
-    w_s: Dual<N>,
+    per_w_s: Dual<N>,
     turn: [Dual<N>; LAST_OVER_THE_TURN - FIRST_OVER_THE_TURN + 1],
     limit: Option<Dual<N>>,
     /// What of its way the drive goes in a step, `1 - exp(-h / tau)`.
@@ -288,7 +295,7 @@ impl<const N: usize> Equations<N> {
             k_s: one(6),
             offset: one(7),
             k_t: one(8),
-            w_s: one(9),
+            per_w_s: one(9).inverse(),
             turn: std::array::from_fn(|j| one(FIRST_OVER_THE_TURN + j)),
             limit: task.theta[17].is_finite().then(|| one(17)),
             share,
@@ -299,7 +306,8 @@ impl<const N: usize> Equations<N> {
 
     #[inline(always)]
     fn at(&self, angle: f64) -> Turn<N> {
-        let ((s1, c1), (s2, c2)) = (angle.sin_cos(), (2.0 * angle).sin_cos());
+        let (s1, c1) = angle.sin_cos();
+        let (s2, c2) = (2.0 * s1 * c1, (c1 - s1) * (c1 + s1));
         let [first_c, first_s, second_c, second_s, c, s] = &self.turn;
         let inertia = self.k_a.plus(c2, c).plus(s2, s);
         // an inertia is positive, whatever a search tries
@@ -327,7 +335,7 @@ impl<const N: usize> Equations<N> {
         if self.k_t.value == 0.0 && self.k_t.by == [0.0; N] {
             return self.k_s;
         }
-        let ratio = speed.times(&self.w_s.inverse());
+        let ratio = speed.times(&self.per_w_s);
         let shape = ratio
             .times(&ratio)
             .plus(1.0, &Dual::constant(1.0))
@@ -369,10 +377,16 @@ impl<const N: usize> Equations<N> {
         if self.drop.value != 0.0 || self.drop.by != [0.0; N] {
             let (share, drop, ripple) = (self.share.value, self.drop.value, self.ripple.value);
             let mut x = from.value;
+            // one root and one division in a chain that every sample of the run waits for
+            let (most, square) = (share * drop, ripple * ripple);
             for _ in 0..NEWTON {
-                let root = (x * x + ripple * ripple).sqrt();
-                let slope = 1.0 + share * drop * ripple * ripple / (root * root * root);
-                x -= (x + share * drop * x / root - aim.value) / slope.max(0.1);
+                let per_root = 1.0 / (x * x + square).sqrt();
+                let slope = 1.0 + most * square * (per_root * per_root * per_root);
+                let by = (x + most * x * per_root - aim.value) / slope.max(0.1);
+                x -= by;
+                if by.abs() < NEWTON_TOLERANCE * ripple {
+                    break;
+                }
             }
             // one step more, carrying derivatives, makes them exact: those of an implicit function
             let root = (x * x + ripple * ripple).sqrt();

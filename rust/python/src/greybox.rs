@@ -4,7 +4,7 @@ use numpy::{PyArray1, PyArray2, PyReadonlyArray1};
 use pyo3::prelude::*;
 use sewfast_control::{Listening, TRACKED, Tracker as Core};
 use sewfast_core::Error;
-use sewfast_core::greybox::{self, PARAMETERS, Run};
+use sewfast_core::greybox::{self, Current, Measured, PARAMETERS, Run};
 
 use crate::arrays::{array1, array2, raise, slice};
 use crate::watch::watched_over;
@@ -12,7 +12,8 @@ use crate::watch::watched_over;
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("GREYBOX_PARAMETERS", PARAMETERS)?;
     module.add_class::<Tracker>()?;
-    module.add_function(wrap_pyfunction!(greybox_run, module)?)
+    module.add_function(wrap_pyfunction!(greybox_run, module)?)?;
+    module.add_function(wrap_pyfunction!(greybox_normal, module)?)
 }
 
 /// Speed, drive and their derivatives.
@@ -39,15 +40,7 @@ fn greybox_run<'py>(
 ) -> PyResult<Found<'py>> {
     let u = slice(&u, "u")?;
     let angle = angle.as_ref().map(|a| slice(a, "angle")).transpose()?;
-    let values = slice(&theta, "theta")?;
-    let theta = values.try_into().map_err(|_| {
-        let message = format!(
-            "expected {} parameters, got {}",
-            PARAMETERS.len(),
-            values.len()
-        );
-        raise(py, Error::setting(message))
-    })?;
+    let theta = all_of(py, slice(&theta, "theta")?)?;
     let found = watched_over(py, u.len(), |monitor| {
         let task = Run {
             theta,
@@ -66,6 +59,78 @@ fn greybox_run<'py>(
         array1(py, found.drive),
         array2(py, found.speed_by, columns)?,
         array2(py, found.drive_by, columns)?,
+    ))
+}
+
+fn all_of<'a>(py: Python<'_>, values: &'a [f64]) -> PyResult<&'a [f64; PARAMETERS.len()]> {
+    values.try_into().map_err(|_| {
+        let message = format!(
+            "expected {} parameters, got {}",
+            PARAMETERS.len(),
+            values.len()
+        );
+        raise(py, Error::setting(message))
+    })
+}
+
+/// Cost, gradient and Gram matrix.
+type Sums<'py> = (f64, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);
+
+/// Currents, their filter and the resistance.
+type Amperes<'py> = (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>, f64);
+
+#[pyfunction]
+#[pyo3(signature = (theta, free, u, y, used, *, Ts, steps, filter, speed=0.0, mean=false, angle=None, current=None))]
+#[allow(non_snake_case, clippy::too_many_arguments)]
+fn greybox_normal<'py>(
+    py: Python<'py>,
+    theta: PyReadonlyArray1<'py, f64>,
+    free: Vec<usize>,
+    u: PyReadonlyArray1<'py, f64>,
+    y: PyReadonlyArray1<'py, f64>,
+    used: PyReadonlyArray1<'py, bool>,
+    Ts: f64,
+    steps: usize,
+    filter: PyReadonlyArray1<'py, f64>,
+    speed: f64,
+    mean: bool,
+    angle: Option<PyReadonlyArray1<'py, f64>>,
+    current: Option<Amperes<'py>>,
+) -> PyResult<Sums<'py>> {
+    let u = slice(&u, "u")?;
+    let angle = angle.as_ref().map(|a| slice(a, "angle")).transpose()?;
+    let theta = all_of(py, slice(&theta, "theta")?)?;
+    let current = match &current {
+        Some((samples, filter, resistance)) => Some(Current {
+            samples: slice(samples, "current")?,
+            filter: slice(filter, "current filter")?,
+            resistance: *resistance,
+        }),
+        None => None,
+    };
+    let measured = Measured {
+        speed: slice(&y, "y")?,
+        used: used.as_slice()?,
+        filter: slice(&filter, "filter")?,
+        current,
+    };
+    let found = watched_over(py, u.len(), |monitor| {
+        let task = Run {
+            theta,
+            free: &free,
+            sample_time: Ts,
+            steps,
+            speed,
+            mean,
+            angle,
+        };
+        greybox::normal(task, u, measured, monitor)
+    })?;
+    let columns = found.gradient.len();
+    Ok((
+        found.cost,
+        array1(py, found.gradient),
+        array2(py, found.matrix, columns)?,
     ))
 }
 

@@ -1,0 +1,379 @@
+"""What a motor's fit compares: free parameters, the whitened residuals of a record, their sums."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from .. import _core
+from ..arrays import FloatArray
+from ..errors import SettingError
+from .intervals import covariance_of, filtered, inverse, whitener
+from .marquardt import Normal, minimised
+from .records import Records
+
+PARAMETERS = tuple(_core.GREYBOX_PARAMETERS)
+PLACE = {name: j for j, name in enumerate(PARAMETERS)}
+
+TERMS: dict[str, tuple[str, ...]] = {
+    "lag": ("tau",),
+    "delay": ("delay",),
+    "coulomb": ("k_s",),
+    "offset": ("offset",),
+    "drop": ("drop", "ripple"),
+    "stribeck": ("k_t", "w_s"),
+    "load_1": ("load_1c", "load_1s"),
+    "load_2": ("load_2c", "load_2s"),
+    "inertia_2": ("inertia_2c", "inertia_2s"),
+    "limit": ("limit",),
+}
+"""Parts of a motor beside back-EMF and inertia, and the parameters of each."""
+VISCOUS = 0.05
+"""Of k_v: viscous friction that is expected where no current parts it from back-EMF, and how far
+from that it may well be. Nothing in its place would be a certainty: the dead zone sees the current
+that it takes, and dry friction would stand for what is missing."""
+ITERATIONS = 40
+COARSE, NEAR, FINE = 1.0, 0.1, 0.01
+"""Squared distances to the minimum in standard errors: on the way, for tests, for what is printed.
+"""
+QUASISTATIC = 0.05
+"""Of the command's standard deviation: that of its accelerating part from which k_a is shown."""
+QUICKEST = 1.0 / 16.0
+"""Of a sample: a time constant that no record shows."""
+WHITE = 12
+"""Order of the autoregression that says how what is left over hangs together."""
+CLIPPED = 5.0
+"""Robust standard deviations from which a sample, alone, is left out as a spike."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Values of all parameters, and which are free."""
+
+    theta: FloatArray
+    resistance: float | None
+    terms: tuple[str, ...]
+
+    def names(self) -> list[str]:
+        free = ["k_e", "k_a", "k_b", *(["R"] if self.resistance is not None else [])]
+        return free + [p for t in self.terms for p in TERMS[t]]
+
+    def vector(self) -> FloatArray:
+        return np.array([self.value(n) for n in self.names()])
+
+    def value(self, name: str) -> float:
+        if name == "R":
+            assert self.resistance is not None
+            return self.resistance
+        return float(self.theta[PLACE[name]])
+
+    def at(self, x: FloatArray) -> State:
+        theta, resistance = self.theta.copy(), self.resistance
+        for name, value in zip(self.names(), x, strict=True):
+            if name == "R":
+                resistance = float(value)
+            else:
+                theta[PLACE[name]] = value
+        return State(theta, resistance, self.terms)
+
+    def having(self, terms: Sequence[str], **values: float) -> State:
+        """With other terms: those that go are set to nothing."""
+        theta = self.theta.copy()
+        for t in set(self.terms) - set(terms):
+            for p in TERMS[t]:
+                theta[PLACE[p]] = NOTHING[PLACE[p]]
+        for name, value in values.items():
+            theta[PLACE[name]] = value
+        return State(theta, self.resistance, tuple(t for t in TERMS if t in terms))
+
+
+NOTHING = np.array(
+    [{"ripple": 1.0, "w_s": 1.0, "k_a": 1.0, "limit": math.inf}.get(p, 0.0) for p in PARAMETERS]
+)
+_POSITIVE = {"k_a", "ripple", "w_s", "limit", "R"}
+_NOT_NEGATIVE = {"tau", "delay", "k_s", "k_t", "drop"}
+
+
+@dataclass
+class Task:
+    """The records, and filters that weigh what is left over of speeds [rad/s] and currents [A]."""
+
+    records: Records
+    steps: int = 2
+    converged: bool = False
+    spikes: int = 0
+    k_v: float = math.nan
+    """From the start: the scale of what is expected of viscous friction."""
+    speed_filter: FloatArray = field(default_factory=lambda: np.ones(1))
+    current_filter: FloatArray = field(default_factory=lambda: np.ones(1))
+
+    @property
+    def has_current(self) -> bool:
+        return self.records.pieces[0].current is not None
+
+    def simulated(self, state: State, free: Sequence[str]) -> list[tuple[FloatArray, ...]]:
+        """Of each piece speed, drive and their derivatives."""
+        places = [PLACE[n] for n in free]
+        r = self.records
+        return [
+            _core.greybox_run(
+                state.theta, places, p.u, Ts=r.Ts, steps=self.steps, speed=p.speed, mean=r.mean,
+                angle=p.angle,
+            )
+            for p in r.pieces
+        ]  # fmt: skip
+
+    def residuals(self, state: State) -> FloatArray:
+        """Simulated less measured, whitened; of each piece the speeds and then the currents."""
+        found = []
+        for p, (y, drive, _, _) in zip(self.records.pieces, self.simulated(state, ()), strict=True):
+            found.append(filtered(y - p.y, p.used, self.speed_filter))
+            if p.current is not None:
+                assert state.resistance is not None
+                off = drive / state.resistance - p.current
+                found.append(filtered(off, p.used, self.current_filter))
+        return np.concatenate(found)
+
+    def jacobian(self, state: State) -> FloatArray:
+        names = state.names()
+        inner = [n for n in names if n != "R"]
+        columns = [names.index(n) for n in inner]
+        found = []
+        for p, (_, drive, y_by, drive_by) in zip(
+            self.records.pieces, self.simulated(state, inner), strict=True
+        ):
+            rows = np.zeros((len(names), len(p.u)))
+            rows[columns] = y_by.T
+            found.append(filtered(rows, p.used, self.speed_filter).T)
+            if p.current is not None:
+                assert state.resistance is not None
+                R = state.resistance
+                rows = np.zeros((len(names), len(p.u)))
+                rows[columns] = drive_by.T / R
+                rows[names.index("R")] = -drive / (R * R)
+                found.append(filtered(rows, p.used, self.current_filter).T)
+        return np.concatenate(found)
+
+    def normal(self, state: State) -> Normal:
+        """Cost, gradient and Gram matrix of the whitened residuals."""
+        names = state.names()
+        inner = [n for n in names if n != "R"]
+        cost, gradient, matrix = self._summed(state, inner)
+        if "R" in names:  # the core has it last
+            order = [*inner, "R"]
+            at = [order.index(n) for n in names]
+            gradient, matrix = gradient[at], matrix[np.ix_(at, at)]
+        off, by, curvature = self._expected(state)
+        return cost + off, gradient + by, matrix + curvature
+
+    def _expected(self, state: State) -> Normal:
+        """What is known of viscous friction beforehand, as one more squared residual."""
+        names = state.names()
+        by, curvature = np.zeros(len(names)), np.zeros((len(names), len(names)))
+        if self.has_current or not math.isfinite(self.k_v):
+            return 0.0, by, curvature
+        at, scale = names.index("k_b"), VISCOUS * self.k_v
+        off = (state.value("k_b") - scale) / scale
+        by[at], curvature[at, at] = off / scale, 1.0 / scale**2
+        return off**2, by, curvature
+
+    def cost(self, state: State) -> float:
+        """Of the whitened residuals; infinite where nothing can be simulated."""
+        try:
+            cost, _, _ = self._summed(state, ())
+        except SettingError:
+            return math.inf
+        cost += self._expected(state)[0]
+        return cost if math.isfinite(cost) else math.inf
+
+    def _summed(self, state: State, free: Sequence[str]) -> Normal:
+        places, r = [PLACE[n] for n in free], self.records
+        cost, gradient, matrix = 0.0, np.zeros(0), np.zeros((0, 0))
+        for p in r.pieces:
+            current = None
+            if p.current is not None:
+                assert state.resistance is not None
+                current = (p.current, self.current_filter, state.resistance)
+            one, slope, gram = _core.greybox_normal(
+                state.theta, places, p.u, p.y, p.used, Ts=r.Ts, steps=self.steps,
+                filter=self.speed_filter, speed=p.speed, mean=r.mean, angle=p.angle,
+                current=current,
+            )  # fmt: skip
+            cost += one
+            gradient = slope + (gradient if gradient.size else 0.0)
+            matrix = gram + (matrix if matrix.size else 0.0)
+        return cost, gradient, matrix
+
+    @property
+    def count(self) -> int:
+        """Residuals."""
+        return self.records.used * (2 if self.has_current else 1)
+
+    def outcome(self, state: State) -> tuple[FloatArray, ...]:
+        """Measured and simulated speed [rad/s] of the samples used, and their free-run error."""
+        ys, models = [], []
+        for p, (y, *_) in zip(self.records.pieces, self.simulated(state, ()), strict=True):
+            ys.append(p.y[p.used])
+            models.append(y[p.used])
+        return np.concatenate(ys), np.concatenate(models)
+
+    def rmse(self, state: State) -> float:
+        """Of the free run's speed [rad/s]."""
+        y, model = self.outcome(state)
+        return float(np.sqrt(np.mean((y - model) ** 2)))
+
+    def weigh(self, state: State, order: int = WHITE) -> None:
+        """Filters that make white, of variance 1, what this fit leaves over.
+
+        An encoder's steps in a difference of counts cancel from sample to sample, and a load that
+        no term has stays for many: each has its own colour, and counts as little as it deserves.
+        """
+        speeds, currents = [], []
+        for p, (y, drive, _, _) in zip(self.records.pieces, self.simulated(state, ()), strict=True):
+            speeds.append(np.where(p.used, y - p.y, 0.0))
+            if p.current is not None:
+                assert state.resistance is not None
+                currents.append(np.where(p.used, drive / state.resistance - p.current, 0.0))
+        self.speed_filter = whitener(speeds, order)
+        if currents:
+            self.current_filter = whitener(currents, 0)
+
+    def leave_out_spikes(self, state: State) -> None:
+        """Samples that stand far off alone, once a fit shows what is far."""
+        for p, (y, *_) in zip(self.records.pieces, self.simulated(state, ()), strict=True):
+            off = np.abs(y - p.y)
+            spread = max(1.4826 * float(np.median(off[p.used])), self.records.quantum)
+            far = off > CLIPPED * spread
+            far &= p.used
+            alone = far & ~np.roll(far, 1) & ~np.roll(far, -1)
+            p.used[alone] = False
+            self.spikes += int(alone.sum())
+
+    def settle_starts(self, state: State) -> None:
+        """Speeds at the pieces' first samples, by least squares together with what is free.
+
+        A line through the first samples is no more than a first guess where the motor is fast
+        beside the sampling, or the record noisy.
+        """
+        columns, moving = self._starts(state)
+        if not moving:
+            return
+        J = np.concatenate([self.jacobian(state), columns], axis=1)
+        matrix, slope, n = J.T @ J, J.T @ self.residuals(state), len(state.names())
+        _, by, curvature = self._expected(state)
+        matrix[:n, :n] += curvature
+        slope[:n] += by
+        step = -(inverse(matrix)[0] @ slope)[-len(moving) :]
+        pieces = list(self.records.pieces)
+        for j, by in zip(moving, step, strict=True):
+            pieces[j] = replace(pieces[j], speed=pieces[j].speed + float(by))
+        self.records = replace(self.records, pieces=tuple(pieces))
+
+    def _starts(self, state: State) -> tuple[FloatArray, list[int]]:
+        """Derivatives of the residuals by the starts of pieces that do not begin at a standstill.
+
+        They fade with the motor's time constant; at a standstill dry friction holds, and nothing
+        fades.
+        """
+        T = state.theta[PLACE["k_a"]] / max(state.theta[0] + state.theta[1], 1e-12)
+        pieces = self.records.pieces
+        moving = [j for j, p in enumerate(pieces) if p.speed != 0.0]
+        found = []
+        for j, p in enumerate(pieces):
+            rows = np.zeros((len(moving), len(p.u)))
+            if j in moving:
+                rows[moving.index(j)] = np.exp(-np.arange(len(p.u)) * self.records.Ts / T)
+            found.append(filtered(rows, p.used, self.speed_filter).T)
+            if p.current is not None:
+                found.append(np.zeros((len(p.u), len(moving))))
+        return np.concatenate(found), moving
+
+    def is_slow(self, state: State) -> bool:
+        """Whether the command that accelerates hardly changes beside the whole command.
+
+        A constant acceleration, as under a ramp, takes what dry friction takes.
+        """
+        rates = [np.diff(y) / self.records.Ts for y, *_ in self.simulated(state, ())]
+        u = np.concatenate([p.u for p in self.records.pieces])
+        effort = state.value("k_a") * float(np.std(np.concatenate(rates)))
+        return bool(effort < QUASISTATIC * float(np.std(u)))
+
+    def stribeck_speeds(self) -> tuple[float, float]:
+        """In which friction may fall off: below, there is hardly a sample to show it."""
+        usual = float(np.quantile(np.abs(np.concatenate([p.y for p in self.records.pieces])), 0.9))
+        return 0.01 * usual, usual
+
+    def settle_steps(self, state: State) -> None:
+        """Integration steps for the time constants that were found."""
+        k_v = max(state.theta[0] + state.theta[1], 1e-12)
+        fastest = min(self.records.Ts / 2.0, state.theta[PLACE["k_a"]] / k_v / 100.0)
+        tau = state.theta[PLACE["tau"]]
+        if tau > 0.05 * self.records.Ts:
+            fastest = min(fastest, tau / 4.0)
+        self.steps = int(np.clip(math.ceil(self.records.Ts / max(fastest, 1e-12)), 2, 64))
+
+    def covariance(self, state: State) -> FloatArray:
+        """Of the estimate, (n, n); that the starts are estimated too is counted in.
+
+        Sums of scores over a window stand for their long-run covariance.
+        """
+        n, J = len(state.names()), [self.jacobian(state), self._starts(state)[0]]
+        k_v = max(state.theta[0] + state.theta[1], 1e-12)
+        settling = 2.0 * state.theta[PLACE["k_a"]] / k_v / self.records.Ts
+        lengths = [len(p.u) for p in self.records.pieces]
+        windows = [int(np.clip(max(settling, math.sqrt(m)), 1, max(m // 15, 1))) for m in lengths]
+        whole = covariance_of(
+            np.concatenate(J, axis=1), self.residuals(state), lengths, windows,
+            channels=2 if self.has_current else 1, known=self._expected(state)[2],
+        )  # fmt: skip
+        return whole[:n, :n]
+
+
+def fitted(task: Task, state: State, enough: float = COARSE) -> State:
+    """At the least squares of all that is free in it."""
+    names = state.names()
+    low, high = bounds_of(task, state)
+    found = minimised(
+        lambda x: task.normal(state.at(x)),
+        lambda x: task.cost(state.at(x)),
+        np.clip(state.vector(), low, high),
+        (low, high),
+        task.count,
+        enough=enough,
+        iterations=ITERATIONS,
+    )
+    # where dry friction makes the cost a broken line no test confirms a minimum: it is near enough
+    # where what is left to gain is less than what noise alone would give
+    task.converged = found.left < len(names)
+    return state.at(found.x)
+
+
+def bounds_of(task: Task, state: State) -> tuple[FloatArray, FloatArray]:
+    """Least and largest values of what is free, (n,) each."""
+    names = state.names()
+    low = np.array([_least(n, state) for n in names])
+    high = np.full(len(names), np.inf)
+    for j, n in enumerate(names):
+        if n == "k_a":
+            low[j] = max(low[j], least_inertia(task, state))
+        if n == "delay":
+            high[j] = 100.0 * task.records.Ts
+        if n == "w_s":
+            low[j], high[j] = task.stribeck_speeds()
+    return low, high
+
+
+def least_inertia(task: Task, state: State) -> float:
+    """k_a of a motor that is too fast for the samples to show it, and for steps to follow it."""
+    return float(QUICKEST * task.records.Ts * max(state.theta[0] + state.theta[1], 0.0))
+
+
+def _least(name: str, state: State) -> float:
+    if name in _POSITIVE:
+        value = state.value(name)
+        return 1e-3 * value if math.isfinite(value) and value > 0 else 1e-9
+    unparted = name == "k_b" and state.resistance is None
+    return 0.0 if name in _NOT_NEGATIVE or unparted else -np.inf
