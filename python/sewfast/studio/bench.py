@@ -174,8 +174,7 @@ class Bench:
                 self._go.set()
             else:
                 self.work.put(asked)
-        with suppress(OSError):  # the pipe to the server is gone as well
-            self.stop("the server is gone")
+        self.stop("the server is gone")
         self.work.put(None)
         time.sleep(LAST_WORDS)
         os._exit(1)
@@ -356,15 +355,14 @@ def main() -> None:
 
     def send(message: dict[str, Any], curves: Mapping[str, FloatArray] | None = None) -> None:
         body = packed(message, curves or {})
-        with sending:
+        with sending, suppress(BrokenPipeError):  # the server is gone, as `listen` hears too
             out.write(struct.pack("<I", len(body)) + body)
             out.flush()
 
     bench = Bench(send)
     for run in (lambda: bench.listen(sys.stdin.buffer), bench.watch, bench.show_always):
         threading.Thread(target=run, daemon=True).start()
-    with suppress(BrokenPipeError):  # the server was killed: nobody is left to hear of it
-        bench.serve()
+    bench.serve()
 
 
 if __name__ == "__main__":
