@@ -290,7 +290,8 @@ class Project:
             "fit": found.simulation.fit_percent,
             "rmse": found.simulation.rmse,
             "unit": found.unit,
-            "verdict": found.verdict,
+            # of the whole card: by its fit alone a model may be praised that fails a test below
+            "verdict": card.summary,
             "card": str(card),
             "free_run": curves,
         }
