@@ -9,6 +9,8 @@ comma := ,
 # one interpreter and one target folder for every step, so that cargo compiles nothing twice
 export PYO3_PYTHON := $(BIN)/python
 export CARGO_TARGET_DIR := $(CURDIR)/target
+# cargo is not to look for the job server of a make that runs checks side by side: make keeps it from other programs
+export CARGO_MAKEFLAGS :=
 export PYTHONDONTWRITEBYTECODE := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # one version of each tool and library, so that no release of theirs fails a build (make constraints)

@@ -125,7 +125,7 @@ def test_a_model_says_how_its_data_were_prepared() -> None:
     model = identify(flat, model="arx", na=1, nb=1)
     assert "prepared: array [0:2000]: 2 outputs masked" in str(model)
     assert "mean of all experiments taken off" in model.training["preparation"][1]
-    with pytest.raises(DataError, match="offset was taken off"):
+    with pytest.raises(DataError, match="without an offset taken off"):
         model.validate(flat, against="truth")
     assert model.validate(data, against="truth").n == 1980
 

@@ -97,5 +97,5 @@ def test_what_has_no_graph_is_refused(
     assert main(["deploy", str(tmp_path / "drive.json"), str(out), "--to", "onnx", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["files"]) == 2
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(SettingError, match=r"pip install 'sewfast\[onnx\]'"):
+    with pytest.raises(SettingError, match=r'pip install "sewfast\[onnx\]"'):
         deploy(model, tmp_path, to="onnx")

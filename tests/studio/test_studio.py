@@ -278,7 +278,7 @@ def test_copies_of_a_search_give_the_same_file(tuned: Studio) -> None:
 def test_a_cancelled_search_gives_its_best_so_far(tuned: Studio) -> None:
     with Page(tuned) as page:
         page.ask("tune_search", evaluations=20_000, seed=0, **MOVE)
-        assert "running" in page.ask("tune_search", evaluations=10, seed=0, **MOVE)["error"]
+        assert "a job that runs" in page.ask("tune_search", evaluations=10, seed=0, **MOVE)["error"]
         page.hear(lambda m: m.get("event") == "progress" and m["done"] > 100)
         page.ask("cancel")
         found = page.event("searched")["found"]
@@ -382,7 +382,7 @@ def test_a_model_is_identified_and_validated(folder: Path, page: Page) -> None:
 
 def test_a_cancelled_search_writes_nothing(folder: Path, page: Page) -> None:
     page.ask("identify", **{**STEP, "model": "auto"})
-    assert "running" in page.ask("identify", **STEP)["error"]
+    assert "a job that runs" in page.ask("identify", **STEP)["error"]
     page.ask("cancel")
     assert "cancelled" in page.event("identified")["error"]
     assert not (folder / "model.json").exists()

@@ -358,7 +358,7 @@ def test_ensembles_on_the_command_line(name: str, tmp_path: Path) -> None:
     tune = ("--reference", "r.csv", "--start", "c.json", "--evaluations", "8", "-o", "new.json")
     assert "evaluations" in command(tmp_path, "tune", "m.json", *tune).out
     both = command(tmp_path, "tune", "m.json", *tune, "--u-max", "3", "--filter", "2", done=2)
-    assert "leave out --u-max, --filter" in both.err
+    assert "received --u-max, --filter; leave them out" in both.err
 
 
 def test_a_position_is_tuned_from_a_controller_on_the_command_line(tmp_path: Path) -> None:

@@ -174,7 +174,7 @@ def test_limits_are_not_made_up_and_wide_ones_are_remarked_on() -> None:
     both = sewfast.Ensemble.of([model, drive(0.01, 0.2, 10.0, (-4.0, 2.0))])
     assert recorded_limits([both]) == (-4.0, 3.0)
     unknown = replace(model, training={})
-    with pytest.raises(SettingError, match=r"expected u_min and u_max.*--u-min"):
+    with pytest.raises(SettingError, match=r"u_min and u_max: expected .*--u-min"):
         sewfast.tune(unknown)
     assert sewfast.tune(unknown, u_min=-3.0, u_max=3.0, evaluations=20).controller.u_max == 3.0
 
