@@ -80,5 +80,5 @@ def test_a_recording_is_no_place_for_a_log(
 ) -> None:
     kept = tmp_path / "run.mcap"
     kept.write_bytes(b"what a drive did")
-    assert "it is kept" in refused(capsys, "device", option, str(kept), "--for", "0.1")
+    assert "which is kept" in refused(capsys, "device", option, str(kept), "--for", "0.1")
     assert kept.read_bytes() == b"what a drive did"

@@ -133,7 +133,7 @@ def test_a_port_is_tried_again_no_longer_than_promised():
         port = Vanishing(device, quiet._clock, back=99)
         drive = Drive(linked(port))
         drive.set_limits(volt=10.0)
-        with pytest.raises(LinkError, match=r"did not come back within 0\.5 s"):
+        with pytest.raises(LinkError, match=r"the port back within 0\.5 s"):
             drive.stream(Plan("commands", LONG), Kept())
         assert port.waits[0] == pytest.approx(0.5)
         assert all(RETRY <= wait <= 0.5 for wait in port.waits)

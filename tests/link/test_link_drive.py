@@ -386,7 +386,9 @@ def test_a_dead_device_is_given_up_with_a_clear_error(device, drive):
         device.intercept = lambda frame: True
         device.mangle = lambda kind, wire: []
 
-    with pytest.raises(LinkError, match=r"an answer to STATUS, none came within \S+ s"):
+    with pytest.raises(
+        LinkError, match=r"an answer to STATUS, received nothing at all within \S+ s"
+    ):
         drive.stream(Plan("commands", LONG), sink := Kept(die))
     assert drive.outcome is not None
     assert drive.outcome.state == "unknown"

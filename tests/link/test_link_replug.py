@@ -80,7 +80,7 @@ def test_a_stop_still_reaches_a_device_whose_port_comes_back_late(served):
     drive = connect(served.url, watchdog=5.0, resume=0.1)
     drive.set_limits(volt=10.0)
     sink = Kept(once(lambda: served.do(lambda: replug(served, 1.2))))
-    with pytest.raises(LinkError, match=r"did not come back within 0\.1 s: the device stops its"):
+    with pytest.raises(LinkError, match=r"the port back within 0\.1 s, .*; the device stops its"):
         drive.stream(Plan("commands", LONG), sink)
     assert served.state == script.IDLE
     assert drive.outcome is not None
@@ -93,7 +93,7 @@ def test_a_port_that_stays_away(served):
     sink = Kept(once(lambda: served.do(lambda: replug(served, math.inf))))
     drive = connect(served.url, watchdog=1.0, resume=0.2)
     drive.set_limits(volt=10.0)
-    with pytest.raises(LinkError, match=r"vanished .*did not come back within 0\.2 s"):
+    with pytest.raises(LinkError, match=r"back within 0\.2 s, received one that vanished"):
         drive.stream(Plan("commands", LONG), sink)
     drive.close()
     assert sink.kinds[-1] == "stop_unconfirmed"

@@ -409,7 +409,7 @@ class Connection(Unique):
                 if time.monotonic() - lost + RETRY > self.resume:
                     raise LinkError(
                         name=self.port.url, expected=f"the port back within {self.resume:g} s",
-                        received=str(error),
+                        received=error.received or str(error),
                         remedy=f"the device stops its motor {self.watchdog:g} s after the last "
                         "heartbeat",
                     ) from failed  # fmt: skip
