@@ -10,6 +10,8 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -451,9 +453,9 @@ def test_a_missing_extra_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch)
         Studio(Project(folder))
 
 
-@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="needs the signals of POSIX")
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
-def test_a_closed_terminal_leaves_as_little_as_ctrl_c(folder: Path, name: str) -> None:
+@contextmanager
+def started(folder: Path) -> Iterator[tuple[subprocess.Popen[str], Any]]:
+    """The command in a process of its own, and a page that has shown its token."""
     command = [*PROGRAM, "studio", str(folder), "--no-browser"]
     with subprocess.Popen(
         command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -463,28 +465,27 @@ def test_a_closed_terminal_leaves_as_little_as_ctrl_c(folder: Path, name: str) -
         place = address.replace("http", "ws") + "/socket"
         with websockets.connect(place, origin=address) as page:
             page.send(token)
-            page.send(json.dumps({"do": "upload", "file": "half.csv", "size": 10}))
-            until(lambda: list(folder.glob(".*.part")))
-            for _ in range(2):  # as a shell does
-                process.send_signal(getattr(signal, name))
-            _, err = process.communicate(timeout=20)
+            yield process, page
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="needs the signals of POSIX")
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_closed_terminal_leaves_as_little_as_ctrl_c(folder: Path, name: str) -> None:
+    with started(folder) as (process, page):
+        page.send(json.dumps({"do": "upload", "file": "half.csv", "size": 10}))
+        until(lambda: list(folder.glob(".*.part")))
+        for _ in range(2):  # as a shell does
+            process.send_signal(getattr(signal, name))
+        _, err = process.communicate(timeout=20)
     assert (process.returncode, err) == (0, "")
     assert not list(folder.glob(".*.part"))
 
 
 def test_ctrl_c_ends_it_cleanly(folder: Path) -> None:
-    command = [*PROGRAM, "studio", str(folder), "--no-browser"]
-    with subprocess.Popen(
-        command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        address, _, token = process.stdout.readline().rstrip().partition("/#")
-        place = address.replace("http", "ws") + "/socket"
-        with websockets.connect(place, origin=address) as deaf:
-            deaf.send(token)
-            deaf.recv()
-            began = time.monotonic()
-            process.send_signal(signal.SIGINT)
-            _, err = process.communicate(timeout=20)
+    with started(folder) as (process, deaf):
+        deaf.recv()
+        began = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=20)
     assert (process.returncode, err) == (0, "")
     assert time.monotonic() - began < 5.0

@@ -196,7 +196,9 @@ def load_equations(path: str | os.PathLike[str]) -> EquationFit:
     try:
         rad_per_second(fields.text("speed_unit"))
     except SettingError:
-        raise fields.refuse("speed_unit", "rpm, rev/s, rad/s or deg/s", fields.text("speed_unit")) from None  # fmt: skip  # noqa: E501
+        raise fields.refuse(
+            "speed_unit", "rpm, rev/s, rad/s or deg/s", fields.text("speed_unit")
+        ) from None
     return EquationFit(
         parameters,
         {n: undetermined.text(n) for n in undetermined.values},
