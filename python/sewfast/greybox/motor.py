@@ -444,12 +444,14 @@ def motor_of(
             more, less = (of({**known, free: at[j] + s * h}) for s in (1.0, -1.0))
             slope[j] = (more - less) / (2.0 * h)
         half = CONFIDENCE * math.sqrt(max(float(slope @ estimate.covariance @ slope), 0.0))
-        vague = half >= VAGUE * abs(value) and name not in _MAY_BE_NOTHING
+        vague = half >= VAGUE * abs(value)
+        if name == "delay":  # that there is none is an answer
+            vague = half >= APART * max(value, records.Ts)
         if not math.isfinite(half) or vague:
             undetermined[name] = (
                 "the record does not part it from the others; add steps to several speeds, in both "
                 "directions"
-                if not half < APART * abs(value)
+                if not half < APART * abs(value) or name == "delay"
                 else f"its interval, {value - half:.3g} to {value + half:.3g} {unit}, is as wide "
                 "as its value"
             )
@@ -488,7 +490,6 @@ def motor_of(
     )
 
 
-_MAY_BE_NOTHING = ("delay",)
 _SIGNED = ("offset", "k_b", "viscous_friction")
 
 _OF_TERM = {

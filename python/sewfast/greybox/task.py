@@ -13,7 +13,7 @@ from ..arrays import FloatArray
 from ..errors import SettingError
 from .intervals import covariance_of, filtered, inverse, whitener
 from .marquardt import Normal, minimised
-from .records import Records
+from .records import Records, spikes_of
 
 PARAMETERS = tuple(_core.GREYBOX_PARAMETERS)
 PLACE = {name: j for j, name in enumerate(PARAMETERS)}
@@ -43,10 +43,11 @@ QUASISTATIC = 0.05
 """Of the command's standard deviation: that of its accelerating part from which k_a is shown."""
 QUICKEST = 1.0 / 16.0
 """Of a sample: a time constant that no record shows."""
+STARTS = 5
+"""Steps at most by which the pieces' starts are settled: dry friction bends what one step takes for
+straight where the start is on the wrong side of a standstill."""
 WHITE = 12
 """Order of the autoregression that says how what is left over hangs together."""
-CLIPPED = 5.0
-"""Robust standard deviations from which a sample, alone, is left out as a spike."""
 
 
 @dataclass(frozen=True)
@@ -242,15 +243,12 @@ class Task:
             self.current_filter = whitener(currents, 0)
 
     def leave_out_spikes(self, state: State) -> None:
-        """Samples that stand far off alone, once a fit shows what is far."""
+        """Samples whose error stands far off its neighbours': a fit shows smaller spikes."""
         for p, (y, *_) in zip(self.records.pieces, self.simulated(state, ()), strict=True):
-            off = np.abs(y - p.y)
-            spread = max(1.4826 * float(np.median(off[p.used])), self.records.quantum)
-            far = off > CLIPPED * spread
-            far &= p.used
-            alone = far & ~np.roll(far, 1) & ~np.roll(far, -1)
-            p.used[alone] = False
-            self.spikes += int(alone.sum())
+            used = np.flatnonzero(p.used)
+            far = used[spikes_of((y - p.y)[used], self.records.quantum)]
+            p.used[far] = False
+            self.spikes += len(far)
 
     def settle_starts(self, state: State) -> None:
         """Speeds at the pieces' first samples, by least squares together with what is free.
@@ -258,19 +256,24 @@ class Task:
         A line through the first samples is no more than a first guess where the motor is fast
         beside the sampling, or the record noisy.
         """
-        columns, moving = self._starts(state)
-        if not moving:
-            return
-        J = np.concatenate([self.jacobian(state), columns], axis=1)
-        matrix, slope, n = J.T @ J, J.T @ self.residuals(state), len(state.names())
-        _, by, curvature = self._expected(state)
-        matrix[:n, :n] += curvature
-        slope[:n] += by
-        step = -(inverse(matrix)[0] @ slope)[-len(moving) :]
-        pieces = list(self.records.pieces)
-        for j, by in zip(moving, step, strict=True):
-            pieces[j] = replace(pieces[j], speed=pieces[j].speed + float(by))
-        self.records = replace(self.records, pieces=tuple(pieces))
+        for _ in range(STARTS):
+            columns, moving = self._starts(state)
+            if not moving:
+                return
+            J = np.concatenate([self.jacobian(state), columns], axis=1)
+            matrix, slope, n = J.T @ J, J.T @ self.residuals(state), len(state.names())
+            _, by, curvature = self._expected(state)
+            matrix[:n, :n] += curvature
+            slope[:n] += by
+            step = -(inverse(matrix)[0] @ slope)[-len(moving) :]
+            before, cost = self.records, self.cost(state)
+            pieces = list(before.pieces)
+            for j, change in zip(moving, step, strict=True):
+                pieces[j] = replace(pieces[j], speed=pieces[j].speed + float(change))
+            self.records = replace(before, pieces=tuple(pieces))
+            if not self.cost(state) < cost:
+                self.records = before
+                return
 
     def _starts(self, state: State) -> tuple[FloatArray, list[int]]:
         """Derivatives of the residuals by the starts of pieces that do not begin at a standstill.
