@@ -351,6 +351,23 @@ _NUMBERS = (
 )
 
 
+def findings(fields: storage.Fields) -> tuple[dict[str, Parameter], dict[str, str], str]:
+    """Of a file: parameters, reasons of those that are not determined, unit of the speed."""
+    stored, undetermined = fields.object("parameters"), fields.object("undetermined")
+    parameters = {}
+    for name in stored.values:
+        one = stored.object(name)
+        one.require_only(["value", "low", "high", "unit"])
+        value, low, high = (one.number(n) for n in ("value", "low", "high"))
+        parameters[name] = Parameter(value, low, high, one.text("unit"))
+    unit = fields.text("speed_unit")
+    try:
+        rad_per_second(unit)
+    except SettingError:
+        raise fields.refuse("speed_unit", "rpm, rev/s, rad/s or deg/s", unit) from None
+    return parameters, {n: undetermined.text(n) for n in undetermined.values}, unit
+
+
 def load_motor(path: str | os.PathLike[str]) -> Motor:
     """Read what `Motor.save` wrote; nothing in it is executed.
 
@@ -375,14 +392,7 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
             "theta",
         ]
     )
-    stored = fields.object("parameters")
-    parameters = {}
-    for name in stored.values:
-        one = stored.object(name)
-        one.require_only(["value", "low", "high", "unit"])
-        value, low, high = (one.number(n) for n in ("value", "low", "high"))
-        parameters[name] = Parameter(value, low, high, one.text("unit"))
-    undetermined = fields.object("undetermined")
+    parameters, undetermined, unit = findings(fields)
     theta = fields.object("theta")
     theta.require_only(NAMES)
     values = [math.inf if n == "limit" and theta.any(n) is None else theta.number(n) for n in NAMES]
@@ -391,14 +401,9 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
     terms = fields.items("terms")
     if not all(isinstance(t, str) for t in terms):
         raise fields.refuse("terms", "names", terms)
-    unit = fields.text("speed_unit")
-    try:
-        rad_per_second(unit)
-    except SettingError:
-        raise fields.refuse("speed_unit", "rpm, rev/s, rad/s or deg/s", unit) from None
     return Motor(
         parameters,
-        {n: undetermined.text(n) for n in undetermined.values},
+        undetermined,
         tuple(terms),
         fields.number("fit_percent"),
         fields.number("rmse"),
