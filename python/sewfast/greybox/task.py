@@ -94,7 +94,7 @@ class State:
 NOTHING = np.array(
     [{"ripple": 1.0, "w_s": 1.0, "k_a": 1.0, "limit": math.inf}.get(p, 0.0) for p in PARAMETERS]
 )
-_POSITIVE = {"k_a", "ripple", "w_s", "limit", "R"}
+_POSITIVE = {"k_a", "limit", "R"}
 _NOT_NEGATIVE = {"tau", "delay", "k_s", "k_t", "drop"}
 
 
@@ -309,6 +309,11 @@ class Task:
         usual = float(np.quantile(np.abs(np.concatenate([p.y for p in self.records.pieces])), 0.9))
         return 0.01 * usual, usual
 
+    def ripples(self) -> tuple[float, float]:
+        """Over which the drop may rise: over all of the command it would be a resistance."""
+        usual = float(np.quantile(np.abs(np.concatenate([p.u for p in self.records.pieces])), 0.9))
+        return 0.001 * usual, 0.1 * usual
+
     def settle_steps(self, state: State) -> None:
         """Integration steps for the time constants that were found."""
         k_v = max(state.theta[0] + state.theta[1], 1e-12)
@@ -366,6 +371,8 @@ def bounds_of(task: Task, state: State) -> tuple[FloatArray, FloatArray]:
             high[j] = 100.0 * task.records.Ts
         if n == "w_s":
             low[j], high[j] = task.stribeck_speeds()
+        if n == "ripple":
+            low[j], high[j] = task.ripples()
     return low, high
 
 
