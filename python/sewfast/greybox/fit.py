@@ -46,7 +46,8 @@ UNEXPLAINED = 0.005
 LIMITED = 0.9
 """Of the cost without, that a limit of the current has to fall below."""
 STRETCH = 10_000
-"""Samples on which the way is found; all of them then have their say."""
+"""Samples on which the way is found; all of them then have their say. Of 20 s at 1 kHz, 5,000 end
+in another minimum for 1 of 60 machines, 2,500 for 1 of 8; all 20,000 gain nothing."""
 BUMPS = (0.02, 0.06)
 """Of the usual speed, at which Stribeck's friction is tried to fall off."""
 WORSE = 1.1

@@ -31,16 +31,21 @@ TERMS: dict[str, tuple[str, ...]] = {
     "limit": ("limit",),
 }
 """Parts of a motor beside back-EMF and inertia, and the parameters of each."""
-VISCOUS = 0.05
+VISCOUS, VISCOUS_SPREAD = 0.05, 0.15
 """Of k_v: viscous friction that is expected where no current parts it from back-EMF, and how far
 from that it may well be. Nothing in its place would be a certainty: the dead zone sees the current
-that it takes, and dry friction would stand for what is missing."""
+that it takes, and dry friction would stand for what is missing. On 36 machines with 1 to 32 % of
+it, intervals of k_v, k_a and k_s held the truth 102 times of 108; with a spread of .05, 90 times.
+"""
 ITERATIONS = 40
 COARSE, NEAR, FINE = 1.0, 0.1, 0.01
 """Squared distances to the minimum in standard errors: on the way, for tests, for what is printed.
 """
 QUASISTATIC = 0.05
-"""Of the command's standard deviation: that of its accelerating part from which k_a is shown."""
+"""Of the command's standard deviation: that of its accelerating part from which k_a is shown. Of 60
+slow ramps, sines and triangles one interval, at .003, was off by 87 % of the truth; those of .01 to
+.05 were as wide as two thirds of it or more; from .05 on 43 of 46 held it, the others off by .6 %.
+"""
 QUICKEST = 1.0 / 16.0
 """Of a sample: a time constant that no record shows."""
 STARTS = 5
@@ -176,8 +181,8 @@ class Task:
         by, curvature = np.zeros(len(names)), np.zeros((len(names), len(names)))
         if self.has_current or not math.isfinite(self.k_v):
             return 0.0, by, curvature
-        at, scale = names.index("k_b"), VISCOUS * self.k_v
-        off = (state.value("k_b") - scale) / scale
+        at, scale = names.index("k_b"), VISCOUS_SPREAD * self.k_v
+        off = (state.value("k_b") - VISCOUS * self.k_v) / scale
         by[at], curvature[at, at] = off / scale, 1.0 / scale**2
         return off**2, by, curvature
 
