@@ -13,6 +13,7 @@ others with several differences at once.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import sys
@@ -280,18 +281,21 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", help="machines by name, drawnN among them")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--oracle", type=int, default=0, help="evaluations of an oracle")
-    parser.add_argument("-o", dest="out", type=Path, help="JSON to write")
+    parser.add_argument("-o", dest="out", type=Path, help="JSON to write, and to go on from")
     args = parser.parse_args()
     named = {d.name: d for d in FAMILY}
     wanted = args.only or list(named)
     drives = [named[n] if n in named else drawn(int(n.removeprefix("drawn"))) for n in wanted]
-    found = []
-    for drive in drives:
-        for seed in range(args.seeds):
-            found.append(figures(drive, seed, args.oracle))
-            print(line(found[-1]), flush=True)
-    if args.out is not None:
-        args.out.write_text(json.dumps([vars(f) for f in found], indent=1) + "\n")
+    kept = args.out is not None and args.out.exists()
+    found = [Figures(**f) for f in json.loads(args.out.read_text())] if kept else []
+    done = {(f.machine, f.seed) for f in found}
+    for seed, drive in itertools.product(range(args.seeds), drives):
+        if (drive.name, seed) in done:
+            continue
+        found.append(figures(drive, seed, args.oracle))
+        print(line(found[-1]), flush=True)
+        if args.out is not None:  # after each, as a family takes an hour
+            args.out.write_text(json.dumps([vars(f) for f in found], indent=1) + "\n")
     return 0
 
 

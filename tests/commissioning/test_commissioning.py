@@ -297,7 +297,7 @@ def test_ctrl_c_does_not_wait_for_what_cannot_be_stopped(monkeypatch: pytest.Mon
         signal.setitimer(signal.ITIMER_REAL, 0.05)
 
     threading.Thread(target=alarm).start()
-    monkeypatch.setattr(training, "identify", deaf)
+    monkeypatch.setattr(training, "seeded", deaf)
     try:
         with pytest.raises(Interrupted) as caught:
             commission(VirtualMachine(), **SMALL)

@@ -186,12 +186,19 @@ def test_a_load_behind_a_gear_is_found_over_the_angle_of_the_output_shaft() -> N
         return Recording(u, counts, y, None, 1e-3, 1572.0, name)
 
     ensemble = Ensemble.of([plant])
-    for ratio in (1.0, 1.0 / 3.0, 1.0 / 19.2):
+    for ratio in (1.0 / 3.0, 1.0 / 19.2, 1.0):
         learned, judge = (recorded(n, ratio, name) for n, name in ((20_000, "a"), (15_000, "b")))
         found = turn_load(ensemble, plant, [learned], judge)
         assert found is not None
         assert found.ratio == pytest.approx(ratio, rel=5e-3)
         assert found.rms == pytest.approx(0.4 / np.sqrt(2.0), rel=0.15)
+    # a current limit keeps the speed back by far more, and is no load
+    limited = learned.y.copy()
+    for begin in range(1000, len(limited), 2000):
+        limited[begin : begin + 60] -= 2000.0 * np.hanning(60)
+    again = turn_load(ensemble, plant, [replace(learned, y=limited)], judge)
+    assert again is not None
+    assert again.rms == pytest.approx(0.4 / np.sqrt(2.0), rel=0.15)
     noise = replace(learned, y=core.simulate(learned.u[:, None], np.zeros(core.na)))
     noise = replace(noise, y=noise.y + rng.normal(0.0, 5.0, len(noise)))
     assert turn_load(ensemble, plant, [noise], replace(judge, y=noise.y[:15_000])) is None

@@ -34,8 +34,8 @@ def _short() -> Any:
     with pytest.MonkeyPatch.context() as patch:
         quick = functools.partial(identification.identify, iterations=3, starts=1)
         patch.setattr(loops, "identify", quick)
-        able = functools.partial(identification.identify, iterations=15)
-        patch.setattr(training, "identify", able)
+        able = functools.partial(identification.seeded, iterations=15)
+        patch.setattr(training, "seeded", able)
         short = functools.partial(commission, members=2, evaluations=25)
         patch.setattr(loops, "commission", short)
         yield

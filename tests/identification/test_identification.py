@@ -15,7 +15,7 @@ import pytest
 from plants import OFFSET, A, B, bent_data, linear_data
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError, Interrupted, SettingError
-from sewfast.identification import identify
+from sewfast.identification import identify, seeded
 from sewfast.models import ARX, IV, Ensemble, LinearOE, NeuralOE, NeuralSS
 from sewfast.readers import read
 from sewfast.validation import validate
@@ -53,6 +53,25 @@ def test_two_experiments_are_fitted_together() -> None:
     np.testing.assert_allclose(model.core.a, A, rtol=1e-6)
     assert model.training["samples"] == 400
     assert [d["samples"] for d in model.training["data"]] == [200, 200]
+
+
+def test_networks_that_share_their_linear_start_are_those_of_identify() -> None:
+    data = bent_data()
+    train = seeded(data, iterations=5)
+    thetas = []
+    for seed in (0, 3):
+        alone = identify(
+            data, model="neural_oe", starts=1, seed=seed, iterations=5, threads=1, select=False
+        )
+        network = train(seed)
+        np.testing.assert_array_equal(network.core.theta, alone.core.theta)
+        evidence = {"region", "uncertainty", "information"}
+        assert set(alone.training) - set(network.training) <= evidence
+        assert network.training["cost"] == alone.training["cost"]
+        thetas.append(network.core.theta)
+    assert not np.array_equal(*thetas)
+    with pytest.raises(DataError):
+        seeded(linear_data(20))
 
 
 def test_the_network_fits_what_no_linear_model_can() -> None:

@@ -19,6 +19,6 @@ SMALL: dict[str, Any] = {"members": 2, "evaluations": 25, "seed": 1}
 def short() -> Iterator[None]:
     """Networks that are trained for 15 iterations."""
     with pytest.MonkeyPatch.context() as patch:
-        quick = functools.partial(identification.identify, iterations=15)
-        patch.setattr(training, "identify", quick)
+        quick = functools.partial(identification.seeded, iterations=15)
+        patch.setattr(training, "seeded", quick)
         yield

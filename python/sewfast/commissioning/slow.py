@@ -40,6 +40,10 @@ LEAST_TURNS = 8.0
 """Of a load in the recordings that it is taken from: fewer cannot be told from friction."""
 GEARED = 0.95
 """Largest turns of a load in one of the encoder's shaft that count as behind a gear."""
+BIWEIGHT, REWEIGHTED = 4.685, 5
+"""Deviations at which a sample counts for nothing, the usual number; rounds of it."""
+CELLS = 32
+"""Of a turn of the encoder's shaft, by which a line is looked for: a load turns less often."""
 REFINED = 15
 """Ratios that are tried between two of those that the record can tell apart."""
 
@@ -111,7 +115,7 @@ def turn_load(
         span = max(u.span(ratio) for u in known)
         pairs = [u.parts(plant, ratio, span) for u in known]
         rows, rest = np.vstack([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
-        solution, *_ = np.linalg.lstsq(rows, rest, rcond=1e-6)
+        solution = _robust(rows, rest)
         row, rest = other.parts(plant, ratio, span)
         before, after = float(np.mean(rest**2)), float(np.mean((rest - row @ solution) ** 2))
         if after < WORTH_IT**2 * before and before - after > gained:
@@ -166,6 +170,23 @@ class _Unexplained:
         return np.column_stack(columns), _fast(self.rest, slow)
 
 
+def _robust(rows: FloatArray, rest: FloatArray) -> FloatArray:
+    """Least squares with Tukey's biweight (Huber and Ronchetti, Robust Statistics, 2009, ch. 4).
+
+    What a model misses at a current limit is many times what the load does, and no wave over the
+    angle. With all samples alike, drive `weak` had 9.3 V of load by its linear model, where it has
+    .12; so it has .18. Of nine drives, what is unexplained on the random levels falls to .82
+    (median; .69 to 1.15) of that before.
+    """
+    weight: FloatArray = np.ones(len(rest))
+    for _ in range(1 + REWEIGHTED):
+        found, *_ = np.linalg.lstsq(weight[:, None] * rows, weight * rest, rcond=1e-6)
+        error = rest - rows @ found
+        reach = BIWEIGHT * float(np.median(np.abs(error))) / 0.6745
+        weight = np.maximum(1.0 - (error / max(reach, 1e-12)) ** 2, 0.0)
+    return np.asarray(found, np.float64)
+
+
 def _behind_a_gear(plant: Model, known: Sequence[_Unexplained]) -> list[float]:
     """Turns of a load in one of the encoder's shaft, where a line says so: one at most.
 
@@ -178,17 +199,24 @@ def _behind_a_gear(plant: Model, known: Sequence[_Unexplained]) -> list[float]:
     if total * GEARED <= LEAST_TURNS:
         return []
     step = 0.5 / total
-    ratios = np.arange(LEAST_TURNS / total, GEARED, step)
     turns = longest.turns[:: longest.thinning.k][: len(longest.rest)]
-    rest = _fast(longest.rest, max(3, round(longest.span(float(ratios[0])) / longest.Ts)))
-    first = float(ratios[int(np.argmax([_line_at(ratio * turns, rest) for ratio in ratios]))])
+    rest = _fast(longest.rest, max(3, round(longest.span(LEAST_TURNS / total) / longest.Ts)))
+    lowest, end = math.ceil(2.0 * LEAST_TURNS), math.ceil(2.0 * GEARED * total)
+    first = step * (lowest + int(np.argmax(_lines(turns, rest, total)[lowest:end])))
     near = first + np.linspace(-step, step, REFINED)
     return [float(near[int(np.argmin([_left(plant, longest, ratio) for ratio in near]))])]
 
 
-def _line_at(turns: FloatArray, rest: FloatArray) -> float:
-    """Power of what swings once a turn."""
-    return float(np.abs(np.exp(2j * np.pi * turns) @ rest) ** 2)
+def _lines(turns: FloatArray, rest: FloatArray, total: float) -> FloatArray:
+    """Power of what swings 0, 1, 2, .. times in twice the total of turns.
+
+    One transform of what falls into each cell of angle, where a sum over all samples for each of
+    thousands of ratios took four seconds of a slow drive's commissioning.
+    """
+    cells = math.ceil(CELLS * total)
+    at = np.rint(turns * (cells / total)).astype(int) % (2 * cells)
+    powers: FloatArray = np.abs(np.fft.rfft(np.bincount(at, rest, 2 * cells))) ** 2
+    return powers
 
 
 def _left(plant: Model, known: _Unexplained, ratio: float) -> float:

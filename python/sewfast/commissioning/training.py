@@ -11,8 +11,8 @@ import numpy as np
 
 from ..dataset import Dataset, Experiment
 from ..errors import FitError
-from ..evidence import ReportCard, check
-from ..identification import identify
+from ..evidence import ReportCard, check, remembered
+from ..identification import seeded
 from ..identification.folds import folds, thinned
 from ..identification.task import wrap
 from ..models import Ensemble, LinearOE, Model
@@ -127,34 +127,37 @@ def _members(
     """
     stopped = threading.Event()
     seeds = [demands.seed + i for i in range(DRAWN * demands.members)]
-    done: list[Model | None] = [None] * len(seeds)
 
-    def one(i: int) -> None:
-        def look(*_: object) -> None:
-            if stopped.is_set():
-                raise InterruptedError
-
-        try:
-            done[i] = identify(
-                data, model="neural_oe", starts=1, seed=seeds[i], threads=1, select=False,
-                progress=look,
-            )  # fmt: skip
-        except (FitError, InterruptedError):
-            return
+    def look(*_: object) -> None:
+        if stopped.is_set():
+            raise InterruptedError
 
     pool = ThreadPoolExecutor(min(demands.threads, len(seeds)))
     try:
-        for i, future in enumerate([pool.submit(one, i) for i in range(len(seeds))]):
-            future.result()
-            progress(i + 1, len(seeds))
+        train = pool.submit(seeded, data, progress=look).result()
+
+        def one(seed: int) -> Model | None:
+            try:
+                return train(seed, look)
+            except (FitError, InterruptedError):
+                return None
+
+        done: list[Model | None] = []
+        for future in [pool.submit(one, seed) for seed in seeds]:
+            done.append(future.result())
+            progress(len(done), len(seeds))
+        trained = [m for m in done if m is not None]
+        trained.sort(key=lambda m: validate_member(m, data)[0])
+        kept = list(pool.map(lambda m: remembered(m, data), trained[: demands.members]))
+    except FitError:
+        kept = []
     except BaseException:
         stopped.set()
         # the evidence that follows a training cannot be stopped, nor is it waited for
         pool.shutdown(wait=False, cancel_futures=True)
         raise
     pool.shutdown()
-    trained = sorted((m for m in done if m is not None), key=lambda m: validate_member(m, data)[0])
-    return trained[: demands.members]
+    return kept
 
 
 # --- The linear rival: a model of another kind, from the same recordings --------------------------

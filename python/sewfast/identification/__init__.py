@@ -7,6 +7,6 @@ threads), `search` (which structures are tried), `choice` (which of them becomes
 Beside them: `delays` and `order_table` (`delay`, `orders`), `least_squares`.
 """
 
-from .entry import identify
+from .entry import identify, seeded
 
-__all__ = ["identify"]
+__all__ = ["identify", "seeded"]

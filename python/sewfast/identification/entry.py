@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Literal
 
 from ..dataset import Dataset, require_dataset
@@ -202,6 +204,43 @@ def identify(
         return remembered(found, _excerpt(found, task))
     except KeyboardInterrupt:
         raise Interrupted(found) from None
+
+
+def seeded(
+    data: Dataset, *, iterations: int | None = None, progress: Progress | None = None
+) -> Callable[[int, Progress | None], Model]:
+    """What trains networks that differ in their seeds alone, called with a seed and a progress.
+
+    Each is what `identify(data, model="neural_oe", starts=1, select=False)` returns, bit by bit,
+    without the evidence that is kept with it (`remembered`). The linear model that all of them
+    begin at is fitted here, once: it takes longer than three networks.
+
+    Parameters
+    ----------
+    data : Dataset
+    iterations : int, optional
+        At most this many, of the linear fits as of each network.
+    progress : callable, optional
+        Of the linear fits.
+
+    Raises
+    ------
+    DataError, FitError
+        As `identify`.
+    """
+    task = Task(
+        data=_in_effect(data, "data"), validation=None, na=_LAGS, nb=_LAGS, nk=None, nx=None,
+        hidden=None, output=None, starts=1, seed=0, iterations=iterations, threads=1,
+        progress=progress, select=False,
+    )  # fmt: skip
+    _require_data(task, "neural_oe")
+    _, start = lagged.begun(task, time.perf_counter())
+
+    def train(seed: int, progress: Progress | None = None) -> Model:
+        own = replace(task, seed=seed, progress=progress)
+        return lagged.unselected(own, start, time.perf_counter())
+
+    return train
 
 
 def _in_effect(data: Dataset, what: str) -> Dataset:

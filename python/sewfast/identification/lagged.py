@@ -82,12 +82,9 @@ def neural_oe(task: Task) -> Model:
     all data without them, and a note says so.
     """
     began = time.perf_counter()
-    brief = replace(task, progress=task.clock.limited(task.progress, LINEAR_SHARE))
-    linear = _linear(brief, began)
-    start = _start(brief, linear)
+    linear, start = begun(task, began)
     if not task.select:
-        fit = _network_fit(task, start, DECAYS[-1], began)
-        return _network_model(task, fit, began, {"weight_decay": DECAYS[-1], "selected": False})
+        return unselected(task, start, began)
     trial = task if task.validation is not None else _with_blocks_held_out(task)
     network, decays = _selected_network(trial, start, began)
     choice = _comparison(trial, linear, network)
@@ -101,6 +98,19 @@ def neural_oe(task: Task) -> Model:
     choice["reason"] += "; no step of the training did better on held-out blocks"
     provenance = {**decays, "samples_fitted": len(task.data), "weight_decay": DECAYS[-1]}
     return _network_model(task, network, began, provenance | _choice_provenance(choice))
+
+
+def begun(task: Task, began: float) -> tuple[_core.LinearModel, _core.LinearModel]:
+    """The linear model of the data, and the one that networks begin at."""
+    brief = replace(task, progress=task.clock.limited(task.progress, LINEAR_SHARE))
+    linear = _linear(brief, began)
+    return linear, _start(brief, linear)
+
+
+def unselected(task: Task, start: _core.LinearModel, began: float) -> Model:
+    """The network trained on all data to the last iteration."""
+    fit = _network_fit(task, start, DECAYS[-1], began)
+    return _network_model(task, fit, began, {"weight_decay": DECAYS[-1], "selected": False})
 
 
 def _require_trained(task: Task, network: _core.NeuralFit) -> None:
