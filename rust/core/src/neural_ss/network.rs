@@ -227,7 +227,9 @@ impl Network {
     pub fn rises<V: F64x8>(&self, arguments: &[f64], rises: &mut [Lanes]) {
         let (states, inputs) = arguments.split_at(self.shape.nx);
         for (g, rises) in rises.iter_mut().enumerate() {
-            self.argument::<V>(g, states, inputs).rise().store(&mut rises.0);
+            self.argument::<V>(g, states, inputs)
+                .rise()
+                .store(&mut rises.0);
         }
     }
 
@@ -243,7 +245,9 @@ impl Network {
         let nx = if NX == 0 { self.shape.nx } else { NX };
         let (states, inputs) = arguments.split_at(nx);
         for (g, hidden) in hidden.iter_mut().enumerate() {
-            self.argument::<V>(g, states, inputs).tanh().store(&mut hidden.0);
+            self.argument::<V>(g, states, inputs)
+                .tanh()
+                .store(&mut hidden.0);
         }
         for (q, next) in next[..nx].iter_mut().enumerate() {
             *next = self.row::<V>(q, states, inputs, hidden);

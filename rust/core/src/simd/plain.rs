@@ -10,9 +10,16 @@ impl Plain {
     #[inline(always)]
     fn each(self, f: impl Fn(usize, f64) -> f64) -> Self {
         let v = self.0;
-        let low = [f(0, v[0]), f(1, v[1]), f(2, v[2]), f(3, v[3])];
-        let high = [f(4, v[4]), f(5, v[5]), f(6, v[6]), f(7, v[7])];
-        Self([low[0], low[1], low[2], low[3], high[0], high[1], high[2], high[3]])
+        Self([
+            f(0, v[0]),
+            f(1, v[1]),
+            f(2, v[2]),
+            f(3, v[3]),
+            f(4, v[4]),
+            f(5, v[5]),
+            f(6, v[6]),
+            f(7, v[7]),
+        ])
     }
 
     #[inline(always)]
