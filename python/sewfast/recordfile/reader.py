@@ -24,23 +24,19 @@ from .format import (
     FOOTER,
     FOOTER_BODY,
     HEADER,
-    LARGEST_HEADER,
     MAGIC,
     MESSAGE,
     MESSAGE_HEAD,
     MESSAGE_INDEX,
-    MOST_MISSING,
     RECORD,
     SCHEMA,
     Block,
-    Header,
     Message,
     Topic,
-    bearable,
     decode,
     parse,
-    plain,
 )
+from .header import LARGEST_HEADER, MOST_MISSING, Header, bearable, plain
 
 # --- The whole chunks of an MCAP file, and what between them is damaged ---------------------------
 # Nothing is believed that no checksum covers: a chunk is searched for, not reached by the lengths

@@ -18,7 +18,8 @@ from ..errors import DataError, SettingError
 from ..writers import write_table
 from . import format
 from .filing import Block, End, Event, Filing, Sink, batched, replacing
-from .format import MOST_MISSING, Assembler, Header, Message, Topic, bearable, opening, plain
+from .format import Assembler, Message, Topic, opening
+from .header import MOST_MISSING, Header, bearable, plain
 from .reader import RecordedFile, read_header, read_recording
 
 # --- What is not written over: a recording of a drive, which cannot be had again ------------------
