@@ -21,7 +21,7 @@ from ..arrays import FloatArray, as_column
 from ..errors import DataError, FitError, SettingError
 from ..frequency.shaft import Parameter
 from ..identification.least_squares import least_squares
-from ..plotting import html_of
+from ..tables import html_of
 from .intervals import CONFIDENCE, covariance_of, filtered, whitener
 from .motor import findings
 from .records import Piece, Records, rad_per_second

@@ -17,7 +17,8 @@ from ..errors import DataError, SettingError
 from ..frequency.shaft import Parameter, sampled_model
 from ..machine import VirtualMachine
 from ..models import LinearOE
-from ..plotting import LOOKS, Drawing, html_of
+from ..plotting import LOOKS, Drawing
+from ..tables import html_of
 from .exports import Target, Winding, export
 from .intervals import CONFIDENCE
 from .records import Records, rad_per_second

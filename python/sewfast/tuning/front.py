@@ -17,8 +17,9 @@ from ..control.controller import Controller, pid_of
 from ..control.loop import Plants, References
 from ..errors import Interrupted, SettingError
 from ..gains import whole
-from ..plotting import Drawing, Panel, Plotted, Table, lettered, significant
+from ..plotting import Drawing, Panel, Plotted, lettered
 from ..progress import shown_in_notebooks
+from ..tables import Table, significant
 from ..writers import write_table
 from .objective import Constraints, Cost, LoadStep
 from .search import tune

@@ -17,6 +17,7 @@ from ..control.loop import Plant, Plants, References, check_fits, each_plant, ru
 from ..errors import FitError, Interrupted, SettingError
 from ..gains import whole
 from ..progress import shown_in_notebooks
+from ..tables import Table, significant
 from .objective import Constraints, Cost, LoadStep
 from .opinion import SHARE, SecondOpinion, second_opinion
 from .task import (
@@ -148,8 +149,6 @@ class TuningResult:
 
     def _repr_html_(self) -> str:
         """A table for a notebook."""
-        from ..plotting import Table, significant
-
         unit = self.controller.y_unit or "y"
         rows = tuple(
             (v.name, significant(v.value, 4), significant(v.low), significant(v.high))
