@@ -184,7 +184,7 @@ class RecordWriter:
         self._next = 0
         self._received = 0
         self._closed = False
-        self._told = False
+        self._is_reported = False
 
     def __enter__(self) -> RecordWriter:
         return self
@@ -320,8 +320,8 @@ class RecordWriter:
             # one Ctrl-C must not cost the end of the file, a second one may
             self._filing.finish()
             raise
-        if self._filing.failure is not None and not self._told:
-            self._told = True
+        if self._filing.failure is not None and not self._is_reported:
+            self._is_reported = True
             raise self._filing.refusal(self._filing.failure)
 
     def _require_open(self) -> None:

@@ -136,8 +136,8 @@ class ParetoFront(Plotted):
             f"{'*' if i == self.pick else ' '} " + "".join(f"{v:>{width + 2}.4g}" for v in row)
             for i, row in enumerate(self.values)
         ]
-        told = "* the knee: closest to the best of every objective, in shares of its range here"
-        return "\n".join([f"{len(self)} controllers", head, *rows, told])
+        note = "* the knee: closest to the best of every objective, in shares of its range here"
+        return "\n".join([f"{len(self)} controllers", head, *rows, note])
 
 
 @shown_in_notebooks("pareto")

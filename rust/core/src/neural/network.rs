@@ -1,8 +1,8 @@
 //! The network in scaled units: weights in groups of eight hidden units, one step and its slopes.
 
-mod beside;
+mod lanes;
 
-pub(crate) use beside::{Meanwhile, Nothing};
+pub(crate) use lanes::{Meanwhile, Nothing};
 
 use crate::gram::Gram;
 use crate::lagged::{Lagged, Lags};
