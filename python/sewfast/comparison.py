@@ -12,7 +12,8 @@ from .arrays import labelled
 from .dataset import Dataset
 from .dynamic_model import INIT, DynamicModel
 from .errors import FitError, SettingError
-from .plotting import Drawing, Plotted, Table, fit_panels, percent, significant, stacked
+from .plotting import Drawing, Plotted, fit_panels, stacked
+from .tables import Table, percent, significant
 from .validation import Validation, validate
 
 ORDER = "compare(model, model, ..., data)"

@@ -23,6 +23,7 @@ from .dataset import (
 )
 from .dataset.experiment import without_weightless
 from .errors import DataError, SettingError, SewfastError
+from .tables import html_of
 
 FORMAT = "sewfast.model"
 VERSION = 1
@@ -436,8 +437,6 @@ class DynamicModel(ABC):
 
     def _repr_html_(self) -> str:
         """A table for a notebook."""
-        from .plotting import html_of
-
         first, *lines = str(self).splitlines()
         return html_of("\n".join([first, f"orders: {lines[0]}", *lines[1:]]))
 

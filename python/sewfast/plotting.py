@@ -1,4 +1,4 @@
-"""Pictures of results: the look of every figure, `plot`; numbers and tables of a page.
+"""Pictures of results: the look of every figure, `plot`.
 
 What a result looks like is a `Drawing`: panels, each a function that draws into axes. `plot` puts
 them into a new figure, into axes that the caller has, or into a file; the report puts the same
@@ -10,13 +10,11 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
-import math
 import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -26,6 +24,7 @@ from numpy.typing import NDArray
 
 from .errors import SettingError, not_installed, unwritable
 from .storage import replace_file
+from .tables import Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,119 +35,13 @@ else:
     Panel: TypeAlias = object
 
 
-# --- Numbers as a reader likes them: few digits, a unit, a dash where there is none ---------------
-
-
-SHADE = "#e6e6e6"
-"""Of a range that a line may be in."""
-NONE = "–"
-_SPACE = "\N{NO-BREAK SPACE}"
-
-
-def significant(value: float | None, digits: int = 3) -> str:
-    """`digits` significant digits, plain where that is short, else a power of ten."""
-    if value is None or not math.isfinite(value):
-        return NONE
-    if value == 0.0:
-        return "0"
-    # of the rounded value: 9.996 has two digits before the point
-    size = int(f"{value:.{digits - 1}e}".split("e")[1])
-    if not -3 <= size <= 5:
-        mantissa = value / 10.0**size
-        text = f"{mantissa:.{digits - 1}f} × 10{_raised(size)}"
-        return text.replace("-", "−").replace(" ", _SPACE)
-    return f"{value:,.{max(digits - 1 - size, 0)}f}".replace("-", "−")
-
-
-def rpm(value: float | None) -> str:
-    """A speed or its error [RPM]."""
-    return NONE if value is None else f"{significant(value)}{_SPACE}RPM"
-
-
-def volt(value: float | None) -> str:
-    """A command or its change [V]."""
-    return NONE if value is None else f"{significant(value)}{_SPACE}V"
-
-
-def percent(value: float | None, digits: int = 2) -> str:
-    """A share [%]."""
-    if value is None or not math.isfinite(value):
-        return NONE
-    return f"{value:.{digits}f}{_SPACE}%".replace("-", "−")
-
-
-def milliseconds(value: float | None) -> str:
-    """A duration [ms]."""
-    return NONE if value is None else f"{value:.0f}{_SPACE}ms"
-
-
-def html_of(text: str) -> str:
-    """Lines of text, `name: value` or `name   value`, as a table; the first line is its caption."""
-    caption, *lines = text.splitlines()
-    rows: list[tuple[str, ...]] = []
-    for line in lines:
-        parts = re.split(r": | {2,}", line.strip(), maxsplit=1)
-        rows.append((parts[0], parts[1]) if len(parts) == 2 else ("", parts[0]))
-    return Table(caption, (), tuple(rows), words=True).to_html()
-
-
-def _raised(exponent: int) -> str:
-    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-
-
-# --- Table: rows of text under headers ------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Table:
-    """Rows whose first cell is a header.
-
-    Attributes
-    ----------
-    caption : str
-        What it shows.
-    header : tuple of str
-    rows : tuple of tuple of str
-    best : frozenset of (row, column)
-        Cells to set in bold.
-    words : bool
-        Whether its cells hold words rather than numbers, which begin at the left.
-    """
-
-    caption: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    best: frozenset[tuple[int, int]] = frozenset()
-    words: bool = False
-
-    def to_html(self, notes: Sequence[str] = ()) -> str:
-        """As HTML for a notebook, everything escaped: no style or script of its own.
-
-        Parameters
-        ----------
-        notes : sequence of str
-            Lines below the table.
-        """
-        heads = "".join(f'<th scope="col">{escape(h)}</th>' for h in self.header)
-        head = f"<thead><tr>{heads}</tr></thead>\n" if self.header else ""
-        rows = "\n".join(
-            f'<tr><th scope="row">{escape(row[0])}</th>'
-            + "".join(f"<td>{escape(cell)}</td>" for cell in row[1:])
-            + "</tr>"
-            for row in self.rows
-        )
-        below = "".join(f"\n<div>{escape(note)}</div>" for note in notes)
-        return (
-            f"<table><caption>{escape(self.caption)}</caption>\n{head}"
-            f"<tbody>\n{rows}\n</tbody></table>{below}"
-        )
-
-
 # --- The canvas: the look of every figure, thinning of long series, figures as inline SVG ---------
 
 
 Float = NDArray[np.float64]
 
+SHADE = "#e6e6e6"
+"""Of a range that a line may be in."""
 WIDTH = 9.2
 """Of every figure [inch]."""
 

@@ -15,7 +15,8 @@ from .dataset.experiment import in_effect, without_weightless
 from .dataset.outliers import white_noise
 from .dynamic_model import INIT, DynamicModel, require_init
 from .errors import DataError
-from .plotting import Drawing, Plotted, Table, fit_panels, percent, significant, stacked
+from .plotting import Drawing, Plotted, fit_panels, stacked
+from .tables import Table, percent, significant
 
 GOOD, FAIR, POOR = 90.0, 70.0, 30.0
 """Percent of the free run's fit from which a model is good, fair, poor; below it is useless."""

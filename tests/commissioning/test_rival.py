@@ -19,7 +19,8 @@ from sewfast.errors import Interrupted, SettingError
 from sewfast.machine import VirtualMachine
 from sewfast.models import LinearOE
 from sewfast.tuning.objective import Constraints
-from sewfast.tuning.search import MUCH, SecondOpinion, TuningResult, tune
+from sewfast.tuning.opinion import MUCH, SecondOpinion
+from sewfast.tuning.search import TuningResult, tune
 
 SHORT = signals.reference("trapezoid")[:900]
 

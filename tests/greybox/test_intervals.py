@@ -12,7 +12,7 @@ import sewfast
 from sewfast import physics
 from sewfast.greybox.intervals import covariance_of
 from sewfast.greybox.marquardt import minimised
-from sewfast.greybox.records import records_of
+from sewfast.greybox.records import records_of, spikes_of
 from sewfast.greybox.task import NOTHING, PLACE, State, Task
 
 FREE = (np.full(2, -np.inf), np.full(2, np.inf))
@@ -60,6 +60,31 @@ def test_scores_that_hang_together_widen_the_covariance() -> None:
     one, other = (float(covariance_of(J, r, [4000], [40])[0, 0]) for r in (e, alike))
     assert one == pytest.approx(1 / 4000, rel=0.4)
     assert other == pytest.approx(10 / 4000, rel=0.6)
+
+
+def test_windows_to_which_a_fit_bends_do_not_narrow_the_covariance() -> None:
+    """Of 12 parameters that show for a while each; without the correction the ratio is .5."""
+    rng = np.random.default_rng(7)
+    shape = np.exp(-0.5 * ((np.arange(300.0)[:, None] - np.linspace(20, 280, 12)) / 15) ** 2)
+    ratios = []
+    for _ in range(60):
+        J, e = shape * rng.standard_normal((300, 12)), rng.standard_normal(300)
+        left = e - J @ np.linalg.lstsq(J, e, rcond=None)[0]
+        found = np.diag(covariance_of(J, left, [300], [20]))
+        ratios.append(np.mean(found / np.diag(np.linalg.inv(J.T @ J))))
+    student = (1.0 + 1.2 / (1.5 * 300 / 20)) ** 2
+    assert np.mean(ratios) / student == pytest.approx(1.0, abs=0.12)
+
+
+def test_spikes_of_a_short_record_are_found_and_its_corners_kept() -> None:
+    """Eleven in 300 samples, two of them side by side at the end."""
+    _, y = linear(300)
+    at = np.array([20, 57, 90, 91, 130, 155, 180, 222, 260, 298, 299])
+    spiked = y.copy()
+    spiked[at] += np.where(np.arange(11) % 3, 400.0, -300.0)
+    spiked[299] = spiked[298]
+    assert np.array_equal(np.flatnonzero(spikes_of(spiked, 0.0)), at)
+    assert not spikes_of(y, 0.0).any()
 
 
 def test_the_sums_of_the_core_are_those_of_residuals_and_jacobian() -> None:

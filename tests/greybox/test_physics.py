@@ -95,6 +95,16 @@ def test_a_current_without_volts_tells_no_inertia(record: Any) -> None:
     )
 
 
+def test_a_start_that_takes_all_back_emf_for_friction_is_fitted_on() -> None:
+    """Without a current the first fit may part k_v in any way; only its sum counts."""
+    machine = VirtualMachine(1136)
+    recording, _ = recorded(machine, steps(20.0, machine.Ts, 1136))
+    truth = truths(machine.parameters)
+    motor = physics(recording)
+    assert motor.value("k_v") == pytest.approx(truth["k_v"], rel=0.005)
+    assert motor.value("k_a") == pytest.approx(truth["k_a"], rel=0.01)
+
+
 def test_a_motor_of_another_simulator_is_told() -> None:
     pytest.importorskip("mujoco")
     from physics import hinge

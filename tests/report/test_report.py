@@ -17,10 +17,11 @@ from hypothesis import strategies as st
 
 import result_folder
 from sewfast.errors import DataError, ModelFileError, SewfastError
-from sewfast.plotting import significant, thin
+from sewfast.plotting import thin
 from sewfast.report import report
 from sewfast.report.artefacts import load
 from sewfast.report.page import goals
+from sewfast.tables import significant
 
 PAPER_FIGURES = [*range(2, 6), *range(7, 16), *range(19, 23)]
 VOID = {"meta", "link", "br", "img", "input", "hr"}

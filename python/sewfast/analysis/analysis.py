@@ -25,7 +25,7 @@ from ..control.loop import (
 )
 from ..control.systems import LinearLoop
 from ..errors import FitError, SettingError
-from ..plotting import Table
+from ..tables import Table
 from ..trust import Judgement, Limits, judge
 from ..tuning.objective import Cost
 from .changes import Change

@@ -342,14 +342,14 @@ def say_interrupted(count: int, place: Path) -> int:
 
 
 def stop_command(args: argparse.Namespace) -> None:
-    _told(args, "stop")
+    _send(args, "stop")
 
 
 def clear_command(args: argparse.Namespace) -> None:
-    _told(args, "clear")
+    _send(args, "clear")
 
 
-def _told(args: argparse.Namespace, what: str) -> None:
+def _send(args: argparse.Namespace, what: str) -> None:
     from ..link import connect
 
     with connect(args.port, baud=args.baud) as drive:

@@ -176,7 +176,7 @@ def _write(args: argparse.Namespace, made: Recording, machine: str, place: Path 
     """The columns and what they say; `place` already holds those of a drive."""
     from ..recording import UNITS
 
-    summary, line = _told(made, machine)
+    summary, line = _summary(made, machine)
     summary |= _settings(args)
     write_columns(
         args.out, made.columns(), UNITS, summary, [line], as_json=args.json,
@@ -184,7 +184,7 @@ def _write(args: argparse.Namespace, made: Recording, machine: str, place: Path 
     )  # fmt: skip
 
 
-def _told(made: Recording, machine: str) -> tuple[dict[str, Any], str]:
+def _summary(made: Recording, machine: str) -> tuple[dict[str, Any], str]:
     """A recording in numbers and in a line."""
     import numpy as np
 

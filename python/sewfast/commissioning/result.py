@@ -18,10 +18,11 @@ from ..control.controller import Controller
 from ..errors import DataError, SettingError
 from ..evidence import Line, ReportCard
 from ..models import Ensemble
-from ..plotting import Trace, html_of, loop_drawing
+from ..plotting import Trace, loop_drawing
 from ..recording import Recording
 from ..report.commissioned import FORMAT, NUMBERS, VERSION, run_file
 from ..rules import Fopdt
+from ..tables import html_of
 from ..trust import Judgement
 from ..tuning.objective import Cost
 from ..tuning.search import TuningResult

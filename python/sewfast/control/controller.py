@@ -12,8 +12,8 @@ from .. import _core, storage
 from ..arrays import counts_per_unit
 from ..errors import SettingError
 from ..gains import Gains, real, whole
-from ..plotting import html_of
 from ..storage import Fields
+from ..tables import html_of
 from .biquad import MOST, NUMBERS, Biquad
 
 GAIN_NAMES = ("Kp", "Ti", "Td")

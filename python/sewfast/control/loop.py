@@ -19,6 +19,7 @@ from ..errors import DataError, FitError, SettingError
 from ..gains import Gains, vector
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
+from ..tables import Table, percent, significant
 from .controller import Controller, SampledController, pid_of
 from .defaults import default_references, drive_references
 
@@ -170,8 +171,6 @@ class HasMetrics(Protocol):
 
 def run_html(found: HasMetrics, caption: str) -> str:
     """What a controller did, as a table for a notebook."""
-    from ..plotting import Table, percent, significant
-
     m, u, y = found.metrics(), found.units["u"], found.units["y"]
     saturated = m["saturated"]
 

@@ -17,8 +17,9 @@ from ..evidence.operating import OperatingPoint, operating_range, point_at_level
 from ..gains import Gains, real, vector
 from ..models import Model
 from ..models.conversion import from_state_space, polynomials_of, transfer_function
-from ..plotting import SHADE, Drawing, Plotted, html_of, legend, stacked
+from ..plotting import SHADE, Drawing, Plotted, legend, stacked
 from ..rules import Fopdt
+from ..tables import html_of
 from .controller import Controller
 from .loop import plant_units, require_controller, require_units
 

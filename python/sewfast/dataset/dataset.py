@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import labelled, range_of, texts
 from ..errors import DataError, SettingError
+from ..tables import Table, significant
 from . import frames, outliers, pieces, rates, summary, trends
 from .experiment import Experiment, require_some_weight
 
@@ -213,8 +214,6 @@ class Dataset:
 
     def _repr_html_(self) -> str:
         """A table for a notebook."""
-        from ..plotting import Table, significant
-
         names = [*map(labelled, self.input_names, self.input_units)]
         columns = [
             ("input", name, span) for name, span in zip(names, self.input_range, strict=True)

@@ -23,7 +23,7 @@ from ..control.controller import Controller
 from ..control.margins import Margins, loop_path, margins, sampled
 from ..errors import FitError, SettingError
 from ..gains import Gains, real
-from ..plotting import html_of
+from ..tables import html_of
 from .response import Complex
 from .shaft import ShaftFit
 

@@ -16,7 +16,8 @@ from ..arrays import FloatArray
 from ..control.controller import Controller
 from ..control.margins import loop_path
 from ..errors import DataError, SettingError
-from ..plotting import LOOKS, Drawing, html_of, stacked
+from ..plotting import LOOKS, Drawing, stacked
+from ..tables import html_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -25,7 +25,7 @@ from ..control.biquad import Biquad
 from ..errors import DataError, FitError
 from ..identification.least_squares import least_squares
 from ..models import LinearOE
-from ..plotting import html_of
+from ..tables import html_of
 from .response import Complex, FrequencyResponse
 
 LEAST = 20

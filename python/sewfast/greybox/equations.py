@@ -21,8 +21,9 @@ from ..arrays import FloatArray, as_column
 from ..errors import DataError, FitError, SettingError
 from ..frequency.shaft import Parameter
 from ..identification.least_squares import least_squares
-from ..plotting import html_of
+from ..tables import html_of
 from .intervals import CONFIDENCE, covariance_of, filtered, whitener
+from .motor import findings
 from .records import Piece, Records, rad_per_second
 
 Equations: TypeAlias = Callable[[Any, Any, Mapping[str, Any]], Any]
@@ -181,27 +182,14 @@ def load_equations(path: str | os.PathLike[str]) -> EquationFit:
     """
     fields = storage.Fields(str(path), storage.read(path, FORMAT, (VERSION,)))
     fields.require_only(["version", "parameters", "undetermined", "values", *_KEPT])
-    stored, undetermined, values = (
-        fields.object(n) for n in ("parameters", "undetermined", "values")
-    )
-    parameters = {}
-    for name in stored.values:
-        one = stored.object(name)
-        one.require_only(["value", "low", "high", "unit"])
-        value, low, high = (one.number(n) for n in ("value", "low", "high"))
-        parameters[name] = Parameter(value, low, high, one.text("unit"))
+    parameters, undetermined, unit = findings(fields)
+    values = fields.object("values")
     for name in ("states", "substeps"):
         if fields.integer(name) < 1:
             raise fields.refuse(name, "a whole number above 0", fields.integer(name))
-    try:
-        rad_per_second(fields.text("speed_unit"))
-    except SettingError:
-        raise fields.refuse(
-            "speed_unit", "rpm, rev/s, rad/s or deg/s", fields.text("speed_unit")
-        ) from None
     return EquationFit(
         parameters,
-        {n: undetermined.text(n) for n in undetermined.values},
+        undetermined,
         {n: values.number(n) for n in values.values},
         fields.text("equations_name"),
         fields.integer("states"),
@@ -212,7 +200,7 @@ def load_equations(path: str | os.PathLike[str]) -> EquationFit:
         fields.integer("samples"),
         fields.positive("Ts"),
         fields.text("u_unit"),
-        fields.text("speed_unit"),
+        unit,
     )
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 from ..errors import SettingError
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 
 Target: TypeAlias = Literal["wpilib", "mujoco", "urdf", "odrive", "moteus", "simplefoc"]
 Winding: TypeAlias = Literal["line", "q"]
-BOARDS = ("odrive", "moteus", "simplefoc")
 AMPLITUDES = 1.5
 """Power over volts times amperes, where both are amplitudes of the q axis."""
 
@@ -40,7 +38,7 @@ def export(motor: Motor, target: Target, winding: Winding | None) -> str:
     simulators = {"wpilib": _wpilib, "mujoco": _mujoco, "urdf": _urdf}
     if target in simulators:
         return simulators[target](motor, factor)
-    return _BOARDS[target](Phase(motor, winding == "q"))
+    return _board(target, Phase(motor, winding == "q"))
 
 
 def _wpilib(motor: Motor, factor: float) -> str:
@@ -85,8 +83,8 @@ class Phase:
         Torque per amplitude of the current along q [N m/A].
     KV : float
         Speed [rpm] per amplitude of the back-EMF between two terminals [V].
-    inertia : float
-        [kg m^2].
+    inertia, inertia_of_turns : float
+        [kg m^2], and per turn in place of radian.
     """
 
     def __init__(self, motor: Motor, is_q: bool) -> None:
@@ -98,6 +96,7 @@ class Phase:
         self.torque_constant = AMPLITUDES * self.flux
         self.KV = 30.0 / math.pi / (math.sqrt(3.0) * self.flux)
         self.inertia = motor.value("inertia") * (AMPLITUDES if is_q else 1.0)
+        self.inertia_of_turns = 2.0 * math.pi * self.inertia
         self.origin = (
             "the record's volts and amperes as amplitudes along q: torque = 3/2 K i"
             if is_q
@@ -106,51 +105,42 @@ class Phase:
         self.missing = "" if shown else "the inductance (the record does not show the lag), "
 
 
-def _odrive(phase: Phase) -> str:
-    axis = "odrv0.axis0"
-    lines = [
-        f"# ODrive, firmware 0.6; from {phase.origin}",
-        f"{axis}.config.motor.torque_constant = {phase.torque_constant:.6g}  "
-        f"# N m per A along q, 8.27/KV with KV = {phase.KV:.5g} rpm/V",
-        f"{axis}.config.motor.phase_resistance = {phase.resistance:.6g}  # ohm",
-        f"{axis}.controller.config.inertia = {2 * math.pi * phase.inertia:.6g}  # N m/(turn/s^2)",
-        f"# not known from a record: {phase.missing}motor_type, pole_pairs, current_soft_max, "
+BOARDS = {
+    "odrive": (
+        "# ODrive, firmware 0.6; from {p.origin}",
+        "odrv0.axis0.config.motor.torque_constant = {p.torque_constant:.6g}  "
+        "# N m per A along q, 8.27/KV with KV = {p.KV:.5g} rpm/V",
+        "odrv0.axis0.config.motor.phase_resistance = {p.resistance:.6g}  # ohm",
+        "odrv0.axis0.config.motor.phase_inductance = {p.inductance:.6g}  # H",
+        "odrv0.axis0.controller.config.inertia = {p.inertia_of_turns:.6g}  # N m/(turn/s^2)",
+        "# not known from a record: {p.missing}motor_type, pole_pairs, current_soft_max, "
         "current_hard_max, encoder and its offset, gains",
-    ]
-    if phase.inductance is not None:
-        lines.insert(3, f"{axis}.config.motor.phase_inductance = {phase.inductance:.6g}  # H")
-    return "\n".join(lines) + "\n"
-
-
-def _moteus(phase: Phase) -> str:
-    lines = [
-        f"# moteus; from {phase.origin}; lines with # are notes",
-        f"conf set motor.resistance_ohm {phase.resistance:.6g}",
-        f"conf set motor.Kv {phase.KV:.6g}",
-        f"conf set servo.inertia_feedforward {2 * math.pi * phase.inertia:.6g}",
-        f"# not known from a record: {phase.missing}motor.poles, motor.phase_invert, motor.offset "
+    ),
+    "moteus": (
+        "# moteus; from {p.origin}; lines with # are notes",
+        "conf set motor.resistance_ohm {p.resistance:.6g}",
+        "conf set motor.Kv {p.KV:.6g}",
+        "conf set motor.inductance_q_H {p.inductance:.6g}",
+        "conf set servo.inertia_feedforward {p.inertia_of_turns:.6g}",
+        "# not known from a record: {p.missing}motor.poles, motor.phase_invert, motor.offset "
         "(moteus_tool --calibrate), servo.max_current_A, saturation (motor.rotation_...), gains",
-    ]
-    if phase.inductance is not None:
-        lines.insert(3, f"conf set motor.inductance_q_H {phase.inductance:.6g}")
-    return "\n".join(lines) + "\n"
-
-
-def _simplefoc(phase: Phase) -> str:
-    lines = [
-        f"// SimpleFOC; from {phase.origin}",
-        f"motor.phase_resistance = {phase.resistance:.6g};  // ohm, phase to neutral",
-        f"motor.KV_rating = {phase.KV:.6g};  // rpm/V: back-EMF = speed/(KV sqrt(3))",
-        f"// not known from a record: {phase.missing}pole pairs, direction and zero angle of the "
+    ),
+    "simplefoc": (
+        "// SimpleFOC; from {p.origin}",
+        "motor.phase_resistance = {p.resistance:.6g};  // ohm, phase to neutral",
+        "motor.KV_rating = {p.KV:.6g};  // rpm/V: back-EMF = speed/(KV sqrt(3))",
+        "motor.phase_inductance = {p.inductance:.6g};  // H",
+        "// not known from a record: {p.missing}pole pairs, direction and zero angle of the "
         "sensor, voltage_limit, current_limit, gains",
-    ]
-    if phase.inductance is not None:
-        lines.insert(3, f"motor.phase_inductance = {phase.inductance:.6g};  // H")
-    return "\n".join(lines) + "\n"
-
-
-_BOARDS: dict[str, Callable[[Phase], str]] = {
-    "odrive": _odrive,
-    "moteus": _moteus,
-    "simplefoc": _simplefoc,
+    ),
 }
+"""Lines of each board's settings; that of an inductance is left out where there is none."""
+
+
+def _board(target: str, phase: Phase) -> str:
+    lines = [
+        line
+        for line in BOARDS[target]
+        if phase.inductance is not None or "{p.inductance" not in line
+    ]
+    return "\n".join(lines).format(p=phase) + "\n"

@@ -24,6 +24,8 @@ Normal: TypeAlias = tuple[float, FloatArray, FloatArray]
 DAMPING = 1e-3
 RAISE, LOWER = 6.0, 8.0
 """What a rejected trial multiplies the damping by, and an accepted one divides it by."""
+SAME = 0.8
+"""Share of what a rejected trial promised, above which another damping makes no other trial."""
 MOST_DAMPING = 1e7
 LEAST_DAMPING = 1e-9
 SINGULAR = 1e-12
@@ -93,7 +95,14 @@ def minimised(
         left = float(np.sum(slope[known] ** 2 / size[known])) / variance
         if left < enough:
             break
+        refused = math.inf
         while mu <= MOST_DAMPING:
+            promised = float(np.sum((slope**2 * (size + 2.0 * mu) / (size + mu) ** 2)[known]))
+            if promised < enough * variance:
+                return Minimum(x, now, left)  # a kink: steps this short are worth no trial
+            if promised > SAME * refused:
+                mu *= RAISE
+                continue  # about the step that was just refused
             step = np.zeros(len(x))
             step[free] = -(along @ np.where(known, slope / (size + mu), 0.0)) / scale
             trial = np.clip(x + step, low, high)
@@ -101,6 +110,7 @@ def minimised(
             if after < now:
                 break
             mu *= RAISE
+            refused = promised
         else:
             break  # a kink: what the linear model still promises is not there
         gained = (now - after) / variance

@@ -17,7 +17,8 @@ from ..errors import DataError, SettingError
 from ..frequency.shaft import Parameter, sampled_model
 from ..machine import VirtualMachine
 from ..models import LinearOE
-from ..plotting import LOOKS, Drawing, html_of
+from ..plotting import LOOKS, Drawing
+from ..tables import html_of
 from .exports import Target, Winding, export
 from .intervals import CONFIDENCE
 from .records import Records, rad_per_second
@@ -351,6 +352,23 @@ _NUMBERS = (
 )
 
 
+def findings(fields: storage.Fields) -> tuple[dict[str, Parameter], dict[str, str], str]:
+    """Of a file: parameters, reasons of those that are not determined, unit of the speed."""
+    stored, undetermined = fields.object("parameters"), fields.object("undetermined")
+    parameters = {}
+    for name in stored.values:
+        one = stored.object(name)
+        one.require_only(["value", "low", "high", "unit"])
+        value, low, high = (one.number(n) for n in ("value", "low", "high"))
+        parameters[name] = Parameter(value, low, high, one.text("unit"))
+    unit = fields.text("speed_unit")
+    try:
+        rad_per_second(unit)
+    except SettingError:
+        raise fields.refuse("speed_unit", "rpm, rev/s, rad/s or deg/s", unit) from None
+    return parameters, {n: undetermined.text(n) for n in undetermined.values}, unit
+
+
 def load_motor(path: str | os.PathLike[str]) -> Motor:
     """Read what `Motor.save` wrote; nothing in it is executed.
 
@@ -375,14 +393,7 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
             "theta",
         ]
     )
-    stored = fields.object("parameters")
-    parameters = {}
-    for name in stored.values:
-        one = stored.object(name)
-        one.require_only(["value", "low", "high", "unit"])
-        value, low, high = (one.number(n) for n in ("value", "low", "high"))
-        parameters[name] = Parameter(value, low, high, one.text("unit"))
-    undetermined = fields.object("undetermined")
+    parameters, undetermined, unit = findings(fields)
     theta = fields.object("theta")
     theta.require_only(NAMES)
     values = [math.inf if n == "limit" and theta.any(n) is None else theta.number(n) for n in NAMES]
@@ -391,14 +402,9 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
     terms = fields.items("terms")
     if not all(isinstance(t, str) for t in terms):
         raise fields.refuse("terms", "names", terms)
-    unit = fields.text("speed_unit")
-    try:
-        rad_per_second(unit)
-    except SettingError:
-        raise fields.refuse("speed_unit", "rpm, rev/s, rad/s or deg/s", unit) from None
     return Motor(
         parameters,
-        {n: undetermined.text(n) for n in undetermined.values},
+        undetermined,
         tuple(terms),
         fields.number("fit_percent"),
         fields.number("rmse"),
@@ -444,12 +450,14 @@ def motor_of(
             more, less = (of({**known, free: at[j] + s * h}) for s in (1.0, -1.0))
             slope[j] = (more - less) / (2.0 * h)
         half = CONFIDENCE * math.sqrt(max(float(slope @ estimate.covariance @ slope), 0.0))
-        vague = half >= VAGUE * abs(value) and name not in _MAY_BE_NOTHING
+        vague = half >= VAGUE * abs(value)
+        if name == "delay":  # that there is none is an answer
+            vague = half >= APART * max(value, records.Ts)
         if not math.isfinite(half) or vague:
             undetermined[name] = (
                 "the record does not part it from the others; add steps to several speeds, in both "
                 "directions"
-                if not half < APART * abs(value)
+                if not half < APART * abs(value) or name == "delay"
                 else f"its interval, {value - half:.3g} to {value + half:.3g} {unit}, is as wide "
                 "as its value"
             )
@@ -488,7 +496,6 @@ def motor_of(
     )
 
 
-_MAY_BE_NOTHING = ("delay",)
 _SIGNED = ("offset", "k_b", "viscous_friction")
 
 _OF_TERM = {

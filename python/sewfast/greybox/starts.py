@@ -56,7 +56,7 @@ def started(task: Task, terms: tuple[str, ...]) -> State:
     best = fitted(alone, best)
     alone.settle_steps(best)
     explained = 1.0 - alone.cost(best) / max(float(np.sum((y - y.mean()) ** 2)), 1e-300)
-    if best.theta[0] < 0.0 or explained < 0.5:
+    if best.value("k_e") + best.value("k_b") < 0.0 or explained < 0.5:
         raise FitError(
             f"expected a speed that follows the command as a motor's does, received one of which "
             f"the free run explains {100 * max(explained, 0):.0f} %; is the output a speed, the "

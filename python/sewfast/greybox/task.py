@@ -13,7 +13,7 @@ from ..arrays import FloatArray
 from ..errors import SettingError
 from .intervals import covariance_of, filtered, inverse, whitener
 from .marquardt import Normal, minimised
-from .records import Records
+from .records import Records, spikes_of
 
 PARAMETERS = tuple(_core.GREYBOX_PARAMETERS)
 PLACE = {name: j for j, name in enumerate(PARAMETERS)}
@@ -31,22 +31,28 @@ TERMS: dict[str, tuple[str, ...]] = {
     "limit": ("limit",),
 }
 """Parts of a motor beside back-EMF and inertia, and the parameters of each."""
-VISCOUS = 0.05
+VISCOUS, VISCOUS_SPREAD = 0.05, 0.15
 """Of k_v: viscous friction that is expected where no current parts it from back-EMF, and how far
 from that it may well be. Nothing in its place would be a certainty: the dead zone sees the current
-that it takes, and dry friction would stand for what is missing."""
+that it takes, and dry friction would stand for what is missing. On 36 machines with 1 to 32 % of
+it, intervals of k_v, k_a and k_s held the truth 102 times of 108; with a spread of .05, 90 times.
+"""
 ITERATIONS = 40
 COARSE, NEAR, FINE = 1.0, 0.1, 0.01
 """Squared distances to the minimum in standard errors: on the way, for tests, for what is printed.
 """
 QUASISTATIC = 0.05
-"""Of the command's standard deviation: that of its accelerating part from which k_a is shown."""
+"""Of the command's standard deviation: that of its accelerating part from which k_a is shown. Of 60
+slow ramps, sines and triangles one interval, at .003, was off by 87 % of the truth; those of .01 to
+.05 were as wide as two thirds of it or more; from .05 on 43 of 46 held it, the others off by .6 %.
+"""
 QUICKEST = 1.0 / 16.0
 """Of a sample: a time constant that no record shows."""
+STARTS = 5
+"""Steps at most by which the pieces' starts are settled: dry friction bends what one step takes for
+straight where the start is on the wrong side of a standstill."""
 WHITE = 12
 """Order of the autoregression that says how what is left over hangs together."""
-CLIPPED = 5.0
-"""Robust standard deviations from which a sample, alone, is left out as a spike."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +99,7 @@ class State:
 NOTHING = np.array(
     [{"ripple": 1.0, "w_s": 1.0, "k_a": 1.0, "limit": math.inf}.get(p, 0.0) for p in PARAMETERS]
 )
-_POSITIVE = {"k_a", "ripple", "w_s", "limit", "R"}
+_POSITIVE = {"k_a", "limit", "R"}
 _NOT_NEGATIVE = {"tau", "delay", "k_s", "k_t", "drop"}
 
 
@@ -175,8 +181,8 @@ class Task:
         by, curvature = np.zeros(len(names)), np.zeros((len(names), len(names)))
         if self.has_current or not math.isfinite(self.k_v):
             return 0.0, by, curvature
-        at, scale = names.index("k_b"), VISCOUS * self.k_v
-        off = (state.value("k_b") - scale) / scale
+        at, scale = names.index("k_b"), VISCOUS_SPREAD * self.k_v
+        off = (state.value("k_b") - VISCOUS * self.k_v) / scale
         by[at], curvature[at, at] = off / scale, 1.0 / scale**2
         return off**2, by, curvature
 
@@ -242,15 +248,12 @@ class Task:
             self.current_filter = whitener(currents, 0)
 
     def leave_out_spikes(self, state: State) -> None:
-        """Samples that stand far off alone, once a fit shows what is far."""
+        """Samples whose error stands far off its neighbours': a fit shows smaller spikes."""
         for p, (y, *_) in zip(self.records.pieces, self.simulated(state, ()), strict=True):
-            off = np.abs(y - p.y)
-            spread = max(1.4826 * float(np.median(off[p.used])), self.records.quantum)
-            far = off > CLIPPED * spread
-            far &= p.used
-            alone = far & ~np.roll(far, 1) & ~np.roll(far, -1)
-            p.used[alone] = False
-            self.spikes += int(alone.sum())
+            used = np.flatnonzero(p.used)
+            far = used[spikes_of((y - p.y)[used], self.records.quantum)]
+            p.used[far] = False
+            self.spikes += len(far)
 
     def settle_starts(self, state: State) -> None:
         """Speeds at the pieces' first samples, by least squares together with what is free.
@@ -258,19 +261,24 @@ class Task:
         A line through the first samples is no more than a first guess where the motor is fast
         beside the sampling, or the record noisy.
         """
-        columns, moving = self._starts(state)
-        if not moving:
-            return
-        J = np.concatenate([self.jacobian(state), columns], axis=1)
-        matrix, slope, n = J.T @ J, J.T @ self.residuals(state), len(state.names())
-        _, by, curvature = self._expected(state)
-        matrix[:n, :n] += curvature
-        slope[:n] += by
-        step = -(inverse(matrix)[0] @ slope)[-len(moving) :]
-        pieces = list(self.records.pieces)
-        for j, by in zip(moving, step, strict=True):
-            pieces[j] = replace(pieces[j], speed=pieces[j].speed + float(by))
-        self.records = replace(self.records, pieces=tuple(pieces))
+        for _ in range(STARTS):
+            columns, moving = self._starts(state)
+            if not moving:
+                return
+            J = np.concatenate([self.jacobian(state), columns], axis=1)
+            matrix, slope, n = J.T @ J, J.T @ self.residuals(state), len(state.names())
+            _, by, curvature = self._expected(state)
+            matrix[:n, :n] += curvature
+            slope[:n] += by
+            step = -(inverse(matrix)[0] @ slope)[-len(moving) :]
+            before, cost = self.records, self.cost(state)
+            pieces = list(before.pieces)
+            for j, change in zip(moving, step, strict=True):
+                pieces[j] = replace(pieces[j], speed=pieces[j].speed + float(change))
+            self.records = replace(before, pieces=tuple(pieces))
+            if not self.cost(state) < cost:
+                self.records = before
+                return
 
     def _starts(self, state: State) -> tuple[FloatArray, list[int]]:
         """Derivatives of the residuals by the starts of pieces that do not begin at a standstill.
@@ -305,6 +313,11 @@ class Task:
         """In which friction may fall off: below, there is hardly a sample to show it."""
         usual = float(np.quantile(np.abs(np.concatenate([p.y for p in self.records.pieces])), 0.9))
         return 0.01 * usual, usual
+
+    def ripples(self) -> tuple[float, float]:
+        """Over which the drop may rise: over all of the command it would be a resistance."""
+        usual = float(np.quantile(np.abs(np.concatenate([p.u for p in self.records.pieces])), 0.9))
+        return 0.001 * usual, 0.1 * usual
 
     def settle_steps(self, state: State) -> None:
         """Integration steps for the time constants that were found."""
@@ -363,6 +376,8 @@ def bounds_of(task: Task, state: State) -> tuple[FloatArray, FloatArray]:
             high[j] = 100.0 * task.records.Ts
         if n == "w_s":
             low[j], high[j] = task.stribeck_speeds()
+        if n == "ripple":
+            low[j], high[j] = task.ripples()
     return low, high
 
 

@@ -15,7 +15,8 @@ from .. import _core
 from ..dataset import Dataset, Experiment, FloatArray, require_dataset
 from ..dataset.experiment import in_effect
 from ..errors import DataError, FitError, SettingError
-from ..plotting import SHADE, html_of, lettered, stacked
+from ..plotting import SHADE, lettered, stacked
+from ..tables import html_of
 
 CHUNK = 4096
 DEPENDENT = 1e-10

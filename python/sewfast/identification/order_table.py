@@ -16,8 +16,9 @@ from ..dataset import Dataset, Experiment, FloatArray, labelled, require_dataset
 from ..dataset.experiment import in_effect
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, SettingError
-from ..plotting import Table, legend, lettered, significant, stacked
+from ..plotting import legend, lettered, stacked
 from ..progress import shown_in_notebooks
+from ..tables import Table, significant
 from .delays import LONGEST, DelayEstimate, LaggedRegression, Solution, delay
 
 Progress: TypeAlias = Callable[[int, int, float], object]

@@ -230,8 +230,8 @@ def _limits(drive: Drive) -> Finding:
     if not limits.are_set:
         return Finding("limits", "ok", "none set in this session: it will not arm before they are")
     volt, speed, acceleration, current = limits.values
-    told = f"{volt:g} V, {speed:g} RPM, {acceleration:g} RPM/s, {current:g} A"
-    return Finding("limits", "ok", told, values=values)
+    detail = f"{volt:g} V, {speed:g} RPM, {acceleration:g} RPM/s, {current:g} A"
+    return Finding("limits", "ok", detail, values=values)
 
 
 # --- the link -------------------------------------------------------------------------------------
@@ -251,11 +251,11 @@ def _echo(drive: Drive, echoes: int) -> dict[int, list[float]]:
 def _round_trip(times: dict[int, list[float]]) -> Finding:
     median, worst = statistics.median(times[SHORT]), max(times[SHORT])
     values = {"median_s": median, "worst_s": worst}
-    told = f"median {_time(median)}, worst {_time(worst)} of {len(times[SHORT])}"
+    detail = f"median {_time(median)}, worst {_time(worst)} of {len(times[SHORT])}"
     if median <= SLOW_TRIP:
-        return Finding("round trip", "ok", told, values=values)
+        return Finding("round trip", "ok", detail, values=values)
     return Finding(
-        "round trip", "warn", told,
+        "round trip", "warn", detail,
         "an adapter's latency timer or a busy computer; runs go on, a loop on the host suffers",
         values,
     )  # fmt: skip
@@ -270,22 +270,24 @@ def _throughput(times: dict[int, list[float]], drive: Drive, port: Port) -> Find
     needed = size / (BATCH * drive.identity.Ts)
     values = {"needed_bytes_per_s": needed, "stated_baud": port.baud}
     if cost < MEASURABLE:
-        told = f"too fast to be measured; {needed:.0f} B/s are needed for counts and command"
-        return Finding("throughput", "ok", told, values=values)
+        detail = f"too fast to be measured; {needed:.0f} B/s are needed for counts and command"
+        return Finding("throughput", "ok", detail, values=values)
     rate = 2 * (LONG - SHORT) / cost
     spare = 1.0 - needed / rate
     values |= {"bytes_per_s": rate, "spare": spare}
-    told = (
+    detail = (
         f"{rate:.0f} B/s each way; counts and command each {drive.identity.Ts * 1e3:g} ms need "
         f"{needed:.0f}"
     )
     remedy = "raise the baud rate of both sides, or stream fewer channels"
     if spare < 0.0:
-        return Finding("throughput", "fail", f"{told}: too slow", remedy, values)
-    told += f": {100 * spare:.0f} % to spare"
+        return Finding("throughput", "fail", f"{detail}: too slow", remedy, values)
+    detail += f": {100 * spare:.0f} % to spare"
     if spare < SPARE:
-        return Finding("throughput", "warn", f"{told}, {100 * SPARE:.0f} % wanted", remedy, values)
-    return Finding("throughput", "ok", told, values=values)
+        return Finding(
+            "throughput", "warn", f"{detail}, {100 * SPARE:.0f} % wanted", remedy, values
+        )
+    return Finding("throughput", "ok", detail, values=values)
 
 
 def _loss(
@@ -302,7 +304,7 @@ def _loss(
     }  # fmt: skip
     bad = to_device + counters["missing"]
     odd = damaged + counters["rejected"] + counters["repeated"] + counters["late"]
-    told = (
+    detail = (
         f"{to_device} of {sent} frames lost on the way there ({damaged} seen damaged), "
         f"{counters['missing']} on the way back ({counters['rejected']} damaged), "
         f"of {echoes} echoes"
@@ -311,7 +313,7 @@ def _loss(
         return Finding("loss", "ok", f"none of {echoes} echoes", values=values)
     verdict: Verdict = "fail" if bad > LOSSY * 2 * echoes else "warn"
     return Finding(
-        "loss", verdict, told,
+        "loss", verdict, detail,
         "shorten or shield the cable, connect the grounds, lower the baud rate, and make sure "
         "that no other program has the port open",
         values,
@@ -350,7 +352,7 @@ def _counters(after: wire.Status, before: wire.Status, drive: Drive) -> Finding:
         "received": after.received, "refused": after.refused, "dropped": after.dropped,
         "late_us": after.late_us, "foreign": after.foreign,
     }  # fmt: skip
-    told = (
+    detail = (
         f"since boot: {after.received} frames received, {after.refused} refused, {after.dropped} "
         f"dropped; latest control period {after.late_us} us late"
     )
@@ -364,7 +366,7 @@ def _counters(after: wire.Status, before: wire.Status, drive: Drive) -> Finding:
             "frames of another host arrived meanwhile: use the line from one program only"
         )
     verdict: Verdict = "warn" if remedies else "ok"
-    return Finding("counters", verdict, told, "; ".join(remedies), values)
+    return Finding("counters", verdict, detail, "; ".join(remedies), values)
 
 
 def _time(seconds: float) -> str:

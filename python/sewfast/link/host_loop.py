@@ -293,13 +293,13 @@ def _message(outcome: Mapping[str, Any]) -> str:
 
 def _jitter(found: Mapping[str, Any], controller: Controller, scheduling: Sequence[str]) -> Jitter:
     memory = found["memory"]
-    told = list(scheduling)
+    scheduled = list(scheduling)
     if memory is not None:
-        told.append("memory locked" if not memory else f"memory not locked ({memory})")
+        scheduled.append("memory locked" if not memory else f"memory not locked ({memory})")
     ticks = found["ticks"]
     return Jitter(
         late=ticks["late"], age=ticks["age"], period=1e6 * controller.Ts,
         missed=found["missed"], blind=int(np.count_nonzero(ticks["fresh"] == 0.0)),
         unsent=found["unsent"], round_trip=found["round_trip"], device_late=found["device_late"],
-        real_time=", ".join(told),
+        real_time=", ".join(scheduled),
     )  # fmt: skip

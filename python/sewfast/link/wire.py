@@ -229,11 +229,11 @@ class Reply:
 
 def identity(body: bytes) -> Identity:
     """The reply to HELLO."""
-    told, session, key = _whole(LinkBodies.greeting(body), body, "HELLO")
+    fields, session, key = _whole(LinkBodies.greeting(body), body, "HELLO")
     (
         name, firmware, version, boot, schema, state, channels, period, capabilities, capacity,
         counts,
-    ) = told  # fmt: skip
+    ) = fields  # fmt: skip
     if not 2 <= channels <= 16 or period == 0 or not (math.isfinite(counts) and counts >= 0):
         raise LinkError(
             name="HELLO",
@@ -248,8 +248,8 @@ def identity(body: bytes) -> Identity:
 
 def channel(body: bytes) -> Channel:
     """The reply to DESCRIBE."""
-    told = _whole(LinkBodies.description(body), body, "DESCRIBE")
-    number, encoding, steps, name, unit = told
+    fields = _whole(LinkBodies.description(body), body, "DESCRIBE")
+    number, encoding, steps, name, unit = fields
     if encoding > 2 or (encoding == 1 and steps == 0):
         raise LinkError(
             name=f"DESCRIBE: channel {number}", expected="encoding 0, 1 (with steps per unit) or 2",
@@ -304,13 +304,13 @@ def uploaded(body: bytes) -> tuple[int, int]:
 T = TypeVar("T")
 
 
-def _whole(told: T | None, body: bytes, name: str) -> T:
-    if told is None:
+def _whole(fields: T | None, body: bytes, name: str) -> T:
+    if fields is None:
         raise LinkError(
             name=name, expected="a whole reply", received=f"{len(body)} bytes",
             remedy="fix the firmware (docs/PROTOCOL.md)",
         )  # fmt: skip
-    return told
+    return fields
 
 
 def _shown(name: str) -> str:

@@ -4,7 +4,7 @@ Read in this order: `format` (the bytes), `writer` (by whole chunks), `filing` (
 it may write), `reader` (which salvages what is damaged).
 """
 
-from .format import Header
+from .header import Header
 from .reader import RecordedFile, read_recording
 from .writer import RecordWriter, export, save_columns
 

@@ -16,7 +16,8 @@ from typing import Any, NamedTuple, TypeAlias
 
 from ..errors import DataError, SettingError, SewfastError, unwritable
 from . import format
-from .format import Assembler, Header, Message, Topic, bearable, opening
+from .format import Assembler, Message, Topic, opening
+from .header import Header, bearable
 
 # --- A file that grows by whole pieces: what is in it is complete, whatever stops the writer ------
 

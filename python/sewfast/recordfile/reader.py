@@ -24,23 +24,19 @@ from .format import (
     FOOTER,
     FOOTER_BODY,
     HEADER,
-    LARGEST_HEADER,
     MAGIC,
     MESSAGE,
     MESSAGE_HEAD,
     MESSAGE_INDEX,
-    MOST_MISSING,
     RECORD,
     SCHEMA,
     Block,
-    Header,
     Message,
     Topic,
-    bearable,
     decode,
     parse,
-    plain,
 )
+from .header import LARGEST_HEADER, MOST_MISSING, Header, bearable, plain
 
 # --- The whole chunks of an MCAP file, and what between them is damaged ---------------------------
 # Nothing is believed that no checksum covers: a chunk is searched for, not reached by the lengths
@@ -320,12 +316,12 @@ def _made(
 
 def _event(event: Mapping[str, Any]) -> str:
     at = "" if event["index"] is None else f" at sample {event['index']}"
-    told = dict(event["detail"])
-    if told.get("reason") == "none":
+    detail = dict(event["detail"])
+    if detail.get("reason") == "none":
         # a device says so of every event; only with a reason does the value mean something
-        told = {key: value for key, value in told.items() if key not in ("reason", "value")}
-    detail = ", ".join(f"{key} {value}" for key, value in told.items())
-    return f"{event['kind']}{at}" + (f": {detail}" if detail else "")
+        detail = {key: value for key, value in detail.items() if key not in ("reason", "value")}
+    text = ", ".join(f"{key} {value}" for key, value in detail.items())
+    return f"{event['kind']}{at}" + (f": {text}" if text else "")
 
 
 def read_recording(path: str | os.PathLike[str]) -> RecordedFile:

@@ -18,7 +18,8 @@ from ..errors import DataError, SettingError
 from ..writers import write_table
 from . import format
 from .filing import Block, End, Event, Filing, Sink, batched, replacing
-from .format import MOST_MISSING, Assembler, Header, Message, Topic, bearable, opening, plain
+from .format import Assembler, Message, Topic, opening
+from .header import MOST_MISSING, Header, bearable, plain
 from .reader import RecordedFile, read_header, read_recording
 
 # --- What is not written over: a recording of a drive, which cannot be had again ------------------
@@ -183,7 +184,7 @@ class RecordWriter:
         self._next = 0
         self._received = 0
         self._closed = False
-        self._told = False
+        self._is_reported = False
 
     def __enter__(self) -> RecordWriter:
         return self
@@ -319,8 +320,8 @@ class RecordWriter:
             # one Ctrl-C must not cost the end of the file, a second one may
             self._filing.finish()
             raise
-        if self._filing.failure is not None and not self._told:
-            self._told = True
+        if self._filing.failure is not None and not self._is_reported:
+            self._is_reported = True
             raise self._filing.refusal(self._filing.failure)
 
     def _require_open(self) -> None:

@@ -9,20 +9,9 @@ from typing import Any
 from .. import storage
 from ..analysis import analysis as analyses
 from ..errors import DataError, ModelFileError
-from ..plotting import (
-    Picture,
-    Table,
-    Trace,
-    loop_drawing,
-    milliseconds,
-    percent,
-    rpm,
-    significant,
-    style,
-    svg,
-    volt,
-)
+from ..plotting import Picture, Trace, loop_drawing, style, svg
 from ..readers import read_table
+from ..tables import Table, milliseconds, percent, rpm, significant, volt
 from .artefacts import drawing
 
 FORMAT = "sewfast.commissioning"

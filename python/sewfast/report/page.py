@@ -10,7 +10,8 @@ from importlib import resources
 from typing import Any
 
 from ..errors import ModelFileError
-from ..plotting import Table, milliseconds, percent, rpm, significant, style
+from ..plotting import style
+from ..tables import Table, milliseconds, percent, rpm, significant
 from . import artefacts as labels
 from . import commissioned, pictures
 from .artefacts import MODELS, PLANTS, REFERENCES, SCORED, Artefacts

@@ -12,22 +12,17 @@ from ..plotting import (
     Drawing,
     Float,
     Picture,
-    Table,
     Trace,
     draw,
     legend,
     loop_drawing,
     loop_panels,
-    milliseconds,
     panels,
-    percent,
-    rpm,
-    significant,
     stacked,
     svg,
     thin,
-    volt,
 )
+from ..tables import Table, milliseconds, percent, rpm, significant, volt
 from . import artefacts as labels
 from .artefacts import Artefacts, Columns, record_of
 

@@ -17,8 +17,9 @@ from ..control.controller import Controller, pid_of
 from ..control.loop import Plants, References
 from ..errors import Interrupted, SettingError
 from ..gains import whole
-from ..plotting import Drawing, Panel, Plotted, Table, lettered, significant
+from ..plotting import Drawing, Panel, Plotted, lettered
 from ..progress import shown_in_notebooks
+from ..tables import Table, significant
 from ..writers import write_table
 from .objective import Constraints, Cost, LoadStep
 from .search import tune
@@ -135,8 +136,8 @@ class ParetoFront(Plotted):
             f"{'*' if i == self.pick else ' '} " + "".join(f"{v:>{width + 2}.4g}" for v in row)
             for i, row in enumerate(self.values)
         ]
-        told = "* the knee: closest to the best of every objective, in shares of its range here"
-        return "\n".join([f"{len(self)} controllers", head, *rows, told])
+        note = "* the knee: closest to the best of every objective, in shares of its range here"
+        return "\n".join([f"{len(self)} controllers", head, *rows, note])
 
 
 @shown_in_notebooks("pareto")

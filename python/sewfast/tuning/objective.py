@@ -213,7 +213,7 @@ class Constraints:
 
     def __str__(self) -> str:
         given = {n: getattr(self, n) for n in LIMITS if getattr(self, n) is not None}
-        return ", ".join(_told(n, v) for n, v in given.items()) or "none"
+        return ", ".join(_described(n, v) for n, v in given.items()) or "none"
 
 
 LIMITS = {"Ms": "", "overshoot": " %", "u": "", "recovery": " ms", "load": ""}
@@ -221,7 +221,7 @@ LIMITS = {"Ms": "", "overshoot": " %", "u": "", "recovery": " ms", "load": ""}
 BY_RIVAL = ("recovery", "load")
 
 
-def _told(name: str, limit: float | Controller) -> str:
+def _described(name: str, limit: float | Controller) -> str:
     if isinstance(limit, Controller):
         return f"{name} no larger than under {limit.notes or 'another controller'}"
     return f"{name} <= {limit:g}{LIMITS[name]}"

@@ -73,7 +73,7 @@ pub fn fit(
     let start = start.and_then(|m| refiner.point(m)).ok_or_else(no_model)?;
     let mut search = Search::new(start);
     search.termination = search.iterate(&refiner, records, max_iterations, monitor);
-    Ok(search.told(&refiner, records))
+    Ok(search.fit(&refiner, records))
 }
 
 /// The iterations' state: where they are and the best free run so far.
@@ -133,7 +133,7 @@ impl Search {
     }
 
     /// The fit, with the best model's own free run and covariance.
-    fn told(self, refiner: &Refiner, records: &[Record]) -> LinearFit {
+    fn fit(self, refiner: &Refiner, records: &[Record]) -> LinearFit {
         let Point { model, runs } = &*self.best;
         let parameters = model.parameters();
         let samples: usize = runs.iter().map(|r| r.measured).sum();

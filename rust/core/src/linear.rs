@@ -143,7 +143,7 @@ impl LinearModel {
 
     /// The outputs for eight regressors, lane by lane; each to the bit what [`Lagged::output`] gives for it.
     #[inline(always)]
-    pub(crate) fn beside<V: F64x8>(&self, phi: &[Lanes]) -> V {
+    pub(crate) fn next_in_lanes<V: F64x8>(&self, phi: &[Lanes]) -> V {
         let (past, inputs) = phi.split_at(self.lags.na);
         let (a, b) = (&self.a[..past.len()], &self.b[..inputs.len()]);
         let mut sum = V::splat(self.offset);

@@ -24,7 +24,7 @@
 mod level;
 mod one;
 mod plain;
-pub(crate) mod tanh;
+mod tanh;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
@@ -97,22 +97,34 @@ pub(crate) trait F64x8: Choice {
     /// `2^n` for numbers that hold the integer `n` in their low bits.
     fn power_of_two(self) -> Self;
 
+    /// `tanh`, as [`tanh::tanh`] computes it.
+    #[inline(always)]
+    fn tanh(self) -> Self {
+        tanh::tanh(self)
+    }
+
+    /// The derivative of `tanh`, as [`tanh::rise`] computes it.
+    #[inline(always)]
+    fn rise(self) -> Self {
+        tanh::rise(self)
+    }
+
     /// `tanh` by the shortest chain, for results that wait for each other.
     #[inline(always)]
     fn tanh_in_chain(self) -> Self {
-        tanh::tanh(self)
+        self.tanh()
     }
 
     /// `tanh` by the fewest operations, for results that do not wait for each other.
     #[inline(always)]
     fn tanh_of_four([a, b, c, d]: [Self; 4]) -> [Self; 4] {
-        [tanh::tanh(a), tanh::tanh(b), tanh::tanh(c), tanh::tanh(d)]
+        [a.tanh(), b.tanh(), c.tanh(), d.tanh()]
     }
 
     /// To the bit what [`tanh_of_four`](Self::tanh_of_four) gives where neighbours are its first two or its last two.
     #[inline(always)]
     fn tanh_as_of_four(self) -> Self {
-        tanh::tanh(self)
+        self.tanh()
     }
 
     /// The step that closes the chain of a free run: `y = 1'(direct + second h)`, `z = rest + weights y`.
@@ -156,13 +168,11 @@ pub(crate) trait Kernel {
 }
 
 /// Does the work on the level in use.
-#[inline]
 pub(crate) fn run<K: Kernel>(kernel: K) -> K::Output {
     run_at(level::in_use(), kernel)
 }
 
 /// Does the work on a level that this processor has.
-#[inline]
 fn run_at<K: Kernel>(level: Level, kernel: K) -> K::Output {
     #[cfg(target_arch = "x86_64")]
     match level {

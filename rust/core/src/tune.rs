@@ -3,8 +3,8 @@
 //! A candidate's cost is taken over every plant and every reference, with encoder, filter and limits in the loop;
 //! [`search`](crate::search) finds the least, or the front of what can be had ([`pareto`]).
 
+mod batch;
 mod bench;
-mod beside;
 mod constraint;
 mod cost;
 mod front;

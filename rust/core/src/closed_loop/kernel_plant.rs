@@ -245,8 +245,8 @@ impl<'a> BatchPlant<'a> {
         push_eight(&mut phi[na..], due);
         let newest = V::load(&phi[0].0);
         let y = match self.known.form {
-            Form::Linear(model) => model.beside::<V>(phi),
-            Form::Network(network) => network.beside::<V, N>(phi, meanwhile),
+            Form::Linear(model) => model.next_in_lanes::<V>(phi),
+            Form::Network(network) => network.next_in_lanes::<V, N>(phi, meanwhile),
         };
         let moved = V::splat(self.known.ts).mul(newest.add(y));
         // a product with 1/2 is as exact as the quotient

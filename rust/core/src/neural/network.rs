@@ -1,12 +1,11 @@
 //! The network in scaled units: weights in groups of eight hidden units, one step and its slopes.
 
-mod beside;
+mod lanes;
 
-pub(crate) use beside::{Meanwhile, Nothing};
+pub(crate) use lanes::{Meanwhile, Nothing};
 
 use crate::gram::Gram;
 use crate::lagged::{Lagged, Lags};
-use crate::simd::tanh::{rise, tanh};
 use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
 use crate::{Error, Result};
 
@@ -186,7 +185,7 @@ impl Network {
     ) -> f64 {
         let mut sum = self.argument::<V>(self.second.len(), newest, phi);
         for (group, second) in self.second.iter().enumerate() {
-            let h = tanh(self.argument::<V>(group, newest, phi));
+            let h = self.argument::<V>(group, newest, phi).tanh();
             sum = sum.add_product(V::load(&second.0), h);
             hidden(group, h);
         }
@@ -218,7 +217,7 @@ impl Network {
     #[inline(always)]
     pub(super) fn unit<V: F64x8>(&self, group: usize, phi: &[f64]) -> (V, V) {
         let argument = self.argument::<V>(group, phi[0], phi);
-        (tanh(argument), rise(argument))
+        (argument.tanh(), argument.rise())
     }
 
     /// The outputs of all hidden units for the regressor `phi`.

@@ -2,7 +2,6 @@
 
 use super::output::OutputFunction;
 use super::shape::Shape;
-use crate::simd::tanh::{rise, tanh};
 use crate::simd::{F64x8, LANES, Lanes};
 
 /// The weights laid out for the kernels: hidden units in groups of eight, missing ones with weights of zero.
@@ -228,7 +227,9 @@ impl Network {
     pub fn rises<V: F64x8>(&self, arguments: &[f64], rises: &mut [Lanes]) {
         let (states, inputs) = arguments.split_at(self.shape.nx);
         for (g, rises) in rises.iter_mut().enumerate() {
-            rise(self.argument::<V>(g, states, inputs)).store(&mut rises.0);
+            self.argument::<V>(g, states, inputs)
+                .rise()
+                .store(&mut rises.0);
         }
     }
 
@@ -244,7 +245,9 @@ impl Network {
         let nx = if NX == 0 { self.shape.nx } else { NX };
         let (states, inputs) = arguments.split_at(nx);
         for (g, hidden) in hidden.iter_mut().enumerate() {
-            tanh(self.argument::<V>(g, states, inputs)).store(&mut hidden.0);
+            self.argument::<V>(g, states, inputs)
+                .tanh()
+                .store(&mut hidden.0);
         }
         for (q, next) in next[..nx].iter_mut().enumerate() {
             *next = self.row::<V>(q, states, inputs, hidden);
@@ -269,7 +272,7 @@ impl Network {
             // The states come last: everything else is ready before they are known.
             let weights = &self.first[g * (width + 1)..][..width + 1];
             *unit = affine::<V, NX>(weights, x, v);
-            *unit = tanh(*unit);
+            *unit = unit.tanh();
             unit.store(&mut hidden[g].0);
         }
         let mut linear = Lanes::ZERO;

@@ -1,14 +1,30 @@
 //! Eight numbers as the baseline of any processor has them.
 
-use super::{Arithmetic, Choice, F64x8, LANES};
+use super::{Arithmetic, Choice, F64x8, LANES, tanh};
 
 #[derive(Clone, Copy)]
 pub(super) struct Plain([f64; LANES]);
 
 impl Plain {
+    /// Written out: `array::from_fn` and `map` are left as calls in kernels as large as these.
+    #[inline(always)]
+    fn each(self, f: impl Fn(usize, f64) -> f64) -> Self {
+        let v = self.0;
+        Self([
+            f(0, v[0]),
+            f(1, v[1]),
+            f(2, v[2]),
+            f(3, v[3]),
+            f(4, v[4]),
+            f(5, v[5]),
+            f(6, v[6]),
+            f(7, v[7]),
+        ])
+    }
+
     #[inline(always)]
     fn with(self, other: Self, f: impl Fn(f64, f64) -> f64) -> Self {
-        Self(std::array::from_fn(|i| f(self.0[i], other.0[i])))
+        self.each(|i, v| f(v, other.0[i]))
     }
 }
 
@@ -42,19 +58,19 @@ impl Arithmetic for Plain {
     fn add_product(self, a: Self, b: Self) -> Self {
         // 64-bit ARM has it in its baseline; elsewhere it would be a call.
         if cfg!(target_arch = "aarch64") {
-            return Self(std::array::from_fn(|i| a.0[i].mul_add(b.0[i], self.0[i])));
+            return self.each(|i, v| a.0[i].mul_add(b.0[i], v));
         }
         self.add(a.mul(b))
     }
 
     #[inline(always)]
     fn at_most(self, limit: f64) -> Self {
-        Self(self.0.map(|v| if v > limit { limit } else { v }))
+        self.each(|_, v| if v > limit { limit } else { v })
     }
 
     #[inline(always)]
     fn at_least(self, limit: f64) -> Self {
-        Self(self.0.map(|v| if v < limit { limit } else { v }))
+        self.each(|_, v| if v < limit { limit } else { v })
     }
 }
 
@@ -78,36 +94,22 @@ impl Choice for Plain {
 
     #[inline(always)]
     fn abs(self) -> Self {
-        Self(self.0.map(f64::abs))
+        self.each(|_, v| v.abs())
     }
 
     #[inline(always)]
     fn floor(self) -> Self {
-        Self(self.0.map(floor))
+        self.each(|_, v| floor(v))
     }
 
     #[inline(always)]
     fn if_less(self, other: Self, yes: Self, no: Self) -> Self {
-        let one = |i: usize| {
-            if self.0[i] < other.0[i] {
-                yes.0[i]
-            } else {
-                no.0[i]
-            }
-        };
-        Self(std::array::from_fn(one))
+        self.each(|i, v| if v < other.0[i] { yes.0[i] } else { no.0[i] })
     }
 
     #[inline(always)]
     fn if_equal(self, other: Self, yes: Self, no: Self) -> Self {
-        let one = |i: usize| {
-            if self.0[i] == other.0[i] {
-                yes.0[i]
-            } else {
-                no.0[i]
-            }
-        };
-        Self(std::array::from_fn(one))
+        self.each(|i, v| if v == other.0[i] { yes.0[i] } else { no.0[i] })
     }
 
     #[inline(always)]
@@ -133,17 +135,34 @@ impl F64x8 for Plain {
     #[inline(always)]
     fn abs_up_to(self, limit: f64) -> Self {
         // A comparison rather than `min`, which would turn NaN into a number.
-        Self(
-            self.0
-                .map(|v| if v.abs() > limit { limit } else { v.abs() }),
-        )
+        self.each(|_, v| if v.abs() > limit { limit } else { v.abs() })
+    }
+
+    #[inline(always)]
+    fn tanh(self) -> Self {
+        tanh_of(&self)
+    }
+
+    #[inline(always)]
+    fn rise(self) -> Self {
+        rise_of(&self)
     }
 
     #[inline(always)]
     fn power_of_two(self) -> Self {
-        let power = |v: f64| f64::from_bits((v.to_bits() << 52).wrapping_add(1023 << 52));
-        Self(self.0.map(power))
+        self.each(|_, v| f64::from_bits((v.to_bits() << 52).wrapping_add(1023 << 52)))
     }
+}
+
+/// Called rather than written out: eight of them in sixteen registers are hundreds of instructions, most of a kernel's.
+#[inline(never)]
+fn tanh_of(x: &Plain) -> Plain {
+    tanh::tanh(*x)
+}
+
+#[inline(never)]
+fn rise_of(x: &Plain) -> Plain {
+    tanh::rise(*x)
 }
 
 /// From here on every number is an integer.

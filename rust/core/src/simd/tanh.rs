@@ -46,7 +46,7 @@ const NEAR: f64 = tanh::NEAR.end;
 ///
 /// A branch that is nearly always foretold keeps what large arguments need off the chain of dependent operations.
 #[inline(always)]
-pub(crate) fn tanh<V: F64x8>(x: V) -> V {
+pub(super) fn tanh<V: F64x8>(x: V) -> V {
     let (size, limit) = (x.abs(), V::splat(NEAR));
     let near = near(x);
     if size.are_less(limit) == u8::MAX {
@@ -147,7 +147,7 @@ const TAYLOR: [f64; 12] = [
 /// `1 - tanh(x)^2 = q (2 - q)` with `q = 1 - |tanh(x)| = 2/(exp(2|x|) + 1)`: near saturation the difference itself has
 /// lost its digits.
 #[inline(always)]
-pub(crate) fn rise<V: F64x8>(x: V) -> V {
+pub(super) fn rise<V: F64x8>(x: V) -> V {
     let two = V::splat(2.0);
     let q = two.div(growth(x).add(two));
     q.mul(two.sub(q))

@@ -2,7 +2,7 @@
 
 use sewfast_control::{AnyController, AnyDesign, Controller};
 
-use super::beside::{Beside, Runs};
+use super::batch::{Batch, Runs};
 use super::cost::{Measure, Terms, Weights};
 use super::{Aggregate, LoadLimit, Task};
 use crate::closed_loop::batch::MOST;
@@ -22,7 +22,7 @@ pub(super) struct Bench<P> {
     measures: Vec<Measure>,
     weights: Weights,
     run: Run,
-    beside: Beside,
+    batch: Batch,
 }
 
 /// Candidates that are best judged at once.
@@ -46,7 +46,7 @@ impl<P: Plant + Clone> Bench<P> {
             measures: task.references.iter().map(measure).collect(),
             weights,
             run: Run::with_capacity(longest),
-            beside: Beside::default(),
+            batch: Batch::default(),
         })
     }
 
@@ -171,7 +171,7 @@ impl<P: Plant + Clone> Bench<P> {
     ) -> Vec<Option<Terms>> {
         let controllers: Vec<&AnyController<f64>> = open.iter().map(|(_, c)| c).collect();
         match self.plants[plant].known() {
-            Some(known) if Beside::take(&controllers) => {
+            Some(known) if Batch::take(&controllers) => {
                 let course = Runs {
                     known,
                     signals: task.signals(run),
@@ -179,7 +179,7 @@ impl<P: Plant + Clone> Bench<P> {
                     load: task.loads.get(run),
                     measure: run.checked_sub(task.loads.len()).map(|r| self.measures[r]),
                 };
-                self.beside.terms(&course, &controllers, monitor)
+                self.batch.terms(&course, &controllers, monitor)
             }
             _ => open
                 .iter_mut()

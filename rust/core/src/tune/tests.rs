@@ -1,6 +1,6 @@
 //! The search on plants with known answers, its determinism, its outcomes.
 
-mod beside;
+mod batch;
 
 use super::*;
 use crate::closed_loop::{LaggedPlant, Varied};

@@ -96,10 +96,10 @@ fn tune<'py>(
     let tuned = watched(py, progress, |monitor| {
         given.with(monitor, |task| tuning::tune(task, method, options, monitor))
     })?;
-    told(py, &given, tuned)
+    result(py, &given, tuned)
 }
 
-fn told<'py>(py: Python<'py>, given: &Given, tuned: Tuned) -> PyResult<Bound<'py, PyDict>> {
+fn result<'py>(py: Python<'py>, given: &Given, tuned: Tuned) -> PyResult<Bound<'py, PyDict>> {
     let dict = named(
         py,
         [

@@ -26,13 +26,13 @@ pub(super) struct Runs<'a> {
 
 /// The memory of runs that go side by side.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Beside {
+pub(super) struct Batch {
     tallies: Vec<Tally>,
     /// The outputs of one lane.
     y: Vec<f64>,
 }
 
-impl Beside {
+impl Batch {
     /// Whether controllers can be run side by side, and had better be: several of one kind.
     pub fn take(controllers: &[&AnyController<f64>]) -> bool {
         let ts = controllers.first().map(|c| c.ts());
@@ -126,15 +126,15 @@ impl Beside {
 }
 
 /// Judges controllers of whatever kind it is given.
-struct OfKind<'a, 'b>(&'a mut Beside, &'a Runs<'b>, &'a Monitor);
+struct OfKind<'a, 'b>(&'a mut Batch, &'a Runs<'b>, &'a Monitor);
 
 impl WithKind for OfKind<'_, '_> {
     type Output = Vec<Option<Terms>>;
 
     fn with<C: InLanes>(self, controllers: &[&C]) -> Self::Output {
-        let Self(beside, runs, monitor) = self;
+        let Self(batch, runs, monitor) = self;
         let some = controllers.chunks(MOST);
-        some.flat_map(|some| beside.some(runs, some, monitor))
+        some.flat_map(|some| batch.some(runs, some, monitor))
             .collect()
     }
 }

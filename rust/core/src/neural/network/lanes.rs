@@ -10,7 +10,7 @@ impl Network {
     ///
     /// `N` is the number of regressors, 0 for any. Some of other work is done after each hidden unit.
     #[inline(always)]
-    pub(crate) fn beside<V: F64x8, const N: usize>(
+    pub(crate) fn next_in_lanes<V: F64x8, const N: usize>(
         &self,
         phi: &[Lanes],
         meanwhile: &mut impl Meanwhile,

@@ -1,0 +1,111 @@
+"""Numbers and tables as a reader likes them: few digits, a unit, a dash where there is none."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+NONE = "–"
+_SPACE = "\N{NO-BREAK SPACE}"
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """`digits` significant digits, plain where that is short, else a power of ten."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    if value == 0.0:
+        return "0"
+    # of the rounded value: 9.996 has two digits before the point
+    size = int(f"{value:.{digits - 1}e}".split("e")[1])
+    if not -3 <= size <= 5:
+        mantissa = value / 10.0**size
+        text = f"{mantissa:.{digits - 1}f} × 10{_raised(size)}"
+        return text.replace("-", "−").replace(" ", _SPACE)
+    return f"{value:,.{max(digits - 1 - size, 0)}f}".replace("-", "−")
+
+
+def rpm(value: float | None) -> str:
+    """A speed or its error [RPM]."""
+    return NONE if value is None else f"{significant(value)}{_SPACE}RPM"
+
+
+def volt(value: float | None) -> str:
+    """A command or its change [V]."""
+    return NONE if value is None else f"{significant(value)}{_SPACE}V"
+
+
+def percent(value: float | None, digits: int = 2) -> str:
+    """A share [%]."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    return f"{value:.{digits}f}{_SPACE}%".replace("-", "−")
+
+
+def milliseconds(value: float | None) -> str:
+    """A duration [ms]."""
+    return NONE if value is None else f"{value:.0f}{_SPACE}ms"
+
+
+def html_of(text: str) -> str:
+    """Lines of text, `name: value` or `name   value`, as a table; the first line is its caption."""
+    caption, *lines = text.splitlines()
+    rows: list[tuple[str, ...]] = []
+    for line in lines:
+        parts = re.split(r": | {2,}", line.strip(), maxsplit=1)
+        rows.append((parts[0], parts[1]) if len(parts) == 2 else ("", parts[0]))
+    return Table(caption, (), tuple(rows), words=True).to_html()
+
+
+def _raised(exponent: int) -> str:
+    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
+# --- Table: rows of text under headers ------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows whose first cell is a header.
+
+    Attributes
+    ----------
+    caption : str
+        What it shows.
+    header : tuple of str
+    rows : tuple of tuple of str
+    best : frozenset of (row, column)
+        Cells to set in bold.
+    words : bool
+        Whether its cells hold words rather than numbers, which begin at the left.
+    """
+
+    caption: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    best: frozenset[tuple[int, int]] = frozenset()
+    words: bool = False
+
+    def to_html(self, notes: Sequence[str] = ()) -> str:
+        """As HTML for a notebook, everything escaped: no style or script of its own.
+
+        Parameters
+        ----------
+        notes : sequence of str
+            Lines below the table.
+        """
+        heads = "".join(f'<th scope="col">{escape(h)}</th>' for h in self.header)
+        head = f"<thead><tr>{heads}</tr></thead>\n" if self.header else ""
+        rows = "\n".join(
+            f'<tr><th scope="row">{escape(row[0])}</th>'
+            + "".join(f"<td>{escape(cell)}</td>" for cell in row[1:])
+            + "</tr>"
+            for row in self.rows
+        )
+        below = "".join(f"\n<div>{escape(note)}</div>" for note in notes)
+        return (
+            f"<table><caption>{escape(self.caption)}</caption>\n{head}"
+            f"<tbody>\n{rows}\n</tbody></table>{below}"
+        )

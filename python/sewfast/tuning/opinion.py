@@ -1,0 +1,161 @@
+"""A second opinion on tuned gains, of a model of another kind.
+
+A search finds what is good on its models, their mistakes included: a network can follow a record to
+94 % and still reward gains that its drive does not. A model of another kind has other mistakes. Its
+own gains are searched for briefly; where either gains cost much more on the other's model than that
+one's own, at least one model is wrong in closed loop, and no simulation says which. Then the gains
+are taken that are the least wrong whichever it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import _core
+from ..control.controller import SampledController
+from ..errors import FitError
+from .task import TuningTask
+
+SHARE = 0.2
+"""Of the evaluations on the models, those that each search of a second opinion has."""
+MUCH = 3.0
+"""Times the cost of a model's own gains there, from which models contradict each other."""
+OWN, OTHER, BOTH = range(3)
+_TITLES = (
+    "those tuned on the models",
+    "those tuned on the rival",
+    "others, tuned on the models and the rival",
+)
+
+Search = Callable[[TuningTask], SampledController]
+"""Searches a task; FitError where nothing keeps to its constraints."""
+
+
+@dataclass(frozen=True, eq=False)
+class SecondOpinion:
+    """Candidates, and what each costs on either kind of plant.
+
+    Attributes
+    ----------
+    candidates : tuple of Controller
+        Tuned on the models, on the rival and, where these contradict each other, on both.
+    costs : array, shape (2, candidates)
+        In the output's unit, on the models and on the rival; inf where a loop diverges.
+    allowed : array of bool, shape (candidates,)
+        Which keep to the constraints on the models, and may be taken.
+    """
+
+    candidates: tuple[SampledController, ...]
+    costs: NDArray[np.float64]
+    allowed: NDArray[np.bool_]
+
+    @property
+    def relative(self) -> NDArray[np.float64]:
+        """The costs over the least on the same plants; shape (2, candidates)."""
+        return _relative(self.costs)
+
+    @property
+    def is_contradiction(self) -> bool:
+        """Whether either gains cost much more on the other's plants than those plants' own."""
+        return max(self._crossed) > MUCH
+
+    @property
+    def _crossed(self) -> tuple[float, float]:
+        """Of the models' gains on the rival, and of the rival's on the models."""
+        relative = _relative(self.costs[:, :BOTH])
+        return float(relative[1, OWN]), float(relative[0, OTHER])
+
+    @property
+    def pick(self) -> int:
+        """The candidate to take: that of the models, or the one that is least wrong on either."""
+        if not self.is_contradiction:
+            return OWN
+        worst = self.relative.max(axis=0)
+        return int(np.argmin(np.where(self.allowed, worst, np.inf)))
+
+    @property
+    def warning(self) -> str | None:
+        """What is to be known of it, and what to do; None where the models agree."""
+        if not self.is_contradiction:
+            return None
+        on_rival, on_models = self._crossed
+        worst = float(self.relative[:, self.pick].max())
+        return (
+            f"the gains tuned on the models cost {_times(on_rival)} the rival's own gains on the "
+            f"rival, and those {_times(on_models)} the models' own gains on the models: one of the "
+            f"two is wrong in closed loop; taken are {_TITLES[self.pick]}, at most "
+            f"{_times(worst)} the least on either. Record a closed loop at the speeds and commands "
+            "of the references and identify again"
+        )
+
+
+def second_opinion(
+    own: SampledController, task: TuningTask, rival: TuningTask, search: Search
+) -> SecondOpinion | None:
+    """Ask a rival about gains that were tuned on a task.
+
+    Parameters
+    ----------
+    own : Controller
+        The gains that were found.
+    task, rival : TuningTask
+        What they were found on; the same on the rival's plants.
+    search : callable
+        A brief search on a task.
+
+    Returns
+    -------
+    SecondOpinion or None
+        None where the rival has no opinion: nothing on it keeps to the constraints.
+    """
+    # from the cheaper of two starts: gains that are good on both are then found to be so
+    starts = [own, task.start]
+    begun = replace(rival, start=starts[int(np.argmin([_judged(rival, c)[0] for c in starts]))])
+    try:
+        other = search(begun)
+    except FitError:
+        return None
+    found = _opinion((own, other), task, rival)
+    if not found.is_contradiction:
+        return found
+    least_wrong = found.candidates[int(np.argmin(found.relative.max(axis=0)))]
+    both = replace(task, plants=[*task.plants, *rival.plants], start=least_wrong)
+    try:
+        third = search(both)
+    except FitError:
+        return found
+    return _opinion((own, other, third), task, rival)
+
+
+def _opinion(
+    candidates: tuple[SampledController, ...], task: TuningTask, rival: TuningTask
+) -> SecondOpinion:
+    on_models = [_judged(task, c) for c in candidates]
+    on_rival = [_judged(rival, c)[0] for c in candidates]
+    # the first was found within the constraints, by the search itself
+    allowed = [i == OWN or violation == 0.0 for i, (_, violation) in enumerate(on_models)]
+    return SecondOpinion(
+        candidates, np.array([[cost for cost, _ in on_models], on_rival]), np.array(allowed)
+    )
+
+
+def _judged(task: TuningTask, controller: SampledController) -> tuple[float, float]:
+    """Cost, and by how much constraints are broken."""
+    return _core.tuning_costs(task.core(), [controller.core()], threads=1)[0]
+
+
+def _relative(costs: NDArray[np.float64]) -> NDArray[np.float64]:
+    least = costs.min(axis=1, keepdims=True)
+    # on plants that nothing is stable on, all are as bad
+    ratios = np.full(costs.shape, np.inf)
+    known = np.isfinite(costs) & (least > 0.0)
+    np.divide(costs, least, out=ratios, where=known)
+    return ratios
+
+
+def _times(ratio: float) -> str:
+    return f"{ratio:.3g} times" if np.isfinite(ratio) else "endlessly more than"
