@@ -9,6 +9,7 @@ from typing import Any
 from .. import _core
 from ..errors import Interrupted, SettingError
 from ..models import ARX, IV, Ensemble, LinearOE, Model, NeuralOE, NeuralSS
+from ..models.base import StructuredModel
 from .linear import arx, iv, linear_model
 from .task import Task, arrays, documented, fit_provenance, wrap
 
@@ -21,10 +22,13 @@ def trained(task: Task, model: Model) -> Model:
     Raises
     ------
     SettingError
-        Where the data have other inputs or another sample time than the model's.
+        For a model of a kind that is not trained further, or an ensemble that holds one; where the
+        data have other inputs or another sample time than the model's.
     FitError
         Where the model's free run on the data leaves the finite numbers.
     """
+    for m in model.members or (model,):
+        _require_trainable(m)
     _require_match(task, model)
     began = time.perf_counter()
     if isinstance(model, Ensemble):
@@ -42,6 +46,21 @@ def trained(task: Task, model: Model) -> Model:
     if isinstance(model, NeuralSS):
         return _state_space(task, model, began)
     return _lagged(task, model, began)
+
+
+def _require_trainable(model: Model) -> None:
+    """A fit that can begin at this model."""
+    if isinstance(model, StructuredModel):
+        raise SettingError(
+            name="model", expected="a model that can be trained further",
+            received=f"the {model.title} model, whose fit begins anew",
+            remedy=f"identify it anew (model={model.kind!r}) on all the data",
+        )  # fmt: skip
+    if isinstance(model, NeuralOE) and not model.core.settings["bypass"]:
+        raise SettingError(
+            "model: the paper's network has no linear part and is not trained further; identify "
+            "it anew (preset='paper')"
+        )
 
 
 def _require_match(task: Task, model: Model) -> None:
@@ -90,11 +109,6 @@ def _state_space(task: Task, model: NeuralSS, began: float) -> Model:
 
 def _lagged(task: Task, model: Model, began: float) -> Model:
     s = model.core.settings
-    if not s["bypass"]:
-        raise SettingError(
-            "model: the paper's network has no linear part and is not trained further; identify "
-            "it anew (preset='paper')"
-        )
     decay = _decay(model)
     theta = model.core.theta
     fit = _core.fit_neural_oe(
