@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import sewfast
 from plants import bent_data, linear_data
 from sewfast import Dataset, Ensemble, LinearOE, NeuralOE, NeuralSS, _core, identify, validate
-from sewfast.errors import FitError, Interrupted, SettingError
+from sewfast.errors import DataError, FitError, Interrupted, SettingError
 from sewfast.identification.effort import Clock, Pool, Stopped
 from sewfast.identification.folds import (
     FOLDS,
@@ -381,6 +381,33 @@ def test_a_model_is_trained_further_in_its_own_structure() -> None:
         identify(data, model=early, nx=2)
     with pytest.raises(SettingError, match="expected data like the model's"):
         identify(linear_data(inputs=2), model=early)
+
+
+@pytest.mark.parametrize(("input_units", "output_unit"), [("mV", "RPM"), ("V", "deg")])
+@pytest.mark.parametrize("kind", ["arx", "oe", "neural_oe"])
+def test_a_model_is_not_trained_further_on_data_in_other_units(
+    kind: Any, input_units: str, output_unit: str
+) -> None:
+    data = bent_data(400)
+    assert (data.input_units, data.output_unit) == (("V",), "RPM")
+    model = identify(data, model=kind, starts=1, iterations=2)
+    e = data.experiments[0]
+    other = Dataset.from_arrays(
+        e.u, e.y, data.Ts, input_units=[input_units], output_unit=output_unit
+    )
+    with pytest.raises(DataError, match=r"the unit '(V|RPM)'"):
+        identify(other, model=model)
+
+
+def test_a_network_that_runs_away_on_other_data_asks_for_what_can_be_given() -> None:
+    data = bent_data(400)
+    model = identify(data, model="neural_ss", nx=1, nk=1, hidden=4, starts=1, iterations=5)
+    e = data.experiments[0]
+    other = Dataset.from_arrays(1e9 * e.u, 1e9 * e.y, data.Ts)
+    with pytest.raises(FitError) as refused:
+        identify(other, model=model)
+    assert refused.value.expected == "data on which the model's free run is finite"
+    assert "identify anew" in str(refused.value.remedy)
 
 
 @pytest.mark.parametrize("reached", [0, 2])

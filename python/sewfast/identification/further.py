@@ -7,7 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 from .. import _core
-from ..errors import Interrupted, SettingError
+from ..dataset import require_same_units
+from ..errors import FitError, Interrupted, SettingError
 from ..models import ARX, IV, Ensemble, LinearOE, Model, NeuralOE, NeuralSS
 from ..models.base import StructuredModel
 from .linear import arx, iv, linear_model
@@ -24,6 +25,8 @@ def trained(task: Task, model: Model) -> Model:
     SettingError
         For a model of a kind that is not trained further, or an ensemble that holds one; where the
         data have other inputs or another sample time than the model's.
+    DataError
+        Where the data have other units.
     FitError
         Where the model's free run on the data leaves the finite numbers.
     Interrupted
@@ -87,9 +90,14 @@ def _single(task: Task, model: Model) -> Model:
         return arx(own) if isinstance(model, ARX) else iv(own)
     if isinstance(model, LinearOE):
         return _linear(task, model, began)
-    if isinstance(model, NeuralSS):
-        return _state_space(task, model, began)
-    return _lagged(task, model, began)
+    try:
+        return (_state_space if isinstance(model, NeuralSS) else _lagged)(task, model, began)
+    except FitError as e:
+        # the core asks for other starts and sizes, which a model that is given does not have
+        raise FitError(
+            name=f"{task.data.source}", expected="data on which the model's free run is finite",
+            received="none", remedy="check scale and signs of the data, or identify anew",
+        ) from e  # fmt: skip
 
 
 def _require_trainable(model: Model) -> None:
@@ -114,6 +122,7 @@ def _require_match(task: Task, model: Model) -> None:
             f"model: expected data like the model's, {len(model.input_names)} input(s) at "
             f"{model.Ts:g} s, received {data.n_inputs} at {data.Ts:g} s; identify anew"
         )
+    require_same_units(model, data)
 
 
 def _linear(task: Task, model: LinearOE, began: float) -> Model:
