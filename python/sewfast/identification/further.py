@@ -91,7 +91,9 @@ def _single(task: Task, model: Model) -> Model:
     if isinstance(model, LinearOE):
         return _linear(task, model, began)
     try:
-        return (_state_space if isinstance(model, NeuralSS) else _lagged)(task, model, began)
+        if isinstance(model, NeuralSS):
+            return _state_space(task, model, began)
+        return _lagged(task, model, began)
     except FitError as e:
         # the core asks for other starts and sizes, which a model that is given does not have
         raise FitError(
