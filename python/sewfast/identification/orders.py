@@ -92,7 +92,12 @@ class LinearTable:
         return 1 if self.task.nk is None else self.task.nk
 
     def search(self, until: float | None) -> None:
-        """Orders upwards until two have not gained, then delays of the best small order."""
+        """Orders upwards until two have not gained, then delays of the best small order.
+
+        A long dead time is looked at first: large orders feign one, and take most of the time.
+        """
+        if self.task.nk is None:
+            self.add(self._late(), until)
         best, idle = math.inf, 0
         orders = iter(ORDERS)
         while idle < PATIENCE:
@@ -111,8 +116,6 @@ class LinearTable:
             # what looked like an order may have been a delay, so one order less is asked as well
             small = min(self.choice.order, 3)
             self.add(((o, nk) for nk in DELAYS for o in (small - 1, small) if o > 0), until)
-            if until is None or not self.pool.clock.over():
-                self.add(self._late(), until)
 
     def _late(self) -> list[tuple[int, int]]:
         """Small orders with the estimated dead time, where it is longer than `DELAYS`.
