@@ -320,7 +320,7 @@ class Choice(Finals):
                 "be closed around the model; for a controller identify with nk = 1"
             )
         extra: Provenance = {"notes": notes} if notes else {}
-        extra["verdict"] = verdict(self, error)
+        extra["verdict"] = verdict(self, model, error)
         return replace(with_provenance(model, extra), alternatives=tuple(alternatives))
 
     def _choice(self, kind: str, error: float) -> Provenance:
