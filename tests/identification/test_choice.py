@@ -421,6 +421,23 @@ def test_a_budget_too_short_gives_the_kind_or_says_so(kind: Any, budget: float) 
         assert model.training.get("iterations") != 0 or kind not in ("neural_oe", "neural_ss")
 
 
+@pytest.mark.parametrize(
+    ("samples", "settings"),
+    [
+        (500, {"nx": 8, "time_budget": 5.0}),
+        (500, {"hidden": 40, "time_budget": 5.0}),
+        (250, {"nx": 6, "hidden": 16, "time_budget": 5.0}),
+        (250, {"nx": 6, "hidden": 16}),
+    ],
+)
+def test_where_no_network_of_that_size_can_be_trained_the_linear_model_says_so(
+    samples: int, settings: dict[str, Any]
+) -> None:
+    model = identify(bent_data(samples, noise=0.02), **settings)
+    assert model.kind == "oe"
+    assert "too few samples" in model.training["choice"]["reason"]
+
+
 def test_the_command_line_writes_alternatives_and_trains_further(tmp_path: Any) -> None:
     from cli import refused
     from cli import sewfast as run

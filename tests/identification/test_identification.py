@@ -7,12 +7,14 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from plants import OFFSET, A, B, bent_data, linear_data
+from sewfast import _core
 from sewfast.dataset import Dataset
 from sewfast.errors import DataError, Interrupted, SettingError
 from sewfast.identification import identify, seeded
@@ -266,6 +268,31 @@ def test_an_interruption_hands_over_the_best_model(kind: Any) -> None:
         best = caught.value.best
         assert np.isfinite(best.simulate(bent_data())[0]).all()
         assert kind in ("auto", (best.members or (best,))[0].kind)
+
+
+@pytest.mark.parametrize("stopped", [2, 3])
+def test_an_interruption_of_the_fits_that_judge_the_start_is_not_lost(
+    monkeypatch: pytest.MonkeyPatch, stopped: int
+) -> None:
+    fitted, calls = _core.fit_oe, 0
+
+    def fit(*args: Any, **options: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        found = fitted(*args, **options)
+        # what the core gives back after a Ctrl-C: when it comes cannot be timed
+        return (
+            SimpleNamespace(model=found.model, termination="interrupted")
+            if calls == stopped
+            else found
+        )
+
+    monkeypatch.setattr(_core, "fit_oe", fit)
+    with pytest.raises(Interrupted) as caught:
+        identify(bent_data(600, noise=0.02), model="neural_oe", **QUICK)
+    assert calls == stopped
+    assert caught.value.best.kind == "oe"
+    assert caught.value.best.training["termination"] == "interrupted"
 
 
 # --- bad input --------------------------------------------------------------------------------

@@ -33,6 +33,7 @@ from .folds import LEAST_HELD_OUT, SHARE, compared, errors_of, folds, free_runs
 from .linear import linear_model
 from .orders import LEAST_GAIN, LinearCandidate, LinearTable
 from .search import Search
+from .short import short
 from .task import Provenance, Task, arrays, documented, finite, with_provenance, wrap
 from .training import Network, Request, Structure, train
 from .trials import (
@@ -353,15 +354,14 @@ class Choice(Finals):
 
 
 def _without_held_out(task: Task, began: float, wants_network: bool) -> Model:
-    """A record too short to choose by, or still until its end: second order, and no network."""
+    """A record too short to choose by, or still until its end: no network."""
     reason = (
         f"the record is too short to hold out {100 * SHARE:.0f} % of every experiment, at least "
         f"{LEAST_HELD_OUT} samples, to compare on; or nothing moves before"
     )
     if wants_network:
         raise FitError(f"{task.data.source}: {reason}; record longer, or give validation data")
-    fit = _core.fit_oe(arrays(task.data), **task.fit_options())
-    return linear_model(task, fit, began, {"choice": {"chosen": "oe", "reason": reason}})
+    return short(task, began, reason)
 
 
 def cost_of(model: Model, data: Dataset) -> float:

@@ -98,7 +98,7 @@ def split(data: Dataset, skipped: float = 0.0) -> Split | None:
             fitted.append(e.cut(0, stop))
             continue
         fitted.append(e.cut(0, at))
-        held.append(_with_run_up(e, at, stop))
+        held.append(with_run_up(e, at, stop))
         parts.append(e.cut(at, stop))
     if not held:
         fitted, held = _whole(data, skipped)
@@ -143,7 +143,7 @@ def _measured(y: FloatArray) -> int:
     return int(np.isfinite(y).sum())
 
 
-def _with_run_up(e: Experiment, at: int, stop: int) -> Experiment:
+def with_run_up(e: Experiment, at: int, stop: int) -> Experiment:
     begin = max(0, at - RUN_UP)
     y = e.y[begin:stop].copy()
     y[e.cut(begin, stop).initial_samples(INIT) : at - begin] = np.nan

@@ -243,9 +243,13 @@ class Trials:
 
     def is_affordable(self, s: Structure, fold: int = 0) -> bool:
         """Whether the fold has samples enough for its parameters."""
-        wanted = s.parameters(self.inputs) * SAMPLES_PER_PARAMETER
+        parameters, fitted = s.parameters(self.inputs), self.trials[fold].fitted
+        known = sum(len(e) - e.unmeasured for e in fitted.experiments)
+        # without a surplus over parameters and initial states the core refuses to train it
+        if known <= parameters + s.nx * len(fitted.experiments):
+            return False
         is_given = None not in (self.task.nx, self.task.hidden)
-        return is_given or wanted <= len(self.trials[fold].fitted)
+        return is_given or parameters * SAMPLES_PER_PARAMETER <= len(fitted)
 
     def tried(
         self,
@@ -322,7 +326,8 @@ class Trials:
             until=self.until,
             share=share,
         )
-        if not self._is_late:
+        # nothing to train says nothing of the machine's speed
+        if wanted and not self._is_late:
             self._calibrate(time.perf_counter() - began, wanted)
         return self.guarded(found)
 
