@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 import sewfast
 from plants import bent_data, linear_data
-from sewfast import Dataset, LinearOE, NeuralOE, NeuralSS, _core, identify, validate
-from sewfast.errors import FitError, SettingError
+from sewfast import Dataset, Ensemble, LinearOE, NeuralOE, NeuralSS, _core, identify, validate
+from sewfast.errors import DataError, FitError, Interrupted, SettingError
 from sewfast.identification.effort import Clock, Pool, Stopped
 from sewfast.identification.folds import (
     FOLDS,
@@ -381,6 +381,74 @@ def test_a_model_is_trained_further_in_its_own_structure() -> None:
         identify(data, model=early, nx=2)
     with pytest.raises(SettingError, match="expected data like the model's"):
         identify(linear_data(inputs=2), model=early)
+
+
+@pytest.mark.parametrize(("input_units", "output_unit"), [("mV", "RPM"), ("V", "deg")])
+@pytest.mark.parametrize("kind", ["arx", "oe", "neural_oe"])
+def test_a_model_is_not_trained_further_on_data_in_other_units(
+    kind: Any, input_units: str, output_unit: str
+) -> None:
+    data = bent_data(400)
+    assert (data.input_units, data.output_unit) == (("V",), "RPM")
+    model = identify(data, model=kind, starts=1, iterations=2)
+    e = data.experiments[0]
+    other = Dataset.from_arrays(
+        e.u, e.y, data.Ts, input_units=[input_units], output_unit=output_unit
+    )
+    with pytest.raises(DataError, match=r"the unit '(V|RPM)'"):
+        identify(other, model=model)
+
+
+def test_a_network_that_runs_away_on_other_data_asks_for_what_can_be_given() -> None:
+    data = bent_data(400)
+    model = identify(data, model="neural_ss", nx=1, nk=1, hidden=4, starts=1, iterations=5)
+    e = data.experiments[0]
+    other = Dataset.from_arrays(1e9 * e.u, 1e9 * e.y, data.Ts)
+    with pytest.raises(FitError) as refused:
+        identify(other, model=model)
+    assert refused.value.expected == "data on which the model's free run is finite"
+    assert "identify anew" in str(refused.value.remedy)
+
+
+@pytest.mark.parametrize("reached", [0, 2])
+def test_an_ensemble_whose_further_training_is_stopped_keeps_its_members(
+    monkeypatch: pytest.MonkeyPatch, reached: int
+) -> None:
+    data = bent_data(600, noise=0.02)
+    early = [
+        identify(data, model="neural_ss", nx=1, nk=1, hidden=4, starts=1, iterations=2, seed=i)
+        for i in range(3)
+    ]
+    given = Ensemble.of([m.members[0] if m.members else m for m in early])
+    fitted, calls = _core.fit_neural_ss, 0
+
+    def fit(*args: Any, **options: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls > reached:
+            raise KeyboardInterrupt
+        return fitted(*args, **options)
+
+    monkeypatch.setattr(_core, "fit_neural_ss", fit)
+    with pytest.raises(Interrupted) as caught:
+        identify(data, model=given)
+    best = caught.value.best
+    assert len(best.members) == len(given.members)
+    assert [a == b for a, b in zip(best.members, given.members, strict=True)] == [
+        i >= reached for i in range(3)
+    ]
+    assert ("2 of 3 members" if reached else "as given") in best.training["notes"][-1]
+
+
+@pytest.mark.parametrize("kind", ["oe", "neural_oe", "neural_ss"])
+def test_a_budget_too_short_for_a_step_further_gives_the_model_back(kind: Any) -> None:
+    data = bent_data(600, noise=0.02)
+    small = {"nx": 1, "hidden": 4} if kind == "neural_ss" else {}
+    given = identify(data, model=kind, starts=1, iterations=2, **small)
+    found = identify(bent_data(20_000, seed=9), model=given, time_budget=1e-6)
+    assert found.parameters() == given.parameters()
+    assert found.training["region"] == given.training["region"]
+    assert any("as given" in note for note in found.training["notes"])
 
 
 # --- time budget ----------------------------------------------------------------------------------

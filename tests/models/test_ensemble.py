@@ -33,6 +33,15 @@ def three(combine: Any = "median") -> Ensemble:
     return Ensemble.of([lag(1.0), lag(2.0, 0.7), lag(9.0)], combine)
 
 
+def test_a_member_is_linearised_in_the_middle_of_the_ensembles_inputs(tmp_path: Path) -> None:
+    model = Ensemble.of([lag(1.0), lag(2.0, 0.7)], training={"input_range": [[1.0, 3.0]]})
+    model.save(tmp_path / "m.json")
+    for ensemble in (model, load_model(tmp_path / "m.json")):
+        assert ensemble.members[1].linearise().u.tolist() == [2.0]
+    # a file keeps it once
+    assert [m["training"] for m in model.parameters()["members"]] == [{}, {}]
+
+
 # --- a model like any other -------------------------------------------------------------------
 
 

@@ -170,3 +170,15 @@ def test_the_core_refuses_what_is_no_model() -> None:
     ):  # fmt: skip
         with pytest.raises(SettingError, match=words):
             _core.HammersteinWiener(**{**settings, **change})
+
+
+def test_it_is_not_trained_further_alone_or_in_an_ensemble() -> None:
+    data = _plant(400, 1, before=_band)
+    model = sewfast.identify(data, model="hammerstein_wiener", hidden=2, iterations=5)
+    linear = sewfast.identify(data, model="oe")
+    for given in (model, sewfast.Ensemble.of([linear, model])):
+        with pytest.raises(SettingError) as refused:
+            sewfast.identify(data, model=given)
+        assert refused.value.name == "model"
+        assert "Hammerstein-Wiener" in str(refused.value.received)
+        assert "identify it anew" in str(refused.value.remedy)

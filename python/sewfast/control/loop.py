@@ -471,20 +471,7 @@ def each_plant(on: Plants | None) -> list[Plant]:
                 name="on", expected="models or virtual machines", received=type(plant).__name__,
                 remedy="load a model with load_model",
             )  # fmt: skip
-    return [m for plant in given for m in _singles(plant)]
-
-
-def _singles(plant: Plant) -> list[Plant]:
-    """Members know what their ensemble stores of the training data, region and ranges."""
-    if not isinstance(plant, Ensemble):
-        return [plant]
-    return [_informed(m, plant) for m in plant.members]
-
-
-def _informed(member: Model, ensemble: Ensemble) -> Model:
-    shared = ("input_range", "output_range", "region")
-    known = {k: ensemble.training[k] for k in shared if k in ensemble.training}
-    return replace(member, training={**known, **member.training})
+    return [m for p in given for m in (p.members if isinstance(p, Ensemble) else (p,))]
 
 
 def titles(plants: Sequence[Plant]) -> list[str]:

@@ -198,6 +198,9 @@ def identify(
     _require_data(task, kind)
     if isinstance(model, Model):
         found = _within_budget(lambda t: further.trained(t, model), task)
+        if found.core is model.core:
+            # stopped before its first step: the evidence that it has is that of its own data
+            return found
     else:
         found = _within_budget(_KINDS[kind], task)
     try:

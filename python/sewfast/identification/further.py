@@ -7,10 +7,12 @@ from dataclasses import replace
 from typing import Any
 
 from .. import _core
-from ..errors import Interrupted, SettingError
+from ..dataset import require_same_units
+from ..errors import FitError, Interrupted, SettingError
 from ..models import ARX, IV, Ensemble, LinearOE, Model, NeuralOE, NeuralSS
+from ..models.base import StructuredModel
 from .linear import arx, iv, linear_model
-from .task import Task, arrays, documented, fit_provenance, wrap
+from .task import Task, arrays, documented, fit_provenance, with_provenance, wrap
 
 STARTING_SCALE = 1.0
 
@@ -21,17 +23,66 @@ def trained(task: Task, model: Model) -> Model:
     Raises
     ------
     SettingError
-        Where the data have other inputs or another sample time than the model's.
+        For a model of a kind that is not trained further, or an ensemble that holds one; where the
+        data have other inputs or another sample time than the model's.
+    DataError
+        Where the data have other units.
     FitError
         Where the model's free run on the data leaves the finite numbers.
+    Interrupted
+        On Ctrl-C and at the end of a time budget. `best` is as good as the model at least: the
+        model itself where no step was made, an ensemble with the members that were reached.
     """
+    for m in model.members or (model,):
+        _require_trainable(m)
     _require_match(task, model)
-    began = time.perf_counter()
     if isinstance(model, Ensemble):
-        # the task's budget holds for all members together
-        together = Ensemble.of([trained(task, m) for m in model.members], model.combine)
-        known = {"initial_state": "estimated", "seed": task.seed, "trained_further": True}
-        return documented(together, task, began, known)
+        return _members(task, model)
+    try:
+        return _single(task, model)
+    except KeyboardInterrupt as e:
+        best = _best(model, e)
+        raise Interrupted(_as_given(model) if best is model else best) from None
+
+
+def _members(task: Task, model: Ensemble) -> Model:
+    """Every member in its turn: the task's budget holds for all of them together."""
+    began = time.perf_counter()
+    members, known = list(model.members), {"initial_state": "estimated", "seed": task.seed}
+    known |= {"trained_further": True}
+    for i, member in enumerate(model.members):
+        try:
+            members[i] = _single(task, member)
+        except KeyboardInterrupt as e:
+            members[i] = _best(member, e)
+            if members[0] is model.members[0]:
+                raise Interrupted(_as_given(model)) from None
+            known["termination"] = "interrupted"
+            known["notes"] = [
+                f"{i} of {len(members)} members were trained to the end: those after them are as "
+                "they were given"
+            ]
+            raise Interrupted(
+                documented(Ensemble.of(members, model.combine), task, began, known)
+            ) from None
+    return documented(Ensemble.of(members, model.combine), task, began, known)
+
+
+def _best(model: Model, stopped: KeyboardInterrupt) -> Model:
+    """What there is when the training of a single model has been stopped."""
+    best: Model | None = getattr(stopped, "best", None)
+    # without a step, and of an estimate that is solved anew, nothing is better than the model
+    is_further = best is not None and best.training.get("iterations") and best.kind != "iv"
+    return best if best is not None and is_further else model
+
+
+def _as_given(model: Model) -> Model:
+    notes = [*model.training.get("notes", []), "no step further was made: the model is as given"]
+    return with_provenance(model, {"notes": notes})
+
+
+def _single(task: Task, model: Model) -> Model:
+    began = time.perf_counter()
     if isinstance(model, (ARX, IV)):
         # both are solved anew: what they begin with does not matter
         o = model.orders
@@ -39,9 +90,31 @@ def trained(task: Task, model: Model) -> Model:
         return arx(own) if isinstance(model, ARX) else iv(own)
     if isinstance(model, LinearOE):
         return _linear(task, model, began)
-    if isinstance(model, NeuralSS):
-        return _state_space(task, model, began)
-    return _lagged(task, model, began)
+    try:
+        if isinstance(model, NeuralSS):
+            return _state_space(task, model, began)
+        return _lagged(task, model, began)
+    except FitError as e:
+        # the core asks for other starts and sizes, which a model that is given does not have
+        raise FitError(
+            name=f"{task.data.source}", expected="data on which the model's free run is finite",
+            received="none", remedy="check scale and signs of the data, or identify anew",
+        ) from e  # fmt: skip
+
+
+def _require_trainable(model: Model) -> None:
+    """A fit that can begin at this model."""
+    if isinstance(model, StructuredModel):
+        raise SettingError(
+            name="model", expected="a model that can be trained further",
+            received=f"the {model.title} model, whose fit begins anew",
+            remedy=f"identify it anew (model={model.kind!r}) on all the data",
+        )  # fmt: skip
+    if isinstance(model, NeuralOE) and not model.core.settings["bypass"]:
+        raise SettingError(
+            "model: the paper's network has no linear part and is not trained further; identify "
+            "it anew (preset='paper')"
+        )
 
 
 def _require_match(task: Task, model: Model) -> None:
@@ -51,6 +124,7 @@ def _require_match(task: Task, model: Model) -> None:
             f"model: expected data like the model's, {len(model.input_names)} input(s) at "
             f"{model.Ts:g} s, received {data.n_inputs} at {data.Ts:g} s; identify anew"
         )
+    require_same_units(model, data)
 
 
 def _linear(task: Task, model: LinearOE, began: float) -> Model:
@@ -90,11 +164,6 @@ def _state_space(task: Task, model: NeuralSS, began: float) -> Model:
 
 def _lagged(task: Task, model: Model, began: float) -> Model:
     s = model.core.settings
-    if not s["bypass"]:
-        raise SettingError(
-            "model: the paper's network has no linear part and is not trained further; identify "
-            "it anew (preset='paper')"
-        )
     decay = _decay(model)
     theta = model.core.theta
     fit = _core.fit_neural_oe(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeAlias, cast
 
 import numpy as np
@@ -174,6 +175,8 @@ COMBINATIONS: tuple[Combine, ...] = ("median", "mean")
 MOST_MEMBERS = 1000
 LEAST_SHARE = 0.5
 """Members that must stand an input for the ensemble to answer at all."""
+_OF_ALL_MEMBERS = ("input_range", "output_range", "region")
+"""What a file keeps once for all members."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,10 +298,14 @@ class Ensemble(Model):
         names = (first.input_names, first.output_name, first.input_units, first.output_unit)
         return cls(core, first.Ts, *names, first.counts, training or {})
 
-    @property
+    @cached_property
     def members(self) -> tuple[Model, ...]:
-        """The models it consists of."""
-        return self.core.models
+        """The models it consists of; they know what it stores of the training data."""
+        known = {k: self.training[k] for k in _OF_ALL_MEMBERS if k in self.training}
+        return tuple(
+            m if known.keys() <= m.training.keys() else replace(m, training={**known, **m.training})
+            for m in self.core.models
+        )
 
     @property
     def combine(self) -> Combine:
@@ -341,7 +348,7 @@ class Ensemble(Model):
     def parameters(self) -> dict[str, Any]:
         members = [
             {"kind": m.kind, "parameters": m.parameters(), "training": dict(m.training)}
-            for m in self.members
+            for m in self.core.models
         ]
         return {"combine": self.combine, "members": members}
 
