@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,7 +31,9 @@ from sewfast.evidence.correlations import chi2_quantile, chi2_tail, normal_quant
 from sewfast.evidence.operating import linearise
 from sewfast.evidence.parameters import Criteria
 from sewfast.evidence.residuals import Noise, fast_length
+from sewfast.models import NeuralOE
 from sewfast.models.base import Ensemble
+from sewfast.storage import Fields
 
 
 @cache
@@ -41,6 +44,27 @@ def linear_model() -> Model:
 @cache
 def network() -> Model:
     return sewfast.identify(bent_data(2000, noise=0.05), model="neural-oe", starts=2)
+
+
+@pytest.mark.parametrize("weight", [1e-90, 1e-160, 1e-300])
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_hidden_unit_that_is_next_to_nothing_leaves_evidence_in_numbers(
+    weight: float, tmp_path: Path
+) -> None:
+    data = bent_data(400, noise=0.05)
+    trained = sewfast.identify(data, model="neural_oe", hidden=3, starts=1, iterations=10)
+    theta = trained.theta.copy()
+    theta[trained.parameter_names.index("w2[0]")] = weight
+    model = NeuralOE.core_from(Fields("model", {**trained.parameters(), "theta": theta.tolist()}))
+    model = replace(trained, core=model, training={"input_range": [[-5.0, 5.0]]})
+    kept = remembered(model, data)
+    kept.save(tmp_path / "m.json")
+    assert np.isfinite(kept.bands(data).upper[0]).all()
+    # what the unit does to its own weights is nothing: five directions
+    known = estimate(model, Residuals.of(model, data, horizon="free run"))
+    assert known is not None
+    assert np.isfinite(known.covariance).all()
+    assert known.undetermined >= 5
 
 
 def test_chi_square_tail_of_even_freedom_is_a_poisson_sum() -> None:

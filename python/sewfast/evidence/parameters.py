@@ -67,6 +67,8 @@ class Criteria:
 
 DETERMINED = 1e-10
 """Share of the largest information from which a direction counts; double precision ends there."""
+NOTHING = 1e-60
+"""Length of a sensitivity's column, as a share of the longest, below which it says nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,9 +129,8 @@ class Information:
 
     @property
     def scale(self) -> FloatArray:
-        """Square roots of the diagonal, 1 where it is 0."""
-        diagonal = np.sqrt(np.diag(self.gram) + self.penalty)
-        return np.where(diagonal > 0.0, diagonal, 1.0)
+        """Square roots of the diagonal, the largest one where it is nothing."""
+        return _unit_scale(np.diag(self.gram) + self.penalty)
 
     def inverse(self, less: FloatArray | None = None, determined: float = DETERMINED) -> FloatArray:
         """(gram - less + penalty)^+ over the determined directions."""
@@ -145,14 +146,24 @@ class Information:
 
     def conditioning(self) -> tuple[float, int]:
         """Condition number of the sensitivity, and the directions without information."""
-        diagonal = np.sqrt(np.diag(self.gram))
-        scale = np.where(diagonal > 0.0, diagonal, 1.0)
+        scale = _unit_scale(np.diag(self.gram))
         sizes = np.linalg.eigvalsh(self.gram / np.outer(scale, scale))
         if len(sizes) == 0 or sizes[-1] <= 0.0:
             return np.inf, len(sizes)
         lost = int(np.sum(sizes <= DETERMINED * sizes[-1]))
         condition = np.sqrt(sizes[-1] / sizes[0]) if lost == 0 else np.inf
         return float(condition), lost
+
+
+def _unit_scale(squares: FloatArray) -> FloatArray:
+    """What makes columns of these squared lengths unit ones; a column that is nothing stays so.
+
+    Weight decay can shrink what a hidden unit does to the output to 1e-160: the inverse of its
+    information is no number any more, whatever the units are.
+    """
+    lengths = np.sqrt(squares)
+    largest = lengths.max(initial=0.0) or 1.0
+    return np.where(lengths > NOTHING * largest, lengths, largest)
 
 
 @dataclass(frozen=True)

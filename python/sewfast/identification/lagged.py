@@ -227,7 +227,8 @@ def _network_fit(
         progress=task.progress,
     )
     if fit.termination == "interrupted":
-        raise Interrupted(_network_model(task, fit, began))
+        known = {"weight_decay": decay, "samples_fitted": len(task.data)}
+        raise Interrupted(_network_model(task, fit, began, known))
     return fit
 
 
