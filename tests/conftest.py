@@ -20,9 +20,12 @@ _BESIDE = ROOT.parent / "shared" / "data"
 if "SEWFAST_DATA" not in os.environ and _BESIDE.is_dir():
     os.environ["SEWFAST_DATA"] = str(_BESIDE)
 
-# a shell starts background jobs with SIGINT ignored, and so would the tests of Ctrl-C
+# a shell starts background jobs with SIGINT ignored, nohup with SIGHUP, and so would the tests of
+# Ctrl-C and of a closed terminal
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 # how long an example takes says something about the computer, nothing about the program

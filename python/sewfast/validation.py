@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .dataset import Dataset, Experiment, FloatArray, labelled, require_dataset
-from .dataset.experiment import in_effect, without_weightless
+from .dataset.experiment import in_effect, mean_square, weights_of, without_weightless
 from .dataset.outliers import white_noise
 from .dynamic_model import INIT, DynamicModel, require_init
-from .errors import DataError
+from .errors import DataError, FitError
 from .plotting import Drawing, Plotted, fit_panels, stacked
 from .tables import Table, percent, significant
 
@@ -148,6 +148,8 @@ class Validation(Plotted):
         What the reader should know, such as inputs beyond the range of the training data.
     Ts : float or None
         Sample time of the data [s].
+    without_input : float
+        Root mean square error of the free run with the inputs at rest (`without_input`) [unit].
     """
 
     simulation: Scores
@@ -160,6 +162,7 @@ class Validation(Plotted):
     against: str
     notes: tuple[str, ...] = ()
     Ts: float | None = None
+    without_input: float = math.inf
 
     @property
     def unmeasured(self) -> int:
@@ -173,7 +176,11 @@ class Validation(Plotted):
     @property
     def grade(self) -> str:
         """`good`, `fair`, `poor` or `useless` by the free run; empty if y is constant."""
-        return grade_of(self.simulation.fit_percent, self.simulation.rmse, self.noise)
+        return self._graded()[0]
+
+    def _graded(self) -> tuple[str, str]:
+        s = self.simulation
+        return judged(s.fit_percent, s.rmse, self.noise, self.without_input)
 
     @property
     def verdict(self) -> str:
@@ -182,17 +189,19 @@ class Validation(Plotted):
         return self._judged() + few
 
     def _judged(self) -> str:
-        fit = f"fit {self.simulation.fit_percent:.1f} % in free run"
-        if self.grade == "good" and self.simulation.fit_percent < GOOD:
+        grade, resting = self._graded()
+        fit = f"fit {self.simulation.fit_percent:.1f} % in free run{resting}"
+        if grade == "good" and self.simulation.fit_percent < GOOD:
             return f"good enough to tune a controller on: {fit}, and what is left is noise"
+        constant = "" if resting else f", {_beside_a_constant(self.simulation)}"
         return {
             "": "the output is constant here: only the size of the error says something",
             "good": f"good enough to tune a controller on: {fit}",
             "fair": f"good enough for a first, cautious controller: {fit}",
             "poor": f"not good enough to tune a controller on: {fit}",
-            "useless": f"useless here, {_beside_a_constant(self.simulation)}: {fit}; check the "
-            "columns, or record data like these and identify again",
-        }[self.grade]
+            "useless": f"useless here{constant}: {fit}; check the columns, or record data like "
+            "these and identify again",
+        }[grade]
 
     def to_json(self) -> dict[str, Any]:
         """Scores as JSON values."""
@@ -317,6 +326,61 @@ def _beside_a_constant(scores: Scores) -> str:
     return "worse than a constant" if worse else "hardly better than a constant"
 
 
+def by_input(error: float, resting: float) -> float:
+    """What the moves of the input bring [%]: 100 (1 - error of the free run / error at rest).
+
+    As large as the fit where only the input moves the output. A ramp, a decay to rest or levels
+    that differ from one recording to the next are followed from the initial state alone.
+    """
+    if not math.isfinite(error):
+        return math.nan
+    return 100.0 * (1.0 - error / resting) if resting > 0.0 else 0.0
+
+
+def judged(fit: float, error: float, noise: float, resting: float) -> tuple[str, str]:
+    """The grade, and what is to be said where the input has too small a part in the fit.
+
+    Parameters
+    ----------
+    fit : float
+        Of the free run [%].
+    error, noise, resting : float
+        Of the free run, white measurement noise, and of the free run with the input at rest.
+    """
+    share = by_input(error, resting)
+    by_fit, grade = grade_of(fit, error, noise), grade_of(min(fit, share), error, noise)
+    if grade == by_fit:
+        return grade, ""
+    return grade, (
+        f", but the moves of the input bring {max(share, 0.0):.0f} % of it: the rest follows from "
+        "where each recording begins"
+    )
+
+
+def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
+    """Error of the free run whose inputs rest at their means after the initial samples.
+
+    Root mean square over the known outputs, each as its weight [output unit]; infinite where the
+    free run leaves the finite numbers.
+    """
+    means = np.mean(np.concatenate([e.u for e in data.experiments]), axis=0)
+    resting = []
+    for e in data.experiments:
+        u = e.u.copy()
+        u[e.initial_samples(init) :] = means
+        resting.append(replace(e, u=u))
+    try:
+        runs = model.simulate(replace(data, experiments=tuple(resting)), init=init)
+    except (DataError, FitError):
+        return math.inf
+    squares, weights = [], []
+    for e, run in zip(data.experiments, runs, strict=True):
+        first = e.initial_samples(init)
+        squares.append((e.y - run)[first:] ** 2)
+        weights.append(weights_of(e)[first:])
+    return math.sqrt(mean_square(np.concatenate(squares), np.concatenate(weights)))
+
+
 def validate(
     model: DynamicModel, data: Dataset, *, init: int = INIT, against: str | None = None
 ) -> Validation:
@@ -389,6 +453,7 @@ def validate(
         against or data.output_name,
         tuple(_beyond_training(model, data)),
         data.Ts,
+        without_input(model, data, init) if against is None else math.inf,
     )
 
 

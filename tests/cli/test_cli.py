@@ -268,6 +268,19 @@ def test_several_inputs_keep_their_names(tmp_path: Path) -> None:
 # --- tune, run ----------------------------------------------------------------------------------
 
 
+def test_tune_warns_of_a_model_that_identify_called_useless(tmp_path: Path, walk: Path) -> None:
+    stored = json.loads((walk / "drive.json").read_text())
+    verdict = {"grade": "useless", "text": "useless: it explains 3 %", "fit_percent": 3.0}
+    stored["training"]["verdict"] = {**verdict, "next": []}
+    (tmp_path / "poor.json").write_text(json.dumps(stored))
+    few = ("--evaluations", 5, "-o", "c.json")
+    assert "useless" not in sewfast(tmp_path, "tune", walk / "drive.json", *few).err
+    assert (
+        "warning: poor.json: useless: it explains 3 %"
+        in sewfast(tmp_path, "tune", "poor.json", *few).err
+    )
+
+
 def test_tune_prints_gains_in_every_form(tmp_path: Path, walk: Path) -> None:
     t = np.arange(400) * 0.001
     api.write_table(tmp_path / "cycle.csv", {"t": t, "r": np.where(t > 0.05, 1000.0, 0.0)})

@@ -9,7 +9,7 @@ import pytest
 
 from kinds import TS, model_of, recording
 from plants import linear_data
-from sewfast import Dataset, LinearOE, identify
+from sewfast import Dataset, LinearOE, check, identify
 from sewfast.evidence import Residuals, operating_range
 from sewfast.evidence.card import summary
 from sewfast.evidence.questions import accuracy, correlation, operation
@@ -63,6 +63,46 @@ def test_a_pair_of_poles_has_a_frequency() -> None:
 )
 def test_grades(fit: float, rmse: float, noise: float, grade: str) -> None:
     assert grade_of(fit, rmse, noise) == grade
+
+
+@pytest.mark.parametrize("shape", ["ramp", "decay", "sine"])
+def test_an_output_that_the_input_does_not_move_is_no_good_fit(shape: str) -> None:
+    rng = np.random.default_rng(3)
+    n, t = 600, 0.01 * np.arange(600)
+    u = np.repeat(rng.uniform(-5.0, 5.0, n // 6), 6)
+    y = {"ramp": t, "decay": 10.0 * np.exp(-t / 2.0), "sine": np.sin(2.0 * np.pi * t)}[shape]
+    data = Dataset.from_arrays(u, y + 0.01 * rng.standard_normal(n), 0.01)
+    model = identify(data, time_budget=1.0, seed=0)
+    verdict = model.training["verdict"]
+    found = validate(model, data)
+    for grade in (verdict["grade"], found.grade):
+        assert grade in ("poor", "useless"), (verdict, found.verdict)
+    assert found.without_input < 2.0 * found.simulation.rmse
+    assert check(model, data).lines[0].verdict in ("warn", "fail")
+
+
+def test_levels_that_differ_between_recordings_are_not_the_inputs_work() -> None:
+    rng = np.random.default_rng(3)
+    keeps = LinearOE.from_tf([0.0, 1e-4], [1.0, -1.0], 0.01)
+    u = np.repeat(rng.uniform(-5.0, 5.0, 100), 6)
+    data = Dataset.concat([
+        Dataset.from_arrays(u, level + 0.1 * rng.standard_normal(600), 0.01)
+        for level in (0.0, 5000.0)
+    ])  # fmt: skip
+    found = validate(keeps, data)
+    assert found.simulation.fit_percent > 99.0
+    assert found.grade == "useless"
+    assert "moves of the input" in found.verdict
+
+
+def test_a_model_without_delay_is_not_sent_to_tuning() -> None:
+    rng = np.random.default_rng(5)
+    u, y = np.repeat(rng.uniform(-5.0, 5.0, 200), 3), np.zeros(600)
+    for k in range(600):
+        y[k] = 0.5 * y[k - 1] + 0.5 * u[k]
+    data = Dataset.from_arrays(u, y + 0.01 * rng.standard_normal(600), 0.01)
+    model = identify(data, nk=0, time_budget=1.0, seed=0)
+    assert "nk = 1" in model.training["verdict"]["next"][0]
 
 
 def test_a_useless_fit_is_called_useless() -> None:
@@ -145,7 +185,7 @@ def test_no_line_praises_one_step_errors() -> None:
     data = recording(model, 500, seed=2, noise=0.3)
     scores = horizon_scores(model, data, Residuals.of(model, data))
     assert scores.pooled["1 step"].rmse > scores.pooled["free run"].rmse
-    lines = accuracy(scores, "RPM", float("nan"))
+    lines = accuracy(scores, "RPM", float("nan"), float("inf"))
     ahead = next(x for x in lines if x.name == "1 step ahead")
     assert ahead.verdict == "info"
     assert "says little" in ahead.meaning

@@ -251,7 +251,7 @@ def test_data_are_not_changed() -> None:
 # --- interruption -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["oe", "neural_oe", "auto"])
+@pytest.mark.parametrize("kind", ["oe", "neural_oe", "neural_ss", "auto"])
 def test_an_interruption_hands_over_the_best_model(kind: Any) -> None:
     calls = 0
 
@@ -265,7 +265,9 @@ def test_an_interruption_hands_over_the_best_model(kind: Any) -> None:
         identify(data, model=kind, progress=stop)
     assert calls >= 1
     if isinstance(caught.value, Interrupted):
-        assert np.isfinite(caught.value.best.simulate(bent_data())[0]).all()
+        best = caught.value.best
+        assert np.isfinite(best.simulate(bent_data())[0]).all()
+        assert kind in ("auto", (best.members or (best,))[0].kind)
 
 
 @pytest.mark.parametrize("stopped", [2, 3])

@@ -461,11 +461,14 @@ def started(folder: Path) -> Iterator[tuple[subprocess.Popen[str], Any]]:
         command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
-        address, _, token = process.stdout.readline().rstrip().partition("/#")
-        place = address.replace("http", "ws") + "/socket"
-        with websockets.connect(place, origin=address) as page:
-            page.send(token)
-            yield process, page
+        try:
+            address, _, token = process.stdout.readline().rstrip().partition("/#")
+            place = address.replace("http", "ws") + "/socket"
+            with websockets.connect(place, origin=address) as page:
+                page.send(token)
+                yield process, page
+        finally:  # a test that failed would wait for it
+            process.kill()
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="needs the signals of POSIX")

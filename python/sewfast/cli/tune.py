@@ -206,6 +206,10 @@ def tune_command(args: argparse.Namespace) -> int | None:
         )  # fmt: skip
     require_place(args.front, (*TABLES, *FIGURES), option="--front")
     models = [load_model(path) for path in args.model]
+    for path, model in zip(args.model, models, strict=True):
+        verdict = model.training.get("verdict") or {}
+        if verdict.get("grade") in ("poor", "useless"):
+            print(f"warning: {path}: {verdict['text']}", file=sys.stderr)
     first = models[0]
     references = [
         reference_of(text, first.Ts, first.output_unit) for text in args.reference or ()

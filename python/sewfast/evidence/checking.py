@@ -12,7 +12,7 @@ from ..dataset import Dataset, require_dataset
 from ..dataset.experiment import in_effect
 from ..dynamic_model import INIT, DynamicModel
 from ..errors import FitError, SewfastError
-from ..validation import Scores, noise_of
+from ..validation import Scores, noise_of, without_input
 from . import questions
 from .card import Line, ReportCard
 from .operating import OperatingRange, operating_range
@@ -83,7 +83,8 @@ def check(
     scores = horizon_scores(model, data, free)
     unit = free.unit
     on_training = training is data or (training is None and is_training_data(model, data))
-    lines = questions.accuracy(scores, unit, noise_of([r.y[r.counts] for r in free.runs]))
+    noise = noise_of([r.y[r.counts] for r in free.runs])
+    lines = questions.accuracy(scores, unit, noise, without_input(model, data, init))
     if training is not None and training is not data:
         lines.append(
             questions.generalisation(

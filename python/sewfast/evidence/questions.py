@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from ..dataset import FloatArray
-from ..validation import FAIR, Scores, grade_of
+from ..validation import FAIR, Scores, judged
 from .card import Line, Verdict
 from .correlations import LEVEL, ResidualTest
 from .operating import OperatingRange
@@ -85,7 +85,7 @@ _PASSED = {
 }
 
 
-def accuracy(scores: HorizonScores, unit: str, noise: float) -> list[Line]:
+def accuracy(scores: HorizonScores, unit: str, noise: float, resting: float) -> list[Line]:
     """Free run, judged, and errors some steps ahead, which inform.
 
     Parameters
@@ -94,9 +94,11 @@ def accuracy(scores: HorizonScores, unit: str, noise: float) -> list[Line]:
     unit : str
     noise : float
         White measurement noise of the output; NaN where unknown.
+    resting : float
+        Error of the free run with the input at rest.
     """
     free = scores.pooled["free run"]
-    found = [_free_run(free, unit, grade_of(free.fit_percent, free.rmse, noise))]
+    found = [_free_run(free, unit, judged(free.fit_percent, free.rmse, noise, resting))]
     text = (
         "started from measured outputs each time: the model's own errors have no time to grow, "
         "while the noise of these outputs counts in full; it says little about a model that has "
@@ -108,12 +110,15 @@ def accuracy(scores: HorizonScores, unit: str, noise: float) -> list[Line]:
     return found + _worst(scores, unit)
 
 
-def _free_run(free: Scores, unit: str, grade: str) -> Line:
+def _free_run(free: Scores, unit: str, found: tuple[str, str]) -> Line:
+    grade, resting = found
     verdict, meaning = _GRADES[grade]
     if grade == "good" and free.fit_percent < FAIR:
         meaning = "the model alone follows the output; what is left is measurement noise"
     if grade == "useless" and free.fit_percent < 0.0:
         meaning = meaning.replace("hardly better", "worse")
+    if resting:
+        meaning = f"the model follows the output{resting}; record with more moves of the input"
     shown = fit_text(free, unit)
     return Line("free run", free.rmse, shown, f"fit >= {FAIR:g} %", verdict, meaning)
 

@@ -321,7 +321,7 @@ class Choice(Finals):
                 "be closed around the model; for a controller identify with nk = 1"
             )
         extra: Provenance = {"notes": notes} if notes else {}
-        extra["verdict"] = verdict(self, error)
+        extra["verdict"] = verdict(self, model, error)
         return replace(with_provenance(model, extra), alternatives=tuple(alternatives))
 
     def _choice(self, kind: str, error: float) -> Provenance:
@@ -339,12 +339,14 @@ class Choice(Finals):
         """What there is when Ctrl-C comes: the best candidate, else the linear model."""
         best, linear = self.search.best, self.linear
         bound = math.inf if linear is None else linear.rmse
-        if best is not None and best.error < WORTH_IT * bound and not self.is_linear:
+        is_better = best is not None and (self.wants_network or best.error < WORTH_IT * bound)
+        if best is not None and is_better and not self.is_linear:
             self.reasons = ["interrupted: the best candidate so far"]
             self.is_interrupted = True
             model = self._network([best], [])
             return with_provenance(model, {"termination": "interrupted"})
-        if linear is None or linear.models[0] is None:
+        if self.wants_network or linear is None or linear.models[0] is None:
+            # a kind that was asked for by name is not replaced by another
             raise KeyboardInterrupt from stopped
         model = wrap(LinearOE, linear.models[0], self.task.data)
         provenance = {"termination": "interrupted", "initial_state": "estimated"}

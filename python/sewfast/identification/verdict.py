@@ -7,20 +7,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..dataset import Dataset
-from ..validation import GOOD, grade_of, noise_of
+from ..dynamic_model import INIT
+from ..models import Model
+from ..validation import GOOD, judged, noise_of, without_input
 from .task import Provenance
 
 if TYPE_CHECKING:
     from .choice import Choice
 
 
-def verdict(choice: Choice, error: float) -> Provenance:
+def verdict(choice: Choice, model: Model, error: float) -> Provenance:
     """Whether a controller may be tuned on the model, in words and as values.
 
     Parameters
     ----------
     choice : Choice
         The search and what was held out.
+    model : Model
+        What was chosen.
     error : float
         Free-run error on what is held out [output unit].
 
@@ -33,22 +37,29 @@ def verdict(choice: Choice, error: float) -> Provenance:
     data, spread = choice.task.data, choice.split.spread
     fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else float("nan")
     noise = noise_of([e.y for e in data.experiments])
-    grade = grade_of(fit, error, noise)
+    grade, resting = judged(fit, error, noise, without_input(model, choice.split.held, INIT))
     unit = f" {data.output_unit}" if data.output_unit else ""
-    measured = f"free run explains {fit:.1f} % of data not trained on (rmse {error:.3g}{unit})"
+    measured = (
+        f"free run explains {fit:.1f} % of data not trained on (rmse {error:.3g}{unit}){resting}"
+    )
     text = {
         "": f"the output hardly moves where it was not trained on (rmse {error:.3g}{unit})",
         "good": f"good enough to tune a controller on: {measured}",
         "fair": f"good enough for a first, cautious controller: {measured}",
         "poor": f"not good enough to tune a controller on: {measured}",
-        "useless": f"useless: {measured}; a constant would do about as well",
+        "useless": f"useless: {measured}{'' if resting else '; a constant would do about as well'}",
     }[grade]
     grade = grade or "useless"
     todo = []
     if grade == "good":
         if fit < GOOD:
             text += f"; what is left is measurement noise ({noise:.3g}{unit})"
-        todo.append("validate it on another recording, then tune")
+        todo.append(
+            "validate it on another recording; to tune, identify with nk = 1 (--nk 1): no loop can "
+            "be closed around a model without delay"
+            if any(m.orders["nk"] == 0 for m in model.members or (model,))
+            else "validate it on another recording, then tune"
+        )
     if grade == "good" and choice.search.repeats:
         grade = "fair"
         text = text.replace("good enough to tune a controller on", "good where it repeats itself")
