@@ -541,3 +541,20 @@ def test_the_command_line_writes_alternatives_and_trains_further(tmp_path: Any) 
     done = run(tmp_path, *more, "-o", "n.json", "--json")
     assert done.json()["training"]["samples"] == 600
     assert "--further" in refused(tmp_path, *more, "--model", "oe", "-o", "o.json")
+
+
+def test_alternatives_of_an_earlier_model_do_not_stay_beside_a_new_one(tmp_path: Any) -> None:
+    from cli import sewfast as run
+
+    e = linear_data(300, noise=0.05).experiments[0]
+    sewfast.write_table(tmp_path / "a.csv", {"t": 0.01 * np.arange(300), "u": e.u[:, 0], "y": e.y})
+    old = [tmp_path / f"m-alternative-{i}.json" for i in (1, 2)]
+    other = tmp_path / "m-alternative-best.json"
+    for path in (*old, other):
+        path.write_text("{}")
+    made = ("identify", "a.csv", "--input", "u", "--output", "y", "--model", "oe", "-o", "m.json")
+    run(tmp_path, *made)
+    assert all(path.exists() for path in old)
+    run(tmp_path, *made, "--alternatives")
+    assert not any(path.exists() for path in old)
+    assert other.exists()
