@@ -357,6 +357,14 @@ def test_a_linear_truth_stays_linear() -> None:
     assert kinds == ["oe"] * 5
 
 
+def test_a_linear_truth_without_noise_stays_linear() -> None:
+    for seed in range(3):
+        model = identify(linear_data(600, seed=seed))
+        assert model.kind == "oe"
+        np.testing.assert_allclose(model.core.dc_gain(), 10.0, rtol=1e-6)
+        assert "rounding" in model.training["choice"]["reason"]
+
+
 @pytest.mark.parametrize(("noise", "grade"), [(0.02, "good"), (3.0, "good")])
 def test_the_verdict_knows_noise_from_ignorance(noise: float, grade: str) -> None:
     model = identify(linear_data(1500, noise=noise))

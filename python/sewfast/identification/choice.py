@@ -91,7 +91,11 @@ class Choice(Finals):
 
     def model(self) -> Model:
         """The chosen model, with the second best as alternatives."""
-        asked = self.worth_asking()
+        if self.search.is_exact:
+            self.reasons.append("the linear model's error is at rounding: no network was asked")
+            asked = []
+        else:
+            asked = self.worth_asking()
         while asked:
             finalists = self.finalists(asked)
             finished = self.finish(finalists)

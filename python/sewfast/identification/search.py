@@ -24,6 +24,8 @@ DECAY_MATTERS = 6_000
 """Samples from which on the climb does not ask for another weight decay; the end does."""
 HOPELESS = 0.98
 """Where the best network of the second halving is not below this part of the linear error."""
+ROUNDING = 1e-11
+"""Error of a linear model, in parts of the largest output, that is the arithmetic's own."""
 WORTH_A_STEP = 0.97
 """A step of the climb must bring the error below this part."""
 LEAST_STEP = 0.01
@@ -59,11 +61,24 @@ class Search(Trials):
     def run(self) -> None:
         """Linear models, then networks of every likely size, then what grows out of the best."""
         self.linear.search(self.pool.clock.until(SHARE_OF_LINEAR))
+        if self.is_exact:
+            return
         alive = self.screen()
         for iterations in HALVING_ITERATIONS:
             alive = self.halve(alive, iterations)
         if not self.is_hopeless:
             self.climb()
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the linear model's error is rounding, of which a network could only win a part.
+
+        A network that was asked for by name is trained all the same.
+        """
+        if self.wants_network or not self.linear.eligible:
+            return False
+        size = max(abs(v) for v in self.task.data.output_range)
+        return self.linear.best.rmse <= ROUNDING * size
 
     @property
     def is_hopeless(self) -> bool:
