@@ -79,7 +79,7 @@ def test_linear_data_give_the_plainest_structure_and_straight_curves() -> None:
     assert model.training["structure"] == {"input_pieces": 8, "output_pieces": 1}
     curve = model.characteristics()[0]
     assert np.abs(curve.y - curve.x).max() < 0.02 * np.ptp(curve.x)
-    assert [t["input_pieces"] for t in model.training["tried"]] == [8, 1, 8]
+    assert [t["input_pieces"] for t in model.training["tried"]] == [8, 1, 8, 8]
 
 
 def test_pieces_are_as_many_as_asked_for_and_validation_data_choose() -> None:
@@ -89,6 +89,25 @@ def test_pieces_are_as_many_as_asked_for_and_validation_data_choose() -> None:
     assert model.orders["output_pieces"] == 1
     assert len(model.theta) == len(model.parameter_names) == 2 + 2 + 1 + 3
     assert "curve of u: off by up to" in str(model)
+
+
+def _first_order(seed: int) -> Dataset:
+    u = np.repeat(np.random.default_rng(seed).uniform(-5.0, 5.0, 215), 7)[:1500]
+    y = np.zeros(1500)
+    for k in range(1, 1500):
+        y[k] = 0.9 * y[k - 1] + 0.3 * np.tanh(u[k - 1] / 2.0)
+    return Dataset.from_arrays(u, y + 0.01 * np.random.default_rng(seed + 1).normal(size=1500), TS)
+
+
+def test_a_pole_to_spare_is_left_out_unless_the_order_is_given() -> None:
+    for seed in (104, 109):
+        model: Any = sewfast.identify(_first_order(seed), model="hammerstein-wiener")
+        assert model.orders["na"] == 1
+        assert -model.theta[0] == pytest.approx(0.9, abs=0.01)
+    asked: Any = sewfast.identify(_first_order(104), model="hammerstein-wiener", na=2)
+    assert asked.orders["na"] == 2
+    second: Any = sewfast.identify(_plant(1500, 6, before=_band), model="hammerstein-wiener")
+    assert second.orders["na"] == 2
 
 
 def test_gaps_and_weights_are_heeded() -> None:

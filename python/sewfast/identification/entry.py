@@ -96,7 +96,8 @@ def identify(
     preset : "paper" or None
         The paper's network (docs/CONVENTIONS.md): no linear start, fixed scaling and orders.
     na, nb : int or None
-        Past outputs and past inputs in the regressor of a lagged model; None: 2.
+        Past outputs and past inputs in the regressor of a lagged model; None: 2, for `na` of a
+        Hammerstein-Wiener model 1 where that does about as well.
     nk : int or None
         Delay [samples]. None: 1 for a lagged model; a searched one takes 1 unless the data say
         otherwise. A plant of a control loop needs 1 or more.
@@ -199,6 +200,7 @@ def identify(
         workers=workers,
         clock=clock,
         select=select,
+        is_order_given=na is not None,
     )
     _require_data(task, kind)
     if isinstance(model, Model):

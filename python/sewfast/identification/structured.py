@@ -10,7 +10,7 @@ from typing import Any
 from ..errors import FitError, Interrupted
 from ..models import Model
 from ..models.base import Fitted, StructuredModel
-from .folds import Split, compared, errors_of, folds, free_runs
+from .folds import Errors, Split, compared, errors_of, folds, free_runs
 from .task import Provenance, Task, arrays, documented, finite, fit_provenance, wrap
 
 _BETTER = math.log(0.98)
@@ -43,21 +43,36 @@ def _fit(cls: type[StructuredModel], task: Task, data: Any, structure: Mapping[s
 def _chosen(
     cls: type[StructuredModel], task: Task, structures: tuple[Mapping[str, int], ...]
 ) -> tuple[Mapping[str, int], list[Provenance]]:
-    """The structure with the least held-out error, a plainer one where it does about as well."""
+    """The structure with the least held-out error, a plainer one where it does about as well.
+
+    So is a pole less, unless the order was given: a spare one drifts to where a trend is followed,
+    and takes the steady gain with it.
+    """
     parts = folds(task.data, task.validation)[:1]
     if len(structures) == 1 or not parts:
         return structures[-1], []
     held: Split = parts[0]
     best, least, tried = structures[0], None, []
-    for structure in structures:
+
+    def errors_with(structure: Mapping[str, int]) -> Errors | None:
         try:
             fit = _fit(cls, task, held.fitted, structure)
         except FitError:
-            continue
+            return None
         if fit.termination == "interrupted":
             raise KeyboardInterrupt
         errors = errors_of(free_runs(fit.model, held), held)
         tried.append({**structure, "held_out_rmse": finite(errors.rmse)})
-        if least is None or compared(errors, least)[0] < _BETTER:
+        return errors
+
+    for structure in structures:
+        errors = errors_with(structure)
+        if errors is not None and (least is None or compared(errors, least)[0] < _BETTER):
             best, least = structure, errors
+    if least is not None and task.na > 1 and not task.is_order_given:
+        smaller = {**best, "na": task.na - 1}
+        errors = errors_with(smaller)
+        if errors is not None:
+            ratio, deviation = compared(errors, least)
+            best = smaller if ratio <= max(deviation, -_BETTER) else best
     return best, tried

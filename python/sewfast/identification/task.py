@@ -38,6 +38,7 @@ class Task:
     progress: Progress | None
     workers: Workers | None = None
     select: bool = True
+    is_order_given: bool = False
     clock: Clock = field(default_factory=lambda: Clock(None))
 
     @property
