@@ -57,6 +57,17 @@ def require_init(init: int) -> None:
         raise SettingError(f"init: expected a whole number of 0 or more, received {init!r}")
 
 
+def real_numbers(values: ArrayLike, name: str, expected: str) -> FloatArray:
+    """A copy as C-contiguous float64, or a `DataError` for what is no array of real numbers."""
+    try:
+        given = np.asarray(values)
+        if given.dtype.kind == "c":
+            raise TypeError("complex ones")
+        return np.array(given, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as e:
+        raise DataError(name=name, expected=expected, received=str(e)) from e
+
+
 class Core(Protocol):
     """What the compiled models share."""
 
@@ -328,11 +339,12 @@ class DynamicModel(ABC):
         n = len(self.input_names)
         expected = "(N,) or (N, 1)" if n == 1 else f"(N, {n})"
         if values is None or isinstance(values, (str, os.PathLike)):
-            require_dataset(values, "data")
-        try:
-            u = np.array(values, dtype=np.float64, order="C")
-        except (TypeError, ValueError) as e:
-            raise DataError(f"u: expected numbers of shape {expected}, received {e}") from e
+            raise DataError(
+                name="data", expected=f"a Dataset, or an array of inputs of shape {expected}",
+                received=type(values).__name__,
+                remedy="make a Dataset with sewfast.read or Dataset.from_arrays",
+            )  # fmt: skip
+        u = real_numbers(values, "u", f"numbers of shape {expected}")
         shape = u.shape
         if u.ndim == 1 and n == 1:
             u = u[:, None]
@@ -354,12 +366,7 @@ class DynamicModel(ABC):
         rest: FloatArray = self.core.rest_state()
         if values is None:
             return rest
-        try:
-            state = np.array(values, dtype=np.float64)
-        except (TypeError, ValueError) as e:
-            raise DataError(
-                f"initial_state: expected numbers of shape {rest.shape}, received {e}"
-            ) from e
+        state = real_numbers(values, "initial_state", f"numbers of shape {rest.shape}")
         if state.shape != rest.shape:
             raise DataError(
                 f"initial_state: expected shape {rest.shape}, one value for each of "

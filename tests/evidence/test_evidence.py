@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,6 +66,14 @@ def test_a_hidden_unit_that_is_next_to_nothing_leaves_evidence_in_numbers(
     assert known is not None
     assert np.isfinite(known.covariance).all()
     assert known.undetermined >= 5
+
+
+@pytest.mark.parametrize("level", [0.0, 0.49, 1.0, math.nan, "0.9", True])
+def test_a_level_that_no_band_has_is_refused(level: Any) -> None:
+    for use in (check, bands):
+        with pytest.raises(SettingError) as refused:
+            use(linear_model(), linear_data(100), level=level)
+        assert refused.value.name == "level"
 
 
 def test_chi_square_tail_of_even_freedom_is_a_poisson_sum() -> None:

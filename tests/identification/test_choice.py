@@ -24,7 +24,7 @@ from sewfast.identification.folds import (
     folds,
     free_runs,
 )
-from sewfast.identification.orders import LinearTable, raised
+from sewfast.identification.orders import DELAYS, LinearTable, raised
 from sewfast.identification.search import HALVING_ITERATIONS, STILL_NEAR, Search
 from sewfast.identification.task import Task
 from sewfast.identification.training import Start, Structure
@@ -161,6 +161,26 @@ def test_a_small_order_and_the_delay_are_found(delay: int) -> None:
         if delay > 1:
             assert table.choice.rmse < 0.8 * table.error(1, 1)
     assert sorted(orders)[2] <= 2
+
+
+@pytest.mark.parametrize("delay", [12, 25])
+def test_a_dead_time_beyond_the_usual_delays_is_not_feigned_by_a_large_order(delay: int) -> None:
+    for seed in range(3):
+        data = first_order(seed, delay, noise=0.03)
+        table = LinearTable(task(data), folds(data)[:1], pool())
+        table.search(None)
+        assert table.choice.order <= 3
+        assert abs(table.choice.nk - delay) <= 2
+        feigned = min(c.rmse for c in table.candidates.values() if c.nk == 1)
+        assert table.choice.rmse < 0.9 * feigned
+
+
+def test_without_a_dead_time_no_long_delay_is_looked_at() -> None:
+    for seed in range(3):
+        data = first_order(seed, 1, noise=0.1)
+        table = LinearTable(task(data), folds(data)[:1], pool())
+        table.search(None)
+        assert max(nk for _, nk in table.candidates) == max(DELAYS)
 
 
 def test_the_steady_gain_of_a_motor_is_not_lost_to_a_slow_pole() -> None:
@@ -521,3 +541,20 @@ def test_the_command_line_writes_alternatives_and_trains_further(tmp_path: Any) 
     done = run(tmp_path, *more, "-o", "n.json", "--json")
     assert done.json()["training"]["samples"] == 600
     assert "--further" in refused(tmp_path, *more, "--model", "oe", "-o", "o.json")
+
+
+def test_alternatives_of_an_earlier_model_do_not_stay_beside_a_new_one(tmp_path: Any) -> None:
+    from cli import sewfast as run
+
+    e = linear_data(300, noise=0.05).experiments[0]
+    sewfast.write_table(tmp_path / "a.csv", {"t": 0.01 * np.arange(300), "u": e.u[:, 0], "y": e.y})
+    old = [tmp_path / f"m-alternative-{i}.json" for i in (1, 2)]
+    other = tmp_path / "m-alternative-best.json"
+    for path in (*old, other):
+        path.write_text("{}")
+    made = ("identify", "a.csv", "--input", "u", "--output", "y", "--model", "oe", "-o", "m.json")
+    run(tmp_path, *made)
+    assert all(path.exists() for path in old)
+    run(tmp_path, *made, "--alternatives")
+    assert not any(path.exists() for path in old)
+    assert other.exists()

@@ -295,6 +295,12 @@ def test_an_interruption_of_the_fits_that_judge_the_start_is_not_lost(
     assert caught.value.best.training["termination"] == "interrupted"
 
 
+def test_a_progress_that_cannot_be_called_is_refused() -> None:
+    with pytest.raises(SettingError) as refused:
+        identify(linear_data(), model="arx", progress=3)  # type: ignore[arg-type]
+    assert refused.value.name == "progress"
+
+
 # --- bad input --------------------------------------------------------------------------------
 
 

@@ -339,6 +339,26 @@ def test_what_is_no_data_set_is_refused_with_the_way_to_make_one(wrong: Any) -> 
             use(wrong)
 
 
+@pytest.mark.parametrize("wrong", [None, "data.csv"])
+def test_a_free_run_says_that_it_takes_an_array_as_well(wrong: Any) -> None:
+    with pytest.raises(DataError, match=r"a Dataset, or an array of inputs of shape \(N,\)"):
+        exact().simulate(wrong)
+
+
+@pytest.mark.parametrize("wrong", [np.ones(5) + 1j, ["a"] * 5, [[1.0], 2.0]])
+def test_what_is_no_real_number_is_refused_by_name(wrong: Any) -> None:
+    model = exact()
+    uses = {
+        "u": [model.linearise, model.simulate],
+        "initial_state": [lambda x: model.simulate(np.ones(5), initial_state=x)],
+    }
+    for name, those in uses.items():
+        for use in those:
+            with pytest.raises(DataError) as refused:
+                use(wrong)
+            assert refused.value.name == name
+
+
 @pytest.mark.parametrize("init", [2.5, -1, True, "20", None])
 def test_an_init_that_is_no_count_is_refused(init: Any) -> None:
     for use in (exact().simulate, exact().validate):

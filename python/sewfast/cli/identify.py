@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from itertools import count, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -214,7 +215,8 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
     add_argument("--further", metavar="MODEL.json", help="a model to train further, as it is")
     add_argument(
         "--alternatives", action="store_true",
-        help="also write what would have been chosen next, to MODEL-alternative-1.json and so on",
+        help="also write what would have been chosen next, to MODEL-alternative-1.json and so on, "
+        "in place of those of an earlier MODEL.json",
     )  # fmt: skip
 
 
@@ -245,13 +247,16 @@ def identify_command(args: argparse.Namespace) -> int | None:
 
 
 def _save_alternatives(args: argparse.Namespace, model: Model) -> list[Path]:
-    """Files in the model's folder, the best alternative first."""
+    """Files in the model's folder, the best alternative first; none of an earlier model is left."""
     out = Path(args.out)
+    numbered = (out.with_name(f"{out.stem}-alternative-{i}{out.suffix}") for i in count(1))
     paths = []
-    for i, other in enumerate(model.alternatives, start=1):
-        path = out.with_name(f"{out.stem}-alternative-{i}{out.suffix}")
-        other.save(path)
-        paths.append(path)
+    for other in model.alternatives:
+        paths.append(next(numbered))
+        other.save(paths[-1])
+    # a model that is trained further has none, and may be one of these files itself
+    for old in takewhile(Path.is_file, () if args.further else numbered):
+        old.unlink()
     return paths
 
 

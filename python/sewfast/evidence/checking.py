@@ -24,6 +24,7 @@ from .simulation_bands import (
     LEVEL,
     Bands,
     bands_of,
+    require_level,
     stored_uncertainty,
     uncertainty,
     uncertainty_of,
@@ -55,7 +56,7 @@ def check(
     init : int
         Samples of each experiment that set the initial state and are not judged.
     level : float
-        Of the bands.
+        Of the bands, .5 to .999.
 
     Returns
     -------
@@ -67,8 +68,11 @@ def check(
         If the data do not fit the model or leave nothing to judge.
     FitError
         If the model runs away on these inputs.
+    SettingError
+        For a level out of range.
     """
     require_dataset(data, "data")
+    require_level(level)
     weighed = in_effect(data)
     if training is not None:
         require_dataset(training, "training")

@@ -17,6 +17,7 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -137,6 +138,13 @@ class Bands:
         }
 
 
+def require_level(level: float) -> None:
+    """A share that bands can be made for, or a `SettingError`."""
+    is_number = isinstance(level, Real) and not isinstance(level, bool)
+    if not is_number or not 0.5 <= level <= 0.999:
+        raise SettingError(f"level: expected a share from 0.5 to 0.999, received {level!r}")
+
+
 def bands(
     model: DynamicModel,
     data: Dataset,
@@ -166,8 +174,7 @@ def bands(
     DataError, FitError
         As for `simulate`.
     """
-    if not 0.5 <= level <= 0.999:
-        raise SettingError(f"level: expected a share from 0.5 to 0.999, received {level!r}")
+    require_level(level)
     known = uncertainty(model, training) if training is not None else stored_uncertainty(model)
     if known is None:
         raise SettingError(

@@ -278,7 +278,10 @@ class Choice(Finals):
         everywhere = LinearTable(self.task, self.search.folds, self.search.pool)
         wanted = [(c.order, c.nk) for c in likely]
         everywhere.add(wanted, self.clock.until(SHARE_OF_FINAL))
-        return everywhere.choice if everywhere.eligible else table.choice
+        first = table.choice
+        # a budget that ended before it was asked again must not leave its place to another
+        is_asked = (first.order, first.nk) in everywhere.candidates
+        return everywhere.choice if is_asked else first
 
     def _least_squares(self) -> Model:
         """What there is when no output-error fit has come to an end: least squares, in free run."""

@@ -327,6 +327,12 @@ def delay(
     return DelayEstimate(min(i.nk for i in found), found, data.Ts, confidence)
 
 
+def reach(data: Dataset) -> int:
+    """Delays that short records leave room for."""
+    shortest = min(len(e) for e in data.experiments)
+    return max(1, min(LONGEST, shortest // 10))
+
+
 def _require(data: Dataset, longest: int, least: int, confidence: float) -> None:
     require_dataset(data, "data")
     data.require_inputs()

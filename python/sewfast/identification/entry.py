@@ -174,6 +174,11 @@ def identify(
     )  # fmt: skip
     _require_meaning(kind, na=na, nb=nb, nx=nx, output=output, time_budget=time_budget)
     require_workers(workers)
+    if progress is not None and not callable(progress):
+        raise SettingError(
+            name="progress", expected="a function of done, total and best cost",
+            received=repr(progress), remedy="or leave it out",
+        )  # fmt: skip
     if not isinstance(select, bool):
         raise SettingError(f"select: expected True or False, received {select!r}")
     clock = Clock(time_budget)

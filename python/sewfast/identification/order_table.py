@@ -19,7 +19,7 @@ from ..errors import DataError, FitError, SettingError
 from ..plotting import legend, lettered, stacked
 from ..progress import shown_in_notebooks
 from ..tables import Table, significant
-from .delays import LONGEST, DelayEstimate, LaggedRegression, Solution, delay
+from .delays import DelayEstimate, LaggedRegression, Solution, delay, reach
 
 Progress: TypeAlias = Callable[[int, int, float], object]
 
@@ -268,7 +268,7 @@ def orders(
     data.require_inputs()
     data.require_excited()
     train, later = (in_effect(part) for part in _parts(data, validation, held_out))
-    found = delay(train, longest=_reach(train)) if nk is None else None
+    found = delay(train, longest=reach(train)) if nk is None else None
     grid = _Grid(_upto("na", na, 1), _upto("nb", nb, 1), _delays(nk, found))
     rows, errors = _tried(train, later, grid, progress)
     exact = EXACT * float(np.nanstd(np.concatenate([e.y for e in later.experiments])))
@@ -314,12 +314,6 @@ def _delays(nk: int | Iterable[int] | None, found: DelayEstimate | None) -> tupl
         return _whole("nk", (nk,) if isinstance(nk, int) else nk, 0)
     assert found is not None
     return _whole("nk", {1, found.nk, *(i.low for i in found.inputs)}, 0)
-
-
-def _reach(data: Dataset) -> int:
-    """Delays that short records leave room for."""
-    shortest = min(len(e) for e in data.experiments)
-    return max(1, min(LONGEST, shortest // 10))
 
 
 def _parts(data: Dataset, validation: Dataset | None, held_out: float) -> tuple[Dataset, Dataset]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from .. import _core
 from ..errors import DataError, FitError
+from .delays import delay, reach
 from .effort import Look, Pool
 from .folds import RUNAWAY, Errors, Split, compared, errors_of, free_runs
 from .task import Provenance, Task, arrays, finite
@@ -22,6 +23,10 @@ from .task import Provenance, Task, arrays, finite
 ORDERS = (1, 2, 3, 4, 5, 6, 7, 8)
 DELAYS = (2, 3, 4, 5, 6)
 """Looked at beside the delay of one sample, unless one is given."""
+LATE_ORDERS = (1, 2, 3)
+"""Looked at with a dead time that is estimated to lie beyond these delays."""
+SAMPLES_OF_DELAY = 2_000
+"""Of that estimate."""
 SAMPLES = 6_000
 """Of a fit that only decides: blocks from all over the record."""
 ITERATIONS = 60
@@ -87,7 +92,12 @@ class LinearTable:
         return 1 if self.task.nk is None else self.task.nk
 
     def search(self, until: float | None) -> None:
-        """Orders upwards until two have not gained, then delays of the best small order."""
+        """Orders upwards until two have not gained, then delays of the best small order.
+
+        A long dead time is looked at first: large orders feign one, and take most of the time.
+        """
+        if self.task.nk is None:
+            self.add(self._late(), until)
         best, idle = math.inf, 0
         orders = iter(ORDERS)
         while idle < PATIENCE:
@@ -106,6 +116,20 @@ class LinearTable:
             # what looked like an order may have been a delay, so one order less is asked as well
             small = min(self.choice.order, 3)
             self.add(((o, nk) for nk in DELAYS for o in (small - 1, small) if o > 0), until)
+
+    def _late(self) -> list[tuple[int, int]]:
+        """Small orders with the estimated dead time, where it is longer than `DELAYS`.
+
+        Large orders feign a dead time at the cost of poles that the drive has not. The estimate can
+        be late by a sample.
+        """
+        data = self.folds[0].shortened(SAMPLES_OF_DELAY, SAMPLES_OF_DELAY).fitted
+        try:
+            found = delay(data, longest=reach(data)).nk
+        except (DataError, FitError):
+            return []
+        nks = (found - 1, found) if found > max(DELAYS) else ()
+        return [(o, nk) for nk in nks for o in LATE_ORDERS]
 
     def add(self, wanted: Iterable[tuple[int, int]], until: float | None) -> None:
         """Fit these orders and delays on every fold."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..dataset import Dataset, FloatArray
-from ..dynamic_model import INIT, Core, DynamicModel, FreeRunJacobian
+from ..dynamic_model import INIT, Core, DynamicModel, FreeRunJacobian, real_numbers
 from ..errors import FitError, SettingError
 from ..evidence import Bands, OperatingPoint, ReportCard, bands, check, operating_range
 from ..storage import Fields
@@ -88,7 +88,8 @@ class Model(DynamicModel):
             middle = np.mean(np.atleast_2d(self.training.get("input_range", np.nan)), axis=1)
             given = [np.asarray(middle, dtype=np.float64)]
         else:
-            given = [np.atleast_1d(np.asarray(u, dtype=np.float64))]
+            names = ", ".join(self.input_names)
+            given = [np.atleast_1d(real_numbers(u, "u", f"a number for each of {names}"))]
         return operating_range(self, given).points[0]
 
     def validate(
