@@ -180,7 +180,8 @@ class Validation(Plotted):
 
     def _graded(self) -> tuple[str, str]:
         s = self.simulation
-        return judged(s.fit_percent, s.rmse, self.noise, self.without_input)
+        share = by_input(s.rmse, self.without_input)
+        return judged(s.fit_percent, s.rmse, self.noise, share)
 
     @property
     def verdict(self) -> str:
@@ -337,17 +338,18 @@ def by_input(error: float, resting: float) -> float:
     return 100.0 * (1.0 - error / resting) if resting > 0.0 else 0.0
 
 
-def judged(fit: float, error: float, noise: float, resting: float) -> tuple[str, str]:
+def judged(fit: float, error: float, noise: float, share: float) -> tuple[str, str]:
     """The grade, and what is to be said where the input has too small a part in the fit.
 
     Parameters
     ----------
     fit : float
         Of the free run [%].
-    error, noise, resting : float
-        Of the free run, white measurement noise, and of the free run with the input at rest.
+    error, noise : float
+        Of the free run, and white measurement noise of the output, in one unit.
+    share : float
+        What the moves of the input bring [%], by `by_input`.
     """
-    share = by_input(error, resting)
     by_fit, grade = grade_of(fit, error, noise), grade_of(min(fit, share), error, noise)
     if grade == by_fit:
         return grade, ""
@@ -358,19 +360,24 @@ def judged(fit: float, error: float, noise: float, resting: float) -> tuple[str,
 
 
 def without_input(model: DynamicModel, data: Dataset, init: int) -> float:
-    """Error of the free run whose inputs rest at their means after the initial samples.
-
-    Root mean square over the known outputs, each as its weight [output unit]; infinite where the
-    free run leaves the finite numbers.
-    """
+    """`free_run_error` where the inputs rest at their means after the initial samples."""
     means = np.mean(np.concatenate([e.u for e in data.experiments]), axis=0)
     resting = []
     for e in data.experiments:
         u = e.u.copy()
         u[e.initial_samples(init) :] = means
         resting.append(replace(e, u=u))
+    return free_run_error(model, data, replace(data, experiments=tuple(resting)), init)
+
+
+def free_run_error(model: DynamicModel, data: Dataset, inputs: Dataset, init: int) -> float:
+    """Root mean square error against the outputs of `data` of the free run of `inputs`.
+
+    Over the known outputs after the initial samples, each as its weight [output unit]; infinite
+    where the free run leaves the finite numbers.
+    """
     try:
-        runs = model.simulate(replace(data, experiments=tuple(resting)), init=init)
+        runs = model.simulate(inputs, init=init)
     except (DataError, FitError):
         return math.inf
     squares, weights = [], []

@@ -185,7 +185,7 @@ def test_no_line_praises_one_step_errors() -> None:
     data = recording(model, 500, seed=2, noise=0.3)
     scores = horizon_scores(model, data, Residuals.of(model, data))
     assert scores.pooled["1 step"].rmse > scores.pooled["free run"].rmse
-    lines = accuracy(scores, "RPM", float("nan"), float("inf"))
+    lines = accuracy(scores, "RPM", float("nan"), 100.0)
     ahead = next(x for x in lines if x.name == "1 step ahead")
     assert ahead.verdict == "info"
     assert "says little" in ahead.meaning

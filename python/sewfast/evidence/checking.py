@@ -12,7 +12,7 @@ from ..dataset import Dataset, require_dataset
 from ..dataset.experiment import in_effect
 from ..dynamic_model import INIT, DynamicModel
 from ..errors import FitError, SewfastError
-from ..validation import Scores, noise_of, without_input
+from ..validation import Scores, by_input, noise_of, without_input
 from . import questions
 from .card import Line, ReportCard
 from .operating import OperatingRange, operating_range
@@ -84,7 +84,9 @@ def check(
     unit = free.unit
     on_training = training is data or (training is None and is_training_data(model, data))
     noise = noise_of([r.y[r.counts] for r in free.runs])
-    lines = questions.accuracy(scores, unit, noise, without_input(model, data, init))
+    rmse = scores.pooled["free run"].rmse
+    share = by_input(rmse, without_input(model, data, init))
+    lines = questions.accuracy(scores, unit, noise, share)
     if training is not None and training is not data:
         lines.append(
             questions.generalisation(

@@ -85,7 +85,7 @@ _PASSED = {
 }
 
 
-def accuracy(scores: HorizonScores, unit: str, noise: float, resting: float) -> list[Line]:
+def accuracy(scores: HorizonScores, unit: str, noise: float, share: float) -> list[Line]:
     """Free run, judged, and errors some steps ahead, which inform.
 
     Parameters
@@ -94,11 +94,11 @@ def accuracy(scores: HorizonScores, unit: str, noise: float, resting: float) -> 
     unit : str
     noise : float
         White measurement noise of the output; NaN where unknown.
-    resting : float
-        Error of the free run with the input at rest.
+    share : float
+        What the moves of the input bring [%].
     """
     free = scores.pooled["free run"]
-    found = [_free_run(free, unit, judged(free.fit_percent, free.rmse, noise, resting))]
+    found = [_free_run(free, unit, judged(free.fit_percent, free.rmse, noise, share))]
     text = (
         "started from measured outputs each time: the model's own errors have no time to grow, "
         "while the noise of these outputs counts in full; it says little about a model that has "

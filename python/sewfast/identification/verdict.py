@@ -9,7 +9,7 @@ import numpy as np
 from ..dataset import Dataset
 from ..dynamic_model import INIT
 from ..models import Model
-from ..validation import GOOD, judged, noise_of, without_input
+from ..validation import GOOD, by_input, free_run_error, judged, noise_of, without_input
 from .task import Provenance
 
 if TYPE_CHECKING:
@@ -37,7 +37,10 @@ def verdict(choice: Choice, model: Model, error: float) -> Provenance:
     data, spread = choice.task.data, choice.split.spread
     fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else float("nan")
     noise = noise_of([e.y for e in data.experiments])
-    grade, resting = judged(fit, error, noise, without_input(model, choice.split.held, INIT))
+    # of one model on the same samples: what was held out is not what the error is always of
+    held = choice.split.held
+    own = free_run_error(model, held, held, INIT)
+    grade, resting = judged(fit, error, noise, by_input(own, without_input(model, held, INIT)))
     unit = f" {data.output_unit}" if data.output_unit else ""
     measured = (
         f"free run explains {fit:.1f} % of data not trained on (rmse {error:.3g}{unit}){resting}"
