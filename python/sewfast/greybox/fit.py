@@ -321,9 +321,9 @@ def _shown_terms(
     last = fitted(task, state.having(kept), FINE)
     hidden = [t for t in state.terms if t in SHAPED and t not in kept]
     shapes = {p: state.value(p) for t in hidden for p in TERMS[t] if p in SHAPES}
-    beside = last.having([*kept, *hidden], **shapes)
-    at = [beside.names().index(n) for n in last.names()]
-    return last, out, task.covariance(beside)[np.ix_(at, at)]
+    wider = last.having([*kept, *hidden], **shapes)
+    at = [wider.names().index(n) for n in last.names()]
+    return last, out, task.covariance(wider)[np.ix_(at, at)]
 
 
 def _explained(task: Task, state: State, term: str, covariance: FloatArray) -> float:

@@ -62,10 +62,11 @@ def _members(task: Task, model: Ensemble) -> Model:
                 f"{i} of {len(members)} members were trained to the end: those after them are as "
                 "they were given"
             ]
-            raise Interrupted(
-                documented(Ensemble.of(members, model.combine), task, began, known)
-            ) from None
-    return documented(Ensemble.of(members, model.combine), task, began, known)
+            break
+    found = documented(Ensemble.of(members, model.combine), task, began, known)
+    if "termination" in known:
+        raise Interrupted(found)
+    return found
 
 
 def _best(model: Model, stopped: KeyboardInterrupt) -> Model:
