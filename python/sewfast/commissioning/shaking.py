@@ -243,8 +243,9 @@ UNBOUNDED = 1e6
 
 def margins_at_work(
     bench: Machine, controller: Controller, plant: Any, speed: float, seed: int
-) -> dict[str, Any] | None:
-    """Margins of a loop as a linear plant predicts them and as the machine shows them at a speed.
+) -> tuple[dict[str, Any], FrequencyResponse] | None:
+    """Margins of a loop as a linear plant predicts them and as the machine shows them at a speed,
+    and the response that they were read from.
 
     The reference is shaken by a multisine, half a minute in all. None where the answer is too
     small, the command comes to its limits however little it is shaken, or the machine cannot be
@@ -263,13 +264,14 @@ def margins_at_work(
             # a machine or a sample time that cannot be shaken so
             return None
         predicted = margins(controller, plant, speed=speed)
-        return {
+        found = {
             "speed": speed,
             "predicted": {name: getattr(predicted, name) for name in MARGINS},
             "measured": {name: getattr(measured, name) for name in MARGINS}
             # a circle that holds -1 bounds nothing
             | {"Ms_band": [x if x < UNBOUNDED else math.inf for x in measured.Ms_band]},
         }
+        return found, response
     return None
 
 

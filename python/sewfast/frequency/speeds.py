@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import storage
+from ..arrays import FloatArray
 from ..control.controller import Controller
 from ..errors import DataError, FitError, SettingError
 from ..plotting import Drawing, stacked
@@ -93,8 +94,8 @@ class ResponsesOverSpeed:
     def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
         """Gain and phase at each speed, over each other, and the coherence.
 
-        Frequencies at which less than half of the output is explained are left out. Other arguments
-        and result are those of `Dataset.plot`.
+        Frequencies at which less than half of the output is explained are left out; the phase is
+        drawn between -270 and 90 degrees. Other arguments and result are those of `Dataset.plot`.
         """
         return self.drawing().plot(ax, file)
 
@@ -120,9 +121,13 @@ class ResponsesOverSpeed:
             ax.set_ylim(0.0, 1.05)
             ax.set_xlabel("frequency [Hz]")
 
+        def turned(r: FrequencyResponse) -> FloatArray:
+            # unwrapped over lines that say nothing it would turn by chance
+            return 90.0 - np.mod(90.0 - np.rad2deg(np.angle(r.value)), 360.0)
+
         panels = (
             lambda ax: lines(ax, lambda r: r.magnitude_db, f"gain [dB re 1 {unit}]"),
-            lambda ax: lines(ax, lambda r: r.phase_deg, "phase [deg]"),
+            lambda ax: lines(ax, turned, "phase [deg]"),
             coherence,
         )
         return stacked(panels, (2.4, 2.0, 1.2), legend=min(len(self), 6))
