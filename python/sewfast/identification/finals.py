@@ -48,7 +48,7 @@ BEHIND_LARGE = 1.01
 """The same on much data, where held-out errors are sure and iterations dear."""
 FINISHED = 0.995
 """A leg that does not bring the error below this part ends the training."""
-SHARE_OF_VERIFYING, SHARE_OF_FINAL, SHARE_OF_REFIT = 0.64, 0.84, 0.9
+SHARE_OF_VERIFYING, SHARE_OF_FINAL, SHARE_OF_REFIT = 0.64, 0.89, 0.94
 """Parts of a time budget at which each stage has to be done."""
 
 
@@ -245,7 +245,10 @@ class Finals:
                     share=0.6 + 0.35 * (leg + 1) / LEGS,
                 )
             )
-            following = [self._better(c, starts) for c, starts in zip(alive, found, strict=True)]
+            following = [
+                self._better(c, starts, r.count)
+                for c, starts, r in zip(alive, found, requests, strict=True)
+            ]
             gained = any(
                 n.error < FINISHED * c.error for c, n in zip(alive, following, strict=True)
             )
@@ -301,11 +304,18 @@ class Finals:
         models = c.models
         return replace(c, errors=errors_of(free_runs(median_of(models), self.split), self.split))
 
-    def _better(self, before: Candidate, starts: Sequence[Start]) -> Candidate:
-        """The candidate after a leg, unless that has made it worse."""
+    def _better(self, before: Candidate, starts: Sequence[Start], count: int) -> Candidate:
+        """The candidate after a leg of its first `count` starts, unless that has made it worse.
+
+        Starts for which there was no time stay in the median where they bring its error down.
+        """
         if not starts:
             return before
         after = self.rejudged(replace(before, starts=tuple(starts)))
+        rest = before.members[count:]
+        if rest:
+            together = self.rejudged(replace(before, starts=(*starts, *rest)))
+            after = min(after, together, key=lambda c: (not c.is_sound, c.error))
         if after.error <= 1.02 * before.error and (after.is_sound or not before.is_sound):
             return self._alone(after)
         return before
