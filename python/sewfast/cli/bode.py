@@ -28,9 +28,8 @@ if TYPE_CHECKING:
 BODE = """\
 The Bode plot of a drive, with error bars, and the resonance of its shaft. A machine (--on) is
 brought to a working speed and shaken there by sines of random phases, which separates noise from
-distortion. A record is taken as it is, chirp, steps or whatever moved it: what it shows of before
-its beginning is told from the response (--method local). Two masses and a shaft, or a rigid
-machine, are fitted to it.
+distortion. Of a record, spectra are averaged, or (--method local) what it shows of before its
+beginning is told from the response. Two masses and a shaft, or a rigid machine, are fitted to it.
 
 The machine turns at --speed, a little faster and slower, for a minute or less; at several speeds
 one after the other. Under a controller (--controller) the reference is shaken instead, and the
@@ -46,6 +45,7 @@ examples:
       --limits volt=10,speed=3500,acceleration=30000,current=15
   sewfast bode --on virtual --speed 500,1000,2000 -o speeds.json --plot speeds.png
   sewfast bode run.csv --input u --output y --reference r     a record under feedback
+  sewfast bode chirp.csv --input u --output y --method local  a chirp that began in motion
   sewfast bode response.json --controller controller.json     margins on what was measured
   sewfast bode response.json --propose new.json --u-max 10 --counts-per-rev 1572
 """
@@ -104,9 +104,9 @@ def add(commands: Commands) -> None:
         "--reference", metavar="COL", help="column of a record that its controller followed"
     )
     parser.add_argument(
-        "--method", choices=("local", "segments"),
-        help="of a record: local polynomials, for any record (the default), or spectra averaged "
-        "over segments (with --segment)",
+        "--method", choices=("segments", "local"),
+        help="of a record: spectra averaged over segments (the default), or local polynomials, "
+        "which take the leakage of its beginning and end out",
     )  # fmt: skip
     parser.add_argument(
         "--segment", type=int, metavar="N", help="samples of a record's segments (a ninth of it)"

@@ -55,7 +55,7 @@ SWING, MOST = 0.5, 0.8
 Nearer to standstill friction would act like a step."""
 
 
-RecordMethod: TypeAlias = Literal["local", "segments"]
+RecordMethod: TypeAlias = Literal["segments", "local"]
 
 
 @overload
@@ -117,10 +117,10 @@ def bode(
     reference : str, optional
         Column of a record that the controller follows: without it the response of a record under
         feedback is biased.
-    method : "local" or "segments", optional
-        Of a record: local polynomials, for any record (`sewfast.frequency.local_polynomial`, the
-        default), or spectra averaged over segments (`sewfast.frequency.spectral`, the default if
-        `segment` is given).
+    method : "segments" or "local", optional
+        Of a record: spectra averaged over segments (`sewfast.frequency.spectral`, the default), or
+        local polynomials, which take the leakage of beginning and end out
+        (`sewfast.frequency.local_polynomial`).
     segment : int, optional
         Samples; see `sewfast.frequency.spectral`.
 
@@ -316,11 +316,9 @@ def _of_record(
             "from_counts": on.counts is not None,
         }  # fmt: skip
     provenance = {"recording": name, **_cautions(u, y, on.Ts, is_speed=labels["y_unit"] == "RPM")}
-    if method == "segments" or segment is not None:
-        found = spectral(u, y, Ts=on.Ts, r=r, segment=segment, provenance=provenance, **labels)
-    else:
-        found = local_polynomial(u, y, Ts=on.Ts, r=r, provenance=provenance, **labels)
-    return found
+    if method == "local":
+        return local_polynomial(u, y, Ts=on.Ts, r=r, provenance=provenance, **labels)
+    return spectral(u, y, Ts=on.Ts, r=r, segment=segment, provenance=provenance, **labels)
 
 
 def _one_of(on: Dataset) -> Experiment:
@@ -346,6 +344,8 @@ MOVES = 0.9
 REVERSED = 0.02
 """Of the largest speed, that a mean over 20 ms must have on the other side for a reversal."""
 MEAN = 0.02
+OUTSIDE = 1.0, 99.0
+"""Percentiles of the second half of a record, outside of which it begins with a run-up."""
 
 
 def _cautions(u: FloatArray, y: FloatArray, Ts: float, *, is_speed: bool) -> dict[str, Any]:
@@ -365,6 +365,15 @@ def _cautions(u: FloatArray, y: FloatArray, Ts: float, *, is_speed: bool) -> dic
             found.append(
                 f"the speed changes its sign, first at {back[0] * Ts:.4g} s: there friction acts "
                 "like a step, and the response is that of a mean over both directions"
+            )
+    if len(y) >= LEAST_RUN and np.isfinite(y).all():
+        later = y[len(y) // 2 :]
+        low, high = np.percentile(later, OUTSIDE)
+        ends = np.flatnonzero((y >= low) & (y <= high))
+        if not low <= y[: k + 1].mean() <= high and len(ends):
+            found.append(
+                f"the record begins away from where it works later, which it reaches at "
+                f"{ends[0] * Ts:.4g} s: its lowest frequencies are those of the run-up; cut it off"
             )
     return {"cautions": found} if found else {}
 
