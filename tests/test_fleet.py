@@ -118,6 +118,27 @@ def test_workers_that_are_killed_cost_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("quiet")
+def test_workers_that_are_gone_for_good_are_missed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    distributed = pytest.importorskip("distributed", reason="needs dask")
+    from sewfast.fleets import running
+
+    monkeypatch.setattr(running, "_PATIENCE", 1.0)
+    monkeypatch.setattr(running, "_LOOK", 0.2)
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        cluster.scale(0)
+        with pytest.raises(SettingError, match="expected one at least") as caught:
+            fleet(made(tmp_path / "many", 3), client=client)
+    assert caught.value.name == "workers"
+
+
+@pytest.mark.usefixtures("quiet")
 def test_recordings_that_share_a_task_do_not_share_its_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,7 +9,8 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
@@ -32,6 +33,8 @@ _TASK_SECONDS, _TASK_RECORDINGS = 1.0, 16
 """How long a task takes, and its most recordings: handing one out costs 20 ms of processor."""
 _RETRIES = 50
 """Workers that may die over one recording before it is taken for the cause."""
+_PATIENCE, _LOOK = 120.0, 5.0
+"""How long no worker may be there at all, and how often that is looked at [s]."""
 
 
 @shown_in_notebooks("fleet", "share failed")
@@ -176,7 +179,6 @@ def _worked(
     if not recordings:
         return
     with _connected(client, scheduler, workers, memory) as connected:
-        as_completed = import_module("distributed").as_completed
         killed = import_module("distributed.scheduler").KilledWorker
 
         waiting = deque(recordings)
@@ -199,8 +201,10 @@ def _worked(
             count = max(1, min(fit, _TASK_RECORDINGS, math.ceil(len(waiting) / flying)))
             return [[waiting.popleft() for _ in range(count)]]
 
-        running = as_completed([submit(jobs) for _ in range(flying) for jobs in following()])
-        for future in running:
+        running = {submit(jobs) for _ in range(flying) for jobs in following()}
+        while running:
+            future = _ended(running, connected)
+            running.remove(future)
             together = submitted.pop(future.key)
             alone: list[list[Job]] = []
             try:
@@ -221,6 +225,26 @@ def _worked(
             for jobs in alone or following():
                 running.add(submit(jobs))
             yield from zip(together, rows, strict=False)
+
+
+def _ended(running: Collection[Any], connected: Any) -> Any:
+    """One of the tasks that have ended, waited for as long as there are workers."""
+    distributed = import_module("distributed")
+    seen, missed = time.monotonic(), ""
+    while not missed:
+        try:
+            found = distributed.wait(running, _LOOK, return_when="FIRST_COMPLETED")
+            return next(iter(found.done))
+        except distributed.TimeoutError:
+            if connected.scheduler_info(n_workers=-1)["workers"]:
+                seen = time.monotonic()
+            elif time.monotonic() - seen >= _PATIENCE:
+                missed = f"workers: expected one at least, got none for {_PATIENCE:g} s"
+        except CancelledError:
+            missed = "scheduler: expected it to stay, got a connection that is closed"
+    raise SettingError(
+        f"{missed}; start it again and repeat the call: with `out` it goes on from what is done"
+    )
 
 
 def _rows_of(

@@ -39,7 +39,7 @@ further in the same time, and extrapolates better."""
 WORTH_A_FEEDTHROUGH, STILL_WORTH_A_FEEDTHROUGH = 0.5, 0.9
 """nk = 0 is no plant for a loop, and a smoothed speed leans ahead a little: it must be worth it, at
 equal size, and beside the best with a delay, whose further states may have made up for it."""
-SHARE_OF_GUARD = 0.92
+SHARE_OF_GUARD = 0.95
 SHARE_OF_LINEAR, SHARE_OF_SEARCH, SHARE_OF_SEARCH_VERIFIED = 0.12, 0.58, 0.45
 """Parts of a time budget after which no linear model, and no network, is tried any more."""
 
