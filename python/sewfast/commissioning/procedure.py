@@ -348,8 +348,9 @@ def _carry_out(
     if small is not None and small.resonance is not None:
         speed = SHAKEN_AT * asked.speed
         at_work = margins_at_work(bench, controller, small.model, speed, asked.seed)
-        journal.keep(margins=at_work)
-        if at_work is None:
+        if at_work is not None:
+            journal.keep(margins=at_work[0], response=at_work[1])
+        else:
             journal.say(f"the margins could not be measured at {speed:g} RPM")
     journal.finish()
     found = journal.result(VERIFIED)

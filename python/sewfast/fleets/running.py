@@ -41,8 +41,8 @@ _PATIENCE, _LOOK = 120.0, 5.0
 def fleet(
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
-    inputs: str | Sequence[str] = "u",
-    output: str = "y",
+    inputs: str | Sequence[str] | None = None,
+    output: str | None = None,
     Ts: float | None = None,
     model: Kind = "oe",
     controller: Controller | None = None,
@@ -62,7 +62,10 @@ def fleet(
     recordings : path or sequence of paths
         A folder (with its subfolders), a manifest (CSV with a column `file` and, if they differ,
         `inputs` (several apart by `;`), `output`, `Ts`), or files.
-    inputs, output, Ts
+    inputs, output : str, or sequence of str, or None
+        Columns, as of `sewfast.read`. None: recognised in each recording by their names and units,
+        `u` and `y` first, as on the command line.
+    Ts : float, optional
         As of `sewfast.read`.
     model : str
         As of `identify`. Linear output error by default: its gain and residence time can be
@@ -101,7 +104,8 @@ def fleet(
         For no recordings, an unknown file extension, or if Dask is needed and not installed.
     """
     _require_settings(workers, controller, seed)
-    jobs = jobs_of(recordings, inputs, output, Ts)
+    tables = [Path(p) for p in (out, before) if isinstance(p, str | os.PathLike)]
+    jobs = jobs_of(recordings, inputs, output, Ts, tables)
     settings: dict[str, Any] = {"model": model, "seed": seed, "controller": None}
     if controller is not None:
         settings["controller"] = controller.to_dict()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from .folds import Split, errors_of, free_runs
+from .folds import Split, compared, errors_of, free_runs
 from .orders import LinearCandidate, LinearTable
 from .search import STILL_NEAR, Search, decayed
 from .training import Request, Start, train
@@ -61,11 +61,14 @@ class Finals:
         When the identification began, on `time.perf_counter`.
     reasons : list of str
         What has decided so far, for the model's file.
+    is_hurried : bool
+        Whether a time budget cuts the training to the end short.
     """
 
     search: Search
     began: float
     reasons: list[str] = field(default_factory=list)
+    is_hurried: bool = False
 
     def __post_init__(self) -> None:
         self.task = self.search.task
@@ -212,11 +215,19 @@ class Finals:
             plain = next((c for c in ranked if not c.structure.integrator), None)
             if plain is not None and plain.error <= STILL_NEAR * first.error:
                 found[FINALISTS - 1 :] = [plain]
-        if self.search.is_released and not first.structure.integrator:
+        self.search.share = SHARE_OF_FINAL
+        self.is_hurried = self.search.able(self._operations) < 1.0
+        # the same starts twice are no use where there is hardly time to train them once
+        if self.search.is_released and not (self.is_hurried or first.structure.integrator):
             leading = found[0]
             released = replace(leading, structure=decayed(leading.structure, RELEASED))
             found[FINALISTS - 1 :] = [released]
         return found
+
+    @property
+    def _operations(self) -> float:
+        """Multiplications of the training to the end."""
+        return FINAL_OPERATIONS_LARGE if self.search.is_large else FINAL_OPERATIONS
 
     def _simplest_of_size(self, c: Candidate, ranked: Sequence[Candidate]) -> Candidate:
         """The network of the same states with the fewest hidden units that does about as well."""
@@ -225,18 +236,17 @@ class Finals:
 
     def finish(self, finalists: Sequence[Candidate]) -> list[Candidate]:
         """More starts, then all fitted data, until nothing is gained any more."""
-        search = self.search
-        search.share = SHARE_OF_FINAL
-        until = search.until
-        budget = FINAL_OPERATIONS_LARGE if search.is_large else FINAL_OPERATIONS
-        budget *= search.able(budget)
+        search, until = self.search, self.search.until
+        budget = self._operations * search.able(self._operations)
         alive = self._with_more_starts(finalists, budget / 3.0)
-        alive = [self.rejudged(c) for c in alive]
+        alive = [replace(self.rejudged(c), converged=False) for c in alive]
         spent = 0.0
-        for leg in range(LEGS):
-            if self.clock.over(SHARE_OF_FINAL):
+        legs = 1 if self.is_hurried else LEGS
+        for leg in range(legs):
+            going = [c for c in alive if not c.converged]
+            if not going or self.clock.over(SHARE_OF_FINAL):
                 break
-            requests = self._leg(alive, (budget - spent) / (LEGS - leg))
+            requests = self._leg(going, (budget - spent) / (legs - leg))
             spent += sum(r.operations for r in requests)
             found = search.guarded(
                 train(
@@ -245,23 +255,18 @@ class Finals:
                     self.task.seed,
                     workers=self.task.workers,
                     until=until,
-                    share=0.6 + 0.35 * (leg + 1) / LEGS,
+                    share=0.6 + 0.35 * (leg + 1) / legs,
                 )
             )
             following = [
                 self._better(c, starts, r.count)
-                for c, starts, r in zip(alive, found, requests, strict=True)
+                for c, starts, r in zip(going, found, requests, strict=True)
             ]
-            gained = any(
-                n.error < FINISHED * c.error for c, n in zip(alive, following, strict=True)
-            )
-            alive = following
+            alive = [c for c in alive if c.converged] + following
             if not search.is_small and not (search.repeats and alive[0].structure.integrator):
                 best = min(c.error for c in alive)
                 behind = BEHIND_LARGE if search.is_large else BEHIND
                 alive = [c for c in alive if c.error <= behind * best]
-            if not gained:
-                break
         return sorted(alive, key=lambda c: c.error)
 
     def _with_more_starts(self, finalists: Sequence[Candidate], budget: float) -> list[Candidate]:
@@ -310,26 +315,33 @@ class Finals:
     def _better(self, before: Candidate, starts: Sequence[Start], count: int) -> Candidate:
         """The candidate after a leg of its first `count` starts, unless that has made it worse.
 
-        Starts for which there was no time stay in the median where they bring its error down.
+        Starts for which there was no time stay in the median, unless it does credibly better
+        without them.
         """
+        settled = replace(before, converged=True)
         if not starts:
-            return before
+            return settled
         after = self.rejudged(replace(before, starts=tuple(starts)))
         rest = before.members[count:]
         if rest:
             together = self.rejudged(replace(before, starts=(*starts, *rest)))
-            after = min(after, together, key=lambda c: (not c.is_sound, c.error))
+            after = after if self._is_better_alone(after, together) else together
         if after.error <= 1.02 * before.error and (after.is_sound or not before.is_sound):
-            return self._alone(after)
-        return before
+            return replace(self._alone(after), converged=after.error >= FINISHED * before.error)
+        return settled
 
     def _alone(self, c: Candidate) -> Candidate:
         """The best start alone, where long held-out data say that it is better so."""
         if len(c.models) < 2 or self.split.scored < ENOUGH_TO_CHOOSE_BY:
             return c
-        if self.search.is_large:
-            return self.rejudged(replace(c, starts=(c.members[0],)))
-        if c.structure.integrator and self.search.repeats:
+        if c.structure.integrator and self.search.repeats and not self.search.is_large:
             return c
         one = self.rejudged(replace(c, starts=(c.members[0],)))
-        return one if one.error < ALONE * c.error else c
+        return one if self.search.is_large or self._is_better_alone(one, c) else c
+
+    def _is_better_alone(self, some: Candidate, all_: Candidate) -> bool:
+        """Whether a part of the starts does credibly better: a median errs less often elsewhere."""
+        if self.search.is_large:
+            return some.error < all_.error
+        ratio, deviation = compared(some.errors, all_.errors)
+        return ratio < min(math.log(ALONE), -deviation)
