@@ -33,7 +33,17 @@ from .bench import NotedBench, bench_of, told_of
 from .checkpoint import STAGES, Taken
 from .demands import MS, Demands, Refusal, demands
 from .excitations import first_motion, standard, step_response
-from .gains import Requirements, cause, cautious, cost_of, first_gains, ruled, search, start_of
+from .gains import (
+    Requirements,
+    cause,
+    cautious,
+    cost_of,
+    first_gains,
+    ruled,
+    search,
+    sensible,
+    start_of,
+)
 from .journal import Journal, Progress
 from .result import VERIFIED, VERIFIED_POORLY, Commissioning, require_own
 from .shaking import margins_at_work
@@ -423,7 +433,7 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
             disturbances=plan.pushes, rival=second, variations=plan.thinning.variations(),
         )  # fmt: skip
 
-    alike = agreeing(first, trained.ensemble, practice)
+    alike = sensible(rival, agreeing(first, trained.ensemble, practice), small, asked)
     required, tuning = of(alike)
     ensemble = agreeing(tuning.pid, alike, practice)
     if ensemble is not alike:
