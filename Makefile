@@ -27,7 +27,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures accuracy battery commissioning drives motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures publishable accuracy battery commissioning drives motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -124,7 +124,7 @@ aarch64: ## unit and property tests on an emulated 64-bit ARM (Debian: rustc-web
 	  cargo test --package sewfast-control --package sewfast-core --lib --profile checked --quiet -Zbuild-std --target $(ARM64)
 
 constraints: ## packaging/constraints.txt, the newest versions that fit together (needs uv)
-	uv pip compile pyproject.toml --extra dev --extra docs --extra bench --universal --python-version 3.10 \
+	uv pip compile pyproject.toml --extra dev --extra docs --extra bench --extra release --universal --python-version 3.10 \
 	  --upgrade --no-annotate --no-emit-index-url -o packaging/constraints.txt
 
 licences: ## LICENSE-THIRD-PARTY, from what the crates of a wheel say
@@ -170,6 +170,15 @@ package: $(DEV) ## source archive -> wheel -> import in a clean environment
 	$(PYTHON) -m venv target/package/venv
 	target/package/venv/bin/pip install --quiet target/package/wheels/sewfast-*.whl
 	cd target/package/venv && bin/python -I $(CURDIR)/tests/support/clean_import.py
+
+# actionlint is no Python package: it is asked where it is installed
+publishable: package $(VENV)/release.stamp ## what a release is made of: archives, crates, workflows (twine, cargo publish --dry-run, zizmor, actionlint)
+	$(BIN)/twine check --strict target/package/sewfast-*.tar.gz target/package/wheels/*.whl
+	$(BIN)/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml
+	$(BIN)/check-jsonschema --builtin-schema vendor.renovate renovate.json
+	$(BIN)/zizmor --offline .github/workflows
+	if command -v actionlint; then actionlint; else echo 'actionlint is not installed; the workflows have been checked by their schema only'; fi
+	cargo publish --dry-run --workspace --no-verify --allow-dirty
 
 bench: $(VENV)/bench.stamp ## sewfast and its rivals in one run; writes docs/PERFORMANCE.md (QUICK=1, ONLY=word)
 	$(BIN)/python benches/performance.py $(if $(QUICK),--quick) $(if $(ONLY),--only $(ONLY))
@@ -243,6 +252,10 @@ $(REPORT): $(BUILT)
 
 $(DEV): $(BUILT)
 	$(BIN)/pip install --quiet 'sewfast[dev,docs]'
+	@touch $@
+
+$(VENV)/release.stamp: $(DEV)
+	$(BIN)/pip install --quiet 'sewfast[release]'
 	@touch $@
 
 $(VENV)/bench.stamp: $(DEV)

@@ -74,8 +74,9 @@ def main() -> None:
 
             def kill() -> None:
                 while not ended.wait(10.0):
-                    os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
-                    killed[0] += 1
+                    for pid in list(client.run(os.getpid).values())[:1]:
+                        os.kill(pid, signal.SIGKILL)
+                        killed[0] += 1
 
             killer = threading.Thread(target=kill, daemon=True)
             killer.start()

@@ -18,7 +18,7 @@ import pytest
 from sewfast import Controller, Fleet, Gains, fleet
 from sewfast.cli import main
 from sewfast.errors import SettingError
-from sewfast.fleets import load_fleet
+from sewfast.fleets import Drift, Row, load_fleet
 
 SAMPLES = 1500
 MACHINES = 8
@@ -118,6 +118,27 @@ def test_workers_that_are_killed_cost_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("quiet")
+def test_workers_that_are_gone_for_good_are_missed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    distributed = pytest.importorskip("distributed", reason="needs dask")
+    from sewfast.fleets import running
+
+    monkeypatch.setattr(running, "_PATIENCE", 1.0)
+    monkeypatch.setattr(running, "_LOOK", 0.2)
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        cluster.scale(0)
+        with pytest.raises(SettingError, match="expected one at least") as caught:
+            fleet(made(tmp_path / "many", 3), client=client)
+    assert caught.value.name == "workers"
+
+
+@pytest.mark.usefixtures("quiet")
 def test_recordings_that_share_a_task_do_not_share_its_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -136,6 +157,8 @@ def test_recordings_that_share_a_task_do_not_share_its_fault(
 
     monkeypatch.setattr(running, "row_of", broken)
     monkeypatch.setattr(running, "_RETRIES", 0)
+    # on a busy machine a recording alone may take a task's time
+    monkeypatch.setattr(running, "_TASK_SECONDS", 1e6)
     with (
         distributed.LocalCluster(
             n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
@@ -271,6 +294,48 @@ def test_a_manifest_says_how_each_is_read(tmp_path: Path, folder: Path) -> None:
         manifest.write_text(text)
         with pytest.raises(SettingError, match=said):
             fleet(manifest, workers=0)
+
+
+def test_columns_are_recognised_and_what_is_no_recording_is_left_out(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(0.0, 12.0, 60), 20)
+    y = np.convolve(u, 5.0 * 0.9 ** np.arange(100))[: len(u)] + rng.normal(0.0, 1.0, len(u))
+    lines = (f"{10 * k};{a:.4f};{b:.3f}" for k, (a, b) in enumerate(zip(u, y, strict=True)))
+    (tmp_path / "fan.csv").write_text(
+        ("time_ms;voltage_V;speed_rpm\n" + "\n".join(lines)).replace(".", ",")
+    )
+    (tmp_path / "._fan.csv").write_bytes(b"of another system")
+    (tmp_path / "other.csv").write_text("t,a,b\n0,1,2\n1,2,3\n")
+    out = tmp_path / "table.csv"
+    for _ in range(2):
+        assert main(["fleet", str(tmp_path), "-o", str(out), "--workers", "0"]) == 0
+        found = load_fleet(out)
+        assert [(row.file, row.status) for row in found.rows] == [
+            ("fan.csv", "ok"), ("other.csv", "failed"),
+        ]  # fmt: skip
+    assert found.rows[0].gain == pytest.approx(50.0, rel=0.02)
+    assert "which is the input and which the output" in found.rows[1].message
+    with pytest.raises(SettingError, match=r"fan\.csv: expected both, or neither"):
+        fleet(tmp_path, inputs="voltage_V", workers=0)
+
+
+def test_a_fleet_is_a_table_and_a_picture(alone: Fleet, tmp_path: Path) -> None:
+    assert alone.columns()["gain"] == [row.gain for row in alone.rows]
+    assert set(alone.columns()) == set(Row.__dataclass_fields__)
+    assert "<td>" in alone._repr_html_()
+    assert "m0.npz" in alone._repr_html_()
+    pytest.importorskip("matplotlib")
+    moved = Drift("m3.npz", "gain", 0.5 * alone.rows[3].gain, alone.rows[3].gain, 9.0)
+    axes = Fleet(alone.rows, (moved,)).plot()
+    assert [ax.get_ylabel() for ax in axes] == ["gain", "residence time [s]", "noise"]
+    assert [t.get_text() for t in axes[0].texts] == ["m3.npz"]
+    file = tmp_path / "fleet.png"
+    alone.plot(file=file)
+    assert file.stat().st_size > 10_000
+    failed = Fleet((Row("a.csv", "failed", "damaged"),))
+    assert "damaged" in failed._repr_html_()
+    with pytest.raises(SettingError, match="all failed"):
+        failed.plot()
 
 
 def test_a_controller_for_each(tmp_path: Path) -> None:

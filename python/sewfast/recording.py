@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from .arrays import FloatArray
 from .dataset import Dataset
+from .errors import DataError
 from .recordfile import Header, save_columns
 from .recordfile.writer import require_replaceable
 from .speed import Method, speed_from_counts
@@ -53,6 +54,52 @@ class Recording:
     Ts: float
     counts_per_rev: float
     name: str
+
+    @classmethod
+    def of_counts(
+        cls,
+        u: ArrayLike,
+        counts: ArrayLike,
+        *,
+        Ts: float,
+        counts_per_rev: float,
+        name: str = "recording",
+        speed_true: FloatArray | None = None,
+        method: Method = "kalman",
+    ) -> Recording:
+        """A recording from what a logger wrote: commands and counts, one of each per sample.
+
+        Parameters
+        ----------
+        u : array, shape (N,)
+            Command [V], held from sample k to k + 1.
+        counts : array, shape (N,)
+            Accumulated encoder counts, read before `u[k]` acts; they are counted from the first.
+        Ts, counts_per_rev : float
+            Sample time [s], counts of one turn.
+        name : str
+            Of the excitation.
+        speed_true : array, shape (N,), optional
+            As in the class.
+        method : "kalman", "savgol" or "difference"
+            How the speed is estimated (`speed_from_counts`).
+
+        Raises
+        ------
+        DataError
+            For commands and counts of different lengths, numbers that are not finite, or too few.
+        """
+        command, seen = (np.array(x, dtype=np.float64) for x in (u, counts))
+        if command.shape != seen.shape or command.ndim != 1:
+            raise DataError(
+                name="counts", expected=f"one for each command, shape {command.shape}",
+                received=f"shape {seen.shape}", remedy="log both at every sample",
+            )  # fmt: skip
+        require_finite("command", command)
+        require_finite("counts", seen)
+        seen -= seen[:1]
+        y = speed_from_counts(seen, Ts, counts_per_rev, method=method)
+        return cls(command, seen, y, speed_true, Ts, counts_per_rev, name)
 
     def __len__(self) -> int:
         return len(self.u)
@@ -139,3 +186,19 @@ class Recording:
 
     def __repr__(self) -> str:
         return f"Recording({self.name!r}, {len(self)} samples, Ts={self.Ts:g} s)"
+
+
+def require_finite(name: str, values: FloatArray) -> None:
+    """Refuse NaN and infinity.
+
+    Raises
+    ------
+    DataError
+    """
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        raise DataError(
+            name=name, expected="finite numbers",
+            received=f"{len(bad)} of {len(values)} that are not, the first at {bad[0]}",
+            remedy="mend the signal",
+        )  # fmt: skip

@@ -187,6 +187,13 @@ def _text(path: str | os.PathLike[str]) -> str:
 
 
 def _parse(path: str | os.PathLike[str], text: str) -> Any:
+    if text.lstrip()[:1] not in ("", "{", "["):
+        raise ModelFileError(
+            name=str(path), expected="a file that sewfast has written (JSON)",
+            received="one of another kind",
+            remedy="of a recording, sewfast identify makes a model, and sewfast tune a controller "
+            "of a model",
+        )  # fmt: skip
     try:
         return json.loads(
             text,

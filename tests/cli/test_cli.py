@@ -76,6 +76,11 @@ def test_help_lists_every_command_and_exit_code(tmp_path: Path) -> None:
         assert word in text
 
 
+def test_help_is_a_command_as_well(tmp_path: Path) -> None:
+    assert sewfast(tmp_path, "help").out == sewfast(tmp_path, "--help").out
+    assert sewfast(tmp_path, "help", "tune").out == sewfast(tmp_path, "tune", "--help").out
+
+
 def test_no_command_shows_the_help(tmp_path: Path) -> None:
     assert sewfast(tmp_path).out == sewfast(tmp_path, "--help").out
 

@@ -493,3 +493,9 @@ def test_standard_output_that_is_closed(
     monkeypatch.setattr(sys, "stdout", None)
     assert cli.main(["signals"]) == 0
     assert capsys.readouterr().err == ""
+
+
+def test_a_recording_in_place_of_a_model_is_told_from_a_damaged_one(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text("t,u,y\n0,1,2\n1,2,3\n")
+    for command in (("tune", "run.csv"), ("run", "run.csv", "run.csv")):
+        assert "sewfast identify makes a model" in refused(tmp_path, *command)

@@ -169,6 +169,23 @@ def test_a_message_does_not_steer_the_terminal(tmp_path: Path) -> None:
 # --- init -----------------------------------------------------------------------------------------
 
 
+def test_a_time_column_may_have_any_name(tmp_path: Path) -> None:
+    stranger(tmp_path / "bench.csv", "Uhr [ms];u;y")
+    assert "expected a column t or time" in refused(tmp_path, "identify", "bench.csv")
+    arguments = ("bench.csv", "--model", "oe", "-o", "drive.json")
+    sewfast(tmp_path, "identify", *arguments, "--time", "Uhr")
+    assert api.load_model(tmp_path / "drive.json").Ts == pytest.approx(0.01)
+    sewfast(tmp_path, "validate", "drive.json", "bench.csv", "--time", "Uhr")
+    toml(tmp_path, '[columns]\ntime = "Uhr"\n')
+    sewfast(tmp_path, "identify", *arguments)
+    sewfast(tmp_path, "validate", "drive.json", "bench.csv")
+
+
+def test_a_column_that_is_spoiled_is_named(tmp_path: Path) -> None:
+    (tmp_path / "bench.csv").write_text("t,u,y\n0,1,2\n1,2,OVL\n2,3,4\n")
+    assert "line 3, column 'y'" in refused(tmp_path, "identify", "bench.csv")
+
+
 def test_init_lays_out_a_folder_that_can_be_read(tmp_path: Path) -> None:
     done = sewfast(tmp_path, "init", "spindle", "--json").json()
     assert [Path(f).name for f in done["files"]] == [NAME, "README.md"]
@@ -183,7 +200,7 @@ def test_every_line_that_init_comments_out_is_a_setting(tmp_path: Path) -> None:
     lines = [x.removeprefix("# ") if " = " in x else x for x in text.splitlines()]
     found = load(toml(tmp_path, "\n".join(lines)))
     assert found.port == "/dev/ttyUSB0"
-    assert set(found.columns) == {"input", "output", "counts", "counts_per_rev", "ts"}
+    assert set(found.columns) == {"input", "output", "time", "counts", "counts_per_rev", "ts"}
     assert len(found.limits) == 4
     assert found.command == {"u_min": -10.0, "u_max": 10.0}
     assert found.units == {"u": "V", "speed": "RPM"}

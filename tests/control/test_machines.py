@@ -55,7 +55,9 @@ def stepped() -> SteppedBench:
 
 @dataclass
 class Own:
-    """A user's object with the members of a machine and no base class."""
+    """A user's test rig, with the members of a machine and no base class: it plays a whole signal
+    and hands back its log.
+    """
 
     name = "own"
     Ts = 1e-3
@@ -63,11 +65,30 @@ class Own:
     volt = 10.0
     speed = 6000.0
 
+    def logged(self, law: Callable[[int, float], float], samples: int, name: str) -> Recording:
+        lag, u, counts = Lag(), [], []
+        for k in range(samples):
+            # an encoder does not stand at 0 because a run begins
+            counts.append(lag.counts + 1234.0)
+            u.append(law(k, lag.counts))
+            lag.step(u[-1])
+        return Recording.of_counts(
+            u, counts, Ts=self.Ts, counts_per_rev=self.counts_per_rev, name=name
+        )
+
     def excite(self, u: FloatArray, name: str) -> Recording:
-        return stepped().excite(u, name)
+        return self.logged(lambda k, counts: float(u[k]), len(u), name)
 
     def follow(self, controller: Controller, r: FloatArray, name: str) -> RecordedRun:
-        return replace(stepped().follow(controller, r, name), plant=self.name)
+        core, per_count, before = controller.core(), 60.0 / (self.counts_per_rev * self.Ts), 0.0
+
+        def law(k: int, counts: float) -> float:
+            nonlocal before
+            speed, before = (counts - before) * per_count, counts
+            return core.step(float(r[k]), speed)
+
+        recording = self.logged(law, len(r), name)
+        return RecordedRun.of_recording(recording, controller, r, plant=self.name)
 
 
 @contextmanager
@@ -202,6 +223,20 @@ def test_it_refuses_numbers_that_are_not_finite(machine: Machine, bad: float) ->
 def test_it_refuses_a_controller_of_another_sample_time(machine: Machine) -> None:
     with pytest.raises(SettingError, match=r"sample time|period"):
         run(replace(CONTROLLER, Ts=5.0 * machine.Ts), machine, np.full(100, 300.0))
+
+
+def test_a_rigs_log_is_the_run_of_a_machine_that_is_stepped() -> None:
+    r = np.concatenate([np.zeros(50), np.full(350, 600.0)])
+    logged, known = Own().follow(CONTROLLER, r, "level"), stepped().follow(CONTROLLER, r, "level")
+    for name in ("t", "r", "u", "feedback"):
+        np.testing.assert_array_equal(getattr(logged, name), getattr(known, name))
+    # a log has no true speed
+    np.testing.assert_array_equal(logged.y, known.recording.y)
+    np.testing.assert_array_equal(logged.recording.counts, known.recording.counts)
+    with refuses(DataError, name="reference", received="100"):
+        RecordedRun.of_recording(logged.recording, CONTROLLER, r[:100], plant="own")
+    with refuses(DataError, name="counts", received=r"\(3,\)"):
+        Recording.of_counts([1.0, 2.0], [0, 1, 2], Ts=1e-3, counts_per_rev=4096.0)
 
 
 # --- what no machine is ---------------------------------------------------------------------------

@@ -177,8 +177,8 @@ SCOPES = {
         0.002, ("Channel A", "Channel B"), 0,
     ),
     "quantities below channels": (
-        "x-axis,1,2\nsecond,Volt,Volts\n-0.002,1,2\n0,1,3\n0.002,1,4\n",
-        0.002, ("Volt", "Volts"), 1,
+        "x-axis,1,2\nsecond,Volt,Volt\n-0.002,1,2\n0,1,3\n0.002,1,4\n",
+        0.002, ("1", "2"), 0,
     ),
     "semicolons and decimal commas": (
         "Export von Kanal 1\nDatum;1.2.2026\nt;u;y\n0,000;1,5;2,0\n0,002;1,5;3,0\n",

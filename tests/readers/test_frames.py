@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import re
 import sys
 from collections.abc import Callable
@@ -96,7 +97,7 @@ def test_names_that_meet_are_told_apart() -> None:
 def test_a_dict_of_columns_is_a_table() -> None:
     columns = {"t": T, "u [V]": U, "speed (RPM)": Y, "true": (2 * Y).tolist(), "who": ["me"] * N}
     require_same(read(columns))
-    with pytest.raises(DataError, match=r"dict: column 'who' holds <U2; expected numbers"):
+    with pytest.raises(DataError, match=r"dict: column 'who' holds text; expected numbers"):
         sewfast.read(columns, inputs="who")
     with pytest.raises(DataError, match="did you mean 'speed'"):
         sewfast.read(columns, inputs="u", output="sped")
@@ -283,3 +284,38 @@ def test_a_time_column_without_numbers_is_named() -> None:
     columns = {"t": np.array(["a", "b", "c"]), "u": np.arange(3.0), "y": np.arange(3.0)}
     with pytest.raises(DataError, match="column 't' holds"):
         sewfast.read(columns, inputs="u", output="y")
+
+
+@pytest.mark.parametrize("package", ["pandas", "polars", "pyarrow", "dict"])
+@pytest.mark.parametrize("kind", ["text", "moment", "time of day", "duration"])
+def test_moments_as_objects_or_text_are_times(package: str, kind: str) -> None:
+    begin = datetime.datetime(2026, 3, 14, 10)
+    moments = [begin + datetime.timedelta(milliseconds=10 * k) for k in range(N)]
+    made: dict[str, list[Any]] = {
+        "text": [m.isoformat() for m in moments],
+        "moment": moments,
+        "time of day": [m.time() for m in moments],
+        "duration": [m - begin for m in moments],
+    }
+    columns = {"time": made[kind], "u": U, "speed": U, "true": U}
+    if package == "dict":
+        frame: Any = columns
+    elif package == "pyarrow":
+        frame = pytest.importorskip(package).table(columns)
+    else:
+        frame = pytest.importorskip(package).DataFrame(columns)
+    assert read(frame).Ts == pytest.approx(TS, rel=1e-9)
+
+
+def test_levels_of_an_index_that_have_names_are_columns() -> None:
+    pd = pytest.importorskip("pandas")
+    frame = pd.DataFrame({"run": 1, "t": T, "u": U, "speed": U}).set_index(["run", "t"])
+    assert sewfast.read_table(frame).names == ("run", "t", "u", "speed")
+    assert sewfast.read(frame, inputs="u", output="speed").Ts == pytest.approx(TS)
+    periods = pd.period_range("2026-01-01", periods=N, freq="s")
+    assert sewfast.read(pd.DataFrame({"u": U}, index=periods), inputs="u").Ts == 1.0
+
+
+def test_a_structured_array_is_a_table() -> None:
+    fields = np.rec.fromarrays([T, U, U, U], names="t,u,speed,true")
+    assert read(fields).Ts == pytest.approx(TS)

@@ -96,9 +96,102 @@ def test_a_bad_cell_is_named_by_line_column_and_text(tmp_path: Path) -> None:
     np.testing.assert_array_equal(table["u"], [1.0, 2.0, 4.0])
 
 
-def test_mixed_decimal_marks_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"line 3, column 'u'.*'1\.234,5'.*decimal points"):
-        read_table(csv(tmp_path, "u;y\n1;2\n1.234,5;2\n"))["u"]
+@pytest.mark.parametrize(
+    "text",
+    [
+        "u y\n1.5 2000.25\n3 4000\n",
+        "  u [V]   y [RPM]\n 1.5   2000.25\n 3.0   4000.00\n",
+        "u y\n1,5 2000,25\n3 4000\n",
+        "u|y\n1.5|2000.25\n3|4000\n",
+        'u,y\n1.5,"2,000.25"\n3,"4,000"\n',
+        "u;y\n1,5;2.000,25\n3;4.000\n",
+        "u;y\n1.5;2'000.25\n3;4'000\n",
+        "u;y\n1,5;2\u00a0000,25\n3;4\u202f000\n",
+        "u;y\n1,5;2 000,25\n3;4 000\n",
+        '"u","y"\n"1,5","2000,25"\n"3,0","4000,0"\n',
+        "u;y;note\n1,5;2000,25;vers. 1.0\n3;4000;\n",
+        "u,y\n1.5,2000.25\n# pause\n3,4000\n# end\n",
+        "sep=;\nu;y\n1,5;2000,25\n3;4000\n",
+        "u,y\n1.5,2000.25\n3,4000\n\x1a",
+        "u,y\n1.5,2000.25\n3,4000\n" + 600 * "\0",
+        "u,y\n1.5,2000.25\n3,4000\nEnd of data\n",
+        "u,y,z\n1.5,2000.25,1\n3,4000,1\n4,1.2",
+        "LabVIEW Measurement\t\nWriter_Version\t2\n***End_of_Header***\t\n\nChannels\t2\t\n"
+        "X0\t0\t0\t\n***End_of_Header***\t\t\t\nu\ty\tComment\n1.5\t2000.25\n3\t4000\n",
+        "File;C:\\x.svd\n\nName;u;y\nSampleTime[ms];10;10\n\n0;1,5;2000,25\n10;3;4000\n",
+    ],
+)
+def test_dialects_of_strangers(tmp_path: Path, text: str) -> None:
+    table = read_table(csv(tmp_path, text))
+    np.testing.assert_array_equal(table["u"], [1.5, 3.0])
+    np.testing.assert_array_equal(table["y"], [2000.25, 4000.0])
+    assert len(table.notes) == sum(w in text for w in ("sep=", "End of data", "z\n", "Lab", "svd"))
+
+
+@pytest.mark.parametrize("text", ["u;y\n1;2\n1.5;2,5\n", 'u,y\n1,2\n1,"2,500"\n'])
+def test_marks_that_may_mean_either_are_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(DataError, match=r"line 3, column 'y'.*'2,5(00)?'.*decimal points"):
+        read_table(csv(tmp_path, text))["y"]
+
+
+def test_digits_in_wrong_groups_are_no_number(tmp_path: Path) -> None:
+    table = read_table(csv(tmp_path, "t;u;y\n0;1.234,5;1\n1;12.34,5;1\n"))
+    with pytest.raises(DataError, match=r"line 3, column 'u'.*'12\.34,5'"):
+        table["u"]
+
+
+def test_a_short_line_within_a_table_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"line 3: expected 2 cells.*received 1"):
+        read_table(csv(tmp_path, "u,y\n1,2\nlost\n3,4\n"))
+
+
+def test_numbers_below_a_line_of_text_want_a_header(tmp_path: Path) -> None:
+    with refuses(DataError, name=r"run.csv: line 1", expected="names for the 3 columns"):
+        read_table(csv(tmp_path, "setup done\n0,1,2\n1,2,3\n"))
+    np.testing.assert_array_equal(
+        read_table(csv(tmp_path, "motor speed\n1,5\n2,5\n"))["motor speed"], [1.5, 2.5]
+    )
+
+
+@pytest.mark.parametrize("word", ["", "NaN", "NA", "#N/A", "-", "--", "null", "1.#QNAN"])
+def test_what_programs_write_where_nothing_was_measured(tmp_path: Path, word: str) -> None:
+    table = read_table(csv(tmp_path, f"u,y\n1,2\n2,{word}\n"))
+    np.testing.assert_array_equal(table["y"], [2.0, np.nan])
+
+
+MOMENTS = {
+    "iso": ("2026-03-14T23:59:59.990", "2026-03-15T00:00:00", "2026-03-15T00:00:00.010"),
+    "zone": ("2026-03-29T00:59:59.99Z", "2026-03-29T03:00:00+02:00", "2026-03-29T03:00:00.01+0200"),
+    "spaces": ("2026-03-14 23:59:59.99", "2026-03-15 0:00:00", "2026-03-15 0:00:00.01"),
+    "points": ("14.03.2026 23:59:59,990", "15.03.2026 00:00:00,000", "15.03.2026 00:00:00,010"),
+    "American": ("3/14/2026 11:59:59.990 PM", "3/15/2026 12:00:00 AM", "3/15/2026 12:00:00.010 AM"),
+    "British": ("31/03/2026 23:59:59.99", "01/04/2026 00:00:00", "01/04/2026 00:00:00.01"),
+    "clock": ("23:59:59.990", "00:00:00.000", "00:00:00.010"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MOMENTS)
+def test_moments_become_seconds(tmp_path: Path, name: str) -> None:
+    rows = "".join(f"{moment};1;2\n" for moment in MOMENTS[name])
+    data = read(csv(tmp_path, "Timestamp [ms];u;y\n" + rows), inputs="u", output="y")
+    assert data.Ts == pytest.approx(0.01, rel=1e-12)
+    assert data.notes == ()
+
+
+def test_moments_that_are_none_stay_text(tmp_path: Path) -> None:
+    table = read_table(csv(tmp_path, "t,u\n2026-02-30T10:00:00,1\n2026-02-31T10:00:00,2\n"))
+    with pytest.raises(DataError, match="line 2, column 't': expected a number"):
+        table["t"]
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_time_since_1970_in_small_units_is_no_time_in_seconds(
+    tmp_path: Path, unit: str, scale: float
+) -> None:
+    rows = "".join(f"{round((1773482400 + 0.01 * k) * scale)},1,{k}\n" for k in range(50))
+    data = read(csv(tmp_path, "timestamp,u,y\n" + rows), inputs="u", output="y")
+    assert data.Ts == pytest.approx(0.01, rel=1e-6)
+    assert data.notes == (f"run.csv: column 'timestamp' is taken as {unit} since 1970",)
 
 
 def test_decimal_commas_between_commas_are_refused_with_the_remedy(tmp_path: Path) -> None:
@@ -348,7 +441,7 @@ def test_parquet(tmp_path: Path) -> None:
     np.testing.assert_array_equal(data.experiments[0].u[:, 0], U.astype(np.float32))
     assert np.isnan(data.experiments[0].y[2])
     assert data.input_units == ("V",)
-    with pytest.raises(DataError, match="'s' holds string"):
+    with pytest.raises(DataError, match="'s' holds text"):
         read_table(path)["s"]
 
 

@@ -62,6 +62,9 @@ def add_columns(parser: argparse.ArgumentParser, *, from_model: bool) -> None:
         "1 %%, uneven ones are resampled to it",
     )  # fmt: skip
     parser.add_argument(
+        "--time", metavar="COL", help="column of time, where its name does not say so"
+    )
+    parser.add_argument(
         "--counts", metavar="COL",
         help="column of encoder counts; the output is then the speed [RPM] computed from it",
     )  # fmt: skip

@@ -48,6 +48,7 @@ def _read_named(source: str, args: argparse.Namespace, channels: Sequence[str]) 
             Ts=args.ts,
             counts=counts,
             counts_per_rev=args.counts_per_rev,
+            time=args.time,
             channels=[*channels, *_references(table, (*inputs, output, counts, *channels))],
             weights=getattr(args, "weights", None),
         )
@@ -83,9 +84,10 @@ def _of_recording(
 
 
 def _unnamed(table: Table, what: str, remedy: str) -> SettingError:
+    spoiled = "".join(f"; {why}" for why in list(table.unusable.values())[:3])
     return SettingError(
         name=str(table.path), expected=f"the column of the {what} by its name", received="none",
-        remedy=f"available: {', '.join(table.names)}; name it: {remedy}",
+        remedy=f"available: {', '.join(table.names)}; name it: {remedy}{spoiled}",
     )  # fmt: skip
 
 
@@ -104,6 +106,7 @@ def read_for_model(
     if not needs_output and not _has_output(table, columns):
         columns |= {"output": None, "counts": None, "counts_per_rev": None}
     columns["weights"] = getattr(args, "weights", None)
+    columns["time"] = args.time
     return _with_notes(read(table, Ts=_sample_time(args.ts, table, model), **columns)), table
 
 

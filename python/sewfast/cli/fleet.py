@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..kinds import KINDS
 from ..progress import Progress
-from .arguments import Commands, add_command
+from .arguments import Commands, add_command, add_plot, require_plot
 from .output import DONE, INTERRUPTED, print_json
 
 FLEET = """\
@@ -40,9 +40,12 @@ def add(commands: Commands) -> None:
         "-o", "--out", required=True, type=Path, metavar="OUT", help=".csv, .json or .parquet"
     )
     parser.add_argument(
-        "--input", action="append", metavar="COL", help="column of the input (u); repeat it"
+        "--input", action="append", metavar="COL", help="column of the input; repeat it for several"
     )
-    parser.add_argument("--output", metavar="COL", help="column of the output (y)")
+    parser.add_argument(
+        "--output", metavar="COL",
+        help="column of the output; default: both as their names and units show",
+    )  # fmt: skip
     parser.set_defaults(columns_of="file", counts=None)
     parser.add_argument(
         "--ts", "--Ts", type=float, metavar="S", help="sample time [s]; default: the time column's"
@@ -55,6 +58,7 @@ def add(commands: Commands) -> None:
         "--controller", metavar="FILE.json", help="tune it anew for every recording's model"
     )
     parser.add_argument("--before", metavar="FILE", help="an earlier table, to find drift")
+    add_plot(parser, "gain, residence time and noise of every machine")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster")
     parser.add_argument(
         "--workers", type=int, metavar="N",
@@ -68,6 +72,7 @@ def fleet_command(args: argparse.Namespace) -> int:
     from ..control.files import load_pid
     from ..fleets import fleet
 
+    require_plot(args.plot)
     controller = None if args.controller is None else load_pid(args.controller)
     done = 0
     with Progress("fleet", "share failed", quiet=args.quiet) as shown:
@@ -80,8 +85,8 @@ def fleet_command(args: argparse.Namespace) -> int:
         try:
             found = fleet(
                 args.recordings,
-                inputs=args.input or "u",
-                output=args.output or "y",
+                inputs=args.input,
+                output=args.output,
                 Ts=args.ts,
                 model=args.model,
                 controller=controller,
@@ -100,11 +105,16 @@ def fleet_command(args: argparse.Namespace) -> int:
                 file=sys.stderr,
             )
             return INTERRUPTED
+    if args.plot is not None:
+        found.plot(file=args.plot)
     if args.json:
         drifts = [dataclasses.asdict(drift) for drift in found.drifts]
         failed = [{"file": row.file, "message": row.message} for row in found.failed]
         summary = {"recordings": len(found.rows), "failed": failed, "drifts": drifts}
-        print_json({**summary, "file": str(args.out)})
+        drawn = {} if args.plot is None else {"plot": str(args.plot)}
+        print_json({**summary, "file": str(args.out), **drawn})
     else:
         print(f"{found}\nwritten to {args.out}")
+        if args.plot is not None:
+            print(f"written to {args.plot}")
     return DONE

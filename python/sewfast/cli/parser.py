@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import re
+import sys
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -71,7 +72,10 @@ class Parser(argparse.ArgumentParser):
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> argparse.Namespace:
         found: argparse.Namespace
-        found, unknown = self.parse_known_args(args, namespace)
+        given = list(sys.argv[1:] if args is None else args)
+        if given[:1] == ["help"]:
+            given = [*given[1:2], "--help"]
+        found, unknown = self.parse_known_args(given, namespace)
         if unknown:
             known = self.options_of(found.name)
             self.error(f"unrecognized arguments: {' '.join(unknown)}{meant(unknown, known)}")

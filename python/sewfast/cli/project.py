@@ -29,7 +29,7 @@ NAME = "sewfast.toml"
 _LARGEST = 1_000_000
 _RANGE = ("u_min", "u_max")
 _KEYS: dict[str, tuple[str, ...]] = {
-    "columns": ("input", "output", "counts", "counts_per_rev", "ts", "weights"),
+    "columns": ("input", "output", "time", "counts", "counts_per_rev", "ts", "weights"),
     "limits": (*LIMITS, *_RANGE),
 }
 _TOP = ("port", "columns", "units", "limits")
@@ -46,7 +46,7 @@ class Project:
     port : str or None
         Serial port or socket of the drive.
     columns : mapping
-        `input` (a list), `output`, `counts`, `counts_per_rev`, `ts`, `weights`.
+        `input` (a list), `output`, `time`, `counts`, `counts_per_rev`, `ts`, `weights`.
     units : mapping of str to str
         Of columns whose file states none.
     limits : mapping of str to float
@@ -82,6 +82,9 @@ class Project:
         self._fill_port(args, taken)
         if getattr(args, "columns_of", None) == "file":
             self._fill_columns(args, taken)
+        elif hasattr(args, "time"):
+            # a model knows its columns, but not which one was the time
+            self._take(args, taken, "time", self.columns.get("time"))
         port = getattr(args, "on", None) or getattr(args, "port", None)
         if self.limits and isinstance(port, str) and is_port(port):
             text = ",".join(f"{name}={value:g}" for name, value in self.limits.items())
@@ -325,6 +328,7 @@ _COLUMNS = """\
 # output = "speed"
 # counts = "encoder"          # encoder counts instead of an output, and
 # counts_per_rev = 4096       # how many make one turn
+# time = "clock"              # where its name does not say that it is the time
 # ts = 0.001                  # s, where a file has no time column
 """
 

@@ -21,15 +21,14 @@ from .arguments import (
 )
 from .control import reference_of
 from .output import print_json, print_rows
+from .tune_options import command_limits, constraints, cost, loads, notches, variables
 
 if TYPE_CHECKING:
-    from ..control.biquad import Biquad
     from ..control.controller import Controller, SampledController
     from ..gains import Gains
     from ..tuning.front import ParetoFront
-    from ..tuning.objective import Constraints, Cost, LoadStep
+    from ..tuning.objective import Constraints
     from ..tuning.search import TuningResult
-    from ..tuning.task import Wanted
 
 FORMS = ("standard", "parallel", "per_sample")
 FIGURES = (".png", ".svg", ".pdf")
@@ -237,10 +236,10 @@ def tune_command(args: argparse.Namespace) -> int | None:
 def _settings(args: argparse.Namespace) -> dict[str, Any]:
     """What both searches take."""
     settings: dict[str, Any] = {
-        "variables": _variables(args.variables),
-        "cost": _cost(args.cost),
-        "constraints": _constraints(args.constraint),
-        "loads": _loads(args.load),
+        "variables": variables(args.variables),
+        "cost": cost(args.cost),
+        "constraints": constraints(args.constraint),
+        "loads": loads(args.load),
         "aggregate": args.aggregate,
         "seed": args.seed,
     }
@@ -295,40 +294,16 @@ def _about(args: argparse.Namespace, constraints: Constraints, models: list[Any]
     return replace(constraints, plant=plants, speed=args.speed)
 
 
-def _notches(given: list[str] | None) -> list[Biquad]:
-    """Of every --notch.
-
-    Raises
-    ------
-    SettingError
-        For what is not HZ[:DEPTH[:WIDTH]].
-    """
-    from ..control.biquad import Biquad
-
-    found = []
-    for text in given or ():
-        try:
-            numbers = [float(number) for number in text.split(":")]
-        except ValueError:
-            numbers = []
-        if not 1 <= len(numbers) <= 3:
-            raise SettingError(
-                f"--notch {text}: expected HZ, HZ:DEPTH or HZ:DEPTH:WIDTH, as in --notch 75:0.1:0.5"
-            )
-        found.append(Biquad.notch(*numbers))
-    return found
-
-
 def _started(args: argparse.Namespace, models: list[Any]) -> dict[str, Any]:
     """`_first` with the notches that the options name."""
     first = _first(args)
-    notches = _notches(args.notch)
-    if not notches:
+    given = notches(args.notch)
+    if not given:
         return first
     from ..tuning.task import first_of
 
     start = _pid(first.get("start") or first_of(models[0], **first), "--notch")
-    return {"start": replace(start, biquads=(*start.biquads, *notches))}
+    return {"start": replace(start, biquads=(*start.biquads, *given))}
 
 
 def _pid(start: SampledController, option: str) -> Controller:
@@ -382,7 +357,7 @@ def _first(args: argparse.Namespace) -> dict[str, Any]:
 
 def _loop(args: argparse.Namespace) -> dict[str, Any]:
     """Limits, encoder and filter of the first controller, where they are stated."""
-    u_min, u_max = _command_limits(args)
+    u_min, u_max = command_limits(args)
     return {
         "u_min": u_min,
         "u_max": u_max,
@@ -420,113 +395,6 @@ def _front(
             models, references, objectives=args.pareto.split(","), start=start, **settings,
             progress=progress,
         )  # fmt: skip
-
-
-def _pairs(given: list[str] | None, option: str) -> dict[str, float]:
-    """NAME=NUMBER of every time that an option was given."""
-    pairs = {}
-    for text in given or ():
-        name, equals, number = text.partition("=")
-        try:
-            pairs[name.strip()] = float(number)
-        except ValueError:
-            equals = ""
-        if not equals or not name.strip():
-            raise SettingError(f"{option} {text}: expected NAME=NUMBER, as in {option} overshoot=2")
-    return pairs
-
-
-def _cost(given: list[str] | None) -> Cost:
-    from ..tuning.objective import Cost
-
-    return Cost(**_known(_pairs(given, "--cost"), "--cost", tuple(Cost.__dataclass_fields__)))
-
-
-def _constraints(given: list[str] | None) -> Constraints:
-    from ..tuning.objective import Constraints
-
-    pairs = _pairs(given, "--constraint")
-    return Constraints(
-        **_known(pairs, "--constraint", ("Ms", "overshoot", "u", "recovery", "load"))
-    )
-
-
-def _loads(given: list[str] | None) -> list[LoadStep]:
-    from ..tuning.objective import LoadStep
-
-    steps = []
-    for text in given or ():
-        try:
-            level, disturbance = (float(number) for number in text.split(":"))
-        except ValueError:
-            raise SettingError(
-                f"--load {text}: expected LEVEL:COMMAND, as in --load=1500:-2"
-            ) from None
-        steps.append(LoadStep(level, disturbance))
-    return steps
-
-
-def _known(pairs: dict[str, float], option: str, names: tuple[str, ...]) -> dict[str, Any]:
-    for name in pairs:
-        if name not in names:
-            raise SettingError(f"{option} {name}: expected one of {', '.join(names)}")
-    return dict(pairs)
-
-
-def _variables(text: str | None) -> list[Wanted] | None:
-    """`Kp,Ti=0.02:0.5` as names and (name, low, high).
-
-    Raises
-    ------
-    SettingError
-        For bounds that are not two numbers.
-    """
-    if text is None:
-        return None
-    found: list[Wanted] = []
-    for part in text.split(","):
-        name, equals, bounds = (piece.strip() for piece in part.partition("="))
-        if not equals:
-            found.append(name)
-            continue
-        try:
-            low, high = (float(bound) for bound in bounds.split(":"))
-        except ValueError:
-            raise SettingError(
-                f"--variables {part}: expected NAME or NAME=LOW:HIGH, as in Ti=0.02:0.5"
-            ) from None
-        found.append((name, low, high))
-    return found
-
-
-def _command_limits(args: argparse.Namespace) -> tuple[float | None, float | None]:
-    """Least and largest command [V]: as given, else of a recording's drive, else as recorded.
-
-    Raises
-    ------
-    SettingError, DataError
-        For a recording without a volt limit, or one that cannot be read.
-    """
-    if args.limits_of is None:
-        return args.u_min, args.u_max
-    volt = _volt_limit(args.limits_of)
-    return (
-        -volt if args.u_min is None else args.u_min,
-        volt if args.u_max is None else args.u_max,
-    )
-
-
-def _volt_limit(path: str) -> float:
-    from ..recordfile.reader import read_header
-
-    limits = read_header(path).settings.get("limits")
-    volt = limits.get("volt") if isinstance(limits, dict) else None
-    if not isinstance(volt, (int, float)) or isinstance(volt, bool) or volt <= 0.0:
-        raise SettingError(
-            f"--limits-of {path}: expected a recording of a drive with a volt limit, it states "
-            "none; give --u-min and --u-max"
-        )
-    return float(volt)
 
 
 def _show_tuned(args: argparse.Namespace, found: TuningResult) -> None:

@@ -23,8 +23,8 @@ from ..errors import DataError, SettingError
 from ..gains import real
 from ..machine import VirtualMachine
 from ..recordfile.writer import require_replaceable
-from ..recording import Recording
-from ..speed import Method, speed_from_counts
+from ..recording import Recording, require_finite
+from ..speed import Method
 from .controller import SampledController
 from .loop import ClosedLoopRun, run
 
@@ -50,6 +50,51 @@ class RecordedRun(ClosedLoopRun):
         known = {f.name: getattr(run, f.name) for f in fields(ClosedLoopRun)}
         return cls(**known, recording=recording)
 
+    @classmethod
+    def of_recording(
+        cls, recording: Recording, controller: SampledController, r: FloatArray, *, plant: str
+    ) -> RecordedRun:
+        """The run of which a rig has logged commands and counts.
+
+        What a log does not have, the feedback, is what the controller makes of the counts.
+
+        Parameters
+        ----------
+        recording : Recording
+            As of `Recording.of_counts`; its name becomes the reference's.
+        controller : Controller
+            What computed the commands.
+        r : array, shape (N,)
+            Reference [RPM].
+        plant : str
+            Name of the machine.
+
+        Raises
+        ------
+        SettingError
+            For a controller of another sample time.
+        DataError
+            For a reference of another length, or one that is not finite.
+        """
+        _require_fit(controller, r, recording.Ts)
+        if len(r) != len(recording):
+            raise DataError(
+                name="reference", expected=f"a sample for each of the recording's {len(recording)}",
+                received=f"{len(r)}", remedy="log the whole run",
+            )  # fmt: skip
+        core, feedback = controller.core(), np.zeros(len(r))
+        per_count = 60.0 / (recording.counts_per_rev * recording.Ts)
+        speeds = np.diff(recording.counts, prepend=0.0) * per_count
+        for k, (wanted, speed) in enumerate(zip(r.tolist(), speeds.tolist(), strict=True)):
+            core.step(wanted, speed)
+            feedback[k] = core.filtered
+        t = np.arange(len(r), dtype=np.float64) * recording.Ts
+        y = recording.y if recording.speed_true is None else recording.speed_true
+        return cls(
+            t, np.array(r), recording.u, y, feedback, controller, plant, recording.name,
+            recording=recording,
+        )  # fmt: skip
+
     @property
     def run(self) -> ClosedLoopRun:
         """Itself; there was a pair of run and recording before."""
@@ -59,6 +104,16 @@ class RecordedRun(ClosedLoopRun):
 def Followed(run: ClosedLoopRun, recording: Recording) -> RecordedRun:
     """`RecordedRun.of`, by the name that machines written so far know."""
     return RecordedRun.of(run, recording)
+
+
+def _require_fit(controller: SampledController, r: FloatArray, Ts: float) -> None:
+    """Refuse a controller of another sample time, and a reference that is not finite."""
+    if not math.isclose(controller.Ts, Ts, rel_tol=0.01):
+        raise SettingError(
+            name="controller", expected=f"the machine's sample time of {Ts} s",
+            received=f"{controller.Ts} s", remedy="tune a controller for this machine",
+        )  # fmt: skip
+    require_finite("reference", r)
 
 
 Watch: TypeAlias = Callable[[int, FloatArray, FloatArray], object]
@@ -74,7 +129,8 @@ class Machine(Protocol):
     Any object with these members works with `record`, `run`, `commission` and `bode`: a drive
     behind a port, an FMU, a model of MuJoCo, your own test rig. A `VirtualMachine` has them all.
     Every run, even an interrupted one, ends with no command on the motor. If its `follow` also
-    accepts a `watch` (`Watch`), a run that goes wrong is ended early.
+    accepts a `watch` (`Watch`), a run that goes wrong is ended early. `Recording.of_counts` and
+    `RecordedRun.of_recording` make the results from what a rig has logged.
     """
 
     @property
@@ -299,8 +355,10 @@ class MachineBench:
         u = np.array(u, dtype=np.float64)
         self.machine.reset()
         done = self.machine.run(u)
-        y = speed_from_counts(done.counts, self.Ts, self.counts_per_rev, method=self.method)
-        return Recording(u, done.counts, y, done.speed_rpm, self.Ts, self.counts_per_rev, name)
+        return Recording.of_counts(
+            u, done.counts, Ts=self.Ts, counts_per_rev=self.counts_per_rev, name=name,
+            speed_true=done.speed_rpm, method=self.method,
+        )  # fmt: skip
 
     def follow(
         self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
@@ -375,18 +433,13 @@ class SteppedBench:
                 )  # fmt: skip
 
     def excite(self, u: FloatArray, name: str) -> Recording:
-        _require_finite("command", u)
+        require_finite("command", u)
         return self._recording(u, *self._played(lambda k, counts: float(u[k]), len(u)), name)
 
     def follow(
         self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
     ) -> RecordedRun:
-        if not math.isclose(controller.Ts, self.Ts, rel_tol=0.01):
-            raise SettingError(
-                name="controller", expected=f"the machine's sample time of {self.Ts} s",
-                received=f"{controller.Ts} s", remedy="tune a controller for this machine",
-            )  # fmt: skip
-        _require_finite("reference", r)
+        _require_fit(controller, r, self.Ts)
         core = controller.core()
         per_count = 60.0 / (self.counts_per_rev * self.Ts)
         u, feedback, before = np.zeros(len(r)), np.zeros(len(r)), [0.0]
@@ -426,16 +479,7 @@ class SteppedBench:
     def _recording(
         self, u: FloatArray, counts: FloatArray, speed: FloatArray | None, name: str
     ) -> Recording:
-        y = speed_from_counts(counts, self.Ts, self.counts_per_rev, method="kalman")
-        u = np.clip(u, -self.volt, self.volt)
-        return Recording(u, counts, y, speed, self.Ts, self.counts_per_rev, name)
-
-
-def _require_finite(what: str, values: FloatArray) -> None:
-    bad = np.flatnonzero(~np.isfinite(values))
-    if len(bad):
-        raise DataError(
-            name=what, expected="finite numbers",
-            received=f"{len(bad)} of {len(values)} that are not, the first at {bad[0]}",
-            remedy="mend the signal",
+        return Recording.of_counts(
+            np.clip(u, -self.volt, self.volt), counts, Ts=self.Ts,
+            counts_per_rev=self.counts_per_rev, name=name, speed_true=speed,
         )  # fmt: skip

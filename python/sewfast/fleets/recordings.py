@@ -16,15 +16,19 @@ import numpy as np
 
 from ..control.controller import Controller
 from ..dataset import Dataset
-from ..errors import SettingError, SewfastError
+from ..errors import DataError, SettingError, SewfastError
 from ..evidence import Residuals, estimate
 from ..identification import identify
 from ..models import Model
-from ..readers import read
+from ..readers import read, read_table, roles
 from ..validation import validate
 from .table import Row
 
-READABLE = (".csv", ".mat", ".npz", ".parquet", ".mcap")
+READABLE = (
+    ".csv", ".mat", ".npz", ".parquet", ".mcap",
+    ".mf4", ".mdf", ".tdms", ".ulg", ".wpilog", ".bag", ".bbl", ".bfl",
+)  # fmt: skip
+"""Endings by which recordings and logs in a folder are known; a manifest may name any file."""
 TRAINED = 0.7
 """Share of a recording that is identified from; the rest is what the figures are of."""
 
@@ -39,7 +43,7 @@ class Job:
     file: str
     path: str
     inputs: tuple[str, ...]
-    output: str
+    output: str | None
     Ts: float | None = None
 
     def fingerprint(self) -> list[Any]:
@@ -52,13 +56,26 @@ class Job:
 
 
 def jobs_of(
-    recordings: Any, inputs: str | Sequence[str], output: str, Ts: float | None
+    recordings: Any,
+    inputs: str | Sequence[str] | None,
+    output: str | None,
+    Ts: float | None,
+    tables: Sequence[Path] = (),
 ) -> list[Job]:
-    names = (inputs,) if isinstance(inputs, str) else tuple(inputs)
+    """What is to be done; `tables` are results of a fleet and no recordings."""
+    names = (inputs,) if isinstance(inputs, str) else tuple(inputs or ())
     if isinstance(recordings, str | os.PathLike):
         root = Path(recordings)
         if root.is_dir():
-            files = sorted(p for p in root.rglob("*") if p.suffix.lower() in READABLE)
+            results = {table.resolve() for table in tables}
+            files = sorted(
+                p
+                for p in root.rglob("*")
+                # hidden ones are those of an editor or of another system
+                if p.suffix.lower() in READABLE
+                and not p.name.startswith(".")
+                and p.resolve() not in results
+            )
             jobs = [
                 Job(p.relative_to(root).as_posix(), str(p), names, output, Ts)
                 for p in files
@@ -80,6 +97,13 @@ def jobs_of(
         )
     seen: set[str] = set()
     for job in jobs:
+        if bool(job.inputs) != bool(job.output):
+            raise SettingError(
+                name=f"inputs, output of {job.file}",
+                expected="both, or neither to recognise them by their names",
+                received=f"{', '.join(job.inputs) or None} and {job.output}",
+                remedy="name the other one as well",
+            )  # fmt: skip
         if job.file in seen:
             raise SettingError(
                 f"expected every recording once, got {job.file} twice; take one of them out"
@@ -88,7 +112,9 @@ def jobs_of(
     return jobs
 
 
-def _manifest(path: Path, inputs: tuple[str, ...], output: str, Ts: float | None) -> Iterator[Job]:
+def _manifest(
+    path: Path, inputs: tuple[str, ...], output: str | None, Ts: float | None
+) -> Iterator[Job]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -134,7 +160,7 @@ def row_of(job: Job, settings: Mapping[str, Any], controller: Controller | None)
 
 
 def _identified(job: Job, settings: Mapping[str, Any], controller: Controller | None) -> Row:
-    data = read(job.path, inputs=job.inputs, output=job.output, Ts=job.Ts)
+    data = _read(job)
     samples = sum(len(e.y) for e in data.experiments)
     cut = int(TRAINED * samples)
     model = identify(
@@ -167,6 +193,20 @@ def _identified(job: Job, settings: Mapping[str, Any], controller: Controller | 
         **quantities,
         **gains,
     )
+
+
+def _read(job: Job) -> Dataset:
+    table = read_table(job.path)
+    if job.inputs:
+        return read(table, inputs=job.inputs, output=job.output, Ts=job.Ts)
+    found = roles(table)
+    if found is None:
+        spoiled = "".join(f"; {why}" for why in list(table.unusable.values())[:3])
+        raise DataError(
+            name=str(table.path), expected="columns that show which is the input and which the "
+            "output", received=", ".join(table.names), remedy=f"name both{spoiled}",
+        )  # fmt: skip
+    return read(table, inputs=found.input, output=found.output, Ts=job.Ts)
 
 
 def _physical(model: Model, data: Dataset) -> dict[str, float]:

@@ -9,7 +9,8 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
@@ -32,14 +33,16 @@ _TASK_SECONDS, _TASK_RECORDINGS = 1.0, 16
 """How long a task takes, and its most recordings: handing one out costs 20 ms of processor."""
 _RETRIES = 50
 """Workers that may die over one recording before it is taken for the cause."""
+_PATIENCE, _LOOK = 120.0, 5.0
+"""How long no worker may be there at all, and how often that is looked at [s]."""
 
 
 @shown_in_notebooks("fleet", "share failed")
 def fleet(
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
-    inputs: str | Sequence[str] = "u",
-    output: str = "y",
+    inputs: str | Sequence[str] | None = None,
+    output: str | None = None,
     Ts: float | None = None,
     model: Kind = "oe",
     controller: Controller | None = None,
@@ -59,7 +62,10 @@ def fleet(
     recordings : path or sequence of paths
         A folder (with its subfolders), a manifest (CSV with a column `file` and, if they differ,
         `inputs` (several apart by `;`), `output`, `Ts`), or files.
-    inputs, output, Ts
+    inputs, output : str, or sequence of str, or None
+        Columns, as of `sewfast.read`. None: recognised in each recording by their names and units,
+        `u` and `y` first, as on the command line.
+    Ts : float, optional
         As of `sewfast.read`.
     model : str
         As of `identify`. Linear output error by default: its gain and residence time can be
@@ -98,7 +104,8 @@ def fleet(
         For no recordings, an unknown file extension, or if Dask is needed and not installed.
     """
     _require_settings(workers, controller, seed)
-    jobs = jobs_of(recordings, inputs, output, Ts)
+    tables = [Path(p) for p in (out, before) if isinstance(p, str | os.PathLike)]
+    jobs = jobs_of(recordings, inputs, output, Ts, tables)
     settings: dict[str, Any] = {"model": model, "seed": seed, "controller": None}
     if controller is not None:
         settings["controller"] = controller.to_dict()
@@ -172,7 +179,6 @@ def _worked(
     if not recordings:
         return
     with _connected(client, scheduler, workers, memory) as connected:
-        as_completed = import_module("distributed").as_completed
         killed = import_module("distributed.scheduler").KilledWorker
 
         waiting = deque(recordings)
@@ -195,8 +201,10 @@ def _worked(
             count = max(1, min(fit, _TASK_RECORDINGS, math.ceil(len(waiting) / flying)))
             return [[waiting.popleft() for _ in range(count)]]
 
-        running = as_completed([submit(jobs) for _ in range(flying) for jobs in following()])
-        for future in running:
+        running = {submit(jobs) for _ in range(flying) for jobs in following()}
+        while running:
+            future = _ended(running, connected)
+            running.remove(future)
             together = submitted.pop(future.key)
             alone: list[list[Job]] = []
             try:
@@ -217,6 +225,26 @@ def _worked(
             for jobs in alone or following():
                 running.add(submit(jobs))
             yield from zip(together, rows, strict=False)
+
+
+def _ended(running: Collection[Any], connected: Any) -> Any:
+    """One of the tasks that have ended, waited for as long as there are workers."""
+    distributed = import_module("distributed")
+    seen, missed = time.monotonic(), ""
+    while not missed:
+        try:
+            found = distributed.wait(running, _LOOK, return_when="FIRST_COMPLETED")
+            return next(iter(found.done))
+        except distributed.TimeoutError:
+            if connected.scheduler_info(n_workers=-1)["workers"]:
+                seen = time.monotonic()
+            elif time.monotonic() - seen >= _PATIENCE:
+                missed = f"workers: expected one at least, got none for {_PATIENCE:g} s"
+        except CancelledError:
+            missed = "scheduler: expected it to stay, got a connection that is closed"
+    raise SettingError(
+        f"{missed}; start it again and repeat the call: with `out` it goes on from what is done"
+    )
 
 
 def _rows_of(

@@ -9,16 +9,26 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from .. import storage
 from ..errors import SettingError
+from ..plotting import Drawing, Plotted, lettered, stacked
+from ..tables import Table, percent, significant
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 FORMAT = "sewfast.fleet"
 SIGMAS = 4.0
 LEAST_CHANGE = 0.02
 """Of a gain or a residence time: less is no drift, however certain it is."""
+SHOWN = 50
+"""Rows of a table in a notebook."""
 NOISE_RATIO = 1.5
 """Between the residuals of two recordings, either way, from which on it is drift."""
 
@@ -78,6 +88,8 @@ class Row:
 
 
 COLUMNS = tuple(Row.__dataclass_fields__)
+LABELS = {"gain": "gain", "residence_time": "residence time [s]", "noise": "noise"}
+"""What is drawn, in the model's own units."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +118,7 @@ class Drift:
 
 
 @dataclass(frozen=True)
-class Fleet:
+class Fleet(Plotted):
     """All rows, by file.
 
     Attributes
@@ -123,6 +135,64 @@ class Fleet:
     def failed(self) -> tuple[Row, ...]:
         """The rows without a model."""
         return tuple(row for row in self.rows if row.status != "ok")
+
+    def columns(self) -> dict[str, list[Any]]:
+        """The rows by column, as `pandas.DataFrame` and others take them."""
+        return {name: [getattr(row, name) for row in self.rows] for name in COLUMNS}
+
+    def drawing(self) -> Drawing:
+        """Gain, residence time and noise of every machine, with bands of 4 standard errors.
+
+        A machine that has drifted is named, its earlier value grey.
+
+        Raises
+        ------
+        SettingError
+            Where no recording was identified.
+        """
+        done = [row for row in self.rows if row.status == "ok"]
+        if not done:
+            raise SettingError("expected a recording that was identified; all failed")
+        shown = [q for q in LABELS if any(math.isfinite(getattr(row, q)) for row in done)]
+        panels = [partial(self._panel, done, q, q == shown[-1]) for q in shown]
+        return stacked(panels, [1.8] * len(panels))
+
+    def _panel(self, done: Sequence[Row], quantity: str, last: bool, ax: Axes) -> None:
+        from matplotlib.ticker import MaxNLocator
+
+        value = np.array([getattr(row, quantity) for row in done])
+        error = [SIGMAS * getattr(row, f"{quantity}_error", 0.0) for row in done]
+        x = np.arange(1, len(done) + 1)
+        ax.errorbar(x, value, np.nan_to_num(error), fmt="o", markersize=3.5, capsize=2.0)
+        place = {row.file: k for k, row in enumerate(done)}
+        for drift in self.drifts:
+            if drift.quantity == quantity:
+                k = place[drift.file]
+                ax.plot(x[k], drift.before, marker="o", markersize=3.5, color="0.6")
+                ax.annotate(
+                    lettered(drift.file), (x[k], value[k]), (6, 0), textcoords="offset points",
+                    va="center",
+                )  # fmt: skip
+        ax.set_ylabel(LABELS[quantity])
+        if last:
+            ax.set_xlabel("machine")
+            ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+    def _repr_html_(self) -> str:
+        """A table for a notebook; those that failed are below it."""
+        done = [row for row in self.rows if row.status == "ok"]
+        rows = tuple(
+            (
+                row.file, percent(row.fit_percent), significant(row.rmse, 4),
+                significant(row.gain, 5), significant(row.residence_time, 4),
+                significant(row.noise, 3),
+            )
+            for row in done[:SHOWN]
+        )  # fmt: skip
+        header = ("recording", "fit, held back", "rms error", "gain", "residence time [s]", "noise")
+        caption, *notes = str(self).split("\n")
+        rest = [f"and {len(done) - SHOWN} more rows"] if len(done) > SHOWN else []
+        return Table(caption, header, rows).to_html([*rest, *notes])
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the rows as `.csv`, `.json` or `.parquet`; the file is either complete or absent.
@@ -168,9 +238,8 @@ def require_ending(place: Path) -> None:
 def _content(rows: Sequence[Row], ending: str) -> str | bytes:
     if ending == ".parquet":
         arrow, parquet = _arrow()
-        columns = {name: [getattr(row, name) for row in rows] for name in COLUMNS}
         place = io.BytesIO()
-        parquet.write_table(arrow.table(columns), place)
+        parquet.write_table(arrow.table(Fleet(tuple(rows)).columns()), place)
         return place.getvalue()
     if ending == ".json":
         known = [{k: _or_none(v) for k, v in asdict(row).items()} for row in rows]

@@ -53,7 +53,7 @@ MOST_ALTERNATIVES = 2
 LIKELY = 1.5
 """Linear models whose error on the newest part is within this factor are asked on earlier ones."""
 TOGETHER = 1.25
-"""On little data the median goes over all finalists whose error is within this factor."""
+"""On little data, or in little time, the median goes over all finalists with errors within this."""
 
 
 def auto(task: Task) -> Model:
@@ -144,6 +144,7 @@ class Choice(Finals):
         """
         group = [best]
         worth = 1.0 if self.split.scored < ENOUGH_TO_CHOOSE_BY else ALONE
+        is_unsure = self.search.is_small or (self.is_hurried and not self.search.is_large)
         if best.structure.integrator and self.search.repeats:
             # what is held out repeats what was learned and cannot tell them: all that are small
             return [c for c in able if c is not best and c.structure.integrator]
@@ -152,7 +153,7 @@ class Choice(Finals):
                 continue
             before = self._error_of(group)
             after = self._error_of([*group, c])
-            if after < worth * before or (self.search.is_small and c.error < TOGETHER * best.error):
+            if after < worth * before or (is_unsure and c.error < TOGETHER * best.error):
                 group.append(c)
         return group[1:]
 

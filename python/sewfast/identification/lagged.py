@@ -103,8 +103,12 @@ def neural_oe(task: Task) -> Model:
 def begun(task: Task, began: float) -> tuple[_core.LinearModel, _core.LinearModel]:
     """The linear model of the data, and the one that networks begin at."""
     brief = replace(task, progress=task.clock.limited(task.progress, LINEAR_SHARE))
-    linear = _linear(brief, began)
-    return linear, _start(brief, linear, began)
+    try:
+        linear = _linear(brief, began)
+        return linear, _start(brief, linear)
+    except Interrupted as stopped:
+        # a network that was asked for by name is not replaced by a linear model
+        raise KeyboardInterrupt from stopped
 
 
 def unselected(task: Task, start: _core.LinearModel, began: float) -> Model:
@@ -148,7 +152,7 @@ def _linear(task: Task, began: float) -> _core.LinearModel:
         return _core.fit_arx(arrays(task.data), **task.orders, offset=True)
 
 
-def _start(task: Task, linear: _core.LinearModel, began: float) -> _core.LinearModel:
+def _start(task: Task, linear: _core.LinearModel) -> _core.LinearModel:
     """Where the training begins: the linear model, or a smaller one that is misled less.
 
     Networks that begin at a slow pole which the drive has not (`orders.is_misled`) hardly ever find
@@ -171,11 +175,9 @@ def _start(task: Task, linear: _core.LinearModel, began: float) -> _core.LinearM
             return linear
         except KeyboardInterrupt:
             # by Ctrl-C, or by the linear fits' share of a time budget
-            if task.clock.over(LINEAR_SHARE):
-                return linear
-            known = {"initial_state": "estimated", "termination": "interrupted"}
-            best = documented(wrap(LinearOE, linear, task.data), task, began, known)
-            raise Interrupted(best) from None
+            if not task.clock.over(LINEAR_SHARE):
+                raise
+            return linear
         models.append(fit.model)
     smaller, own = models
     return raised(smaller, orders["na"]) if is_misled(own, smaller, parts[0]) else linear

@@ -21,6 +21,7 @@ from .folds import RUNAWAY, Errors, Split, compared, errors_of, free_runs
 from .task import Provenance, Task, arrays, finite
 
 ORDERS = (1, 2, 3, 4, 5, 6, 7, 8)
+SMALLEST = ORDERS[:2]
 DELAYS = (2, 3, 4, 5, 6)
 """Looked at beside the delay of one sample, unless one is given."""
 LATE_ORDERS = (1, 2, 3)
@@ -94,8 +95,10 @@ class LinearTable:
     def search(self, until: float | None) -> None:
         """Orders upwards until two have not gained, then delays of the best small order.
 
-        A long dead time is looked at first: large orders feign one, and take most of the time.
+        A long dead time is looked at before large orders, which feign one and take most of the
+        time; the smallest orders come first, as networks begin there.
         """
+        self.add(((o, self.nk) for o in SMALLEST), until)
         if self.task.nk is None:
             self.add(self._late(), until)
         best, idle = math.inf, 0
@@ -129,7 +132,7 @@ class LinearTable:
         except (DataError, FitError):
             return []
         nks = (found - 1, found) if found > max(DELAYS) else ()
-        return [(o, nk) for nk in nks for o in LATE_ORDERS]
+        return [(o, nk) for o in LATE_ORDERS for nk in nks]
 
     def add(self, wanted: Iterable[tuple[int, int]], until: float | None) -> None:
         """Fit these orders and delays on every fold."""

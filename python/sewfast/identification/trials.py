@@ -39,9 +39,12 @@ further in the same time, and extrapolates better."""
 WORTH_A_FEEDTHROUGH, STILL_WORTH_A_FEEDTHROUGH = 0.5, 0.9
 """nk = 0 is no plant for a loop, and a smoothed speed leans ahead a little: it must be worth it, at
 equal size, and beside the best with a delay, whose further states may have made up for it."""
-SHARE_OF_GUARD = 0.92
+SHARE_OF_GUARD = 0.95
 SHARE_OF_LINEAR, SHARE_OF_SEARCH, SHARE_OF_SEARCH_VERIFIED = 0.12, 0.58, 0.45
 """Parts of a time budget after which no linear model, and no network, is tried any more."""
+SHARE_OF_LINEAR_STARTS = 0.1
+"""Part of it that fitting the linear models takes which the next networks begin at; where it ends
+before, they begin at smaller ones."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +170,14 @@ class Trials:
         # the climb can be expected to halve the error
         is_by_far = best.error <= 2.0 * BY_FAR * linear.best.rmse
         return SHARE_OF_SEARCH if is_by_far else SHARE_OF_SEARCH_VERIFIED
+
+    @property
+    def _until_started(self) -> float | None:
+        """When the linear models that networks begin at have to be there."""
+        until, budget = self.until, self.pool.clock.budget
+        if until is None or budget is None:
+            return None
+        return min(until, time.perf_counter() + SHARE_OF_LINEAR_STARTS * budget)
 
     def able(self, operations: float) -> float:
         """The part of these operations for which the present stage has time, at most 1."""
@@ -381,7 +392,7 @@ class Trials:
         """Fit what `start` needs, side by side."""
         plain = {(s.nx, s.nk) for s in structures if s.output != ABS}
         if fold == 0:
-            self.linear.add(sorted(plain), self.until)
+            self.linear.add(sorted(plain), self._until_started)
         keys = {
             (s.nx, s.nk, s.output.name, fold): s for s in structures if s.output == ABS or fold > 0
         }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +13,8 @@ import numpy as np
 
 from ..dataset import FloatArray
 from ..errors import DataError
-from .containers import MAX_COLUMNS, Table, from_headers
+from .containers import MAX_COLUMNS, Table, from_headers, split_unit
+from .stamps import is_moment, seconds_of_texts
 
 MAX_LINE = 1_000_000
 _PREAMBLE = 200
@@ -26,7 +27,18 @@ _UNITS = frozenset(
     )
 )
 """Units that oscilloscopes and loggers write into a row of their own, in lower case."""
-_MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
+_MISSING = frozenset(
+    re.split(" ", "nan na n/a <na> #n/a #na #nv null none nat - -- 1.#qnan -1.#ind 1.#ind")
+) | {""}
+"""What programs write where there is no value, in lower case."""
+_DELIMITERS = ";\t|,"
+_WORD = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?")
+"""A cell between spaces: `u`, `1.5` or `u [V]`."""
+_MARKED = re.compile(r"[+-]?\d[\d.,]*(?:e[+-]?\d+)?", re.IGNORECASE)
+_APART = re.compile(r"[+-]?\d{1,3}(?:['’\u00a0\u2009\u202f ]\d{3})+(?=[.,]\d|$)")
+"""Digits in groups of three between marks that are nothing else."""
+_FOOTER = 20
+"""Lines below a table that are left out if they have fewer cells."""
 
 
 @dataclass(frozen=True)
@@ -40,16 +52,19 @@ class _Layout:
     delimiter: str
     decimal: str
     notes: tuple[str, ...] = ()
+    thousands: str = ""
 
 
 def read_delimited(path: Path, raw: bytes) -> Table:
     """Read delimited text with a header row.
 
     Lines above the header, as oscilloscopes write them, are skipped, which `Table.notes` says, and
-    a row of units below it gives the units. The delimiter is comma, semicolon or tab; with the last
-    two, numbers may have decimal commas.
-    Empty cells are NaN. Columns with text are kept as unusable, each with the line and the cell,
-    so that they only matter to those who select them.
+    a row of units below it gives the units. The delimiter is comma, semicolon, tab, bar or space;
+    decimal commas and thousands separators are recognised by the cells. Lines that begin with `#`
+    are comments, and a few shorter lines at the end are left out, with a note.
+    Empty cells are NaN, dates and times of day become seconds from the first one. Columns with text
+    are kept as unusable, each with the line and the cell, so that they only matter to those who
+    select them.
 
     Raises
     ------
@@ -74,14 +89,15 @@ def _decode(path: Path, raw: bytes) -> str:
             text = raw.decode("utf-8-sig")
         except UnicodeDecodeError:
             text = raw.decode("latin-1")
-    head = text[:4096]
+    head = text[:4096].rstrip("\0\x1a") if text.strip("\0\x1a") else text[:4096]
     strange = sum((c < " " and c not in "\t\r\n") or "\x7f" <= c <= "\x9f" for c in head)
     if "\0" in head or strange > 0.02 * len(head):
         raise DataError(
             f"{path}: expected text (CSV), .mat, .npz or Parquet; received binary data of an "
             "unknown kind"
         )
-    return text.replace("\r\n", "\n").replace("\r", "\n")
+    # DOS ends a text with ^Z, and loggers that reserve their space leave zeros
+    return text.rstrip("\0\x1a").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _lines(text: str) -> Iterator[tuple[int, str]]:
@@ -95,17 +111,24 @@ def _lines(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
+    if delimiter == " ":
+        return _WORD.findall(line)
     row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
     return [cell.strip() for cell in row]
 
 
 def _pick_delimiter(line: str) -> str:
-    """The most frequent of semicolon, tab and comma; the earlier where tied."""
-    return max(";\t,", key=line.count)
+    """The most frequent of the delimiters; the earlier where tied."""
+    return max(_DELIMITERS, key=line.count)
 
 
 def _is_numeric(cells: list[str]) -> bool:
-    return all(_number(c.replace(",", "."), ".") is not None for c in cells)
+    """Whether all cells are numbers, or moments as a time column has them."""
+    return all(_is_number(c) or is_moment(c) for c in cells)
+
+
+def _is_number(cell: str) -> bool:
+    return _number(cell.replace(",", "."), ".") is not None
 
 
 def _layout(path: Path, text: str) -> _Layout:
@@ -132,6 +155,17 @@ def _layout(path: Path, text: str) -> _Layout:
             continue
         delimiter = _pick_delimiter(line)
         header, body, above = _cells(line, delimiter), text[offset:], skipped + 1
+        found = _numbers(body[:MAX_LINE].lstrip("\n").partition("\n")[0])
+        # two cells may be one number with a decimal comma
+        if len(header) == 1 and found is not None and (found[0] != "," or found[1] > 2):
+            spaced = _cells(line, " ")
+            if found[0] != " " or len(spaced) != found[1]:
+                raise DataError(
+                    name=f"{path}: line {skipped + 1}",
+                    expected=f"a header with names for the {found[1]} columns below it",
+                    received=_short(line), remedy="add one, such as t,u,y",
+                )  # fmt: skip
+            delimiter, header = " ", spaced
         if _is_numeric(header):
             named = _cells(comment, _pick_delimiter(comment)) if comment else []
             if len(named) != len(header) or _is_numeric(named):
@@ -175,6 +209,11 @@ def _above_numbers(
     heads: list[list[str]] = []
     for k in reversed(above):
         names = _texts(lines[k][1], delimiter, width)
+        if names is None and not heads and _describes(lines[k][1], delimiter, width):
+            # a line on the columns, such as their sample times, between names and numbers
+            continue
+        if len(heads) == 1 and all(map(_looks_like_unit, heads[0])):
+            names = names or _numbered(lines[k][1], delimiter, width)
         if names is None or len(heads) == 2:
             break
         heads.insert(0, names)
@@ -199,7 +238,8 @@ def _above_numbers(
     notes = []
     if skipped:
         shown = _short(lines[skipped[0]][1].strip())
-        notes.append(f"{path.name}: {len(skipped)} lines above the header are skipped: {shown} ...")
+        many = _count(len(skipped), "above the header")
+        notes.append(f"{path.name}: {many} skipped: {shown}")
     start = lines[at][0] - len(lines[at][1]) - 1
     body = text[max(start, 0) :]
     return _Layout(
@@ -212,7 +252,7 @@ def _numbers(line: str) -> tuple[str, int] | None:
     """Delimiter and number of cells of a line that holds numbers and nothing else."""
     if not line.strip() or len(line) > MAX_LINE:
         return None
-    for delimiter in ";\t,":
+    for delimiter in (*_DELIMITERS, " "):
         try:
             cells = _cells(line, delimiter)
         except csv.Error:
@@ -227,11 +267,23 @@ def _numbers(line: str) -> tuple[str, int] | None:
 def _texts(line: str, delimiter: str, width: int) -> list[str] | None:
     """The cells of a line of names: as many as there are columns, none of them a number."""
     cells = _cells(line, delimiter)
-    while len(cells) > width and not cells[-1]:
+    # LabVIEW names a column of comments, in which most lines have no cell
+    while len(cells) > width and cells[-1].lower() in ("", "comment"):
         cells.pop()
-    named = len(cells) == width and all(
-        c and _number(c.replace(",", "."), ".") is None for c in cells
-    )
+    named = len(cells) == width and all(c and not _is_number(c) for c in cells)
+    return cells if named else None
+
+
+def _describes(line: str, delimiter: str, width: int) -> bool:
+    """Whether a line tells something about each column: a text, then numbers."""
+    cells = _cells(line, delimiter)
+    return len(cells) == width and bool(cells[0]) and not _is_numeric(cells[:1])
+
+
+def _numbered(line: str, delimiter: str, width: int) -> list[str] | None:
+    """The cells of a line of names above units, among them numbers, as those of a scope."""
+    cells = _cells(line, delimiter)
+    named = len(cells) == width and all(cells) and not _is_numeric(cells)
     return cells if named else None
 
 
@@ -244,7 +296,30 @@ def _looks_like_unit(cell: str) -> bool:
 
 
 def _decimal(delimiter: str, body: str) -> str:
+    """The decimal mark of a file that holds numbers alone; `_written` looks at the cells."""
     return "," if delimiter != "," and "," in body and "." not in body else "."
+
+
+def _written(layout: _Layout, rows: list[list[str]]) -> _Layout:
+    """The layout with decimal mark and thousands separator as the cells show them.
+
+    A cell with both marks shows which is which. Where there is none, a comma is a decimal one if no
+    cell has a point. `"1,234"` alone, quoted between commas, may be either and stays unread.
+    """
+    if "," not in layout.body or (layout.delimiter == "," and '"' not in layout.body):
+        return replace(layout, decimal=".")
+    marked = {c for row in rows for c in map(str.strip, row) if _MARKED.fullmatch(c)}
+    both = {c for c in marked if "," in c and "." in c}
+    if both:
+        decimal = max(",.", key=min(both).rfind)
+        thousands = ",.".replace(decimal, "")
+        return replace(layout, decimal=decimal, thousands=thousands)
+    commas = {c for c in marked if "," in c}
+    points = {c for c in marked if c.count(".") == 1}
+    groups = all(re.fullmatch(r"[+-]?[1-9]\d{0,2}(,\d{3})+", c) for c in commas)
+    if commas and not points and not (layout.delimiter == "," and groups):
+        return replace(layout, decimal=",")
+    return replace(layout, decimal=".")
 
 
 def _checked(layout: _Layout) -> _Layout:
@@ -267,8 +342,9 @@ def _fast_pass(layout: _Layout) -> list[FloatArray] | None:
         body = body.replace(",", ".")
     try:
         values = np.loadtxt(
-            io.StringIO(body), delimiter=layout.delimiter, comments=None, quotechar='"', ndmin=2
-        )
+            io.StringIO(body), delimiter=None if layout.delimiter == " " else layout.delimiter,
+            comments=None, quotechar='"', ndmin=2,
+        )  # fmt: skip
     except (ValueError, OverflowError):
         return None
     if values.shape != (body.count("\n") + 1, len(layout.header)):
@@ -277,38 +353,77 @@ def _fast_pass(layout: _Layout) -> list[FloatArray] | None:
 
 
 def _slow_pass(layout: _Layout) -> Table:
-    rows: list[list[float]] = []
-    lines: list[int] = []
-    bad: dict[int, str] = {}
-    for number, cells in _rows(layout):
-        rows.append([_value(layout, bad, number, i, c) for i, c in enumerate(cells)])
-        lines.append(number)
+    lines, rows, below = _rows(layout)
     if not rows:
         raise DataError(f"{layout.path}: a header but no rows; expected rows of numbers below it")
-    table = from_headers(layout.path, layout.header, list(np.array(rows).T), bad, lines)
-    return replace(table, notes=layout.notes)
+    layout = _written(layout, rows)
+    header, columns, bad = list(layout.header), [], {}
+    for i, cells in enumerate(zip(*rows, strict=True)):
+        column = _column(layout, cells)
+        if column is None and is_moment(cells[0]):
+            column = seconds_of_texts(cells)
+            header[i] = f"{split_unit(header[i])[0]} [s]" if column is not None else header[i]
+        if column is None:
+            k, column = _spoiled(layout, cells)
+            bad[i] = _complaint(layout, lines[k], i, cells[k])
+        columns.append(column)
+    table = from_headers(layout.path, header, columns, bad, lines)
+    return replace(table, notes=(*layout.notes, *below))
 
 
-def _rows(layout: _Layout) -> Iterator[tuple[int, list[str]]]:
-    """Line number and cells of each row that is not blank, checked against the header."""
+def _rows(layout: _Layout) -> tuple[list[int], list[list[str]], tuple[str, ...]]:
+    """Line numbers and cells of the rows, checked against the header, and a note on what is below.
+
+    Blank lines and comments are no rows.
+    """
     width = len(layout.header)
+    lines: list[int] = []
+    rows: list[list[str]] = []
+    short: list[tuple[int, list[str]]] = []
+    for number, cells in _split(layout):
+        while len(cells) > width and not cells[-1].strip():
+            cells.pop()
+        blank = not any(c.strip() for c in cells) and len(cells) < max(width, 2)
+        if blank or cells[0].lstrip().startswith("#"):
+            continue
+        if len(cells) < width and rows and len(short) < _FOOTER:
+            short.append((number, cells))
+            continue
+        if len(cells) != width or short:
+            raise _of_other_width(layout, *(short[0] if short else (number, cells)))
+        lines.append(number)
+        rows.append(cells)
+    if not short:
+        return lines, rows, ()
+    shown = _short(layout.delimiter.join(short[0][1]))
+    many = _count(len(short), "below the table")
+    return lines, rows, (f"{layout.path.name}: {many} left out: {shown}",)
+
+
+def _split(layout: _Layout) -> Iterator[tuple[int, list[str]]]:
+    """Line number and cells of each line."""
+    if layout.delimiter == " ":
+        for k, (_, line) in enumerate(_lines(layout.body)):
+            yield layout.skipped + k + 1, line.split() or [""]
+        return
     reader = csv.reader((line for _, line in _lines(layout.body)), delimiter=layout.delimiter)
     try:
         for cells in reader:
-            number = layout.skipped + reader.line_num
-            while len(cells) > width and not cells[-1].strip():
-                cells.pop()
-            if not any(c.strip() for c in cells) and len(cells) < max(width, 2):
-                continue
-            if len(cells) != width:
-                raise DataError(
-                    f"{layout.path}: line {number}: expected {width} cells, as in the header, "
-                    f"received {len(cells)}: {_short(layout.delimiter.join(cells))}"
-                    + _comma_hint(layout, len(cells))
-                )
-            yield number, cells
+            yield layout.skipped + reader.line_num, cells or [""]
     except csv.Error as e:
         raise DataError(f"{layout.path}: line {layout.skipped + reader.line_num}: {e}") from e
+
+
+def _of_other_width(layout: _Layout, number: int, cells: list[str]) -> DataError:
+    return DataError(
+        f"{layout.path}: line {number}: expected {len(layout.header)} cells, as in the header, "
+        f"received {len(cells)}: {_short(layout.delimiter.join(cells))}"
+        + _comma_hint(layout, len(cells))
+    )
+
+
+def _count(lines: int, where: str) -> str:
+    return f"1 line {where} is" if lines == 1 else f"{lines} lines {where} are"
 
 
 def _comma_hint(layout: _Layout, received: int) -> str:
@@ -317,18 +432,38 @@ def _comma_hint(layout: _Layout, received: int) -> str:
     return ""
 
 
-def _value(layout: _Layout, bad: dict[int, str], line: int, column: int, cell: str) -> float:
-    value = _number(cell, layout.decimal)
-    if value is None:
-        bad.setdefault(column, _complaint(layout, line, column, cell))
-        return float("nan")
-    return value
+def _column(layout: _Layout, cells: Sequence[str]) -> FloatArray | None:
+    """The numbers of a column; None where a cell is none."""
+    try:
+        # most columns; Python's own digit separators are not a number format of data files
+        if layout.decimal == "." and not layout.thousands and not any("_" in c for c in cells):
+            return np.array([float(c) for c in cells])
+    except ValueError:
+        pass
+    found = []
+    for cell in cells:
+        value = _number(cell, layout.decimal, layout.thousands)
+        if value is None:
+            return None
+        found.append(value)
+    return np.array(found)
 
 
-def _number(cell: str, decimal: str) -> float | None:
+def _spoiled(layout: _Layout, cells: Sequence[str]) -> tuple[int, FloatArray]:
+    """The first cell that is no number, and NaN for the column."""
+    wrong = (_number(c, layout.decimal, layout.thousands) is None for c in cells)
+    return next(k for k, one in enumerate(wrong) if one), np.full(len(cells), np.nan)
+
+
+def _number(cell: str, decimal: str, thousands: str = "") -> float | None:
     text = cell.strip()
     if text.lower() in _MISSING:
         return float("nan")
+    if _APART.match(text):
+        text = re.sub(r"['’\u00a0\u2009\u202f ]", "", text)
+    if thousands and thousands in text:
+        groups = rf"[+-]?\d{{1,3}}(?:\{thousands}\d{{3}})+(?!\d|\{thousands})"
+        text = text.replace(thousands, "") if re.match(groups, text) else "?"
     if decimal == ",":
         text = "?" if "." in text else text.replace(",", ".")
     try:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..arrays import FloatArray
 from ..errors import DataError, SettingError, not_installed
 from .containers import Table, from_headers
+from .stamps import seconds_of_objects
 
 _NUMBER = (int, float, np.number, Decimal)
 
@@ -30,9 +31,10 @@ def table_of(frame: Any) -> Table:
     Parameters
     ----------
     frame : pandas, polars or xarray object, mapping of name to array, or Arrow stream
-        Anything with `__arrow_c_stream__` is read by pyarrow. An index of pandas is a column where
-        it is named or holds moments; without a name it is `t`. Units come from headers such as
-        `u [V]`, from `attrs["units"]` (pandas, xarray) or from a field's metadata `unit` (Arrow).
+        Anything with `__arrow_c_stream__` is read by pyarrow; a structured array of NumPy is a
+        table, too. An index of pandas is a column where it is named or holds moments; without a
+        name it is `t`; of several levels those with names are columns. Units come from headers such
+        as `u [V]`, from `attrs["units"]` (pandas, xarray) or a field's metadata `unit` (Arrow).
 
     Raises
     ------
@@ -50,6 +52,8 @@ def table_of(frame: Any) -> Table:
         found = _of_polars(frame)
     elif "xarray" in kinds:
         found = _of_xarray(frame)
+    elif isinstance(frame, np.ndarray) and frame.dtype.names:
+        found = ((n, *_numbers(frame[n])) for n in frame.dtype.names)
     elif isinstance(frame, Mapping):
         found = ((str(n), *_numbers(_array(v))) for n, v in frame.items())
     elif hasattr(frame, "__arrow_c_stream__"):
@@ -98,7 +102,7 @@ def collected(path: Path, found: Iterator[Found]) -> Table:
 
 
 def of_arrow(table: Any) -> Iterator[Found]:
-    """Columns of a pyarrow table."""
+    """Columns of a pyarrow table; of text those that hold numbers or moments."""
     import pyarrow as pa
 
     for i, entry in enumerate(table.schema):
@@ -111,7 +115,10 @@ def of_arrow(table: Any) -> Iterator[Found]:
                 numbers = column.cast(pa.float64(), safe=False).to_numpy()
                 yield entry.name, numbers, unit, ""
         except pa.ArrowException:
-            yield entry.name, None, "", f"holds {entry.type}"
+            if pa.types.is_string(entry.type) or pa.types.is_large_string(entry.type):
+                yield entry.name, *_numbers(np.array(column.to_pylist(), dtype=object))
+            else:
+                yield entry.name, None, "", f"holds {entry.type}"
 
 
 def _arrow(frame: Any) -> Any:
@@ -131,11 +138,12 @@ def _arrow(frame: Any) -> Any:
 
 def _of_pandas(frame: Any) -> Iterator[Found]:
     units = frame.attrs.get("units", {})
-    index = frame.index
-    counts_rows = (index.name is None and index.dtype.kind in "iu") or index.nlevels > 1
-    if not counts_rows and index.dtype.kind in "iufmM":
+    for index in map(frame.index.get_level_values, range(frame.index.nlevels)):
+        if hasattr(index, "to_timestamp"):  # periods: each begins at a moment
+            index = index.to_timestamp()
+        numbered = index.name is None and (index.dtype.kind in "iu" or frame.index.nlevels > 1)
         name = str(index.name or "t")
-        if name not in map(str, frame.columns):
+        if not numbered and index.dtype.kind in "iufmM" and name not in map(str, frame.columns):
             yield _with_unit(name, _of_series(index), units)
     for i, name in enumerate(frame.columns):
         # by place: a name may occur twice
@@ -149,7 +157,9 @@ def _of_series(column: Any) -> tuple[FloatArray | None, str, str]:
         return _numbers(column.to_numpy(dtype=f"{column.dtype.kind}8[ns]"))
     if column.dtype.kind in "iufb":
         return column.to_numpy(dtype=np.float64, na_value=np.nan), "", ""
-    values: Any = np.where(column.isna(), None, column.to_numpy())
+    if column.dtype.kind == "c":
+        return None, "", f"holds {column.dtype}"
+    values: Any = np.where(column.isna(), None, column.to_numpy(dtype=object))
     return _numbers(values)
 
 
@@ -161,6 +171,8 @@ def _of_polars(frame: Any) -> Iterator[Found]:
             yield name, *_numbers(column.cast(float).to_numpy())
         elif column.dtype.is_temporal() or column.dtype.is_numeric():
             yield name, *_numbers(column.to_numpy())
+        elif str(column.dtype) == "String":
+            yield name, *_numbers(np.array(column.to_list(), dtype=object))
         elif str(column.dtype) == "Boolean":
             yield name, *_numbers(column.cast(int).to_numpy())
         else:
@@ -208,4 +220,14 @@ def _numbers(values: NDArray[Any]) -> tuple[FloatArray | None, str, str]:
         return since / np.timedelta64(1, "s"), "s", ""
     if kind == "O" and all(v is None or isinstance(v, _NUMBER) for v in values):
         return np.array([np.nan if v is None else v for v in values], dtype=np.float64), "", ""
-    return None, "", f"holds {values.dtype}"
+    if kind in "OUT" and (seconds := seconds_of_objects(values.tolist())) is not None:
+        return seconds, "s", ""
+    return None, "", f"holds {_held(values)}"
+
+
+def _held(values: NDArray[Any]) -> str:
+    """What is in an array that holds no numbers."""
+    if values.dtype.kind != "O":
+        return "text" if values.dtype.kind in "UT" else str(values.dtype)
+    one = next((v for v in values if v is not None and not isinstance(v, _NUMBER)), None)
+    return "text" if isinstance(one, str) else type(one).__name__

@@ -22,7 +22,14 @@ _SECONDS = {
     "": 1.0, "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3,
     "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "usec": 1e-6, "ns": 1e-9, "min": 60.0,
 }  # fmt: skip
-_TIME = re.compile(r"(?:t|time|timestamp|seconds?|zeit)(?:[_ ](s|sec|ms|msec|us|µs|usec|ns))?")
+_TIME = re.compile(
+    r"(?:t|time|time[_ ]?stamp|elapsed(?:[_ ]time)?|seconds?|zeit|zeitstempel|temps|x-axis|x_value)"
+    r"(?:[_ ](s|sec|ms|msec|us|µs|usec|ns))?"
+)
+"""Names of a time column; the last two are those of Keysight's scopes and of LabVIEW."""
+_EPOCH = ((1e17, 1e-9, "ns"), (1e14, 1e-6, "us"), (1e11, 1e-3, "ms"))
+"""From which number on a time without a unit is one since 1970 in which unit: seconds since then
+reach 1e11 in the year 5138, milliseconds had in 1973."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,16 +209,17 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
                 remedy="state the sample time in seconds (Ts, --ts), or name the column (time=...)",
             )  # fmt: skip
         return TimeBase(float(given))
-    t = _seconds(table, name)
+    scale, said = _unit(table, name)
+    t = _seconds(table, name, scale)
     steps = np.diff(t)
     period = float(np.median(steps[steps > 0.0]))
     if np.abs(steps - period).max() <= TOLERANCE * period:
         # the mean is exact where every printed time is rounded
         found = float(t[-1] / len(steps))
         Ts = found if given is None else _agreed(table, f"column {name!r}", found, given)
-        return TimeBase(Ts)
+        return TimeBase(Ts, None, said)
     grid = _grid(table, name, t, period, given)
-    return TimeBase(grid.Ts, grid, (grid.says(table.path.name),))
+    return TimeBase(grid.Ts, grid, (*said, grid.says(table.path.name)))
 
 
 def _agreed(table: Table, source: str, found: float, given: float) -> float:
@@ -223,8 +231,11 @@ def _agreed(table: Table, source: str, found: float, given: float) -> float:
     return float(given)
 
 
-def _unit(table: Table, name: str) -> float:
-    """Seconds of one unit of a time column: of its header, else of its name (time_ms)."""
+def _unit(table: Table, name: str) -> tuple[float, tuple[str, ...]]:
+    """Seconds of one unit of a time column: of its header, else of its name (time_ms).
+
+    A number that is too large for seconds since 1970 is one in a smaller unit, which a note says.
+    """
     unit = table.unit(name)
     if not unit:
         match = _TIME.fullmatch(name.lower())
@@ -233,10 +244,15 @@ def _unit(table: Table, name: str) -> float:
         raise DataError(
             f"{table.path}: time in {unit!r} is not understood; expected s, ms, us or ns"
         )
-    return _SECONDS[unit.lower()]
+    first = table[name][0] if len(table[name]) else 0.0
+    for least, scale, epoch in _EPOCH if not unit else ():
+        if math.isfinite(first) and first > least:
+            note = f"{table.path.name}: column {name!r} is taken as {epoch} since 1970"
+            return scale, (note,)
+    return _SECONDS[unit.lower()], ()
 
 
-def _seconds(table: Table, name: str) -> FloatArray:
+def _seconds(table: Table, name: str, unit: float) -> FloatArray:
     """Times [s] from 0 on, which never go back.
 
     Raises
@@ -244,7 +260,7 @@ def _seconds(table: Table, name: str) -> FloatArray:
     DataError
         For fewer than two, values that are not finite, or a time that goes back.
     """
-    unit, raw = _unit(table, name), table[name]
+    raw = table[name]
     if len(raw) < 2:
         raise DataError(
             f"{table.path}: column {name!r}: expected at least 2 samples, received {len(raw)}"
