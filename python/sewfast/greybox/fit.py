@@ -186,10 +186,10 @@ def physics(
     state = _all_terms(first, state, terms)
     if part is records:
         records = first.records  # with the starts that were settled
-    task = Task(records, steps, k_v=first.k_v)
+    task = Task(records, first.steps, k_v=first.k_v)
     task.settle_starts(state)
     task.leave_out_spikes(state)
-    state, shares, covariance = _shown_terms(task, state, terms)
+    state, shares, covariance = _shown_terms(task, state, terms, steps)
     reasons |= {
         t: f"not shown, if there is any (Wald's statistic {shares[t]:.2g}, it takes {SHOWN:g})"
         for t in shares
@@ -290,9 +290,9 @@ def _all_terms(task: Task, state: State, terms: tuple[str, ...]) -> State:
 
 
 def _shown_terms(
-    task: Task, start: State, terms: tuple[str, ...]
+    task: Task, start: State, terms: tuple[str, ...], steps: int
 ) -> tuple[State, dict[str, float], FloatArray]:
-    """All terms fitted together, then without those that are not shown.
+    """All terms fitted together, then without those that are not shown, in as many steps as needed.
 
     Returns the state, the statistics of the terms left out, and the covariance of what is free. It
     counts in that a dead zone or Stribeck's friction which is not shown may still be there, hidden
@@ -322,6 +322,7 @@ def _shown_terms(
         out[weakest] = shown[weakest]
         kept.remove(weakest)
         names, x, covariance = _without(TERMS[weakest], names, x, covariance)
+    task.steps = steps
     last = fitted(task, state.having(kept), FINE)
     hidden = [t for t in state.terms if t in SHAPED and t not in kept]
     shapes = {p: state.value(p) for t in hidden for p in TERMS[t] if p in SHAPES}
