@@ -203,6 +203,8 @@ commissioning: $(DEV) ## figures of commissioning on five virtual machines, besi
 bode: $(VENV)/bench.stamp ## frequency responses and shafts of machines whose truth is known (docs/bode.md)
 	$(BIN)/python benches/bode.py
 	$(BIN)/python benches/bode.py --held --count 20
+	$(BIN)/python benches/records.py --held
+	$(BIN)/python benches/records.py --held --feedback
 
 notches: $(VENV)/bench.stamp ## what a notch brings on machines with a shaft (docs/bode.md)
 	$(BIN)/python benches/notches.py

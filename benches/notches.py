@@ -141,7 +141,7 @@ def again(machine: Any, controller: Controller, model: Any) -> tuple[float, floa
         found = margins_at_work(bench, controller, model, SPEED, 0)
     if found is None:
         return None
-    one, other = found["predicted"], found["measured"]
+    one, other = found[0]["predicted"], found[0]["measured"]
     return (
         other["phase_margin_deg"] - one["phase_margin_deg"],
         20.0 * float(np.log10(other["gain_margin"] / one["gain_margin"])),

@@ -101,6 +101,61 @@ def bode(file: Path) -> None:
     response.plot(fit=sewfast.fit_shaft(response), file=file)
 
 
+def bode_speeds(file: Path) -> None:
+    """The responses about several speeds of bode.md."""
+    machine = sewfast.VirtualMachine(load_inertia=1e-3, stiffness=150.0)
+    sewfast.bode(machine, speed=[500.0, 1000.0, 2000.0], realisations=2).plot(file=file)
+
+
+def bode_record(file: Path) -> None:
+    """Averaged segments and local polynomials on 8 s of a chirp, of bode.md."""
+    from sewfast.frequency import local_polynomial, spectral
+
+    Ts, before, n = 1e-3, 2000, 8000
+    t = np.arange(n) * Ts
+    chirp = np.sin(2.0 * np.pi * (0.5 * t + 0.5 * 399.5 / 8.0 * t * t))
+    rng = np.random.default_rng(1)
+    u = np.concatenate([rng.normal(size=before), chirp])
+
+    def pair(hertz: float, damping: float) -> Any:
+        w = 2.0 * np.pi * hertz * Ts
+        p = np.exp(-damping * w + 1j * w * np.sqrt(1.0 - damping**2))
+        return np.array([1.0, -2.0 * p.real, abs(p) ** 2])
+
+    b, a = pair(60.0, 0.015), np.convolve(pair(80.0, 0.015), [1.0, -np.exp(-Ts / 0.02)])
+    b = np.concatenate([[0.0, 0.0], b * a.sum() / b.sum()])
+    plant = sewfast.LinearOE.from_tf(b, a, Ts)
+    y = plant.simulate(u) + 0.002 * rng.normal(size=len(u))
+    ways = {
+        "averaged segments": (spectral(u[before:], y[before:], Ts=Ts), "machine"),
+        "local polynomials": (local_polynomial(u[before:], y[before:], Ts=Ts), "measured"),
+    }
+    fine = np.geomspace(10.0, 300.0, 20_000)
+    step = np.exp(-2j * np.pi * fine * Ts)
+    truth = np.polyval(b[::-1], step) / np.polyval(a[::-1], step)
+
+    def error(ax: Any) -> None:
+        for name, (response, look) in ways.items():
+            at = (response.hertz > 10.0) & (response.hertz < 300.0)
+            exact = np.interp(response.hertz, fine, truth.real) + 1j * np.interp(
+                response.hertz, fine, truth.imag
+            )
+            off = 100.0 * np.abs(response.value / exact - 1.0)
+            draw(ax, response.hertz[at], off[at], look, name)
+        ax.set(yscale="log", ylim=(0.01, 100.0), ylabel="error [%]", xlabel="frequency [Hz]")
+        ax.grid(True, which="both", alpha=0.3)
+
+    def gain(ax: Any) -> None:
+        ax.plot(fine, 20.0 * np.log10(np.abs(truth)), color="0.6", lw=3.0, label="truth")
+        for name, (response, look) in ways.items():
+            draw(ax, response.hertz, response.magnitude_db, look, name)
+        ax.set(xscale="log", xlim=(10.0, 300.0), ylim=(-60.0, 10.0), ylabel="gain [dB]")
+        ax.grid(True, which="both", alpha=0.3)
+        ax.legend(loc="lower left")
+
+    Drawing(((gain,), (error,)), (2.4, 1.8)).plot(file=file)
+
+
 def draw_all(results: Path, assets: Path) -> list[Path]:
     """Draw every picture into a folder; the files."""
     assets.mkdir(parents=True, exist_ok=True)
@@ -110,7 +165,11 @@ def draw_all(results: Path, assets: Path) -> list[Path]:
     predicted, measured = loops
     apart = float(np.sqrt(np.mean((predicted.y - measured.y) ** 2)))
     print(f"predicted and measured are {apart:.1f} RPM rms apart")
-    drawn: dict[Path, Callable[[Path], object]] = {assets / "bode" / "compliant.png": bode}
+    drawn: dict[Path, Callable[[Path], object]] = {
+        assets / "bode" / "compliant.png": bode,
+        assets / "bode" / "speeds.png": bode_speeds,
+        assets / "bode" / "record.png": bode_record,
+    }
     for name, plot in gallery(results).items():
         drawn[assets / "gallery" / f"{name}.png"] = lambda file, plot=plot: plot(file=file)
     for name, draw_page in PICTURES.items():

@@ -31,7 +31,14 @@ if TYPE_CHECKING:
     )
     from .evidence import ReportCard, check
     from .fleets import Fleet, fleet
-    from .frequency import FrequencyResponse, ShaftFit, fit_shaft, load_response
+    from .frequency import (
+        FrequencyResponse,
+        ResponsesOverSpeed,
+        ShaftFit,
+        fit_shaft,
+        load_response,
+        load_responses,
+    )
     from .gains import Gains
     from .greybox import Motor, load_motor, physics
     from .identification import identify
@@ -88,6 +95,7 @@ __all__ = [
     "ParetoFront",
     "Recording",
     "ReportCard",
+    "ResponsesOverSpeed",
     "SettingError",
     "SewfastError",
     "ShaftFit",
@@ -113,6 +121,7 @@ __all__ = [
     "load_model",
     "load_motor",
     "load_response",
+    "load_responses",
     "margins",
     "operating_point",
     "orders",
@@ -148,7 +157,8 @@ _HOMES = {
     "errors": "DataError FitError Interrupted LinkError ModelFileError SettingError SewfastError",
     "evidence": "ReportCard check",
     "fleets": "Fleet fleet",
-    "frequency": "FrequencyResponse ShaftFit fit_shaft load_response",
+    "frequency": "FrequencyResponse ResponsesOverSpeed ShaftFit fit_shaft load_response "
+    "load_responses",
     "greybox": "Motor load_motor physics",
     "identification": "identify",
     "identification.least_squares": "LeastSquaresResult least_squares",

@@ -7,6 +7,7 @@ does; benches/commissioning.py measures that.
 from __future__ import annotations
 
 import json
+import math
 import signal
 import threading
 from collections.abc import Iterator
@@ -33,9 +34,11 @@ from sewfast import (
     SettingError,
     VirtualMachine,
     _core,
+    bode,
     commission,
     load_controller,
     load_model,
+    load_response,
     read_table,
 )
 from sewfast.commissioning import STAGES, Refusal, gains, training, verification
@@ -60,6 +63,26 @@ def whole(_short: None) -> Commissioning:
 
 
 # --- whole --------------------------------------------------------------------------------------
+
+
+def test_the_page_has_margins_as_predicted_and_as_measured(
+    whole: Commissioning, tmp_path: Path
+) -> None:
+    pytest.importorskip("matplotlib", reason="needs the report extra")
+    response = bode(VirtualMachine(), speed=1000.0, realisations=1, periods=2)
+    margins = {
+        "speed": 1000.0,
+        "predicted": {"Ms": 1.234, "phase_margin_deg": 61.2, "gain_margin": 10.0},
+        "measured": {"Ms": 1.345, "phase_margin_deg": math.inf, "gain_margin": math.inf}
+        | {"Ms_band": [1.3, math.inf]},
+    }
+    found = replace(whole, margins=margins, response=response)
+    page = found.save(tmp_path / "with").read_text(encoding="utf-8")
+    for shown in ("1.23", "1.34 (1.30 to –)", "61°", "20.0 dB", "∞", 'id="frequency-response"'):
+        assert shown in page
+    again = load_response(tmp_path / "with" / "analysis" / "response.json")
+    np.testing.assert_array_equal(again.value, response.value)
+    assert "Margins, predicted" not in whole.save(tmp_path / "without").read_text(encoding="utf-8")
 
 
 def test_it_is_drawn_and_shown(whole: Commissioning, tmp_path: Path) -> None:

@@ -12,12 +12,15 @@ import pytest
 from cli import refused, sewfast
 from sewfast import _core, load_controller, signals
 from sewfast.commissioning.demands import demands
+from sewfast.commissioning.gains import SENSITIVE, sensible
+from sewfast.commissioning.small_signal import SmallSignal
 from sewfast.commissioning.training import linear_rival
 from sewfast.control import Fopdt
 from sewfast.control.machine import MachineBench
+from sewfast.control.margins import margins
 from sewfast.errors import Interrupted, SettingError
 from sewfast.machine import VirtualMachine
-from sewfast.models import LinearOE
+from sewfast.models import Ensemble, LinearOE
 from sewfast.tuning.objective import Constraints
 from sewfast.tuning.opinion import MUCH, SecondOpinion
 from sewfast.tuning.search import TuningResult, tune
@@ -140,6 +143,26 @@ def test_the_command_asks_a_rival(tmp_path: Path) -> None:
         "-o", "c.json",
     )  # fmt: skip
     assert "--rival" in said
+
+
+def test_a_member_that_is_far_more_sensitive_than_the_small_signals_has_no_say() -> None:
+    asked = demands(
+        MachineBench(VirtualMachine()), u_max=None, speed=None, references=None, members=4,
+        evaluations=1, seed=0, threads=1,
+    )  # fmt: skip
+    rule = tuned().controller
+    small = SmallSignal(drive(), None, None)
+    sound, wrong = [drive(), drive(gain=470.0), drive(gain=520.0)], drive(gain=4900.0)
+    assert margins(rule, wrong).Ms > SENSITIVE * margins(rule, small.model).Ms
+    found = sensible(rule, Ensemble.of([*sound, wrong]), small, asked)
+    assert [m.core for m in found.members] == [m.core for m in sound]
+    whole = Ensemble.of(sound)
+    assert sensible(rule, whole, small, asked) is whole
+    # where most of them are, or nothing is known of small signals, all stay
+    most = Ensemble.of([sound[0], wrong, drive(gain=5000.0)])
+    assert sensible(rule, most, small, asked) is most
+    other = Ensemble.of([*sound, wrong])
+    assert sensible(rule, other, None, asked) is other
 
 
 # --- the linear model of a commissioning ----------------------------------------------------------

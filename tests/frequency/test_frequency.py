@@ -164,7 +164,7 @@ def test_a_seed_gives_the_same_bits() -> None:
         ({"speed": 1500.0, "periods": 0}, "periods"),
         ({"speed": 1500.0, "periods": 1, "realisations": 1}, "two in all"),
         ({"speed": 1500.0, "realisations": 2**40}, "realisations"),
-        ({"speed": 1500.0, "segment": 100}, "belong to a record"),
+        ({"speed": 1500.0, "segment": 100}, "belongs to a record"),
         ({"speed": 200.0, "amplitude": 15.0, "f_max": 20.0}, "swings the speed"),
     ],
 )
@@ -290,7 +290,7 @@ def test_a_reference_that_has_nothing_to_do_with_it_is_refused() -> None:
         (np.zeros(5000), "constant"),
         (np.full(5000, np.nan), "finite"),
         (np.zeros((50, 2)), "shape"),
-        (np.zeros(10), "segments"),
+        (np.arange(10.0), "segments"),
         (["a"] * 5000, "numbers"),
     ],
 )

@@ -470,3 +470,26 @@ def test_a_reader_that_finds_no_end_is_ended(
     monkeypatch.setattr(logs, "PATIENCE_PER_MB", 0.0)
     with pytest.raises(DataError, match="no end"):
         read_table(path)
+
+
+def test_samples_that_mdf_calls_invalid_were_not_measured(tmp_path: Path) -> None:
+    asammdf = pytest.importorskip("asammdf")
+    bits = np.arange(len(T)) % 5 == 0
+    with asammdf.MDF(version="4.10") as file:
+        file.append([asammdf.Signal(U, T, name="u", invalidation_bits=bits)])
+        file.save(tmp_path / "run.mf4")
+    u = read_table(tmp_path / "run.mf4")["u"]
+    np.testing.assert_array_equal(u, np.where(bits, np.nan, U))
+
+
+def test_tdms_channels_of_moments_and_without_an_offset(tmp_path: Path) -> None:
+    nptdms = pytest.importorskip("nptdms")
+    moments = np.datetime64("2026-03-14T10:00:00", "us") + (1e6 * T).round().astype("m8[us]")
+    with nptdms.TdmsWriter(tmp_path / "moments.tdms") as writer:
+        columns = {"Time": moments, "u": U, "y": Y}
+        writer.write_segment([nptdms.ChannelObject("g", n, v) for n, v in columns.items()])
+    data = sewfast.read(tmp_path / "moments.tdms", inputs="u", output="y")
+    assert data.Ts == pytest.approx(T[1] - T[0])
+    with nptdms.TdmsWriter(tmp_path / "wave.tdms") as writer:
+        writer.write_segment([nptdms.ChannelObject("g", "u", U, {"wf_increment": 0.004})])
+    assert sewfast.read(tmp_path / "wave.tdms", inputs="u").Ts == pytest.approx(0.004)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,19 +19,22 @@ from .arguments import (
     require_plot,
 )
 from .drive import add_drive, is_port, machine_of, opened, require_no_drive_options
-from .output import print_json
+from .output import REFUSED, print_json
 
 if TYPE_CHECKING:
-    from ..frequency import FrequencyResponse, ShaftFit
+    from ..control.controller import Controller
+    from ..frequency import FrequencyResponse, ResponsesOverSpeed, ShaftFit
 
 BODE = """\
 The Bode plot of a drive, with error bars, and the resonance of its shaft. A machine (--on) is
 brought to a working speed and shaken there by sines of random phases, which separates noise from
-distortion; of a record averaged spectra are taken. Two masses and a shaft, or a rigid machine, are
-fitted to it.
+distortion. Of a record, spectra are averaged, or (--method local) what it shows of before its
+beginning is told from the response. Two masses and a shaft, or a rigid machine, are fitted to it.
 
-The machine turns at --speed, a little faster and slower, for a minute or less. Under a controller
-(--controller) the reference is shaken instead, and the loop's margins are printed as measured.
+The machine turns at --speed, a little faster and slower, for a minute or less; at several speeds
+one after the other. Under a controller (--controller) the reference is shaken instead, and the
+loop's margins are printed as measured. Of a drive that trips meanwhile, what its samples show until
+then is kept and marked; the exit code is 2.
 """
 
 EXAMPLES = """\
@@ -38,7 +43,9 @@ examples:
   sewfast bode --on "virtual?load_inertia=0.001&shaft_stiffness=150" --speed 1500
   sewfast bode --on /dev/ttyUSB0 --speed 1000 --amplitude 1 -o response.json \\
       --limits volt=10,speed=3500,acceleration=30000,current=15
+  sewfast bode --on virtual --speed 500,1000,2000 -o speeds.json --plot speeds.png
   sewfast bode run.csv --input u --output y --reference r     a record under feedback
+  sewfast bode chirp.csv --input u --output y --method local  a chirp that began in motion
   sewfast bode response.json --controller controller.json     margins on what was measured
   sewfast bode response.json --propose new.json --u-max 10 --counts-per-rev 1572
 """
@@ -53,6 +60,7 @@ _ON_A_MACHINE = (
     "f_max",
     "seed",
 )
+_OF_A_RECORD = ("reference", "method", "segment")
 
 
 def add(commands: Commands) -> None:
@@ -67,7 +75,12 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--on", metavar="virtual[:SEED]|FILE.fmu?volt=V|PORT", help="shake this machine instead"
     )
-    parser.add_argument("--speed", type=float, metavar="RPM", help="working speed of the machine")
+    parser.add_argument(
+        "--speed",
+        type=_speeds,
+        metavar="RPM[,RPM...]",
+        help="working speed of the machine, or several",
+    )
     parser.add_argument(
         "--amplitude", type=float, metavar="V",
         help="peak of what shakes it (six tenths of what the command has left); with --controller "
@@ -91,6 +104,11 @@ def add(commands: Commands) -> None:
         "--reference", metavar="COL", help="column of a record that its controller followed"
     )
     parser.add_argument(
+        "--method", choices=("segments", "local"),
+        help="of a record: spectra averaged over segments (the default), or local polynomials, "
+        "which take the leakage of its beginning and end out",
+    )  # fmt: skip
+    parser.add_argument(
         "--segment", type=int, metavar="N", help="samples of a record's segments (a ninth of it)"
     )
     parser.add_argument("--model", metavar="FILE.json", type=Path, help="write the fit as a model")
@@ -109,9 +127,15 @@ def add(commands: Commands) -> None:
     add_drive(parser)
 
 
-def command(args: argparse.Namespace) -> None:
+def _speeds(text: str) -> float | list[float]:
+    """One speed, or several between commas."""
+    found = [float(part) for part in text.split(",")]
+    return found[0] if len(found) == 1 else found
+
+
+def command(args: argparse.Namespace) -> int | None:
     from ..control.files import load_pid
-    from ..frequency import fit_shaft
+    from ..frequency import ResponsesOverSpeed, fit_shaft
 
     require_place(args.out, (".json",))
     require_place(args.model, (".json",), option="--model")
@@ -132,6 +156,8 @@ def command(args: argparse.Namespace) -> None:
     response = _of_record(args) if args.on is None else _of_machine(args, controller)
     if args.out is not None:
         response.save(args.out)
+    if isinstance(response, ResponsesOverSpeed):
+        return _over_speeds(args, response, controller)
     try:
         fit, none = fit_shaft(response), None
     except (DataError, FitError) as refused:
@@ -144,6 +170,46 @@ def command(args: argparse.Namespace) -> None:
     _show(args, response, fit, none, margins)
     if args.propose is not None:
         _propose(args, fit, controller)
+    return _tripped([response])
+
+
+def _tripped(responses: Iterable[FrequencyResponse]) -> int | None:
+    """The exit code, and a line on standard error, of a machine that broke off."""
+    for response in responses:
+        if why := response.provenance.get("incomplete"):
+            print(f"sewfast bode: {why}; what came until then is kept", file=sys.stderr)
+            return REFUSED
+    return None
+
+
+def _over_speeds(
+    args: argparse.Namespace, found: ResponsesOverSpeed, controller: Controller | None
+) -> int | None:
+    for option in ("model", "propose"):
+        if getattr(args, option) is not None:
+            raise SettingError(
+                name=f"--{option}", expected="a response about one speed",
+                received=f"those about {len(found)}", remedy="measure at one of them",
+            )  # fmt: skip
+    if args.plot is not None:
+        found.plot(file=args.plot)
+    margins = {} if controller is None else found.margins(controller)
+    if args.json:
+        shown: dict[str, Any] = found.to_dict()
+        shown["shafts"] = [
+            found.fits[s].to_dict() if s in found.fits else None for s in found.speeds
+        ]
+        if margins:
+            shown["margins"] = [vars(m) for m in margins.values()]
+        print_json(shown)
+    else:
+        print(found)
+        for speed, m in margins.items():
+            print(f"  {speed:>8g}  {m}")
+        for path in (args.out, args.plot):
+            if path is not None:
+                print(f"written to {path}")
+    return _tripped(found)
 
 
 def _propose(args: argparse.Namespace, fit: ShaftFit | None, controller: Any) -> None:
@@ -193,22 +259,32 @@ def _show(
             print(f"written to {path}")
 
 
-def _of_machine(args: argparse.Namespace, controller: Any) -> FrequencyResponse:
+def _of_machine(
+    args: argparse.Namespace, controller: Controller | None
+) -> FrequencyResponse | ResponsesOverSpeed:
     from ..commissioning import bode
 
+    for name in _OF_A_RECORD:
+        if getattr(args, name) is not None:
+            raise SettingError(
+                name=f"--{name}", expected="a record", received="a machine, --on",
+                remedy="leave it out",
+            )  # fmt: skip
+    found: FrequencyResponse | ResponsesOverSpeed
     options = {k: getattr(args, k) for k in _ON_A_MACHINE if getattr(args, k) is not None}
     if is_port(args.on):
         with opened(args) as drive:
-            return bode(drive, controller=controller, **options)
+            found = bode(drive, controller=controller, **options)
+            return found
     require_no_drive_options(args)
-    return bode(machine_of(args.on), controller=controller, **options)
+    found = bode(machine_of(args.on), controller=controller, **options)
+    return found
 
 
-def _of_record(args: argparse.Namespace) -> FrequencyResponse:
+def _of_record(args: argparse.Namespace) -> FrequencyResponse | ResponsesOverSpeed:
     from .. import storage
     from ..commissioning import bode, unsmoothed
-    from ..frequency import load_response
-    from ..frequency.response import FORMAT
+    from ..frequency import load_response, load_responses, response, speeds
     from .data import read_training
 
     require_no_drive_options(args)
@@ -219,14 +295,18 @@ def _of_record(args: argparse.Namespace) -> FrequencyResponse:
                 remedy="leave it out",
             )  # fmt: skip
     if args.data.endswith(".json"):
-        if storage.format_of(args.data) != FORMAT:
+        format = storage.format_of(args.data)
+        if format == speeds.FORMAT:
+            return load_responses(args.data)
+        if format != response.FORMAT:
             raise SettingError(
                 f"{args.data}: expected a recording or a response that `sewfast bode -o` wrote"
             )
         return load_response(args.data)
     source, args.data = args.data, [args.data]
     data = read_training(args)
-    return bode(
+    found: FrequencyResponse = bode(
         data if data.counts is None else unsmoothed(source, data), reference=args.reference,
-        segment=args.segment,
+        method=args.method, segment=args.segment,
     )  # fmt: skip
+    return found

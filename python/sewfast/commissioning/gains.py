@@ -269,6 +269,10 @@ RECOVERED = 0.01
 """Of what the load would do to the speed without control."""
 HAIR = 1.001
 """What a limit taken from the rule's own gains leaves above them, so that these meet it."""
+SENSITIVE = 2.0
+"""Times the Ms of the small signals' model under the rule's gains, above which a network is wrong
+about small signals. Of 44 networks of eleven commissionings 41 had .7 to 1.7 times, three 2.6 and
+more: one of `weak`, two of `heavy`."""
 AS_IT_IS = ((1.0, 0),)
 """Variations of a member: none, its own gain and no more delay."""
 
@@ -365,6 +369,24 @@ def _bears(rival: Controller, ensemble: Ensemble, loads: Sequence[LoadStep]) -> 
         return bool(np.isfinite(recoveries(rival, ensemble, loads)).all())
     except FitError:
         return False
+
+
+def sensible(
+    rule: Controller, ensemble: Ensemble, small: SmallSignal | None, demands: Demands
+) -> Ensemble:
+    """The ensemble without members that are far more sensitive than the machine's small signals.
+
+    All agree on slow references, and the one that is wrong about fast signals would set the limits
+    of Ms and of recovery for the gains of all.
+    """
+    if small is None or demands.Ms is None:
+        return ensemble
+    known = _linear(ensemble.members, demands, rule.Ts)
+    most = SENSITIVE * margins(rule, small.model).Ms
+    wrong = [m for m in known if not margins(rule, m, speed=LEVEL * demands.speed).Ms <= most]
+    kept = [m for m in ensemble.members if not any(m is other for other in wrong)]
+    # where most are, it may be the small signals
+    return Ensemble.of(kept) if wrong and 2 * len(kept) >= len(ensemble.members) else ensemble
 
 
 def _linear(members: Sequence[Model], demands: Demands, Ts: float) -> list[Model]:

@@ -33,7 +33,17 @@ from .bench import NotedBench, bench_of, told_of
 from .checkpoint import STAGES, Taken
 from .demands import MS, Demands, Refusal, demands
 from .excitations import first_motion, standard, step_response
-from .gains import Requirements, cause, cautious, cost_of, first_gains, ruled, search, start_of
+from .gains import (
+    Requirements,
+    cause,
+    cautious,
+    cost_of,
+    first_gains,
+    ruled,
+    search,
+    sensible,
+    start_of,
+)
 from .journal import Journal, Progress
 from .result import VERIFIED, VERIFIED_POORLY, Commissioning, require_own
 from .shaking import margins_at_work
@@ -338,8 +348,9 @@ def _carry_out(
     if small is not None and small.resonance is not None:
         speed = SHAKEN_AT * asked.speed
         at_work = margins_at_work(bench, controller, small.model, speed, asked.seed)
-        journal.keep(margins=at_work)
-        if at_work is None:
+        if at_work is not None:
+            journal.keep(margins=at_work[0], response=at_work[1])
+        else:
             journal.say(f"the margins could not be measured at {speed:g} RPM")
     journal.finish()
     found = journal.result(VERIFIED)
@@ -422,7 +433,7 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
             disturbances=plan.pushes, rival=second, variations=plan.thinning.variations(),
         )  # fmt: skip
 
-    alike = agreeing(first, trained.ensemble, practice)
+    alike = sensible(rival, agreeing(first, trained.ensemble, practice), small, asked)
     required, tuning = of(alike)
     ensemble = agreeing(tuning.pid, alike, practice)
     if ensemble is not alike:

@@ -17,10 +17,11 @@ from ..analysis.analysis import NUMBERS as ANALYSIS
 from ..control.controller import Controller
 from ..errors import DataError, SettingError
 from ..evidence import Line, ReportCard
+from ..frequency import FrequencyResponse
 from ..models import Ensemble
 from ..plotting import Trace, loop_drawing
 from ..recording import Recording
-from ..report.commissioned import FORMAT, NUMBERS, VERSION, run_file
+from ..report.commissioned import FORMAT, NUMBERS, RESPONSE, VERSION, run_file
 from ..rules import Fopdt
 from ..tables import html_of
 from ..trust import Judgement
@@ -91,6 +92,8 @@ class Commissioning:
     margins : mapping or None
         Of a machine with a resonance: `predicted` by its small signals and `measured` on it, at
         `speed` [RPM]: `Ms`, `phase_margin_deg`, `gain_margin`.
+    response : FrequencyResponse or None
+        From which the measured margins were read.
     sample_time : float or None
         Of what is simulated [s]: for a slow drive a multiple of the machine's.
     notes : tuple of str
@@ -123,6 +126,7 @@ class Commissioning:
     judgement: Judgement | None = None
     comparisons: tuple[Comparison, ...] = ()
     margins: Mapping[str, Any] | None = None
+    response: FrequencyResponse | None = None
     sample_time: float | None = None
     notes: tuple[str, ...] = ()
     recorded_in: Path | None = None
@@ -390,6 +394,8 @@ def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
                 old.unlink()
     _artefacts(found, folder)
     _analysis(found, folder)
+    if found.response is not None:
+        found.response.save(folder / RESPONSE)
     storage.write(folder / NUMBERS, FORMAT, VERSION, {"sewfast": __version__, **numbers(found)})
     own = found.recorded_in is not None and found.recorded_in.resolve() == folder.resolve()
     if own and found.is_verified:

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal, TypeAlias, get_args, overload
 
 import numpy as np
 
@@ -18,9 +19,15 @@ from ..arrays import FloatArray
 from ..control.controller import Controller
 from ..control.machine import Machine
 from ..control.margins import margins
-from ..dataset import Dataset
-from ..errors import DataError, SettingError
-from ..frequency import FrequencyResponse, periodic, spectral
+from ..dataset import Dataset, Experiment
+from ..errors import DataError, LinkError, SettingError
+from ..frequency import (
+    FrequencyResponse,
+    ResponsesOverSpeed,
+    local_polynomial,
+    periodic,
+    spectral,
+)
 from ..gains import real
 from ..readers import parse_source, read_table
 from ..recording import Recording
@@ -48,10 +55,27 @@ SWING, MOST = 0.5, 0.8
 Nearer to standstill friction would act like a step."""
 
 
+RecordMethod: TypeAlias = Literal["segments", "local"]
+
+
+@overload
+def bode(
+    on: Any, *, speed: float | None = ..., amplitude: float | None = ...,
+    controller: Controller | None = ..., period: float = ..., realisations: int = ...,
+    periods: int = ..., f_min: float = ..., f_max: float | None = ..., seed: int = ...,
+    reference: str | None = ..., method: RecordMethod | None = ..., segment: int | None = ...,
+) -> FrequencyResponse: ...  # fmt: skip
+@overload
+def bode(
+    on: Any, *, speed: Sequence[float], amplitude: float | None = ...,
+    controller: Controller | None = ..., period: float = ..., realisations: int = ...,
+    periods: int = ..., f_min: float = ..., f_max: float | None = ..., seed: int = ...,
+    reference: str | None = ..., method: RecordMethod | None = ..., segment: int | None = ...,
+) -> ResponsesOverSpeed: ...  # fmt: skip
 def bode(
     on: Any,
     *,
-    speed: float | None = None,
+    speed: float | Sequence[float] | None = None,
     amplitude: float | None = None,
     controller: Controller | None = None,
     period: float = 2.0,
@@ -61,19 +85,20 @@ def bode(
     f_max: float | None = None,
     seed: int = 0,
     reference: str | None = None,
+    method: RecordMethod | None = None,
     segment: int | None = None,
-) -> FrequencyResponse:
+) -> FrequencyResponse | ResponsesOverSpeed:
     """The frequency response from command to speed, with error bars.
 
     Parameters
     ----------
     on : machine, Recording or Dataset
-        A machine (`VirtualMachine`, drive, `SteppedBench`) is excited about a working speed. For a
-        recording or a data set, spectra are averaged; `reference` and `segment` apply to these
-        only.
-    speed : float, optional
+        A machine (`VirtualMachine`, drive, `SteppedBench`) is excited about a working speed. A
+        recording or a data set is taken as it is, with whatever moved its input; `reference`,
+        `method` and `segment` apply to these only.
+    speed : float or sequence of float, optional
         Working speed [RPM], required for a machine. It turns at this speed, and a little faster and
-        slower.
+        slower. Of several speeds, the response about each.
     amplitude : float, optional
         Peak of the multisine [V]; six tenths of what the command has left at that speed. Under a
         controller the peak of the reference's [RPM], a twentieth of the speed.
@@ -92,14 +117,20 @@ def bode(
     reference : str, optional
         Column of a record that the controller follows: without it the response of a record under
         feedback is biased.
+    method : "segments" or "local", optional
+        Of a record: spectra averaged over segments (`sewfast.frequency.spectral`, the default), or
+        local polynomials, which take the leakage of beginning and end out
+        (`sewfast.frequency.local_polynomial`).
     segment : int, optional
         Samples; see `sewfast.frequency.spectral`.
 
     Returns
     -------
-    FrequencyResponse
+    FrequencyResponse or ResponsesOverSpeed
         From the command [V] to the mean speed over the sample before [RPM] where counts are known,
-        else to the record's output.
+        else to the record's output. Of a drive that trips while it is excited, what its samples up
+        to then show: `provenance["incomplete"]` says so, and why. Of several speeds, those that
+        could be measured.
 
     Raises
     ------
@@ -110,11 +141,11 @@ def bode(
         If the machine comes near to standstill, a command is clipped, nothing of the multisine
         is seen in the counts, or a record cannot be used.
     LinkError
-        If a drive fails or trips.
+        If a drive fails or trips before there is anything to keep.
 
     Notes
     -----
-    Pintelon and Schoukens (2012), System Identification, chapters 4 and 5.
+    Pintelon and Schoukens (2012), System Identification, chapters 4, 5 and 7.
 
     Examples
     --------
@@ -124,30 +155,81 @@ def bode(
     """
     if isinstance(on, (Recording, Dataset)):
         given = {"speed": speed, "amplitude": amplitude, "controller": controller}
-        for name, value in given.items():
-            if value is not None:
+        for name in given:
+            if given[name] is not None:
                 raise SettingError(
                     name=name, expected="a machine that is shaken", received="a record",
                     remedy="leave it out",
                 )  # fmt: skip
-        return _of_record(on, reference, segment)
-    if reference is not None or segment is not None:
-        raise SettingError(
-            name="reference, segment", expected="neither for a machine", received="one of them",
-            remedy="they belong to a record; leave them out",
-        )  # fmt: skip
+        return _of_record(on, reference, method, segment)
+    of_record = {"reference": reference, "method": method, "segment": segment}
+    for name in of_record:
+        if of_record[name] is not None:
+            raise SettingError(
+                name=name, expected="none for a machine", received=repr(of_record[name]),
+                remedy="it belongs to a record; leave it out",
+            )  # fmt: skip
     if speed is None:
         raise SettingError(
             name="speed", expected="the working speed to shake the machine about [RPM]",
             received="none", remedy="for example speed=1500",
         )  # fmt: skip
+    design = (period, realisations, periods, f_min, f_max, seed)
+    if np.ndim(speed) == 0:
+        with bench_of(on, None) as bench:
+            plan = _Plan.of(bench, real("speed", speed), *design)
+            return _shaken(bench, plan, amplitude, controller)
     with bench_of(on, None) as bench:
-        plan = _Plan.of(
-            bench, real("speed", speed), period, realisations, periods, f_min, f_max, seed
+        return _over_speeds(
+            bench, [_Plan.of(bench, s, *design) for s in _rising(speed)], amplitude, controller
         )
-        if controller is None:
-            return _in_open_loop(bench, plan, amplitude)
-        return _under_feedback(bench, plan, amplitude, controller)
+
+
+def _rising(speed: Any) -> list[float]:
+    found = [real("speed", s) for s in np.atleast_1d(speed).tolist()] if np.ndim(speed) == 1 else []
+    if not found or len(set(found)) < len(found):
+        raise SettingError(
+            name="speed", expected="different working speeds [RPM]", received=repr(speed),
+            remedy="for example speed=[500, 1000, 1500]",
+        )  # fmt: skip
+    return sorted(found)
+
+
+def _over_speeds(
+    bench: Machine, plans: list[_Plan], amplitude: float | None, controller: Controller | None
+) -> ResponsesOverSpeed:
+    """One after the other: a speed that cannot be measured does not cost the others."""
+    found: dict[float, FrequencyResponse] = {}
+    refused: dict[float, str] = {}
+    for i, plan in enumerate(plans):
+        try:
+            found[plan.speed] = _shaken(bench, plan, amplitude, controller)
+        except (DataError, SettingError) as error:
+            if i == len(plans) - 1 and not found:
+                raise
+            refused[plan.speed] = str(error)
+            continue
+        except LinkError as error:
+            if not found:
+                raise
+            refused |= {p.speed: str(error) for p in plans[i:]}
+            break
+        incomplete = found[plan.speed].provenance.get("incomplete")
+        if incomplete is not None:
+            # a drive that has tripped does not start again by itself
+            refused |= {p.speed: f"not measured after {incomplete}" for p in plans[i + 1 :]}
+            break
+    return ResponsesOverSpeed(found, refused)
+
+
+def _shaken(
+    bench: Machine, plan: _Plan, amplitude: float | None, controller: Controller | None,
+    *, is_whole: bool = False,
+) -> FrequencyResponse:  # fmt: skip
+    """The response about one speed; with `is_whole` none of a run that broke off."""
+    if controller is None:
+        return _in_open_loop(bench, plan, amplitude, is_whole=is_whole)
+    return _under_feedback(bench, plan, amplitude, controller, is_whole=is_whole)
 
 
 # --- Margins, predicted and measured --------------------------------------------------------------
@@ -161,8 +243,9 @@ UNBOUNDED = 1e6
 
 def margins_at_work(
     bench: Machine, controller: Controller, plant: Any, speed: float, seed: int
-) -> dict[str, Any] | None:
-    """Margins of a loop as a linear plant predicts them and as the machine shows them at a speed.
+) -> tuple[dict[str, Any], FrequencyResponse] | None:
+    """Margins of a loop as a linear plant predicts them and as the machine shows them at a speed,
+    and the response that they were read from.
 
     The reference is shaken by a multisine, half a minute in all. None where the answer is too
     small, the command comes to its limits however little it is shaken, or the machine cannot be
@@ -171,10 +254,8 @@ def margins_at_work(
     share = 1.0
     while share >= LEAST_SHAKEN:
         try:
-            response = bode(
-                bench, speed=speed, controller=controller, amplitude=share * STEPS * abs(speed),
-                realisations=2, seed=seed,
-            )  # fmt: skip
+            plan = _Plan.of(bench, speed, 2.0, 2, 4, 1.0, None, seed)
+            response = _shaken(bench, plan, share * STEPS * abs(speed), controller, is_whole=True)
             measured = response.margins(controller, speed=speed)
         except DataError:
             share *= AGAIN
@@ -183,13 +264,14 @@ def margins_at_work(
             # a machine or a sample time that cannot be shaken so
             return None
         predicted = margins(controller, plant, speed=speed)
-        return {
+        found = {
             "speed": speed,
             "predicted": {name: getattr(predicted, name) for name in MARGINS},
             "measured": {name: getattr(measured, name) for name in MARGINS}
             # a circle that holds -1 bounds nothing
             | {"Ms_band": [x if x < UNBOUNDED else math.inf for x in measured.Ms_band]},
         }
+        return found, response
     return None
 
 
@@ -197,19 +279,49 @@ def margins_at_work(
 
 
 def _of_record(
-    on: Recording | Dataset, reference: str | None, segment: int | None
+    on: Recording | Dataset, reference: str | None, method: str | None, segment: int | None
 ) -> FrequencyResponse:
+    if method not in (None, *get_args(RecordMethod)):
+        raise SettingError(
+            name="method", expected=" or ".join(get_args(RecordMethod)), received=repr(method)
+        )
+    if method == "local" and segment is not None:
+        raise SettingError(
+            name="segment", expected="none with the method local", received=repr(segment),
+            remedy="leave it out: how many frequencies belong together is found for each",
+        )  # fmt: skip
     if isinstance(on, Recording):
+        u, r = on.u, None
         y = speed_from_counts(on.counts, on.Ts, on.counts_per_rev, method="difference")
         if reference is not None:
             raise SettingError(
                 name="reference", expected="none for a recording of a command",
                 received=repr(reference), remedy="a data set names its columns",
             )  # fmt: skip
-        return spectral(
-            on.u, y, Ts=on.Ts, segment=segment, u_unit="V", y_unit="RPM", from_counts=True,
-            provenance={"recording": on.name},
-        )  # fmt: skip
+        labels = {"u_unit": "V", "y_unit": "RPM", "from_counts": True}
+        name = on.name
+    else:
+        one = _one_of(on)
+        u, y, r, name = one.u[:, 0], one.y, None, one.name
+        if reference is not None:
+            if reference not in one.channels:
+                raise SettingError(
+                    name="reference",
+                    expected=f"one of {', '.join(one.channels) or 'no columns'}",
+                    received=repr(reference),
+                )  # fmt: skip
+            r = one.channels[reference]
+        labels = {
+            "u_unit": on.input_units[0], "y_unit": on.output_unit,
+            "from_counts": on.counts is not None,
+        }  # fmt: skip
+    provenance = {"recording": name, **_cautions(u, y, on.Ts, is_speed=labels["y_unit"] == "RPM")}
+    if method == "local":
+        return local_polynomial(u, y, Ts=on.Ts, r=r, provenance=provenance, **labels)
+    return spectral(u, y, Ts=on.Ts, r=r, segment=segment, provenance=provenance, **labels)
+
+
+def _one_of(on: Dataset) -> Experiment:
     if len(on.experiments) != 1 or len(on.input_names) != 1:
         raise DataError(
             name="data", expected="one record with one input",
@@ -222,20 +334,62 @@ def _of_record(
             received="a speed that was smoothed with samples after it, which hides the delay",
             remedy="take bode(recording), or a speed by method=\"difference\"",
         )  # fmt: skip
-    one = on.experiments[0]
-    r = None
-    if reference is not None:
-        if reference not in one.channels:
-            raise SettingError(
-                name="reference", expected=f"one of {', '.join(one.channels) or 'no columns'}",
-                received=repr(reference),
-            )  # fmt: skip
-        r = one.channels[reference]
-    return spectral(
-        one.u[:, 0], one.y, Ts=on.Ts, r=r, segment=segment, u_unit=on.input_units[0],
-        y_unit=on.output_unit, from_counts=on.counts is not None,
-        provenance={"recording": one.name},
-    )  # fmt: skip
+    return on.experiments[0]
+
+
+LEAST_RUN = 3
+"""Equal samples in a row at the largest or smallest value, from which a command is at a limit."""
+MOVES = 0.9
+"""Share of its other samples that differ from the one before, of a command that is no staircase."""
+REVERSED = 0.02
+"""Of the largest speed, that a mean over 20 ms must have on the other side for a reversal."""
+MEAN = 0.02
+OUTSIDE = 1.0, 99.0
+"""Percentiles of the second half of a record, outside of which it begins with a run-up."""
+
+
+def _cautions(u: FloatArray, y: FloatArray, Ts: float, *, is_speed: bool) -> dict[str, Any]:
+    """What a record has in it that a linear response does not describe."""
+    found = []
+    at = _limited(np.asarray(u, dtype=np.float64))
+    if len(at):
+        found.append(
+            f"u rests at its largest or smallest value in {len(at)} samples, the first at "
+            f"{at[0] * Ts:.4g} s: if it was limited after it was recorded, the response is wrong"
+        )
+    k = max(1, round(MEAN / Ts))
+    if is_speed and len(y) >= k and np.isfinite(y).all():
+        means = np.convolve(y, np.ones(k) / k, "valid")
+        back = np.flatnonzero(means * np.sign(means.sum()) < -REVERSED * np.abs(means).max())
+        if len(back):
+            found.append(
+                f"the speed changes its sign, first at {back[0] * Ts:.4g} s: there friction acts "
+                "like a step, and the response is that of a mean over both directions"
+            )
+    if len(y) >= LEAST_RUN and np.isfinite(y).all():
+        later = y[len(y) // 2 :]
+        low, high = np.percentile(later, OUTSIDE)
+        ends = np.flatnonzero((y >= low) & (y <= high))
+        if not low <= y[: k + 1].mean() <= high and len(ends):
+            found.append(
+                f"the record begins away from where it works later, which it reaches at "
+                f"{ends[0] * Ts:.4g} s: its lowest frequencies are those of the run-up; cut it off"
+            )
+    return {"cautions": found} if found else {}
+
+
+def _limited(u: FloatArray) -> Any:
+    """Samples at which a command that moves otherwise rests at an extreme."""
+    if len(u) < LEAST_RUN or not np.isfinite(u).all():
+        return np.zeros(0, dtype=np.intp)
+    extreme = (u == u.max()) | (u == u.min())
+    edges = np.diff(np.concatenate([[0], extreme.astype(np.intp), [0]]))
+    starts, stops = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    long = stops - starts >= LEAST_RUN
+    moves = np.mean(np.diff(u)[~extreme[1:]] != 0.0) if not extreme[1:].all() else 0.0
+    if not long.any() or moves < MOVES:
+        return np.zeros(0, dtype=np.intp)
+    return np.concatenate([np.arange(a, b) for a, b in zip(starts[long], stops[long], strict=True)])
 
 
 def unsmoothed(source: str | os.PathLike[str], data: Dataset) -> Dataset:
@@ -361,11 +515,21 @@ class _Plan:
     def blocks(self, signal: FloatArray, start: int) -> FloatArray:
         """Shape (realisations, periods, samples), without what settles."""
         shape = (self.realisations, self.periods + 1, self.samples)
-        kept: FloatArray = signal[start:].reshape(shape)[:, 1:]
+        kept: FloatArray = signal[start : start + math.prod(shape)].reshape(shape)[:, 1:]
         return kept
 
+    def left(self, samples: int) -> _Plan | None:
+        """What of it so many samples hold whole; None for fewer than two periods."""
+        whole = samples // ((self.periods + 1) * self.samples)
+        if whole * self.periods >= 2:
+            return replace(self, realisations=min(whole, self.realisations))
+        periods = samples // self.samples - 1
+        return replace(self, realisations=1, periods=periods) if periods >= 2 else None
 
-def _in_open_loop(bench: Machine, plan: _Plan, amplitude: float | None) -> FrequencyResponse:
+
+def _in_open_loop(
+    bench: Machine, plan: _Plan, amplitude: float | None, *, is_whole: bool
+) -> FrequencyResponse:
     level, lead, time = _working_point(bench, plan.speed)
     left = bench.volt - abs(level)
     swing = _swing(plan, plan.speed / level, time)
@@ -383,8 +547,34 @@ def _in_open_loop(bench: Machine, plan: _Plan, amplitude: float | None) -> Frequ
                 "RPM, less with a higher f_min",
             )  # fmt: skip
     u = np.concatenate([np.full(lead, level), level + peak * plan.signal()])
-    recording = bench.excite(u, "multisine")
-    return _response(bench, plan, recording, lead, None, {"level": level, "amplitude": peak})
+    more: dict[str, Any] = {"level": level, "amplitude": peak}
+    try:
+        recording = bench.excite(u, "multisine")
+    except LinkError as error:
+        recording = _kept(error, lead, plan, is_whole=is_whole)
+        more["incomplete"] = f"{error}"
+    return _response(bench, plan, recording, lead, None, more)
+
+
+def _kept(error: LinkError, lead: int, plan: _Plan, *, is_whole: bool) -> Recording:
+    """What a run that broke off has recorded, up to the first gap, if that is a period or more.
+
+    Raises
+    ------
+    LinkError
+        The error itself, where it is not.
+    """
+    found = getattr(error.recording, "recording", error.recording)
+    if is_whole or not isinstance(found, Recording):
+        raise error
+    gaps = np.flatnonzero(~(np.isfinite(found.u) & np.isfinite(found.counts)))
+    n = int(gaps[0]) if len(gaps) else len(found.u)
+    if n < lead + plan.samples:
+        raise error
+    return replace(
+        found, u=found.u[:n], counts=found.counts[:n], y=found.y[:n],
+        speed_true=None if found.speed_true is None else found.speed_true[:n],
+    )  # fmt: skip
 
 
 def _swing(plan: _Plan, gain: float, time: float) -> float:
@@ -398,7 +588,7 @@ def _swing(plan: _Plan, gain: float, time: float) -> float:
 
 
 def _under_feedback(
-    bench: Machine, plan: _Plan, amplitude: float | None, controller: Controller
+    bench: Machine, plan: _Plan, amplitude: float | None, controller: Controller, *, is_whole: bool
 ) -> FrequencyResponse:
     peak = STEPS * abs(plan.speed) if amplitude is None else real("amplitude", amplitude)
     if not 0.0 < peak <= MOST * abs(plan.speed):
@@ -410,20 +600,22 @@ def _under_feedback(
     lead = round(HOLD / plan.Ts)
     ramp = np.minimum(np.arange(lead) / (0.5 * lead), 1.0) * plan.speed
     r = np.concatenate([ramp, plan.speed + peak * plan.signal()])
-    followed = bench.follow(controller, r, "multisine")
+    more: dict[str, Any] = {"amplitude": peak, "feedback": True}
+    try:
+        recording = bench.follow(controller, r, "multisine").recording
+    except LinkError as error:
+        recording = _kept(error, lead, plan, is_whole=is_whole)
+        more["incomplete"] = f"{error}"
     limits = (controller.u_min, controller.u_max)
-    limited = np.isin(followed.u[lead:], limits)
+    limited = np.isin(recording.u[lead:], limits)
     if limited.any():
         raise DataError(
             name="amplitude", expected="a command within its limits",
             received=f"{limited.sum()} samples at one, the first at "
-            f"{(lead + int(limited.argmax())) * plan.Ts:.4g} s: the response would be "
-            "that of the limit",
+            f"{(lead + int(limited.argmax())) * plan.Ts:.4g} s",
             remedy="the response would be that of the limit; lower the amplitude",
         )  # fmt: skip
-    return _response(
-        bench, plan, followed.recording, lead, r, {"amplitude": peak, "feedback": True}
-    )
+    return _response(bench, plan, recording, lead, r, more)
 
 
 def _response(
@@ -444,14 +636,23 @@ def _response(
             received=f"a speed down to {slowest:.4g} RPM",
             remedy="at a reversal friction acts like a step: lower it, or raise the speed or f_min",
         )  # fmt: skip
-    found = periodic(
-        plan.blocks(recording.u, lead), plan.blocks(y, lead), Ts=plan.Ts, lines=plan.lines,
-        r=None if r is None else plan.blocks(r, lead), u_unit="V", y_unit="RPM", from_counts=True,
-        provenance={
+    labels: dict[str, Any] = {
+        "u_unit": "V", "y_unit": "RPM", "from_counts": True,
+        "provenance": {
             "machine": bench.name, "speed": plan.speed, "seed": plan.seed,
             "counts_per_rev": bench.counts_per_rev, **more,
         },
-    )  # fmt: skip
+    }  # fmt: skip
+    left, n = plan.left(len(y) - lead), len(y)
+    if left is not None:
+        found = periodic(
+            left.blocks(recording.u, lead), left.blocks(y, lead), Ts=plan.Ts, lines=plan.lines,
+            r=None if r is None else left.blocks(r, lead), **labels,
+        )  # fmt: skip
+    else:
+        found = local_polynomial(
+            recording.u[lead:], y[lead:], Ts=plan.Ts, r=None if r is None else r[lead:n], **labels
+        )
     if found.coherence.max() < 0.5:
         raise DataError(
             name="amplitude", expected="an answer to the multisine in the counts",

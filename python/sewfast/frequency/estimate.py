@@ -19,6 +19,8 @@ SEGMENTS = 16
 the coherence is a half."""
 LEAST = 16
 """Samples of a segment or period, at the least."""
+LARGEST = 1e150
+"""Of a signal: sums of its squares do not overflow."""
 
 
 def periodic(
@@ -146,13 +148,8 @@ def spectral(
         For other shapes, values that are not finite, fewer than three segments, a constant input,
         or a reference that has nothing to do with it.
     """
-    signals = [_signal("u", u), _signal("y", y)]
-    if r is not None:
-        signals.append(_signal("r", r))
-    lengths = [len(s) for s in signals]
-    if len(set(lengths)) > 1:
-        raise DataError(name="r, u, y", expected="one length", received=str(lengths))
-    n = lengths[0]
+    signals = record_of(u, y, r)
+    n = len(signals[0])
     size = _segment(segment, n)
     starts = range(0, n - size + 1, size // 2)
     if len(starts) < 3:
@@ -172,19 +169,6 @@ def spectral(
     by = len(signals) - 1 if r is not None else 0
     Suu, Syy, Srr = (power[j, j].real for j in (0, 1, by))
     Sru, Sry = power[by, 0], power[by, 1]
-    if not np.isfinite(power).all():
-        raise DataError(
-            expected="values with finite squares",
-            received="larger ones",
-            remedy="change their units",
-        )
-    if not np.any(Suu > 0.0):
-        raise DataError(name="u", expected="an input that moves", received="a constant one")
-    if not np.any(Srr > 0.0):
-        raise DataError(
-            name="r", expected="a reference that moves", received="a constant one",
-            remedy="name the column that the controller follows",
-        )  # fmt: skip
     # halves of Hann windows overlap: each segment counts 11/18 of an independent one
     blocks = max(len(starts) * 11.0 / 18.0, 2.0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -224,6 +208,35 @@ def _segment(segment: int | None, n: int) -> int:
             name="segment", expected=f"at least {LEAST} samples", received=repr(segment)
         )
     return int(segment) // 2 * 2
+
+
+def record_of(u: ArrayLike, y: ArrayLike, r: ArrayLike | None) -> list[FloatArray]:
+    """Input, output and, if there is one, reference of a record, of one length and finite power.
+
+    Raises
+    ------
+    DataError
+        For anything else, and an input or a reference that does not move.
+    """
+    given = {"u": u, "y": y} if r is None else {"u": u, "y": y, "r": r}
+    signals = {name: _signal(name, values) for name, values in given.items()}
+    lengths = [len(s) for s in signals.values()]
+    if len(set(lengths)) > 1:
+        raise DataError(name=", ".join(given), expected="one length", received=str(lengths))
+    for name, signal in signals.items():
+        if np.abs(signal).max(initial=0.0) > LARGEST:
+            raise DataError(
+                name=name, expected="values with finite squares", received="larger ones",
+                remedy="change their units",
+            )  # fmt: skip
+    if not (signals["u"] != signals["u"][:1]).any():
+        raise DataError(name="u", expected="an input that moves", received="a constant one")
+    if r is not None and not (signals["r"] != signals["r"][:1]).any():
+        raise DataError(
+            name="r", expected="a reference that moves", received="a constant one",
+            remedy="name the column that the controller follows",
+        )  # fmt: skip
+    return list(signals.values())
 
 
 def _signal(name: str, values: ArrayLike) -> FloatArray:

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 Complex = NDArray[np.complex128]
 
 FORMAT = "sewfast-frequency-response"
-VERSION = 1
+VERSION, VERSIONS = 2, (1, 2)
+"""Before 2, `blocks` was one number always."""
 
 LEVEL = 0.95
 """Of the bands."""
@@ -54,7 +55,7 @@ class FrequencyResponse:
         The part of it seen when the same excitation is repeated: noise alone.
     coherence : array, shape (n,)
         Share of the output's power that the response explains, 0 to 1.
-    blocks : float
+    blocks : float or array, shape (n,)
         Independent blocks that were averaged; the variance is known from one fewer.
     Ts : float
         Sample time [s].
@@ -62,14 +63,14 @@ class FrequencyResponse:
     from_counts : bool
         Whether the output is a difference of encoder counts: the mean speed over the sample before.
     provenance : mapping
-        Machine, speed, method.
+        Machine, speed, method; `cautions` on a record, `incomplete` where the run broke off.
     """
 
     hertz: FloatArray
     value: Complex
     variance: FloatArray
     coherence: FloatArray
-    blocks: float
+    blocks: float | FloatArray
     Ts: float
     noise: FloatArray | None = None
     u_unit: str = ""
@@ -107,7 +108,7 @@ class FrequencyResponse:
             raise SettingError(
                 name="level", expected="a share between 0 and 1", received=repr(level)
             )
-        nu = max(self.blocks - 1.0, 1.0)
+        nu = np.maximum(np.asarray(self.blocks) - 1.0, 1.0)
         quantile = nu * ((1.0 - level) ** (-1.0 / nu) - 1.0)
         found: FloatArray = np.sqrt(self.variance * quantile)
         return found
@@ -217,7 +218,7 @@ class FrequencyResponse:
             "variance": self.variance.tolist(),
             "noise": None if self.noise is None else self.noise.tolist(),
             "coherence": self.coherence.tolist(),
-            "blocks": self.blocks,
+            "blocks": self.blocks.tolist() if isinstance(self.blocks, np.ndarray) else self.blocks,
             "Ts": self.Ts,
             "u_unit": self.u_unit,
             "y_unit": self.y_unit,
@@ -305,7 +306,7 @@ class FrequencyResponse:
         db = 20.0 * np.log10(1.0 + self.radius() / np.maximum(np.abs(self.value), 1e-300))
         lines = [
             f"frequency response, {len(self.hertz)} lines from {self.hertz[0]:.4g} to "
-            f"{self.hertz[-1]:.4g} Hz, {self.blocks:.4g} blocks",
+            f"{self.hertz[-1]:.4g} Hz, {np.median(self.blocks):.4g} blocks",
             f"  coherence  above .95 at {100 * known.mean():.0f} % of them, {span}",
             f"  band       95 %: {np.median(db):.2g} dB in the median, {db.max():.2g} dB at most",
         ]
@@ -314,6 +315,9 @@ class FrequencyResponse:
             lines.append(
                 f"  distortion {100 * share:.0f} % of the uncertainty is no noise (in the median)"
             )
+        lines += [f"  caution    {text}" for text in self.provenance.get("cautions", ())]
+        if "incomplete" in self.provenance:
+            lines.append(f"  incomplete {self.provenance['incomplete']}")
         return "\n".join(lines)
 
 
@@ -332,11 +336,28 @@ def load_response(path: str | os.PathLike[str]) -> FrequencyResponse:
     ModelFileError
         For any other file.
     """
-    fields = storage.Fields(str(path), storage.read(path, FORMAT, (VERSION,)))
+    return response_of(storage.Fields(str(path), storage.read(path, FORMAT, VERSIONS)))
+
+
+def response_of(fields: storage.Fields) -> FrequencyResponse:
+    """From what `FrequencyResponse.to_dict` gave.
+
+    Raises
+    ------
+    ModelFileError
+        For anything else.
+    """
     hertz = fields.vector("hertz")
     noise = None if fields.any("noise") is None else fields.vector("noise")
     arrays = {name: fields.vector(name) for name in ("real", "imaginary", "variance", "coherence")}
     Ts = fields.positive("Ts")
+    blocks: float | FloatArray
+    if isinstance(fields.any("blocks"), list):
+        blocks = arrays["blocks"] = fields.vector("blocks")
+        if not np.all(blocks > 0.0):
+            raise fields.refuse("blocks", "numbers above 0", fields.any("blocks"))
+    else:
+        blocks = fields.positive("blocks")
     if (
         not len(hertz)
         or np.any(np.diff(hertz) <= 0.0)
@@ -348,7 +369,7 @@ def load_response(path: str | os.PathLike[str]) -> FrequencyResponse:
             raise fields.refuse(name, f"{len(hertz)} numbers, one per frequency", len(array))
     return FrequencyResponse(
         hertz, arrays["real"] + 1j * arrays["imaginary"], arrays["variance"], arrays["coherence"],
-        fields.positive("blocks"), Ts, noise, fields.text("u_unit"), fields.text("y_unit"),
+        blocks, Ts, noise, fields.text("u_unit"), fields.text("y_unit"),
         fields.flag("from_counts"), fields.any("provenance"),
     )  # fmt: skip
 

@@ -45,7 +45,8 @@ RATIOS = (0.03, 30.0)
 """Of load to motor inertia; beyond them the pair of zeros and poles is something else."""
 NEAR, SHOWN = 1.4, 8
 """Frequencies within this factor of antiresonance and resonance, and how many must be usable: two
-for each of the shaft's parameters. Fewer can be explained by many a shaft that is not there."""
+for each of the shaft's parameters, and so half of them about either. Fewer can be explained by many
+a shaft that is not there."""
 CONFIDENCE = 1.96
 DEPTHS, WIDTHS = (0.02, 0.7), (0.1, 2.0)
 """Of a proposed notch."""
@@ -346,6 +347,9 @@ def _is_shaft(theta: FloatArray, f: FloatArray) -> bool:
     inside = f[0] < wa / (2 * math.pi) and wr / (2 * math.pi) < f[-1]
     shown = (f > wa / (2 * math.pi) / NEAR) & (f < wr / (2 * math.pi) * NEAR)
     inside &= int(shown.sum()) >= SHOWN
+    for w in (wa, wr):
+        about = np.abs(np.log(f * 2 * math.pi / w)) < math.log(NEAR)
+        inside &= int(about.sum()) >= SHOWN // 2
     return bool(inside and RATIOS[0] < (wr / wa) ** 2 - 1.0 < RATIOS[1] and max(zr, za) < DAMPED)
 
 

@@ -230,7 +230,11 @@ def _mdf(path: Path, raw: bytes) -> Iterator[Signal]:
     with MDF(io.BytesIO(raw)) as file:
         for channel in file.iter_channels(skip_master=True):
             t = np.asarray(channel.timestamps, dtype=np.float64)
-            yield Signal(channel.name, t, np.asarray(channel.samples), channel.unit or "")
+            values, invalid = np.asarray(channel.samples), channel.invalidation_bits
+            if invalid is not None and values.dtype.kind in "biuf":
+                # the bus or the sensor was not there
+                values = np.where(np.asarray(invalid, dtype=bool), np.nan, values)
+            yield Signal(channel.name, t, values, channel.unit or "")
 
 
 def _tdms(path: Path, raw: bytes) -> Iterator[Signal]:
@@ -241,14 +245,17 @@ def _tdms(path: Path, raw: bytes) -> Iterator[Signal]:
     groups = file.groups()
     for group in groups:
         for channel in group.channels():
-            values = channel[:]
+            values, given = np.asarray(channel[:]), channel.properties
             name = channel.name if len(groups) == 1 else f"{group.name}.{channel.name}"
+            given.setdefault("wf_start_offset", 0.0)
             try:
                 t = np.asarray(channel.time_track(), dtype=np.float64)
             except KeyError:
                 t = None
-            unit = channel.properties.get("unit_string", "")
-            yield Signal(name, t, np.asarray(values), unit if isinstance(unit, str) else "")
+            unit = given.get("unit_string", "")
+            if values.dtype.kind == "M" and len(values):
+                values, unit = (values - values[0]) / np.timedelta64(1, "s"), "s"
+            yield Signal(name, t, values, unit if isinstance(unit, str) else "")
 
 
 def _ulog(path: Path, raw: bytes) -> Iterator[Signal]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from .. import storage
 from ..analysis import analysis as analyses
 from ..errors import DataError, ModelFileError
+from ..frequency import load_response
 from ..greybox import load_motor
 from ..plotting import Picture, Trace, loop_drawing, style, svg
 from ..readers import read_table
@@ -18,6 +20,7 @@ from .artefacts import drawing
 FORMAT = "sewfast.commissioning"
 VERSION = 1
 NUMBERS = "commissioning.json"
+RESPONSE = "analysis/response.json"
 _RUN = ("t", "r", "u", "y")
 WHAT = {
     "first motion": "which command moves the machine, and which way",
@@ -67,6 +70,8 @@ def context(folder: Path) -> dict[str, Any]:
                 "evidence": [_judged(*item) for item in found.get("evidence", {}).items()],
                 "verified": _verified(found),
                 "analysed": section(folder),
+                "margins": _predicted_and_measured(found),
+                "response": _response(folder),
                 "motor": motor_section(folder),
                 "loops": [_picture(folder, name, n) for name, n in found["references"].items()],
             }
@@ -144,6 +149,48 @@ def _judged(name: str, judged: Mapping[str, Any]) -> Table:
     )
     header = ("question", "found", "limit", "verdict", "what it means")
     return Table(f"{name.capitalize()}: {judged['verdict']}.", header, rows, words=True)
+
+
+def _predicted_and_measured(found: Mapping[str, Any]) -> Table | None:
+    """Margins of the loop at work and as predicted; none for a machine without a resonance."""
+    margins = found.get("margins")
+    if not margins:
+        return None
+    one, other = margins["predicted"], margins["measured"]
+    low, high = (significant(x) for x in other["Ms_band"])
+
+    def decibel(share: float | None) -> str:
+        return "∞" if share is None else f"{20.0 * math.log10(share):.1f} dB"
+
+    def degrees(angle: float | None) -> str:
+        return "–" if angle is None else f"{angle:.0f}°"
+
+    rows = (
+        (
+            "largest sensitivity Ms",
+            significant(one["Ms"]),
+            f"{significant(other['Ms'])} ({low} to {high})",
+        ),
+        ("phase margin", degrees(one["phase_margin_deg"]), degrees(other["phase_margin_deg"])),
+        ("gain margin", decibel(one["gain_margin"]), decibel(other["gain_margin"])),
+    )
+    caption = f"Margins about {rpm(margins['speed'])}; of Ms the 95 % band."
+    return Table(caption, ("margin", "predicted", "measured on the machine"), rows)
+
+
+def _response(folder: Path) -> Picture | None:
+    """The frequency response from which the margins were read."""
+    if not (folder / RESPONSE).is_file():
+        return None
+    figure = load_response(folder / RESPONSE).drawing().figure()
+    key, alt = "frequency-response", "gain, phase and coherence over frequency, with 95 % bands"
+    caption = (
+        "From command to speed, measured under the controller with its reference shaken; bands "
+        "hold the response at 95 %. Pale: less than half of the speed comes from the command."
+    )
+    return Picture(
+        key, "", "Frequency response of the machine", alt, caption, svg(figure, key, alt)
+    )
 
 
 def _ms(seconds: float | None) -> float | None:

@@ -1,0 +1,318 @@
+"""Frequency responses of any record by local polynomials: no window, no periods, bands that hold.
+
+The spectra of a finite record are related, at the line k of its transform, by
+
+    Y(k) = G(k) U(k) + T(k) + V(k)
+
+T is leakage: what the machine was still doing when the record began, less what it was still doing
+at its end. It is as smooth over the frequency as G, so over a few lines both are parabolas, found
+by least squares; what these leave is noise, which tells the variance (Pintelon and Schoukens 2012,
+section 7.2). A window only makes the leakage smaller, and smears a resonance for it. How large the
+leakage can be in an interval, all the others show.
+
+How many lines are few is the question that is left. The lines are divided into intervals: from wide
+ones, an interval is halved, and its halves again, where Akaike's criterion, corrected for few
+lines, says that two parabolas predict better than one (Hurvich and Tsai, Biometrika 76, 1989).
+Around a resonance the intervals come out narrow; where the response is smooth they stay wide, and
+average the more. Each is read at the three Gauss points: there a parabola's error from a smooth
+curve is least, and under even power the three errors are independent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import FloatArray
+from ..errors import DataError
+from .estimate import record_of
+from .response import LEVEL, Complex, FrequencyResponse
+
+LINES = 13
+"""Of an interval, at the least: seven more than the two parabolas have coefficients."""
+WIDEST = 0.25
+"""Of an interval's first frequency: so wide it is at the most."""
+NARROWEST = 0.006
+"""Of its frequency, below which an interval is not halved: a damping of .003 is seen with it, and
+the time for long records is that of their transform."""
+SAMPLES = 4 * LINES
+RANK = 1e-9
+"""Of the largest diagonal element of R, below which a column adds nothing."""
+ROUNDING = 1e-13
+"""Of the largest line, below which others are none."""
+FLOOR = 1e-24
+"""Mean square of what is left, that is not told from rounding."""
+GAUSS = np.array([-math.sqrt(0.6), 0.0, math.sqrt(0.6)])
+CHANCE = 3.0
+"""Standard deviations above what chance brings, by which a reference must be seen in the input."""
+
+
+def local_polynomial(
+    u: ArrayLike, y: ArrayLike, *, Ts: float, r: ArrayLike | None = None, **labels: Any
+) -> FrequencyResponse:
+    """From any record, without the leakage of its beginning and end.
+
+    Parameters
+    ----------
+    u, y : array, shape (N,)
+        Input and output; the machine may be in motion at the start and at the end.
+    Ts : float
+        Sample time [s].
+    r : array, shape (N,), optional
+        Reference of a loop that is closed around the plant, or whatever else moves u and is not
+        moved by the noise. Output and input are each related to it, and their quotient is the
+        plant.
+    labels
+        `u_unit`, `y_unit`, `from_counts`, `provenance` of the result.
+
+    Returns
+    -------
+    FrequencyResponse
+        At frequencies that lie closer where the response bends more; `blocks` has a value for each.
+
+    Raises
+    ------
+    DataError
+        For other shapes, values that are not finite, fewer than 52 samples, an input that does not
+        move, or a reference that has nothing to do with it.
+    """
+    signals = record_of(u, y, r)
+    n = len(signals[0])
+    if n < SAMPLES:
+        raise DataError(
+            name="u", expected=f"at least {SAMPLES} samples", received=str(n),
+            remedy="record longer",
+        )  # fmt: skip
+    largest = [max(float(np.abs(s).max()), 1e-300) for s in signals]
+    spectra = np.stack(
+        [
+            np.fft.rfft((s - s.mean()) / top)[1 : (n + 1) // 2]
+            for s, top in zip(signals, largest, strict=True)
+        ]
+    )
+    # what rounding leaves of a line is no power
+    size = np.abs(spectra)
+    spectra[size < ROUNDING * size.max(axis=1, keepdims=True)] = 0.0
+    by = 0 if r is None else 2
+    outputs = np.ascontiguousarray(spectra[[1] if r is None else [1, 0]].T)
+    pieces = list(_divided(spectra[by], outputs))
+    if not pieces:
+        raise DataError(
+            name="u" if r is None else "r", expected="power at three frequencies or more",
+            received="one that hardly moves", remedy="excite more frequencies",
+        )  # fmt: skip
+    if r is not None:
+        _require_related(pieces)
+    leakage = _leakage(pieces)
+    pieces = [_shrunk(piece, spectra[by], outputs, leakage) for piece in pieces]
+    seen = [piece.response() for piece in pieces]
+    value: Complex = np.concatenate([part[0] for part in seen])
+    place, variance, coherence = (np.concatenate([part[k] for part in seen]) for k in (1, 2, 3))
+    blocks = np.repeat([piece.freedom + 1.0 for piece in pieces], len(GAUSS))
+    scale = largest[1] / largest[0]
+    known = np.isfinite(value * scale) & np.isfinite(variance * scale**2)
+    return FrequencyResponse(
+        place[known] / (n * Ts), value[known] * scale,
+        np.maximum(variance[known] * scale**2, 1e-300), coherence[known], blocks[known],
+        float(Ts), **labels,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """Two parabolas over the lines from index `start` to before `stop`.
+
+    Attributes
+    ----------
+    solution : array of complex, shape (6, m)
+        Coefficients, of the response first, of its input over `scale`, for each of m outputs.
+    inverse : array of complex, shape (6, 6)
+        Of the triangle R of the regressors.
+    products : array of complex, shape (m, m)
+        Of what is left of the outputs: the sums of conj(e_i) e_j.
+    power : float
+        Mean squared magnitude of u.
+    output : array, shape (m,)
+        Mean squared magnitude of each output.
+    """
+
+    start: int
+    stop: int
+    scale: float
+    solution: Complex
+    inverse: Complex
+    products: Complex
+    power: float
+    output: FloatArray
+
+    @property
+    def freedom(self) -> int:
+        """Complex degrees of freedom that are left beside two parabolas."""
+        return self.stop - self.start - 6
+
+    @property
+    def ratio(self) -> FloatArray:
+        """Variance of the noise over the power, of each output."""
+        found: FloatArray = np.diag(self.products).real / self.freedom / self.output
+        return found
+
+    @cached_property
+    def criterion(self) -> float:
+        """Akaike's, corrected; real and imaginary part of a line are two observations.
+
+        Outputs are taken as independent: of a loop they have one noise, and a determinant of 0.
+        """
+        n, k = 2 * (self.stop - self.start), 2 * len(self.solution)
+        size = 2.0 * np.diag(self.products).real / n + FLOOR
+        return float(n * np.log(size).sum() + len(size) * n * (n + k) / (n - k - 2))
+
+    @property
+    def places(self) -> FloatArray:
+        """Numbers of the lines at its Gauss points, between two of them where it comes so."""
+        return 1.0 + self.start + 0.5 * (1.0 + GAUSS) * (self.stop - self.start - 1)
+
+    def gains(self) -> tuple[Complex, FloatArray]:
+        """Of each output, shape (3, m), and what a noise of variance 1 does to each, shape (3,)."""
+        powers = GAUSS[:, None] ** np.arange(3)
+        spread = (np.abs(powers @ self.inverse[:3]) ** 2).sum(axis=1)
+        return powers @ self.solution[:3] / self.scale, spread / self.scale**2
+
+    def response(self) -> tuple[Complex, FloatArray, FloatArray, FloatArray]:
+        """Output over input, number of the line, variance, coherence."""
+        gains, spread = self.gains()
+        C = self.products / self.freedom
+        if C.shape == (1, 1):
+            value, per = gains[:, 0], np.ones(len(gains))
+            noise = np.full(len(gains), C[0, 0].real)
+        else:
+            # of the output less the response times the input, which is what the noise makes of both
+            value, per = gains[:, 0] / gains[:, 1], np.abs(gains[:, 1]) ** 2
+            noise = C[0, 0].real - 2.0 * (value * C[0, 1]).real + np.abs(value) ** 2 * C[1, 1].real
+            noise = np.maximum(noise, 0.0)
+        # a response that is not known is not large: what its error adds is taken off
+        explained = np.maximum(np.abs(value) ** 2 - noise * spread / per, 0.0) * self.power
+        share = explained / np.maximum(explained + noise, 1e-300)
+        return value, self.places, noise * spread / per, share
+
+
+def _divided(source: Complex, outputs: Complex) -> Iterator[_Piece]:
+    """The intervals, from the lowest line on."""
+    start, lines = 0, len(source)
+    while lines - start >= LINES:
+        width = max(LINES, int(WIDEST * (start + 1)))
+        piece = None
+        # a sparse multisine has no power in a few lines
+        while piece is None and width < 2 * lines:
+            stop = start + width
+            stop = lines if lines - stop < LINES else stop
+            piece, width = _piece(source, outputs, start, stop), 2 * width
+        if piece is None:
+            return
+        yield from _best(source, outputs, piece)[1]
+        start = piece.stop
+
+
+def _best(source: Complex, outputs: Complex, piece: _Piece) -> tuple[float, list[_Piece]]:
+    """The piece itself, or the best of its halves where these have the lower criterion."""
+    length = piece.stop - piece.start
+    if length < max(2 * LINES, NARROWEST * piece.start):
+        return piece.criterion, [piece]
+    middle = piece.start + length // 2
+    halves = [
+        _piece(source, outputs, piece.start, middle),
+        _piece(source, outputs, middle, piece.stop),
+    ]
+    if any(half is None for half in halves):
+        return piece.criterion, [piece]
+    parts = [_best(source, outputs, half) for half in halves if half is not None]
+    together = sum(criterion for criterion, _ in parts)
+    if together < piece.criterion:
+        return together, [p for _, found in parts for p in found]
+    return piece.criterion, [piece]
+
+
+def _piece(source: Complex, outputs: Complex, start: int, stop: int) -> _Piece | None:
+    """None where the input has too little in it to tell a response."""
+    part, seen = source[start:stop], outputs[start:stop]
+    scale = float(np.abs(part).max())
+    if scale == 0.0:
+        return None
+    Q, R = np.linalg.qr(_regressors(part / scale))
+    diagonal = np.abs(np.diag(R))
+    k = int(np.argmin(np.append(diagonal > RANK * diagonal.max(), False)))
+    if k < 3:
+        return None
+    inverse = np.linalg.inv(R[:k, :k])
+    turned = Q[:, :k].conj().T @ seen
+    left = seen - Q[:, :k] @ turned
+    own = part if seen.shape[1] == 1 else seen[:, 1]
+    return _Piece(
+        start, stop, scale, inverse @ turned, inverse, left.conj().T @ left,
+        float(np.mean(np.abs(own) ** 2)), np.mean(np.abs(seen) ** 2, axis=0),
+    )  # fmt: skip
+
+
+def _regressors(source: Complex) -> Complex:
+    """Parabolas times the input, and parabolas, shape (lines, 6)."""
+    x = np.linspace(-1.0, 1.0, len(source))
+    powers = np.stack([np.ones_like(x), x, x * x], axis=1)
+    return np.hstack([powers * source[:, None], powers])
+
+
+def _leakage(pieces: list[_Piece]) -> FloatArray:
+    """Mean squares of the leakage's three coefficients over the outputs' power, shape (3,).
+
+    From the half of the intervals that show them best.
+    """
+    full = [piece for piece in pieces if len(piece.solution) == 6]
+    if not full:
+        return np.zeros(3)
+    share = np.array([np.mean(np.abs(p.solution[3:]) ** 2 / p.output, axis=1) for p in full])
+    doubt = np.array([(np.abs(p.inverse[3:]) ** 2).sum(axis=1) * p.ratio.mean() for p in full])
+    clear = doubt <= np.median(doubt, axis=0)
+    found: FloatArray = np.maximum(np.where(clear, share - doubt, 0.0).sum(axis=0), 0.0)
+    found /= clear.sum(axis=0)
+    return found
+
+
+def _shrunk(piece: _Piece, source: Complex, outputs: Complex, leakage: FloatArray) -> _Piece:
+    """The piece, with its leakage expected to be as large as elsewhere.
+
+    Its coefficients are three observations more, of 0 with the variance that the others show. Where
+    the command's own spectrum is smooth, as of a chirp near its start, response and leakage cannot
+    be told apart otherwise.
+    """
+    kept = leakage > 0.0
+    columns = np.flatnonzero(np.append([True] * 3, kept))
+    observed = np.zeros((kept.sum(), len(columns)))
+    observed[:, 3:] = np.diag(np.sqrt(piece.ratio.min() / leakage[kept]))
+    lines = slice(piece.start, piece.stop)
+    regressors = _regressors(source[lines] / piece.scale)[:, columns]
+    Q, R = np.linalg.qr(np.vstack([regressors, observed]))
+    inverse = np.linalg.inv(R)
+    turned = Q[: len(regressors)].conj().T @ outputs[lines]
+    return replace(piece, solution=inverse @ turned, inverse=inverse)
+
+
+def _require_related(pieces: list[_Piece]) -> None:
+    """Refuse a reference that is seen in the input no more often than chance has it."""
+    seen = []
+    for piece in pieces:
+        gains, spread = piece.gains()
+        nu = piece.freedom
+        noise = piece.products[1, 1].real / nu
+        quantile = nu * ((1.0 - LEVEL) ** (-1.0 / nu) - 1.0)
+        seen += (np.abs(gains[:, 1]) ** 2 > quantile * noise * spread).tolist()
+    chance = 1.0 - LEVEL
+    if np.mean(seen) < chance + CHANCE * math.sqrt(chance * LEVEL / len(seen)):
+        raise DataError(
+            name="r", expected="a reference that moves u",
+            received="one that has nothing to do with it",
+            remedy="name the column that the controller follows",
+        )  # fmt: skip
