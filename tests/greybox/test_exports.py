@@ -6,6 +6,7 @@ import json
 import math
 import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -134,8 +135,6 @@ def test_a_motor_without_a_current_has_no_settings() -> None:
 
 def test_a_motor_without_a_lag_has_no_inductance(along_q: Motor) -> None:
     parameters = {n: p for n, p in along_q.parameters.items() if n != "inductance"}
-    from dataclasses import replace
-
     text = replace(along_q, parameters=parameters).export("simplefoc", winding="q")
     assert "phase_inductance" not in text
     assert "the inductance" in text
@@ -156,6 +155,13 @@ def test_on_the_command_line_a_board_asks_for_the_winding(
     assert "--winding" in capsys.readouterr().err
     assert main([*words, "--winding", "q"]) == 0
     assert "conf set motor.Kv" in (tmp_path / "moteus.cfg").read_text()
+    assert main([*words, "--winding", "q", "--gear", "10"]) != 0
+    assert "gear" in capsys.readouterr().err
+    words[words.index("moteus") :] = ["wpilib", "gains.json", "--json"]
+    assert main([*words, "--gear", "10"]) == 0
+    k_v = json.loads(capsys.readouterr().out)["parameters"]["k_v"]["value"]
+    gains = json.loads(Path("gains.json").read_text())["feedforward"]
+    assert gains["kV"] == pytest.approx(10 * k_v)
 
 
 # --- Behind a gear, under gravity -----------------------------------------------------------------
