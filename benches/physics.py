@@ -5,6 +5,7 @@
     python benches/physics.py --logs 200             logs at 20 ms with gaps, spikes, wrong signs
     python benches/physics.py --coverage 200         how often intervals hold the truth
     python benches/physics.py --race 3               one joint against mujoco.sysid, same optimum
+    python benches/physics.py --friction 20          Stribeck's and LuGre's friction
     python benches/physics.py --tracked 24           followed online: false alarms, J +10 % seen
 
 Errors are in percent of the truth (delay in samples); `inside` counts 95 % intervals that hold it.
@@ -16,7 +17,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -128,7 +129,7 @@ def hinge(seed: int, seconds: float) -> tuple[sewfast.Recording, np.ndarray, dic
     R = rng.uniform(0.5, 5.0)
     dry, viscous = rng.uniform(0.02, 0.08) * K / R * 12, rng.uniform(0.02, 0.3) * K * K / R
     model = mujoco.MjModel.from_xml_string(
-        f"""<mujoco><option timestep="0.00005" integrator="implicitfast" gravity="0 0 0"/>
+        f"""<mujoco><option timestep="0.00005" integrator="RK4" gravity="0 0 0"/>
         <worldbody><body><joint type="hinge" axis="0 0 1" armature="{J - 1e-6}"
         damping="{viscous}" frictionloss="{dry}" solreffriction="-1 -1e4" name="j"/>
         <inertial pos="0 0 0" mass="0.01" diaginertia="1e-6 1e-6 1e-6"/></body></worldbody>
@@ -145,8 +146,9 @@ def hinge(seed: int, seconds: float) -> tuple[sewfast.Recording, np.ndarray, dic
         # read before the command of this sample acts, as a drive does
         current[k] = (data.ctrl[0] - K * data.qvel[0]) / R
         data.ctrl[0] = v
-        for _ in range(20):  # its steps are of first order: of 1/50 of a time constant they show
-            mujoco.mj_step(model, data)
+        # not its implicit integrators: they add half a step's worth of damping to the inertia and
+        # half a step to the angle, which the intervals of these records are narrow enough to show
+        mujoco.mj_step(model, data, 20)
     y = speed_from_counts(counts, Ts, 4000.0)
     recording = sewfast.Recording(u, counts, y, None, Ts, 4000.0, "steps")
     torque = K / R
@@ -319,6 +321,73 @@ def race(count: int) -> None:
     )
 
 
+def rubbing(seeds: Sequence[int], run: int, seconds: float, kind: str) -> list[sewfast.Recording]:
+    """Motors whose dry friction falls off with the speed, or is LuGre's; 1 kHz, 4,000 counts.
+
+    Steps are small and large in turn, with many reversals and standstills. LuGre's (Canudas
+    de Wit and others 1995) bends by 1 to 10 mrad before it slides.
+    """
+    Ts, per, motors, commands = 0.001, 20, [], []
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        T, k_v, k_s = (
+            10 ** rng.uniform(-1.8, -0.7),
+            10 ** rng.uniform(-2, -1.3),
+            rng.uniform(0.2, 0.8),
+        )
+        k_t, fall = k_s * rng.uniform(0.3, 1.0), rng.uniform(0.02, 0.08) * 8.0 / k_v
+        motors.append(
+            (k_v, T * k_v, k_s, k_t, fall, 10 ** rng.uniform(-3, -2), rng.uniform(0.3, 1))
+        )
+        sizes = np.random.default_rng([seed, run]).choice([2.0, 4.0, 8.0], math.ceil(seconds / 2))
+        u = steps(seconds, Ts, 1000 * run + seed, 1.0)
+        commands.append(u * np.repeat(sizes, 2000)[: len(u)])
+    k_v, k_a, k_s, k_t, fall, bend, damped = np.array(motors).T
+    u = np.array(commands).T
+    stiff = k_s / bend
+    damping = 2.0 * damped * np.sqrt(stiff * k_a)
+    w, angle, bristle, angles, h = *np.zeros((3, len(seeds))), np.empty_like(u), Ts / per
+    for k, command in enumerate(u):
+        angles[k] = angle
+        for _ in range(per):
+            dry = k_s + k_t * np.exp(-((w / fall) ** 2))
+            if kind == "LuGre":
+                bent = (bristle + h * w) / (1.0 + h * stiff * np.abs(w) / dry)
+                rate, bristle = (bent - bristle) / h, bent
+                w = w + h / k_a * (command - k_v * w - stiff * bristle - damping * rate)
+            else:
+                free = w + h / k_a * (command - k_v * w)
+                w = np.sign(free) * np.maximum(np.abs(free) - h * dry / k_a, 0.0)
+            angle = angle + h * w
+    counts = np.floor(angles / math.tau * 4000)
+    return [
+        sewfast.Recording(v, c, speed_from_counts(c, Ts, 4000.0), None, Ts, 4000.0, "steps")
+        for v, c in zip(u.T.copy(), counts.T.copy(), strict=True)
+    ]
+
+
+def friction(count: int, first: int, seconds: float) -> None:
+    """Free-run error on another record, less that of the counts, over Coulomb's."""
+    seeds = range(first, first + count)
+    for kind in ("Stribeck", "LuGre"):
+        ratios = []
+        pairs = [rubbing(seeds, run, seconds, kind) for run in (0, 1)]
+        for seed, record, other in zip(seeds, *pairs, strict=True):
+            speed = np.diff(other.counts, prepend=0.0) / 4000 * 60 / other.Ts
+            errors = []
+            for structure in (["lag", "delay", "coulomb", "offset"], "dcmotor"):
+                motor = sewfast.physics(record, structure=structure)
+                model = motor.simulate(other.u)
+                mean = np.concatenate([[0.0], 0.5 * (model[1:] + model[:-1])])
+                square = np.mean((mean - speed) ** 2) - (60 / 4000 / other.Ts) ** 2 / 6
+                errors.append(math.sqrt(max(square, 0.0)))
+            ratios.append(errors[1] / errors[0])
+            print(f"  {kind} {seed}: Coulomb {errors[0]:.2f} RPM, all terms {errors[1]:.2f} RPM, "
+                  f"{', '.join(motor.terms)}")  # fmt: skip
+        print(f"{kind}, seeds {first} to {first + count - 1}: error over Coulomb's "
+              f"{np.median(ratios):.2f} median, {max(ratios):.2f} worst")  # fmt: skip
+
+
 def tracked(count: int, seconds: float) -> None:
     """Machines followed from 5 s on; the same with a tenth more inertia from then on."""
     start, false, seen, share = 5000, dict.fromkeys(("k_v", "k_a", "k_s"), 0), [], []
@@ -363,11 +432,14 @@ def main() -> None:
     parser.add_argument("--tracked", type=int, default=0)
     parser.add_argument("--coverage", type=int, default=0)
     parser.add_argument("--race", type=int, default=0)
+    parser.add_argument("--friction", type=int, default=0)
     args = parser.parse_args()
     if args.count:
         virtual(args.count, args.first, args.seconds)
     if args.mujoco:
         simulated(args.mujoco, args.seconds)
+    if args.friction:
+        friction(args.friction, args.first, args.seconds)
     if args.tracked:
         tracked(args.tracked, 120.0)
     if args.coverage:

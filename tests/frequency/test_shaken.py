@@ -102,6 +102,31 @@ def test_the_command_takes_several_speeds(
     assert "--model: expected a response about one speed" in capsys.readouterr().err
 
 
+# --- A resonance beyond what was measured ---------------------------------------------------------
+
+
+@pytest.mark.parametrize(("hertz", "near"), [(470.0, 0.03), (700.0, 0.05), (None, None)])
+def test_a_resonance_beyond_the_measured_frequencies_is_said_to_be_there(
+    hertz: float | None, near: float | None
+) -> None:
+    """Below and above half the sample rate, 500 Hz; a rigid machine has none."""
+    shaft: dict[str, float] = {}
+    if hertz is not None:
+        motor, load = 1.5e-3, 1.5e-3
+        reduced, w = motor * load / (motor + load), 2.0 * np.pi * hertz
+        shaft = {"load_inertia": load, "stiffness": reduced * w**2, "damping": 0.04 * w * reduced}
+    machine = VirtualMachine(quantisation=False, parameters={"inertia": 1.5e-3}, **shaft)
+    fit = sewfast.fit_shaft(bode(machine, speed=1500.0, realisations=2))
+    assert not fit.has_resonance
+    if hertz is None:
+        assert fit.beyond_hertz is None
+        assert "beyond" not in str(fit)
+    else:
+        assert fit.beyond_hertz == pytest.approx(hertz, rel=near)
+        assert "a resonance beyond 399.5 Hz" in str(fit)
+        assert fit.to_dict()["beyond_hertz"] == fit.beyond_hertz
+
+
 # --- A run that breaks off ------------------------------------------------------------------------
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +17,8 @@ import sewfast
 from sewfast import Motor, physics
 from sewfast.cli import main
 from sewfast.errors import DataError, SettingError
+from sewfast.frequency.shaft import Parameter
+from sewfast.greybox.motor import NAMES
 
 POLE_PAIRS = 7
 R, L, FLUX = 0.4, 2e-4, 0.006
@@ -130,8 +135,6 @@ def test_a_motor_without_a_current_has_no_settings() -> None:
 
 def test_a_motor_without_a_lag_has_no_inductance(along_q: Motor) -> None:
     parameters = {n: p for n, p in along_q.parameters.items() if n != "inductance"}
-    from dataclasses import replace
-
     text = replace(along_q, parameters=parameters).export("simplefoc", winding="q")
     assert "phase_inductance" not in text
     assert "the inductance" in text
@@ -152,3 +155,82 @@ def test_on_the_command_line_a_board_asks_for_the_winding(
     assert "--winding" in capsys.readouterr().err
     assert main([*words, "--winding", "q"]) == 0
     assert "conf set motor.Kv" in (tmp_path / "moteus.cfg").read_text()
+    assert main([*words, "--winding", "q", "--gear", "10"]) != 0
+    assert "gear" in capsys.readouterr().err
+    words[words.index("moteus") :] = ["wpilib", "gains.json", "--json"]
+    assert main([*words, "--gear", "10"]) == 0
+    k_v = json.loads(capsys.readouterr().out)["parameters"]["k_v"]["value"]
+    gains = json.loads(Path("gains.json").read_text())["feedforward"]
+    assert gains["kV"] == pytest.approx(10 * k_v)
+
+
+# --- Behind a gear, under gravity -----------------------------------------------------------------
+
+
+def test_a_joint_behind_a_gear_has_its_square_of_the_inertia(along_q: Motor) -> None:
+    alone, geared = (
+        dict(re.findall(r'(\w+)="([^"]+)"', along_q.export("mujoco", winding="q", gear=g)))
+        for g in (1.0, 50.0)
+    )
+    assert float(geared["armature"]) == pytest.approx(2500 * float(alone["armature"]), rel=1e-4)
+    assert float(geared["damping"]) == pytest.approx(2500 * float(alone["damping"]), rel=1e-4)
+    assert float(geared["frictionloss"]) == pytest.approx(
+        50 * float(alone["frictionloss"]), rel=1e-4
+    )
+    assert float(geared["gear"]) == 50.0
+    assert "gear" not in alone
+    assert geared["gainprm"] == alone["gainprm"]  # MuJoCo has the actuator before its gear
+    urdf = dict(re.findall(r'(\w+)="([^"]+)"', along_q.export("urdf", winding="q", gear=50.0)))
+    assert float(urdf["friction"]) == pytest.approx(float(geared["frictionloss"]), rel=1e-4)
+
+
+def test_mujoco_moves_a_geared_joint_as_the_motor(along_q: Motor) -> None:
+    mujoco = pytest.importorskip("mujoco")
+    speeds = []
+    for gear in (1.0, 20.0):
+        joint, actuator = along_q.export("mujoco", winding="q", gear=gear).splitlines()
+        model = mujoco.MjModel.from_xml_string(
+            f"""<mujoco><option timestep="0.0002" integrator="RK4" gravity="0 0 0"/><worldbody>
+            <body>{joint.replace("<joint", '<joint name="j"')}
+            <inertial pos="0 0 0" mass="1e-9" diaginertia="1e-12 1e-12 1e-12"/></body></worldbody>
+            <actuator>{actuator.replace("<general", '<general joint="j"')}</actuator></mujoco>"""
+        )
+        data = mujoco.MjData(model)
+        data.ctrl[0] = 4.0
+        mujoco.mj_step(model, data, 300)
+        speeds.append(gear * data.qvel[0])
+    assert speeds[0] > 1.0
+    assert speeds[1] == pytest.approx(speeds[0], rel=0.01)
+
+
+def test_gravity_has_gains_of_its_own(along_q: Motor) -> None:
+    theta = along_q.theta.copy()
+    theta[[NAMES.index(n) for n in ("offset", "load_1c", "load_1s")]] = 0.4, 0.3, -0.4
+    interval = {"offset": Parameter(0.4, 0.3, 0.5, "V"), "load_1": Parameter(0.5, 0.4, 0.6, "V")}
+    arm = replace(along_q, theta=theta, parameters={**along_q.parameters, **interval})
+    gains = json.loads(arm.export("wpilib"))["feedforward"]
+    assert gains["kG"] == 0.4
+    assert gains["kG_cos"] == 0.5
+    assert gains["horizontal"] == pytest.approx(math.atan2(-0.4, 0.3))
+    # where the arm is horizontal the load is all that it can be, and the map has it there
+    assert arm.turn_load([gains["horizontal"]])[0] == pytest.approx(0.5)
+    geared = json.loads(arm.export("wpilib", gear=10.0))["feedforward"]
+    assert geared["kV"] == pytest.approx(10 * gains["kV"])
+    assert geared["kA"] == pytest.approx(10 * gains["kA"])
+    assert geared["kS"] == gains["kS"]
+    assert "kG_cos" not in geared  # once per turn of the motor is not once per turn of the arm
+    plain = json.loads(along_q.export("wpilib"))["feedforward"]
+    assert "kG" not in plain
+
+
+@pytest.mark.parametrize("gear", [0.0, -2.0, math.nan, math.inf, "ten"])
+def test_a_gear_is_a_number_above_0(along_q: Motor, gear: Any) -> None:
+    with pytest.raises(SettingError) as caught:
+        along_q.export("urdf", winding="q", gear=gear)
+    assert caught.value.name == "gear"
+
+
+def test_a_board_has_no_gear(along_q: Motor) -> None:
+    with pytest.raises(SettingError) as caught:
+        along_q.export("odrive", winding="q", gear=10.0)
+    assert caught.value.name == "gear"

@@ -61,14 +61,30 @@ def results() -> dict[str, Any]:
     tuned = sewfast.tune(model(), counts_per_rev=None, evaluations=5, threads=1)
     front = sewfast.pareto(model(), start=tuned.controller, evaluations=20, size=4, threads=1)
     return {
-        "model": model(), "data": held, "validation": sewfast.validate(model(), both),
+        "model": model(), "data": held, "summary": held.summary(),
+        "diagnosis": sewfast.diagnose(Dataset.from_arrays(
+            np.repeat([0.0, 1.0] * 10, 30), np.arange(600.0), 0.01, input_names=HOSTILE
+        )),
+        "validation": sewfast.validate(model(), both),
         "card": sewfast.check(model(), held), "run": run, "tuning": tuned, "front": front,
         "controller": replace(tuned.controller, notes=HOSTILE),
     }  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    "name", ["model", "data", "validation", "card", "run", "tuning", "front", "controller"]
+    "name",
+    [
+        "model",
+        "data",
+        "summary",
+        "diagnosis",
+        "validation",
+        "card",
+        "run",
+        "tuning",
+        "front",
+        "controller",
+    ],
 )
 def test_a_notebook_shows_a_table_and_runs_nothing(name: str) -> None:
     found = Cells(results()[name]._repr_html_())

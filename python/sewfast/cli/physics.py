@@ -67,6 +67,10 @@ def add(commands: Commands) -> None:
         "the q axis, as boards log them (q)",
     )  # fmt: skip
     parser.add_argument(
+        "--gear", type=float, default=1.0, metavar="N",
+        help="for --export wpilib, mujoco, urdf: turns of the motor per turn of the joint",
+    )  # fmt: skip
+    parser.add_argument(
         "--model", metavar="FILE.json", type=Path,
         help="write the turning motor as a linear model, to tune on",
     )  # fmt: skip
@@ -99,7 +103,7 @@ def command(args: argparse.Namespace) -> None:
         volts=args.volts,
         speed_unit=args.speed_unit,
     )
-    text = "" if target is None else motor.export(target, winding=args.winding)
+    text = "" if target is None else motor.export(target, winding=args.winding, gear=args.gear)
     if args.out is not None:
         motor.save(args.out)
     if text:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray, labelled, runs
+from ..tables import Table
 from .feedback import Integration, feedback, integration
 from .outliers import MAD, quantum
 from .pieces import LARGEST, require_dataset
@@ -96,6 +97,14 @@ class Diagnosis:
     def to_json(self) -> dict[str, Any]:
         """As JSON values."""
         return {"findings": [f.to_json() for f in self.findings]}
+
+    def _repr_html_(self) -> str:
+        """A table for a notebook."""
+        if not self.findings:
+            return Table(str(self), (), ()).to_html()
+        rows = tuple((f.kind, f.text, f.remedy) for f in self.findings)
+        header = ("finding", "what was seen", "what to do")
+        return Table("what the data are", header, rows, words=True).to_html()
 
     def __repr__(self) -> str:
         return f"Diagnosis({', '.join(f.kind for f in self.findings) or 'nothing found'})"

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..arrays import FloatArray, labelled, runs
 from ..plotting import Drawing, legend, lettered, thin
+from ..tables import Table
 from .diagnosis import Diagnosis, diagnose
 from .outliers import (
     band,
@@ -146,15 +147,26 @@ class Summary:
         assert self.data is not None
         return self.data.plot(ax, file=file)
 
+    def _repr_html_(self) -> str:
+        """A table for a notebook, what helps below it."""
+        (_, header), *rows = _rows(self.columns)
+        cells = tuple((label, *cells) for label, cells in rows)
+        hints = [*map(str, self.diagnosis.findings), *self.advice]
+        notes = [f"note: {note}" for note in self.notes]
+        return Table(self._caption(), ("", *header), cells).to_html([*hints, *notes])
+
     def __repr__(self) -> str:
         hints = len(self.advice) + len(self.diagnosis.findings)
         return f"Summary({self.n} samples, {len(self.columns)} columns, {hints} hints)"
 
-    def __str__(self) -> str:
+    def _caption(self) -> str:
         count = len(self.experiments)
         several = f" in {count} experiments" if count > 1 else ""
         rate = f"Ts = {self.Ts:g} s ({1 / self.Ts:.4g} Hz)"
-        lines = [f"{self.n} samples{several}, {self.n * self.Ts:.4g} s at {rate}"]
+        return f"{self.n} samples{several}, {self.n * self.Ts:.4g} s at {rate}"
+
+    def __str__(self) -> str:
+        lines = [self._caption()]
         lines += [f"  {name} [{text}]" for name, text, _ in self.experiments[:10]]
         lines += ["", *table(self.columns)]
         hints = [*self.diagnosis.findings, *self.advice] or ["nothing stands in the way"]
@@ -249,6 +261,18 @@ def _size(value: float) -> float:
 
 def table(columns: Sequence[ColumnSummary]) -> list[str]:
     """The columns side by side, one quantity per line."""
+    rows = _rows(columns)
+    widths = [max(len(cells[i]) for _, cells in rows) for i in range(len(columns))]
+    return [
+        "  ".join(
+            [label.ljust(19), *(c.rjust(w) for c, w in zip(cells, widths, strict=True))]
+        ).rstrip()
+        for label, cells in rows
+    ]
+
+
+def _rows(columns: Sequence[ColumnSummary]) -> list[tuple[str, list[str]]]:
+    """A label and a cell for each column; the first row is the header."""
     rows: list[tuple[str, list[str]]] = [
         ("", [f"{c.role} {labelled(c.name, c.unit)}" for c in columns]),
         ("range", [f"{_number(c.low)} to {_number(c.high)}" for c in columns]),
@@ -266,13 +290,7 @@ def table(columns: Sequence[ColumnSummary]) -> list[str]:
     ]
     if all(c.band is None for c in columns):
         rows.pop()
-    widths = [max(len(cells[i]) for _, cells in rows) for i in range(len(columns))]
-    return [
-        "  ".join(
-            [label.ljust(19), *(c.rjust(w) for c, w in zip(cells, widths, strict=True))]
-        ).rstrip()
-        for label, cells in rows
-    ]
+    return rows
 
 
 def _number(value: float) -> str:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,9 @@ NEAR, SHOWN = 1.4, 8
 """Frequencies within this factor of antiresonance and resonance, and how many must be usable: two
 for each of the shaft's parameters, and so half of them about either. Fewer can be explained by many
 a shaft that is not there."""
+BEYOND, FARTHEST = (1.05, 1.3, 1.8), 1.0
+"""Of the highest measured frequency, where a resonance beyond it is looked for; the farthest that
+is believed, of the sample rate."""
 CONFIDENCE = 1.96
 DEPTHS, WIDTHS = (0.02, 0.7), (0.1, 2.0)
 """Of a proposed notch."""
@@ -80,12 +84,15 @@ class ShaftFit:
         Root of the mean squared error over its standard deviation: 1 if noise explains everything.
     response : FrequencyResponse
         What was fitted.
+    beyond_hertz : float or None
+        Where a resonance seems to lie that is above all measured frequencies, by its flank [Hz].
     """
 
     parameters: Mapping[str, Parameter]
     misfit: float
     response: FrequencyResponse
     _theta: FloatArray
+    beyond_hertz: float | None = None
 
     @property
     def has_resonance(self) -> bool:
@@ -136,7 +143,10 @@ class ShaftFit:
     def to_dict(self) -> dict[str, Any]:
         """Parameters with their intervals, as JSON values."""
         rows = {name: vars(p) for name, p in self.parameters.items()}
-        return {"resonance": self.has_resonance, "misfit": self.misfit, "parameters": rows}
+        return {
+            "resonance": self.has_resonance, "misfit": self.misfit, "parameters": rows,
+            "beyond_hertz": self.beyond_hertz,
+        }  # fmt: skip
 
     def _repr_html_(self) -> str:
         return html_of(str(self))
@@ -149,6 +159,11 @@ class ShaftFit:
         width = max(map(len, self.parameters))
         rows = [f"  {name:<{width}}  {p}" for name, p in self.parameters.items()]
         found = [f"{kind}, misfit {self.misfit:.3g} (95 % intervals)", *rows]
+        if self.beyond_hertz is not None:
+            found.append(
+                f"  a resonance beyond {self.response.hertz[-1]:.4g} Hz, near "
+                f"{self.beyond_hertz:.3g} Hz by its flank: sample faster, or raise f_max"
+            )
         return "\n".join([*found, f"  {self.notch()}"] if self.has_resonance else found)
 
 
@@ -181,7 +196,7 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
     sigma = np.sqrt(0.5 * _smoothed(response.variance[usable]) + (FLOOR * np.abs(g)) ** 2)
     task = _Task(f, g, sigma, response.Ts, response.from_counts)
     rigid = min((_solved(task, x) for x in _rigid_starts(task)), key=lambda s: s[0])
-    best = rigid
+    best, beyond = rigid, None
     if resonance is not False:
         found = [_solved(task, x) for x in _shaft_starts(task, rigid[1])]
         shaft = min((s for s in found if _is_shaft(s[1], f)), key=lambda s: s[0], default=None)
@@ -192,6 +207,8 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
             )  # fmt: skip
         if shaft is not None and (resonance or _is_better(task, shaft[0], rigid[0])):
             best = shaft
+        elif best is rigid:
+            beyond = _beyond(task, rigid)
     cost, theta, covariance = best
     if not math.isfinite(cost):
         raise FitError(
@@ -201,7 +218,7 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
     freedom = max(2 * len(f) - len(theta), 1)
     scale = max(1.0, cost / freedom)
     parameters = _parameters(theta, covariance * scale, response)
-    return ShaftFit(parameters, math.sqrt(cost / freedom), response, theta)
+    return ShaftFit(parameters, math.sqrt(cost / freedom), response, theta, beyond)
 
 
 # --- The sampled response: partial fractions ------------------------------------------------------
@@ -340,6 +357,24 @@ def _shaft_starts(task: _Task, rigid: FloatArray) -> list[FloatArray]:
             shaft = np.log([2 * math.pi * place, 0.03, 2 * math.pi * antiresonance, 0.03])
             starts.append(np.concatenate([rigid, shaft]))
     return starts
+
+
+def _beyond(task: _Task, rigid: tuple[float, FloatArray, FloatArray]) -> float | None:
+    """The frequency of a resonance above all that were measured [Hz]; None where none is told.
+
+    Its flank has to explain as much as a resonance among them would have to.
+    """
+    found = []
+    for factor, ratio in product(BEYOND, (0.6, 0.85)):
+        w = 2.0 * math.pi * factor * task.hertz[-1]
+        start = np.concatenate([rigid[1], np.log([w, 0.02, ratio * w, 0.02])])
+        cost, theta, _ = _solved(task, start)
+        wr, zr, wa, za = np.exp(theta[4:])
+        above = task.hertz[-1] < wr / (2.0 * math.pi) < FARTHEST / task.Ts
+        inertias = RATIOS[0] < (wr / wa) ** 2 - 1.0 < RATIOS[1]
+        if above and inertias and max(zr, za) < DAMPED and _is_better(task, cost, rigid[0]):
+            found.append((cost, float(wr / (2.0 * math.pi))))
+    return min(found, default=(0.0, None))[1]
 
 
 def _is_shaft(theta: FloatArray, f: FloatArray) -> bool:

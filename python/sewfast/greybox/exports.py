@@ -24,7 +24,7 @@ AMPLITUDES = 1.5
 """Power over volts times amperes, where both are amplitudes of the q axis."""
 
 
-def export(motor: Motor, target: Target, winding: Winding | None) -> str:
+def export(motor: Motor, target: Target, winding: Winding | None, gear: float) -> str:
     """See `Motor.export`."""
     if target not in get_args(Target):
         raise SettingError(f"expected {', '.join(get_args(Target))} as target, received {target!r}")
@@ -34,17 +34,36 @@ def export(motor: Motor, target: Target, winding: Winding | None) -> str:
             remedy="line: volts and amperes of the record are those between two terminals, as of a "
             "DC motor; q: amplitudes along the q axis, as boards log them",
         )  # fmt: skip
+    if not (isinstance(gear, (int, float)) and math.isfinite(gear) and gear > 0):
+        raise SettingError(
+            name="gear", expected="turns of the motor per turn of the joint, above 0",
+            received=repr(gear), remedy="1 (the default) where the joint is the motor's shaft",
+        )  # fmt: skip
     factor = AMPLITUDES if winding == "q" else 1.0
     simulators = {"wpilib": _wpilib, "mujoco": _mujoco, "urdf": _urdf}
     if target in simulators:
-        return simulators[target](motor, factor)
+        return simulators[target](motor, factor, float(gear))
+    if gear != 1:
+        raise SettingError(
+            name="gear", expected=f"none with {target}", received=f"{gear:g}",
+            remedy="leave it out: a board's settings are those of the motor's own shaft",
+        )  # fmt: skip
     return _board(target, Phase(motor, winding == "q"))
 
 
-def _wpilib(motor: Motor, factor: float) -> str:
-    gains = {"kS": motor.of["k_s"], "kV": motor.value("k_v"), "kA": motor.value("k_a")}
+def _wpilib(motor: Motor, factor: float, gear: float) -> str:
+    k_v, k_a = (gear * motor.value(name) for name in ("k_v", "k_a"))
+    gains = {"kS": motor.of["k_s"], "kV": k_v, "kA": k_a}
     u = motor.u_unit
     units = {"kS": u, "kV": f"{u}/(rad/s)", "kA": f"{u}/(rad/s^2)"}
+    if "offset" in motor.parameters:  # a constant load, as that of an elevator
+        gains["kG"], units["kG"] = motor.value("offset"), u
+    if (
+        "load_1" in motor.parameters and gear == 1.0
+    ):  # an arm on the shaft: kG cos(angle - horizontal)
+        of = motor.of
+        gains["kG_cos"], units["kG_cos"] = motor.value("load_1"), u
+        gains["horizontal"], units["horizontal"] = math.atan2(of["load_1s"], of["load_1c"]), "rad"
     return json.dumps({"feedforward": gains, "units": units}, indent=1) + "\n"
 
 
@@ -54,18 +73,25 @@ def _torque(motor: Motor, name: str) -> float:
     return motor.of[name] * K * motor.value("volts") / R
 
 
-def _urdf(motor: Motor, factor: float) -> str:
+def _at_joint(motor: Motor, factor: float, gear: float) -> tuple[float, float]:
+    """Viscous [N m s/rad] and dry friction [N m] of the motor, as its joint feels them."""
     viscous, dry = (factor * _torque(motor, name) for name in ("k_b", "k_s"))
+    return gear**2 * viscous, gear * dry
+
+
+def _urdf(motor: Motor, factor: float, gear: float) -> str:
+    viscous, dry = _at_joint(motor, factor, gear)
     return f'<dynamics damping="{viscous:.6g}" friction="{dry:.6g}"/>\n'
 
 
-def _mujoco(motor: Motor, factor: float) -> str:
-    viscous, dry = (factor * _torque(motor, name) for name in ("k_b", "k_s"))
+def _mujoco(motor: Motor, factor: float, gear: float) -> str:
+    viscous, dry = _at_joint(motor, factor, gear)
     K, R, G = (motor.value(n) for n in ("motor_constant", "resistance_ohm", "volts"))
+    gears = "" if gear == 1.0 else f'gear="{gear:.6g}" '
     return (
-        f'<joint type="hinge" armature="{factor * motor.value("inertia"):.6g}" '
+        f'<joint type="hinge" armature="{factor * gear**2 * motor.value("inertia"):.6g}" '
         f'damping="{viscous:.6g}" frictionloss="{dry:.6g}"/>\n'
-        f'<general gainprm="{factor * K * G / R:.6g}" biastype="affine" '
+        f'<general {gears}gainprm="{factor * K * G / R:.6g}" biastype="affine" '
         f'biasprm="0 0 {-factor * K * K / R:.6g}"/>\n'
     )
 

@@ -216,29 +216,50 @@ class Motor:
         machine.set_load(of["offset"] * torque)
         return machine
 
-    def export(self, target: Target, *, winding: Winding | None = None) -> str:
+    def export(self, target: Target, *, winding: Winding | None = None, gear: float = 1.0) -> str:
         """Settings of another tool, as text.
 
         Parameters
         ----------
         target : "wpilib", "mujoco", "urdf", "odrive", "moteus" or "simplefoc"
-            `wpilib`: kS, kV, kA as JSON, kV and kA per rad/s and per rad/s^2. `mujoco`: joint and
-            actuator elements; `urdf`: the joint's dynamics. Boards: resistance and inductance of a
-            phase, KV or torque constant per amplitude along q, inertia; what the record cannot
-            tell is named in the text. All but `wpilib` take SI units.
+            `wpilib`: kS, kV, kA as JSON, kV and kA per rad/s and per rad/s^2, kG of a constant load
+            and, of an arm on the shaft, kG_cos and the angle where it is horizontal. `mujoco`:
+            joint and actuator elements; `urdf`: the joint's dynamics. Boards: resistance and
+            inductance of a phase, KV or torque constant per amplitude along q, inertia; what the
+            record cannot tell is named in the text. All but `wpilib` take SI units.
         winding : "line" or "q"
             What the record's volts and amperes are: those between two terminals, as of a DC motor,
             or amplitudes along the q axis, as boards log them. Boards need it; without it, a
             simulator gets a DC motor. With "q", torques and inertia are 3/2 of those printed.
+        gear : float
+            Turns of the motor per turn of the joint or mechanism whose settings these are; the
+            record has the speed of the motor. Not for boards.
 
         Raises
         ------
         SettingError
-            For another target, or a board without `winding`.
+            For another target, a board without `winding` or with a gear, or a gear not above 0.
         DataError
             If the record does not determine what the target needs.
         """
-        return export(self, target, winding)
+        return export(self, target, winding, gear)
+
+    def turn_load(self, angle: ArrayLike) -> FloatArray:
+        """Command that holds the shaft against what varies over the turn, at angles [rad], (N,).
+
+        Loads once and twice per turn, without the constant load: as a feed-forward it takes them
+        out of the speed. The angle is that of the record: of a `Recording` its
+        counts.
+
+        Raises
+        ------
+        DataError
+            If the angles are not finite, one-dimensional numbers.
+        """
+        at, of = as_column(angle, "angle"), self.of
+        waves = ((1, "load_1"), (2, "load_2"))
+        sums = [of[w + "c"] * np.cos(n * at) + of[w + "s"] * np.sin(n * at) for n, w in waves]
+        return np.asarray(np.sum(sums, axis=0))
 
     @property
     def of(self) -> dict[str, float]:

@@ -11,6 +11,7 @@ from .. import storage
 from ..analysis import analysis as analyses
 from ..errors import DataError, ModelFileError
 from ..frequency import load_response
+from ..greybox import load_motor
 from ..plotting import Picture, Trace, loop_drawing, style, svg
 from ..readers import read_table
 from ..tables import Table, milliseconds, percent, rpm, significant, volt
@@ -71,6 +72,7 @@ def context(folder: Path) -> dict[str, Any]:
                 "analysed": section(folder),
                 "margins": _predicted_and_measured(found),
                 "response": _response(folder),
+                "motor": motor_section(folder),
                 "loops": [_picture(folder, name, n) for name, n in found["references"].items()],
             }
     except (KeyError, TypeError, AttributeError) as e:
@@ -354,3 +356,44 @@ def _score_cells(s: Mapping[str, Any]) -> tuple[str, ...]:
         significant(s["chatter"]),
         significant(s["Ms"]),
     )
+
+
+# --- The section of a page on a motor that lies in its folder (`Motor.save`) ----------------------
+
+MOTOR = "motor.json"
+
+
+def motor_section(folder: Path) -> dict[str, Any] | None:
+    """What the template `motor.html` shows; None where the folder holds no motor.
+
+    Raises
+    ------
+    ModelFileError
+        Where its file is damaged.
+    """
+    path = folder / MOTOR
+    if not path.is_file():
+        return None
+    motor = load_motor(path)
+    rows = tuple(
+        (name, f"{p.value:.5g}", f"{p.low:.5g} to {p.high:.5g}", p.unit)
+        for name, p in motor.parameters.items()
+    )
+    reasons = dict.fromkeys(motor.undetermined.values())
+    missing = {why: [n for n, w in motor.undetermined.items() if w == why] for why in reasons}
+    alt = "the command that it takes to hold a speed, with its step at standstill"
+    picture = Picture(
+        "motor", "", "What it takes to hold a speed",
+        alt, "The step at standstill is dry friction and the dead zone of the inverter.",
+        svg(motor.drawing().figure(), "motor", alt),
+    )  # fmt: skip
+    caption = (
+        f"Free run on its record: {motor.fit_percent:.2f} %, {motor.rmse:.3g} {motor.speed_unit} "
+        f"rms of {motor.samples:,} samples."
+    )
+    header = ("parameter", "value", "95 % interval", "unit")
+    return {
+        "parameters": Table(caption, header, rows, words=True),
+        "missing": [(", ".join(names), why) for why, names in missing.items()],
+        "picture": picture,
+    }

@@ -421,6 +421,7 @@ def _context(artefacts: Artefacts) -> dict[str, Any]:
         "check": artefacts.results.get("check"),
         "analysed": commissioned.section(artefacts.folder)
         or commissioned.section(artefacts.folder / "commissioning"),
+        "motor": commissioned.motor_section(artefacts.folder),
         # nor those of before commissioning
         "commissioning": artefacts.results.get("commissioning"),
     }
