@@ -62,6 +62,23 @@ def starts(device: VirtualDevice) -> int:
     return sum(entry["event"] == "on" for entry in device.trace())
 
 
+def test_what_the_attacks_say_starts_the_motor_of_whoever_knows_tag_and_key() -> None:
+    # without this, that the attacks start nothing would say nothing about the locks
+    with VirtualDevice(endpoint="tcp") as device, RawHost(device.port, session=99) as host:
+        hello, *_ = blind(0, 0, 99).split(b"\0")[1:]
+        host.write(b"\0" + hello + b"\0")
+        reply = host.wait_for(raw.HELLO + 0x80)
+        # a motor that is known to stand still can be armed
+        time.sleep(0.3)
+        (key,) = struct.unpack("<I", reply[-1][-4:])
+        _, _, *rest = blind(reply[1], key, 99).split(b"\0")
+        host.write(b"\0".join(rest))
+        deadline = time.monotonic() + 5.0
+        while starts(device) != 1 and time.monotonic() < deadline:
+            host.read(0.01)
+        assert starts(device) == 1
+
+
 def test_a_web_page_starts_nothing_even_if_it_knows_the_tag() -> None:
     dice = random.Random(1)
     with VirtualDevice(endpoint="tcp") as device:
