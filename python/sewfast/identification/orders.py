@@ -21,7 +21,6 @@ from .folds import RUNAWAY, Errors, Split, compared, errors_of, free_runs
 from .task import Provenance, Task, arrays, finite
 
 ORDERS = (1, 2, 3, 4, 5, 6, 7, 8)
-SMALLEST = ORDERS[:2]
 DELAYS = (2, 3, 4, 5, 6)
 """Looked at beside the delay of one sample, unless one is given."""
 LATE_ORDERS = (1, 2, 3)
@@ -96,9 +95,11 @@ class LinearTable:
         """Orders upwards until two have not gained, then delays of the best small order.
 
         A long dead time is looked at before large orders, which feign one and take most of the
-        time; the smallest orders come first, as networks begin there.
+        time; the smallest orders come first, as networks begin there. The very first is fitted
+        however short the time, so that there is a linear model.
         """
-        self.add(((o, self.nk) for o in SMALLEST), until)
+        self.add([(ORDERS[0], self.nk)], None)
+        self.add([(ORDERS[1], self.nk)], until)
         if self.task.nk is None:
             self.add(self._late(), until)
         best, idle = math.inf, 0
