@@ -3,15 +3,16 @@
 Read in this order: `procedure` (`commission`, its stages one after the other), `demands` (what is
 asked and allowed, `Refusal`), `bench` (what is put around a machine); the stages: `excitations`,
 `small_signal`, `gains`, `training`, `slow`, `verification`; `result` (the value and its folder).
-Beside them: `shaking` (`bode` of a machine), `fmu` (an FMU as a machine).
+Beside them: `shaking`, `records` (`bode` of a machine, of a record), `fmu` (an FMU as a machine).
 """
 
 from .bench import Bench, Followed, Stepped, SteppedBench
 from .demands import Refusal
 from .fmu import FmuMachine, fmu_bench
 from .procedure import STAGES, commission
+from .records import unsmoothed
 from .result import Commissioning
-from .shaking import bode, unsmoothed
+from .shaking import bode
 from .training import Rival
 from .verification import Comparison
 
