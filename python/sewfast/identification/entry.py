@@ -226,7 +226,7 @@ def seeded(
     """What trains networks that differ in their seeds alone, called with a seed and a progress.
 
     Each is what `identify(data, model="neural_oe", starts=1, select=False)` returns, bit by bit,
-    without the evidence that is kept with it (`remembered`). The linear model that all of them
+    without the evidence and the verdict that are kept with it. The linear model that all of them
     begin at is fitted here, once: it takes longer than three networks.
 
     Parameters
