@@ -244,6 +244,66 @@ def test_a_reference_that_cannot_be_run_is_refused(samples: list[float], receive
     assert bench.played == 0
 
 
+class Odd(MachineBench):
+    """A machine of the user's own that states nonsense, or hands it back."""
+
+    def __init__(self, shown: Any = None, /, **stated: Any) -> None:
+        super().__init__(VirtualMachine())
+        self.__dict__.update(shown=shown, stated=stated, played=0)
+
+    def __getattribute__(self, name: str) -> Any:
+        stated = object.__getattribute__(self, "__dict__").get("stated", {})
+        return stated[name] if name in stated else object.__getattribute__(self, name)
+
+    def excite(self, u: np.ndarray, name: str) -> Any:
+        self.__dict__["played"] += 1
+        return self.shown(super().excite(u, name))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("Ts", value) for value in (np.nan, 0.0, -1e-3, "1 ms", np.inf, 1e-12, 10.0, None)),
+        *(("counts_per_rev", value) for value in (0.0, np.nan, -5.0, None, np.inf)),
+        *(("volt", value) for value in (0.0, np.nan, None, "20")),
+        *(("speed", value) for value in (np.nan, None, -1.0)),
+    ],
+)
+def test_a_machine_whose_numbers_are_none_is_refused_before_it_moves(name: str, value: Any) -> None:
+    odd = Odd(**{name: value})
+    with pytest.raises(SettingError) as caught:
+        commission(odd, **SMALL)
+    assert caught.value.name == name
+    assert odd.played == 0
+
+
+def _first_is_missing(recording: Recording) -> Recording:
+    counts = recording.counts.copy()
+    counts[0] = np.nan
+    return replace(recording, counts=counts)
+
+
+@pytest.mark.parametrize(
+    ("shown", "error", "expected"),
+    [
+        (lambda recording: None, SettingError, "a Recording"),
+        (lambda recording: recording.counts, SettingError, "a Recording"),
+        (lambda recording: replace(recording, counts=recording.counts[:5]), DataError, "shape"),
+        (lambda recording: replace(recording, u=recording.u[:, None]), DataError, "shape"),
+        (_first_is_missing, DataError, "finite"),
+        (lambda recording: replace(recording, Ts=0.01), DataError, "the machine's Ts"),
+    ],
+)
+def test_a_machine_that_hands_back_nonsense_is_refused_at_its_first_run(
+    shown: Callable[[Recording], Any], error: type[Exception], expected: str
+) -> None:
+    odd = Odd(shown)
+    with pytest.raises(error) as caught:
+        commission(odd, **SMALL)
+    assert expected in caught.value.expected  # type: ignore[attr-defined]
+    assert odd.played == 1
+
+
 def test_only_machines_are_commissioned() -> None:
     with pytest.raises(SettingError, match="VirtualMachine, a Drive or a Machine"):
         commission("virtual")  # type: ignore[arg-type]

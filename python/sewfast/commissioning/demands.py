@@ -58,6 +58,10 @@ OVER = 1.25
 """Training reaches this many times the top of the working range: the loop overshoots it."""
 
 
+SAMPLE_TIMES = (1e-5, 0.1)
+"""Of machines that can be commissioned [s]: signals are planned in seconds."""
+
+
 @dataclass(frozen=True)
 class Demands:
     """Limits, working range and effort.
@@ -122,6 +126,7 @@ def demands(
     ------
     SettingError
     """
+    _require_machine(bench)
     volt = bench.volt if u_max is None else real("u_max", u_max)
     if not 0.0 < volt < math.inf:
         raise SettingError(
@@ -163,6 +168,24 @@ def demands(
         None if Ms is None else Constraints(Ms=Ms).Ms,
         None if time_budget is None else budget(time_budget),
     )
+
+
+def _require_machine(bench: Machine) -> None:
+    """Refuse numbers of a machine that no command can be planned from, before it moves."""
+    for name, low, high in (("Ts", *SAMPLE_TIMES), ("counts_per_rev", 1.0, 1e9)):
+        value = real(name, getattr(bench, name))
+        if not low <= value <= high:
+            raise SettingError(
+                name=name, expected=f"{low:g} to {high:g} of the machine", received=f"{value:g}",
+                remedy="see what its controller and its encoder are set to",
+            )  # fmt: skip
+    for name in ("volt", "speed"):
+        value = real(name, getattr(bench, name))
+        if not value > 0.0:
+            raise SettingError(
+                name=name, expected="a limit of the machine above 0", received=f"{value:g}",
+                remedy="see its amplifier; a speed without a limit is inf",
+            )  # fmt: skip
 
 
 def _load(load: float | None, volt: float) -> float | None:

@@ -146,8 +146,9 @@ def commission(
         See `Commissioning.save`.
     resume : bool
         Continue from the recordings that an earlier attempt left in `folder`: those of exactly the
-        same commands and references are not taken again. With the same settings the controller is,
-        bit by bit, that of an attempt without interruption on the same recordings.
+        same commands and references on a machine of this name are not taken again. With the same
+        settings the controller is, bit by bit, that of an attempt without interruption on the same
+        recordings.
     cancel : threading.Event, optional
         Set in another thread, it ends the commissioning as Ctrl-C does: a drive that runs is
         stopped at once, everything else at its next step.
@@ -246,7 +247,10 @@ def _place(
     folder = Path(name)
     require_own(folder, overwrite=overwrite or resume)
     device, conditions = told_of(bench)
-    own = {"u_max": asked.u_max, "speed": asked.speed, "seed": asked.seed}
+    own = {
+        "u_max": asked.u_max, "speed": asked.speed, "seed": asked.seed,
+        "machine": bench.name, "Ts": bench.Ts, "counts_per_rev": bench.counts_per_rev,
+    }  # fmt: skip
     taken = Taken(folder, device, {**own, **conditions}, resume)
     taken.begin()
     return taken
