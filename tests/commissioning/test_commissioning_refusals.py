@@ -196,6 +196,13 @@ def test_a_machine_that_changed_is_not_verified() -> None:
         ({"u_max": 40.0}, "u_max", "within the machine's limit of 20 V"),
         ({"speed": -1.0}, "speed", "above 0 RPM"),
         ({"members": 0}, "members", "1 or more"),
+        ({"members": 10**9}, "members", "up to 100"),
+        ({"cost": "x"}, "cost", "a Cost, or None"),
+        ({"progress": "x"}, "progress", "a function, or None"),
+        ({"between": 5}, "between", "a function, or None"),
+        ({"cancel": "x"}, "cancel", "a threading.Event, or None"),
+        ({"references": 5}, "references", "a mapping from names to samples, or a sequence of "
+         "names"),
         ({"evaluations": 0}, "evaluations", "1 or more"),
         ({"load": -1.0}, "load", "from 0 V to below u_max = 20 V"),
         ({"load": 20.0}, "load", "from 0 V to below u_max = 20 V"),
@@ -234,7 +241,12 @@ def test_what_a_part_of_it_refuses_is_refused_before_anything_moves(
 
 @pytest.mark.parametrize(
     ("samples", "received"),
-    [([], "none"), ([1.0, float("nan")], "NaN or infinity"), ([0.0, 0.0], "zeros only")],
+    [
+        ([], "0"),
+        ([500.0], "1"),
+        ([1.0, float("nan")], "NaN or infinity"),
+        ([0.0] * 40, "zeros only"),
+    ],
 )
 def test_a_reference_that_cannot_be_run_is_refused(samples: list[float], received: str) -> None:
     bench = bent()

@@ -52,6 +52,7 @@ def require(met: bool, message: str) -> None:
 LONGEST_NAME = 100
 """Of a reference's file [bytes]; file systems take 255, of which endings need some."""
 
+MOST_MEMBERS = 100
 MS = 2.0
 """Largest sensitivity unless said otherwise."""
 OVER = 1.25
@@ -160,7 +161,7 @@ def demands(
         top,
         _fixed(references),
         _fixed(practice),
-        _at_least(1, "members", members),
+        _members(members),
         _at_least(1, "evaluations", evaluations),
         whole("seed", seed),
         _at_least(1, "threads", threads),
@@ -220,6 +221,16 @@ def _fixed(references: Mapping[str, FloatArray] | None) -> Mapping[str, FloatArr
             )  # fmt: skip
         files[file] = name
     return MappingProxyType(dict(references))
+
+
+def _members(value: int) -> int:
+    number = _at_least(1, "members", value)
+    if number > MOST_MEMBERS:
+        raise SettingError(
+            name="members", expected=f"up to {MOST_MEMBERS}", received=f"{number}",
+            remedy="4 are usual, and each is trained for seconds",
+        )  # fmt: skip
+    return number
 
 
 def _at_least(least: int, name: str, value: int) -> int:
