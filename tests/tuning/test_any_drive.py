@@ -143,6 +143,15 @@ def test_a_position_is_tuned_with_no_option(
         assert abs(run.y[-1] - run.r[-1]) < 0.05 * np.ptp(run.r)
 
 
+def test_a_spare_pole_at_1_is_no_position() -> None:
+    slow, spare = math.exp(-0.05), 1.0 - 5e-5
+    num = 0.1 * np.convolve([0.0, 1.0 - slow], [1.0, -spare * (1.0 - 1e-7)])
+    model = LinearOE.from_tf(num, np.poly([slow, spare]), 0.01, input_units=["V"], output_unit="mm")
+    model = replace(model, training={"input_range": [[-5.0, 5.0]], "output_range": [-0.5, 0.5]})
+    assert "Table 1" in first_controller(model).notes
+    assert drive_references(model, -5.0, 5.0)["trapezoid"].max() < 0.5
+
+
 def test_a_position_that_cannot_return_needs_references() -> None:
     with pytest.raises(SettingError, match="limits that move a position both ways"):
         sewfast.tune(servo(0.01, 0.1, 5.0, (0.0, 10.0)), evaluations=4)

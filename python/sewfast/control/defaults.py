@@ -206,9 +206,9 @@ def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
     FitError
         Where that of no step does.
     """
-    if not _integrates(model):
-        return None
     size = u_max if u_max >= -u_min else u_min
+    if not _integrates(model) or not _moves_on(model, _STEP_SHARES[0] * size):
+        return None
     reason: Exception | None = None
     for share in _STEP_SHARES:
         for samples in _STEP_SAMPLES:
@@ -243,6 +243,19 @@ def _integrates(model: Model) -> bool:
     small = linearise(representative(model).core, np.zeros(1))
     finite = bool(np.isfinite(small.A).all())
     return finite and bool(np.any(np.abs(np.linalg.eigvals(small.A) - 1.0) < _INTEGRATES))
+
+
+def _moves_on(model: Model, size: float) -> bool:
+    """Whether a step is still felt as much at its end as before.
+
+    A pole at 1 that a zero all but cancels is no integrator.
+    """
+    samples = _STEP_SAMPLES[-1]
+    u = np.zeros((samples, 1))
+    # not from the first sample on, which would be taken for the command before the step
+    u[samples // 20 :] = size
+    y = model.core.simulate(u, model.core.rest_state())
+    return bool(abs(y[-1] - y[samples // 2]) > 0.25 * abs(y[-1] - y[0]))
 
 
 @dataclass(frozen=True)
