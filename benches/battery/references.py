@@ -48,6 +48,8 @@ class References:
     oe_order : int
     gain : float or None
         True steady gain of a motor.
+    range_gain : float or None
+        The same between the ends of the recorded input, as the record itself shows it.
     oracle_gain_error, oe_gain_error : float or None
         Relative errors of it.
     """
@@ -58,6 +60,7 @@ class References:
     oe: float
     oe_order: int
     gain: float | None = None
+    range_gain: float | None = None
     oracle_gain_error: float | None = None
     oe_gain_error: float | None = None
 
@@ -70,12 +73,13 @@ def references(case: Case) -> References:
     theta = refitted(case)
     order, linear = output_error(case)
     found: dict[str, float | None] = {}
-    if case.gain_probe is not None:
+    if case.gain_probe is not None and case.range_probe is not None:
         gain = _gain(case.truth.run(case.truth.theta, case.gain_probe), case.gain_probe)
-        found["gain"] = gain
+        whole = case.truth.run(case.truth.theta, case.range_probe)
+        found |= {"gain": gain, "range_gain": _gain(whole, case.range_probe)}
         own = _gain(case.truth.run(theta, case.gain_probe), case.gain_probe)
         found["oracle_gain_error"] = abs(own / gain - 1)
-        found["oe_gain_error"] = gain_error(case, linear, gain)
+        found["oe_gain_error"] = gain_error(case, linear, gain, case.gain_probe)
     return References(
         digest(case), case.noise, oracle_error(case, theta), score(case, linear), order, **found
     )  # fmt: skip
@@ -160,10 +164,8 @@ def score(case: Case, model: Model) -> float:
     return _pooled(errors)
 
 
-def gain_error(case: Case, model: Model, gain: float) -> float:
+def gain_error(case: Case, model: Model, gain: float, probe: FloatArray) -> float:
     """Relative error of a motor's steady gain, by the same two steps for truth and model."""
-    probe = case.gain_probe
-    assert probe is not None
     try:
         (run,) = model.simulate(case.dataset(probe, np.zeros(len(probe))), init=0)
     except FitError:

@@ -57,6 +57,7 @@ class Run:
     kind: str = ""
     orders: str = ""
     gain_error: float | None = None
+    range_gain_error: float | None = None
     failure: str = ""
 
     @property
@@ -154,9 +155,12 @@ def _run(task: Task, case: Case, kept: References, seed: int) -> Run:
     wall, used = time.perf_counter() - wall, time.process_time() - used
     if model is None:
         return Run(seed, math.inf, wall, used, failure=failure)
-    gain = None if kept.gain is None else gain_error(case, model, kept.gain)
+    gains = [
+        None if gain is None or probe is None else gain_error(case, model, gain, probe)
+        for gain, probe in ((kept.gain, case.gain_probe), (kept.range_gain, case.range_probe))
+    ]
     orders = " ".join(f"{k}={v}" for k, v in model.orders.items())
-    return Run(seed, score(case, model), wall, used, kind_of(model), orders, gain)
+    return Run(seed, score(case, model), wall, used, kind_of(model), orders, *gains)
 
 
 def kind_of(model: Model) -> str:
@@ -224,6 +228,7 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, dict[str, float | int | No
 def _summary(outcomes: Sequence[Outcome]) -> dict[str, float | int | None]:
     runs = [(o, r) for o in outcomes for r in o.runs]
     gains = [r.gain_error for _, r in runs if r.gain_error is not None]
+    range_gains = [r.range_gain_error for _, r in runs if r.range_gain_error is not None]
     linear = [r.is_network for o, r in runs if o.is_linear]
     worse = [x > WORSE for o in outcomes for x in o.over_oe()]
     visibly = [x > WORSE for o in outcomes for x in o.over_oe_measured()]
@@ -243,6 +248,7 @@ def _summary(outcomes: Sequence[Outcome]) -> dict[str, float | int | None]:
         "networks_for_linear_truth": _share(linear),
         "gain_error_median": _quantile(gains, 0.5),
         "gain_error_worst": _quantile(gains, 1.0),
+        "range_gain_error_worst": _quantile(range_gains, 1.0),
         "seconds_median": _quantile([r.seconds for _, r in runs], 0.5),
         "seconds_worst": _quantile([r.seconds for _, r in runs], 1.0),
         "cpu_total": float(sum(r.cpu for _, r in runs)),
@@ -275,6 +281,7 @@ _WORDS = {
     "networks_for_linear_truth": "share of networks for a linear truth",
     "gain_error_median": "steady gain of motors, median error",
     "gain_error_worst": "steady gain of motors, worst error",
+    "range_gain_error_worst": "the same between the ends of the record, worst",
     "seconds_median": "wall, median [s]",
     "seconds_worst": "wall, worst [s]",
     "cpu_total": "processor, all runs [s]",

@@ -607,6 +607,11 @@ def test_an_angle_that_wraps() -> None:
     assert sewfast.diagnose(spikes).find("wraps") is None
     # a static plant jumps by its whole range too
     assert sewfast.diagnose(Dataset.from_arrays(bits, 3.0 * bits, TS)).find("wraps") is None
+    # so does noise, now and then; but its moves are of every size
+    for seed in range(12):
+        r = np.random.default_rng(seed)
+        noise = Dataset.from_arrays(r.normal(size=4000), r.normal(size=4000), TS)
+        assert sewfast.diagnose(noise).find("wraps") is None
 
 
 def test_coarse_outputs_and_limited_inputs() -> None:

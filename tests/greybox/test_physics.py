@@ -21,7 +21,7 @@ from sewfast.errors import DataError, FitError, ModelFileError, SettingError, Se
 from sewfast.greybox import Tracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benches"))
-from physics import recorded, steps, truths
+from physics import logged, recorded, steps, truths
 
 SI = {"resistance_ohm", "motor_constant", "inertia", "viscous_friction", "coulomb_torque"}
 
@@ -57,6 +57,17 @@ def linear(n: int = 1500, Ts: float = 0.02, seed: int = 0, noise: float = 1.0) -
 
 
 # --- Motors whose truth is known ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [12, 170, 181])
+def test_a_ramp_that_shows_no_inertia_says_so(seed: int) -> None:
+    """Eight steps a sample overshoot a motor as fast as the least inertia makes it."""
+    u, y, truth, defect = logged(seed)
+    assert defect == "ramp"
+    motor = physics(sewfast.Dataset.from_arrays(u, y, 0.02, output_unit="rpm"))
+    assert "how the motor speeds up" in motor.undetermined["k_a"]
+    if "k_v" in motor.parameters:
+        assert motor.value("k_v") == pytest.approx(truth["k_v"], rel=0.05)
 
 
 def test_command_and_speed_show_what_it_takes_to_turn(record: Any, alone: Motor) -> None:

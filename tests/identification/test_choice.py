@@ -382,6 +382,33 @@ def test_a_useless_model_is_called_useless() -> None:
     assert verdict["next"]
 
 
+@pytest.mark.parametrize("kind", ["arx", "iv", "oe", "neural_oe", "hammerstein_wiener"])
+def test_a_kind_by_name_gets_a_verdict_too(kind: Any) -> None:
+    options: dict[str, Any] = {"starts": 2, "iterations": 20} if kind == "neural_oe" else {}
+    own = identify(linear_data(800), model=kind, **options).training["verdict"]
+    assert own["grade"] == "good"
+    assert "of its own training data" in own["text"]
+    given = identify(
+        linear_data(800), model=kind, validation=linear_data(400, seed=5), **options
+    ).training["verdict"]
+    assert "of data not trained on" in given["text"]
+    rng = np.random.default_rng(1)
+    noise = Dataset.from_arrays(rng.normal(size=600), rng.normal(size=600), 0.01)
+    assert identify(noise, model=kind, **options).training["verdict"]["grade"] == "useless"
+
+
+def test_a_model_that_runs_away_is_useless() -> None:
+    rng = np.random.default_rng(0)
+    u, y = rng.normal(size=120), np.zeros(120)
+    for k in range(1, 120):
+        y[k] = 1.2 * y[k - 1] + u[k - 1] + rng.normal()
+    growing = Dataset.from_arrays(u, y, 0.01, input_units="V")
+    longer = linear_data(5000)
+    own = identify(growing, model="arx", validation=longer).training["verdict"]
+    assert "leaves the finite numbers" in own["text"]
+    assert own["grade"] == "useless"
+
+
 # --- no costume, no selection, further training ---------------------------------------------------
 
 

@@ -147,8 +147,9 @@ def test_output_error_is_the_order_best_on_the_last_fifth() -> None:
     assert model.orders == {"na": order, "nb": order + 1, "nk": 1}
     assert order >= 2
     assert references.score(c, model) < 0.05 * c.noise
-    gain = references.references(c).gain
-    assert references.gain_error(c, model, gain) < 0.01
+    held = references.references(c)
+    assert references.gain_error(c, model, held.gain, c.gain_probe) < 0.01
+    assert references.gain_error(c, model, held.range_gain, c.range_probe) < 0.01
 
 
 def test_the_score_sees_no_output_after_the_first_ones() -> None:
@@ -180,6 +181,7 @@ def test_the_default_is_no_worse_than_output_error(name: str) -> None:
     # with the noise of a real test record: both may be a hundredth of it away from the truth
     assert found.over_oe_measured()[0] <= scoring.WORSE
     assert run.gain_error is None or run.gain_error < 0.05
+    assert run.range_gain_error is None or run.range_gain_error < 0.05
 
 
 # --- scores ---------------------------------------------------------------------------------------
@@ -188,7 +190,16 @@ def test_the_default_is_no_worse_than_output_error(name: str) -> None:
 def outcome(name: str, errors: list[float], *, kind: str = "oe", oe: float = 2.0) -> Any:
     held = references.References("", noise=1.0, oracle=0.5, oe=oe, oe_order=2, gain=3.0)
     runs = [
-        scoring.Run(i, e, 10.0, 15.0, kind, gain_error=0.01 * i, failure="" if e < 9e9 else "no")
+        scoring.Run(
+            i,
+            e,
+            10.0,
+            15.0,
+            kind,
+            gain_error=0.01 * i,
+            range_gain_error=0.02 * i,
+            failure="" if e < 9e9 else "no",
+        )
         for i, e in enumerate(errors)
     ]
     linear = families.FAMILIES[name].is_linear
@@ -216,6 +227,7 @@ def test_ratios_and_summary() -> None:
     assert rules["networks_for_linear_truth"] == 0.25
     assert rules["spread_95"] == 1.5
     assert rules["gain_error_worst"] == 0.02
+    assert rules["range_gain_error_worst"] == 0.04
     assert summary["held"]["failed"] == 1
     assert summary["held"]["spread_95"] == math.inf
     assert summary["held"]["networks_for_linear_truth"] is None

@@ -23,7 +23,7 @@ import numpy as np
 
 from ..simulators import FloatArray
 from . import blocks, linear, motors, plants, positions
-from .system import FAMILIES, Case, Family, Record, System, Truth, rms
+from .system import FAMILIES, Case, Family, Levels, Record, System, Truth, rms
 
 __all__ = [
     "FAMILIES",
@@ -61,14 +61,23 @@ def make(name: str, seed: int) -> Case:
         entry.is_linear,
         drawn.truth,
         rms(np.concatenate(residuals)),
-        _probe(drawn),
+        _probe(drawn, drawn.gain_levels),
+        _probe(drawn, _range(drawn)),
     )
 
 
-def _probe(drawn: System) -> FloatArray | None:
+def _range(drawn: System) -> Levels | None:
+    """The ends of the recorded first input, each held as long as the other levels."""
     if drawn.gain_levels is None:
         return None
-    low, high, hold = drawn.gain_levels
+    u = np.concatenate([r.u if r.u.ndim == 1 else r.u[:, 0] for r in drawn.train])
+    return float(u.min()), float(u.max()), drawn.gain_levels[2]
+
+
+def _probe(drawn: System, levels: Levels | None) -> FloatArray | None:
+    if levels is None:
+        return None
+    low, high, hold = levels
     u = np.repeat([low, high], hold)
     # further inputs (a brake) rest
     return u if drawn.inputs == 1 else np.column_stack([u, np.zeros((len(u), drawn.inputs - 1))])

@@ -14,6 +14,8 @@ from ..simulators import FloatArray
 
 Rng: TypeAlias = np.random.Generator
 Split: TypeAlias = Literal["rules", "held"]
+Levels: TypeAlias = tuple[float, float, int]
+"""Two inputs, and the samples for which each is held."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +69,8 @@ class Case:
     gain_probe : array or None
         Two constant inputs, one after the other, each held until a motor has settled: the steady
         gain is the difference of the last outputs over that of the inputs. None: not a motor.
+    range_probe : array or None
+        The same between the ends of the recorded input: the gain that the record itself shows.
     """
 
     family: str
@@ -79,6 +83,7 @@ class Case:
     truth: Truth
     noise: float
     gain_probe: FloatArray | None = None
+    range_probe: FloatArray | None = None
 
     @property
     def training(self) -> Dataset:
@@ -114,7 +119,7 @@ class System:
     train: Sequence[Record]
     test: Sequence[Record]
     Ts: float = 0.001
-    gain_levels: tuple[float, float, int] | None = None
+    gain_levels: Levels | None = None
     inputs: int = 1
 
 

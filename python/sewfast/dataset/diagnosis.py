@@ -246,6 +246,8 @@ def _wraps(data: Dataset) -> Iterator[Finding]:
     back, other, sizes = 0, 0, []
     for y in columns:
         change = np.diff(y)
+        # between the moves of an angle and its jumps there is nothing; between those of noise, all
+        other += int(np.sum((np.abs(change) > 0.35 * span) & (np.abs(change) <= 0.7 * span)))
         jumps = np.where(np.abs(change) > 0.7 * span, np.sign(change), 0.0)
         for k in np.flatnonzero(jumps):
             if -jumps[k] in jumps[max(k - 5, 0) : k + 6]:

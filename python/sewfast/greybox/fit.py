@@ -179,6 +179,8 @@ def physics(
     first = Task(part)
     state = fitted(first, started(first, terms))
     steps, first.steps = first.steps, min(first.steps, ON_THE_WAY)
+    if not math.isfinite(first.cost(state)):  # so few overshoot: no record shows its inertia
+        first.steps = steps
     first.settle_starts(state)
     first.leave_out_spikes(state)
     state = _with_limit(first, fitted(first, state), terms)

@@ -25,6 +25,7 @@ from .folds import thinned
 from .outputs import OUTPUTS
 from .task import Task, with_provenance
 from .training import Structure
+from .verdict import verdict_by_name
 
 _KINDS: dict[str, Callable[[Task], Model]] = {
     "auto": choice.auto,
@@ -211,6 +212,9 @@ def identify(
     else:
         found = _within_budget(_KINDS[kind], task)
     try:
+        if "verdict" not in found.training:
+            own = verdict_by_name(found, task.data, task.validation)
+            found = with_provenance(found, {"verdict": own})
         return remembered(found, _excerpt(found, task))
     except KeyboardInterrupt:
         raise Interrupted(found) from None
@@ -222,7 +226,7 @@ def seeded(
     """What trains networks that differ in their seeds alone, called with a seed and a progress.
 
     Each is what `identify(data, model="neural_oe", starts=1, select=False)` returns, bit by bit,
-    without the evidence that is kept with it (`remembered`). The linear model that all of them
+    without the evidence and the verdict that are kept with it. The linear model that all of them
     begin at is fitted here, once: it takes longer than three networks.
 
     Parameters

@@ -270,16 +270,12 @@ def _with_enough_measured(pieces: list[Experiment]) -> list[Experiment]:
     return [e for e in pieces if len(e) - e.unmeasured > LEAST_BLOCK]
 
 
-_NOTHING_HELD_OUT: Provenance = {
-    "chosen": "oe",
-    "reason": f"the record is too short to hold out blocks of {LEAST_BLOCK} samples to compare on",
-}
-
-
 def _comparison(task: Task, linear: _core.LinearModel, network: _core.NeuralFit) -> Provenance:
     """Free-run errors of both on data not trained on, the choice and its reason."""
+    asked = "a lagged network was asked for"
     if task.validation is None:
-        return _NOTHING_HELD_OUT
+        short = f"the record is too short to hold out blocks of {LEAST_BLOCK} samples to compare on"
+        return {"chosen": "neural_oe", "reason": f"{asked}; {short}", "is_better": False}
     rmse = {
         "oe": free_run_rmse(wrap(LinearOE, linear, task.data), task.validation),
         "neural_oe": free_run_rmse(wrap(NeuralOE, network.model, task.data), task.validation),
@@ -287,23 +283,25 @@ def _comparison(task: Task, linear: _core.LinearModel, network: _core.NeuralFit)
     is_better = network.sound and rmse["neural_oe"] < WORTH_IT * rmse["oe"]
     ratio = rmse["neural_oe"] / rmse["oe"] if rmse["oe"] > 0.0 else 1.0
     reason = (
-        f"free-run error of the network on data not trained on: {100 * ratio:.1f} % of the linear "
-        f"model's; the network is chosen below {100 * WORTH_IT:.0f} %"
+        f"{asked}; its free-run error on data not trained on is {100 * ratio:.1f} % of the linear "
+        "model's"
     )
     if not network.sound:
         reason += "; it runs away on larger inputs or does not forget its initial state"
     return {
-        "chosen": "neural_oe" if is_better else "oe",
+        "chosen": "neural_oe",
         "reason": reason,
+        "is_better": is_better,
         "free_run_rmse": {k: finite(v) for k, v in rmse.items()},
         "held_out": sources(task.validation),
     }
 
 
 def _choice_provenance(choice: Provenance) -> Provenance:
-    if choice["chosen"] != "neural_oe":
-        return {"choice": choice, "notes": [f"{choice['reason']}; consider model oe"]}
-    return {"choice": choice}
+    if choice.pop("is_better"):
+        return {"choice": choice}
+    bound = f"not credibly better than the linear model (below {100 * WORTH_IT:.0f} % of its error)"
+    return {"choice": choice, "notes": [f"{bound}: consider model oe"]}
 
 
 def _network_model(

@@ -10,6 +10,7 @@ from ..dataset import Dataset
 from ..dynamic_model import INIT
 from ..models import Model
 from ..validation import GOOD, by_input, free_run_error, judged, noise_of, without_input
+from .folds import Split
 from .task import Provenance
 
 if TYPE_CHECKING:
@@ -34,26 +35,57 @@ def verdict(choice: Choice, model: Model, error: float) -> Provenance:
         `grade` ("good", "fair", "poor" or "useless"), `fit_percent` on data not trained on,
         `text`, and `next`: a list of things to do, the most important one first.
     """
-    data, spread = choice.task.data, choice.split.spread
+    found = _judged(model, choice.task.data, choice.split, error)
+    if found["grade"] == "good" and choice.search.repeats:
+        found["grade"] = "fair"
+        found["text"] = found["text"].replace(_TEXTS["good"], "good where it repeats itself")
+        found["next"] += _what_to_record(choice.task.data)
+    if choice.clock.truncated and found["grade"] != "good":
+        found["next"].insert(0, "give a longer time budget, or none")
+    found["next"] += [f"{f.text}: {f.remedy}" for f in choice.search.diagnosis.findings]
+    return found
+
+
+def verdict_by_name(model: Model, data: Dataset, validation: Dataset | None) -> Provenance:
+    """`verdict` on a kind that was asked for: nothing was held out to choose by.
+
+    Judged on the validation data, else on what it was trained on, and the text says which.
+    """
+    part = Split(data, validation or data, is_given=validation is not None)
+    error = free_run_error(model, part.held, part.held, INIT)
+    return _judged(model, data, part, error, "" if part.is_given else "its own training data")
+
+
+_TEXTS = {
+    "": "the output hardly moves where it was not trained on",
+    "good": "good enough to tune a controller on",
+    "fair": "good enough for a first, cautious controller",
+    "poor": "not good enough to tune a controller on",
+    "useless": "useless",
+}
+
+
+def _judged(model: Model, data: Dataset, part: Split, error: float, where: str = "") -> Provenance:
+    """The model's grade by its error on what is held, with the reason and what to do next."""
+    spread = part.spread
     fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else float("nan")
     noise = noise_of([e.y for e in data.experiments])
     # of one model on the same samples: what was held out is not what the error is always of
-    held = choice.split.held
-    own = free_run_error(model, held, held, INIT)
-    grade, resting = judged(fit, error, noise, by_input(own, without_input(model, held, INIT)))
+    own = free_run_error(model, part.held, part.held, INIT)
+    share = by_input(own, without_input(model, part.held, INIT))
+    grade, resting = judged(fit, error, noise, share)
     unit = f" {data.output_unit}" if data.output_unit else ""
-    measured = (
-        f"free run explains {fit:.1f} % of data not trained on (rmse {error:.3g}{unit}){resting}"
-    )
-    text = {
-        "": f"the output hardly moves where it was not trained on (rmse {error:.3g}{unit})",
-        "good": f"good enough to tune a controller on: {measured}",
-        "fair": f"good enough for a first, cautious controller: {measured}",
-        "poor": f"not good enough to tune a controller on: {measured}",
-        "useless": f"useless: {measured}{'' if resting else '; a constant would do about as well'}",
-    }[grade]
-    grade = grade or "useless"
-    todo = []
+    rmse = f"rmse {error:.3g}{unit}"
+    of = where or "data not trained on"
+    text, todo = _TEXTS[grade], []
+    if not np.isfinite(error):
+        text = "useless: its free run leaves the finite numbers"
+    elif grade:
+        text += f": free run explains {fit:.1f} % of {of} ({rmse}){resting}"
+        if grade == "useless" and not resting:
+            text += "; a constant would do about as well"
+    else:
+        text += f" ({rmse})"
     if grade == "good":
         if fit < GOOD:
             text += f"; what is left is measurement noise ({noise:.3g}{unit})"
@@ -63,16 +95,10 @@ def verdict(choice: Choice, model: Model, error: float) -> Provenance:
             if any(m.orders["nk"] == 0 for m in model.members or (model,))
             else "validate it on another recording, then tune"
         )
-    if grade == "good" and choice.search.repeats:
-        grade = "fair"
-        text = text.replace("good enough to tune a controller on", "good where it repeats itself")
-    if choice.clock.truncated and grade != "good":
-        todo.append("give a longer time budget, or none")
-    if grade in ("fair", "poor", "useless"):
-        todo += _what_to_record(choice.task.data)
-    todo += [f"{f.text}: {f.remedy}" for f in choice.search.diagnosis.findings]
+    else:
+        todo += _what_to_record(data)
     return {
-        "grade": grade,
+        "grade": grade or "useless",
         "fit_percent": fit if np.isfinite(fit) else None,
         "text": text,
         "next": todo,
