@@ -20,6 +20,7 @@ from ..control.defaults import (
     default_references,
     drive_step,
     filter_length,
+    rate_step,
     require_one_input,
 )
 from ..control.files import KINDS
@@ -37,7 +38,7 @@ from ..control.margins import sampled
 from ..errors import FitError, SettingError
 from ..gains import Gains, real, vector, whole
 from ..models import Model
-from ..rules import table_1
+from ..rules import Fopdt, Rule, table_1
 from ..threads import available
 from .objective import Constraints, Cost, LoadStep
 
@@ -404,7 +405,8 @@ def first_controller(
 ) -> Controller:
     """A conservative controller from a model's own step response by Table 1 (nearest row).
 
-    The moving average's delay counts as dead time. Parameters are those of `tune`.
+    Where the output integrates the command, as a position does, SIMC on the rate's step response
+    takes its place. The moving average's delay counts as dead time. Parameters are those of `tune`.
 
     Raises
     ------
@@ -417,11 +419,14 @@ def first_controller(
     plant = _require_model(plant)
     low, high, note = command_limits([plant], u_min, u_max)
     u_unit, y_unit = _units(plant, output_unit)
-    step = drive_step(plant, low, high)
+    moving = rate_step(plant, low, high)
+    step = drive_step(plant, low, high) if moving is None else moving
     if filter_samples is None:
         filter_samples = filter_length(plant.Ts, step.slowest)
     average = (max(1, whole("filter_samples", filter_samples)) - 1) / 2 * plant.Ts
-    rule = table_1(replace(step.fopdt, L=step.fopdt.L + average), outside="nearest")
+    late = replace(step.fopdt, L=step.fopdt.L + average)
+    rule = table_1(late, outside="nearest") if moving is None else _of_position(late, plant.Ts)
+    said = "Table 1" if moving is None else rule.name
     gains = Gains.standard(
         rule.gains.Kp, rule.gains.Ti, rule.gains.Td, u_unit=u_unit, y_unit=y_unit
     )
@@ -435,8 +440,21 @@ def first_controller(
         u_max=high,
         filter_samples=filter_samples,
         counts_per_rev=_encoder(plant, counts_per_rev, y_unit),
-        notes="; ".join(n for n in ("Table 1 on the model's step response", note) if n),
+        notes="; ".join(n for n in (f"{said} on the model's step response", note) if n),
     )
+
+
+def _of_position(rate: Fopdt, Ts: float) -> Rule:
+    """SIMC for `K e^(-sL) / (s (1 + sT))` (Skogestad 2003, Table 1), in standard form.
+
+    The derivative cancels T; the loop is to be no faster than what it cancels and the dead time,
+    which the hold of a sample adds to.
+    """
+    tau = 2.0 * max(rate.L + Ts, 0.5 * rate.T) + rate.L
+    Kc, Ti, Td = 1.0 / (rate.K * tau), 4.0 * tau, rate.T
+    gains = Gains.standard(Kc * (1.0 + Td / Ti), Ti + Td, Ti * Td / (Ti + Td))
+    # half of a step goes to the integral alone: two integrators overshoot
+    return Rule(gains, 0.5, 1.0, "SIMC for an integrator")
 
 
 def first_of(
