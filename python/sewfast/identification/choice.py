@@ -178,7 +178,11 @@ class Choice(Finals):
     # --- the model ------------------------------------------------------------------------------
 
     def _refitted(self, c: Candidate, most: int) -> list[Network]:
-        """A few iterations on everything, the held-out part included, where that stays sound."""
+        """A few iterations on everything, the held-out part included, where that stays sound.
+
+        None where there is no time for all of them: models that were cut short on the way from one
+        minimum to the other are often worse than before.
+        """
         search, models = self.search, c.models[:most]
         is_late = self.is_interrupted or self.clock.over(SHARE_OF_REFIT)
         if self.split.is_given or is_late:
@@ -188,6 +192,9 @@ class Choice(Finals):
             c.structure, self.task.data, None, 6 if search.samples > 60_000 else 15,
             linear if c.structure.kind == "neural_oe" else None, initial=models,
         )  # fmt: skip
+        search.share = SHARE_OF_REFIT
+        if search.able(request.operations) < 1.0:
+            return models
         (found,) = search.guarded(
             train(
                 [request], search.pool, self.task.seed, workers=self.task.workers,
@@ -200,7 +207,7 @@ class Choice(Finals):
     def _network(self, chosen: Sequence[Candidate], others: Sequence[Candidate]) -> Model:
         task, first = self.task, chosen[0]
         most = math.ceil(MOST_MEMBERS / len(chosen))
-        models = [m for c in chosen for m in self._refitted(c, most)]
+        models = [m for c in chosen for m in self._refitted(c, most)][:MOST_MEMBERS]
         error = self._error_of(chosen)
         s = first.structure
         provenance: Provenance = {

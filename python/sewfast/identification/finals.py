@@ -334,6 +334,9 @@ class Finals:
         """The best start alone, where long held-out data say that it is better so."""
         if len(c.models) < 2 or self.split.scored < ENOUGH_TO_CHOOSE_BY:
             return c
+        # starts that are still on their way are best at different places: their median is safer
+        if self.is_hurried and not self.search.is_large:
+            return c
         if c.structure.integrator and self.search.repeats and not self.search.is_large:
             return c
         one = self.rejudged(replace(c, starts=(c.members[0],)))
