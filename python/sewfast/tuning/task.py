@@ -35,7 +35,7 @@ from ..control.loop import (
     reference_samples,
 )
 from ..control.margins import sampled
-from ..errors import SettingError
+from ..errors import FitError, SettingError
 from ..gains import Gains, real, vector, whole
 from ..models import Model
 from ..rules import Fopdt, Rule, table_1
@@ -163,6 +163,32 @@ class TuningTask:
             [sampled(plant, self.start.Ts, self.constraints.speed) for plant in known],
             [response.lines(self.start) for response in seen],
         )
+
+
+def out_of_reach(task: TuningTask) -> str | None:
+    """References that no gains can follow on the variation with the least gain, in words; or None.
+
+    Tuning on them looks for the gains that lose least at the limit of the command.
+    """
+    (plant, *_), start = task.plants, task.start
+    gain = min(gain for gain, _ in task.variations)
+    if not isinstance(plant, Model) or gain >= 1.0:
+        return None
+    try:
+        fopdt = drive_step(plant, start.u_min, start.u_max).fopdt
+    except (FitError, SettingError):
+        return None  # what it reaches is not known
+    low, high = sorted(gain * (fopdt.K * u + fopdt.offset) for u in (start.u_min, start.u_max))
+    top, bottom = max(r.max() for r in task.references), min(r.min() for r in task.references)
+    if bottom >= min(low, 0.0) and top <= max(high, 0.0):
+        return None
+    unit = f" {start.y_unit}" if start.y_unit else ""
+    return (
+        f"the references ask for {bottom:.4g} to {top:.4g}{unit}, with {gain:g} of its gain the "
+        f"drive reaches {low:.4g} to {high:.4g} at the limits of its command: there no gains help, "
+        "and those found look for the least loss; lower the references, raise the limits, or give "
+        "variations without that gain"
+    )
 
 
 def _assumed(start: SampledController, given: list[Any], *, derived: bool) -> str:
