@@ -14,10 +14,10 @@ import sewfast
 
 ORDER = """
     errors kinds arrays storage tables plotting progress threads speed signals
-    writers recordfile dataset readers benchmarks machine live recording
+    writers recordfile dataset readers benchmarks machine live gains recording
     dynamic_model validation comparison evidence models
     motorfit identification sklearn
-    gains rules control tuning trust analysis frequency deployment fleets
+    rules control tuning trust analysis frequency deployment fleets
     link greybox report commissioning experiment studio cli __main__
 """
 
