@@ -114,7 +114,7 @@ FAMILY = (
     replace(BASE, name="enc8192", counts=8192.0),
     replace(BASE, name="weak", current=2.5, coulomb=0.2),
     replace(BASE, name="knocking", once=0.6),
-    replace(BASE, name="sag", sag=6.0),
+    replace(BASE, name="sag", sag=60.0),
     replace(BASE, name="old3", old=3),
     replace(BASE, name="slow10", inertia=0.02, current=5.0),
     replace(BASE, name="fast02", inertia=0.0004),

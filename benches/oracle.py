@@ -19,6 +19,7 @@ from sewfast import Commissioning, Controller
 from sewfast.commissioning import SteppedBench
 from sewfast.commissioning.demands import demands
 from sewfast.commissioning.excitations import standard
+from sewfast.commissioning.slow import Thinning
 from sewfast.control.loop import ClosedLoopRun
 from sewfast.control.margins import margins
 from sewfast.tuning.objective import Cost
@@ -58,8 +59,10 @@ def oracle(
     assert found.controller is not None
     assert found.tuning is not None
     assert found.cost is not None
-    own, box, cost = found.controller, found.tuning.variables, found.cost
-    verify = {c.reference: c.predicted.r for c in found.comparisons}
+    own, cost = found.controller, found.cost
+    box = [_including(v, own, found) for v in found.tuning.variables]
+    # not of the prediction, which takes every k-th sample of a slow drive
+    verify = {c.reference: c.measured.r for c in found.comparisons if c.measured is not None}
     asked = demands(
         bench, u_max=own.u_max, speed=float(verify["trapezoid"].max()), references=None, members=1,
         evaluations=evaluations, seed=seed, threads=1,
@@ -173,13 +176,25 @@ def _at(point: Sequence[float], box: Sequence[Variable], like: Controller) -> Co
     return replace(like.with_values(values, "oracle"), notes="oracle")
 
 
+def _including(v: Variable, own: Controller, found: Commissioning) -> Variable:
+    """Bounds at the machine's samples: those of a slow drive's search are at every k-th of them."""
+    k = Thinning.between(found.sample_time or own.Ts, own.Ts).k
+    low, high = (v.low, k * v.high) if v.name == "filter_samples" else (v.low, v.high)
+    value = _value(own, v)
+    return replace(v, low=min(low, value) if value > 0.0 else low, high=max(high, value))
+
+
+def _value(controller: Controller, v: Variable) -> float:
+    """Of a variable."""
+    of = controller.gains.to("standard") if v.name in ("Kp", "Ti", "Td") else controller
+    return float(getattr(of, v.name))
+
+
 def _place(controller: Controller, box: Sequence[Variable]) -> np.ndarray:
     """The point of the unit box where a controller lies."""
-    gains, places = controller.gains.to("standard"), []
+    places = []
     for v in box:
-        own = (
-            getattr(gains, v.name) if v.name in ("Kp", "Ti", "Td") else getattr(controller, v.name)
-        )
+        own = _value(controller, v)
         if v.name in LINEAR or v.low <= 0.0:
             places.append((own - v.low) / (v.high - v.low))
         else:

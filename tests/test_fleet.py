@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
+import sys
 import threading
 import time
 import warnings
@@ -17,8 +19,10 @@ import pytest
 
 from sewfast import Controller, Fleet, Gains, fleet
 from sewfast.cli import main
-from sewfast.errors import SettingError
+from sewfast.errors import SettingError, SewfastError
 from sewfast.fleets import Drift, Row, load_fleet
+from sewfast.fleets.recordings import jobs_of
+from sewfast.fleets.running import Journal
 
 SAMPLES = 1500
 MACHINES = 8
@@ -418,3 +422,125 @@ def test_the_command(
     assert main([*again, "--before", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["drifts"] == []
     assert main(["fleet", str(tmp_path / "nix"), "-o", str(out), "--workers", "0"]) == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such file names")
+@pytest.mark.parametrize("ending", ["csv", "json", "parquet"])
+def test_any_file_name_comes_back(tmp_path: Path, ending: str) -> None:
+    place = made(tmp_path / "odd", 1)
+    for name in (b"\xff.npz", b"new\nline.npz", b'a; "b", c.npz'):
+        shutil.copy(place / "m0.npz", os.fsencode(place) + b"/" + name)
+    found = fleet(place, workers=0, out=tmp_path / f"x.{ending}")
+    assert len(found.rows) == 4
+    assert not found.failed
+    assert bits(load_fleet(tmp_path / f"x.{ending}")) == bits(found)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("file\n" + "x" * 200_000, "line 1: expected a line of CSV"),
+        ("file;output\na.npz;y\n;\n", "line 3: expected the name of a file"),
+        ("file;Ts\na.npz;0,x\n", "line 2: expected Ts as a number"),
+        ("t;u;y\n", "expected a manifest with a column file"),
+    ],
+)
+def test_a_manifest_with_a_fault_names_the_line(tmp_path: Path, content: str, words: str) -> None:
+    (tmp_path / "list.csv").write_text(content)
+    with pytest.raises(SettingError, match=words):
+        fleet(tmp_path / "list.csv", workers=0)
+
+
+def test_a_manifest_of_a_spreadsheet_with_semicolons(tmp_path: Path) -> None:
+    place = made(tmp_path / "m", 1)
+    (place / "list.csv").write_text('file;inputs;output;Ts\nm0.npz;"u";y;0,001\nnot\0there;;;\n')
+    found = fleet(place / "list.csv", workers=0)
+    assert [row.status for row in found.rows] == ["ok", "failed"]
+    assert found.rows[0].Ts == pytest.approx(0.001)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'{"of": [1], "row": {"file": "x", "new": 3}}', b'{"of": 3}', b"{}", b"[1]", b"\xff\xfe",
+        b'{"of": [1], "row": {"file": [3]}}', b'{"of": null, "row": null}', b'{"a":' * 100_000,
+    ],
+)  # fmt: skip
+def test_a_damaged_line_of_the_journal_is_left_out(
+    folder: Path, tmp_path: Path, line: bytes
+) -> None:
+    settings = {"model": "oe", "seed": 0, "controller": None}
+    with Journal(tmp_path / "x.csv", settings) as journal:
+        (job,) = jobs_of([folder / "m0.npz"], None, None, None)
+        journal.add(job, Row(job.file, message="kept"))
+    assert journal.place is not None
+    with journal.place.open("ab") as file:
+        file.write(line + b"\n")
+    (row,) = fleet([folder / "m0.npz"], workers=0, out=tmp_path / "x.csv").rows
+    assert row.message == "kept"
+
+
+def test_a_journal_that_cannot_be_read_is_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / ".x.csv.journal").mkdir()
+    with pytest.raises(SettingError, match=r"x\.csv\.journal: expected a file that can be read"):
+        fleet([folder / "m0.npz"], workers=0, out=tmp_path / "x.csv")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no limit of a file's size")
+def test_a_full_disk_keeps_what_is_done(folder: Path, tmp_path: Path) -> None:
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1500, hard))
+    try:
+        with pytest.raises(SewfastError) as caught:
+            fleet(folder, workers=0, out=tmp_path / "x.csv")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert "make room" in caught.value.remedy
+    assert not (tmp_path / "x.csv").exists()
+    lines = (tmp_path / ".x.csv.journal").read_bytes().splitlines()
+    assert len(lines) > 2
+    seen: list[int] = []
+    found = fleet(folder, workers=0, out=tmp_path / "x.csv", progress=lambda n, *_: seen.append(n))
+    assert len(found.rows) == MACHINES
+    assert not found.failed
+    assert 0 < len(seen) < MACHINES
+
+
+def test_a_fault_in_a_reader_costs_its_own_row(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(path: str) -> Any:
+        raise RuntimeError("out of luck")
+
+    monkeypatch.setattr("sewfast.fleets.recordings.read_table", broken)
+    (row,) = fleet([folder / "m0.npz"], workers=0).rows
+    assert (row.status, row.message) == ("failed", "RuntimeError: out of luck")
+
+
+def test_columns_that_stand_still_are_named(tmp_path: Path) -> None:
+    t = np.arange(100) * 0.01
+    np.savez(tmp_path / "a.npz", t=t, u=np.full(100, np.nan), y=np.ones(100))
+    (row,) = fleet(tmp_path, workers=0).rows
+    assert "no two different numbers in u, y" in row.message
+
+
+@pytest.mark.parametrize(
+    ("wrong", "name"),
+    [
+        ({"client": "tcp://host:1"}, "client"), ({"scheduler": 3}, "scheduler"),
+        ({"model": "nix"}, "model"), ({"model": ["oe"]}, "model"),
+    ],
+)  # fmt: skip
+def test_other_arguments_are_refused_before_any_work(
+    folder: Path, wrong: dict[str, Any], name: str
+) -> None:
+    with pytest.raises(SettingError) as caught:
+        fleet(folder, **wrong)
+    assert caught.value.name == name
+    with pytest.raises(SettingError) as caught:
+        fleet([3], workers=0)  # type: ignore[list-item]
+    assert caught.value.name == "recordings"

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from .arrays import FloatArray
 from .dataset import Dataset
 from .errors import DataError
+from .gains import vector
 from .recordfile import Header, save_columns
 from .recordfile.writer import require_replaceable
 from .speed import Method, speed_from_counts
@@ -87,10 +88,10 @@ class Recording:
         Raises
         ------
         DataError
-            For commands and counts of different lengths, numbers that are not finite, or too few.
+            For commands and counts of different lengths, what is no finite number, or too few.
         """
-        command, seen = (np.array(x, dtype=np.float64) for x in (u, counts))
-        if command.shape != seen.shape or command.ndim != 1:
+        command, seen = vector("u", u).copy(), vector("counts", counts).copy()
+        if command.shape != seen.shape:
             raise DataError(
                 name="counts", expected=f"one for each command, shape {command.shape}",
                 received=f"shape {seen.shape}", remedy="log both at every sample",

@@ -95,6 +95,18 @@ def table(tmp_path: Path, *names: str) -> api.readers.Table:
         (("u", "speed [RPM]", "angle [rad]"), None),
         (("v1 [V]", "v2 [V]", "speed [RPM]"), None),
         (("u", "foo", "bar"), None),
+        (("motor voltage", "motor speed", "torque [Nm]"), ("motor voltage", "motor speed")),
+        (("MotorVoltage", "ActualSpeed", "StatusWord"), ("MotorVoltage", "ActualSpeed")),
+        (("bus_voltage [V]", "voltage [V]", "speed [rpm]"), ("voltage", "speed")),
+        (("pwm [%]", "current [A]", "n [U/min]"), ("pwm", "n")),
+        (("motor [Volt]", "tacho [Volt]"), ("motor", "tacho")),
+        (("voltage [V]", "speed [rpm]", "temperature [°C]"), ("voltage", "speed")),
+        (("voltage", "temperature"), ("voltage", "temperature")),
+        (("speed_ref", "voltage", "speed"), ("voltage", "speed")),
+        (("n_soll [rpm]", "Spannung", "n_ist [rpm]"), ("Spannung", "n_ist")),
+        (("voltage_ref", "rpm"), ("voltage_ref", "rpm")),
+        (("u1", "y1", "noise"), ("u1", "y1")),
+        (("speed 1", "speed 2", "u"), None),
     ],
 )
 def test_columns_are_recognised_or_left_open(
@@ -102,6 +114,28 @@ def test_columns_are_recognised_or_left_open(
 ) -> None:
     found = roles(table(tmp_path, *names))
     assert (None if found is None else (found.input, found.output)) == expected
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["epoch_ms;u;y", "Elapsed Time (ms);u;y", "relative_time_ms;u;y", "time_ms;u;y;time_ms"],
+)
+def test_other_names_of_the_time(tmp_path: Path, header: str) -> None:
+    rows = [f"{1_772_000_000_000 + 10 * k};{k % 7};{k % 5}" for k in range(60)]
+    again = [f"{row};{row.split(';')[0]}" if header.endswith("time_ms") else row for row in rows]
+    (tmp_path / "x.csv").write_text("\n".join([header, *again]))
+    assert api.read(tmp_path / "x.csv", inputs="u", output="y").Ts == pytest.approx(0.01)
+
+
+def test_dates_are_the_time_where_nothing_else_is(tmp_path: Path) -> None:
+    rows = [f"2026-03-14 10:00:{k / 100:05.2f},{k % 7},{k % 5}" for k in range(60)]
+    (tmp_path / "x.csv").write_text("\n".join(["Date,u,y", *rows]))
+    assert api.read(tmp_path / "x.csv", inputs="u", output="y").Ts == pytest.approx(0.01)
+
+
+def test_a_header_that_occurs_twice_with_other_values_is_named(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("t,u,y,y\n" + "".join(f"{k},{k % 3},1,{k}\n" for k in range(9)))
+    assert "occurs more than once, with other values" in refused(tmp_path, "identify", "x.csv")
 
 
 def test_a_column_that_never_changes_is_neither(tmp_path: Path) -> None:
@@ -297,6 +331,7 @@ def test_a_byte_order_mark_is_no_setting(tmp_path: Path) -> None:
         ("[limits]\nvolt = 3", "speed, acceleration, current missing"),
         ('[limits]\nu_max = "9"', "[limits] u_max: expected a number, received '9'"),
         ("[limits]\nu_max = nan", "expected a number"),
+        ("[limits]\nu_max = " + "9" * 400, "expected a number below 1e308, received 400 digits"),
         ("[limits]\nu_max = true", "expected a number"),
         ("[limits]\nu_min = 3\nu_max = -3", "expected u_min below u_max, received u_min = 3"),
         ("[limits]\nu_min = 3\nu_max = 3", "expected u_min below u_max"),

@@ -210,8 +210,8 @@ def test_a_reference_does_not_replace_a_recording_of_its_name(tmp_path: Path) ->
 class Trips(MachineBench):
     """The virtual machine, whose link fails once, as it is asked for a signal of this name."""
 
-    def __init__(self, at: str | None) -> None:
-        super().__init__(VirtualMachine())
+    def __init__(self, at: str | None, machine: int | None = None) -> None:
+        super().__init__(VirtualMachine(machine))
         object.__setattr__(self, "at", at)
         object.__setattr__(self, "played", [])
 
@@ -282,3 +282,14 @@ def test_what_was_recorded_under_other_settings_is_not_taken(tmp_path: Path) -> 
     with pytest.raises(SettingError) as caught:
         commission(VirtualMachine(), resume=True)
     assert (caught.value.name, caught.value.received) == ("folder", "none")
+
+
+def test_what_was_recorded_on_another_machine_is_not_taken(tmp_path: Path) -> None:
+    other = Trips("small_signals", machine=3)
+    with short():
+        with pytest.raises(LinkError):
+            commission(Trips("small_signals"), **SMALL, folder=tmp_path)
+        with pytest.raises(LinkError):
+            commission(other, **SMALL, folder=tmp_path, resume=True)
+    # the first pulse is the same command, and not the same motor
+    assert other.played[0] == "motion_1"  # type: ignore[attr-defined]

@@ -196,6 +196,13 @@ def test_a_machine_that_changed_is_not_verified() -> None:
         ({"u_max": 40.0}, "u_max", "within the machine's limit of 20 V"),
         ({"speed": -1.0}, "speed", "above 0 RPM"),
         ({"members": 0}, "members", "1 or more"),
+        ({"members": 10**9}, "members", "up to 100"),
+        ({"cost": "x"}, "cost", "a Cost, or None"),
+        ({"progress": "x"}, "progress", "a function, or None"),
+        ({"between": 5}, "between", "a function, or None"),
+        ({"cancel": "x"}, "cancel", "a threading.Event, or None"),
+        ({"references": 5}, "references", "a mapping from names to samples, or a sequence of "
+         "names"),
         ({"evaluations": 0}, "evaluations", "1 or more"),
         ({"load": -1.0}, "load", "from 0 V to below u_max = 20 V"),
         ({"load": 20.0}, "load", "from 0 V to below u_max = 20 V"),
@@ -234,7 +241,12 @@ def test_what_a_part_of_it_refuses_is_refused_before_anything_moves(
 
 @pytest.mark.parametrize(
     ("samples", "received"),
-    [([], "none"), ([1.0, float("nan")], "NaN or infinity"), ([0.0, 0.0], "zeros only")],
+    [
+        ([], "0"),
+        ([500.0], "1"),
+        ([1.0, float("nan")], "NaN or infinity"),
+        ([0.0] * 40, "zeros only"),
+    ],
 )
 def test_a_reference_that_cannot_be_run_is_refused(samples: list[float], received: str) -> None:
     bench = bent()
@@ -242,6 +254,66 @@ def test_a_reference_that_cannot_be_run_is_refused(samples: list[float], receive
         commission(bench, references={"mine": samples})
     assert (caught.value.name, caught.value.received) == ("mine", received)
     assert bench.played == 0
+
+
+class Odd(MachineBench):
+    """A machine of the user's own that states nonsense, or hands it back."""
+
+    def __init__(self, shown: Any = None, /, **stated: Any) -> None:
+        super().__init__(VirtualMachine())
+        self.__dict__.update(shown=shown, stated=stated, played=0)
+
+    def __getattribute__(self, name: str) -> Any:
+        stated = object.__getattribute__(self, "__dict__").get("stated", {})
+        return stated[name] if name in stated else object.__getattribute__(self, name)
+
+    def excite(self, u: np.ndarray, name: str) -> Any:
+        self.__dict__["played"] += 1
+        return self.shown(super().excite(u, name))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("Ts", value) for value in (np.nan, 0.0, -1e-3, "1 ms", np.inf, 1e-12, 10.0, None)),
+        *(("counts_per_rev", value) for value in (0.0, np.nan, -5.0, None, np.inf)),
+        *(("volt", value) for value in (0.0, np.nan, None, "20")),
+        *(("speed", value) for value in (np.nan, None, -1.0)),
+    ],
+)
+def test_a_machine_whose_numbers_are_none_is_refused_before_it_moves(name: str, value: Any) -> None:
+    odd = Odd(**{name: value})
+    with pytest.raises(SettingError) as caught:
+        commission(odd, **SMALL)
+    assert caught.value.name == name
+    assert odd.played == 0
+
+
+def _first_is_missing(recording: Recording) -> Recording:
+    counts = recording.counts.copy()
+    counts[0] = np.nan
+    return replace(recording, counts=counts)
+
+
+@pytest.mark.parametrize(
+    ("shown", "error", "expected"),
+    [
+        (lambda recording: None, SettingError, "a Recording"),
+        (lambda recording: recording.counts, SettingError, "a Recording"),
+        (lambda recording: replace(recording, counts=recording.counts[:5]), DataError, "shape"),
+        (lambda recording: replace(recording, u=recording.u[:, None]), DataError, "shape"),
+        (_first_is_missing, DataError, "finite"),
+        (lambda recording: replace(recording, Ts=0.01), DataError, "the machine's Ts"),
+    ],
+)
+def test_a_machine_that_hands_back_nonsense_is_refused_at_its_first_run(
+    shown: Callable[[Recording], Any], error: type[Exception], expected: str
+) -> None:
+    odd = Odd(shown)
+    with pytest.raises(error) as caught:
+        commission(odd, **SMALL)
+    assert expected in caught.value.expected  # type: ignore[attr-defined]
+    assert odd.played == 1
 
 
 def test_only_machines_are_commissioned() -> None:

@@ -237,6 +237,9 @@ def test_a_rigs_log_is_the_run_of_a_machine_that_is_stepped() -> None:
         RecordedRun.of_recording(logged.recording, CONTROLLER, r[:100], plant="own")
     with refuses(DataError, name="counts", received=r"\(3,\)"):
         Recording.of_counts([1.0, 2.0], [0, 1, 2], Ts=1e-3, counts_per_rev=4096.0)
+    for nonsense in (["a", "b"], object(), [[1.0], [1.0, 2.0]], [1j, 2j], [[1.0, 2.0]]):
+        with refuses(DataError, name="u"):
+            Recording.of_counts(nonsense, [0, 1], Ts=1e-3, counts_per_rev=4096.0)
 
 
 # --- what no machine is ---------------------------------------------------------------------------

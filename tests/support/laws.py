@@ -2,13 +2,16 @@
 
 python tests/support/laws.py [--seeds 20] [--cases 10000] [--package NAME ...] [--only WORD]
 
-A law that holds for one seed may fail for the next. Cases that fail are kept by proptest in the
-crate's proptest-regressions, and are tried first from then on: commit them with what mends them.
+Each law runs in a process of its own, `--jobs` of them at a time, and all laws under one seed
+before the next seed: an interrupted run has whole seeds. A law that holds for one seed may fail for
+the next. Cases that fail are kept by proptest in the crate's proptest-regressions, and are tried
+first from then on: commit them with what mends them.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import re
@@ -16,6 +19,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -65,6 +70,29 @@ def laws(program: Path, package: str, only: str) -> list[str]:
     return found
 
 
+@dataclass(frozen=True)
+class Law:
+    """What came of one under one seed: what its process said where it failed, else nothing."""
+
+    said: str
+    seconds: float
+
+
+def try_law(program: Path, package: str, seed: int, cases: int, name: str) -> Law:
+    """Run one under one seed."""
+    began = time.monotonic()
+    done = subprocess.run(
+        [program, "--exact", name],
+        cwd=ROOT / "rust" / CRATES[package],
+        env={**os.environ, "PROPTEST_RNG_SEED": str(seed), "PROPTEST_CASES": str(cases)},
+        capture_output=True,
+        text=True,
+    )
+    ran = done.returncode == 0 and "1 passed" in done.stdout
+    said = "" if ran else f"{name} ended with {done.returncode}\n{done.stdout}{done.stderr}"
+    return Law(said, time.monotonic() - began)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=20)
@@ -72,6 +100,7 @@ def main() -> int:
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--package", action="append", choices=CRATES)
     parser.add_argument("--only", default="", help="properties with this in their name")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes at a time")
     asked = parser.parse_args()
     failed: list[str] = []
     rows: list[str] = []
@@ -79,30 +108,24 @@ def main() -> int:
         program = binary(package)
         names = laws(program, package, asked.only)
         began, broken = time.monotonic(), 0
+        took = dict.fromkeys(names, 0.0)
         for seed in range(asked.first, asked.first + asked.seeds) if names else ():
-            done = subprocess.run(
-                [program, "--exact", *names],
-                cwd=ROOT / "rust" / CRATES[package],
-                env={
-                    **os.environ,
-                    "PROPTEST_RNG_SEED": str(seed),
-                    "PROPTEST_CASES": str(asked.cases),
-                },
-                capture_output=True,
-                text=True,
-            )
-            found = re.findall(r"^test (.+) \.\.\. FAILED$", done.stdout, re.MULTILINE)
-            if done.returncode and not found:
-                found = [f"{package}, which ended with {done.returncode}"]
-            broken += len(found)
-            failed += [f"{name} (seed {seed})" for name in found]
-            print(f"{package} seed {seed}: {len(names)} laws, {len(found)} failed", flush=True)
-            if found:
-                print(done.stdout[-4000:], flush=True)
+            with ThreadPoolExecutor(asked.jobs) as pool:
+                tried = functools.partial(try_law, program, package, seed, asked.cases)
+                found = dict(zip(names, pool.map(tried, names), strict=True))
+            bad = [name for name, law in found.items() if law.said]
+            took = {name: took[name] + law.seconds for name, law in found.items()}
+            broken += len(bad)
+            failed += [f"{name} (seed {seed})" for name in bad]
+            print(f"{package} seed {seed}: {len(names)} laws, {len(bad)} failed", flush=True)
+            for name in bad:
+                print(found[name].said[-4000:], flush=True)
         seconds = time.monotonic() - began
+        slowest = sorted(took, key=lambda name: -took[name])[:3]
         rows.append(
             f"{package:<16} {len(names):>4} laws x {asked.seeds} seeds x {asked.cases} cases: "
-            f"{broken} failed, {seconds:.0f} s"
+            f"{broken} failed, {seconds:.0f} s; slowest "
+            + ", ".join(f"{name.rpartition('::')[2]} {took[name]:.0f} s" for name in slowest)
         )
     print("\n".join(["", *rows, *failed]))
     return 1 if failed else 0

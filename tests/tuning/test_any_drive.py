@@ -98,6 +98,65 @@ def test_tune_with_no_option_ends_with_a_loop_that_tracks(
         assert metrics["saturated"] < 0.25
 
 
+def servo(
+    Ts: float, T: float, gain: float, u: tuple[float, float], delay: int = 1, drift: float = 0.0
+) -> LinearOE:
+    """A position: a rate of `gain` [y/s/u] behind a lag, recorded for a second each way."""
+    a = math.exp(-Ts / T)
+    k = gain * Ts
+    num = np.r_[np.zeros(delay), k * (1.0 - T / Ts * (1.0 - a)), k * (T / Ts * (1.0 - a) - a)]
+    den = np.poly([1.0 - drift, a])
+    model = LinearOE.from_tf(num, den, Ts, input_units=["V"], output_unit="mm")
+    went = sorted(gain * end for end in u)
+    return replace(model, training={"input_range": [list(u)], "output_range": went})
+
+
+SERVOS = [
+    # sample time [s], time constant [s], gain [y/s/u], command [u], delay in samples, drift
+    (0.0002, 0.004, 3000.0, (-10.0, 10.0), 1, 0.0),
+    (0.001, 0.03, -20.0, (-24.0, 24.0), 3, 0.0),
+    (0.001, 0.3, 1.0e4, (-12.0, 9.0), 1, 1e-6),
+    (0.005, 0.06, 40.0, (-3.0, 3.0), 1, 2e-5),
+    (0.01, 0.02, 0.5, (-5.0, 5.0), 5, 0.0),
+    (0.02, 0.4, 100.0, (-1.0, 2.0), 2, 0.0),
+]
+
+
+@pytest.mark.parametrize(("Ts", "T", "gain", "u", "delay", "drift"), SERVOS)
+def test_a_position_is_tuned_with_no_option(
+    Ts: float, T: float, gain: float, u: tuple[float, float], delay: int, drift: float
+) -> None:
+    model = servo(Ts, T, gain, u, delay, drift)
+    low, high = model.training["output_range"]
+    first = first_controller(model)
+    assert "SIMC for an integrator" in first.notes
+    controller = sewfast.tune(model, evaluations=200, threads=2).controller
+    for reference in default_references(model, controller, ("trapezoid", "random")):
+        run = sewfast.run(controller, model, reference)
+        assert low - 1e-9 <= run.r.min() < run.r.max() <= high + 1e-9
+        assert run.metrics()["rmse"] < 0.04 * np.ptp(run.r)
+    # a machine that is not quite the model; the first controller is no worse than slow
+    other = servo(Ts, 1.3 * T, 0.8 * gain, u, delay + 1)
+    for one in (first, controller):
+        run = sewfast.run(one, other, sewfast.run(one, model).r)
+        assert run.metrics()["rmse"] < 0.25 * np.ptp(run.r)
+        assert abs(run.y[-1] - run.r[-1]) < 0.05 * np.ptp(run.r)
+
+
+def test_a_spare_pole_at_1_is_no_position() -> None:
+    slow, spare = math.exp(-0.05), 1.0 - 5e-5
+    num = 0.1 * np.convolve([0.0, 1.0 - slow], [1.0, -spare * (1.0 - 1e-7)])
+    model = LinearOE.from_tf(num, np.poly([slow, spare]), 0.01, input_units=["V"], output_unit="mm")
+    model = replace(model, training={"input_range": [[-5.0, 5.0]], "output_range": [-0.5, 0.5]})
+    assert "Table 1" in first_controller(model).notes
+    assert drive_references(model, -5.0, 5.0)["trapezoid"].max() < 0.5
+
+
+def test_a_position_that_cannot_return_needs_references() -> None:
+    with pytest.raises(SettingError, match="limits that move a position both ways"):
+        sewfast.tune(servo(0.01, 0.1, 5.0, (0.0, 10.0)), evaluations=4)
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     Ts=st.floats(1e-4, 0.1),

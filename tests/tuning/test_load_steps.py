@@ -40,6 +40,14 @@ def test_a_load_step_is_a_ramp_a_hold_and_a_command_behind_the_limits() -> None:
     assert LoadStep(800.0, 1.0, ramp=0.0).samples(0.001)[0][0] == 800.0
 
 
+@pytest.mark.parametrize("name", ["ramp", "settle", "look", "mean"])
+def test_a_load_step_that_no_memory_holds_is_refused(name: str) -> None:
+    long: dict[str, Any] = {name: 1e300}
+    with pytest.raises(SettingError) as caught:
+        LoadStep(1500.0, -2.0, **long).samples(0.001)
+    assert caught.value.expected == "up to 10000 s with its mean"
+
+
 def test_recoveries_are_those_of_the_run() -> None:
     r, d, band, _ = STEP.samples(QUIET.Ts)
     off = run(QUIET, drive(), r, disturbance=d).y[800:] - 1500.0

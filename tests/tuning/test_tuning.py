@@ -1,6 +1,7 @@
 """Tuning by simulation: what it finds, that it repeats, what it refuses."""
 
 import math
+import re
 import signal
 import threading
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from loops import QUIET
 from sewfast import _core, pareto, signals
 from sewfast.control import Controller, Gains
 from sewfast.control.loop import run
@@ -351,3 +353,21 @@ def test_a_unit_that_nobody_stated_stays_open_until_it_is_needed() -> None:
     assert (stated.gains.y_unit, stated.counts_per_rev) == ("rad/s", 1572.0)
     with pytest.raises(SettingError, match=r"model's unit 'RPM', got output_unit = 'rad/s'"):
         tune(drive(), output_unit="rad/s")
+
+
+@pytest.mark.parametrize(
+    ("top", "least", "is_said"), [(7_000, 0.8, False), (9_000, 0.8, True), (9_000, 1.0, False)]
+)
+def test_references_beyond_what_the_least_gain_reaches_are_said(
+    top: float, least: float, is_said: bool
+) -> None:
+    """The drive reaches 9,800 RPM at its limit of 20 V, with .8 of its gain 7,840."""
+    r = top * np.minimum(1.0, np.arange(400) / 300.0)
+    options: dict[str, Any] = {"start": QUIET, "evaluations": 10, "threads": 1}
+    found = tune(drive(), [r], variations=[(least, 0), (1.25, 2)], **options)
+    assert (found.warning is not None) is is_said
+    if found.warning is not None:
+        assert "the references ask for 0 to 9000 RPM" in found.warning
+        low, high = re.search(r"reaches (\S+) to (\S+) at", found.warning).groups()  # type: ignore[union-attr]
+        assert [float(low), float(high)] == pytest.approx([-7840.0, 7840.0], rel=0.02)
+        assert found.warning in str(found)

@@ -84,10 +84,11 @@ def _of_recording(
 
 
 def _unnamed(table: Table, what: str, remedy: str) -> SettingError:
-    spoiled = "".join(f"; {why}" for why in list(table.unusable.values())[:3])
+    from ..readers import left_out
+
     return SettingError(
         name=str(table.path), expected=f"the column of the {what} by its name", received="none",
-        remedy=f"available: {', '.join(table.names)}; name it: {remedy}{spoiled}",
+        remedy=f"available: {', '.join(table.names)}; name it: {remedy}{left_out(table)}",
     )  # fmt: skip
 
 

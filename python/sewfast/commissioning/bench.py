@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,10 +29,10 @@ from ..control.machine import (
     machine_of,
 )  # fmt: skip
 from ..dataset import FloatArray
-from ..errors import FitError, LinkError
+from ..errors import DataError, FitError, LinkError, SettingError
 from ..link import Drive
 from ..link.record import conditions_of, device_of
-from ..recording import Recording
+from ..recording import Recording, require_finite
 
 __all__ = ["Bench", "Followed", "MachineBench", "Stepped", "SteppedBench"]
 
@@ -154,7 +155,10 @@ class NotedBench(Around):
 
     def excite(self, u: FloatArray, name: str) -> Recording:
         key = key_of(u)
-        recording = self.kept(name, key) or self.inner.excite(u, name)
+        recording = self.kept(name, key)
+        if recording is None:
+            recording = self.inner.excite(u, name)
+            require_record(self.inner, name, len(u), recording)
         self.note(name, key, recording, None)
         return recording
 
@@ -170,8 +174,61 @@ class NotedBench(Around):
                 # of another name: whoever goes on is to run it again, and whole
                 self.note(f"{name}{ABORTED}", key, stop.recording, None)
                 raise
+            _require_run(self.inner, name, len(r), found)
         self.note(name, key, found.recording, found)
         return found
+
+
+def require_record(machine: Machine, name: str, samples: int, found: object) -> None:
+    """Refuse what a machine of the user's own hands back, where nothing can be learned from it.
+
+    Raises
+    ------
+    SettingError
+        For what is no recording.
+    DataError
+        For one of other samples than were asked for, or with numbers that are not finite.
+    """
+    if not isinstance(found, Recording):
+        raise SettingError(
+            name=f"{machine.name}, {name}", expected="a Recording", received=type(found).__name__,
+            remedy="make it by Recording.of_counts",
+        )  # fmt: skip
+    columns = {"u": found.u, "counts": found.counts, "y": found.y}
+    for column, values in columns.items():
+        if np.shape(values) != (samples,):
+            raise DataError(
+                name=f"{machine.name}, {name}", expected=f"{column} of shape ({samples},), one for "
+                "each command", received=f"shape {np.shape(values)}",
+                remedy="log every sample of the run",
+            )  # fmt: skip
+        require_finite(f"{machine.name}, {name}: {column}", values)
+    for member in ("Ts", "counts_per_rev"):
+        own, its = getattr(machine, member), getattr(found, member)
+        if not math.isclose(own, its, rel_tol=1e-6):
+            raise DataError(
+                name=f"{machine.name}, {name}", expected=f"the machine's {member} of {own:g}",
+                received=f"{its:g}", remedy="state the same in both",
+            )  # fmt: skip
+
+
+def _require_run(machine: Machine, name: str, samples: int, found: object) -> None:
+    """The same of a loop."""
+    if not isinstance(found, RecordedRun):
+        raise SettingError(
+            name=f"{machine.name}, {name}", expected="a RecordedRun", received=type(found).__name__,
+            remedy="make it by RecordedRun.of_recording",
+        )  # fmt: skip
+    require_record(machine, name, samples, found.recording)
+    for column in ("r", "u", "y"):
+        values = getattr(found, column)
+        if np.shape(values) != (samples,):
+            raise DataError(
+                name=f"{machine.name}, {name}", expected=f"{column} of shape ({samples},), one for "
+                "each sample of the reference", received=f"shape {np.shape(values)}",
+                remedy="log every sample of the run",
+            )  # fmt: skip
+        require_finite(f"{machine.name}, {name}: {column}", values)
 
 
 def key_of(signal: FloatArray, controller: SampledController | None = None) -> str:

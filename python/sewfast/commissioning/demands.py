@@ -52,10 +52,15 @@ def require(met: bool, message: str) -> None:
 LONGEST_NAME = 100
 """Of a reference's file [bytes]; file systems take 255, of which endings need some."""
 
+MOST_MEMBERS = 100
 MS = 2.0
 """Largest sensitivity unless said otherwise."""
 OVER = 1.25
 """Training reaches this many times the top of the working range: the loop overshoots it."""
+
+
+SAMPLE_TIMES = (1e-5, 0.1)
+"""Of machines that can be commissioned [s]: signals are planned in seconds."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +127,7 @@ def demands(
     ------
     SettingError
     """
+    _require_machine(bench)
     volt = bench.volt if u_max is None else real("u_max", u_max)
     if not 0.0 < volt < math.inf:
         raise SettingError(
@@ -155,7 +161,7 @@ def demands(
         top,
         _fixed(references),
         _fixed(practice),
-        _at_least(1, "members", members),
+        _members(members),
         _at_least(1, "evaluations", evaluations),
         whole("seed", seed),
         _at_least(1, "threads", threads),
@@ -163,6 +169,24 @@ def demands(
         None if Ms is None else Constraints(Ms=Ms).Ms,
         None if time_budget is None else budget(time_budget),
     )
+
+
+def _require_machine(bench: Machine) -> None:
+    """Refuse numbers of a machine that no command can be planned from, before it moves."""
+    for name, low, high in (("Ts", *SAMPLE_TIMES), ("counts_per_rev", 1.0, 1e9)):
+        value = real(name, getattr(bench, name))
+        if not low <= value <= high:
+            raise SettingError(
+                name=name, expected=f"{low:g} to {high:g} of the machine", received=f"{value:g}",
+                remedy="see what its controller and its encoder are set to",
+            )  # fmt: skip
+    for name in ("volt", "speed"):
+        value = real(name, getattr(bench, name))
+        if not value > 0.0:
+            raise SettingError(
+                name=name, expected="a limit of the machine above 0", received=f"{value:g}",
+                remedy="see its amplifier; a speed without a limit is inf",
+            )  # fmt: skip
 
 
 def _load(load: float | None, volt: float) -> float | None:
@@ -197,6 +221,16 @@ def _fixed(references: Mapping[str, FloatArray] | None) -> Mapping[str, FloatArr
             )  # fmt: skip
         files[file] = name
     return MappingProxyType(dict(references))
+
+
+def _members(value: int) -> int:
+    number = _at_least(1, "members", value)
+    if number > MOST_MEMBERS:
+        raise SettingError(
+            name="members", expected=f"up to {MOST_MEMBERS}", received=f"{number}",
+            remedy="4 are usual, and each is trained for seconds",
+        )  # fmt: skip
+    return number
 
 
 def _at_least(least: int, name: str, value: int) -> int:

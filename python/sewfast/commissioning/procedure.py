@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike
 from .. import signals
 from ..control.controller import Controller, SampledController
 from ..control.loop import ClosedLoopRun
-from ..control.machine import Machine, RecordedRun
+from ..control.machine import WATCHED, Machine, RecordedRun
 from ..dataset import FloatArray
 from ..errors import DataError, Interrupted, SettingError
 from ..gains import vector
@@ -56,6 +57,8 @@ __all__ = ["STAGES", "commission"]
 
 MEMBERS = 4
 EVALUATIONS = 3000
+SHORTEST = 2 * WATCHED
+"""Samples of a reference: of fewer no loop can be judged."""
 FALLS_SHORT = 0.7
 """Of the planned acceleration: below it a drive limits its current."""
 
@@ -146,8 +149,9 @@ def commission(
         See `Commissioning.save`.
     resume : bool
         Continue from the recordings that an earlier attempt left in `folder`: those of exactly the
-        same commands and references are not taken again. With the same settings the controller is,
-        bit by bit, that of an attempt without interruption on the same recordings.
+        same commands and references on a machine of this name are not taken again. With the same
+        settings the controller is, bit by bit, that of an attempt without interruption on the same
+        recordings.
     cancel : threading.Event, optional
         Set in another thread, it ends the commissioning as Ctrl-C does: a drive that runs is
         stopped at once, everything else at its next step.
@@ -175,6 +179,7 @@ def commission(
     Interrupted
         On Ctrl-C or `cancel`; the motor is stopped, `best` is the `Commissioning` so far.
     """
+    _require_kinds(cost, progress, cancel, between)
     with bench_of(on, u_max, cancel) as bench:
         asked = demands(
             bench,
@@ -234,6 +239,21 @@ def commission(
             raise Interrupted(journal.result("interrupted", reason)) from stop
 
 
+def _require_kinds(cost: Any, progress: Any, cancel: Any, between: Any) -> None:
+    """Refuse what cannot be used for these, before anything moves."""
+    for name, given, expected, is_one in (
+        ("cost", cost, "a Cost", isinstance(cost, Cost)),
+        ("progress", progress, "a function", callable(progress)),
+        ("cancel", cancel, "a threading.Event", hasattr(cancel, "is_set")),
+        ("between", between, "a function", callable(between)),
+    ):
+        if given is not None and not is_one:
+            raise SettingError(
+                name=name, expected=f"{expected}, or None", received=type(given).__name__,
+                remedy="leave it out",
+            )  # fmt: skip
+
+
 def _place(
     name: str | os.PathLike[str], bench: Machine, asked: Demands, *, overwrite: bool, resume: bool
 ) -> Taken:
@@ -246,7 +266,10 @@ def _place(
     folder = Path(name)
     require_own(folder, overwrite=overwrite or resume)
     device, conditions = told_of(bench)
-    own = {"u_max": asked.u_max, "speed": asked.speed, "seed": asked.seed}
+    own = {
+        "u_max": asked.u_max, "speed": asked.speed, "seed": asked.seed,
+        "machine": bench.name, "Ts": bench.Ts, "counts_per_rev": bench.counts_per_rev,
+    }  # fmt: skip
     taken = Taken(folder, device, {**own, **conditions}, resume)
     taken.begin()
     return taken
@@ -471,7 +494,8 @@ def _samples(
 ) -> Mapping[str, FloatArray] | None:
     if references is None:
         return None
-    if isinstance(references, str) or not references:
+    given = isinstance(references, (Mapping, Sequence)) and not isinstance(references, str)
+    if not given or not references:
         raise SettingError(
             name="references", expected="a mapping from names to samples, or a sequence of names",
             received=repr(references), remedy="leave it out for the standard ones",
@@ -489,10 +513,14 @@ def _samples(
 def _whole(name: str, reference: ArrayLike) -> FloatArray:
     """A reference with samples that are numbers."""
     samples = vector(name, reference).copy()
-    if not (len(samples) and np.all(np.isfinite(samples))):
+    if not np.all(np.isfinite(samples)):
         raise DataError(
-            name=name, expected="finite samples of a reference",
-            received="NaN or infinity" if len(samples) else "none",
+            name=name, expected="finite samples of a reference", received="NaN or infinity"
+        )
+    if len(samples) < SHORTEST:
+        raise DataError(
+            name=name, expected=f"{SHORTEST} samples of a reference or more",
+            received=f"{len(samples)}", remedy="hold its end for longer",
         )  # fmt: skip
     if not samples.any():
         raise DataError(

@@ -35,8 +35,12 @@ _MOST_FILTERED = 64
 _STEP_SHARES = (0.25, 0.5, 0.1)
 """Shares of the larger limit that the step response is looked for at."""
 _STEP_SAMPLES = (4_000, 16_000)
-_INTEGRATES = 1e-5
-"""Distance of a pole from 1 below which a step takes far longer than these."""
+_INTEGRATES = 1e-4
+"""Distance of a pole from 1 below which a step takes longer than these."""
+_TRAVEL = 10.0
+"""Longest way of a position in shares of what it goes in a time constant at the limit."""
+_RATE_USED = 0.4
+"""Rate of a position's ramps in shares of its rate at the limit: the rest starts and stops it."""
 _REACHED = 0.7
 """Top of the references in shares of the steady output at the limit: the rest accelerates."""
 _RECORDED = 0.9
@@ -185,17 +189,42 @@ def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
                 reason = error
                 continue
             return DriveStep(fopdt, float(y[at - 1]), _slowest(fopdt, y[at:], model.Ts))
-    if _integrates(model):
-        raise FitError(
-            name="model", expected="one whose step response settles",
-            received="one that integrates its input, as a position does",
-            remedy="give a controller to start from, or identify the rate: differentiate the "
-            "recorded output",
-        ) from reason  # fmt: skip
     raise FitError(
         name="model", expected="one whose step response settles",
         received=f"none up to u = {0.5 * size:g} ({reason})",
         remedy="give a controller to start from",
+    ) from reason  # fmt: skip
+
+
+def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
+    """The step response of the output's rate [y/s], for a model that integrates; None for others.
+
+    A position moves on for as long as the command acts; its speed settles.
+
+    Raises
+    ------
+    FitError
+        Where that of no step does.
+    """
+    size = u_max if u_max >= -u_min else u_min
+    if not _integrates(model) or not _moves_on(model, _STEP_SHARES[0] * size):
+        return None
+    reason: Exception | None = None
+    for share in _STEP_SHARES:
+        for samples in _STEP_SAMPLES:
+            u = np.zeros(samples)
+            at = samples // 20
+            u[at:] = share * size
+            y = model.core.simulate(u[:, None], model.core.rest_state())
+            try:
+                fopdt = fit_fopdt(u[1:], np.diff(y) / model.Ts, Ts=model.Ts)
+            except (DataError, FitError) as error:
+                reason = error
+                continue
+            return DriveStep(fopdt, float(y[0]), fopdt.T)
+    raise FitError(
+        name="model", expected="one that integrates its input and whose rate settles after a step",
+        received=f"{reason}", remedy="give a controller to start from",
     ) from reason  # fmt: skip
 
 
@@ -207,10 +236,26 @@ def _slowest(fopdt: Fopdt, y: FloatArray, Ts: float) -> float:
 
 
 def _integrates(model: Model) -> bool:
-    """Whether a pole lies at 1, or so near that no step within reach settles."""
+    """Whether a pole lies at 1, or so near that no step within reach settles.
+
+    A record of a position gives it to within its noise.
+    """
     small = linearise(representative(model).core, np.zeros(1))
     finite = bool(np.isfinite(small.A).all())
     return finite and bool(np.any(np.abs(np.linalg.eigvals(small.A) - 1.0) < _INTEGRATES))
+
+
+def _moves_on(model: Model, size: float) -> bool:
+    """Whether a step is still felt as much at its end as before.
+
+    A pole at 1 that a zero all but cancels is no integrator.
+    """
+    samples = _STEP_SAMPLES[-1]
+    u = np.zeros((samples, 1))
+    # not from the first sample on, which would be taken for the command before the step
+    u[samples // 20 :] = size
+    y = model.core.simulate(u, model.core.rest_state())
+    return bool(abs(y[-1] - y[samples // 2]) > 0.25 * abs(y[-1] - y[0]))
 
 
 @dataclass(frozen=True)
@@ -283,6 +328,9 @@ def drive_references(
 def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span:
     u_min, u_max = _finite_limits(model, u_min, u_max)
     low, high = _output_range(model) or (-math.inf, math.inf)
+    moving = rate_step(model, u_min, u_max)
+    if moving is not None and math.isfinite(high - low):
+        return _way(moving, u_min, u_max, low, high, model.Ts)
     try:
         step = drive_step(model, u_min, u_max)
     except FitError:
@@ -317,6 +365,30 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
     )
     both = other if other > 0.25 * x else 0.0
     return _Span(rest, rest + sign * slow, rest + sign * x, rest - sign * both, edge)
+
+
+def _way(step: DriveStep, u_min: float, u_max: float, low: float, high: float, Ts: float) -> _Span:
+    """Levels of a position: within the record, and no farther than a few time constants go."""
+    fopdt, rest = step.fopdt, step.rest
+    rates = [fopdt.K * u + fopdt.offset for u in (u_min, u_max)]
+    slower = min(max(rates), -min(rates))
+    if slower <= 0.05 * max(map(abs, rates)):
+        raise SettingError(
+            name="u_min, u_max", expected="limits that move a position both ways",
+            received=f"{u_min:g} to {u_max:g}, which move it at {min(rates):g} to {max(rates):g} "
+            "a second", remedy="give wider ones, or the references as samples",
+        )  # fmt: skip
+    inside = low <= rest <= high
+    up, down = (high - rest, rest - low) if inside else (high - low, 0.0)
+    sign, x = (1.0, up) if up >= down else (-1.0, down)
+    lag = step.slowest + fopdt.L + Ts
+    x = min(_RECORDED * x, _TRAVEL * lag * slower)
+    average = max(1, filter_length(Ts, step.slowest)) * Ts
+    edge = max(x / (_RATE_USED * slower), 10.0 * (fopdt.L + Ts) + 4.0 * average)
+    other = min(min(up, down), x)
+    return _Span(
+        rest, rest, rest + sign * x, rest - sign * (other if other > 0.25 * x else 0.0), edge
+    )
 
 
 def _finite_limits(model: Model, u_min: float, u_max: float) -> tuple[float, float]:

@@ -40,7 +40,11 @@ LIMITED, VISITS = 0.02, 3
 _MOST = 65_536
 """Values that a period is looked for in; longer records are averaged in blocks."""
 _REFERENCE = re.compile(
-    r"(y_?)?(r|ref|reference|set_?point|sp|target|soll|sollwert|demand)([_ .-].*)?", re.IGNORECASE
+    r"((y_?)?(r|ref|reference|set_?point|sp|target|soll|sollwert|demand)"
+    # a `voltage_ref` may be the plant's input, a `speed_ref` is not
+    r"|(motor[_ ]?)?(n|speed|rpm|velocity|vel|omega|drehzahl|position|pos|angle|theta|winkel)"
+    r"[_ .-]?(ref|reference|set_?point|sp|target|soll|sollwert|demand|cmd|command))([_ .-].*)?",
+    re.IGNORECASE,
 )
 
 
@@ -388,7 +392,7 @@ def _closed_loop(data: Dataset) -> Iterator[Finding]:
 
 
 def is_reference(name: str) -> bool:
-    """Whether a column is named as the reference of a loop: r, ref, setpoint, target_speed."""
+    """Whether a column is named as the reference of a loop: r, setpoint, speed_ref."""
     return _REFERENCE.fullmatch(name) is not None
 
 

@@ -16,11 +16,11 @@ import numpy as np
 
 from ..control.controller import Controller
 from ..dataset import Dataset
-from ..errors import DataError, SettingError, SewfastError
+from ..errors import DataError, SettingError, SewfastError, printable
 from ..evidence import Residuals, estimate
 from ..identification import identify
 from ..models import Model
-from ..readers import read, read_table, roles
+from ..readers import left_out, read, read_table, roles
 from ..validation import validate
 from .table import Row
 
@@ -50,7 +50,7 @@ class Job:
         """What changes where the file does."""
         try:
             stat = os.stat(self.path)
-        except OSError:
+        except (OSError, ValueError):  # a name with the character 0 is a ValueError
             return [None, None, *self.inputs, self.output, self.Ts]
         return [stat.st_size, stat.st_mtime_ns, *self.inputs, self.output, self.Ts]
 
@@ -77,19 +77,21 @@ def jobs_of(
                 and p.resolve() not in results
             )
             jobs = [
-                Job(p.relative_to(root).as_posix(), str(p), names, output, Ts)
+                Job(printable(p.relative_to(root).as_posix()), str(p), names, output, Ts)
                 for p in files
                 if p.is_file()
             ]
         else:
             jobs = list(_manifest(root, names, output, Ts))
-    elif isinstance(recordings, Sequence):
-        jobs = [Job(str(p), os.fspath(p), names, output, Ts) for p in recordings]
+    elif isinstance(recordings, Sequence) and all(
+        isinstance(p, str | os.PathLike) for p in recordings
+    ):
+        jobs = [Job(printable(str(p)), os.fspath(p), names, output, Ts) for p in recordings]
     else:
         raise SettingError(
-            f"recordings: expected a folder, a manifest or a list of files, got {recordings!r}; "
-            "name the folder"
-        )
+            name="recordings", expected="a folder, a manifest or a list of files",
+            received=printable(f"{recordings!r:.200}"), remedy="name the folder",
+        )  # fmt: skip
     if not jobs:
         raise SettingError(
             f"expected recordings ({', '.join(READABLE)}), got none in {recordings}; name a folder "
@@ -121,29 +123,47 @@ def _manifest(
         raise SettingError(
             f"{path}: expected a folder, or a manifest in CSV, got none that can be read ({error})"
         ) from error
-    rows = csv.DictReader(io.StringIO(text))
+    head = text.partition("\n")[0]
+    # a spreadsheet where the comma is the decimal mark writes semicolons
+    semicolons = ";" in head and "," not in head
+    rows = csv.DictReader(io.StringIO(text), delimiter=";" if semicolons else ",")
     known = ("file", "inputs", "output", "Ts")
-    if "file" not in (rows.fieldnames or ()) or not set(rows.fieldnames or ()) <= set(known):
-        raise SettingError(
-            f"{path}: expected a manifest with a column file and any of inputs, output, Ts, got "
-            f"{', '.join(rows.fieldnames or ()) or 'nothing'}"
-        )
-    for number, row in enumerate(rows, start=2):
-        try:
-            own = float(row["Ts"]) if row.get("Ts") else Ts
-        except ValueError:
+    try:
+        names = tuple(rows.fieldnames or ())
+        if "file" not in names or not set(names) <= set(known):
             raise SettingError(
-                f"{path}, line {number}: expected Ts as a number of seconds, got {row['Ts']!r}"
-            ) from None
-        file = row["file"]
-        if not file or None in row:
-            found = "more cells than columns" if file else "none"
-            raise SettingError(
-                f"{path}, line {number}: expected the name of a file, and a cell for each column, "
-                f"got {found}; correct the line"
+                f"{path}: expected a manifest with a column file and any of inputs, output, Ts, "
+                f"got {', '.join(names)[:200] or 'nothing'}"
             )
-        names = tuple(row["inputs"].split(";")) if row.get("inputs") else inputs
-        yield Job(file, str(path.parent / file), names, row.get("output") or output, own)
+        for row in rows:
+            yield _listed(path, rows.line_num, row, inputs, output, Ts)
+    except csv.Error as error:
+        raise SettingError(
+            f"{path}, line {rows.line_num}: expected a line of CSV, got one that cannot be read: "
+            f"{error}; correct the line"
+        ) from error
+
+
+def _listed(
+    path: Path, number: int, row: Mapping[Any, str], inputs: tuple[str, ...],
+    output: str | None, Ts: float | None,
+) -> Job:  # fmt: skip
+    """The recording of one line of a manifest."""
+    try:
+        own = float(row["Ts"].replace(",", ".")) if row.get("Ts") else Ts
+    except ValueError:
+        raise SettingError(
+            f"{path}, line {number}: expected Ts as a number of seconds, got {row['Ts']!r}"
+        ) from None
+    file = row["file"]
+    if not file or None in row:
+        found = "more cells than columns" if file else "none"
+        raise SettingError(
+            f"{path}, line {number}: expected the name of a file, and a cell for each column, "
+            f"got {found}; correct the line"
+        )
+    names = tuple(row["inputs"].split(";")) if row.get("inputs") else inputs
+    return Job(printable(file), str(path.parent / file), names, row.get("output") or output, own)
 
 
 # --- One recording --------------------------------------------------------------------------------
@@ -155,7 +175,7 @@ def row_of(job: Job, settings: Mapping[str, Any], controller: Controller | None)
         return _identified(job, settings, controller)
     except SewfastError as error:
         return Row(job.file, "failed", str(error))
-    except (OSError, MemoryError, ArithmeticError, np.linalg.LinAlgError) as error:
+    except Exception as error:  # one recording is not to end the work on thousands of others
         return Row(job.file, "failed", f"{type(error).__name__}: {error}")
 
 
@@ -201,10 +221,9 @@ def _read(job: Job) -> Dataset:
         return read(table, inputs=job.inputs, output=job.output, Ts=job.Ts)
     found = roles(table)
     if found is None:
-        spoiled = "".join(f"; {why}" for why in list(table.unusable.values())[:3])
         raise DataError(
             name=str(table.path), expected="columns that show which is the input and which the "
-            "output", received=", ".join(table.names), remedy=f"name both{spoiled}",
+            "output", received=", ".join(table.names), remedy=f"name both{left_out(table)}",
         )  # fmt: skip
     return read(table, inputs=found.input, output=found.output, Ts=job.Ts)
 

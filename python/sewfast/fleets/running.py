@@ -21,11 +21,11 @@ import numpy as np
 
 from .. import storage
 from ..control.controller import Controller
-from ..errors import SettingError
-from ..kinds import Kind
+from ..errors import ModelFileError, SettingError, unreadable, unwritable
+from ..kinds import KINDS, Kind
 from ..progress import shown_in_notebooks
 from .recordings import Job, jobs_of, row_of
-from .table import FORMAT, Fleet, Row, drifts, earlier_rows, require_ending
+from .table import COLUMNS, FORMAT, Fleet, Row, drifts, earlier_rows, require_ending
 
 _IN_FLIGHT = 4
 """Tasks handed out at once for each worker: no more lie in the scheduler's memory."""
@@ -103,7 +103,8 @@ def fleet(
     SettingError
         For no recordings, an unknown file extension, or if Dask is needed and not installed.
     """
-    _require_settings(workers, controller, seed)
+    _require_settings(workers, controller, seed, model)
+    _require_cluster(client, scheduler)
     tables = [Path(p) for p in (out, before) if isinstance(p, str | os.PathLike)]
     jobs = jobs_of(recordings, inputs, output, Ts, tables)
     settings: dict[str, Any] = {"model": model, "seed": seed, "controller": None}
@@ -123,13 +124,14 @@ def fleet(
     journal = Journal(None if place is None else place, settings)
     rows = {job.file: row for job in jobs if (row := journal.known(job)) is not None}
     waiting = [job for job in jobs if job.file not in rows]
+    failed = sum(row.status != "ok" for row in rows.values())
     with journal:
         for job, row in _worked(waiting, settings, controller, client, scheduler, workers, memory):
             rows[job.file] = row
             journal.add(job, row)
+            failed += row.status != "ok"
             if progress is not None:
-                failed = sum(r.status != "ok" for r in rows.values()) / len(rows)
-                progress(len(rows), len(jobs), failed)
+                progress(len(rows), len(jobs), failed / len(rows))
     ordered = tuple(rows[file] for file in sorted(rows))
     found = Fleet(ordered, tuple(drifts(earlier, ordered)))
     if place is not None:
@@ -138,7 +140,11 @@ def fleet(
     return found
 
 
-def _require_settings(workers: Any, controller: Any, seed: Any) -> None:
+def _require_settings(workers: Any, controller: Any, seed: Any, model: Any) -> None:
+    if not isinstance(model, str) or model.replace("-", "_") not in KINDS:
+        raise SettingError(
+            name="model", expected=", ".join(KINDS), received=repr(model), remedy="take 'oe'"
+        )
     if workers is not None and not (_is_whole(workers) and workers >= 0):
         raise SettingError(
             f"workers: expected a whole number of 0 or more, got {workers!r}; 0 works in this "
@@ -153,6 +159,19 @@ def _require_settings(workers: Any, controller: Any, seed: Any) -> None:
         raise SettingError(
             f"seed: expected a whole number from 0 to 2^64 - 1, got {seed!r}; take 0"
         )
+
+
+def _require_cluster(client: Any, scheduler: Any) -> None:
+    if client is not None and not (hasattr(client, "submit") and hasattr(client, "scheduler_info")):
+        raise SettingError(
+            name="client", expected="a dask.distributed.Client",
+            received=type(client).__name__, remedy="give an address as `scheduler`",
+        )  # fmt: skip
+    if scheduler is not None and not isinstance(scheduler, str):
+        raise SettingError(
+            name="scheduler", expected="an address as text", received=repr(scheduler),
+            remedy="for example 'tcp://host:8786'; a client goes to `client`",
+        )  # fmt: skip
 
 
 def _is_whole(value: Any) -> bool:
@@ -333,13 +352,17 @@ class Journal:
         place = self.place
         if place is None or not place.exists():
             return
-        lines = place.read_text(encoding="utf-8", errors="replace").splitlines()
+        try:
+            lines = place.read_text(encoding="utf-8", errors="replace").splitlines()
+        except OSError as error:
+            raise unreadable(SettingError, place, error) from error
         entries = [entry for line in lines if (entry := _parsed(line)) is not None]
         if not entries or entries[0] != self._head():
             return
         for entry in entries[1:]:
-            row = Row(**entry["row"])
-            self._rows[row.file] = (entry["of"], row)
+            row = _row(entry)
+            if row is not None:
+                self._rows[row.file] = (entry["of"], row)
 
     @property
     def place(self) -> Path | None:
@@ -357,14 +380,17 @@ class Journal:
         if self.place is not None:
             lines = [self._head(), *({"of": f, "row": asdict(r)} for f, r in self._rows.values())]
             storage.replace(self.place, "".join(json.dumps(line) + "\n" for line in lines))
-            self._file = self.place.open("a", encoding="utf-8")
+            self._file = self.place.open("ab", buffering=0)
         return self
 
     def add(self, job: Job, row: Row) -> None:
         if self._file is not None:
             line = {"of": job.fingerprint(), "row": asdict(row)}
-            self._file.write(json.dumps(line) + "\n")
-            self._file.flush()
+            try:
+                self._file.write((json.dumps(line) + "\n").encode())
+            except OSError as error:
+                remedy = "make room; the same call goes on from what is done"
+                raise unwritable(ModelFileError, self.place, error, remedy) from error
 
     def __exit__(self, *_: object) -> None:
         if self._file is not None:
@@ -378,6 +404,14 @@ class Journal:
 def _parsed(line: str) -> dict[str, Any] | None:
     try:
         found = json.loads(line)
-    except json.JSONDecodeError:
+    except (json.JSONDecodeError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
+
+
+def _row(entry: Mapping[str, Any]) -> Row | None:
+    """The row of a journal's line; None for one that is damaged or of another version."""
+    values = entry.get("row")
+    if not isinstance(values, dict) or set(values) != set(COLUMNS) or "of" not in entry:
+        return None
+    return Row(**values) if isinstance(values["file"], str) else None

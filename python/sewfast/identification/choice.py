@@ -220,7 +220,7 @@ class Choice(Finals):
     def _network(self, chosen: Sequence[Candidate], others: Sequence[Candidate]) -> Model:
         task, first = self.task, chosen[0]
         most = math.ceil(MOST_MEMBERS / len(chosen))
-        models = [m for c in chosen for m in self._refitted(c, most)]
+        models = [m for c in chosen for m in self._refitted(c, most)][:MOST_MEMBERS]
         error = self._error_of(chosen)
         s = first.structure
         provenance: Provenance = {

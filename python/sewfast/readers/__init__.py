@@ -6,6 +6,6 @@ Read in this order: `recording` (`read`, `read_table`), `timebase` (the sample t
 
 from .containers import Table
 from .recording import parse_source, read, read_table
-from .roles import Roles, roles
+from .roles import Roles, left_out, roles
 
-__all__ = ["Roles", "Table", "parse_source", "read", "read_table", "roles"]
+__all__ = ["Roles", "Table", "left_out", "parse_source", "read", "read_table", "roles"]

@@ -155,12 +155,16 @@ def from_headers(
     bad: Mapping[int, str],
     lines: Sequence[int] | None = None,
 ) -> Table:
-    """A table from a header row; `bad` holds the reason for each column that cannot be used."""
+    """A table from a header row; `bad` holds the reason for each column that cannot be used.
+
+    A column that is there twice with the same header and values, as loggers repeat the time, is
+    taken once.
+    """
     names, units = split_units(headers)
     unusable = {
-        n: f"the header {n!r} occurs more than once; rename one"
-        for n in names
-        if names.count(n) > 1
+        n: f"the header {n!r} occurs more than once, with other values; rename one"
+        for n in dict.fromkeys(n for n in names if names.count(n) > 1)
+        if not _all_equal([c for name, c in zip(names, columns, strict=True) if name == n])
     }
     unusable |= {names[i]: reason for i, reason in bad.items()}
     used = {n: c for n, c in zip(names, columns, strict=True) if n and n not in unusable}
@@ -168,6 +172,10 @@ def from_headers(
         raise DataError(f"{path}: {next(iter(unusable.values()))}")
     known = {n: u for n, u in zip(names, units, strict=True) if u and n in used}
     return Table(path, {n: freeze(c) for n, c in used.items()}, known, unusable, lines)
+
+
+def _all_equal(columns: Sequence[FloatArray]) -> bool:
+    return all(np.array_equal(columns[0], other, equal_nan=True) for other in columns[1:])
 
 
 def freeze(values: np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> FloatArray:

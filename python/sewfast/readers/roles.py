@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,17 +12,52 @@ from ..dataset import is_reference
 from .containers import Table, unit_in_name
 from .timebase import time_column
 
-_COMMAND = re.compile(
-    r"u|in|input|command|cmd|pwm|duty|volt(s|age)?|spannung|motor_?voltage|v_?motor"
+_SPEEDS = frozenset(
+    re.split(
+        ",",
+        "rpm,1/min,min-1,min^-1,r/min,u/min,upm,tr/min,rev/s,rps,rad/s,deg/s,°/s,"
+        "m/s,mm/s,cm/s,m/min,km/h",
+    )
 )
-_CURRENT = re.compile(r"i|curr(ent)?|strom|amps?|i_?motor|motor_?current")
-_MEASURED = re.compile(
-    r"y|out|output|speed|rpm|velocity|vel|omega|drehzahl|position|pos|angle|theta|winkel|temperature"
+
+
+@dataclass(frozen=True)
+class _Sort:
+    """Columns of one sort, known by the words that a name is made of or by a unit."""
+
+    words: frozenset[str]
+    units: frozenset[str]
+
+
+def _sort(words: str, units: Iterable[str]) -> _Sort:
+    return _Sort(frozenset(words.split()), frozenset(units))
+
+
+_INPUTS = (
+    _sort(
+        "u in input command cmd pwm duty volt volts voltage spannung tension control",
+        ("v", "mv", "volt", "volts"),
+    ),
+    _sort("i curr current strom amp amps courant", ("a", "ma", "amp", "ampere", "amps")),
 )
-_COMMAND_UNITS = frozenset({"v", "mv", "volt", "volts"})
-_CURRENT_UNITS = frozenset({"a", "ma", "amp", "ampere"})
-_SPEEDS = ("rpm", "1/min", "rev/s", "rad/s", "deg/s", "°/s", "m/s", "mm/s")
-_MEASURED_UNITS = frozenset((*_SPEEDS, "rad", "deg", "°", "rev", "m", "mm", "°c", "degc"))
+_OUTPUTS = (
+    _sort(
+        "y out output speed rpm velocity vel omega drehzahl geschwindigkeit vitesse tacho tach "
+        "position pos angle theta winkel weg",
+        (*_SPEEDS, "rad", "deg", "°", "rev", "m", "mm"),
+    ),
+    _sort("temperature temp temperatur", ("°c", "degc", "k")),
+)
+"""The first sort of which there is a column counts; the others are what was logged beside it."""
+_QUALIFIERS = frozenset(
+    re.split(
+        " ",
+        "motor shaft actual act ist meas measured measurement gemessen signal value wert cycle "
+        "percent pct raw filt filtered",
+    )
+)
+"""Words that say nothing about what a column is."""
+_WORD = re.compile(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+(?![^\W\d_A-Z])")
 
 
 @dataclass(frozen=True)
@@ -38,8 +73,9 @@ def roles(table: Table) -> Roles | None:
 
     Time, references and columns that never change are neither. The plain names `u` and `y` come
     first, then a voltage or a command (a current only where there is no voltage) as input and a
-    speed, a position or a temperature as output. Where one of the two is known and one column is
-    left, that is the other.
+    speed or a position (a temperature only where there is neither) as output. A column whose name
+    and unit both say so comes before one of which only one does. Where one of the two is known and
+    one column is left, that is the other.
     """
     time = time_column(table)
     length = max((len(table[name]) for name in table.names), default=0)
@@ -48,14 +84,8 @@ def roles(table: Table) -> Roles | None:
         if name != time and len(table[name]) == length and _moves(table, name)
         and not is_reference(name) and _stem(name) != "speed_true"
     ]  # fmt: skip
-    given = (
-        _only(left, lambda n: n == "u")
-        or _only(left, lambda n: _is(table, n, _COMMAND, _COMMAND_UNITS))
-        or _only(left, lambda n: _is(table, n, _CURRENT, _CURRENT_UNITS))
-    )
-    found = _only(left, lambda n: n == "y") or _only(
-        left, lambda n: _is(table, n, _MEASURED, _MEASURED_UNITS)
-    )
+    given = _only(left, "u") or _first(table, left, _INPUTS)
+    found = _only(left, "y") or _first(table, left, _OUTPUTS)
     if len(left) == 2 and (given is None) != (found is None):
         (other,) = (name for name in left if name not in (given, found))
         given, found = given or other, found or other
@@ -74,11 +104,31 @@ def _stem(name: str) -> str:
     return unit_in_name(name)[0].lower()
 
 
-def _is(table: Table, name: str, words: re.Pattern[str], units: frozenset[str]) -> bool:
-    unit = table.unit(name).lower()
-    return unit in units if unit else words.fullmatch(_stem(name)) is not None
+def left_out(table: Table) -> str:
+    """Why columns that one may expect there are neither, as the end of a message."""
+    why = list(table.unusable.values())[:3]
+    still = [name for name in table.names if not _moves(table, name)]
+    if still:
+        why.append(f"no two different numbers in {', '.join(still[:10])}")
+    return "".join(f"; {reason}" for reason in why)
 
 
-def _only(names: list[str], holds: Callable[[str], bool]) -> str | None:
-    fitting = [name for name in names if holds(name)]
-    return fitting[0] if len(fitting) == 1 else None
+def _only(names: list[str], plain: str) -> str | None:
+    return plain if plain in names else None
+
+
+def _first(table: Table, names: list[str], sorts: Sequence[_Sort]) -> str | None:
+    """The column of the first sort that any belongs to; None where several do equally well."""
+    for sort in sorts:
+        scores = {name: _score(table, name, sort) for name in names}
+        best = max(scores.values(), default=0)
+        if best:
+            fitting = [name for name in names if scores[name] == best]
+            return fitting[0] if len(fitting) == 1 else None
+    return None
+
+
+def _score(table: Table, name: str, sort: _Sort) -> int:
+    """2 for a column whose name and unit are those of the sort, 1 for one of both, else 0."""
+    words = {word.lower() for word in _WORD.findall(unit_in_name(name)[0])} - _QUALIFIERS
+    return (bool(words) and words <= sort.words) + (table.unit(name).lower() in sort.units)

@@ -23,10 +23,12 @@ _SECONDS = {
     "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "usec": 1e-6, "ns": 1e-9, "min": 60.0,
 }  # fmt: skip
 _TIME = re.compile(
-    r"(?:t|time|time[_ ]?stamp|elapsed(?:[_ ]time)?|seconds?|zeit|zeitstempel|temps|x-axis|x_value)"
-    r"(?:[_ ](s|sec|ms|msec|us|µs|usec|ns))?"
+    r"(?:t|time|time[_ ]?stamp|(?:elapsed|relative|rel|unix|epoch)(?:[_ ]time)?|seconds?|zeit|"
+    r"zeitstempel|temps|x-axis|x_value)(?:[_ ](s|sec|ms|msec|us|µs|usec|ns))?"
 )
 """Names of a time column; the last two are those of Keysight's scopes and of LabVIEW."""
+_DATE = re.compile(r"date|date[_ ]?time|datum|zeitpunkt|moment")
+"""Names of one where its cells were dates with times of day."""
 _EPOCH = ((1e17, 1e-9, "ns"), (1e14, 1e-6, "us"), (1e11, 1e-3, "ms"))
 """From which number on a time without a unit is one since 1970 in which unit: seconds since then
 reach 1e11 in the year 5138, milliseconds had in 1973."""
@@ -159,7 +161,9 @@ def _means(values: FloatArray, edges: FloatArray, ends: FloatArray) -> FloatArra
 
 def time_column(table: Table) -> str | None:
     """The column that is named as time: t, time, timestamp, seconds, also time_ms and the like."""
-    names = [n for n in table.names if _is_time(n)]
+    names = [n for n in table.names if _is_time(n)] or [
+        n for n in table.names if _DATE.fullmatch(n.lower()) and table.unit(n) == "s"
+    ]
     return next((n for n in names if n.lower() in ("t", "time")), next(iter(names), None))
 
 

@@ -232,6 +232,8 @@ def _described(name: str, limit: float | Controller) -> str:
 
 BAND = 0.01
 """Of the level: deviation that counts as recovered."""
+MOST_SAMPLES = 10_000_000
+"""Of a load step, which every candidate runs."""
 
 
 @dataclass(frozen=True)
@@ -290,7 +292,19 @@ class LoadStep:
                 raise SettingError(f"expected a {name} of a load step other than 0, got 0")
 
     def samples(self, Ts: float) -> tuple[FloatArray, FloatArray, float, int]:
-        """Reference [y], disturbance [u], band [y] and samples of the mean."""
+        """Reference [y], disturbance [u], band [y] and samples of the mean.
+
+        Raises
+        ------
+        SettingError
+            For one of more than `MOST_SAMPLES`.
+        """
+        lasts = self.ramp + self.settle + self.look + self.mean
+        if not lasts / Ts <= MOST_SAMPLES:
+            raise SettingError(
+                name="load step", expected=f"up to {MOST_SAMPLES * Ts:g} s with its mean",
+                received=f"{lasts:g} s", remedy="shorten ramp, settle, look or mean",
+            )  # fmt: skip
         on = round((self.ramp + self.settle) / Ts)
         k = np.arange(on + max(1, round(self.look / Ts)))
         share = np.minimum(1.0, k * Ts / self.ramp) if self.ramp > 0.0 else np.ones(len(k))

@@ -29,6 +29,7 @@ from .task import (
     Variable,
     Wanted,
     budget,
+    out_of_reach,
     threads_or_all,
 )
 
@@ -73,6 +74,8 @@ class TuningResult:
         ``genetic`` or ``cma-es``.
     opinion : SecondOpinion or None
         The comparison with a rival; None without one, or if no gains suit it.
+    beyond : str or None
+        References that are out of reach with the least gain of the variations, in words.
     """
 
     controller: SampledController
@@ -87,14 +90,17 @@ class TuningResult:
     constraints: Constraints
     method: str
     opinion: SecondOpinion | None = None
+    beyond: str | None = None
 
     @property
     def warning(self) -> str | None:
-        """An objection to the gains, and what to do; None if there is none.
+        """Objections to the gains, and what to do; None if there are none.
 
-        Models of two kinds that contradict each other on which gains are good.
+        Models of two kinds that contradict each other on which gains are good; references that the
+        drive cannot follow with the least gain of the variations.
         """
-        return None if self.opinion is None else self.opinion.warning
+        opinion = None if self.opinion is None else self.opinion.warning
+        return "; ".join(said for said in (opinion, self.beyond) if said) or None
 
     @property
     def pid(self) -> Controller:
@@ -318,6 +324,8 @@ def tune(
     # before anything is searched, so that a rival that cannot be used costs nothing
     other = None if rival is None else replace(task, plants=_rivals(rival, task))
     result = search.on(task, variables)
+    if references is not None:
+        result = replace(result, beyond=out_of_reach(task))
     return result if other is None else _asked(result, task, other, search, variables)
 
 

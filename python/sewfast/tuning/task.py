@@ -20,6 +20,7 @@ from ..control.defaults import (
     default_references,
     drive_step,
     filter_length,
+    rate_step,
     require_one_input,
 )
 from ..control.files import KINDS
@@ -34,10 +35,10 @@ from ..control.loop import (
     reference_samples,
 )
 from ..control.margins import sampled
-from ..errors import SettingError
+from ..errors import FitError, SettingError
 from ..gains import Gains, real, vector, whole
 from ..models import Model
-from ..rules import table_1
+from ..rules import Fopdt, Rule, table_1
 from ..threads import available
 from .objective import Constraints, Cost, LoadStep
 
@@ -162,6 +163,32 @@ class TuningTask:
             [sampled(plant, self.start.Ts, self.constraints.speed) for plant in known],
             [response.lines(self.start) for response in seen],
         )
+
+
+def out_of_reach(task: TuningTask) -> str | None:
+    """References that no gains can follow on the variation with the least gain, in words; or None.
+
+    Tuning on them looks for the gains that lose least at the limit of the command.
+    """
+    (plant, *_), start = task.plants, task.start
+    gain = min(gain for gain, _ in task.variations)
+    if not isinstance(plant, Model) or gain >= 1.0:
+        return None
+    try:
+        fopdt = drive_step(plant, start.u_min, start.u_max).fopdt
+    except (FitError, SettingError):
+        return None  # what it reaches is not known
+    low, high = sorted(gain * (fopdt.K * u + fopdt.offset) for u in (start.u_min, start.u_max))
+    top, bottom = max(r.max() for r in task.references), min(r.min() for r in task.references)
+    if bottom >= min(low, 0.0) and top <= max(high, 0.0):
+        return None
+    unit = f" {start.y_unit}" if start.y_unit else ""
+    return (
+        f"the references ask for {bottom:.4g} to {top:.4g}{unit}, with {gain:g} of its gain the "
+        f"drive reaches {low:.4g} to {high:.4g} at the limits of its command: there no gains help, "
+        "and those found look for the least loss; lower the references, raise the limits, or give "
+        "variations without that gain"
+    )
 
 
 def _assumed(start: SampledController, given: list[Any], *, derived: bool) -> str:
@@ -378,7 +405,8 @@ def first_controller(
 ) -> Controller:
     """A conservative controller from a model's own step response by Table 1 (nearest row).
 
-    The moving average's delay counts as dead time. Parameters are those of `tune`.
+    Where the output integrates the command, as a position does, SIMC on the rate's step response
+    takes its place. The moving average's delay counts as dead time. Parameters are those of `tune`.
 
     Raises
     ------
@@ -391,11 +419,14 @@ def first_controller(
     plant = _require_model(plant)
     low, high, note = command_limits([plant], u_min, u_max)
     u_unit, y_unit = _units(plant, output_unit)
-    step = drive_step(plant, low, high)
+    moving = rate_step(plant, low, high)
+    step = drive_step(plant, low, high) if moving is None else moving
     if filter_samples is None:
         filter_samples = filter_length(plant.Ts, step.slowest)
     average = (max(1, whole("filter_samples", filter_samples)) - 1) / 2 * plant.Ts
-    rule = table_1(replace(step.fopdt, L=step.fopdt.L + average), outside="nearest")
+    late = replace(step.fopdt, L=step.fopdt.L + average)
+    rule = table_1(late, outside="nearest") if moving is None else _of_position(late, plant.Ts)
+    said = "Table 1" if moving is None else rule.name
     gains = Gains.standard(
         rule.gains.Kp, rule.gains.Ti, rule.gains.Td, u_unit=u_unit, y_unit=y_unit
     )
@@ -409,8 +440,21 @@ def first_controller(
         u_max=high,
         filter_samples=filter_samples,
         counts_per_rev=_encoder(plant, counts_per_rev, y_unit),
-        notes="; ".join(n for n in ("Table 1 on the model's step response", note) if n),
+        notes="; ".join(n for n in (f"{said} on the model's step response", note) if n),
     )
+
+
+def _of_position(rate: Fopdt, Ts: float) -> Rule:
+    """SIMC for `K e^(-sL) / (s (1 + sT))` (Skogestad 2003, Table 1), in standard form.
+
+    The derivative cancels T; the loop is to be no faster than what it cancels and the dead time,
+    which the hold of a sample adds to.
+    """
+    tau = 2.0 * max(rate.L + Ts, 0.5 * rate.T) + rate.L
+    Kc, Ti, Td = 1.0 / (rate.K * tau), 4.0 * tau, rate.T
+    gains = Gains.standard(Kc * (1.0 + Td / Ti), Ti + Td, Ti * Td / (Ti + Td))
+    # half of a step goes to the integral alone: two integrators overshoot
+    return Rule(gains, 0.5, 1.0, "SIMC for an integrator")
 
 
 def first_of(

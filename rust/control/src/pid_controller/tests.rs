@@ -58,6 +58,24 @@ fn free() -> impl Strategy<Value = Design<f64>> {
     )
 }
 
+/// Samples in which all that a controller remembers fades by `exp(-fade)`, but for its integral: the ramp of a reference
+/// within 100, the moving average, derivative, filter, observer and sections, one after the other.
+fn fading<T: Real>(design: &Design<T>, fade: f64) -> u32 {
+    let (pid, ts) = (&design.pid, design.pid.ts.to_f64());
+    let all = design.schedule.points().iter().map(|p| p.gains);
+    let td = all.chain([pid.gains]).map(|g| g.td.to_f64());
+    let times = [
+        td.fold(0.0, f64::max) / pid.n.to_f64(),
+        design.filter_time.to_f64(),
+        2.0 * design.observer_time.to_f64(),
+    ];
+    let slow = times.iter().filter(|time| **time > 0.0);
+    let memory: f64 = slow.map(|time| time / ts + 1.0).sum();
+    let ramp = 100.0 / (design.r_rate.to_f64() * ts);
+    let own = ramp + design.filter_samples as f64 + fade * memory;
+    own.ceil() as u32 + settling(&design.biquads, fade)
+}
+
 /// The integral's own move in one sample, at most.
 fn creep(design: &Design<f64>, e: f64) -> f64 {
     let all = design.schedule.points().iter().map(|p| p.gains);
@@ -73,8 +91,7 @@ proptest! {
     ) {
         let mut controller = PidController::new(old).unwrap();
         controller.step_with(r, y / 2.0, feedforward);
-        let samples = 20_000 + settling(&old.biquads, 40.0);
-        let before = (0..samples).map(|_| controller.step_with(r, y, feedforward)).last().unwrap();
+        let before = (0..fading(&old, 40.0)).map(|_| controller.step_with(r, y, feedforward)).last().unwrap();
         controller.set_design(new).unwrap();
         let after = controller.step_with(r, y, feedforward);
         let scale = 1e-11 * (1.0 + before.abs() + 400.0);
@@ -120,7 +137,7 @@ proptest! {
         controller.step_with(r, y / 3.0, feedforward);
         controller.set_manual(manual).unwrap();
         let mut u = 0.0;
-        for _ in 0..20_000 + settling(&design.biquads, 40.0) {
+        for _ in 0..fading(&design, 40.0) {
             u = controller.step_with(r, y, feedforward);
             prop_assert_eq!(u, manual.clamp(-10.0, 10.0));
         }

@@ -232,8 +232,16 @@ fn faults() -> impl Strategy<Value = Faults> {
     })
 }
 
+/// So many cases, as one of these takes long; with `PROPTEST_CASES` as many as that says.
+fn cases(few: u32) -> ProptestConfig {
+    match std::env::var_os("PROPTEST_CASES") {
+        Some(_) => ProptestConfig::default(),
+        None => ProptestConfig::with_cases(few),
+    }
+}
+
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 48, ..ProptestConfig::default() })]
+    #![proptest_config(cases(48))]
 
     /// An upload is refused where the one before was executed twice or not at all.
     #[test]
