@@ -80,7 +80,9 @@ def _chosen(
         return structures[-1]
     held: Split = parts[0]
     brief = replace(task, progress=task.clock.limited(task.progress, SHARE_OF_CHOICE))
-    best, least, kept = structures[0], None, None
+    best = structures[0]
+    kept: Fitted | None = None
+    least: Errors | None = None
 
     def tested(structure: Mapping[str, int]) -> tuple[Fitted, Errors] | None:
         try:
