@@ -244,7 +244,9 @@ $(VENV)/bin/python:
 
 $(BUILT): $(RUST) pyproject.toml | $(VENV)/bin/python
 	$(BIN)/pip install --quiet 'maturin>=1.9,<2'
-	VIRTUAL_ENV=$(VENV) $(BIN)/maturin develop --release --quiet
+	@echo 'compiling the core; the first time this takes some minutes'
+	@# pip would name every extra that is not asked for
+	PIP_QUIET=1 VIRTUAL_ENV=$(VENV) $(BIN)/maturin develop --release --quiet
 	@touch $@
 
 # sewfast itself is there already, so that pip only adds what its extras name

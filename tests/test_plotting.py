@@ -103,6 +103,8 @@ def test_wrong_axes_and_files_are_refused(tmp_path: Path) -> None:
         run.plot([None])
     with pytest.raises(SettingError, match=r"\.png, \.svg or \.pdf"):
         run.plot(file=tmp_path / "run.jpg")
+    with pytest.raises(SettingError, match="expected the name of a figure, received 3"):
+        run.plot(file=3)  # type: ignore[arg-type]
     with pytest.raises(SettingError, match="folder that exists"):
         run.plot(file=tmp_path / "none" / "run.png")
     figure, axes = pyplot.subplots(1, 4)

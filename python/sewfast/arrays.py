@@ -46,6 +46,11 @@ def labelled(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
+def in_unit(number: str, unit: str) -> str:
+    """`number unit`, or the number alone where the unit is unknown."""
+    return f"{number} {unit}" if unit else number
+
+
 # --- What a caller hands over -> read-only columns of float64 -------------------------------------
 
 

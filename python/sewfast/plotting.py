@@ -260,6 +260,11 @@ class Drawing:
             raise SettingError(
                 "expected axes or a file, got both; the figure of the axes has savefig"
             )
+        if not (file is None or isinstance(file, (str, os.PathLike))):
+            raise SettingError(
+                name="file", expected="the name of a figure", received=repr(file),
+                remedy="for example 'loop.png'",
+            )  # fmt: skip
         require_matplotlib()
         if ax is not None:
             return self._into(ax)

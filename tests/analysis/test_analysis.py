@@ -258,6 +258,16 @@ def test_files_and_figures_are_whole(tmp_path: Path) -> None:
         several().save(tmp_path / "file")
 
 
+def test_units_that_nobody_knows_leave_no_brackets() -> None:
+    pytest.importorskip("matplotlib", reason="needs the report extra")
+    found = several()
+    bare = tuple(replace(r, y_unit="", u_unit="") for r in found.responses)
+    drawn = replace(found, responses=bare).plot()
+    words = [text for ax in drawn.ravel() for text in (ax.get_ylabel(), ax.get_title(loc="left"))]
+    assert "output" in words
+    assert not any("[]" in text or text != text.strip() or "  " in text for text in words)
+
+
 def test_a_notebook_shows_margins_and_judgement() -> None:
     shown = several()._repr_html_()
     assert shown.count("<table") == 2

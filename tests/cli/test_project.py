@@ -331,6 +331,7 @@ def test_a_byte_order_mark_is_no_setting(tmp_path: Path) -> None:
         ("[limits]\nvolt = 3", "speed, acceleration, current missing"),
         ('[limits]\nu_max = "9"', "[limits] u_max: expected a number, received '9'"),
         ("[limits]\nu_max = nan", "expected a number"),
+        ("[limits]\nu_max = " + "9" * 400, "expected a number below 1e308, received 400 digits"),
         ("[limits]\nu_max = true", "expected a number"),
         ("[limits]\nu_min = 3\nu_max = -3", "expected u_min below u_max, received u_min = 3"),
         ("[limits]\nu_min = 3\nu_max = 3", "expected u_min below u_max"),

@@ -314,6 +314,7 @@ def test_levels_of_an_index_that_have_names_are_columns() -> None:
     assert sewfast.read(frame, inputs="u", output="speed").Ts == pytest.approx(TS)
     periods = pd.period_range("2026-01-01", periods=N, freq="s")
     assert sewfast.read(pd.DataFrame({"u": U}, index=periods), inputs="u").Ts == 1.0
+    assert sewfast.read(pd.DataFrame({"t": periods, "u": U}), inputs="u").Ts == 1.0
 
 
 def test_a_structured_array_is_a_table() -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import storage
+from ..arrays import in_unit
 from ..control.controller import Controller
 from ..control.defaults import catalogue_fits
 from ..control.loop import (
@@ -393,13 +394,14 @@ def _response_line(r: Responses) -> str:
     found = r.metrics()
     if r.kind == "reference":
         return (
-            f"reference step of {r.size:.4g} {r.y_unit} at {r.level:.4g} {r.y_unit}: "
+            f"reference step of {in_unit(f'{r.size:.4g}', r.y_unit)} at "
+            f"{in_unit(f'{r.level:.4g}', r.y_unit)}: "
             f"rise {span([m['rise_ms'] for m in found])} ms, overshoot "
             f"{span([m['overshoot_percent'] for m in found])} %, settled within "
             f"{span([m['settling_ms'] for m in found])} ms"
         )
     return (
-        f"disturbance worth {r.disturbance:.3g} {r.u_unit} at the plant's input: "
+        f"disturbance worth {in_unit(f'{r.disturbance:.3g}', r.u_unit)} at the plant's input: "
         f"{span([m['peak'] for m in found])} {r.y_unit} off, back within "
         f"{span([m['recovery_ms'] for m in found])} ms"
     )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..arrays import in_unit, labelled
 from ..dataset import FloatArray
 from ..errors import SettingError
 from ..evidence.figures import shade
@@ -104,7 +105,7 @@ def _output(ax: Axes, r: Responses) -> None:
     name = "median of the plants" if len(r.plants) > 1 else r.plants[0]
     ax.plot(*thin(t, np.median(r.y, axis=0)), color=BLUE, lw=1.4, label=name)
     ax.set_title(_step_title(r))
-    ax.set_ylabel(lettered(f"output [{r.y_unit}]"))
+    ax.set_ylabel(lettered(labelled("output", r.y_unit)))
     ax.set_xlabel("time since the step [ms]")
     ax.margins(x=0.01)
 
@@ -114,15 +115,16 @@ def _command(ax: Axes, r: Responses) -> None:
     if len(r.plants) > 1:
         _band(ax, t, r.u.min(axis=0), r.u.max(axis=0))
     ax.plot(*thin(t, np.median(r.u, axis=0)), color=BLUE, lw=1.1)
-    ax.set_ylabel(lettered(f"command [{r.u_unit}]"))
+    ax.set_ylabel(lettered(labelled("command", r.u_unit)))
     ax.set_xlabel("time since the step [ms]")
     ax.margins(x=0.01)
 
 
 def _step_title(r: Responses) -> str:
     if r.kind == "reference":
-        return lettered(f"reference step of {r.size:.4g} {r.y_unit}")
-    return lettered(f"disturbance worth {r.disturbance:.3g} {r.u_unit} at the plant's input")
+        return lettered(f"reference step of {in_unit(f'{r.size:.4g}', r.y_unit)}")
+    size = in_unit(f"{r.disturbance:.3g}", r.u_unit)
+    return lettered(f"disturbance worth {size} at the plant's input")
 
 
 def _band(ax: Axes, t: FloatArray, low: FloatArray, high: FloatArray) -> None:
@@ -246,8 +248,8 @@ def what_if_drawing(a: Analysis) -> Drawing:
     """Cost, worst error and Ms on changed plants, one row per change."""
     unit = lettered(a.controller.gains.y_unit)
     values: tuple[tuple[str, Callable[[Score], float]], ...] = (
-        (f"cost [{unit}]", lambda s: s.cost),
-        (f"worst error [{unit} rms]", lambda s: s.tracking),
+        (labelled("cost", unit), lambda s: s.cost),
+        (labelled("worst error", f"{unit} rms".lstrip()), lambda s: s.tracking),
         ("Ms [1]", lambda s: s.Ms),
     )
     panels = tuple(

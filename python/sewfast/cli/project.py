@@ -255,9 +255,14 @@ def _text(path: Path, where: str, value: Any) -> str:
 
 
 def _number(path: Path, where: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value:
         raise SettingError(f"{path}: {where}: expected a number, received {value!r}")
-    return float(value)
+    try:
+        return float(value)
+    except OverflowError:  # TOML's whole numbers have any length
+        raise SettingError(
+            f"{path}: {where}: expected a number below 1e308, received {len(str(value))} digits"
+        ) from None
 
 
 def with_units(table: Table, args: argparse.Namespace) -> Table:

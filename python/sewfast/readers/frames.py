@@ -152,6 +152,8 @@ def _of_pandas(frame: Any) -> Iterator[Found]:
 
 def _of_series(column: Any) -> tuple[FloatArray | None, str, str]:
     """Of a column or an index of pandas."""
+    if str(column.dtype).startswith("period"):
+        column = column.dt.to_timestamp()
     if column.dtype.kind in "mM":
         # a moment with a time zone becomes one in UTC
         return _numbers(column.to_numpy(dtype=f"{column.dtype.kind}8[ns]"))
