@@ -272,6 +272,24 @@ class NeuralSS(Model):
         """Maximum a posteriori, (nx,); NaN in y does not count."""
     def jacobian(self, u: _F, state: _F) -> tuple[_F, _F]: ...
 
+GREYBOX_UNITS: int
+
+@final
+class GreyBox(Model):
+    """A motor's equations and a network for what they leave; theta = [free parameters, (b, p, q, c) of each unit]."""
+
+    def __new__(
+        cls, *, values: _F, free: Sequence[int], Ts: float, steps: int, mean: bool, unit: float,
+        speed_scale: float, command_scale: float, residual_variance: float, process_noise: float,
+        theta: _F,
+    ) -> GreyBox:
+        """``values`` (18,) in the order of GREYBOX_PARAMETERS, ``free`` places in it; ``unit`` of the output [rad/s]."""
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Every constructor argument but theta; nx, nk, n_inputs, hidden, integrator."""
+    def states(self, u: _F, state: _F) -> _F:
+        """States of the free run, (N, 3)."""
+
 @final
 class HammersteinWiener(Model):
     """A linear difference equation between static curves; theta = [a, b, offset, bends of f, log slopes of g]."""

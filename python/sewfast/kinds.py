@@ -11,6 +11,8 @@ Kind: TypeAlias = Literal[
     "oe",
     "hammerstein_wiener",
     "hammerstein-wiener",
+    "grey_box",
+    "grey-box",
     "neural_oe",
     "neural-oe",
     "neural_ss",
@@ -22,6 +24,7 @@ TEXTS: dict[str, str] = {
     "iv": "refined instrumental variables",
     "oe": "linear output error",
     "hammerstein_wiener": "linear output error between static characteristics",
+    "grey_box": "equations of a motor, a network for what they leave",
     "neural_oe": "lagged network output error",
     "neural_ss": "neural state space",
 }

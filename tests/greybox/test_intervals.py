@@ -10,10 +10,10 @@ from test_physics import linear
 
 import sewfast
 from sewfast import physics
-from sewfast.greybox.intervals import covariance_of
-from sewfast.greybox.marquardt import minimised
-from sewfast.greybox.records import records_of, spikes_of
-from sewfast.greybox.task import NOTHING, PLACE, State, Task
+from sewfast.motorfit.intervals import covariance_of
+from sewfast.motorfit.marquardt import minimised
+from sewfast.motorfit.records import records_of, spikes_of
+from sewfast.motorfit.task import NOTHING, PLACE, State, Task
 
 FREE = (np.full(2, -np.inf), np.full(2, np.inf))
 T = np.linspace(0.0, 4.0, 25)

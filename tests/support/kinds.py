@@ -11,6 +11,7 @@ import numpy as np
 
 from sewfast import ARX, IV, Dataset, Ensemble, LinearOE, Model, NeuralOE, NeuralSS, _core
 from sewfast.evidence import remembered
+from sewfast.models.grey_box import NAMES, GreyBox
 from sewfast.models.hammerstein import HammersteinWiener
 
 TS = 0.01
@@ -84,6 +85,22 @@ def _hammerstein_wiener(
         theta=np.concatenate([a, b, [0.5], bends, slopes]),
     )  # fmt: skip
     return _wrapped(HammersteinWiener, core, inputs)
+
+
+def _grey_box(hidden: int = 3, delay: float = 0.0, free: tuple[str, ...] = ()) -> Any:
+    motor = {
+        "k_e": 0.019, "k_a": 0.004, "tau": 0.007, "k_s": 0.2, "offset": 0.1, "drop": 0.06,
+        "ripple": 0.2, "k_t": 0.05, "w_s": 9.0, "k_b": 0.001, "delay": delay, "limit": np.inf,
+    }  # fmt: skip
+    names = free or ("k_e", "k_a", "tau", "k_s", "offset", "drop", "ripple", "k_t", "w_s")
+    network = np.random.default_rng(2).normal(size=(hidden, 4)) * [0.5, 1.0, 1.0, 0.1]
+    core = _core.GreyBox(
+        values=np.array([motor.get(n, 0.0) for n in NAMES]), free=[NAMES.index(n) for n in names],
+        Ts=TS, steps=4, mean=True, unit=2.0 * np.pi / 60.0, speed_scale=120.0, command_scale=2.5,
+        residual_variance=4.0, process_noise=1e-4,
+        theta=np.concatenate([[motor[n] for n in names], network.ravel()]),
+    )  # fmt: skip
+    return _wrapped(GreyBox, core, 1)
 
 
 def _neural_oe(nk: int = 1, inputs: int = 1, bypass: bool = True, saturates: bool = False) -> Any:
@@ -166,6 +183,9 @@ CASES: dict[str, Case] = {
         lambda: _hammerstein_wiener(nk=2, inputs=2), deploys=False
     ),
     "wiener, na 1": Case(lambda: _hammerstein_wiener(pieces=(1, 4), na=1), deploys=False),
+    "grey_box": Case(_grey_box, deploys=False),
+    "grey_box, no network": Case(lambda: _grey_box(hidden=0), deploys=False),
+    "grey_box, late by 1.4 samples": Case(lambda: _grey_box(delay=0.014), deploys=False),
     "neural_oe": Case(_neural_oe),
     "neural_oe, nk 0": Case(lambda: _neural_oe(nk=0)),
     "neural_oe, nk 2, no bypass": Case(lambda: _neural_oe(nk=2, bypass=False)),

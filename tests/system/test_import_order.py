@@ -16,7 +16,7 @@ ORDER = """
     errors kinds arrays storage tables plotting progress threads speed signals
     writers recordfile dataset readers benchmarks machine live recording
     dynamic_model validation comparison evidence models
-    identification sklearn
+    motorfit identification sklearn
     gains rules control tuning trust analysis frequency deployment fleets
     link greybox report commissioning experiment studio cli __main__
 """

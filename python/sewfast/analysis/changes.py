@@ -17,6 +17,7 @@ from ..machine import VirtualMachine
 from ..models import Model, NeuralSS
 from ..models.base import SingleModel
 from ..models.files import from_dict
+from ..models.grey_box import GreyBox
 from ..models.linear import LinearDifference
 
 
@@ -154,15 +155,17 @@ def with_gain(model: Model, factor: float) -> Model:
 
 def with_delay(model: Model, samples: int) -> Model:
     """The same model whose input acts some samples later."""
-    return _changed(model, nk=model.parameters()["nk"] + samples)
+    if not isinstance(model, SingleModel):
+        raise SettingError("delay: expected a single model, received an ensemble; take its members")
+    return _changed(model, **model.with_input_delayed(samples))
 
 
 def with_time_constants(model: Model, factor: float) -> Model:
     """The same steady states, reached a factor more slowly.
 
     Linear: every pole p becomes p^(1/factor), the steady gain, or an integrator's rate over the
-    factor, stays. State space: every step goes 1/factor of its way. A lagged network has no time
-    constants of its own to change.
+    factor, stays. State space: every step goes 1/factor of its way. Grey box: inertia and lag
+    are a factor larger. A lagged network has no time constants of its own to change.
 
     Raises
     ------
@@ -173,6 +176,9 @@ def with_time_constants(model: Model, factor: float) -> Model:
         return _slower_linear(model, factor)
     if isinstance(model, NeuralSS):
         return _changed(model, theta=model.core.slowed(factor).theta.tolist())
+    if isinstance(model, GreyBox):
+        slow = [factor if n in ("k_a", "tau") else 1.0 for n in model.parameter_names]
+        return _changed(model, theta=(model.theta * slow).tolist())
     raise SettingError(
         f"expected a linear or a state-space model to change time constants of, got a "
         f"{model.kind}; identify with model='neural_ss', or look at the gain instead"

@@ -21,10 +21,10 @@ from ..arrays import FloatArray, as_column
 from ..errors import DataError, FitError, SettingError
 from ..frequency.shaft import Parameter
 from ..identification.least_squares import least_squares
+from ..motorfit.intervals import CONFIDENCE, covariance_of, filtered, whitener
+from ..motorfit.records import Piece, Records, rad_per_second
 from ..tables import html_of
-from .intervals import CONFIDENCE, covariance_of, filtered, whitener
 from .motor import findings
-from .records import Piece, Records, rad_per_second
 
 Equations: TypeAlias = Callable[[Any, Any, Mapping[str, Any]], Any]
 """`f(x, u, p)`: derivatives of the state (n,), under a command, with parameters by name."""

@@ -17,11 +17,11 @@ from ..errors import DataError, SettingError
 from ..frequency.shaft import Parameter, sampled_model
 from ..machine import VirtualMachine
 from ..models import LinearOE
+from ..motorfit.intervals import CONFIDENCE
+from ..motorfit.records import Records, rad_per_second
 from ..plotting import LOOKS, Drawing
 from ..tables import html_of
 from .exports import Target, Winding, export
-from .intervals import CONFIDENCE
-from .records import Records, rad_per_second
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

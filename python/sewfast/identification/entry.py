@@ -19,7 +19,7 @@ from ..models import Model
 from ..models.files import STRUCTURED
 from ..progress import shown_in_notebooks
 from ..threads import Workers, available, require_workers
-from . import choice, further, lagged, linear, structured
+from . import choice, further, grey_box, lagged, linear, structured
 from .effort import Clock, Progress
 from .folds import thinned
 from .outputs import OUTPUTS
@@ -32,6 +32,7 @@ _KINDS: dict[str, Callable[[Task], Model]] = {
     "arx": linear.arx,
     "iv": linear.iv,
     "oe": linear.oe,
+    "grey_box": grey_box.grey_box,
     "neural_oe": lagged.neural_oe,
     "neural_ss": choice.neural_ss,
     "paper": lagged.paper,
@@ -86,9 +87,11 @@ def identify(
         (a sample of weight 0 counts as not measured); starts, scalings, output functions, the guard
         and the evidence stored with the model ignore them. `iv` takes no weights between 0 and the
         largest.
-    model : {"auto", "arx", "iv", "oe", "neural_oe", "neural_ss"} or Model
+    model : {"auto", "arx", "iv", "oe", "grey_box", "neural_oe", "neural_ss"} or Model
         `arx`: least squares of the one-step error. `iv`: refined instrumental variables, which
-        measurement noise does not bias. `oe`: linear output error. `neural_oe`: the
+        measurement noise does not bias. `oe`: linear output error. `grey_box`: the equations of a
+        motor from its command to its speed, with a network of `hidden` units beside them; None:
+        with 4 where these are credibly better on held-out data. `neural_oe`: the
         lagged network, trained in free run from the linear output-error model. `neural_ss`: the
         state-space network. `auto`: one of `oe`, `neural_ss` and `neural_oe`, by the free-run error
         on held-out data; on little data the median of several networks, an `Ensemble`. A kind
@@ -174,7 +177,7 @@ def identify(
         na=na, nb=nb, nk=nk, nx=nx, hidden=hidden, starts=starts, seed=seed,
         iterations=iterations, threads=threads,
     )  # fmt: skip
-    _require_meaning(kind, na=na, nb=nb, nx=nx, output=output, time_budget=time_budget)
+    _require_meaning(kind, na=na, nb=nb, nk=nk, nx=nx, output=output, time_budget=time_budget)
     require_workers(workers)
     if progress is not None and not callable(progress):
         raise SettingError(
@@ -341,6 +344,7 @@ def _require_meaning(
     *,
     na: int | None,
     nb: int | None,
+    nk: int | None,
     nx: int | None,
     output: str | None,
     time_budget: float | None,
@@ -348,9 +352,12 @@ def _require_meaning(
     """Settings that another kind of model has are a misunderstanding."""
     searched = kind in _SEARCHED
     of_the_other = {"na": na, "nb": nb} if searched else {"nx": nx, "output": output}
+    if kind == "grey_box":
+        of_the_other = {"na": na, "nb": nb, "nk": nk, "nx": nx, "output": output}
     for name, value in of_the_other.items():
         if value is not None:
             remedy = "give nx, or name a lagged model" if searched else "give na, nb and hidden"
+            remedy = "give hidden, or name another kind" if kind == "grey_box" else remedy
             raise SettingError(f"{name}: model {kind} has none, received {value!r}; {remedy}")
     if output is not None and output not in OUTPUTS:
         raise SettingError(f"output: expected one of {', '.join(OUTPUTS)}, received {output!r}")

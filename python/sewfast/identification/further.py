@@ -11,6 +11,7 @@ from ..dataset import require_same_units
 from ..errors import FitError, Interrupted, SettingError
 from ..models import ARX, IV, Ensemble, LinearOE, Model, NeuralOE, NeuralSS
 from ..models.base import StructuredModel
+from ..models.grey_box import GreyBox
 from .linear import arx, iv, linear_model
 from .task import Task, arrays, documented, fit_provenance, with_provenance, wrap
 
@@ -105,7 +106,7 @@ def _single(task: Task, model: Model) -> Model:
 
 def _require_trainable(model: Model) -> None:
     """A fit that can begin at this model."""
-    if isinstance(model, StructuredModel):
+    if isinstance(model, (StructuredModel, GreyBox)):
         raise SettingError(
             name="model", expected="a model that can be trained further",
             received=f"the {model.title} model, whose fit begins anew",

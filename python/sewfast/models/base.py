@@ -138,6 +138,10 @@ class SingleModel(Model):
     def with_output_scaled(self, factor: float) -> dict[str, Any]:
         """The parameters that change where the output is a factor as large."""
 
+    def with_input_delayed(self, samples: int) -> dict[str, Any]:
+        """The parameters that change where the input acts some samples later."""
+        return {"nk": self.parameters()["nk"] + samples}
+
 
 class Fitted(Protocol):
     """A compiled fit: the model and how it went."""

@@ -14,13 +14,14 @@ from ..dynamic_model import FORMAT, VERSION
 from ..errors import ModelFileError, SewfastError, located
 from ..storage import Fields
 from .base import COMBINATIONS, MOST_MEMBERS, Ensemble, Model, SingleModel, StructuredModel
+from .grey_box import GreyBox
 from .hammerstein import HammersteinWiener
 from .linear import ARX, IV, LinearOE
 from .neural import NeuralOE, NeuralSS
 
 SCHEMA = f"model-{VERSION}.json"
 SINGLE: tuple[type[SingleModel], ...] = (
-    ARX, IV, LinearOE, HammersteinWiener, NeuralOE, NeuralSS,
+    ARX, IV, LinearOE, HammersteinWiener, GreyBox, NeuralOE, NeuralSS,
 )  # fmt: skip
 """Every kind of model but the ensemble."""
 STRUCTURED = tuple(c for c in SINGLE if issubclass(c, StructuredModel))

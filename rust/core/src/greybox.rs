@@ -16,8 +16,10 @@
 //! `k_a = J R/K`, `k_b = B R/K`, `k_s = T R/K`. Derivatives are carried along with the values, as dual numbers
 //! (Griewank and Walther 2008, chapter 3): one more parameter costs one more column and no more code.
 
+mod model;
 mod normal;
 
+pub use model::{Frame, GreyBox, MOST_UNITS};
 pub use normal::{Current, Measured, Normal, normal};
 
 use crate::simd::{self, F64x8, Kernel};
@@ -242,6 +244,7 @@ fn check(task: &Run<'_>, u: &[f64]) -> Result<()> {
 }
 
 /// The parameters, as numbers that carry their derivatives.
+#[derive(Clone, Debug)]
 struct Equations<const N: usize> {
     k_e: Dual<N>,
     k_b: Dual<N>,
@@ -266,6 +269,7 @@ struct Equations<const N: usize> {
 }
 
 /// What depends on the angle.
+#[derive(Clone, Copy, Debug)]
 struct Turn<const N: usize> {
     per_inertia: Dual<N>,
     half_slope: Dual<N>,

@@ -70,6 +70,7 @@ macro_rules! started_fit_methods {
 }
 
 pub mod embedded;
+mod grey_box;
 mod guard;
 mod hammerstein;
 pub mod linear;
@@ -91,6 +92,7 @@ use embedded::EmbeddedModel;
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Model>()?;
     embedded::register(module)?;
+    grey_box::register(module)?;
     guard::register(module)?;
     hammerstein::register(module)?;
     linear::register(module)?;

@@ -1,0 +1,258 @@
+"""The grey box: a motor's equations by output error, a network where held-out data ask for one."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from .. import _core
+from ..dataset import Dataset, Experiment, FloatArray
+from ..dynamic_model import INIT
+from ..errors import DataError, FitError, SettingError
+from ..models import Model
+from ..models.grey_box import MOST_UNITS, GreyBox
+from ..motorfit import PLACE, estimated, rad_per_second, records_of
+from ..motorfit.marquardt import Normal, minimised
+from .folds import Split, compared, errors_of, folds, free_runs
+from .task import Provenance, Task, documented, finite, wrap
+
+TERMS = ("lag", "delay", "coulomb", "offset", "drop", "stribeck", "limit")
+"""Of a motor: those that do not ask where a turn begins."""
+HIDDEN = 4
+"""Units of the network that is tried."""
+STARTS = 2
+"""Of the network, which begins at random weights; the better one is taken."""
+ENOUGH = 1.0
+"""Squared distance in standard errors at which the descent ends."""
+ARGUMENTS, OUTPUTS = 3.0, 0.1
+"""Standard deviations of the weights beforehand, in units of the scales; they keep a network small
+where the record says nothing, and weigh as much as a single residual does."""
+CREDIBLE = 2.0
+"""Standard errors by which the network has to bring the held-out error down."""
+WORTH_IT = math.log(0.98)
+"""And of its logarithm at least so much."""
+NOISES = tuple(10.0**e for e in range(-10, -1))
+"""Process noises that are tried, in squares of the scales."""
+PROBED = 20_000
+"""Samples that the choice of one looks at."""
+
+
+def grey_box(task: Task) -> Model:
+    """The motor, with a network where that is credibly better on held-out data."""
+    began = time.perf_counter()
+    require_motor(task.data)
+    hidden, tried = _hidden(task)
+    core = fitted(task.data, hidden, task.seed, task.iterations_or_usual)
+    known: Provenance = {
+        "initial_state": "estimated",
+        "cost": _cost(core, task.data),
+        "cost_horizon": "free run",
+        "cost_unit": "output unit squared",
+        "structure": {"hidden": hidden},
+        "tried": tried,
+    }
+    return documented(wrap(GreyBox, core, task.data), task, began, known)
+
+
+def require_motor(data: Dataset) -> None:
+    """One command and a speed.
+
+    Raises
+    ------
+    DataError
+        For another number of inputs.
+    SettingError
+        For an output that is in no unit of speed.
+    """
+    if data.n_inputs != 1:
+        raise DataError(
+            name="inputs", expected="one input, the motor's command",
+            received=", ".join(data.input_names), remedy="choose its column",
+        )  # fmt: skip
+    try:
+        rad_per_second(data.output_unit)
+    except SettingError:
+        raise SettingError(
+            name="output_unit", expected="a speed in rpm, rev/s, rad/s or deg/s",
+            received=repr(data.output_unit),
+            remedy="name the unit of the output, or identify another kind of model",
+        ) from None  # fmt: skip
+
+
+def fitted(data: Dataset, hidden: int, seed: int, iterations: int) -> _core.GreyBox:
+    """The motor's parameters, a network of so many units beside it, and the noise of its states."""
+    core = _motor(data)
+    if hidden:
+        starts = (_with_network(core, data, hidden, seed + i, iterations) for i in range(STARTS))
+        core = min(starts, key=lambda c: _cost(c, data))
+    return _with_noise(core, data)
+
+
+def _hidden(task: Task) -> tuple[int, list[Provenance]]:
+    """Units of the network, by what is held out, and what was compared."""
+    if task.hidden is not None:
+        if task.hidden > MOST_UNITS:
+            raise SettingError(
+                name="hidden", expected=f"1 to {MOST_UNITS} units beside a motor",
+                received=str(task.hidden), remedy="identify with model neural_ss for more",
+            )  # fmt: skip
+        return task.hidden, []
+    parts = folds(task.data, task.validation)[:1] if task.select else ()
+    if not parts:
+        return 0, []
+    held: Split = parts[0]
+    tried, errors = [], []
+    for hidden in (0, HIDDEN):
+        core = fitted(held.fitted, hidden, task.seed, task.iterations_or_usual)
+        errors.append(errors_of(free_runs(core, held), held))
+        tried.append({"hidden": hidden, "held_out_rmse": finite(errors[-1].rmse)})
+    ratio, deviation = compared(errors[1], errors[0])
+    return (HIDDEN if ratio < min(-CREDIBLE * deviation, WORTH_IT) else 0), tried
+
+
+# --- The motor ------------------------------------------------------------------------------------
+
+
+def _motor(data: Dataset) -> _core.GreyBox:
+    """The equations alone, at the least squares of the free run."""
+    found = estimated(records_of(data, None, None), TERMS)
+    state, records = found.state, found.records
+    free = [n for n in state.names() if n not in ("k_b", "delay")]
+    y, model = found.task.outcome(state)
+    unit = rad_per_second(data.output_unit)
+    commands = np.concatenate([p.u for p in records.pieces])
+    return _core.GreyBox(
+        values=state.theta,
+        free=[PLACE[n] for n in free],
+        Ts=data.Ts,
+        steps=found.task.steps,
+        mean=records.mean,
+        unit=unit,
+        speed_scale=float(np.std(y)),
+        command_scale=float(np.std(commands)),
+        residual_variance=max(float(np.mean((y - model) ** 2)), 1e-18 * float(np.var(y))) / unit**2,
+        process_noise=NOISES[len(NOISES) // 2],
+        theta=np.array([state.value(n) for n in free]),
+    )
+
+
+def _changed(core: _core.GreyBox, **values: Any) -> _core.GreyBox:
+    own: dict[str, Any] = {**core.settings, "theta": core.theta, **values}
+    return _core.GreyBox(**{k: v for k, v in own.items() if k not in _DERIVED})
+
+
+_DERIVED = ("nx", "nk", "n_inputs", "integrator", "hidden")
+
+
+# --- The network beside it ------------------------------------------------------------------------
+
+
+def _with_network(
+    core: _core.GreyBox, data: Dataset, hidden: int, seed: int, iterations: int
+) -> _core.GreyBox:
+    """Motor and network together at the least squares of the free run.
+
+    The network begins without an effect; its weights are held near 0 as if each had been measured
+    once, with a standard deviation beforehand.
+    """
+    rng, motor = np.random.default_rng(seed), core.theta
+    weights = rng.standard_normal((hidden, 4)) * [0.5, 1.5, 1.5, 0.0]
+    start = np.concatenate([motor, weights.ravel()])
+    prior = np.tile([1.0 / ARGUMENTS] * 3 + [1.0 / OUTPUTS], hidden)
+    prior = np.concatenate([np.zeros(len(motor)), prior]) * math.sqrt(
+        core.settings["residual_variance"]
+    )
+    states = [state for _, _, _, state in _runs(core, data)]
+    low = np.full(len(start), -np.inf)
+    for j, value in enumerate(motor):  # what is above nothing stays there
+        low[j] = 1e-3 * value if value > 0.0 else -np.inf
+
+    def at(x: FloatArray) -> _core.GreyBox | None:
+        try:
+            return _changed(core, theta=x)
+        except SettingError:
+            return None
+
+    def normal(x: FloatArray) -> Normal:
+        own = at(x)
+        assert own is not None
+        cost, slope, gram = float((prior * x) @ (prior * x)), prior**2 * x, np.diag(prior**2)
+        for e, state in zip(data.experiments, states, strict=True):
+            y, rows = own.jacobian(e.u, state)
+            known = _weights(e)
+            error, rows = (known * (y - np.nan_to_num(e.y))), known[:, None] * rows[:, : len(x)]
+            cost += float(error @ error)
+            slope = slope + rows.T @ error
+            gram = gram + rows.T @ rows
+        return cost, slope, gram
+
+    def cost(x: FloatArray) -> float:
+        own = at(x)
+        if own is None:
+            return math.inf
+        total = float((prior * x) @ (prior * x))
+        try:
+            for e, state in zip(data.experiments, states, strict=True):
+                error = _weights(e) * (own.simulate(e.u, state) - np.nan_to_num(e.y))
+                total += float(error @ error)
+        except FitError:
+            return math.inf
+        return total if math.isfinite(total) else math.inf
+
+    count = sum(int(np.isfinite(e.y).sum()) for e in data.experiments)
+    bounds = (low, np.full(len(start), np.inf))
+    found = minimised(normal, cost, start, bounds, count, enough=ENOUGH, iterations=iterations)
+    best = _changed(core, theta=found.x)
+    residual = 2.0 * _cost(best, data)
+    return _changed(best, residual_variance=max(residual, 1e-300))
+
+
+def _weights(e: Experiment) -> FloatArray:
+    """Roots of the weights; nothing where nothing was measured."""
+    root = np.ones(len(e)) if e.weights is None else np.sqrt(e.weights)
+    return np.where(np.isfinite(e.y), root, 0.0)
+
+
+def _runs(
+    core: _core.GreyBox, data: Dataset
+) -> Iterator[tuple[Experiment, FloatArray, FloatArray, FloatArray]]:
+    """Experiments with their free run, error (NaN where none was measured) and initial state."""
+    for e in data.experiments:
+        first = e.initial_samples(INIT)
+        state = core.estimate_initial_state(e.u[:first], e.y[:first])
+        run = core.simulate(e.u, state)
+        yield e, run, e.y - run, state
+
+
+def _cost(core: _core.GreyBox, data: Dataset) -> float:
+    """J of the free run [output unit squared]; infinite for a runaway."""
+    try:
+        pairs = [(_weights(e), error) for e, _, error, _ in _runs(core, data)]
+    except FitError:
+        return math.inf
+    squares = sum(float(np.sum((w * np.nan_to_num(error)) ** 2)) for w, error in pairs)
+    return 0.5 * squares / max(sum(float(w @ w) for w, _ in pairs), 1e-300)
+
+
+def _with_noise(core: _core.GreyBox, data: Dataset) -> _core.GreyBox:
+    """With the process noise of the least one-step error."""
+    part: Sequence[tuple[Experiment, FloatArray]] = [
+        (e, state) for e, _, _, state in _runs(core, data)
+    ]
+
+    def one_step(noise: float) -> float:
+        own, total, left = _changed(core, process_noise=noise), 0.0, PROBED
+        for e, state in part:
+            n = min(left, len(e))
+            left -= n
+            if n:
+                y = e.y[:n]
+                error = _weights(e)[:n] * np.nan_to_num(own.predict(e.u[:n], y, state, 1) - y)
+                total += float(error @ error)
+        return total
+
+    return _changed(core, process_noise=min(NOISES, key=one_step))
