@@ -1,6 +1,7 @@
 """`Validation`: scores by their definitions, what is scored, and what is said beside it."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from plants import OFFSET, A, B, linear_data
 from refusals import refuses
 from sewfast import _core
 from sewfast.dataset import Dataset
-from sewfast.errors import DataError
+from sewfast.errors import DataError, SettingError
 from sewfast.models import ARX
 from sewfast.validation import Scores, validate
 
@@ -122,3 +123,10 @@ def test_samples_that_were_not_measured_are_counted_and_not_scored() -> None:
     known[:25] = False
     rmse = np.sqrt(np.mean((y - e.simulated)[known] ** 2))
     assert found.simulation.rmse == pytest.approx(rmse, rel=1e-12)
+
+
+@pytest.mark.parametrize("wrong", [None, 3, "m.json"])
+def test_what_is_no_model_is_refused_in_words(wrong: Any) -> None:
+    data = Dataset.from_arrays(np.arange(30.0), np.arange(30.0), 0.01)
+    with pytest.raises(SettingError, match=r"model: expected a model, received .*load_model"):
+        validate(wrong, data)

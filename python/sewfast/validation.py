@@ -14,7 +14,7 @@ from .dataset import Dataset, Experiment, FloatArray, labelled, require_dataset
 from .dataset.experiment import in_effect, mean_square, weights_of, without_weightless
 from .dataset.outliers import white_noise
 from .dynamic_model import INIT, DynamicModel, require_init
-from .errors import DataError, FitError
+from .errors import DataError, FitError, SettingError
 from .plotting import Drawing, Plotted, fit_panels, stacked
 from .tables import Table, percent, significant
 
@@ -416,6 +416,11 @@ def validate(
     """
     require_dataset(data, "data")
     require_init(init)
+    if not isinstance(model, DynamicModel):
+        raise SettingError(
+            name="model", expected="a model", received=type(model).__name__,
+            remedy="identify one, or read one with sewfast.load_model",
+        )  # fmt: skip
     data.require_measured()
     given, data = data, in_effect(data)
     for e in data.experiments:

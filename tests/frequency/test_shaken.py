@@ -15,8 +15,8 @@ import sewfast
 from refusals import refuses
 from sewfast import VirtualMachine, bode, load_response, load_responses
 from sewfast.cli import main
-from sewfast.commissioning.bench import MachineBench
-from sewfast.errors import LinkError, ModelFileError, SettingError
+from sewfast.commissioning.bench import MachineBench, SteppedBench
+from sewfast.errors import DataError, LinkError, ModelFileError, SettingError
 from sewfast.recording import Recording
 
 COMPLIANT = {"load_inertia": 1e-3, "stiffness": 150.0, "damping": 0.01}
@@ -231,3 +231,33 @@ def test_a_speed_that_reverses_is_refused() -> None:
 
     with refuses(sewfast.DataError, name="amplitude", expected="keeps its sign"):
         bode(Strong(), speed=500.0, **QUICK)
+
+
+class Lag:
+    """100 RPM/V with a time constant of .1 s, and how often it was advanced at a limit of 4 V."""
+
+    def __init__(self) -> None:
+        self.limited = 0
+        self.reset()
+
+    def reset(self) -> None:
+        self.turns = self.speed = self.counts = 0.0
+
+    def step(self, u: float) -> None:
+        self.limited += u in (0.0, 4.0) and self.turns > 0.0
+        self.speed += 0.01 * (100.0 * u - self.speed)
+        self.turns += self.speed / 60.0 * 1e-3
+        self.counts = float(np.floor(self.turns * 4096.0))
+
+
+def test_a_loop_that_is_shaken_to_its_limit_is_ended_at_once() -> None:
+    """Not after half a minute from limit to limit: nothing of it could be used."""
+    lag = Lag()
+    on = SteppedBench(lag, Ts=0.001, counts_per_rev=4096.0, volt=10.0)
+    gains = sewfast.Gains.standard(Kp=0.2, Ti=0.2, Td=0.0)
+    tight = sewfast.Controller(
+        gains, Ts=0.001, u_min=0, u_max=4, counts_per_rev=4096, filter_samples=4
+    )
+    with refuses(DataError, name="amplitude", expected="within its limits"):
+        bode(on, speed=300.0, controller=tight, amplitude=60.0)
+    assert lag.limited < 100

@@ -14,6 +14,7 @@ import sewfast
 from plants import bent_data, linear_data
 from sewfast import Dataset, Ensemble, LinearOE, NeuralOE, NeuralSS, _core, identify, validate
 from sewfast.errors import DataError, FitError, Interrupted, SettingError
+from sewfast.identification import trials
 from sewfast.identification.effort import Clock, Pool, Stopped
 from sewfast.identification.folds import (
     FOLDS,
@@ -395,6 +396,19 @@ def test_a_kind_by_name_gets_a_verdict_too(kind: Any) -> None:
     rng = np.random.default_rng(1)
     noise = Dataset.from_arrays(rng.normal(size=600), rng.normal(size=600), 0.01)
     assert identify(noise, model=kind, **options).training["verdict"]["grade"] == "useless"
+
+
+def test_a_network_by_name_is_trained_where_the_linear_fits_took_the_search_s_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(trials, "SHARE_OF_SEARCH", 1e-9)
+    data = bent_data(600)
+    model = identify(data, model="neural_ss", time_budget=600.0)
+    assert isinstance(model, NeuralSS)
+    assert "time for one network only" in model.training["choice"]["reason"]
+    assert validate(model, data).simulation.rmse < 0.9 * (
+        validate(identify(data, model="oe"), data).simulation.rmse
+    )
 
 
 def test_a_model_that_runs_away_is_useless() -> None:

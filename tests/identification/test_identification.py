@@ -248,6 +248,13 @@ def test_data_are_not_changed() -> None:
     np.testing.assert_array_equal(y, before[1])
 
 
+@pytest.mark.parametrize("kind", ["auto", "neural_oe"])
+def test_a_seed_is_a_number_for_every_kind(kind: Any) -> None:
+    wrong: Any = None
+    with pytest.raises(SettingError, match="seed: expected a whole number"):
+        identify(linear_data(200), model=kind, seed=wrong)
+
+
 # --- interruption -----------------------------------------------------------------------------
 
 

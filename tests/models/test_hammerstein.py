@@ -12,7 +12,8 @@ import pytest
 import sewfast
 from cli import sewfast as command
 from sewfast import Dataset, _core
-from sewfast.errors import ModelFileError, SettingError
+from sewfast.errors import Interrupted, ModelFileError, SettingError
+from sewfast.identification import structured
 from sewfast.models.hammerstein import HammersteinWiener
 
 TS = 0.01
@@ -160,6 +161,37 @@ def test_a_seed_and_threads_change_nothing() -> None:
     options: Any = {"model": "hammerstein-wiener", "hidden": 4}
     one, two = (sewfast.identify(data, threads=t, seed=s, **options) for t, s in ((1, 0), (2, 5)))
     np.testing.assert_array_equal(one.theta, two.theta)
+
+
+def test_an_interrupt_of_the_choice_hands_over_the_best_so_far(tmp_path: Path) -> None:
+    fits, last = 0, 0
+
+    def progress(done: int, total: int, best: float) -> None:
+        nonlocal fits, last
+        fits += done < last
+        last = done
+        if fits == 2:
+            raise KeyboardInterrupt
+
+    data = _plant(800, 14, before=_band)
+    with pytest.raises(Interrupted) as caught:
+        sewfast.identify(data, model="hammerstein-wiener", progress=progress)
+    best = caught.value.best
+    assert best.kind == "hammerstein_wiener"
+    assert len(best.training["tried"]) >= 1
+    best.save(tmp_path / "m.json")
+    assert sewfast.load_model(tmp_path / "m.json").training == best.training
+
+
+def test_a_budget_that_ends_the_choice_leaves_time_for_a_model(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(structured, "SHARE_OF_CHOICE", 1e-9)
+    data = _plant(800, 14, before=_band)
+    model = sewfast.identify(data, model="hammerstein-wiener", time_budget=600.0)
+    assert model.training["tried"] == []
+    assert any("ended the choice of a structure early" in n for n in model.training["notes"])
+    assert sewfast.validate(model, data).simulation.fit_percent > 90.0
 
 
 def test_the_command_line_makes_and_uses_one(tmp_path: Path) -> None:

@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 from typing import Any, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import FloatArray
 from ..control.controller import Controller
-from ..control.machine import Machine
+from ..control.machine import Machine, is_watched
 from ..control.margins import margins
 from ..dataset import Dataset
 from ..errors import DataError, LinkError, SettingError
@@ -449,21 +450,34 @@ def _under_feedback(
     ramp = np.minimum(np.arange(lead) / (0.5 * lead), 1.0) * plan.speed
     r = np.concatenate([ramp, plan.speed + peak * plan.signal()])
     more: dict[str, Any] = {"amplitude": peak, "feedback": True}
+    limits = (controller.u_min, controller.u_max)
+
+    def watch(first: int, u: FloatArray, counts: FloatArray) -> None:
+        """End at the first sample at a limit: nothing that follows could be used."""
+        limited = np.isin(u[max(0, lead - first) :], limits)
+        if limited.any():
+            raise _limited(limited, max(first, lead), plan.Ts)
+
+    watched: dict[str, Any] = {"watch": watch} if is_watched(bench) else {}
     try:
-        recording = bench.follow(controller, r, "multisine").recording
+        recording = bench.follow(controller, r, "multisine", **watched).recording
     except LinkError as error:
         recording = _kept(error, lead, plan, is_whole=is_whole)
         more["incomplete"] = f"{error}"
-    limits = (controller.u_min, controller.u_max)
     limited = np.isin(recording.u[lead:], limits)
     if limited.any():
-        raise DataError(
-            name="amplitude", expected="a command within its limits",
-            received=f"{limited.sum()} samples at one, the first at "
-            f"{(lead + int(limited.argmax())) * plan.Ts:.4g} s",
-            remedy="the response would be that of the limit; lower the amplitude",
-        )  # fmt: skip
+        raise _limited(limited, lead, plan.Ts)
     return _response(bench, plan, recording, lead, r, more)
+
+
+def _limited(limited: NDArray[np.bool_], first: int, Ts: float) -> DataError:
+    """Samples at a limit, of those from `first` on."""
+    return DataError(
+        name="amplitude", expected="a command within its limits",
+        received=f"{limited.sum()} samples at one, the first at "
+        f"{(first + int(limited.argmax())) * Ts:.4g} s",
+        remedy="the response would be that of the limit; lower the amplitude",
+    )  # fmt: skip
 
 
 def _response(

@@ -32,7 +32,7 @@ from .finals import (
 from .folds import LEAST_HELD_OUT, SHARE, compared, errors_of, folds, free_runs
 from .linear import linear_model
 from .orders import LEAST_GAIN, LinearCandidate, LinearTable
-from .search import Search
+from .search import CLIMB_ITERATIONS, Search
 from .short import short
 from .task import Provenance, Task, arrays, documented, finite, with_provenance, wrap
 from .training import Network, Request, Structure, train
@@ -162,10 +162,17 @@ class Choice(Finals):
         return errors_of(free_runs(median_of(models), self.split), self.split).rmse
 
     def _any_network(self) -> list[Candidate]:
-        found = [
-            c for c in self.search.candidates.values()
-            if c.structure.kind == "neural_ss" and math.isfinite(c.error)
-        ]  # fmt: skip
+        """The best network although it is not sound, or one that is trained in the time left."""
+        found = self._state_space_networks()
+        asked = [s for s in self.search.candidates if s.kind == "neural_ss"]
+        if asked and not found and not self.clock.over(SHARE_OF_FINAL):
+            # slow linear fits have taken the search's share of a time budget
+            self.search.share = SHARE_OF_FINAL
+            self.search.tried([(asked[0], CLIMB_ITERATIONS, 1)])
+            found = self._state_space_networks()
+            if found and found[0].is_sound:
+                self.reasons.append("there was time for one network only")
+                return found
         if not found:
             remedy = "give more time" if self.clock.truncated else "record longer"
             raise FitError(
@@ -174,6 +181,12 @@ class Choice(Finals):
             )
         self.reasons.append("no network passed the guard: the best of them all the same")
         return [min(found, key=lambda c: c.error)]
+
+    def _state_space_networks(self) -> list[Candidate]:
+        return [
+            c for c in self.search.candidates.values()
+            if c.structure.kind == "neural_ss" and math.isfinite(c.error)
+        ]  # fmt: skip
 
     # --- the model ------------------------------------------------------------------------------
 

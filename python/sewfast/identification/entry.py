@@ -276,8 +276,9 @@ def _within_budget(identified: Callable[[Task], Model], task: Task) -> Model:
     except Interrupted as e:
         if not task.clock.over(SHARE_OF_FIT):
             raise
-        # a network without a step is still the linear model it began at
-        if e.best.kind in NETWORKS and e.best.training.get("iterations") == 0:
+        # without a step these are still the linear model they began at
+        begins_linear = e.best.kind in (*NETWORKS, *(cls.kind for cls in STRUCTURED))
+        if begins_linear and e.best.training.get("iterations") == 0:
             raise too_short from None
         note = f"the time budget of {task.clock.budget:g} s ended the training early"
         return with_provenance(e.best, {"notes": [*e.best.training.get("notes", []), note]})
@@ -330,7 +331,7 @@ def _require_settings(**settings: object) -> None:
     least = {"nk": 0, "seed": 0}
     most = {"na": 100, "nb": 100, "nk": 1000, "nx": 100, "hidden": 1000, "seed": 2**64 - 1}
     for name, value in settings.items():
-        if value is None:
+        if value is None and name != "seed":
             continue
         low, high = least.get(name, 1), most.get(name, 1_000_000)
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
