@@ -411,6 +411,27 @@ def test_a_network_by_name_is_trained_where_the_linear_fits_took_the_search_s_ti
     )
 
 
+def test_a_pole_that_the_record_cannot_show_is_said() -> None:
+    spared = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        u, y = np.repeat(rng.uniform(-6.0, 6.0, 40), 20), np.zeros(800)
+        for k in range(1, 800):
+            y[k] = 0.9 * y[k - 1] + 100.0 * np.tanh(u[k - 1] / 3.0)
+        data = Dataset.from_arrays(u, y + rng.normal(size=800), 0.01)
+        model = identify(data, model="oe")
+        own = model.training["verdict"]
+        is_seen = abs(model.core.dc_gain()[0]) < 1000.0
+        spared.append(is_seen)
+        assert ("a guess" in own["text"]) == (not is_seen)
+        assert is_seen or own["grade"] == "poor"
+        # it does integrate: nothing is wrong with such a pole
+        position = Dataset.from_arrays(u, np.cumsum(y), 0.01)
+        assert "a guess" not in identify(position, model="oe").training["verdict"]["text"]
+    assert any(spared)
+    assert not all(spared)
+
+
 def test_a_model_that_runs_away_is_useless() -> None:
     rng = np.random.default_rng(0)
     u, y = rng.normal(size=120), np.zeros(120)

@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..dataset import Dataset
+from ..dataset import Dataset, diagnose
 from ..dynamic_model import INIT
 from ..models import Model
 from ..validation import GOOD, by_input, free_run_error, judged, noise_of, without_input
 from .folds import Split
+from .short import UNSEEN, time_constant
 from .task import Provenance
 
 if TYPE_CHECKING:
@@ -53,7 +54,19 @@ def verdict_by_name(model: Model, data: Dataset, validation: Dataset | None) -> 
     """
     part = Split(data, validation or data, is_given=validation is not None)
     error = free_run_error(model, part.held, part.held, INIT)
-    return _judged(model, data, part, error, "" if part.is_given else "its own training data")
+    found = _judged(model, data, part, error, "" if part.is_given else "its own training data")
+    if model.kind in ("arx", "iv", "oe") and found["grade"] in ("good", "fair"):
+        slowest, longest = time_constant(model.core), max(len(e) for e in data.experiments)
+        # an integrator is no pole too many
+        if slowest > UNSEEN * longest and diagnose(data).find("integrator") is None:
+            found["grade"] = "poor"
+            measured = found["text"].partition(": ")[2]
+            found["text"] = (
+                f"{_TEXTS['poor']}: its slowest pole takes {slowest * data.Ts:.3g} s, longer than "
+                f"the record can show, so that its steady gain is a guess; {measured}"
+            )
+            found["next"].insert(0, "lower na, or leave model out and let the search choose")
+    return found
 
 
 _TEXTS = {
