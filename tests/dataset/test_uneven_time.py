@@ -226,6 +226,7 @@ def test_a_table_with_text_in_it_is_read_as_before(tmp_path: Path) -> None:
     Ts=st.none() | st.floats(1e-12, 1e12),
 )
 @example(t=[0.0, 0.0, 8.9e307], ordered=False, Ts=0.5)
+@example(t=[0.0, 1.0, 1.1984620899082105e308], ordered=False, Ts=None)
 def test_any_time_column_is_a_grid_or_an_error(
     t: list[float], ordered: bool, Ts: float | None
 ) -> None:

@@ -22,7 +22,7 @@ from sewfast.control.defaults import (
     filter_length,
     recorded_limits,
 )
-from sewfast.errors import FitError, SettingError
+from sewfast.errors import SettingError
 from sewfast.models import LinearOE
 from sewfast.tuning import first_controller
 from terminal import Terminal
@@ -246,20 +246,21 @@ def test_a_drive_without_a_brake_is_not_asked_to_fall_faster_than_it_coasts() ->
     assert np.all(np.diff(r[peak:]) / 0.01 >= -r[peak + 1 :] / 0.3 - 1e-9)
 
 
-def test_what_does_not_settle_needs_a_start_and_then_runs() -> None:
+def test_what_integrates_needs_no_start_and_may_have_one() -> None:
     integrator = LinearOE.from_tf([0.0, 0.02], [1.0, -1.0], 0.01, output_unit="deg")
     integrator = replace(
         integrator, training={"input_range": [[-2.0, 2.0]], "output_range": [-90.0, 90.0]}
     )
-    with pytest.raises(FitError, match="integrates"):
-        sewfast.tune(integrator)
+    alone = sewfast.tune(integrator, evaluations=40)
+    assert alone.cost <= alone.start_cost
     start = Controller(
         Gains.standard(2.0, 1.0, u_unit="", y_unit="deg"), Ts=0.01, u_min=-2.0, u_max=2.0
     )
     found = sewfast.tune(integrator, start=start, evaluations=40)
     r = default_references(integrator, start)[0]
     assert isinstance(r, np.ndarray)
-    assert r.max() == pytest.approx(81.0)
+    # 4 a second at the limit: what it goes in 500 samples, well within the record
+    assert r.max() == pytest.approx(20.0)
     assert found.cost <= found.start_cost
 
 

@@ -325,8 +325,9 @@ def test_plants_that_cannot_be_tuned_on_are_refused() -> None:
         tune([], SHORT)
     with pytest.raises(SettingError, match="machine"):
         tune(VirtualMachine(), SHORT)
+    # neither it nor its rate settles: an acceleration is commanded
     with pytest.raises(FitError, match="settles"):
-        tune(linear([-1.0], [1.0]), SHORT)
+        tune(linear([-2.0, 1.0], [1.0, 0.0]), SHORT)
     unstable, start = linear([-3.0], [1.0]), first_controller(drive())
     with pytest.raises(FitError, match="diverge"):
         tune(unstable, SHORT, start=start, evaluations=30, threads=2)

@@ -37,8 +37,9 @@ _STEP_SHARES = (0.25, 0.5, 0.1)
 _STEP_SAMPLES = (4_000, 16_000)
 _INTEGRATES = 1e-4
 """Distance of a pole from 1 below which a step takes longer than these."""
-_TRAVEL = 10.0
-"""Longest way of a position in shares of what it goes in a time constant at the limit."""
+_TRAVEL, _TRAVEL_SAMPLES = 10.0, 500
+"""Longest way of a position: what it goes at the limit in so many time constants, or in so many
+samples where a drive has hardly a time constant."""
 _RATE_USED = 0.4
 """Rate of a position's ramps in shares of its rate at the limit: the rest starts and stops it."""
 _REACHED = 0.7
@@ -382,7 +383,7 @@ def _way(step: DriveStep, u_min: float, u_max: float, low: float, high: float, T
     up, down = (high - rest, rest - low) if inside else (high - low, 0.0)
     sign, x = (1.0, up) if up >= down else (-1.0, down)
     lag = step.slowest + fopdt.L + Ts
-    x = min(_RECORDED * x, _TRAVEL * lag * slower)
+    x = min(_RECORDED * x, max(_TRAVEL * lag, _TRAVEL_SAMPLES * Ts) * slower)
     average = max(1, filter_length(Ts, step.slowest)) * Ts
     edge = max(x / (_RATE_USED * slower), 10.0 * (fopdt.L + Ts) + 4.0 * average)
     other = min(min(up, down), x)

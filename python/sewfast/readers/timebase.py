@@ -17,6 +17,8 @@ TOLERANCE = 0.01
 """Of the period: how far steps may be from it to count as even."""
 GAP = 3.5
 """Steps of more periods than that are gaps: what happened in them is not known."""
+LATEST = 1e300
+"""Largest time [s] that can be reckoned with; beyond it sums of times leave the numbers."""
 _MOST_PER_ROW = 100
 _SECONDS = {
     "": 1.0, "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3,
@@ -278,7 +280,7 @@ def _seconds(table: Table, name: str, unit: float) -> FloatArray:
     with np.errstate(over="ignore", invalid="ignore"):
         t: FloatArray = (raw - raw[0]) * unit
         steps = np.diff(t)
-    if not np.isfinite(t).all():
+    if not (np.abs(t) <= LATEST).all():
         raise DataError(
             f"{table.path}: column {name!r}: expected times within the numbers, received "
             f"{raw.min():g} to {raw.max():g}; check the column"
