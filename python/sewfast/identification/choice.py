@@ -193,11 +193,12 @@ class Choice(Finals):
     def _refitted(self, c: Candidate, most: int) -> list[Network]:
         """A few iterations on everything, the held-out part included, where that stays sound.
 
-        None where there is no time for all of them: models that were cut short on the way from one
-        minimum to the other are often worse than before.
+        None where a budget has cut the training short, but on little data: models that are still
+        on their way to one minimum do worse after some steps towards another.
         """
         search, models = self.search, c.models[:most]
-        is_late = self.is_interrupted or self.clock.over(SHARE_OF_REFIT)
+        is_early = self.is_hurried and not search.is_small
+        is_late = self.is_interrupted or is_early or self.clock.over(SHARE_OF_REFIT)
         if self.split.is_given or is_late:
             return models
         linear = search.start(c.structure.nx, c.structure.nk, c.structure.output)
@@ -205,9 +206,6 @@ class Choice(Finals):
             c.structure, self.task.data, None, 6 if search.samples > 60_000 else 15,
             linear if c.structure.kind == "neural_oe" else None, initial=models,
         )  # fmt: skip
-        search.share = SHARE_OF_REFIT
-        if search.able(request.operations) < 1.0:
-            return models
         (found,) = search.guarded(
             train(
                 [request], search.pool, self.task.seed, workers=self.task.workers,
