@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -195,14 +195,7 @@ def require_record(machine: Machine, name: str, samples: int, found: object) -> 
             remedy="make it by Recording.of_counts",
         )  # fmt: skip
     columns = {"u": found.u, "counts": found.counts, "y": found.y}
-    for column, values in columns.items():
-        if np.shape(values) != (samples,):
-            raise DataError(
-                name=f"{machine.name}, {name}", expected=f"{column} of shape ({samples},), one for "
-                "each command", received=f"shape {np.shape(values)}",
-                remedy="log every sample of the run",
-            )  # fmt: skip
-        require_finite(f"{machine.name}, {name}: {column}", values)
+    _require_columns(f"{machine.name}, {name}", columns, samples, "command")
     for member in ("Ts", "counts_per_rev"):
         own, its = getattr(machine, member), getattr(found, member)
         if not math.isclose(own, its, rel_tol=1e-6):
@@ -220,15 +213,21 @@ def _require_run(machine: Machine, name: str, samples: int, found: object) -> No
             remedy="make it by RecordedRun.of_recording",
         )  # fmt: skip
     require_record(machine, name, samples, found.recording)
-    for column in ("r", "u", "y"):
-        values = getattr(found, column)
+    columns = {"r": found.r, "u": found.u, "y": found.y}
+    _require_columns(f"{machine.name}, {name}", columns, samples, "sample of the reference")
+
+
+def _require_columns(
+    where: str, columns: Mapping[str, FloatArray], samples: int, each: str
+) -> None:
+    """As many finite values in every column as were asked for."""
+    for column, values in columns.items():
         if np.shape(values) != (samples,):
             raise DataError(
-                name=f"{machine.name}, {name}", expected=f"{column} of shape ({samples},), one for "
-                "each sample of the reference", received=f"shape {np.shape(values)}",
-                remedy="log every sample of the run",
+                name=where, expected=f"{column} of shape ({samples},), one for each {each}",
+                received=f"shape {np.shape(values)}", remedy="log every sample of the run",
             )  # fmt: skip
-        require_finite(f"{machine.name}, {name}: {column}", values)
+        require_finite(f"{where}: {column}", values)
 
 
 def key_of(signal: FloatArray, controller: SampledController | None = None) -> str:

@@ -53,8 +53,9 @@ def verdict_by_name(model: Model, data: Dataset, validation: Dataset | None) -> 
     Judged on the validation data, else on what it was trained on, and the text says which.
     """
     part = Split(data, validation or data, is_given=validation is not None)
-    error = free_run_error(model, part.held, part.held, INIT)
-    found = _judged(model, data, part, error, "" if part.is_given else "its own training data")
+    found = _judged(
+        model, data, part, where=_UNSEEN_DATA if part.is_given else "its own training data"
+    )
     if model.kind in ("arx", "iv", "oe") and found["grade"] in ("good", "fair"):
         slowest, longest = time_constant(model.core), max(len(e) for e in data.experiments)
         # an integrator is no pole too many
@@ -78,23 +79,32 @@ _TEXTS = {
 }
 
 
-def _judged(model: Model, data: Dataset, part: Split, error: float, where: str = "") -> Provenance:
+_UNSEEN_DATA = "data not trained on"
+
+
+def _judged(
+    model: Model,
+    data: Dataset,
+    part: Split,
+    error: float | None = None,
+    where: str = _UNSEEN_DATA,
+) -> Provenance:
     """The model's grade by its error on what is held, with the reason and what to do next."""
+    # of one model on the same samples: what was held out is not what the error is always of
+    own = free_run_error(model, part.held, part.held, INIT)
+    error = own if error is None else error
     spread = part.spread
     fit = 100.0 * (1.0 - error / spread) if spread > 0.0 else float("nan")
     noise = noise_of([e.y for e in data.experiments])
-    # of one model on the same samples: what was held out is not what the error is always of
-    own = free_run_error(model, part.held, part.held, INIT)
     share = by_input(own, without_input(model, part.held, INIT))
     grade, resting = judged(fit, error, noise, share)
     unit = f" {data.output_unit}" if data.output_unit else ""
     rmse = f"rmse {error:.3g}{unit}"
-    of = where or "data not trained on"
     text, todo = _TEXTS[grade], []
     if not np.isfinite(error):
         text = "useless: its free run leaves the finite numbers"
     elif grade:
-        text += f": free run explains {fit:.1f} % of {of} ({rmse}){resting}"
+        text += f": free run explains {fit:.1f} % of {where} ({rmse}){resting}"
         if grade == "useless" and not resting:
             text += "; a constant would do about as well"
     else:
