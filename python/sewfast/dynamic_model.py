@@ -505,21 +505,26 @@ def _table(
     candidates: Sequence[Mapping[str, Any]], choice: Mapping[str, Any], unit: str
 ) -> list[str]:
     heading = f"free-run rmse{f' [{unit}]' if unit else ''} on data not trained on:"
-    rows = [_row(c, choice.get("chosen_structure")) for c in candidates]
+    rows = [_row(c, choice) for c in candidates]
     widths = [max(len(r[i]) for r in rows) for i in range(_COLUMNS)]
     padded = (["  ", *(t.ljust(w + 2) for t, w in zip(r, widths, strict=True))] for r in rows)
     return [heading, *("".join(p).rstrip() for p in padded)]
 
 
-def _row(c: Mapping[str, Any], chosen: Any) -> tuple[str, ...]:
+def _row(c: Mapping[str, Any], choice: Mapping[str, Any]) -> tuple[str, ...]:
     """Model, output function, weight decay, error, mark."""
     error = _number(c.get("free_run_rmse"), "runs away")
     if c.get("kind") == "oe":
         return f"oe, na = {c.get('na')}, nb = {c.get('nb')}, nk = {c.get('nk')}", "", "", error, ""
+    if c.get("kind") == "grey_box":
+        beside = f", {c['hidden']} tanh" if c.get("hidden") else ""
+        is_chosen = choice.get("chosen") == "grey_box"
+        return f"grey_box, a motor{beside}", "", "", error, "chosen" if is_chosen else ""
     orders = ", ".join(f"{k} = {c[k]}" for k in ("nx", "na", "nb") if k in c)
     size = f"{c.get('kind')}, {orders}, {c.get('hidden')} tanh, nk = {c.get('nk')}"
     size += ", integrator" if c.get("integrator") else ""
     decay = f"decay {_number(c.get('weight_decay'), '?')}"
+    chosen = choice.get("chosen_structure")
     is_chosen = isinstance(chosen, Mapping) and all(c.get(k) == v for k, v in chosen.items())
     return size, str(c.get("output")), decay, error, "chosen" if is_chosen else ""
 

@@ -190,3 +190,65 @@ def test_a_slower_and_a_later_one_are_what_they_say() -> None:
     assert slow.motor["k_a"] == pytest.approx(2.0 * model.motor["k_a"])
     long = np.full(2500, 6.0)
     assert slow.simulate(long)[-1] == pytest.approx(model.simulate(long)[-1], rel=0.01)
+
+
+# --- as a candidate of the search -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_search_takes_a_motor_for_a_motor(seed: int) -> None:
+    model: Any = sewfast.identify(_plant(4000, seed), seed=seed)
+    assert model.kind == "grey_box"
+    choice = model.training["choice"]
+    assert choice["chosen"] == "grey_box"
+    assert "the equations of a motor" in choice["reason"]
+    assert [c["kind"] for c in choice["candidates"]].count("grey_box") == 1
+    assert choice["free_run_rmse"]["grey_box"] < 0.7 * choice["free_run_rmse"]["oe"]
+    assert model.training["verdict"]["grade"] == "good"
+    assert model.alternatives[-1].kind == "oe"
+    fresh = _plant(3000, seed + 40)
+    assert model.validate(fresh).simulation.rmse < 1.15 * 2.0  # rpm, the noise is 2
+
+
+def test_what_is_linear_stays_linear_whatever_its_unit() -> None:
+    for seed in range(3):
+        u, rng = _steps(3000, seed), np.random.default_rng(seed)
+        y = np.zeros(len(u))
+        for k in range(2, len(u)):
+            y[k] = 1.6 * y[k - 1] - 0.64 * y[k - 2] + 3.0 * u[k - 1]
+        y += rng.normal(size=len(y))
+        data = Dataset.from_arrays(u, y, TS, output_unit="rpm")
+        assert sewfast.identify(data, seed=seed).kind == "oe"
+
+
+@pytest.mark.parametrize("given", [{"nx": 2}, {"nk": 1}, {"hidden": 4}, {"output": "linear"}])
+def test_a_structure_that_is_given_is_no_motor_s(given: dict[str, Any]) -> None:
+    model = sewfast.identify(_plant(1000, 1), time_budget=4.0, **given)
+    assert "grey_box" not in [c["kind"] for c in model.training["choice"]["candidates"]]
+
+
+def test_a_search_in_a_hurry_and_one_interrupted_keep_the_motor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def stopped(self: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sewfast.identification.search.Search.screen", stopped)
+    with pytest.raises(sewfast.Interrupted) as e:
+        sewfast.identify(_plant(3000, 1))
+    assert e.value.best.kind == "grey_box"
+    assert e.value.best.training["termination"] == "interrupted"
+    assert e.value.best.validate(_plant(3000, 41)).simulation.rmse < 1.2 * 2.0
+
+
+def test_it_is_trained_further_alone_and_with_its_network() -> None:
+    for hidden in (None, 2):
+        early = sewfast.identify(
+            _plant(1500, 5, 6e-5), model="grey_box", hidden=hidden, iterations=2, select=False
+        )
+        data = _plant(4000, 6, 6e-5)
+        further = sewfast.identify(data, model=early)
+        assert further.orders == early.orders
+        assert further.training["trained_further"]
+        rmse = [m.validate(data).simulation.rmse for m in (early, further)]
+        assert rmse[1] < rmse[0]

@@ -18,6 +18,8 @@ from ..dataset import Dataset
 from ..dataset.experiment import mean_square, weights_of
 from ..errors import FitError, Interrupted
 from ..models import Ensemble, LinearOE, Model, NeuralOE, NeuralSS
+from ..models.grey_box import GreyBox
+from . import grey_box
 from .effort import Look, Pool, Stopped
 from .finals import (
     ALONE,
@@ -31,7 +33,7 @@ from .finals import (
 )
 from .folds import LEAST_HELD_OUT, SHARE, compared, errors_of, folds, free_runs
 from .linear import linear_model
-from .orders import LEAST_GAIN, LinearCandidate, LinearTable
+from .orders import HELD_OUT, LEAST_GAIN, LinearCandidate, LinearTable
 from .search import CLIMB_ITERATIONS, Search
 from .short import short
 from .task import Provenance, Task, arrays, documented, finite, with_provenance, wrap
@@ -104,12 +106,13 @@ class Choice(Finals):
                 others = [c for c in finished if c.is_sound and c not in chosen]
                 return self._network(chosen, others)
             asked = [c for c in asked if c.structure not in {f.structure for f in finalists}]
-            if self.clock.over(SHARE_OF_FINAL):
+            # where the best do not beat a motor the next ones do not
+            if not self._beats_motor(finished[0]) or self.clock.over(SHARE_OF_FINAL):
                 break
         if self.wants_network:
             return self._network(self._any_network(), [])
         self.is_linear = True
-        return self._linear()
+        return self._motor() if self._is_motor() else self._linear()
 
     # --- the choice -----------------------------------------------------------------------------
 
@@ -119,6 +122,7 @@ class Choice(Finals):
         linear = self.linear
         if linear is not None and not self.wants_network:
             able = [c for c in able if c.error < WORTH_LOOKING * linear.rmse]
+        able = [c for c in able if self._beats_motor(c)]
         plain = [c for c in able if not c.structure.integrator]
         integrates = bool(able) and able[0].structure.integrator
         if integrates and plain and able[0].error > WORTH_AN_INTEGRATOR * plain[0].error:
@@ -135,6 +139,11 @@ class Choice(Finals):
                 best = c
                 break
         return [best, *self._joining(best, able)]
+
+    def _beats_motor(self, c: Candidate) -> bool:
+        """Whether it is by far better than a motor's equations, where these are a candidate."""
+        motor = self.search.motor
+        return motor is None or c.error < WORTH_IT * motor.rmse
 
     def _joining(self, best: Candidate, able: Sequence[Candidate]) -> list[Candidate]:
         """Others whose runs bring the median's error down, on little data all about as good.
@@ -272,6 +281,50 @@ class Choice(Finals):
         extra: Provenance = {"initial_state": "estimated", "choice": choice}
         return [documented(wrap(LinearOE, core, self.task.data), self.task, self.began, extra)]
 
+    def _is_motor(self) -> bool:
+        """Whether a motor's equations beat linear models, on the newest part and the one before."""
+        motor, linear, search = self.search.motor, self.linear, self.search
+        if motor is None or linear is None:
+            return motor is not None
+        if motor.rmse >= WORTH_IT * linear.rmse:
+            return False
+        if len(motor.errors) > 1:
+            earlier = LinearTable(self.task, [search.folds[1]], search.pool)
+            orders = sorted({search.linear.choice.order, linear.order})
+            earlier.add([(o, linear.nk) for o in orders], self.clock.until(SHARE_OF_FINAL))
+            if earlier.candidates and motor.errors[1].rmse >= WORTH_IT * earlier.best.rmse:
+                return False
+        self.reasons.append(
+            "the equations of a motor: their free-run error on data not trained on is "
+            f"{100 * motor.rmse / max(linear.rmse, 1e-300):.1f} % of the best linear model's"
+        )
+        return True
+
+    def _motor(self) -> Model:
+        """The motor's equations on all data."""
+        task, found = self.task, self.search.motor
+        assert found is not None
+        until = self.clock.until(SHARE_OF_REFIT)
+        jobs = [] if self.split.is_given or self.is_interrupted else [found]
+        part = self.split.shortened(len(task.data), HELD_OUT)
+        fits = self.search.pool.map(
+            lambda c, look: grey_box.completed(task, c, part, look), jobs, until=until, share=1.0
+        )
+        core = next((c for c in fits if c is not None), found.core)
+        ranked = sorted((c for c in self.search.eligible if c.is_sound), key=lambda c: c.error)
+        provenance: Provenance = {
+            "initial_state": "estimated",
+            "cost_horizon": "free run",
+            "cost_unit": "output unit squared",
+            "termination": "time budget" if self.clock.truncated else "chosen by free run",
+            "choice": self._choice("grey_box", found.rmse),
+        }
+        model = wrap(GreyBox, core, task.data)
+        provenance["cost"] = cost_of(model, task.data)
+        others = [self._alternative(c) for c in ranked[:1]]
+        model = documented(model, task, self.began, provenance)
+        return self._closed(model, found.rmse, [*others, *self._linear_alternative()])
+
     def _linear(self) -> Model:
         """Output error on all data, of the simplest order that is about as good as the best."""
         task, table = self.task, self.search.linear
@@ -363,14 +416,19 @@ class Choice(Finals):
 
     def best_so_far(self, stopped: BaseException) -> Model:
         """What there is when Ctrl-C comes: the best candidate, else the linear model."""
-        best, linear = self.search.best, self.linear
+        best, linear, motor = self.search.best, self.linear, self.search.motor
         bound = math.inf if linear is None else linear.rmse
+        if motor is not None and motor.rmse < WORTH_IT * bound:
+            bound = motor.rmse
         is_better = best is not None and (self.wants_network or best.error < WORTH_IT * bound)
         if best is not None and is_better and not self.is_linear:
             self.reasons = ["interrupted: the best candidate so far"]
             self.is_interrupted = True
             model = self._network([best], [])
             return with_provenance(model, {"termination": "interrupted"})
+        if motor is not None and bound == motor.rmse:
+            self.reasons, self.is_interrupted = ["interrupted: the equations of a motor"], True
+            return with_provenance(self._motor(), {"termination": "interrupted"})
         if self.wants_network or linear is None or linear.models[0] is None:
             # a kind that was asked for by name is not replaced by another
             raise KeyboardInterrupt from stopped

@@ -93,8 +93,9 @@ def identify(
         motor from its command to its speed, with a network of `hidden` units beside them; None:
         with 4 where these are credibly better on held-out data. `neural_oe`: the
         lagged network, trained in free run from the linear output-error model. `neural_ss`: the
-        state-space network. `auto`: one of `oe`, `neural_ss` and `neural_oe`, by the free-run error
-        on held-out data; on little data the median of several networks, an `Ensemble`. A kind
+        state-space network. `auto`: one of `oe`, `neural_ss` and `neural_oe`, and of speeds
+        `grey_box`, by the free-run error on held-out data; on little data the median of several
+        networks, an `Ensemble`. A kind
         requested by name is always returned. A model is trained further on these data, in its own
         structure.
     preset : "paper" or None

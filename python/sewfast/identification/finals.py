@@ -20,7 +20,7 @@ from .trials import (
 )
 
 WORTH_IT = 0.9
-"""A network must bring the error below this part of the best linear model's."""
+"""A network must bring the error below this part of the best linear model's, and of a motor's."""
 WORTH_LOOKING = 0.97
 """Where the median of the starts does not even reach this, nothing is asked."""
 VERIFIED = 4
@@ -101,9 +101,18 @@ class Finals:
             f"free-run error of the best network on data not trained on: {100 * ratio:.1f} % of "
             "the best linear model's"
         )
-        if ratio >= WORTH_LOOKING:
+        if ratio >= WORTH_LOOKING or self._is_behind_motor(ranked[0]):
             return []
         return ranked if ratio <= BY_FAR else self._verified(ranked, linear)
+
+    def _is_behind_motor(self, best: Candidate) -> bool:
+        motor = self.search.motor
+        if motor is None or best.error < motor.rmse:
+            return False
+        self.reasons.append(
+            f"{best.error / max(motor.rmse, 1e-300):.2g} times that of the motor's equations"
+        )
+        return True
 
     def _why_no_network(self, found: Sequence[Candidate]) -> str:
         if found:

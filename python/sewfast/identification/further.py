@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 from typing import Any
@@ -12,6 +13,7 @@ from ..errors import FitError, Interrupted, SettingError
 from ..models import ARX, IV, Ensemble, LinearOE, Model, NeuralOE, NeuralSS
 from ..models.base import StructuredModel
 from ..models.grey_box import GreyBox
+from .grey_box import trained_from
 from .linear import arx, iv, linear_model
 from .task import Task, arrays, documented, fit_provenance, with_provenance, wrap
 
@@ -92,6 +94,8 @@ def _single(task: Task, model: Model) -> Model:
         return arx(own) if isinstance(model, ARX) else iv(own)
     if isinstance(model, LinearOE):
         return _linear(task, model, began)
+    if isinstance(model, GreyBox):
+        return _grey(task, model, began)
     try:
         if isinstance(model, NeuralSS):
             return _state_space(task, model, began)
@@ -106,7 +110,7 @@ def _single(task: Task, model: Model) -> Model:
 
 def _require_trainable(model: Model) -> None:
     """A fit that can begin at this model."""
-    if isinstance(model, (StructuredModel, GreyBox)):
+    if isinstance(model, StructuredModel):
         raise SettingError(
             name="model", expected="a model that can be trained further",
             received=f"the {model.title} model, whose fit begins anew",
@@ -136,6 +140,18 @@ def _linear(task: Task, model: LinearOE, began: float) -> Model:
     if fit.termination == "interrupted":
         raise Interrupted(found)
     return found
+
+
+def _grey(task: Task, model: GreyBox, began: float) -> Model:
+    iterations = task.iterations_or_usual
+
+    def look(*_: object) -> None:
+        if task.progress is not None:
+            task.progress(0, iterations, math.inf)
+
+    core = trained_from(model.core, model.core.theta, task.data, iterations, look)
+    found = wrap(GreyBox, core, task.data)
+    return documented(found, task, began, {"initial_state": "estimated", "trained_further": True})
 
 
 def _state_space(task: Task, model: NeuralSS, began: float) -> Model:

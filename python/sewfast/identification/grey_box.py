@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,8 @@ from ..models import Model
 from ..models.grey_box import MOST_UNITS, GreyBox
 from ..motorfit import PLACE, estimated, rad_per_second, records_of
 from ..motorfit.marquardt import Normal, minimised
-from .folds import Split, compared, errors_of, folds, free_runs
+from .effort import Look, Pool
+from .folds import Errors, Split, compared, errors_of, folds, free_runs, thinned
 from .task import Provenance, Task, documented, finite, wrap
 
 TERMS = ("lag", "delay", "coulomb", "offset", "drop", "stribeck", "limit")
@@ -26,6 +28,12 @@ HIDDEN = 4
 """Units of the network that is tried."""
 STARTS = 2
 """Of the network, which begins at random weights; the better one is taken."""
+EXCERPT, POLISHING = 8_000, 10
+"""Samples to which the starts are trained, and iterations of the better one on all of them."""
+SEARCHED, MOST_FITTED = 10_000, 100_000
+"""Samples that a motor is fitted to in a search of structures, and at its end."""
+PER_SAMPLE = 2e-4
+"""Seconds that the fits of a motor take on one processor, that to all data at the end included."""
 ENOUGH = 1.0
 """Squared distance in standard errors at which the descent ends."""
 ARGUMENTS, OUTPUTS = 3.0, 0.1
@@ -46,7 +54,7 @@ def grey_box(task: Task) -> Model:
     began = time.perf_counter()
     require_motor(task.data)
     hidden, tried = _hidden(task)
-    core = fitted(task.data, hidden, task.seed, task.iterations_or_usual)
+    core = fitted(task, task.data, hidden)
     known: Provenance = {
         "initial_state": "estimated",
         "cost": _cost(core, task.data),
@@ -83,13 +91,10 @@ def require_motor(data: Dataset) -> None:
         ) from None  # fmt: skip
 
 
-def fitted(data: Dataset, hidden: int, seed: int, iterations: int) -> _core.GreyBox:
+def fitted(task: Task, data: Dataset, hidden: int, look: Look | None = None) -> _core.GreyBox:
     """The motor's parameters, a network of so many units beside it, and the noise of its states."""
-    core = _motor(data)
-    if hidden:
-        starts = (_with_network(core, data, hidden, seed + i, iterations) for i in range(STARTS))
-        core = min(starts, key=lambda c: _cost(c, data))
-    return _with_noise(core, data)
+    core = _motor(data, look)
+    return _with_noise(_with_network(core, task, data, hidden, look) if hidden else core, data)
 
 
 def _hidden(task: Task) -> tuple[int, list[Provenance]]:
@@ -104,22 +109,111 @@ def _hidden(task: Task) -> tuple[int, list[Provenance]]:
     parts = folds(task.data, task.validation)[:1] if task.select else ()
     if not parts:
         return 0, []
-    held: Split = parts[0]
-    tried, errors = [], []
-    for hidden in (0, HIDDEN):
-        core = fitted(held.fitted, hidden, task.seed, task.iterations_or_usual)
-        errors.append(errors_of(free_runs(core, held), held))
-        tried.append({"hidden": hidden, "held_out_rmse": finite(errors[-1].rmse)})
-    ratio, deviation = compared(errors[1], errors[0])
-    return (HIDDEN if ratio < min(-CREDIBLE * deviation, WORTH_IT) else 0), tried
+    alone = _judged(_motor(parts[0].fitted), parts[0])
+    more = _beside(alone, task, parts[0])
+    tried = [{"hidden": c.hidden, "held_out_rmse": finite(c.rmse)} for c in (alone, more)]
+    return (more if _is_better(more, alone) else alone).hidden, tried
+
+
+# --- In a search of structures --------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MotorCandidate:
+    """The motor's equations, with a network or without, and their errors on what is held out.
+
+    `errors` are those on every part that was asked, the newest first.
+    """
+
+    hidden: int
+    core: _core.GreyBox
+    errors: tuple[Errors, ...]
+
+    @property
+    def rmse(self) -> float:
+        """On the newest part."""
+        return self.errors[0].rmse
+
+    def row(self) -> Provenance:
+        """For the table."""
+        return {"kind": "grey_box", "hidden": self.hidden, "free_run_rmse": finite(self.rmse)}
+
+
+def candidate(
+    task: Task, parts: Sequence[Split], pool: Pool, until: float | None
+) -> MotorCandidate | None:
+    """A motor fitted on each of the parts; None where the data are none of a motor.
+
+    Without a network first: where time is short, that is what there is.
+    """
+    try:
+        require_motor(task.data)
+    except (DataError, SettingError):
+        return None
+
+    def alone(part: Split, look: Look) -> MotorCandidate | None:
+        return _or_none(lambda: _judged(_motor(part.fitted, look), part))
+
+    def more(job: tuple[Split, MotorCandidate | None], look: Look) -> MotorCandidate | None:
+        part, motor = job
+        return motor and _or_none(lambda: _beside(motor, task, part, look))
+
+    plain = pool.map(alone, parts, until=until)
+    if plain[0] is None:
+        return None
+    fuller = pool.map(more, list(zip(parts, plain, strict=True)), until=until)
+    first = fuller[0]
+    best = fuller if first is not None and _is_better(first, plain[0]) else plain
+    return _together([c for c in best if c is not None])
+
+
+def _or_none(found: Callable[[], MotorCandidate]) -> MotorCandidate | None:
+    """None where the data are none of a motor after all."""
+    try:
+        return found()
+    except (DataError, FitError, SettingError, np.linalg.LinAlgError):
+        return None
+
+
+def _together(found: Sequence[MotorCandidate]) -> MotorCandidate:
+    """The newest part's, with the errors on all parts."""
+    return replace(found[0], errors=tuple(e for c in found for e in c.errors))
+
+
+def completed(task: Task, found: MotorCandidate, part: Split, look: Look) -> _core.GreyBox:
+    """The candidate fitted to all data, unless that does worse on the part it was chosen by."""
+    try:
+        core = fitted(task, thinned(task.data, MOST_FITTED), found.hidden, look)
+    except (DataError, FitError, SettingError, np.linalg.LinAlgError):
+        return found.core
+    ratio, deviation = compared(errors_of(free_runs(core, part), part), found.errors[0])
+    return found.core if ratio > deviation else core
+
+
+def _judged(core: _core.GreyBox, part: Split) -> MotorCandidate:
+    core = _with_noise(core, part.fitted)
+    return MotorCandidate(core.settings["hidden"], core, (errors_of(free_runs(core, part), part),))
+
+
+def _beside(
+    motor: MotorCandidate, task: Task, part: Split, look: Look | None = None
+) -> MotorCandidate:
+    """The same motor with a network."""
+    return _judged(_with_network(motor.core, task, part.fitted, HIDDEN, look), part)
+
+
+def _is_better(more: MotorCandidate, alone: MotorCandidate) -> bool:
+    """Whether a network makes the motor credibly better."""
+    ratio, deviation = compared(more.errors[0], alone.errors[0])
+    return ratio < min(-CREDIBLE * deviation, WORTH_IT)
 
 
 # --- The motor ------------------------------------------------------------------------------------
 
 
-def _motor(data: Dataset) -> _core.GreyBox:
+def _motor(data: Dataset, look: Look | None = None) -> _core.GreyBox:
     """The equations alone, at the least squares of the free run."""
-    found = estimated(records_of(data, None, None), TERMS)
+    found = estimated(records_of(data, None, None), TERMS, _at_any_time(look))
     state, records = found.state, found.records
     free = [n for n in state.names() if n not in ("k_b", "delay")]
     y, model = found.task.outcome(state)
@@ -151,21 +245,43 @@ _DERIVED = ("nx", "nk", "n_inputs", "integrator", "hidden")
 # --- The network beside it ------------------------------------------------------------------------
 
 
+def _at_any_time(look: Look | None) -> Callable[[], None]:
+    """`look` without what it shows of a fit's progress."""
+    return (lambda: None) if look is None else lambda: look(0, 0, math.inf)
+
+
 def _with_network(
-    core: _core.GreyBox, data: Dataset, hidden: int, seed: int, iterations: int
+    core: _core.GreyBox, task: Task, data: Dataset, hidden: int, look: Look | None = None
 ) -> _core.GreyBox:
     """Motor and network together at the least squares of the free run.
 
-    The network begins without an effect; its weights are held near 0 as if each had been measured
-    once, with a standard deviation beforehand.
+    The network begins without an effect. Its starts are trained to an excerpt, the better one to
+    all data.
     """
-    rng, motor = np.random.default_rng(seed), core.theta
-    weights = rng.standard_normal((hidden, 4)) * [0.5, 1.5, 1.5, 0.0]
-    start = np.concatenate([motor, weights.ravel()])
+    part = thinned(data, EXCERPT)
+    begun = []
+    for i in range(STARTS):
+        rng = np.random.default_rng(task.seed + i)
+        weights = rng.standard_normal((hidden, 4)) * [0.5, 1.5, 1.5, 0.0]
+        start = np.concatenate([core.theta, weights.ravel()])
+        begun.append(trained_from(core, start, part, task.iterations_or_usual, look))
+    best = min(begun, key=lambda c: _cost(c, part))
+    if part is data:
+        return best
+    return trained_from(best, best.theta, data, min(POLISHING, task.iterations_or_usual), look)
+
+
+def trained_from(
+    core: _core.GreyBox, start: FloatArray, data: Dataset, iterations: int, look: Look | None = None
+) -> _core.GreyBox:
+    """From parameters of the motor, and weights after them, to the least squares of the free run.
+
+    Weights are held near 0 as if each had been measured once, with a standard deviation beforehand.
+    """
+    asked, free = _at_any_time(look), len(core.settings["free"])
+    motor, hidden = start[:free], (len(start) - free) // 4
     prior = np.tile([1.0 / ARGUMENTS] * 3 + [1.0 / OUTPUTS], hidden)
-    prior = np.concatenate([np.zeros(len(motor)), prior]) * math.sqrt(
-        core.settings["residual_variance"]
-    )
+    prior = np.concatenate([np.zeros(free), prior]) * math.sqrt(core.settings["residual_variance"])
     states = [state for _, _, _, state in _runs(core, data)]
     low = np.full(len(start), -np.inf)
     for j, value in enumerate(motor):  # what is above nothing stays there
@@ -178,6 +294,7 @@ def _with_network(
             return None
 
     def normal(x: FloatArray) -> Normal:
+        asked()
         own = at(x)
         assert own is not None
         cost, slope, gram = float((prior * x) @ (prior * x)), prior**2 * x, np.diag(prior**2)
@@ -191,6 +308,7 @@ def _with_network(
         return cost, slope, gram
 
     def cost(x: FloatArray) -> float:
+        asked()
         own = at(x)
         if own is None:
             return math.inf

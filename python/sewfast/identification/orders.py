@@ -28,6 +28,7 @@ LATE_ORDERS = (1, 2, 3)
 SAMPLES_OF_DELAY = 2_000
 """Of that estimate."""
 SAMPLES = 6_000
+HELD_OUT = 10 * SAMPLES
 """Of a fit that only decides: blocks from all over the record."""
 ITERATIONS = 60
 WORTH_AN_ORDER = 0.98
@@ -84,7 +85,7 @@ class LinearTable:
     candidates: dict[tuple[int, int], LinearCandidate] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._excerpts = [f.shortened(SAMPLES, 10 * SAMPLES) for f in self.folds]
+        self._excerpts = [f.shortened(SAMPLES, HELD_OUT) for f in self.folds]
 
     @property
     def nk(self) -> int:

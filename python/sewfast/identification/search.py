@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -11,12 +12,20 @@ import numpy as np
 
 from .. import _core
 from ..dataset import Diagnosis, diagnose
+from . import grey_box
 from .folds import compared
-from .orders import MISLED, slowest_pole
+from .orders import HELD_OUT, MISLED, slowest_pole
 from .outputs import ABS, LINEAR, Output, named, rms_error, suggested
 from .task import arrays
 from .training import Request, Structure
-from .trials import SHARE_OF_LINEAR, WORTH_A_FEEDTHROUGH, Candidate, Trials, best_of_each_size
+from .trials import (
+    SHARE_OF_LINEAR,
+    SHARE_OF_MOTOR,
+    WORTH_A_FEEDTHROUGH,
+    Candidate,
+    Trials,
+    best_of_each_size,
+)
 
 MOST_NX, MOST_HIDDEN, MOST_HIDDEN_SMALL = 8, 32, 16
 LEAST_DECAY, MOST_DECAY = 1e-10, 1e-1
@@ -63,11 +72,25 @@ class Search(Trials):
         self.linear.search(self.pool.clock.until(SHARE_OF_LINEAR))
         if self.is_exact:
             return
+        self.motor = self._as_motor()
         alive = self.screen()
         for iterations in HALVING_ITERATIONS:
             alive = self.halve(alive, iterations)
         if not self.is_hopeless:
             self.climb()
+
+    def _as_motor(self) -> grey_box.MotorCandidate | None:
+        """The equations of a motor, on the two latest parts, where nothing else was asked for."""
+        task = self.task
+        if self.wants_network or {task.nk, task.nx, task.hidden, task.output} != {None}:
+            return None
+        # what linear models are judged on, so that both can be compared block by block
+        parts = [f.shortened(grey_box.SEARCHED, HELD_OUT) for f in self.folds[:2]]
+        until = self.pool.clock.until(SHARE_OF_MOTOR)
+        wanted = grey_box.PER_SAMPLE * len(parts[0].fitted)
+        if until is not None and until - time.perf_counter() < wanted:
+            return None  # begun and not ended it would take the networks' time for nothing
+        return grey_box.candidate(task, parts, self.pool, until)
 
     @property
     def is_exact(self) -> bool:
@@ -82,10 +105,14 @@ class Search(Trials):
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether no network is visibly better than linear by now: growing them would not help."""
+        """Whether no network is visibly better than linear, or than a motor's equations, by now.
+
+        Growing them would not help.
+        """
         if self.wants_network or not self.linear.eligible or self.best is None:
             return False
-        return self.best.error >= HOPELESS * self.linear.best.rmse
+        motor = math.inf if self.motor is None else self.motor.rmse
+        return self.best.error >= min(HOPELESS * self.linear.best.rmse, motor)
 
     def screen(self) -> list[Candidate]:
         """A short training of every likely structure; the best first."""

@@ -17,6 +17,7 @@ from ..errors import FitError
 from ..models.base import EnsembleCore
 from .effort import Look, Pool
 from .folds import RUNAWAY, Errors, Split, errors_of, free_runs
+from .grey_box import MotorCandidate
 from .orders import LinearTable
 from .outputs import ABS, LINEAR, Output, rectified_start
 from .task import Provenance, Task, arrays, finite
@@ -40,8 +41,9 @@ WORTH_A_FEEDTHROUGH, STILL_WORTH_A_FEEDTHROUGH = 0.5, 0.9
 """nk = 0 is no plant for a loop, and a smoothed speed leans ahead a little: it must be worth it, at
 equal size, and beside the best with a delay, whose further states may have made up for it."""
 SHARE_OF_GUARD = 0.95
-SHARE_OF_LINEAR, SHARE_OF_SEARCH, SHARE_OF_SEARCH_VERIFIED = 0.12, 0.58, 0.45
-"""Parts of a time budget after which no linear model, and no network, is tried any more."""
+SHARE_OF_LINEAR, SHARE_OF_MOTOR = 0.12, 0.4
+SHARE_OF_SEARCH, SHARE_OF_SEARCH_VERIFIED = 0.58, 0.45
+"""Parts of a time budget after which no linear model, no motor and no network is tried any more."""
 SHARE_OF_LINEAR_STARTS = 0.1
 """Part of it that fitting the linear models takes which the next networks begin at; where it ends
 before, they begin at smaller ones."""
@@ -138,6 +140,8 @@ class Trials:
         self.share = 0.0
         # whether the screening has found that the output depends on the input of the same sample
         self.feeds_through = False
+        # the equations of a motor, where the data are those of one
+        self.motor: MotorCandidate | None = None
         self._starts: dict[tuple[int, int, str, int], _core.LinearModel | None] = {}
         self._guarded = arrays(self.task.data)
 
@@ -248,6 +252,7 @@ class Trials:
     def rows(self) -> Iterator[Provenance]:
         """The table: linear models, then networks in the order of their trials."""
         yield from self.linear.rows()
+        yield from () if self.motor is None else (self.motor.row(),)
         yield from (c.to_json() for c in self.candidates.values())
 
     # --- training -------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ def started(task: Task, terms: tuple[str, ...]) -> State:
                 for name, value in values.items():
                     theta[PLACE[name]] = value
                 state = State(theta, None, first)
-                of_this = _Speeds(task.records, task.steps).cost(state)
+                of_this = _Speeds(task).cost(state)
                 if of_this < cost:
                     best, cost = state, of_this
     y = np.concatenate([p.y for p in task.records.pieces])
@@ -51,7 +51,7 @@ def started(task: Task, terms: tuple[str, ...]) -> State:
             "expected a speed that follows the command as a motor's does, none of the starts is "
             "one; is the output a speed, and the input what drives the motor?"
         )
-    alone = _Speeds(task.records, task.steps)
+    alone = _Speeds(task)
     task.k_v = alone.k_v = max(float(best.theta[0]), 1e-12)
     best = fitted(alone, best)
     alone.settle_steps(best)
@@ -84,9 +84,9 @@ def started(task: Task, terms: tuple[str, ...]) -> State:
 class _Speeds(Task):
     """The speeds alone: a start needs no resistance."""
 
-    def __init__(self, records: Records, steps: int) -> None:
-        pieces = tuple(replace(p, current=None) for p in records.pieces)
-        super().__init__(replace(records, pieces=pieces), steps)
+    def __init__(self, task: Task) -> None:
+        pieces = tuple(replace(p, current=None) for p in task.records.pieces)
+        super().__init__(replace(task.records, pieces=pieces), task.steps, look=task.look)
 
 
 Smoothed: TypeAlias = tuple[FloatArray, FloatArray, NDArray[np.bool_]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -121,6 +121,8 @@ class Task:
     spikes: int = 0
     k_v: float = math.nan
     """From the start: the scale of what is expected of viscous friction."""
+    look: Callable[[], object] = lambda: None
+    """Called before every simulation; what it raises ends the fit."""
     speed_filter: FloatArray = field(default_factory=lambda: np.ones(1))
     current_filter: FloatArray = field(default_factory=lambda: np.ones(1))
 
@@ -204,6 +206,7 @@ class Task:
         return cost if math.isfinite(cost) else math.inf
 
     def _summed(self, state: State, free: Sequence[str]) -> Normal:
+        self.look()
         places, r = [PLACE[n] for n in free], self.records
         cost, gradient, matrix = 0.0, np.zeros(0), np.zeros((0, 0))
         for p in r.pieces:

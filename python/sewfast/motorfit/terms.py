@@ -8,6 +8,7 @@ free run. All terms are then fitted together, those that the record does not sho
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,8 +74,12 @@ class Estimated:
     task: Task
 
 
-def estimated(records: Records, terms: tuple[str, ...]) -> Estimated:
+def estimated(
+    records: Records, terms: tuple[str, ...], look: Callable[[], object] = lambda: None
+) -> Estimated:
     """The parameters, and which of the terms the records show.
+
+    `look` is called from time to time; what it raises ends the fit.
 
     Raises
     ------
@@ -94,7 +99,7 @@ def estimated(records: Records, terms: tuple[str, ...]) -> Estimated:
             "the speed has one sign, so that k_s holds friction and constant load together"
         )
     part = records.liveliest(STRETCH)
-    first = Task(part)
+    first = Task(part, look=look)
     state = fitted(first, started(first, terms))
     steps, first.steps = first.steps, min(first.steps, ON_THE_WAY)
     if not math.isfinite(first.cost(state)):  # so few overshoot: no record shows its inertia
@@ -106,7 +111,7 @@ def estimated(records: Records, terms: tuple[str, ...]) -> Estimated:
     state = _all_terms(first, state, terms)
     if part is records:
         records = first.records  # with the starts that were settled
-    task = Task(records, first.steps, k_v=first.k_v)
+    task = Task(records, first.steps, k_v=first.k_v, look=look)
     task.settle_starts(state)
     task.leave_out_spikes(state)
     state, shares, covariance = _shown_terms(task, state, terms, steps)

@@ -647,3 +647,6 @@ impl Plant for GreyBoxPlant {
         self.position += self.stepper.frame.sample_time * mean / self.stepper.frame.unit;
     }
 }
+
+#[cfg(test)]
+mod tests;
