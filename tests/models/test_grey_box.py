@@ -142,8 +142,6 @@ def test_what_is_no_motor_is_refused() -> None:
             sewfast.identify(data, model="grey_box", **setting)  # type: ignore[arg-type]
     with pytest.raises(SettingError, match="no form for microcontrollers"):
         _model().core.embedded()
-    with pytest.raises(SettingError, match="identify it anew"):
-        sewfast.identify(data, model=_model())
 
 
 def test_the_core_refuses_what_is_no_motor() -> None:
