@@ -37,7 +37,7 @@ def read_installed(path: Path) -> Table | None:
     ending = path.suffix.lower().removeprefix(".")
     if not ending or ending in OWN:
         return None
-    # here and not above: it brings the parsers of mail and archives, which reading CSV does not need
+    # not above: it brings parsers of mail and archives, which reading CSV does not need
     from importlib.metadata import entry_points
 
     found = tuple(entry_points(group=GROUP, name=ending))
