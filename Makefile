@@ -27,7 +27,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures publishable accuracy battery commissioning drives motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures publishable accuracy battery strangers commissioning drives motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -79,8 +79,8 @@ studio-hour: $(DEV) ## the studio through an hour of live signals: pictures a se
 studio-kills: $(DEV) ## browser killed, hung, frozen or closed, studio killed, link pulled: output off after (TRIALS=50)
 	$(BIN)/python benches/studio_kills.py --trials $(or $(TRIALS),50)
 
-fuzz-logs: $(DEV) ## damaged logs of every format, refused or read (COUNT=100000; ONLY="mf4 tdms"; hours)
-	$(BIN)/python tests/support/fuzzed_logs.py --count $(or $(COUNT),100000) $(if $(ONLY),--only $(ONLY))
+fuzz-logs: $(DEV) ## damaged logs of every format, refused or read (COUNT=100000; SECONDS= for each; ONLY="mf4 tdms"; hours)
+	$(BIN)/python tests/support/fuzzed_logs.py --count $(or $(COUNT),100000) $(if $(SECONDS),--seconds $(SECONDS)) $(if $(ONLY),--only $(ONLY))
 
 bits: $(DEV) ## deployed code against the core over ten million samples of every kind (an hour)
 	$(BIN)/python tests/support/deployed.py
@@ -196,6 +196,9 @@ battery: $(VENV)/bench.stamp ## identify on simulated systems of known truth (SP
 	$(BIN)/python benches/battery.py --cache target/battery.json $(if $(SPLIT),--split $(SPLIT)) \
 	  $(if $(FAMILIES),--families $(FAMILIES)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(RUNS),--runs $(RUNS)) \
 	  $(if $(QUICK),--quick) $(if $(JSON),--json $(JSON))
+
+strangers: $(DEV) ## twelve files as strangers have them, to a controller with three commands (SEEDS="0 1", ONLY=counts,iso)
+	$(BIN)/python benches/strangers.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(ONLY),--only $(ONLY))
 
 commissioning: $(DEV) ## figures of commissioning on five virtual machines, beside an oracle (docs/RESULTS.md)
 	$(BIN)/python benches/commissioning.py
