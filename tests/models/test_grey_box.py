@@ -250,3 +250,11 @@ def test_it_is_trained_further_alone_and_with_its_network() -> None:
         assert further.training["trained_further"]
         rmse = [m.validate(data).simulation.rmse for m in (early, further)]
         assert rmse[1] < rmse[0]
+
+
+@pytest.mark.parametrize("unit", ["min^-1", "U/min", "min⁻¹", "1/min", "tr/min", "r/min", "Rpm"])
+def test_speeds_are_known_by_their_spellings(unit: str) -> None:
+    data = _plant(1500, 2)
+    other = Dataset.from_arrays(data.experiments[0].u, data.experiments[0].y, TS, output_unit=unit)
+    models: Any = [sewfast.identify(d, model="grey_box", select=False) for d in (data, other)]
+    np.testing.assert_array_equal(models[0].theta, models[1].theta)

@@ -18,6 +18,9 @@ SHORTEST = 50
 """Samples of a piece between gaps; a shorter one says less than its unknown start costs."""
 LEAST = 200
 """Samples of all pieces."""
+_SPELLINGS = {"rps": "rev/s", "1/s": "rev/s", "°/s": "deg/s"} | dict.fromkeys(
+    ("r/min", "rev/min", "1/min", "min-1", "min^-1", "min⁻¹", "u/min", "upm", "tr/min"), "rpm"
+)
 SPIKE = 8.0
 """Standard deviations from the median of its neighbours, from which a sample is a spike."""
 
@@ -87,9 +90,8 @@ class Records:
 def rad_per_second(unit: str) -> float:
     """How many rad/s one of a unit of speed is."""
     known: Mapping[str, float] = REVOLUTIONS_PER_SECOND
-    key = {"rps": "rev/s", "1/s": "rev/s", "r/min": "rpm", "1/min": "rpm"}.get(
-        unit.strip().lower(), unit.strip().lower()
-    )
+    key = unit.strip().lower()
+    key = _SPELLINGS.get(key, key)
     if key not in known:
         raise SettingError(
             f"expected a speed in {', '.join(known)}, received the unit {unit!r}; say which it is: "

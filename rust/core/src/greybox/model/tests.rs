@@ -1,5 +1,4 @@
 use super::*;
-use crate::Monitor;
 use crate::random::Random;
 
 fn frame(delay: f64) -> Frame {
@@ -35,25 +34,6 @@ fn commands(n: usize) -> Vec<f64> {
     let mut random = Random::new(3);
     let levels: Vec<f64> = (0..n / 31 + 1).map(|_| random.between(-8.0, 8.0)).collect();
     (0..n).map(|k| levels[k / 31]).collect()
-}
-
-#[test]
-fn without_a_network_it_is_the_motor_that_physics_fits() {
-    let (model, u) = (made(0, 0.0005), commands(500));
-    let mut run = model.run();
-    run.speed = 30.0;
-    let drive = u[0] - 0.02 * 30.0;
-    let known = super::super::run(run, &u, &Monitor::default()).unwrap();
-    let own = model
-        .simulate(&u, 1, &[30.0 / 150.0, drive / 3.0, u[0] / 3.0])
-        .unwrap();
-    for k in 1..500 {
-        let before = known.speed[k] / model.frame.unit;
-        assert!(
-            (own[k - 1] - before).abs() < 1e-9 * (1.0 + before.abs()),
-            "{k}"
-        );
-    }
 }
 
 /// Against differences, until a sample passes a kink between them.
@@ -150,26 +130,6 @@ fn small_signals_are_the_derivatives_of_a_step() {
             "{i}"
         );
     }
-}
-
-#[test]
-fn measured_outputs_bring_the_state_in_and_gaps_do_not_harm() {
-    let (model, u) = (made(2, 0.0), commands(600));
-    let mut y = model.simulate(&u, 1, &[0.6, 0.1, u[0] / 3.0]).unwrap();
-    let truth = y.clone();
-    y[200..260].fill(f64::NAN);
-    let state = model.estimate_state(&u[..40], 1, &y[..40]).unwrap();
-    assert!((state[0] - 0.6).abs() < 1e-3, "{state:?}");
-    for horizon in [1, 5] {
-        let ahead = model.predict(&u, 1, &y, &[0.0; 3], horizon).unwrap();
-        assert_eq!(ahead.len(), 600);
-        let late = (100..600)
-            .map(|k| (ahead[k] - truth[k]).abs())
-            .fold(0.0, f64::max);
-        assert!(late < 1.0, "{horizon}: {late}");
-    }
-    let whole = model.predict(&u, 1, &y, &state, 1000).unwrap();
-    assert_eq!(whole, model.simulate(&u, 1, &state).unwrap());
 }
 
 #[test]
