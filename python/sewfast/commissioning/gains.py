@@ -25,6 +25,7 @@ from ..models import Ensemble, Model
 from ..rules import Fopdt, Rule, eq_12, simc
 from ..tuning.objective import Constraints, Cost, LoadStep
 from ..tuning.search import TuningResult, costs, recoveries, tune
+from .bench import Aborted
 from .demands import Demands, Refusal
 from .excitations import pace_of
 from .slow import Thinning
@@ -503,8 +504,13 @@ def cautious(
         expected = 0.0
         if models is not None:
             expected = _chatter(tried, models, r, settled, thinning or Thinning())
-        found = bench.follow(tried, r, f"{name}_{100 * share:g}")
-        swing = swing_of(found, settled, share, expected)
+        try:
+            found = bench.follow(tried, r, f"{name}_{100 * share:g}")
+            swing = swing_of(found, settled, share, expected)
+        except Aborted as stop:
+            if stop.frequency is None:
+                raise
+            swing = Swing(share, stop.frequency, float(stop.recording.u.std()), 1.0)
         if swing is None:
             continue
         kept = BACK * share
