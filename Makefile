@@ -27,7 +27,7 @@ DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures publishable accuracy battery commissioning drives motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help demo pictures publishable accuracy battery strangers commissioning drives motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -196,6 +196,9 @@ battery: $(VENV)/bench.stamp ## identify on simulated systems of known truth (SP
 	$(BIN)/python benches/battery.py --cache target/battery.json $(if $(SPLIT),--split $(SPLIT)) \
 	  $(if $(FAMILIES),--families $(FAMILIES)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(RUNS),--runs $(RUNS)) \
 	  $(if $(QUICK),--quick) $(if $(JSON),--json $(JSON))
+
+strangers: $(DEV) ## twelve files as strangers have them, to a controller with three commands (SEEDS="0 1", ONLY=counts,iso)
+	$(BIN)/python benches/strangers.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(ONLY),--only $(ONLY))
 
 commissioning: $(DEV) ## figures of commissioning on five virtual machines, beside an oracle (docs/RESULTS.md)
 	$(BIN)/python benches/commissioning.py

@@ -1,7 +1,7 @@
 """Recordings a second of `fleet` on one worker and on two, and what a worker's death costs.
 
 python benches/fleet.py                       2,000 recordings of 5,000 samples
-python benches/fleet.py --recordings 200
+python benches/fleet.py --recordings 200 --killed    the last part alone, compared with this process
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import tempfile
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +37,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--recordings", type=int, default=2000)
     parser.add_argument("--samples", type=int, default=5000)
+    parser.add_argument("--killed", action="store_true", help="only with workers being killed")
     args = parser.parse_args()
     import dask
     import distributed
@@ -44,8 +46,12 @@ def main() -> None:
         folder = Path(place)
         made(folder, args.recordings, args.samples)
         rows, seconds = {}, {}
-        for workers in (1, 2):
-            options = {"threads_per_worker": 1, "dashboard_address": None, "memory_limit": "500MB"}
+        options: dict[str, Any] = {
+            "threads_per_worker": 1, "dashboard_address": None, "memory_limit": "500MB",
+        }  # fmt: skip
+        if args.killed:
+            rows[1] = [repr(row) for row in fleet(folder, workers=0).rows]
+        for workers in () if args.killed else (1, 2):
             with (
                 distributed.LocalCluster(n_workers=workers, **options) as cluster,
                 distributed.Client(cluster) as client,
@@ -63,8 +69,9 @@ def main() -> None:
                 f"{memory / 1e6:.0f} MB a worker",
                 flush=True,
             )
-        print(f"two over one: {seconds[1] / seconds[2]:.2f} x (must 1.8)")
-        print(f"same bits: {rows[1] == rows[2]}")
+        if not args.killed:
+            print(f"two over one: {seconds[1] / seconds[2]:.2f} x (must 1.8)")
+            print(f"same bits: {rows[1] == rows[2]}")
         with (
             dask.config.set({"distributed.scheduler.allowed-failures": 50}),
             distributed.LocalCluster(n_workers=2, **options) as cluster,
@@ -80,9 +87,14 @@ def main() -> None:
 
             killer = threading.Thread(target=kill, daemon=True)
             killer.start()
+            began = time.perf_counter()
             found = [repr(row) for row in fleet(folder, client=client).rows]
             ended.set()
-            print(f"{killed[0]} workers killed: rows and bits the same: {found == rows[1]}")
+            taken = time.perf_counter() - began
+            print(
+                f"{killed[0]} killed in {taken:.0f} s: {len(found)} rows of {len(rows[1])}, "
+                f"the same bits: {found == rows[1]}"
+            )
 
 
 if __name__ == "__main__":

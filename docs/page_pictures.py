@@ -250,6 +250,23 @@ def state_feedback(file: Path) -> None:
     loop_drawing(loops, "RPM", "V", (-20.0, 20.0)).plot(file=file)
 
 
+def live(file: Path) -> None:
+    """The speed of a view, from the counts of the last 20 ms, and that of the recording."""
+    machine = sewfast.VirtualMachine()
+    recording = sewfast.record(machine, sewfast.signals.excitation("step"))
+    counts, window = recording.counts, 20
+    shown = np.full(len(counts), np.nan)
+    shown[window:] = (counts[window:] - counts[:-window]) * 60e3 / (window * machine.counts_per_rev)
+    t = 0.001 * np.arange(len(counts))
+    part = slice(490, 700)
+    with axes(file) as ax:
+        ax.step(t[part], shown[part], where="post", color=MUTED, label="while you watch")
+        ax.plot(t[part], recording.y[part], color=FIRST, label="in the recording")
+        ax.set_xlabel("time [s]")
+        ax.set_ylabel("speed [RPM]")
+        ax.legend(frameon=False, loc="lower right")
+
+
 PICTURES: dict[str, Callable[[Path], None]] = {
     "fleet": fleet,
     "recordings": recordings,
@@ -258,6 +275,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "accuracy": accuracy,
     "speed": speed,
     "state-feedback": state_feedback,
+    "live": live,
 }
 
 

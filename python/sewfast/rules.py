@@ -46,7 +46,7 @@ class Fopdt:
         Whether the machine was not at rest before the step: its free response was fitted as well.
     overshoot_percent : float
         How far the response goes beyond where it settles, in percent of its rise; 0 where that does
-        not stand out of the noise. Such a response is of no first order.
+        not stand out from the noise. Such a response is of no first order.
 
     Raises
     ------

@@ -17,7 +17,7 @@ from cli import refused, sewfast
 from sewfast.cli.project import NAME, find, load
 from sewfast.errors import SettingError
 from sewfast.readers import read_table, roles
-from sewfast.readers.containers import unit_in_name
+from sewfast.readers.containers import split_unit, unit_in_name
 
 LIMITS = "volt = 8\nspeed = 3500\nacceleration = 40000\ncurrent = 15\n"
 
@@ -107,6 +107,12 @@ def table(tmp_path: Path, *names: str) -> api.readers.Table:
         (("voltage_ref", "rpm"), ("voltage_ref", "rpm")),
         (("u1", "y1", "noise"), ("u1", "y1")),
         (("speed 1", "speed 2", "u"), None),
+        (("Setpoint voltage [V]", "Drum speed [rpm]"), ("Setpoint voltage", "Drum speed")),
+        (("Setpoint", "voltage [V]", "speed [rpm]"), ("voltage", "speed")),
+        (("Setpoint Current [A]", "Velocity [mm/s]"), ("Setpoint Current", "Velocity")),
+        (("Ankerspannung in V", "Ist-Drehzahl in U/min"), ("Ankerspannung", "Ist-Drehzahl")),
+        (("Spannung / V", "Drehzahl / min⁻¹"), ("Spannung", "Drehzahl")),
+        (("FanCommand_pct", "wheel_speed_mps"), ("FanCommand_pct", "wheel_speed_mps")),
     ],
 )
 def test_columns_are_recognised_or_left_open(
@@ -156,10 +162,32 @@ def test_a_column_that_never_changes_is_neither(tmp_path: Path) -> None:
     [
         ("speed_rpm", "RPM"), ("u_V", "V"), ("current_A", "A"), ("w_rad_s", "rad/s"),
         ("phase_A", ""), ("rpm", ""), ("i_a", ""), ("pos_m", ""), ("speed", ""), ("", ""),
+        ("vel_m_s", "m/s"), ("omega_rad_per_s", "rad/s"), ("pwm_percent", "%"), ("ao_volts", "V"),
     ],
 )  # fmt: skip
 def test_units_in_names(name: str, unit: str) -> None:
     assert unit_in_name(name)[1] == unit
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ("n/rpm", ("n", "rpm")), ("Drehzahl / 1/min", ("Drehzahl", "1/min")),
+        ("Voltage, V", ("Voltage", "V")), ("u in mV", ("u", "mV")),
+        ("speed m/s", ("speed m/s", "")),
+        ("rad/s", ("rad/s", "")), ("in", ("in", "")), ("in / out", ("in / out", "")),
+        ("power on/off", ("power on/off", "")), ("km/h", ("km/h", "")), ("/s", ("/s", "")),
+    ],
+)  # fmt: skip
+def test_units_behind_a_name(header: str, expected: tuple[str, str]) -> None:
+    assert split_unit(header) == expected
+
+
+def test_names_may_hold_a_delimiter_that_the_numbers_do_not(tmp_path: Path) -> None:
+    rows = "".join(f"{k / 100};{k % 7};{k % 5}\n" for k in range(60))
+    (tmp_path / "x.csv").write_text("Time, s;Voltage, V;Speed, rpm\n" + rows)
+    data = api.read(tmp_path / "x.csv", inputs="Voltage", output="Speed")
+    assert (data.Ts, data.output_unit) == (pytest.approx(0.01), "rpm")
 
 
 def test_in_doubt_it_asks(tmp_path: Path) -> None:

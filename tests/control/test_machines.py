@@ -1,4 +1,4 @@
-"""One table for every `Machine`: virtual, drive, simulator, FMU, MuJoCo, a user's own."""
+"""One table for every `Machine`: virtual, drive, simulator, FMU, MuJoCo, boards, a user's own."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import boards
 import sewfast
 from foreign_fmu import OF_MOTOR, motor_fmu
 from refusals import refuses
@@ -22,7 +23,7 @@ from sewfast.commissioning import SteppedBench
 from sewfast.commissioning.bench import bench_of
 from sewfast.control.machine import MEMBERS, MachineBench, RecordedRun, machine_of
 from sewfast.errors import DataError, SettingError
-from sewfast.link import VirtualDevice, connect
+from sewfast.link import ODrive, SimpleFOC, VirtualDevice, connect
 from sewfast.recordfile import read_recording
 
 pytestmark = pytest.mark.alone
@@ -128,6 +129,21 @@ def mujoco(folder: Path) -> Iterator[Machine]:
 
 
 @contextmanager
+def odrive(folder: Path) -> Iterator[Machine]:
+    """Of another maker, with a motor that takes volts."""
+    axis = boards.EmulatedODrive(boards.Motor(100.0, 0.06, 0.1, 16384.0))
+    axis.properties["axis0.motor.config.motor_type"] = 2.0
+    line = boards.Line(axis)
+    yield ODrive(line, clock=line, volt=12.0, speed=3000.0)
+
+
+@contextmanager
+def simplefoc(folder: Path) -> Iterator[Machine]:
+    line = boards.Line(boards.simplefoc())
+    yield SimpleFOC(line, clock=line, volt=12.0, speed=3000.0, counts_per_rev=16384.0)
+
+
+@contextmanager
 def whole(folder: Path) -> Iterator[Machine]:
     """A drive as commissioning takes it."""
     with drive(folder) as found, bench_of(found, None) as bench:
@@ -135,7 +151,7 @@ def whole(folder: Path) -> Iterator[Machine]:
 
 
 TABLE: tuple[Callable[[Path], Any], ...] = (
-    virtual, drive, whole, simulator, own, fmu, mujoco,
+    virtual, drive, whole, simulator, own, fmu, mujoco, odrive, simplefoc,
 )  # fmt: skip
 
 

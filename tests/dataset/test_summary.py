@@ -82,7 +82,7 @@ def test_the_spectrum_holds_the_power() -> None:
         (
             excited(),
             np.sin(9 * T) + 5.0 * (T[777] == T),
-            "1 value of y stands out of its neighbours, at sample 777:",
+            "1 value of y stands out from its neighbours, at sample 777:",
         ),
         (excited()[:300], excited(1)[:300], "300 samples are few"),
         (excited(), np.sin(2 * np.pi * 300 * T), "close to half the sampling rate"),
@@ -160,7 +160,7 @@ def test_look_lists_columns_then_says_what_is_in_them(folder: Path) -> None:
     assert "--input COL --output COL" in listed
     text = sewfast(folder, "look", "run.csv:u:speed").out
     assert "50 in 1 gaps" in text
-    assert "1 value of speed stands out of its neighbours, at sample 700" in text
+    assert "1 value of speed stands out from its neighbours, at sample 700" in text
     assert "--mask outliers" in text
     taken = sewfast(folder, "look", "run.csv:u:speed", "--mask", "outliers")
     assert "stands out" not in taken.out

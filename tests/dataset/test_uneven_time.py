@@ -129,12 +129,53 @@ def test_nothing_is_made_up_inside_a_gap_of_an_uneven_log(tmp_path: Path) -> Non
     [
         ("time_ms", 1e-3), ("t_ms", 1e-3), ("t [ms]", 1e-3), ("time_us", 1e-6), ("Time (us)", 1e-6),
         ("timestamp", 1.0), ("timestamp_ns", 1e-9), ("seconds", 1.0), ("Time_s", 1.0),
+        ("millis", 1e-3), ("Micros", 1e-6), ("ms", 1e-3), ("t / ms", 1e-3), ("Zeit in ms", 1e-3),
+        ("Time since start [ms]", 1e-3), ("t/us", 1e-6), ("time_milliseconds", 1e-3),
     ],
 )  # fmt: skip
 def test_the_time_columns_name_says_its_unit(tmp_path: Path, header: str, factor: float) -> None:
-    data = load(made(tmp_path, 4.0 * np.arange(50), header))
-    assert data.Ts == pytest.approx(4.0 * factor)
+    data = load(made(tmp_path, 0.4 * np.arange(50), header))
+    assert data.Ts == pytest.approx(0.4 * factor)
     assert data.notes == ()
+
+
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.2])
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("Ts", [2e-5, 1e-4, 1e-3, 4e-3, 0.02, 0.2])
+def test_a_time_without_a_unit_is_not_taken_as_seconds_in_silence(
+    tmp_path: Path, Ts: float, unit: str, jitter: float
+) -> None:
+    """Sample times of drives in every unit; half a unit is the least that can be noticed."""
+    t = stamps(60, jitter, Ts)
+    path = made(tmp_path, t / UNITS[unit])
+    step = Ts / UNITS[unit]
+    if unit == "s" or step < 0.4:
+        assert not any("warning" in note for note in load(path).notes)
+        return
+    if step >= 950.0:
+        with refuses(SettingError, expected="a time with its unit", remedy=f"counts {unit}"):
+            load(path)
+    else:
+        assert any(f"if it counts {unit}" in note for note in load(path).notes)
+    # the sample time that it names settles the unit
+    data = load(path, Ts=Ts)
+    assert data.Ts == pytest.approx(Ts)
+    assert len(data) == pytest.approx(60, abs=8)
+    assert not any("warning" in note for note in data.notes)
+
+
+@pytest.mark.parametrize("Ts", [1.0, 10.0, 300.0])
+def test_a_slow_process_is_read_and_pointed_out(tmp_path: Path, Ts: float) -> None:
+    path = made(tmp_path, Ts * np.arange(60))
+    data = load(path)
+    assert data.Ts == pytest.approx(Ts)
+    (note,) = data.notes
+    assert note.startswith("warning: ")
+    assert load(path, Ts=Ts).notes == ()
+    assert load(made(tmp_path, Ts * np.arange(60), "t_s")).notes == ()
 
 
 @pytest.mark.parametrize(

@@ -210,7 +210,7 @@ def add_preparation(parser: argparse.ArgumentParser, *, detrend: bool = True) ->
     group.add_argument(
         "--mask", action="append", metavar="A:B", default=[],
         help="outputs of each file to take out: no weight, no score; repeat it for several ranges; "
-        "outliers: those that stand out of their neighbours",
+        "outliers: those that stand out from their neighbours",
     )  # fmt: skip
     add_hold(group)
     group.add_argument(

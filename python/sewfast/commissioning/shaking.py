@@ -518,7 +518,7 @@ def _response(
     if found.coherence.max() < 0.5:
         raise DataError(
             name="amplitude", expected="an answer to the multisine in the counts",
-            received="none that stands out of their rounding and of the load",
+            received="none that stands out from their rounding and of the load",
             remedy="raise amplitude or periods",
         )  # fmt: skip
     return found

@@ -106,9 +106,9 @@ def small_signal(
 ) -> SmallSignal | None:
     """Shake the machine about half its top speed; None where that shows nothing.
 
-    Where a pair of poles swings, or a line stands out of what a first order leaves unexplained, it
-    is shaken at a higher speed as well. What has moved in proportion with the speed is a load over
-    the turn: it is taken out, and no resonance.
+    Where a pair of poles swings, or a line stands out from what a first order leaves unexplained,
+    it is shaken at a higher speed as well. What has moved in proportion with the speed is a load
+    over the turn: it is taken out, and no resonance.
     """
     u, settled = shaking(demands, motion, fopdt, bench.Ts, SHAKEN_AT)
     slow = Shaken.of(bench.excite(u, "small_signals"), settled)

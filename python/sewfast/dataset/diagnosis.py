@@ -43,7 +43,9 @@ _REFERENCE = re.compile(
     r"((y_?)?(r|ref|reference|set_?point|sp|target|soll|sollwert|demand)"
     # a `voltage_ref` may be the plant's input, a `speed_ref` is not
     r"|(motor[_ ]?)?(n|speed|rpm|velocity|vel|omega|drehzahl|position|pos|angle|theta|winkel)"
-    r"[_ .-]?(ref|reference|set_?point|sp|target|soll|sollwert|demand|cmd|command))([_ .-].*)?",
+    r"[_ .-]?(ref|reference|set_?point|sp|target|soll|sollwert|demand|cmd|command))"
+    # a `setpoint voltage` is what an amplifier is given
+    r"([_ .-](?!(motor[_ ]?)?(volt|spannung|tension|pwm|duty|curr|strom)).*)?",
     re.IGNORECASE,
 )
 

@@ -273,7 +273,7 @@ def _series(data: Dataset, model: Simulates | None) -> list[FloatArray]:
 
 
 def distances(y: FloatArray, window: int = 7) -> FloatArray:
-    """How far each value stands out of its window, in robust standard deviations.
+    """How far each value stands out from its window, in robust standard deviations.
 
     The smaller of two: the distance to the window's median over the record's deviation, which a
     steep but steady window does not raise; the same without the window's slope, over the larger of

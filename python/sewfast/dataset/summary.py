@@ -95,7 +95,7 @@ class Summary:
     columns : tuple of ColumnSummary
         Inputs, then the output.
     outliers_at : tuple of (str, int)
-        Experiment and sample (0-based, of its file) of outputs that stand out of their neighbours
+        Experiment and sample (0-based, of its file) of outputs that stand out from their neighbours
         (`Dataset.mark_outliers`).
     diagnosis : Diagnosis
         What the data are (`sewfast.diagnose`).
@@ -399,7 +399,7 @@ def _outliers(found: Summary, name: str) -> str:
     one = found.outliers == 1
     return (
         f"{found.outliers} {'value' if one else 'values'} of {name} "
-        f"{'stands' if one else 'stand'} out of {'its' if one else 'their'} neighbours, at sample"
+        f"{'stands' if one else 'stand'} out from {'its' if one else 'their'} neighbours, at sample"
         f"{'' if one else 's'} {shown}{more}: look at {'it' if one else 'them'}, then take "
         f"{'it' if one else 'them'} out, data.mask(data.mark_outliers()) (--mask outliers)"
     )

@@ -5,9 +5,10 @@ Read in this order: `ports` (transports, their failures), `wire` (what bodies st
 (what a run is to do, and what became of it) and `settings` (what must fit before it moves), `run`
 (the pump of a run with its way out), `record` (into memory, a file and a live view). Then
 `host_loop` and `host_run` (a controller on this computer), `doctor` and `access`, `virtual` and
-`emulated` (devices without a motor).
+`emulated` (devices without a motor), and `boards` (drives of other makers, polled over text).
 """
 
+from .boards import ODrive, PolledBoard, SimpleFOC
 from .clock import ClockBounds
 from .doctor import Diagnosis, Finding, examine
 from .drive import Drive, connect
@@ -30,10 +31,13 @@ __all__ = [
     "Jitter",
     "Layout",
     "Limits",
+    "ODrive",
     "Outcome",
     "Plan",
+    "PolledBoard",
     "Port",
     "PortInfo",
+    "SimpleFOC",
     "Sink",
     "Status",
     "VirtualDevice",

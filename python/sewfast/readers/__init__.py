@@ -1,7 +1,8 @@
 """Files in: CSV, `.mat`, `.npz`, Parquet and MCAP, read into a `Table` or a `Dataset`.
 
 Read in this order: `recording` (`read`, `read_table`), `timebase` (the sample time of a column),
-`delimited`, `containers`, `logs` (formats of other tools), `frames` (tables in memory).
+`delimited`, `containers`, `logs` (formats of other tools), `frames` (tables in memory),
+`installed` (formats that other packages add).
 """
 
 from .containers import Table

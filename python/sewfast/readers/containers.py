@@ -111,17 +111,42 @@ class Table:
 
 
 def split_unit(header: str) -> tuple[str, str]:
-    """`u [V]` or `u (V)` -> `("u", "V")`; no unit gives an empty one."""
+    """`u [V]`, `u (V)`, `u, V`, `u in V` or `u / V` -> `("u", "V")`; no unit gives an empty one."""
     match = re.fullmatch(r"\s*(\S.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*", header)
-    if match is None:
-        return header.strip(), ""
-    return match[1], (match[2] or match[3] or "").strip()
+    if match is not None:
+        return match[1], (match[2] or match[3] or "").strip()
+    text = header.strip()
+    for between in _BEFORE_UNIT.finditer(text):
+        name, unit = text[: between.start()], text[between.end() :]
+        # `speed m/s` is no `speed m` in seconds
+        if name and is_unit(unit) and not is_unit(text[len(name.rpartition(" ")[0]) :]):
+            return name, unit
+    return text, ""
+
+
+_UNITS = frozenset(
+    re.split(
+        " ",
+        "s sec second seconds ms us µs ns min v volt volts mv a amp ampere amperes ma rpm rev "
+        "rev/s u/min upm tr/min r/min min-1 min^-1 min⁻¹ 1/min rad rad/s deg deg/s ° °/s nm n "
+        "m cm mm m/s cm/s mm/s m/min km/h w hz khz % °c degc counts counts/s",
+    )
+)
+"""Units that oscilloscopes, loggers and people write behind or below a name, in lower case."""
+_BEFORE_UNIT = re.compile(r"\s+in\s+|\s*/\s*|\s*,\s+")
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text is one of the units that measurements have."""
+    return text.strip().lower() in _UNITS
 
 
 _SUFFIX = {
     "V": "V", "mV": "mV", "A": "A", "mA": "mA", "rpm": "RPM", "RPM": "RPM", "radps": "rad/s",
     "rad_s": "rad/s", "degps": "deg/s", "deg_s": "deg/s", "deg": "deg", "rad": "rad", "Nm": "Nm",
-    "mm": "mm", "Hz": "Hz",
+    "mm": "mm", "Hz": "Hz", "rad_per_s": "rad/s", "deg_per_s": "deg/s", "m_s": "m/s",
+    "mm_s": "mm/s", "m_per_s": "m/s", "mm_per_s": "mm/s", "mps": "m/s", "percent": "%", "pct": "%",
+    "volt": "V", "volts": "V",
 }  # fmt: skip
 _CURRENT = re.compile(r"i|curr(ent)?|strom|amps?|i_?motor|motor_?current")
 _SUFFIXED = re.compile(rf"(.+)[_ ]({'|'.join(sorted(_SUFFIX, key=len, reverse=True))})")

@@ -13,20 +13,12 @@ import numpy as np
 
 from ..dataset import FloatArray
 from ..errors import DataError
-from .containers import MAX_COLUMNS, Table, from_headers, split_unit
+from .containers import MAX_COLUMNS, Table, from_headers, is_unit, split_unit
 from .stamps import is_moment, seconds_of_texts
 
 MAX_LINE = 1_000_000
 _PREAMBLE = 200
 """Lines within which the numbers of a table must begin for lines above its header to be skipped."""
-_UNITS = frozenset(
-    re.split(
-        " ",
-        "s sec second seconds ms us µs ns v volt volts mv a amp ampere amperes ma rpm rev rev/s "
-        "rad rad/s deg deg/s nm n m mm m/s mm/s w hz khz % °c degc counts counts/s 1/min",
-    )
-)
-"""Units that oscilloscopes and loggers write into a row of their own, in lower case."""
 _MISSING = frozenset(
     re.split(" ", "nan na n/a <na> #n/a #na #nv null none nat - -- 1.#qnan -1.#ind 1.#ind")
 ) | {""}
@@ -156,6 +148,9 @@ def _layout(path: Path, text: str) -> _Layout:
         delimiter = _pick_delimiter(line)
         header, body, above = _cells(line, delimiter), text[offset:], skipped + 1
         found = _numbers(body[:MAX_LINE].lstrip("\n").partition("\n")[0])
+        if found is not None and len(_cells(line, found[0])) == found[1] > 1:
+            # names may hold the other ones: `Time, s;Voltage, V`
+            delimiter, header = found[0], _cells(line, found[0])
         # two cells may be one number with a decimal comma
         if len(header) == 1 and found is not None and (found[0] != "," or found[1] > 2):
             spaced = _cells(line, " ")
@@ -292,7 +287,7 @@ def _looks_like_unit(cell: str) -> bool:
     text = cell.strip()
     if len(text) > 2 and text[0] + text[-1] in ("()", "[]"):
         return True
-    return text.lower() in _UNITS
+    return is_unit(text)
 
 
 def _decimal(delimiter: str, body: str) -> str:

@@ -23,14 +23,27 @@ _MOST_PER_ROW = 100
 _SECONDS = {
     "": 1.0, "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3,
     "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "usec": 1e-6, "ns": 1e-9, "min": 60.0,
+    "millis": 1e-3, "milliseconds": 1e-3, "micros": 1e-6, "microseconds": 1e-6,
+    "nanos": 1e-9, "nanoseconds": 1e-9,
 }  # fmt: skip
+_UNIT = r"s|sec|seconds|ms|msec|millis(?:econds)?|us|µs|usec|micros(?:econds)?|ns|nanos(?:econds)?"
 _TIME = re.compile(
-    r"(?:t|time|time[_ ]?stamp|(?:elapsed|relative|rel|unix|epoch)(?:[_ ]time)?|seconds?|zeit|"
-    r"zeitstempel|temps|x-axis|x_value)(?:[_ ](s|sec|ms|msec|us|µs|usec|ns))?"
+    r"(?:t|(?:(?:elapsed|relative|rel|unix|epoch|system|sys|log|run)[_ ]?)?time|time[_ ]?stamp|"
+    r"(?:elapsed|relative|rel|unix|epoch)|time[_ ]since[_ ](?:start|boot|power[_ ]?on)|seconds?|"
+    rf"zeit|laufzeit|zeitstempel|temps|x-axis|x_value)(?:[_ ]({_UNIT}))?"
+    r"|(ms|us|millis(?:econds)?|micros(?:econds)?|nanos(?:econds)?)"
 )
-"""Names of a time column; the last two are those of Keysight's scopes and of LabVIEW."""
+"""Names of a time column, with its unit or as its unit alone; `x-axis` and `x_value` are those of
+Keysight's scopes and of LabVIEW, `millis` and `micros` those of an Arduino."""
 _DATE = re.compile(r"date|date[_ ]?time|datum|zeitpunkt|moment")
 """Names of one where its cells were dates with times of day."""
+_SMALLER = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
+LONG, ABSURD, SHORT = 0.5, 900.0, 1e-5
+"""Sample times [s] of a time column without a unit. From `LONG` on it is said that it may not count
+seconds: drives are sampled every 20 us to 200 ms, so that 1 ms and more in milliseconds, and 1 us
+and more in smaller units, lie above it. Processes with time constants of minutes are sampled
+above it as well, but none that is controlled above `ABSURD`: that is asked about. Units that would
+make one below `SHORT` are not named."""
 _EPOCH = ((1e17, 1e-9, "ns"), (1e14, 1e-6, "us"), (1e11, 1e-3, "ms"))
 """From which number on a time without a unit is one since 1970 in which unit: seconds since then
 reach 1e11 in the year 5138, milliseconds had in 1973."""
@@ -216,9 +229,12 @@ def time_base(table: Table, given: float | None, column: str | None = None) -> T
             )  # fmt: skip
         return TimeBase(float(given))
     scale, said = _unit(table, name)
-    t = _seconds(table, name, scale)
+    t = _seconds(table, name, scale or 1.0)
     steps = np.diff(t)
     period = float(np.median(steps[steps > 0.0]))
+    if scale is None:
+        scale, said = _guessed(table, name, period, given)
+        t, steps, period = t * scale, steps * scale, period * scale
     if np.abs(steps - period).max() <= TOLERANCE * period:
         # the mean is exact where every printed time is rounded
         found = float(t[-1] / len(steps))
@@ -237,15 +253,16 @@ def _agreed(table: Table, source: str, found: float, given: float) -> float:
     return float(given)
 
 
-def _unit(table: Table, name: str) -> tuple[float, tuple[str, ...]]:
+def _unit(table: Table, name: str) -> tuple[float | None, tuple[str, ...]]:
     """Seconds of one unit of a time column: of its header, else of its name (time_ms).
 
     A number that is too large for seconds since 1970 is one in a smaller unit, which a note says.
+    None where nothing says a unit.
     """
     unit = table.unit(name)
     if not unit:
         match = _TIME.fullmatch(name.lower())
-        unit = (match[1] or "") if match else ""
+        unit = (match[1] or match[2] or "") if match else ""
     if unit.lower() not in _SECONDS:
         raise DataError(
             f"{table.path}: time in {unit!r} is not understood; expected s, ms, us or ns"
@@ -255,7 +272,45 @@ def _unit(table: Table, name: str) -> tuple[float, tuple[str, ...]]:
         if math.isfinite(first) and first > least:
             note = f"{table.path.name}: column {name!r} is taken as {epoch} since 1970"
             return scale, (note,)
-    return _SECONDS[unit.lower()], ()
+    return _SECONDS[unit.lower()] if unit else None, ()
+
+
+def _guessed(
+    table: Table, name: str, step: float, given: float | None
+) -> tuple[float, tuple[str, ...]]:
+    """Seconds of one unit of a time column that states none, by its median step.
+
+    Seconds, unless a sample time is given that fits a smaller unit. Seconds that are long for a
+    drive are pointed out, since the column may well count milliseconds.
+
+    Raises
+    ------
+    SettingError
+        Where seconds would make a sample time that no machine is run at.
+    """
+    for unit, scale in _SMALLER if given is not None and given < 0.01 * step else ():
+        # far finer than the rows is no grid for them
+        if given is not None and 0.5 * given < step * scale < 2.0 * given:
+            return scale, (f"{table.path.name}: column {name!r} is taken as {unit}, as Ts says",)
+    if step < LONG or given is not None:
+        return 1.0, ()
+    ways = " or ".join(
+        f"--ts {step * scale:.3g} if it counts {unit}"
+        for unit, scale in _SMALLER
+        if SHORT <= step * scale < LONG
+    )
+    if step >= ABSURD:
+        raise SettingError(
+            name=f"{table.path}: column {name!r}", expected="a time with its unit",
+            received=f"steps of {step:g} without one",
+            remedy=f"state the sample time in seconds (Ts), {ways or '--ts'}, or name the unit in "
+            "the header: t [ms]",
+        )  # fmt: skip
+    return 1.0, (
+        f"warning: {table.path.name}: column {name!r} states no unit and is taken as seconds, so "
+        f"that Ts = {step:g} s, long for a drive; if that is wrong, give "
+        f"{ways or 'the sample time (--ts)'}, or name the unit in the header: t [ms]",
+    )
 
 
 def _seconds(table: Table, name: str, unit: float) -> FloatArray:
