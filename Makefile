@@ -79,8 +79,8 @@ studio-hour: $(DEV) ## the studio through an hour of live signals: pictures a se
 studio-kills: $(DEV) ## browser killed, hung, frozen or closed, studio killed, link pulled: output off after (TRIALS=50)
 	$(BIN)/python benches/studio_kills.py --trials $(or $(TRIALS),50)
 
-fuzz-logs: $(DEV) ## damaged logs of every format, refused or read (COUNT=100000; ONLY="mf4 tdms"; hours)
-	$(BIN)/python tests/support/fuzzed_logs.py --count $(or $(COUNT),100000) $(if $(ONLY),--only $(ONLY))
+fuzz-logs: $(DEV) ## damaged logs of every format, refused or read (COUNT=100000; SECONDS= for each; ONLY="mf4 tdms"; hours)
+	$(BIN)/python tests/support/fuzzed_logs.py --count $(or $(COUNT),100000) $(if $(SECONDS),--seconds $(SECONDS)) $(if $(ONLY),--only $(ONLY))
 
 bits: $(DEV) ## deployed code against the core over ten million samples of every kind (an hour)
 	$(BIN)/python tests/support/deployed.py

@@ -38,6 +38,7 @@ def main() -> None:
     parser.add_argument("--recordings", type=int, default=2000)
     parser.add_argument("--samples", type=int, default=5000)
     parser.add_argument("--killed", action="store_true", help="only with workers being killed")
+    parser.add_argument("--every", type=float, default=10.0, help="seconds between two kills")
     args = parser.parse_args()
     import dask
     import distributed
@@ -80,8 +81,10 @@ def main() -> None:
             ended, killed = threading.Event(), [0]
 
             def kill() -> None:
-                while not ended.wait(10.0):
-                    for pid in list(client.run(os.getpid).values())[:1]:
+                while not ended.wait(args.every):
+                    # one that goes while it is asked is killed the next time
+                    alive = client.run(os.getpid, on_error="ignore")
+                    for pid in list(alive.values())[:1]:
                         os.kill(pid, signal.SIGKILL)
                         killed[0] += 1
 

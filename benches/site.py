@@ -1,4 +1,5 @@
-"""Pages of the built site that are wider than their column at 1,280 pixels, in a real browser.
+"""Pages of the built site that are wider than their column at 1,280 pixels, and its search without
+a network, in a real browser.
 
 make docs && python benches/site.py
 python benches/site.py --shots target/shots      pictures of every page as well
@@ -11,6 +12,7 @@ import sys
 from pathlib import Path
 
 from selenium import webdriver
+from selenium.webdriver.support.ui import WebDriverWait
 
 ROOT = Path(__file__).resolve().parents[1]
 SITE = ROOT / "site"
@@ -21,6 +23,22 @@ return [...document.querySelectorAll('pre code, pre, table, .formula, img, p, ma
     + e.textContent.trim().split('\\n').reduce((a, b) => a.length > b.length ? a : b, ''))
 """
 PAGE = "return document.documentElement.scrollWidth - document.documentElement.clientWidth"
+
+
+SOUGHT = {"notch": "bode.html", "time_ms": "data-preparation.html", "watchdog": "first-run.html"}
+"""Words, and a page that must be among those that the search finds for each."""
+FOUND = "return [...document.querySelectorAll('.md-search-result__link')].map(e => e.href)"
+
+
+def searched(driver: webdriver.Chrome, word: str) -> list[str]:
+    """Names of the pages that the site's own search finds."""
+    driver.get((SITE / "index.html").as_uri())
+    field = driver.find_element("css selector", ".md-search__input")
+    field.click()
+    field.send_keys(word)
+    WebDriverWait(driver, 60).until(lambda d: d.execute_script(FOUND))
+    links = driver.execute_script(FOUND)
+    return sorted({link.rpartition("/")[2].partition("?")[0].partition("#")[0] for link in links})
 
 
 def browser(width: int) -> webdriver.Chrome:
@@ -51,10 +69,15 @@ def main() -> int:
             if args.shots is not None:
                 args.shots.mkdir(parents=True, exist_ok=True)
                 driver.save_screenshot(str(args.shots / f"{page.stem}.png"))
+        lost = 0
+        for word, page_of_it in SOUGHT.items():
+            pages = searched(driver, word)
+            lost += page_of_it not in pages
+            print(f"search for {word!r}: {', '.join(pages)}")
     finally:
         driver.quit()
-    print(f"{wide} pages with something wider than its column")
-    return min(wide, 1)
+    print(f"{wide} pages with something wider than its column; {lost} words not found")
+    return min(wide + lost, 1)
 
 
 if __name__ == "__main__":

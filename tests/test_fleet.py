@@ -12,6 +12,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -140,6 +141,36 @@ def test_workers_that_are_gone_for_good_are_missed(
         with pytest.raises(SettingError, match="expected one at least") as caught:
             fleet(made(tmp_path / "many", 3), client=client)
     assert caught.value.name == "workers"
+
+
+@pytest.mark.parametrize("present", [True, False])
+def test_a_look_that_takes_long_is_no_absence(
+    monkeypatch: pytest.MonkeyPatch, present: bool
+) -> None:
+    """A computer so busy that each look takes 200 s, the first while a worker starts anew."""
+    from sewfast.fleets import running
+
+    now, looks = 0.0, [{}, {"worker": 1} if present else {}]
+
+    class Distributed:
+        TimeoutError = TimeoutError
+
+        @staticmethod
+        def wait(tasks: set[str], timeout: float, return_when: str) -> SimpleNamespace:
+            nonlocal now
+            now += 200.0
+            if looks:
+                raise TimeoutError
+            return SimpleNamespace(done=tasks)
+
+    client = SimpleNamespace(scheduler_info=lambda n_workers: {"workers": looks.pop(0)})
+    monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(running, "import_module", lambda name: Distributed)
+    if present:
+        assert running._ended({"task"}, client) == "task"
+    else:
+        with pytest.raises(SettingError, match="none for 120 s"):
+            running._ended({"task"}, client)
 
 
 @pytest.mark.usefixtures("quiet")

@@ -113,6 +113,11 @@ def table(tmp_path: Path, *names: str) -> api.readers.Table:
         (("Ankerspannung in V", "Ist-Drehzahl in U/min"), ("Ankerspannung", "Ist-Drehzahl")),
         (("Spannung / V", "Drehzahl / min⁻¹"), ("Spannung", "Drehzahl")),
         (("FanCommand_pct", "wheel_speed_mps"), ("FanCommand_pct", "wheel_speed_mps")),
+        (("duty_cycle", "wheel_rpm", "battery_V"), ("duty_cycle", "wheel_rpm")),
+        (("Supply voltage [V]", "voltage [V]", "rpm"), ("voltage", "rpm")),
+        (("stellgroesse", "istwert", "regelabweichung"), ("stellgroesse", "istwert")),
+        (("voltaje_V", "velocidad_rpm"), ("voltaje_V", "velocidad_rpm")),
+        (("voltage/V", "speed/(rad/s)"), ("voltage", "speed")),
     ],
 )
 def test_columns_are_recognised_or_left_open(
@@ -142,6 +147,14 @@ def test_dates_are_the_time_where_nothing_else_is(tmp_path: Path) -> None:
 def test_a_header_that_occurs_twice_with_other_values_is_named(tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_text("t,u,y,y\n" + "".join(f"{k},{k % 3},1,{k}\n" for k in range(9)))
     assert "occurs more than once, with other values" in refused(tmp_path, "identify", "x.csv")
+
+
+def test_a_column_that_counts_the_rows_is_neither(tmp_path: Path) -> None:
+    rows = "".join(f"{k},{10 * k},{k % 7},{k % 5}\n" for k in range(60))
+    (tmp_path / "x.csv").write_text("Sample,time_ms,Vmot,RPM\n" + rows)
+    found = roles(read_table(tmp_path / "x.csv"))
+    assert found is not None
+    assert (found.input, found.output) == ("Vmot", "RPM")
 
 
 def test_a_column_that_never_changes_is_neither(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 import mgh
 import nist
@@ -329,6 +330,26 @@ def test_accepts_lists_integers_and_strides() -> None:
 
     fit = least_squares(lambda x: list(_decay(x)), [1, 1], jac)
     assert fit.success
+
+
+def test_the_result_is_used_as_scipys_is() -> None:
+    """A mapping with the names of `OptimizeResult`, and its gradient."""
+    scipy = pytest.importorskip("scipy.optimize")
+    t = np.arange(6.0)
+
+    def residuals(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return x[0] * np.exp(-x[1] * t) - np.array([2.1, 1.2, 0.8, 0.4, 0.3, 0.1])
+
+    found, known = least_squares(residuals, [1.0, 1.0]), scipy.least_squares(residuals, [1.0, 1.0])
+    assert set(known) <= set(found)
+    assert len(found) == len(dict(found)) == len(list(found))
+    for name in ("x", "cost", "fun", "jac", "active_mask"):
+        np.testing.assert_allclose(found[name], known[name], rtol=1e-5, atol=1e-7)
+        np.testing.assert_array_equal(dict(found)[name], getattr(found, name))
+    np.testing.assert_array_equal(found["grad"], found.jac.T @ found.fun)
+    assert np.abs(found.grad).max() == pytest.approx(found.optimality, abs=1e-12)
+    with pytest.raises(KeyError, match="gradient"):
+        found["gradient"]
 
 
 class _OwnError(Exception):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
+import json
 import os
 import struct
 import subprocess
@@ -130,6 +131,26 @@ def _ros(path: Path, version: str) -> Path:
     return next(folder.glob("*.mcap"))
 
 
+def foxglove(path: Path) -> Path:
+    """As Foxglove's own writer makes it, with a topic in another encoding."""
+    writing = pytest.importorskip("mcap.writer")
+    with path.open("wb") as file:
+        writer = writing.Writer(file, chunk_size=4000)
+        writer.start()
+        schema = writer.register_schema("drive", "jsonschema", b"{}")
+        drive = writer.register_channel("/drive", "json", schema)
+        slow = writer.register_channel("/slow", "json", schema)
+        image = writer.register_channel("/image", "protobuf", 0)
+        for k, (t, u, y) in enumerate(zip(T, U, Y, strict=True)):
+            data = json.dumps({"u": u, "state": {"y": y, "on": True}, "text": "x"}).encode()
+            writer.add_message(drive, round(t * 1e9), data, round(t * 1e9), k)
+        for t, value in zip(SLOW_T, SLOW, strict=True):
+            writer.add_message(slow, round(t * 1e9), json.dumps([value]).encode(), 0)
+        writer.add_message(image, round(T[0] * 1e9), b"\x08\x01", 0)
+        writer.finish()
+    return path
+
+
 HEADER = """\
 H Product:Blackbox flight data recorder by Nicholas Sherlock
 H Data version:2
@@ -253,6 +274,7 @@ KINDS: dict[str, tuple[Callable[[Path], Path], str, str]] = {
     "run.wpilog": (wpilog, "u", "y"),
     "run.bag": (ros1, "/drive.x", "/drive.y"),
     "run.mcap": (ros2, "/drive.x", "/drive.y"),
+    "foxglove.mcap": (foxglove, "/drive.u", "/drive.state.y"),
 }
 
 
@@ -493,3 +515,22 @@ def test_tdms_channels_of_moments_and_without_an_offset(tmp_path: Path) -> None:
     with nptdms.TdmsWriter(tmp_path / "wave.tdms") as writer:
         writer.write_segment([nptdms.ChannelObject("g", "u", U, {"wf_increment": 0.004})])
     assert sewfast.read(tmp_path / "wave.tdms", inputs="u").Ts == pytest.approx(0.004)
+
+
+def test_an_mcap_of_json_names_what_it_cannot_read(tmp_path: Path) -> None:
+    table = read_table(foxglove(tmp_path / "run.mcap"))
+    assert "/image (protobuf)" in table.unusable
+    np.testing.assert_array_equal(table["/slow.0"][5::20], SLOW)
+    assert np.isnan(table["/slow.0"][:5]).all()
+    np.testing.assert_array_equal(table["/drive.state.on"], 1.0)
+    np.testing.assert_allclose(table["t"], T - T[0], atol=1e-9)
+
+
+def test_a_recording_of_ours_is_no_log_whoever_has_packed_it(tmp_path: Path) -> None:
+    machine = sewfast.VirtualMachine()
+    sewfast.record(machine, U, file=tmp_path / "run.mcap")
+    raw = (tmp_path / "run.mcap").read_bytes()
+    assert not logs.is_log(raw)
+    # torn, its first chunk damaged, rewritten by another library
+    assert not logs.is_log(raw[: len(raw) // 2].replace(b"/sewfast/", b"/sewbest/"))
+    assert not logs.is_log(raw.replace(b"\x07\0\0\0sewfast", b"\x07\0\0\0another", 1))

@@ -23,11 +23,14 @@ from refusals import refuses
 from sewfast.errors import DataError, SettingError
 from sewfast.recordfile import Header, RecordWriter, export, read_recording, save_columns
 from sewfast.recordfile.format import numbers
+from sewfast.recordfile.reader import read_header
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    return make(tmp_path_factory.mktemp("made") / "run.mcap")
+@pytest.fixture(scope="module", params=[False, True], ids=["plain", "zstd"])
+def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    if request.param:
+        pytest.importorskip("zstandard", reason="needs the extra zstd")
+    return make(tmp_path_factory.mktemp("made") / "run.mcap", compress=request.param)
 
 
 def test_what_was_written_is_read(made: Made) -> None:
@@ -456,3 +459,83 @@ def test_a_recording_is_locked_where_only_windows_locks_are(
         out.samples(0, {name: values[:10] for name, values in signals(10).items()})
     assert library.held == {}
     assert len(read_recording(path)) == 10
+
+
+def test_a_compressed_recording_is_smaller_and_the_same(tmp_path: Path) -> None:
+    pytest.importorskip("zstandard", reason="needs the extra zstd")
+    plain = make(tmp_path / "plain.mcap", 5000)
+    packed = make(tmp_path / "packed.mcap", 5000, compress=True)
+    assert len(packed.raw) < 0.6 * len(plain.raw)
+    found, expected = read_recording(packed.path), read_recording(plain.path)
+    assert (found.header, found.gaps, found.damage) == (expected.header, expected.gaps, ())
+    for name, column in expected.columns.items():
+        np.testing.assert_array_equal(found.columns[name], column)
+    small, large = tmp_path / "small.mcap", tmp_path / "large.mcap"
+    export(plain.path, small, compress=True)
+    export(packed.path, large)
+    assert small.stat().st_size < 0.5 * large.stat().st_size
+    for name, column in expected.columns.items():
+        np.testing.assert_array_equal(read_recording(small).columns[name], column)
+        np.testing.assert_array_equal(read_recording(large).columns[name], column)
+    with refuses(SettingError, name="compress"):
+        export(plain.path, tmp_path / "run.csv", compress=True)
+
+
+def test_a_recording_that_another_program_has_compressed_is_read(
+    made: Made, tmp_path: Path
+) -> None:
+    """As `mcap compress` does: all topics together in chunks of its own size."""
+    pytest.importorskip("zstandard", reason="needs the extra zstd")
+    reader = pytest.importorskip("mcap.reader").make_reader(io.BytesIO(made.raw))
+    own = pytest.importorskip("mcap.writer")
+    path = tmp_path / "packed.mcap"
+    with path.open("wb") as file:
+        writer = own.Writer(file, chunk_size=20_000, compression=own.CompressionType.ZSTD)
+        writer.start()
+        summary = reader.get_summary()
+        for number, schema in sorted(summary.schemas.items()):
+            assert writer.register_schema(schema.name, schema.encoding, schema.data) == number
+        for number, channel in sorted(summary.channels.items()):
+            given = (channel.topic, channel.message_encoding, channel.schema_id)
+            assert writer.register_channel(*given) == number
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            writer.add_message(
+                channel.id, message.log_time, message.data, message.publish_time, message.sequence
+            )
+        writer.finish()
+    found = read_recording(path)
+    for name, column in made.columns.items():
+        np.testing.assert_array_equal(found.columns[name], column)
+    assert (found.gaps, found.outcome) == (made.gaps, "complete")
+
+
+def test_constant_columns_come_back(tmp_path: Path) -> None:
+    """They are packed so well that a reader could not tell them from a file made to be large."""
+    pytest.importorskip("zstandard", reason="needs the extra zstd")
+    columns = {f"a channel with a name, number {k}": np.zeros(3000) for k in range(250)}
+    made = header(3000, columns=dict.fromkeys(columns, "1"))
+    plain, curves = tmp_path / "run.mcap", tmp_path / "curves.mcap"
+    with RecordWriter(plain, made, compress=True) as writer:
+        writer.samples(0, columns)
+    export(plain, curves, compress=True)
+    for path in (plain, curves):
+        found = read_recording(path)
+        assert found.complete
+        assert not np.any(list(found.columns.values()))
+
+
+def test_without_the_package_it_is_named(
+    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    packed = make(tmp_path / "run.mcap", compress=True)
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    for refused in (
+        lambda: RecordWriter(tmp_path / "new.mcap", header(), compress=True),
+        lambda: export(made.path, tmp_path / "new.mcap", compress=True),
+        lambda: read_recording(packed.path),
+    ):
+        with refuses(SettingError, name="zstandard", remedy=r"sewfast\[zstd\]"):
+            refused()
+    assert not (tmp_path / "new.mcap").exists()
+    # what the recording is of can be read, so that it is not replaced
+    assert read_header(packed.path) == header(1000)

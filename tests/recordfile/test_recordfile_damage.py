@@ -29,9 +29,11 @@ from sewfast.recordfile.writer import _groups
 resource = pytest.importorskip("resource", reason="limits a file's size as POSIX systems can")
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    return make(tmp_path_factory.mktemp("made") / "run.mcap")
+@pytest.fixture(scope="module", params=[False, True], ids=["plain", "zstd"])
+def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    if request.param:
+        pytest.importorskip("zstandard", reason="needs the extra zstd")
+    return make(tmp_path_factory.mktemp("made") / "run.mcap", compress=request.param)
 
 
 @pytest.fixture(scope="module")

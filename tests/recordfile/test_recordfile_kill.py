@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,8 @@ _RECORDER = """
     import numpy as np
     from sewfast.recordfile import Header, RecordWriter
     size, pause = int(sys.argv[2]), float(sys.argv[3])
-    with RecordWriter(sys.argv[1], Header("x", 0.001, {"u": "V", "counts": "1"})) as writer:
+    header = Header("x", 0.001, {"u": "V", "counts": "1"})
+    with RecordWriter(sys.argv[1], header, compress=sys.argv[4] == "True") as writer:
         for k in range(0, 10**9, size):
             i = np.arange(k, k + size)
             writer.samples(k, {"u": i / 7, "counts": 3 * i})
@@ -75,6 +77,8 @@ def stopped_recorder(
     """What the recorder reported as written, with times, and when it was stopped."""
     size, pause = RATES[rate]
     command = [sys.executable, "-c", textwrap.dedent(_RECORDER), str(path), str(size), str(pause)]
+    # every other recording is compressed, where it can be
+    command.append(str(int(path.stem) % 2 == 1 and find_spec("zstandard") is not None))
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     with subprocess.Popen(command, **pipes) as recorder:  # type: ignore[call-overload]
         first = recorder.stdout.readline()

@@ -99,8 +99,8 @@ def damaged(raw: bytes, rng: np.random.Generator) -> bytes:
     return bytes(content)
 
 
-def fuzz(name: str, count: int, seed: int, folder: Path) -> bool:
-    """Whether every damaged file of this kind was read or refused."""
+def fuzz(name: str, count: int, seed: int, folder: Path, seconds: float) -> bool:
+    """Whether every damaged file of this kind was read or refused, as far as time allows."""
     try:
         whole = MAKE[name](folder / name)
     except BaseException as error:  # pytest's own, where a library is missing
@@ -116,9 +116,11 @@ def fuzz(name: str, count: int, seed: int, folder: Path) -> bool:
     logs.subprocess = SimpleNamespace(run=forked.run, TimeoutExpired=subprocess.TimeoutExpired)
     gc.freeze()
     outcomes: Counter[str] = Counter()
-    slowest, began = 0.0, time.monotonic()
+    slowest, began, tried = 0.0, time.monotonic(), 0
     place = folder / f"damaged-{name}"
     for k in range(count):
+        if time.monotonic() - began > seconds:
+            break
         rng = np.random.default_rng([seed, k])
         place.write_bytes(damaged(raw, rng))
         start = time.monotonic()
@@ -135,9 +137,10 @@ def fuzz(name: str, count: int, seed: int, folder: Path) -> bool:
             print(f"{name}: damaged file {k} of seed {seed}")
             traceback.print_exc()
         slowest = max(slowest, time.monotonic() - start)
+        tried += 1
     own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print(
-        f"{name}: {count} damaged files, {dict(outcomes)}, slowest {slowest:.2f} s, largest "
+        f"{name}: {tried} damaged files, {dict(outcomes)}, slowest {slowest:.2f} s, largest "
         f"{max(own, forked.largest) / 1e3:.0f} MB, {time.monotonic() - began:.0f} s",
         flush=True,
     )
@@ -148,21 +151,22 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="for each format")
     parser.add_argument("--only", nargs="*", default=[], metavar="WORD")
     args = parser.parse_args()
     chosen = [n for n in MAKE if not args.only or any(word in n for word in args.only)]
     with tempfile.TemporaryDirectory() as place:
         # a process for each kind: what one library leaves behind is not the next one's
-        found = [_apart(name, args.count, args.seed, Path(place)) for name in chosen]
+        found = [_apart(name, args, Path(place)) for name in chosen]
     return 0 if all(found) else 1
 
 
-def _apart(name: str, count: int, seed: int, folder: Path) -> bool:
+def _apart(name: str, args: argparse.Namespace, folder: Path) -> bool:
     child = os.fork()
     if child == 0:
         status = 1
         try:
-            status = 0 if fuzz(name, count, seed, folder) else 1
+            status = 0 if fuzz(name, args.count, args.seed, folder, args.seconds) else 1
         except BaseException:
             traceback.print_exc()
         finally:

@@ -51,11 +51,17 @@ def signals(n: int, seed: int = 0) -> dict[str, NDArray[np.generic]]:
     }
 
 
-def make(path: Path, n: int = 1000, gaps: tuple[tuple[int, int], ...] = ((310, 20),)) -> Made:
+def make(
+    path: Path,
+    n: int = 1000,
+    gaps: tuple[tuple[int, int], ...] = ((310, 20),),
+    *,
+    compress: bool = False,
+) -> Made:
     """Ten samples at a time, as a link gives them, with events and gaps."""
     given = signals(n)
     lost = {k for first, count in gaps for k in range(first, first + count)}
-    with RecordWriter(path, header(n)) as writer:
+    with RecordWriter(path, header(n), compress=compress) as writer:
         writer.event("armed", 0, limits={"u": 20.0})
         for first in range(0, n, 10):
             if first not in lost:

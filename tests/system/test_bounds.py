@@ -6,7 +6,9 @@ import io
 import subprocess
 import sys
 import time
+import tracemalloc
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +21,16 @@ from sewfast import _core
 from sewfast.errors import DataError
 from sewfast.readers import read_table
 from sewfast.recordfile import read_recording
-from sewfast.recordfile.format import CHUNK, CHUNK_HEAD, MAGIC, RECORD
+from sewfast.recordfile.format import (
+    CHUNK,
+    CHUNK_HEAD,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    PACKED_HEAD,
+    RECORD,
+    ZSTD,
+)
 
 
 def limited(code: str) -> subprocess.CompletedProcess[str]:
@@ -86,6 +97,27 @@ def test_a_file_of_heads_alone_is_refused_in_time_that_grows_with_its_size(tmp_p
         read_recording(path)
     # its checksums alone took minutes
     assert time.process_time() - began < 5.0
+
+
+def test_a_recording_that_unpacks_to_gigabytes_is_refused_before_it_does(tmp_path: Path) -> None:
+    """Chunks of one message of 4 MB of spaces; their checksums hold."""
+    zstandard = pytest.importorskip("zstandard", reason="needs the extra zstd")
+    message = MESSAGE_HEAD.pack(2, 0, 0, 0) + b" " * (4_000_000 - MESSAGE_HEAD.size)
+    records = RECORD.pack(MESSAGE, len(message)) + message
+    stored = zstandard.ZstdCompressor().compress(records)
+    head = PACKED_HEAD.pack(
+        CHUNK, PACKED_HEAD.size - RECORD.size + len(stored), 0, 1, len(records),
+        zlib.crc32(records), len(ZSTD), ZSTD, len(stored),
+    )  # fmt: skip
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(MAGIC + (head + stored) * 2000)
+    assert path.stat().st_size < 2_000_000
+    tracemalloc.start()
+    with pytest.raises(DataError, match="at most 200 times the file"):
+        read_recording(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 300 * path.stat().st_size
 
 
 def test_an_archive_that_unpacks_to_gigabytes_is_refused_before_it_does(tmp_path: Path) -> None:

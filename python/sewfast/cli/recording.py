@@ -269,6 +269,9 @@ def add_files(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument("recording", metavar="RECORDING.mcap", help="recording")
     add_output(parser, "OUT", "CSV, .npz, .mat, Parquet or .mcap", required=True)
+    parser.add_argument(
+        "--compress", action="store_true", help="of .mcap: compress it by zstd (sewfast[zstd])"
+    )
     add_overwrite(parser)
 
 
@@ -286,7 +289,7 @@ def export_command(args: argparse.Namespace) -> None:
     from ..recordfile import export
 
     require_place(args.out, RECORDINGS)
-    found = export(args.recording, args.out, overwrite=args.overwrite)
+    found = export(args.recording, args.out, overwrite=args.overwrite, compress=args.compress)
     if args.json:
         print_json({**_content(found), "file": str(args.out)})
     else:

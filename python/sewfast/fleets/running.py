@@ -249,15 +249,16 @@ def _worked(
 def _ended(running: Collection[Any], connected: Any) -> Any:
     """One of the tasks that have ended, waited for as long as there are workers."""
     distributed = import_module("distributed")
-    seen, missed = time.monotonic(), ""
+    without, missed = math.inf, ""
     while not missed:
         try:
             found = distributed.wait(running, _LOOK, return_when="FIRST_COMPLETED")
             return next(iter(found.done))
         except distributed.TimeoutError:
-            if connected.scheduler_info(n_workers=-1)["workers"]:
-                seen = time.monotonic()
-            elif time.monotonic() - seen >= _PATIENCE:
+            # since when none has been seen: on a busy computer a look itself takes its time
+            none = not connected.scheduler_info(n_workers=-1)["workers"]
+            without = min(without, time.monotonic()) if none else math.inf
+            if time.monotonic() - without >= _PATIENCE:
                 missed = f"workers: expected one at least, got none for {_PATIENCE:g} s"
         except CancelledError:
             missed = "scheduler: expected it to stay, got a connection that is closed"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
@@ -25,6 +25,7 @@ _ERRORS = {"2-point": 2.0**-24, "3-point": 2.0**-33, "cs": 0.0}
 class LeastSquaresResult:
     """A solution, how the iteration reached it and how well the data determine it.
 
+    As with SciPy's result, ``result["x"]`` is ``result.x``, and ``dict(result)`` has all of it.
     ``success`` is True only if a test for a minimum held and was confirmed: the Jacobian has
     full rank, and further undamped steps became shorter and ended below the tolerances.
 
@@ -92,6 +93,34 @@ class LeastSquaresResult:
     condition: float
     rank: int
     trace: FloatArray
+
+    @property
+    def grad(self) -> FloatArray:
+        """Gradient of the cost at ``x``: ``jac.T @ fun``, shape (n,)."""
+        gradient: FloatArray = self.jac.T @ self.fun
+        return gradient
+
+    def keys(self) -> tuple[str, ...]:
+        """Names of the values, as of a mapping."""
+        return (*(f.name for f in fields(self)), "grad")
+
+    def __getitem__(self, name: str) -> Any:
+        """The value of a name.
+
+        Raises
+        ------
+        KeyError
+            Where there is none of it.
+        """
+        if name not in self.keys():
+            raise KeyError(name)
+        return getattr(self, name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.keys())
+
+    def __len__(self) -> int:
+        return len(self.keys())
 
     def __str__(self) -> str:
         ended = "converged" if self.success else "NOT converged"

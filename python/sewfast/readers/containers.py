@@ -112,7 +112,7 @@ class Table:
 
 def split_unit(header: str) -> tuple[str, str]:
     """`u [V]`, `u (V)`, `u, V`, `u in V` or `u / V` -> `("u", "V")`; no unit gives an empty one."""
-    match = re.fullmatch(r"\s*(\S.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))\s*", header)
+    match = re.fullmatch(r"\s*(\S.*?)[\s/]*(?:\[([^\]]*)\]|\(([^)]*)\))\s*", header)
     if match is not None:
         return match[1], (match[2] or match[3] or "").strip()
     text = header.strip()

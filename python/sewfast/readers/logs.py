@@ -1,4 +1,4 @@
-"""Logs of other tools -> `Table`: MDF, TDMS, ULog, WPILOG, ROS bags, Betaflight, Saleae.
+"""Logs of other tools -> `Table`: MDF, TDMS, ULog, WPILOG, ROS bags, MCAP, Betaflight, Saleae.
 
 Such a log holds signals that each have time stamps of their own. The signal with the most samples
 gives the rows; those with the same stamps are added as they are, any other is held: each row
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import json
 import os
 import struct
 import subprocess
@@ -25,7 +26,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import DataError, not_installed, printable
-from ..recordfile.format import MAGIC
+from ..recordfile.format import LIBRARY, MAGIC
 from .blackbox import BLACKBOX, SALEAE, blackbox_series, saleae_series
 from .containers import MAX_COLUMNS, Table, freeze
 
@@ -286,12 +287,40 @@ def _rosbag(path: Path, raw: bytes) -> Iterator[Signal]:
         yield Signal(name, np.array(times), np.array(values))
 
 
+def _mcap(path: Path, raw: bytes) -> Iterator[Signal]:
+    """MCAP files with JSON messages: `/topic.field`, stamped when they were logged.
+
+    Of topics in other encodings no value is known, and they are named as such.
+    """
+    from mcap.reader import make_reader
+
+    series: dict[str, tuple[list[int], list[float]]] = {}
+    others: set[str] = set()
+    for _, channel, message in make_reader(io.BytesIO(raw)).iter_messages():
+        if channel.message_encoding != "json":
+            others.add(f"{channel.topic} ({channel.message_encoding or 'no encoding'})")
+            continue
+        for name, value in _numbers(channel.topic, json.loads(message.data), 0):
+            times, values = series.setdefault(name, ([], []))
+            times.append(message.log_time)
+            values.append(value)
+    # nanoseconds since 1970 are more than a float64 holds
+    first = min((times[0] for times, _ in series.values()), default=0)
+    for name, (stamps, values) in series.items():
+        yield Signal(name, (np.array(stamps) - first) * 1e-9, np.array(values))
+    for name in sorted(others):
+        yield Signal(name, None, np.array("no JSON"))
+
+
 def _numbers(name: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
     if isinstance(value, (bool, int, float, np.number, np.bool_)):
         yield name, float(value)
     elif isinstance(value, (list, tuple, np.ndarray)):
         for k, item in enumerate(value[:_ELEMENTS] if depth < _DEPTH else ()):
             yield from _numbers(f"{name}.{k}", item, depth + 1)
+    elif isinstance(value, dict) and depth < _DEPTH:
+        for field, item in value.items():
+            yield from _numbers(f"{name}.{field}", item, depth + 1)
     elif hasattr(value, "__dataclass_fields__") and depth < _DEPTH:
         for field in value.__dataclass_fields__:
             if not field.startswith("__"):
@@ -381,6 +410,7 @@ _KINDS = {
     "ulog": _Kind((b"ULog\x01\x12\x35",), "a PX4 ULog", "pyulog", _ulog),
     "wpilog": _Kind((b"WPILOG",), "a WPILib data log", None, _wpilog),
     "rosbag": _Kind((b"#ROSBAG V2.0",), "a ROS bag", "rosbags", _rosbag),
+    "mcap": _Kind((), "an MCAP file", "mcap", _mcap),
     "blackbox": _Kind((BLACKBOX,), "a Betaflight black box log", None, _blackbox),
     "saleae": _Kind((SALEAE,), "a Saleae export", None, _saleae),
 }
@@ -390,6 +420,11 @@ def _kind_of(raw: bytes) -> str | None:
     for name, kind in _KINDS.items():
         if raw.startswith(kind.magic):
             return name
-    # an MCAP file says who wrote it behind opcode and length of its header
-    is_of_ros = raw.startswith(MAGIC + b"\x01") and raw[len(MAGIC) + 13 :][:3] == b"ros"
-    return "rosbag" if is_of_ros else None
+    if not raw.startswith(MAGIC):
+        return None
+    # an MCAP file says of what kind it is behind opcode and length of its header
+    if raw.startswith(b"ros", len(MAGIC) + 13):
+        return "rosbag"
+    # of a recording of ours, damaged or packed by others, one of these is left
+    own = any(mark in raw for mark in (b"/sewfast/", b"sewfast.recording", LIBRARY.encode()))
+    return None if own else "mcap"

@@ -35,7 +35,8 @@ def _sort(words: str, units: Iterable[str]) -> _Sort:
 
 _INPUTS = (
     _sort(
-        "u in input command cmd pwm duty volt volts voltage spannung tension control",
+        "u in input command cmd pwm duty volt volts voltage spannung tension control throttle "
+        "stellgröße stellgroesse commande voltaje tensione",
         ("v", "mv", "volt", "volts"),
     ),
     _sort("i curr current strom amp amps courant", ("a", "ma", "amp", "ampere", "amps")),
@@ -43,12 +44,18 @@ _INPUTS = (
 _OUTPUTS = (
     _sort(
         "y out output speed rpm velocity vel omega drehzahl geschwindigkeit vitesse tacho tach "
-        "position pos angle theta winkel weg",
+        "position pos angle theta winkel weg istwert velocidad velocità",
         (*_SPEEDS, "rad", "deg", "°", "rev", "m", "mm"),
     ),
     _sort("temperature temp temperatur", ("°c", "degc", "k")),
 )
 """The first sort of which there is a column counts; the others are what was logged beside it."""
+_SUPPLY = re.compile(r"(battery|batt|bat|vbat|supply|bus|akku|batterie|versorgung)(?![a-z])")
+"""What a drive is fed from, which nobody commands."""
+_NUMBER = re.compile(
+    r"#|(sample|row|line|record|packet|frame)s?([_ ]?(no|nr|number|index))?|index|idx|no|nr|seq"
+)
+"""Names of a column that numbers the rows."""
 _QUALIFIERS = frozenset(
     re.split(
         " ",
@@ -71,11 +78,11 @@ class Roles:
 def roles(table: Table) -> Roles | None:
     """Input and output of a table; None where its names and units leave a doubt.
 
-    Time, references and columns that never change are neither. The plain names `u` and `y` come
-    first, then a voltage or a command (a current only where there is no voltage) as input and a
-    speed or a position (a temperature only where there is neither) as output. A column whose name
-    and unit both say so comes before one of which only one does. Where one of the two is known and
-    one column is left, that is the other.
+    Time, references, row numbers, supplies and columns that never change are neither. The plain
+    names `u` and `y` come first, then a voltage or a command (a current only where there is no
+    voltage) as input and a speed or a position (a temperature only where there is neither) as
+    output. A column whose name and unit both say so comes before one of which only one does. Where
+    one of the two is known and one column is left, that is the other.
     """
     time = time_column(table)
     length = max((len(table[name]) for name in table.names), default=0)
@@ -83,6 +90,7 @@ def roles(table: Table) -> Roles | None:
         name for name in table.names
         if name != time and len(table[name]) == length and _moves(table, name)
         and not is_reference(name) and _stem(name) != "speed_true"
+        and not _SUPPLY.match(_stem(name)) and not _counts_rows(table, name)
     ]  # fmt: skip
     given = _only(left, "u") or _first(table, left, _INPUTS)
     found = _only(left, "y") or _first(table, left, _OUTPUTS)
@@ -97,6 +105,11 @@ def roles(table: Table) -> Roles | None:
 def _moves(table: Table, name: str) -> bool:
     known = table[name][np.isfinite(table[name])]
     return len(known) > 0 and bool(known.min() < known.max())
+
+
+def _counts_rows(table: Table, name: str) -> bool:
+    steps = np.diff(table[name])
+    return _NUMBER.fullmatch(name.lower()) is not None and bool((steps == steps[0]).all())
 
 
 def _stem(name: str) -> str:

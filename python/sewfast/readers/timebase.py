@@ -30,7 +30,7 @@ _UNIT = r"s|sec|seconds|ms|msec|millis(?:econds)?|us|µs|usec|micros(?:econds)?|
 _TIME = re.compile(
     r"(?:t|(?:(?:elapsed|relative|rel|unix|epoch|system|sys|log|run)[_ ]?)?time|time[_ ]?stamp|"
     r"(?:elapsed|relative|rel|unix|epoch)|time[_ ]since[_ ](?:start|boot|power[_ ]?on)|seconds?|"
-    rf"zeit|laufzeit|zeitstempel|temps|x-axis|x_value)(?:[_ ]({_UNIT}))?"
+    rf"zeit|laufzeit|zeitstempel|temps|tiempo|tempo|x-axis|x_value)(?:[_ ]({_UNIT}))?"
     r"|(ms|us|millis(?:econds)?|micros(?:econds)?|nanos(?:econds)?)"
 )
 """Names of a time column, with its unit or as its unit alone; `x-axis` and `x_value` are those of

@@ -282,12 +282,14 @@ Item: TypeAlias = Block | Event | End
 class Filing:
     """Owner of the file. Only `put`, `finish`, `failure` and `refusal` are for other threads."""
 
-    def __init__(self, path: Path, header: Header, *, overwrite: bool, lazy: bool) -> None:
+    def __init__(
+        self, path: Path, header: Header, *, overwrite: bool, lazy: bool, compress: bool
+    ) -> None:
         self.failure: Exception | None = None
         self._path, self._overwrite = path, overwrite
         self._header = header
         self._opened: Sink | None = None
-        self._assembler = Assembler(header.columns)
+        self._assembler = Assembler(header.columns, compress=compress)
         self._pending: dict[str, list[Any]] = {name: [] for name in header.columns}
         self._first = 0
         self._since = 0.0

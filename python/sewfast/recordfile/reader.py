@@ -28,23 +28,29 @@ from .format import (
     MESSAGE,
     MESSAGE_HEAD,
     MESSAGE_INDEX,
+    MOST_RATIO,
+    PACKED_HEAD,
     RECORD,
     SCHEMA,
+    ZSTD,
     Block,
     Message,
     Topic,
     decode,
     parse,
+    zstandard,
 )
 from .header import LARGEST_HEADER, MOST_MISSING, Header, bearable, plain
 
 # --- The whole chunks of an MCAP file, and what between them is damaged ---------------------------
 # Nothing is believed that no checksum covers: a chunk is searched for, not reached by the lengths
-# of the records before it. Its own head states its size three times, and its CRC-32 covers the
-# rest. The search has a budget: a file that is made of heads alone would cost a checksum of
-# megabytes each.
+# of the records before it. Its own head states its size three times, twice where it is compressed,
+# and its CRC-32 covers the rest. The search has a budget: a file that is made of heads alone would
+# cost a checksum of megabytes each.
 
 
+LARGEST_FILE = 4 << 30
+"""Bytes: more than a day of four columns at 1 kHz."""
 LARGEST_CHUNK = 4 << 20
 """Bytes; a recording's own chunks are far smaller."""
 BUDGET = 4
@@ -65,16 +71,26 @@ def chunks(raw: bytes) -> Iterator[Chunk]:
     Raises
     ------
     DataError
-        For a file of so many heads without their chunks that no damage explains them.
+        For a file of so many heads without their chunks that no damage explains them, and for one
+        that unpacks to more than `MOST_RATIO` times its size.
+    SettingError
+        Where a chunk is compressed and zstandard is not installed.
     """
-    at, left = 0, BUDGET * len(raw) + LARGEST_CHUNK
+    at, left, unpacked = 0, BUDGET * len(raw) + LARGEST_CHUNK, 0
     while (at := raw.find(CHUNK.to_bytes(1, "little"), at)) >= 0:
-        size = _claimed(raw, at)
-        chunk = None if size is None else _chunk_at(raw, at, size)
-        if chunk is not None:
+        claim = _claimed(raw, at)
+        chunk = None if claim is None else _chunk_at(raw, at, claim)
+        if chunk is not None and claim is not None:
+            unpacked += claim.size if claim.is_packed else 0
+            if unpacked > min(MOST_RATIO * len(raw), LARGEST_FILE):
+                raise DataError(
+                    name="chunks", received=f"{unpacked} bytes in {chunk.stop} of the file",
+                    expected=f"at most {MOST_RATIO} times the file, and {LARGEST_FILE >> 30} GiB",
+                    remedy="the file is no recording; a long one is recorded in parts",
+                )  # fmt: skip
             yield chunk
-        elif size is not None:
-            left -= size
+        elif claim is not None:
+            left -= claim.size
             if left < 0:
                 raise DataError(
                     name="chunks", expected="heads of chunks with their chunks",
@@ -84,29 +100,51 @@ def chunks(raw: bytes) -> Iterator[Chunk]:
         at = at + 1 if chunk is None else chunk.stop
 
 
-def _claimed(raw: bytes, at: int) -> int | None:
-    """The size that a head states; None where there is no head."""
-    if at + CHUNK_HEAD.size > len(raw):
-        return None
-    _, length, _, _, size, _, compression, stored = CHUNK_HEAD.unpack_from(raw, at)
-    stop = at + CHUNK_HEAD.size + size
-    if compression != 0 or stored != size or length != CHUNK_HEAD.size - RECORD.size + size:
-        return None
-    if size > LARGEST_CHUNK or stop > len(raw):
-        return None
-    return int(size)
+class _Claim(NamedTuple):
+    """What a head states: where the content begins and ends, its size when unpacked, its CRC."""
+
+    begin: int
+    stop: int
+    size: int
+    crc: int
+    is_packed: bool
 
 
-def _chunk_at(raw: bytes, at: int, size: int) -> Chunk | None:
-    stop = at + CHUNK_HEAD.size + size
-    if (
-        zlib.crc32(memoryview(raw)[at + CHUNK_HEAD.size : stop])
-        != CHUNK_HEAD.unpack_from(raw, at)[5]
-    ):
+def _claimed(raw: bytes, at: int) -> _Claim | None:
+    """What the head at a place states; None where there is none."""
+    for head, name in ((CHUNK_HEAD, ()), (PACKED_HEAD, (ZSTD,))):
+        begin = at + head.size
+        if begin > len(raw):
+            return None
+        _, length, _, _, size, crc, letters, *named, stored = head.unpack_from(raw, at)
+        if letters != len(b"".join(name)) or tuple(named) != name:
+            continue
+        if length != head.size - RECORD.size + stored or (not name and stored != size):
+            return None
+        if max(size, stored) > LARGEST_CHUNK or begin + stored > len(raw):
+            return None
+        return _Claim(begin, begin + stored, size, crc, bool(name))
+    return None
+
+
+def _chunk_at(raw: bytes, at: int, claim: _Claim) -> Chunk | None:
+    stored = memoryview(raw)[claim.begin : claim.stop]
+    body = _unpacked(stored, claim.size) if claim.is_packed else stored
+    if body is None or zlib.crc32(body) != claim.crc:
         return None
-    body = raw[at + CHUNK_HEAD.size : stop]
-    messages = _messages(body)
-    return None if messages is None else Chunk(at, stop, messages)
+    messages = _messages(bytes(body))
+    return None if messages is None else Chunk(at, claim.stop, messages)
+
+
+def _unpacked(stored: memoryview, size: int) -> bytes | None:
+    """The content of a compressed chunk; None where it is damaged, or not of the stated size."""
+    zstd = zstandard("reading a compressed recording")
+    try:
+        # a frame may state another size than the head, and would be given it
+        found = zstd.ZstdDecompressor().stream_reader(stored).read(size + 1)
+    except zstd.ZstdError:
+        return None
+    return found if len(found) == size else None
 
 
 def _messages(body: bytes) -> tuple[Message, ...] | None:
@@ -189,10 +227,6 @@ def _u32(raw: bytes, at: int) -> int:
 
 
 # --- read_recording: an MCAP recording in whatever state -> RecordedFile --------------------------
-
-
-LARGEST_FILE = 4 << 30
-"""Bytes: more than a day of four columns at 1 kHz."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -355,8 +389,14 @@ def read_header(path: str | os.PathLike[str]) -> Header:
         As `read_recording`.
     """
     path = _named(path)
-    # both copies of the header message stand in the first bytes
-    return decode_recording(path, _bytes(path, 3 * LARGEST_HEADER)).header
+    # both copies of the header message stand in the first bytes, not compressed
+    raw, found = _bytes(path, 3 * LARGEST_HEADER), _Contents()
+    for chunk in _chunks(path, raw):
+        for message in chunk.messages:
+            found.take(message)
+        if found.header is not None:
+            return found.header
+    raise _headless(path, raw, found.damage)
 
 
 def _named(path: object) -> Path:
@@ -418,7 +458,7 @@ def _headless(path: Path, raw: bytes, damage: list[str]) -> DataError:
     return DataError(
         name=str(path), expected=f"an MCAP file with the message {Topic.HEADER.path} of sewfast",
         received=reason,
-        remedy="a file of another program, one that a program has compressed, or one damaged "
+        remedy="a file of another program, one compressed other than by zstd, or one damaged "
         "from its start on cannot be read as a recording",
     )  # fmt: skip
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -142,11 +141,14 @@ class RecordWriter:
     lazy : bool
         Make the file with the first sample or event; without any, there is none, and one that
         exists is left as it is. That it could be made is found out here all the same.
+    compress : bool
+        Compress each chunk by zstd (`sewfast[zstd]`). All that holds of a plain file holds: a chunk
+        is written as a whole, and a damaged one costs its own samples.
 
     Raises
     ------
     SettingError
-        Where the file exists and `overwrite` is False.
+        Where the file exists and `overwrite` is False, or zstandard is not installed.
     DataError
         Where it cannot be written.
 
@@ -176,10 +178,11 @@ class RecordWriter:
         *,
         overwrite: bool = False,
         lazy: bool = False,
+        compress: bool = False,
     ) -> None:
         self.path = Path(path)
         self.header = header
-        self._filing = Filing(self.path, header, overwrite=overwrite, lazy=lazy)
+        self._filing = Filing(self.path, header, overwrite=overwrite, lazy=lazy, compress=compress)
         self._opened = time.monotonic()
         self._next = 0
         self._received = 0
@@ -368,10 +371,13 @@ def save_columns(
 # --- A recording with one message a sample: what plotting programs draw as curves without more ado
 
 
-CHUNK_SAMPLES = 500
+CHUNK_SAMPLES, CHUNK_BYTES = 500, 1 << 20
+"""Of a chunk, whichever comes first: a reader takes no longer one than 4 MiB for a recording's."""
 
 
-def save_curves(path: str | os.PathLike[str], recording: RecordedFile) -> None:
+def save_curves(
+    path: str | os.PathLike[str], recording: RecordedFile, *, compress: bool = False
+) -> None:
     """Write a recording anew, whole and with one message a sample; it appears whole or not at all.
 
     `read_recording` reads it as it reads any other. Samples in gaps have no message, what was
@@ -381,11 +387,13 @@ def save_curves(path: str | os.PathLike[str], recording: RecordedFile) -> None:
     ------
     DataError
         Where the file cannot be written.
+    SettingError
+        Where it is to be compressed and zstandard is not installed.
     """
     with replacing(Path(path)) as temporary:
+        assembler = Assembler(recording.header.columns, single=True, compress=compress)
         sink = Sink(temporary, overwrite=False)
         try:
-            assembler = Assembler(recording.header.columns, single=True)
             sink.append(opening())
             for count, group in enumerate(_groups(recording)):
                 sink.append(assembler.chunk(group, sink.size, leading=count == 0))
@@ -404,8 +412,15 @@ def _groups(recording: RecordedFile) -> Iterator[list[Message]]:
         at = start + round(event["elapsed"] * 1e9)
         at = at if event["index"] is None else header.time_ns(event["index"])
         yield [Message(Topic.EVENTS, at, at, format.dumps(dict(event)))]
-    messages = _samples(recording)
-    while group := list(itertools.islice(messages, CHUNK_SAMPLES)):
+    group: list[Message] = []
+    size = 0
+    for message in _samples(recording):
+        group.append(message)
+        size += len(message.data)
+        if len(group) == CHUNK_SAMPLES or size >= CHUNK_BYTES:
+            yield group
+            group, size = [], 0
+    if group:
         yield group
     at = header.time_ns(len(recording))
     yield [Message(Topic.COMPLETENESS, at, at, format.dumps(_account(recording)))]
@@ -455,7 +470,11 @@ def _is_earlier(out: Path, recording: RecordedFile) -> bool:
 
 
 def export(
-    path: str | os.PathLike[str], out: str | os.PathLike[str], *, overwrite: bool = False
+    path: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    compress: bool = False,
 ) -> RecordedFile:
     """Write a recording's columns with `t` in the format that the extension of `out` says.
 
@@ -471,6 +490,9 @@ def export(
         step, except a recording of a drive.
     overwrite : bool
         Whether to replace such a recording as well.
+    compress : bool
+        Of `.mcap`: compress its chunks by zstd (`sewfast[zstd]`), which PlotJuggler, Foxglove and
+        sewfast read.
 
     Returns
     -------
@@ -483,8 +505,13 @@ def export(
         Where the recording cannot be read or the other file not be written.
     SettingError
         Where the extension is unknown or its package is not installed, `out` is the recording
-        itself, or another one that cannot be had again.
+        itself, or another one that cannot be had again; to compress another format.
     """
+    if compress and Path(out).suffix.lower() != ENDING:
+        raise SettingError(
+            name="compress", expected=f"a file that ends in {ENDING}", received=str(out),
+            remedy="leave it out: .parquet is compressed anyway",
+        )  # fmt: skip
     recording = read_recording(path)
     if Path(out).exists() and Path(out).samefile(path):
         raise SettingError(
@@ -493,7 +520,7 @@ def export(
         )  # fmt: skip
     require_replaceable(out, overwrite=overwrite or _is_earlier(Path(out), recording))
     if Path(out).suffix.lower() == ".mcap":
-        save_curves(out, recording)
+        save_curves(out, recording, compress=compress)
     else:
         write_table(out, recording.table_columns(), units=recording.units)
     return recording
