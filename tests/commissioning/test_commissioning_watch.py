@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,10 @@ from commissioned import SMALL, short
 from loops import QUIET, drive
 from sewfast import Controller, Gains, VirtualMachine, commission, run
 from sewfast.commissioning import Refusal
-from sewfast.commissioning.bench import Aborted, NotedBench
+from sewfast.commissioning.bench import Aborted, Guard, NotedBench
 from sewfast.commissioning.verification import Watching, measure, predict
-from sewfast.control.machine import MachineBench, RecordedRun, SteppedBench, Watch
+from sewfast.control.controller import SampledController
+from sewfast.control.machine import WATCHED, MachineBench, RecordedRun, SteppedBench, Watch
 from sewfast.dataset import FloatArray
 from sewfast.link import VirtualDevice, connect
 from sewfast.models import Ensemble
@@ -142,7 +144,7 @@ def test_a_commissioning_names_the_reference_and_keeps_what_was_recorded(tmp_pat
         def follow(
             self, controller: Controller, r: FloatArray, name: str, *, watch: Watch | None = None
         ) -> RecordedRun:
-            if watch is not None:
+            if name == "trapezoid":
                 weak = VirtualMachine(parameters={"current_limit": 0.7})
                 object.__setattr__(self, "machine", weak)
             return super().follow(controller, r, name, watch=watch)
@@ -152,3 +154,85 @@ def test_a_commissioning_names_the_reference_and_keeps_what_was_recorded(tmp_pat
     assert refused.value.so_far is not None
     assert any(name.endswith("_aborted") for name in refused.value.so_far.recordings)
     assert list((tmp_path / "unfinished").glob("*_aborted.mcap"))
+
+
+class Fails(SteppedBench):
+    """A machine whose encoder or amplifier fails a second into the first long run."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(Failing(), 1e-3, 1572.0, 20.0)
+        self.machine.what = what  # type: ignore[attr-defined]
+
+    def follow(
+        self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
+    ) -> RecordedRun:
+        if name == "trapezoids":
+            self.machine.left = 1000  # type: ignore[attr-defined]
+        return super().follow(controller, r, name, watch=watch)
+
+
+class Failing:
+    """300 RPM per volt, a time constant of 80 ms."""
+
+    what, left = "", math.inf
+    speed = angle = counts = 0.0
+    railed = 0
+
+    def reset(self) -> None:
+        self.speed = self.angle = self.counts = 0.0
+
+    def step(self, u: float) -> None:
+        self.left -= 1
+        is_out = self.left < 0
+        self.railed += abs(u) >= 19.99
+        self.speed += 0.0125 * (
+            300.0 * (0.0 if is_out and self.what == "amplifier" else u) - self.speed
+        )
+        self.angle += self.speed * 1e-3 / 60.0
+        if not (is_out and self.what == "encoder"):
+            self.counts = math.floor(1572.0 * self.angle)
+
+
+@pytest.mark.parametrize("what", ["encoder", "amplifier"])
+def test_a_loop_without_encoder_or_amplifier_is_ended_and_named(what: str) -> None:
+    on = Fails(what)
+    with short(), pytest.raises(Refusal, match="look for a lost encoder, an amplifier") as refused:
+        commission(on, **SMALL)
+    assert refused.value.stage == "closed loop"
+    # a quarter of a second without a count, and a block; a motor without amplifier coasts before
+    most = {"encoder": 250, "amplifier": 1000}[what] + WATCHED
+    assert on.machine.railed <= most  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("hertz", [3.0, 20.0, 60.0])
+def test_a_command_that_goes_from_limit_to_limit_ends_a_run(hertz: float) -> None:
+    guard = Guard(QUIET, "hold", 1572.0)
+    t = np.arange(5000) * 1e-3
+    u, counts = 20.0 * np.sign(np.sin(2 * np.pi * hertz * t + 0.1)), np.arange(5000.0)
+    with pytest.raises(Aborted, match="8 times in a row from limit to limit") as stop:
+        guard(0, u, counts)
+    assert stop.value.frequency == pytest.approx(hertz, rel=0.1)
+    assert len(stop.value.recording) <= 1000 * 9 / (2 * hertz)
+
+
+@pytest.mark.parametrize(
+    "u",
+    [
+        20.0 * np.sign(np.sin(2 * np.pi * 1.5 * np.arange(5000) * 1e-3)),
+        18.0 * np.sin(2 * np.pi * 20.0 * np.arange(5000) * 1e-3),
+        np.full(5000, 20.0),
+    ],
+    ids=["slower than a swing", "within the limits", "one limit"],
+)
+def test_a_command_that_does_not_swing_ends_no_run(u: FloatArray) -> None:
+    guard = Guard(QUIET, "hold", 1572.0)
+    guard(0, u, np.arange(5000.0))
+
+
+def test_a_motor_that_stands_under_a_small_command_ends_no_run() -> None:
+    guard = Guard(QUIET, "hold", 1572.0)
+    guard(0, np.full(5000, 9.9), np.zeros(5000))
+    guard(0, np.full(245, 20.0), np.zeros(245))
+    with pytest.raises(Aborted, match=r"not by a count for 0\.25 s at 20 V") as stop:
+        guard(0, np.full(20, 20.0), np.zeros(20))
+    assert len(stop.value.recording) == 5250

@@ -297,3 +297,18 @@ def test_a_run_that_is_broken_off_leaves_no_command() -> None:
     with pytest.raises(KeyboardInterrupt):
         record(on, STEP)
     assert on.machine.applied[-2:] == [4.0, 0.0]
+
+
+@pytest.mark.parametrize("counts", [None, "12", float("nan")])
+def test_a_simulators_counts_are_a_number(counts: Any) -> None:
+    class Odd:
+        def reset(self) -> None: ...
+
+        def step(self, u: float) -> None: ...
+
+    odd: Any = Odd()
+    odd.counts = counts
+    on = SteppedBench(odd, Ts=1e-3, counts_per_rev=1000.0, volt=10.0, name="mine")
+    with pytest.raises(SettingError) as caught:
+        on.excite(np.zeros(100), "rest")
+    assert (caught.value.name, caught.value.received) == ("counts of mine", repr(counts))

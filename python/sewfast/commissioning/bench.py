@@ -29,10 +29,12 @@ from ..control.machine import (
     machine_of,
 )  # fmt: skip
 from ..dataset import FloatArray
-from ..errors import DataError, FitError, LinkError, SettingError
+from ..errors import DataError, LinkError, SettingError
 from ..link import Drive
 from ..link.record import conditions_of, device_of
 from ..recording import Recording, require_finite
+from ..speed import speed_or_nan
+from .demands import Refusal
 
 __all__ = ["Bench", "Followed", "MachineBench", "Stepped", "SteppedBench"]
 
@@ -44,12 +46,118 @@ ABORTED = "_aborted"
 """Ends the name of the recording of a run that was ended on the way."""
 
 
-class Aborted(FitError):
-    """A run that was ended on the way, with what it had recorded."""
+class Aborted(Refusal):
+    """A run that was ended on the way.
 
-    def __init__(self, reason: str, recording: Recording) -> None:
+    Attributes
+    ----------
+    recording : Recording
+        What it had recorded.
+    frequency : float or None
+        Of a command that went from limit to limit [Hz].
+    """
+
+    def __init__(
+        self, reason: str, recording: Recording, *, frequency: float | None = None
+    ) -> None:
         super().__init__(reason)
-        self.recording = recording
+        self.recording, self.frequency = recording, frequency
+
+    @classmethod
+    def after(
+        cls,
+        reason: str,
+        name: str,
+        u: FloatArray,
+        counts: FloatArray,
+        like: SampledController,
+        counts_per_rev: float,
+        *,
+        frequency: float | None = None,
+    ) -> Aborted:
+        """Of a run by its name, after these commands [V] and counts."""
+        counts, u = counts - counts[0], u.copy()
+        y = speed_or_nan(counts, like.Ts, counts_per_rev, "kalman")
+        return cls(
+            f"{name!r}, ended after {len(u) * like.Ts:.3g} s: {reason}",
+            Recording(u, counts, y, None, like.Ts, counts_per_rev, f"{name}{ABORTED}"),
+            frequency=frequency,
+        )
+
+
+LARGE, NEAR, WAYS, SPAN = 0.5, 0.05, 8, 0.25
+"""Of the largest command that moves any motor; of the range between the limits, within which a
+command is at one; ways from limit to limit that are a swing; time of a motor that does not move,
+and between two of these ways [s]. A device guards itself by the same (docs/PROTOCOL.md, 9 and 12).
+"""
+
+
+class Guard:
+    """Ends a loop whose motor or encoder has failed, and one that swings from limit to limit.
+
+    Under feedback a lost encoder is a motor at full speed for as long as the reference lasts.
+
+    Parameters
+    ----------
+    controller : Controller or StateFeedback
+    name : str
+        Of the run.
+    counts_per_rev : float
+    """
+
+    def __init__(self, controller: SampledController, name: str, counts_per_rev: float) -> None:
+        self._controller, self._name, self._per_turn = controller, name, counts_per_rev
+        low, high = controller.u_min, controller.u_max
+        self._large, near = LARGE * max(-low, high), NEAR * (high - low)
+        self._low, self._high = low + near, high - near
+        self._span = max(10, round(SPAN / controller.Ts))
+        self._u: list[FloatArray] = []
+        self._counts: list[FloatArray] = []
+        self._done, self._last = 0, math.nan
+        self._still, self._side, self._ways = 0, 0, [0]
+
+    def __call__(self, first: int, u: FloatArray, counts: FloatArray) -> None:
+        """Samples `first`, `first + 1`, ...
+
+        Raises
+        ------
+        Aborted
+        """
+        self._u.append(u.copy())
+        self._counts.append(counts.copy())
+        for command, count in zip(u.tolist(), counts.tolist(), strict=True):
+            self._done += 1
+            is_still = count == self._last and abs(command) >= self._large
+            self._still, self._last = self._still + 1 if is_still else 0, count
+            if self._still >= self._span:
+                self._end(
+                    f"expected the encoder to move, it has not by a count for {SPAN:g} s at "
+                    f"{command:.3g} V; look for a lost encoder, an amplifier that has tripped, a "
+                    "shaft that is blocked"
+                )
+            side = int(command >= self._high) - int(command <= self._low)
+            if side and side != self._side:
+                self._turn(side)
+
+    def _turn(self, side: int) -> None:
+        """The command has come to another limit than it was at before."""
+        now = self._done
+        in_row = self._side != 0 and now - self._ways[-1] <= self._span
+        self._side, self._ways = side, [*self._ways, now] if in_row else [now]
+        if len(self._ways) > WAYS:
+            seconds = (self._ways[-1] - self._ways[0]) * self._controller.Ts
+            hertz = 0.5 * WAYS / seconds
+            self._end(
+                f"expected a command that does not swing, it went {WAYS} times in a row from limit "
+                f"to limit, at {hertz:.3g} Hz; look for play, for a shaft that gives, for a delay",
+                hertz,
+            )
+
+    def _end(self, reason: str, frequency: float | None = None) -> None:
+        u, counts = (np.concatenate(x)[: self._done] for x in (self._u, self._counts))
+        raise Aborted.after(
+            reason, self._name, u, counts, self._controller, self._per_turn, frequency=frequency
+        )
 
 
 @dataclass
@@ -168,8 +276,15 @@ class NotedBench(Around):
         key = key_of(r, controller)
         found = self.kept_run(name, key, controller)
         if found is None:
+            guard = Guard(controller, name, self.counts_per_rev)
+
+            def both(first: int, u: FloatArray, counts: FloatArray) -> None:
+                guard(first, u, counts)
+                if watch is not None:
+                    watch(first, u, counts)
+
             try:
-                found = super().follow(controller, r, name, watch=watch)
+                found = super().follow(controller, r, name, watch=both)
             except Aborted as stop:
                 # of another name: whoever goes on is to run it again, and whole
                 self.note(f"{name}{ABORTED}", key, stop.recording, None)

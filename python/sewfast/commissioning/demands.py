@@ -83,7 +83,7 @@ class Demands:
     load : float or None
         What the load step takes [V]; None for a share of `u_max`, 0 for no such requirement.
     Ms : float or None
-        Largest sensitivity on the members, linearised; None for no such requirement.
+        Largest sensitivity on the small signals; None for no such requirement.
     time_budget : float or None
         Of the search [s].
     """

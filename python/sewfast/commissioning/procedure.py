@@ -128,8 +128,9 @@ def commission(
         ensemble recovers later from it than under Eq. 12's. By default a tenth of `u_max`; 0 for no
         such requirement.
     Ms : float or None
-        Largest sensitivity, on every member linearised at three quarters of the top speed; that of
-        Eq. 12's gains if it is larger and a load is required.
+        Largest sensitivity on the machine's small signals, or where these show nothing on every
+        member linearised at three quarters of the top speed; that of Eq. 12's gains if it is larger
+        and a load is required.
     time_budget : float, optional
         Time of the search [s], after which the best gains so far are taken. A seed then no longer
         gives the same gains again.

@@ -81,8 +81,9 @@ class Commissioning:
     cost : Cost or None
         What counted how much.
     met : mapping or None
-        How the gains meet the requirements besides the cost: `Ms` of the members linearised,
-        `recovery_ms` of each member under the load step, tuned and with the rule's gains.
+        How the gains meet the requirements besides the cost: `Ms` on the small signals, or of the
+        members linearised where there are none, `recovery_ms` of each member under the load step,
+        tuned and with the rule's gains.
     card : ReportCard or None
         How far the best member can be trusted, on the recording `levels`.
     judgement : Judgement or None
@@ -272,7 +273,7 @@ def _evidence(c: Commissioning) -> list[str]:
     if c.card is not None:
         lines.append(f"  report card    {c.card.verdict}{_named(c.card.lines)}")
     if c.met is not None and c.met["Ms"]:
-        lines.append(f"  Ms             {max(c.met['Ms']):.3g} at most over the networks")
+        lines.append(f"  Ms             {max(c.met['Ms']):.3g}")
     if c.met is not None and c.met["load"] is not None:
         tuned, rule = (max(c.met["recovery_ms"][n]) for n in ("tuned", "rule"))
         volt = abs(c.met["load"]["disturbance"])

@@ -14,10 +14,8 @@ from ..control.machine import WATCHED
 from ..dataset import FloatArray
 from ..errors import FitError
 from ..models import Ensemble, Model
-from ..recording import Recording
-from ..speed import speed_or_nan
 from ..trust import Judgement, judge
-from .bench import ABORTED, Aborted, NotedBench
+from .bench import Aborted, NotedBench
 from .demands import Refusal, require
 from .slow import Thinning
 
@@ -191,10 +189,7 @@ def measure(
     for i in sorted(found, key=lambda i: len(found[i].predicted.r)):
         name = found[i].reference
         watch = Watching(found[i].predicted, controller, bench.counts_per_rev)
-        try:
-            run = bench.follow(controller, references[name], name, watch=watch).run
-        except Aborted as stop:
-            raise Refusal(str(stop)) from stop
+        run = bench.follow(controller, references[name], name, watch=watch).run
         found[i] = replace(found[i], measured=run)
         keep(tuple(found[k] for k in range(len(predicted))))
         require_alike(found[i])
@@ -299,15 +294,9 @@ class Watching:
             )  # fmt: skip
 
     def _end(self, end: int, reason: str) -> None:
-        at = f"{self._predicted.reference!r}, ended after {end * self._Ts:.3g} s"
-        counts = self._counts[:end] - self._counts[0]
-        y = speed_or_nan(counts, self._Ts, self._per_turn, "kalman")
-        raise Aborted(
-            f"{at}: {reason}; the controller is not verified",
-            Recording(
-                self._u[:end].copy(), counts, y, None, self._Ts, self._per_turn,
-                f"{self._predicted.reference}{ABORTED}",
-            ),
+        raise Aborted.after(
+            f"{reason}; the controller is not verified", self._predicted.reference,
+            self._u[:end], self._counts[:end], self._controller, self._per_turn,
         )  # fmt: skip
 
 

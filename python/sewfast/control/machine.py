@@ -466,7 +466,8 @@ class SteppedBench:
         """Counts, from 0, and true speeds, each read before the sample's command acts."""
         machine = self.machine
         machine.reset()
-        first, counts, speed = machine.counts, np.zeros(samples), np.zeros(samples)
+        first = real(f"counts of {self.name}", machine.counts)
+        counts, speed = np.zeros(samples), np.zeros(samples)
         try:
             for k in range(samples):
                 counts[k], speed[k] = machine.counts - first, getattr(machine, "speed_rpm", np.nan)

@@ -115,7 +115,7 @@ def _met(found: Mapping[str, Any]) -> Table | None:
     rows = []
     if met["Ms"]:
         rows.append(
-            ("largest sensitivity Ms of the networks", significant(max(met["Ms"])),
+            ("largest sensitivity Ms", significant(max(met["Ms"])),
              significant(met["Ms_limit"])),
         )  # fmt: skip
     if met["load"]:
