@@ -266,13 +266,12 @@ def test_a_heavier_load_is_seen_while_it_runs_and_nothing_else() -> None:
     u, truth = steps(30.0, 0.001, 204), truths(machine.parameters)
     y, other = speeds(machine, u), speeds(heavier, u)
     tracker = Tracker(Ts=0.001, speed=300.0, lag=truth["electrical_lag"])
-    with pytest.raises(DataError, match="too few samples"):
-        tracker.watch()
     tracker.run(u[:5000], y[:5000])
     assert tracker.estimate["k_a"] == pytest.approx(truth["k_a"], rel=0.03)
     assert tracker.deviation["k_a"] < 0.03 * truth["k_a"]
     tracker.watch()
     track = tracker.run(u[5000:], y[5000:])
+    assert not tracker.waits
     assert not any(m.any() for m in track.moved.values())
     assert tracker.moved == ()
     tracker.reset()
@@ -282,13 +281,36 @@ def test_a_heavier_load_is_seen_while_it_runs_and_nothing_else() -> None:
     assert track.estimates["k_a"][5000:].mean() == pytest.approx(1.1 * truth["k_a"], rel=0.03)
 
 
+def test_a_reference_that_is_not_sure_yet_is_waited_for() -> None:
+    """After 5 s the inertia of this machine is still 3.7 % off: eight false alarms came of it."""
+    machine = VirtualMachine(400)
+    u = steps(120.0, 0.001, 400)
+    y = speeds(machine, u)
+    tracker = Tracker(Ts=0.001, speed=300.0, lag=truths(machine.parameters)["electrical_lag"])
+    tracker.watch()
+    assert tracker.waits
+    tracker.run(u[:5000], y[:5000])
+    tracker.watch()
+    assert tracker.waits
+    track = tracker.run(u[5000:], y[5000:])
+    assert not tracker.waits
+    assert not any(m.any() for m in track.moved.values())
+
+
 def test_one_sample_at_a_time_is_the_same() -> None:
-    u, y = linear(3000, 0.001)
+    u, y = linear(9000, 0.001)
+    y[6000:] *= 0.8
     one, other = (Tracker(Ts=0.001, speed=300.0) for _ in range(2))
+    one.watch()
+    other.watch()
     track = one.run(u, y)
+    moved = []
     for a, b in zip(u, y, strict=True):
         other.step(a, b)
+        moved.append(other.moved)
     assert other.estimate == one.estimate
+    assert [bool(m) for m in moved] == np.any(list(track.moved.values()), axis=0).tolist()
+    assert moved[-1]
     assert {n: v[-1] for n, v in track.estimates.items()} == one.estimate
 
 
@@ -301,6 +323,8 @@ def test_a_tracker_refuses_what_it_cannot_use(wrong: dict[str, float]) -> None:
     tracker = Tracker(Ts=0.001, speed=300.0)
     with pytest.raises(SettingError, match="k_v"):
         tracker.watch({"J": 1.0})
+    with pytest.raises(SettingError, match="k_a"):
+        tracker.watch(tolerance={"k_a": 0.0})
     with pytest.raises(DataError):
         tracker.run(np.zeros(3), np.zeros(4))
 
