@@ -141,7 +141,7 @@ class Choice(Finals):
         return [best, *self._joining(best, able)]
 
     def _beats_motor(self, c: Candidate) -> bool:
-        """Whether it is by far better than a motor's equations, where these are a candidate."""
+        """Whether it is better by a tenth than a motor's equations, where these are a candidate."""
         motor = self.search.motor
         return motor is None or c.error < WORTH_IT * motor.rmse
 
@@ -270,6 +270,11 @@ class Choice(Finals):
         extra: Provenance = {"initial_state": "estimated", "choice": choice}
         return documented(model, self.task, self.began, extra)
 
+    def _network_alternative(self) -> list[Model]:
+        """The best network that passed the guard, where none was chosen."""
+        sound = [c for c in self.search.eligible if c.is_sound]
+        return [self._alternative(c) for c in sorted(sound, key=lambda c: c.error)[:1]]
+
     def _linear_alternative(self) -> list[Model]:
         """The linear model that the network was compared with."""
         if not self.search.linear.eligible:
@@ -311,7 +316,6 @@ class Choice(Finals):
             lambda c, look: grey_box.completed(task, c, part, look), jobs, until=until, share=1.0
         )
         core = next((c for c in fits if c is not None), found.core)
-        ranked = sorted((c for c in self.search.eligible if c.is_sound), key=lambda c: c.error)
         provenance: Provenance = {
             "initial_state": "estimated",
             "cost_horizon": "free run",
@@ -321,9 +325,10 @@ class Choice(Finals):
         }
         model = wrap(GreyBox, core, task.data)
         provenance["cost"] = cost_of(model, task.data)
-        others = [self._alternative(c) for c in ranked[:1]]
         model = documented(model, task, self.began, provenance)
-        return self._closed(model, found.rmse, [*others, *self._linear_alternative()])
+        return self._closed(
+            model, found.rmse, [*self._network_alternative(), *self._linear_alternative()]
+        )
 
     def _linear(self) -> Model:
         """Output error on all data, of the simplest order that is about as good as the best."""
@@ -341,9 +346,7 @@ class Choice(Finals):
             model = documented(wrap(LinearOE, core, task.data), task, self.began, extra)
         else:
             model = linear_model(task, fit, self.began, provenance)
-        ranked = sorted((c for c in self.search.eligible if c.is_sound), key=lambda c: c.error)
-        others = [self._alternative(c) for c in ranked[:1]]
-        return self._closed(model, chosen.rmse, others)
+        return self._closed(model, chosen.rmse, self._network_alternative())
 
     def _linear_choice(self) -> LinearCandidate:
         """The simplest linear model within a standard error of the best on all later parts."""
@@ -418,7 +421,8 @@ class Choice(Finals):
         """What there is when Ctrl-C comes: the best candidate, else the linear model."""
         best, linear, motor = self.search.best, self.linear, self.search.motor
         bound = math.inf if linear is None else linear.rmse
-        if motor is not None and motor.rmse < WORTH_IT * bound:
+        is_motor = motor is not None and motor.rmse < WORTH_IT * bound
+        if motor is not None and is_motor:
             bound = motor.rmse
         is_better = best is not None and (self.wants_network or best.error < WORTH_IT * bound)
         if best is not None and is_better and not self.is_linear:
@@ -426,7 +430,7 @@ class Choice(Finals):
             self.is_interrupted = True
             model = self._network([best], [])
             return with_provenance(model, {"termination": "interrupted"})
-        if motor is not None and bound == motor.rmse:
+        if is_motor:
             self.reasons, self.is_interrupted = ["interrupted: the equations of a motor"], True
             return with_provenance(self._motor(), {"termination": "interrupted"})
         if self.wants_network or linear is None or linear.models[0] is None:

@@ -125,9 +125,14 @@ class MotorCandidate:
     `errors` are those on every part that was asked, the newest first.
     """
 
-    hidden: int
     core: _core.GreyBox
     errors: tuple[Errors, ...]
+
+    @property
+    def hidden(self) -> int:
+        """Units of the network."""
+        units: int = self.core.settings["hidden"]
+        return units
 
     @property
     def rmse(self) -> float:
@@ -164,7 +169,8 @@ def candidate(
     fuller = pool.map(more, list(zip(parts, plain, strict=True)), until=until)
     first = fuller[0]
     best = fuller if first is not None and _is_better(first, plain[0]) else plain
-    return _together([c for c in best if c is not None])
+    found = [c for c in best if c is not None]
+    return replace(found[0], errors=tuple(e for c in found for e in c.errors))
 
 
 def _or_none(found: Callable[[], MotorCandidate]) -> MotorCandidate | None:
@@ -173,11 +179,6 @@ def _or_none(found: Callable[[], MotorCandidate]) -> MotorCandidate | None:
         return found()
     except (DataError, FitError, SettingError, np.linalg.LinAlgError):
         return None
-
-
-def _together(found: Sequence[MotorCandidate]) -> MotorCandidate:
-    """The newest part's, with the errors on all parts."""
-    return replace(found[0], errors=tuple(e for c in found for e in c.errors))
 
 
 def completed(task: Task, found: MotorCandidate, part: Split, look: Look) -> _core.GreyBox:
@@ -192,7 +193,7 @@ def completed(task: Task, found: MotorCandidate, part: Split, look: Look) -> _co
 
 def _judged(core: _core.GreyBox, part: Split) -> MotorCandidate:
     core = _with_noise(core, part.fitted)
-    return MotorCandidate(core.settings["hidden"], core, (errors_of(free_runs(core, part), part),))
+    return MotorCandidate(core, (errors_of(free_runs(core, part), part),))
 
 
 def _beside(
