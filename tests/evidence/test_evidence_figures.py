@@ -11,7 +11,7 @@ import pytest
 
 import result_folder
 import sewfast
-from cli import sewfast as command
+from cli import called as command
 from plants import bent_data, linear_data
 from sewfast import Dataset
 from sewfast.errors import DataError, SettingError
