@@ -654,7 +654,7 @@ def test_good_data_have_no_findings() -> None:
 values = st.floats(width=64) | st.sampled_from([0.0, 1.0, np.nan, np.inf, 1e308, -1e308, 5e-324])
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=40)
 @given(st.data(), st.integers(1, 60), st.integers(1, 2), st.sampled_from([1, 9]))
 def test_a_diagnosis_of_anything(draw: st.DataObject, n: int, inputs: int, times: int) -> None:
     u = draw.draw(hnp.arrays(np.float64, (n, inputs), elements=values))
