@@ -664,6 +664,16 @@ def test_a_diagnosis_of_anything(draw: st.DataObject, n: int, inputs: int, times
     json.dumps(sewfast.diagnose(data).to_json(), allow_nan=False)
 
 
+def test_an_input_that_is_wild_where_the_output_is_missing_overflows_nowhere() -> None:
+    """Beside it the inputs that count are so small that in their scale its square is infinite."""
+    u, y = np.zeros(34), np.full(34, 1e150)
+    u[:2] = 4e-151, 1e9
+    y[[0, 2, 3]] = 0.0, 0.0, 1.0
+    once = Experiment(np.tile(u, 9)[:, None], np.tile(y, 9))
+    found = sewfast.diagnose(Dataset((once, once), 0.01, *_names(1)))
+    assert found.find("integrator") is None
+
+
 def _names(inputs: int) -> tuple[Any, ...]:
     return tuple(f"u{i}" for i in range(inputs)), "y", ("",) * inputs
 
