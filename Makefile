@@ -151,10 +151,10 @@ firmware: ## the example firmware for emulated boards, Cortex-M4 and M7 (Debian:
 	  arm-none-eabi-size target/bare/$$1.elf; \
 	done
 
-# first the tests that compute, one on each processor, then those that wait, which can be more
+# first the tests that compute, then those that wait
 python-test: $(DEV) ## pytest, with every snippet of the documentation and every example
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not alone'
-	$(BIN)/python -m pytest -n 4 --dist worksteal -m alone
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m alone
 
 docs: $(DEV) $(OUT)/results.json ## the site, in site/index.html, its pictures drawn from demo/; works offline
 	$(BIN)/python docs/build.py --results $(OUT)
