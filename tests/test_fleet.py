@@ -143,6 +143,81 @@ def test_workers_that_are_gone_for_good_are_missed(
     assert caught.value.name == "workers"
 
 
+@pytest.mark.usefixtures("quiet")
+@pytest.mark.parametrize("own", [True, False], ids=["own cluster", "client's cluster"])
+def test_a_worker_that_starts_slowly_is_not_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: bool
+) -> None:
+    """Dask closes for good what is away for longer than its timeout, here at once."""
+    distributed = pytest.importorskip("distributed", reason="needs dask")
+    import dask
+
+    from sewfast.fleets import running
+
+    many = made(tmp_path / "many", 30)
+    expected = bits(fleet(many, workers=0))
+    monkeypatch.setattr(running, "_LOOK", 0.5)
+    before = set(distributed.Nanny._instances)
+    killed: list[int] = []
+
+    def kill(done: int, *_: Any) -> None:
+        if done >= 3 and not killed:
+            (keeper,) = set(distributed.Nanny._instances) - before
+            killed.append(keeper.pid)
+            os.kill(keeper.pid, signal.SIGKILL)
+
+    settings = {
+        "distributed.deploy.lost-worker-timeout": "10ms",
+        "distributed.scheduler.allowed-failures": 50,
+    }
+    with dask.config.set(settings):
+        if own:
+            found = fleet(many, workers=1, progress=kill)
+        else:
+            with (
+                distributed.LocalCluster(
+                    n_workers=1, threads_per_worker=1, dashboard_address=None
+                ) as cluster,
+                distributed.Client(cluster) as client,
+            ):
+                found = fleet(many, client=client, progress=kill)
+    assert killed
+    assert bits(found) == expected
+
+
+@pytest.mark.parametrize("starting", [True, False])
+def test_workers_that_are_starting_are_waited_for_longer(
+    monkeypatch: pytest.MonkeyPatch, starting: bool
+) -> None:
+    from sewfast.fleets import running
+
+    now = 0.0
+    asked: list[int] = []
+
+    class Distributed:
+        TimeoutError = TimeoutError
+
+        @staticmethod
+        def wait(tasks: set[str], timeout: float, return_when: str) -> SimpleNamespace:
+            nonlocal now
+            now += timeout
+            raise TimeoutError
+
+    keeper = SimpleNamespace(status=SimpleNamespace(name="running"), pid=7 if starting else None)
+    gone = SimpleNamespace(status=SimpleNamespace(name="closed"), pid=None)
+    cluster = SimpleNamespace(
+        worker_spec={0: {}, 1: {}}, workers={0: keeper, 1: gone}, scale=asked.append,
+        loop=SimpleNamespace(add_callback=lambda work: work()),
+    )  # fmt: skip
+    client = SimpleNamespace(cluster=cluster, scheduler_info=lambda n_workers: {"workers": {}})
+    monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(running, "import_module", lambda name: Distributed)
+    with pytest.raises(SettingError, match="600 s, while" if starting else "none for 120 s"):
+        running._ended({"task"}, client)
+    assert set(asked) == {2}
+    assert cluster.workers == {0: keeper}
+
+
 @pytest.mark.parametrize("present", [True, False])
 def test_a_look_that_takes_long_is_no_absence(
     monkeypatch: pytest.MonkeyPatch, present: bool
