@@ -216,9 +216,9 @@ def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
     SettingError, DataError
         For a text that is neither, a file without r, one at another sample time or in another unit.
     """
-    from ..arrays import REVOLUTIONS_PER_SECOND
     from ..readers import read
     from ..signals import REFERENCES
+    from ..units import ANGULAR_SPEEDS, spelled
 
     if text.replace("-", "_").lower() in REFERENCES:
         return text
@@ -235,8 +235,8 @@ def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
             remedy="resample the reference",
         )  # fmt: skip
     given = data.input_units[0]
-    speeds = {given.lower(), unit.lower()}
-    if len(speeds) > 1 and speeds <= REVOLUTIONS_PER_SECOND.keys():
+    speeds = {spelled(given), spelled(unit)}
+    if len(speeds) > 1 and speeds <= ANGULAR_SPEEDS:
         raise DataError(
             f"{text}: expected r in {unit}, the loop's unit, got {given}; convert the column"
         )

@@ -22,6 +22,7 @@ from ..evidence.residuals import representative
 from ..gains import real
 from ..models import Model
 from ..rules import Fopdt, fit_fopdt
+from ..units import spelled
 from .controller import SampledController
 
 NAMES = ("trapezoid", "trapezoids", "random")
@@ -275,7 +276,7 @@ def catalogue_fits(model: Any, u_min: float, u_max: float, unit: str) -> bool:
 
     A plant that stores no range of its record is taken for one that they suit.
     """
-    if unit.lower() != "rpm" or not math.isclose(model.Ts, signals.TS, rel_tol=1e-9):
+    if spelled(unit) != "rpm" or not math.isclose(model.Ts, signals.TS, rel_tol=1e-9):
         return False
     known = _output_range(model) if isinstance(model, Model) else None
     if known is None:

@@ -20,6 +20,7 @@ from ..gains import Gains, vector
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
 from ..tables import Table, percent, significant
+from ..units import spelled
 from .controller import Controller, SampledController, pid_of
 from .defaults import default_references, drive_references
 
@@ -375,7 +376,7 @@ def reference_samples(
         return vector("reference", reference).copy()
     samples = signals.reference(reference, seed)
     unit, Ts = controller.y_unit, controller.Ts
-    if unit.lower() == "rpm" and math.isclose(Ts, signals.TS, rel_tol=1e-9):
+    if spelled(unit) == "rpm" and math.isclose(Ts, signals.TS, rel_tol=1e-9):
         return samples
     if isinstance(plant, Model):
         made = drive_references(
