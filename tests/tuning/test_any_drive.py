@@ -23,7 +23,9 @@ from sewfast.control.defaults import (
     recorded_limits,
 )
 from sewfast.errors import SettingError
+from sewfast.evidence.region import training_region
 from sewfast.models import LinearOE
+from sewfast.trust import judge
 from sewfast.tuning import first_controller
 from terminal import Terminal
 
@@ -244,6 +246,29 @@ def test_a_drive_without_a_brake_is_not_asked_to_fall_faster_than_it_coasts() ->
     peak = int(np.argmax(r))
     assert np.all(r[peak:] >= 0.3 * r.max() - 1e-9)
     assert np.all(np.diff(r[peak:]) / 0.01 >= -r[peak + 1 :] / 0.3 - 1e-9)
+
+
+@pytest.mark.parametrize("gain", [12.0, -0.4])
+@pytest.mark.parametrize("seed", range(6))
+def test_levels_of_a_drive_without_a_brake_are_held_where_its_record_was(
+    seed: int, gain: float
+) -> None:
+    """A record of steps comes by its lowest level; a reference that stays there is outside."""
+    rng = np.random.default_rng(seed)
+    model = drive(0.01, 0.3, gain, (0.0, 80.0))
+    u = np.repeat(np.r_[0.0, rng.uniform(15.0, 80.0, 80)], 60)[30:]
+    data = sewfast.Dataset.from_arrays(
+        u, model.core.simulate(u[:, None], model.core.rest_state()), 0.01, output_unit="rad/s"
+    )
+    went = [float(data.experiments[0].y.min()), float(data.experiments[0].y.max())]
+    training = {
+        "input_range": [[0.0, float(u.max())]], "output_range": went,
+        "region": training_region(model, data),
+    }  # fmt: skip
+    model = replace(model, training=training)
+    controller = sewfast.tune(model, evaluations=60).controller
+    (line, *_) = judge(controller, model, "trapezoid").lines
+    assert (line.name, line.verdict) == ("training region", "ok"), line.shown
 
 
 def test_what_integrates_needs_no_start_and_may_have_one() -> None:

@@ -18,6 +18,7 @@ from .. import _core, signals
 from ..dataset import FloatArray
 from ..errors import DataError, FitError, SettingError
 from ..evidence.operating import linearise
+from ..evidence.region import stored_region
 from ..evidence.residuals import representative
 from ..gains import real
 from ..models import Model
@@ -49,6 +50,8 @@ _RECORDED = 0.9
 """Top of the references in shares of the recorded output, beyond which the model is a guess."""
 _SLOW_RUN = 0.3
 """Lowest level in shares of the top for a drive that cannot brake: it coasts down to that."""
+_HELD = 0.95
+"""Distance of a level that is held from the record's mean, in shares of the region's bound."""
 _MARGIN = 0.1
 """Share of the output at the limit that the ramps leave to the controller."""
 _EDGES = 8
@@ -299,7 +302,8 @@ def drive_references(
     The top is .9 of the recorded output or .7 of the steady output at the limit of the command,
     whichever is less; the fastest edge takes what the command has left, and at least half a
     time constant and ten dead times. Where the command cannot brake (limits on one side of 0), the
-    references stay above .3 of the top and fall no faster than the drive coasts. Where the record
+    references stay above .3 of the top, and as high as the model's training region asks of a level
+    that is held, and fall no faster than the drive coasts. Where the record
     goes both ways, `random` does as well.
 
     Parameters
@@ -353,7 +357,9 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
             remedy="give wider ones, or the references as samples",
         )  # fmt: skip
     strong, weak = (max(reach), -min(reach)) if sign > 0 else (-min(reach), max(reach))
-    slow = 0.0 if weak > 0.25 * x else _SLOW_RUN * x
+    slow = 0.0
+    if weak <= 0.25 * x:
+        slow = max(_SLOW_RUN * x, _lowest_held(model, fopdt, rest, sign))
     # a record that never came near rest: no lower than it went
     floor = (low - rest if sign > 0 else rest - high) + 0.1 * (high - low)
     slow = min(max(slow, floor), 0.6 * x) if math.isfinite(floor) else slow
@@ -367,6 +373,20 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
     )
     both = other if other > 0.25 * x else 0.0
     return _Span(rest, rest + sign * slow, rest + sign * x, rest - sign * both, edge)
+
+
+def _lowest_held(model: Model, fopdt: Fopdt, rest: float, sign: float) -> float:
+    """The lowest level above rest at which the model's training region has been for long [y].
+
+    A record of steps comes by every level and stays at the lowest ones for less time than a
+    reference does.
+    """
+    region = stored_region(model)
+    if region is None:
+        return 0.0
+    (u, y), (far_u, far_y) = region.centre, _HELD * region.level
+    levels = (fopdt.K * (u - sign * np.sign(fopdt.K) * far_u) + fopdt.offset, y - sign * far_y)
+    return max(sign * (float(level) - rest) for level in levels)
 
 
 def _way(step: DriveStep, u_min: float, u_max: float, low: float, high: float, Ts: float) -> _Span:
