@@ -154,6 +154,18 @@ def test_a_spare_pole_at_1_is_no_position() -> None:
     assert drive_references(model, -5.0, 5.0)["trapezoid"].max() < 0.5
 
 
+@pytest.mark.parametrize("drift", [0.0, 8e-5, 1.2e-4, 2e-4, 2.4e-4, 2.6e-4, 4e-4])
+@pytest.mark.parametrize("T", [0.02, 0.08])
+def test_between_a_position_and_a_slow_lag_there_is_no_gap(T: float, drift: float) -> None:
+    """Friction and noise put a position's pole a little below 1, where no step settles in time."""
+    model = servo(0.002, T, 300.0, (-8.0, 8.0), drift=drift)
+    controller = sewfast.tune(model, evaluations=200).controller
+    run = sewfast.run(controller, model)
+    low, high = model.training["output_range"]
+    assert np.ptp(run.r) > 0.1 * (high - low)
+    assert run.metrics()["rmse"] < 0.04 * np.ptp(run.r)
+
+
 def test_a_position_that_cannot_return_needs_references() -> None:
     with pytest.raises(SettingError, match="limits that move a position both ways"):
         sewfast.tune(servo(0.01, 0.1, 5.0, (0.0, 10.0)), evaluations=4)

@@ -37,8 +37,11 @@ _MOST_FILTERED = 64
 _STEP_SHARES = (0.25, 0.5, 0.1)
 """Shares of the larger limit that the step response is looked for at."""
 _STEP_SAMPLES = (4_000, 16_000)
-_INTEGRATES = 1e-4
-"""Distance of a pole from 1 below which a step takes longer than these."""
+_INTEGRATES = 4.0 / _STEP_SAMPLES[-1]
+"""Distance of a pole from 1 below which a step takes longer than these to settle."""
+_MOVES_ON = 0.15
+"""Share of a step's response in the second half of the longest one, above which it is a motion: a
+lag that settles in time has less there, so that every model is either."""
 _TRAVEL, _TRAVEL_SAMPLES = 10.0, 500
 """Longest way of a position: what it goes at the limit in so many time constants, or in so many
 samples where a drive has hardly a time constant."""
@@ -212,7 +215,8 @@ def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
         Where that of no step does.
     """
     size = u_max if u_max >= -u_min else u_min
-    if not _integrates(model) or not _moves_on(model, _STEP_SHARES[0] * size):
+    pole = _integrator(model)
+    if pole is None or not _moves_on(model, _STEP_SHARES[0] * size):
         return None
     reason: Exception | None = None
     for share in _STEP_SHARES:
@@ -222,7 +226,9 @@ def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
             u[at:] = share * size
             y = model.core.simulate(u[:, None], model.core.rest_state())
             try:
-                fopdt = fit_fopdt(u[1:], np.diff(y) / model.Ts, Ts=model.Ts)
+                # what a pole a little below 1 forgets is no part of the rate
+                rate = (y[1:] - y[0] - pole * (y[:-1] - y[0])) / model.Ts
+                fopdt = fit_fopdt(u[1:], rate, Ts=model.Ts)
             except (DataError, FitError) as error:
                 reason = error
                 continue
@@ -240,14 +246,17 @@ def _slowest(fopdt: Fopdt, y: FloatArray, Ts: float) -> float:
     return max(fopdt.T, (int(outside[-1]) + 1) * Ts / 3.0 if len(outside) else 0.0)
 
 
-def _integrates(model: Model) -> bool:
-    """Whether a pole lies at 1, or so near that no step within reach settles.
+def _integrator(model: Model) -> float | None:
+    """The pole at 1, or so near that no step within reach settles; None where there is none.
 
-    A record of a position gives it to within its noise.
+    A record of a position gives it to within its noise and its friction.
     """
     small = linearise(representative(model).core, np.zeros(1))
-    finite = bool(np.isfinite(small.A).all())
-    return finite and bool(np.any(np.abs(np.linalg.eigvals(small.A) - 1.0) < _INTEGRATES))
+    if not np.isfinite(small.A).all():
+        return None
+    poles = np.linalg.eigvals(small.A)
+    nearest = poles[np.argmin(np.abs(poles - 1.0))]
+    return float(nearest.real) if abs(nearest - 1.0) < _INTEGRATES else None
 
 
 def _moves_on(model: Model, size: float) -> bool:
@@ -260,7 +269,7 @@ def _moves_on(model: Model, size: float) -> bool:
     # not from the first sample on, which would be taken for the command before the step
     u[samples // 20 :] = size
     y = model.core.simulate(u, model.core.rest_state())
-    return bool(abs(y[-1] - y[samples // 2]) > 0.25 * abs(y[-1] - y[0]))
+    return bool(abs(y[-1] - y[samples // 2]) > _MOVES_ON * abs(y[-1] - y[0]))
 
 
 @dataclass(frozen=True)
