@@ -172,7 +172,7 @@ def _show_run(
     if args.plot is not None:
         found.plot(file=args.plot)
         summary["plot"] = str(args.plot)
-        lines.append(f"drawn to {args.plot}")
+        lines.append(f"written to {args.plot}")
     write_columns(
         args.out, found.columns(), found.units, summary, [*str(found).splitlines(), *lines],
         as_json=args.json, written=place,
@@ -342,7 +342,7 @@ def _show(args: argparse.Namespace, found: HostLoopRun) -> None:
     if args.plot is not None:
         found.plot(file=args.plot)
         summary["plot"] = str(args.plot)
-        lines.append(f"drawn to {args.plot}")
+        lines.append(f"written to {args.plot}")
     if args.out is None and args.samples is not None:
         print_json(summary) if args.json else print("\n".join(lines))
         return

@@ -17,9 +17,8 @@ import numpy as np
 from .. import _core, signals
 from ..dataset import FloatArray
 from ..errors import DataError, FitError, SettingError
-from ..evidence.operating import linearise
+from ..evidence.operating import integrating_pole
 from ..evidence.region import stored_region
-from ..evidence.residuals import representative
 from ..gains import real
 from ..models import Model
 from ..rules import Fopdt, fit_fopdt
@@ -37,8 +36,6 @@ _MOST_FILTERED = 64
 _STEP_SHARES = (0.25, 0.5, 0.1)
 """Shares of the larger limit that the step response is looked for at."""
 _STEP_SAMPLES = (4_000, 16_000)
-_INTEGRATES = 4.0 / _STEP_SAMPLES[-1]
-"""Distance of a pole from 1 below which a step takes longer than these to settle."""
 _MOVES_ON = 0.15
 """Share of a step's response in the second half of the longest one, above which it is a motion: a
 lag that settles in time has less there, so that every model is either."""
@@ -215,7 +212,7 @@ def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
         Where that of no step does.
     """
     size = u_max if u_max >= -u_min else u_min
-    pole = _integrator(model)
+    pole = integrating_pole(model)
     if pole is None or not _moves_on(model, _STEP_SHARES[0] * size):
         return None
     reason: Exception | None = None
@@ -244,19 +241,6 @@ def _slowest(fopdt: Fopdt, y: FloatArray, Ts: float) -> float:
         return fopdt.T
     outside = np.flatnonzero(np.abs(y - y[-1]) > 0.05 * abs(y[-1] - y[0]))
     return max(fopdt.T, (int(outside[-1]) + 1) * Ts / 3.0 if len(outside) else 0.0)
-
-
-def _integrator(model: Model) -> float | None:
-    """The pole at 1, or so near that no step within reach settles; None where there is none.
-
-    A record of a position gives it to within its noise and its friction.
-    """
-    small = linearise(representative(model).core, np.zeros(1))
-    if not np.isfinite(small.A).all():
-        return None
-    poles = np.linalg.eigvals(small.A)
-    nearest = poles[np.argmin(np.abs(poles - 1.0))]
-    return float(nearest.real) if abs(nearest - 1.0) < _INTEGRATES else None
 
 
 def _moves_on(model: Model, size: float) -> bool:
