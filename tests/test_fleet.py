@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -515,6 +516,38 @@ def test_ctrl_c_says_what_is_kept(
     monkeypatch.setattr(running, "row_of", interrupted)
     assert main(["fleet", str(folder), "-o", str(tmp_path / "a.csv"), "--workers", "0"]) == 130
     assert "2 recordings are done and kept" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no process group to send Ctrl-C to")
+def test_ctrl_c_at_a_terminal_ends_the_workers_without_a_word_of_theirs(
+    folder: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("distributed", reason="needs dask")
+    many = made(tmp_path / "many", 100)
+    command = [
+        sys.executable, "-m", "sewfast", "fleet", str(many), "-o", str(tmp_path / "a.csv"),
+        "--workers", "2",
+    ]  # fmt: skip
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        journal, deadline = tmp_path / ".a.csv.journal", time.monotonic() + 120.0
+        while not journal.exists() or len(journal.read_bytes().splitlines()) < 3:
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        os.killpg(process.pid, signal.SIGINT)
+        out, said = process.communicate(timeout=120.0)
+    assert (process.returncode, out) == (130, "")
+    assert "recordings are done and kept" in said
+    assert "Traceback" not in said
+    assert "distributed" not in said
+
+
+def test_an_infinite_column_warns_nobody(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("no,u,y\n" + "".join(f"inf,{k % 7},inf\n" for k in range(99)))
+    (row,) = fleet(tmp_path, workers=0).rows
+    assert "which is the input and which the output" in row.message
 
 
 def test_the_command(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 import signal
@@ -347,6 +348,8 @@ def _connected(
             "threads_per_worker": 1,
             "memory_limit": memory,
             "dashboard_address": None,
+            # what its processes say of each other while they end is nobody's business here
+            "silence_logs": logging.CRITICAL,
         }
         with _workers_without_ctrl_c():
             cluster = distributed.LocalCluster(**options)
