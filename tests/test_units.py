@@ -10,6 +10,7 @@ import pytest
 
 from refusals import refuses
 from sewfast import Controller, Gains
+from sewfast.cli import main
 from sewfast.cli.control import reference_of
 from sewfast.errors import DataError, SettingError
 from sewfast.link.settings import require_units
@@ -75,6 +76,34 @@ def test_a_reference_in_another_spelling_is_taken_and_in_another_unit_refused(
     np.testing.assert_array_equal(reference_of(str(path), 0.01, "RPM"), np.arange(20.0))
     with pytest.raises(DataError, match="expected r in rad/s"):
         reference_of(str(path), 0.01, "rad/s")
+
+
+def recorded(path: Path, speed: str, volt: str) -> Path:
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-5.0, 5.0, 30), 20)
+    y = np.convolve(u, 5.0 * 0.9 ** np.arange(100))[: len(u)] + rng.normal(size=len(u))
+    rows = "".join(
+        f"{k / 100},{a:.6f},{b:.6f}\n" for k, (a, b) in enumerate(zip(u, y, strict=True))
+    )
+    path.write_text(f"t [s],u [{volt}],speed [{speed}]\n{rows}")
+    return path
+
+
+def test_a_model_takes_data_and_settings_in_another_spelling(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    recorded(tmp_path / "a.csv", "1/min", "V")
+    recorded(tmp_path / "b.csv", "RPM", "volt")
+    recorded(tmp_path / "c.csv", "rad/s", "V")
+    assert main(["identify", "a.csv", "--model", "oe", "-o", "m.json"]) == 0
+    assert main(["validate", "m.json", "b.csv"]) == 0
+    assert main(["validate", "m.json", "c.csv"]) == 2
+    assert "expected the unit '1/min', received 'rad/s'" in capsys.readouterr().err
+    (tmp_path / "sewfast.toml").write_text('[units]\nspeed = "rpm"\n')
+    assert main(["validate", "m.json", "a.csv"]) == 0
+    (tmp_path / "sewfast.toml").write_text('[units]\nspeed = "deg/s"\n')
+    assert main(["validate", "m.json", "a.csv"]) == 2
 
 
 def test_what_is_no_angular_speed_has_no_counts() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import DataError
+from .units import spelled
 
 # --- Names and units of columns -------------------------------------------------------------------
 
@@ -34,7 +35,7 @@ def require_same_units(one: HasUnits, other: HasSource) -> None:
     """Raise `DataError` where a unit is known on both sides and differs."""
     mine = (*one.input_units, one.output_unit)
     for unit, received in zip(mine, (*other.input_units, other.output_unit), strict=True):
-        if unit and received and unit != received:
+        if unit and received and spelled(unit) != spelled(received):
             raise DataError(
                 name=other.source, expected=f"the unit {unit!r}", received=f"{received!r}",
                 remedy="convert the data",

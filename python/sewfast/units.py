@@ -25,16 +25,21 @@ _WRITTEN = {
     "rev/s": "rps 1/s turn/s turns/s",
     "rad/s": "rad/sec",
     "deg/s": "°/s deg/sec",
+    "v": "volt volts",
+    "a": "amp amps ampere amperes",
+    "s": "sec second seconds",
+    "%": "percent pct",
 }
-"""How else a unit of angular speed is written, in lower case; `u` are German turns, `tr` French."""
+"""How else a unit is written, in lower case; `u` are German turns, `tr` French."""
 _SPELLINGS = {other: unit for unit, others in _WRITTEN.items() for other in others.split()}
-ANGULAR_SPEEDS = frozenset(REVOLUTIONS_PER_SECOND) | frozenset(_SPELLINGS)
+ANGULAR_SPEEDS = frozenset(REVOLUTIONS_PER_SECOND) | frozenset(
+    other for other, unit in _SPELLINGS.items() if unit in REVOLUTIONS_PER_SECOND
+)
 SPEEDS = ANGULAR_SPEEDS | frozenset(["m/s", "cm/s", "mm/s", "m/min", "km/h"])
 
 
 def spelled(unit: str) -> str:
-    """A unit in lower case, an angular speed in the package's own spelling: two that are equal mean
-    the same.
+    """A unit in lower case and in the package's own spelling: two that are equal mean the same.
 
     Examples
     --------

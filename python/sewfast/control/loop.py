@@ -422,7 +422,7 @@ def require_units(gains: Gains | SampledController, units: tuple[str, str]) -> N
     """
     own = (gains.u_unit, gains.y_unit)
     for what, theirs, ours in zip(("input", "output"), units, own, strict=True):
-        if theirs and ours and theirs.lower() != ours.lower():
+        if theirs and ours and spelled(theirs) != spelled(ours):
             raise SettingError(
                 name="plant", expected=f"its {what} in the controller's unit {ours!r}",
                 received=repr(theirs), remedy="give the gains in the plant's units",

@@ -317,7 +317,7 @@ def _connected(
     except ImportError as error:
         raise SettingError(
             "expected Dask to work on several recordings at once, got none; pip install "
-            "'sewfast[fleet]', or give workers=0"
+            "'sewfast[fleet]', or give workers=0 (--workers 0)"
         ) from error
     if scheduler is not None:
         try:
