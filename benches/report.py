@@ -135,9 +135,7 @@ def seam(results: Results) -> str:
             )
     if results.get("seam"):
         took = [[f"`{statement}`", number(ms)] for statement, ms in results["seam"].items()]
-        parts.append(
-            table(["an interpreter that runs", "from start to exit [ms]"], took)
-        )
+        parts.append(table(["an interpreter that runs", "from start to exit [ms]"], took))
     if results.get("memory"):
         took = [[name, number(size)] for name, size in results["memory"].items()]
         parts.append(table(["a training with", "memory beyond its data [bytes/sample]"], took))
