@@ -130,17 +130,15 @@ def seam(results: Results) -> str:
             short, long = (rows[key]["contenders"]["sewfast"]["cpu_least"] for key in keys)
             over = short - 0.1 * (long - short)
             parts.append(
-                f"A call of {name} on 100 samples takes {number(over)} us beside its arithmetic, "
-                "which the longer run tells."
+                f"Of a call of {name} on 100 samples, {number(over)} us are not arithmetic (by the "
+                "slope to the longer run)."
             )
     if results.get("seam"):
         took = [[f"`{statement}`", number(ms)] for statement, ms in results["seam"].items()]
-        parts.append(
-            table(["an interpreter that runs", "takes, from its start to its end [ms]"], took)
-        )
+        parts.append(table(["an interpreter that runs", "from start to exit [ms]"], took))
     if results.get("memory"):
         took = [[name, number(size)] for name, size in results["memory"].items()]
-        parts.append(table(["a training of", "takes beside its data [bytes/sample]"], took))
+        parts.append(table(["a training with", "memory beyond its data [bytes/sample]"], took))
     return "\n\n".join(filter(None, parts))
 
 

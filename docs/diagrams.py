@@ -198,12 +198,62 @@ def neighbours(file: Path) -> None:
     written(figure, file)
 
 
+BAUD, PERIOD = 115_200, 10.0
+"""Of the drawn line [bit/s], and its sample time [ms]."""
+ASKED, ANSWERED, TOLD = "f 0", "12.345678 0.000000", "c 0 0.150000"
+"""What goes over the line of an ODrive in a sample; each line ends with a byte or two more."""
+
+
+def polling(file: Path) -> None:
+    """Two samples of a board that is polled over text, to scale."""
+    per_byte = 1e4 / BAUD  # a start bit, eight, and a stop bit [ms]
+    figure, ax = plt.subplots(figsize=(8.0, 3.3), layout="constrained")
+    lanes = {"this computer": 2.4, "the line": 1.6, "the board": 0.8}
+    for name, y in lanes.items():
+        ax.plot((0.0, 2 * PERIOD), (y, y), color="0.88", linewidth=0.8, zorder=0)
+        ax.text(-0.25, y, name, ha="right", va="center", color=INK, fontsize=9)
+    changes = [0.0]
+    for k in (0, 1):
+        due = k * PERIOD
+        ax.axvline(due, color=NOTE, linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
+        ax.text(due + 0.06, 2.86, "due" if k == 0 else "due + Ts", color=NOTE, fontsize=8.5)
+        sent = due + per_byte * (len(ASKED) + 1)
+        looks = sent + 0.15
+        back = looks + 0.15 + per_byte * (len(ANSWERED) + 2)
+        decided = back + 0.5
+        acts = decided + per_byte * (len(TOLD) + 1)
+        for begin, end, text in (
+            (due, sent, "asks"), (looks + 0.15, back, "position"), (decided, acts, "command"),
+        ):  # fmt: skip
+            ax.broken_barh([(begin, end - begin)], (1.45, 0.3), color=LINE)
+            ax.text((begin + end) / 2, 1.84, text, ha="center", color=INK, fontsize=8.5)
+        ax.broken_barh([(back, decided - back)], (2.25, 0.3), color=SECOND)
+        ax.text((back + decided) / 2, 2.64, "computes u", ha="center", color=INK, fontsize=8.5)
+        ax.broken_barh([(acts, due + PERIOD - acts)], (2.25, 0.3), color=FILL)
+        free = "waits for the next sample"
+        ax.text((acts + due + PERIOD) / 2, 2.4, free, ha="center", va="center", fontsize=8.5)
+        ax.plot([looks], [0.8], "o", color=FIRST, markersize=5)
+        ax.plot([acts], [0.8], ">", color=SECOND, markersize=6)
+        if k == 0:
+            ax.text(looks - 0.1, 0.93, "encoder is read", fontsize=8.5)
+            ax.text(acts - 0.1, 0.93, "u acts until the next command", fontsize=8.5)
+        changes.append(acts)
+    levels = (0.05, 0.4, 0.25)
+    ax.step([*changes, 2 * PERIOD], [*levels, levels[-1]], where="post", color=SECOND)
+    ax.text(-0.25, 0.25, "u on the motor", ha="right", va="center", color=INK, fontsize=9)
+    ax.set(xlim=(-3.4, 2 * PERIOD), ylim=(-0.05, 3.05), yticks=[], xlabel="time [ms]")
+    ax.set_xticks(np.arange(0, 21, 2))
+    ax.spines[["top", "right", "left"]].set_visible(False)
+    written(figure, file)
+
+
 DIAGRAMS: dict[str, Callable[[Path], None]] = {
     "loop": loop_and_time,
     "commands": lambda file: way(file, COMMANDS, CHECKED),
     "functions": lambda file: way(file, FUNCTIONS, CHECKED_BY),
     "questions": questions,
     "neighbours": neighbours,
+    "polling": polling,
 }
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -141,6 +142,81 @@ def test_workers_that_are_gone_for_good_are_missed(
         with pytest.raises(SettingError, match="expected one at least") as caught:
             fleet(made(tmp_path / "many", 3), client=client)
     assert caught.value.name == "workers"
+
+
+@pytest.mark.usefixtures("quiet")
+@pytest.mark.parametrize("own", [True, False], ids=["own cluster", "client's cluster"])
+def test_a_worker_that_starts_slowly_is_not_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: bool
+) -> None:
+    """Dask closes for good what is away for longer than its timeout, here at once."""
+    distributed = pytest.importorskip("distributed", reason="needs dask")
+    import dask
+
+    from sewfast.fleets import running
+
+    many = made(tmp_path / "many", 30)
+    expected = bits(fleet(many, workers=0))
+    monkeypatch.setattr(running, "_LOOK", 0.5)
+    before = set(distributed.Nanny._instances)
+    killed: list[int] = []
+
+    def kill(done: int, *_: Any) -> None:
+        if done >= 3 and not killed:
+            (keeper,) = set(distributed.Nanny._instances) - before
+            killed.append(keeper.pid)
+            os.kill(keeper.pid, signal.SIGKILL)
+
+    settings = {
+        "distributed.deploy.lost-worker-timeout": "10ms",
+        "distributed.scheduler.allowed-failures": 50,
+    }
+    with dask.config.set(settings):
+        if own:
+            found = fleet(many, workers=1, progress=kill)
+        else:
+            with (
+                distributed.LocalCluster(
+                    n_workers=1, threads_per_worker=1, dashboard_address=None
+                ) as cluster,
+                distributed.Client(cluster) as client,
+            ):
+                found = fleet(many, client=client, progress=kill)
+    assert killed
+    assert bits(found) == expected
+
+
+@pytest.mark.parametrize("starting", [True, False])
+def test_workers_that_are_starting_are_waited_for_longer(
+    monkeypatch: pytest.MonkeyPatch, starting: bool
+) -> None:
+    from sewfast.fleets import running
+
+    now = 0.0
+    asked: list[int] = []
+
+    class Distributed:
+        TimeoutError = TimeoutError
+
+        @staticmethod
+        def wait(tasks: set[str], timeout: float, return_when: str) -> SimpleNamespace:
+            nonlocal now
+            now += timeout
+            raise TimeoutError
+
+    keeper = SimpleNamespace(status=SimpleNamespace(name="running"), pid=7 if starting else None)
+    gone = SimpleNamespace(status=SimpleNamespace(name="closed"), pid=None)
+    cluster = SimpleNamespace(
+        worker_spec={0: {}, 1: {}}, workers={0: keeper, 1: gone}, scale=asked.append,
+        loop=SimpleNamespace(add_callback=lambda work: work()),
+    )  # fmt: skip
+    client = SimpleNamespace(cluster=cluster, scheduler_info=lambda n_workers: {"workers": {}})
+    monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(running, "import_module", lambda name: Distributed)
+    with pytest.raises(SettingError, match="600 s, while" if starting else "none for 120 s"):
+        running._ended({"task"}, client)
+    assert set(asked) == {2}
+    assert cluster.workers == {0: keeper}
 
 
 @pytest.mark.parametrize("present", [True, False])
@@ -440,6 +516,38 @@ def test_ctrl_c_says_what_is_kept(
     monkeypatch.setattr(running, "row_of", interrupted)
     assert main(["fleet", str(folder), "-o", str(tmp_path / "a.csv"), "--workers", "0"]) == 130
     assert "2 recordings are done and kept" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no process group to send Ctrl-C to")
+def test_ctrl_c_at_a_terminal_ends_the_workers_without_a_word_of_theirs(
+    folder: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("distributed", reason="needs dask")
+    many = made(tmp_path / "many", 100)
+    command = [
+        sys.executable, "-m", "sewfast", "fleet", str(many), "-o", str(tmp_path / "a.csv"),
+        "--workers", "2",
+    ]  # fmt: skip
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        journal, deadline = tmp_path / ".a.csv.journal", time.monotonic() + 120.0
+        while not journal.exists() or len(journal.read_bytes().splitlines()) < 3:
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        os.killpg(process.pid, signal.SIGINT)
+        out, said = process.communicate(timeout=120.0)
+    assert (process.returncode, out) == (130, "")
+    assert "recordings are done and kept" in said
+    assert "Traceback" not in said
+    assert "distributed" not in said
+
+
+def test_an_infinite_column_warns_nobody(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("no,u,y\n" + "".join(f"inf,{k % 7},inf\n" for k in range(99)))
+    (row,) = fleet(tmp_path, workers=0).rows
+    assert "which is the input and which the output" in row.message
 
 
 def test_the_command(

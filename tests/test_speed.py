@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sewfast.arrays import counts_per_unit
 from sewfast.errors import DataError, SettingError
 from sewfast.machine import VirtualMachine
 from sewfast.signals import excitation
 from sewfast.speed import floor_of_J, speed_from_counts
+from sewfast.units import counts_per_unit
 
 METHODS = ["difference", "savgol", "kalman"]
 

@@ -9,7 +9,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import DataError, SettingError
+from .errors import DataError
+from .units import spelled
 
 # --- Names and units of columns -------------------------------------------------------------------
 
@@ -34,7 +35,7 @@ def require_same_units(one: HasUnits, other: HasSource) -> None:
     """Raise `DataError` where a unit is known on both sides and differs."""
     mine = (*one.input_units, one.output_unit)
     for unit, received in zip(mine, (*other.input_units, other.output_unit), strict=True):
-        if unit and received and unit != received:
+        if unit and received and spelled(unit) != spelled(received):
             raise DataError(
                 name=other.source, expected=f"the unit {unit!r}", received=f"{received!r}",
                 remedy="convert the data",
@@ -132,57 +133,3 @@ def runs(mask: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
     """
     edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
     return tuple((int(a), int(b - a)) for a, b in edges.reshape(-1, 2))
-
-
-# --- Units of angular speed and the encoder's resolution in each ----------------------------------
-
-
-#: Revolutions per second that one of each unit stands for.
-REVOLUTIONS_PER_SECOND: dict[str, float] = {
-    "rpm": 1.0 / 60.0,
-    "rev/s": 1.0,
-    "rad/s": 1.0 / math.tau,
-    "deg/s": 1.0 / 360.0,
-}
-
-
-def counts_per_unit(counts_per_rev: float, unit: str = "rpm") -> float:
-    """Encoder counts that pass in one second at a speed of one ``unit``.
-
-    A change of ``n`` counts in ``Ts`` seconds is a speed of ``n / (Ts * counts_per_unit)``.
-    With 1,572 counts/rev and 1 ms one count is 38.168 RPM.
-
-    Parameters
-    ----------
-    counts_per_rev
-        Counts per revolution [counts/rev], above zero.
-    unit
-        One of ``rpm``, ``rev/s``, ``rad/s``, ``deg/s``; capitals do not matter.
-
-    Returns
-    -------
-    float
-        Counts per (unit x second).
-
-    Raises
-    ------
-    SettingError
-        For a resolution that is not finite and above zero, or an unknown unit.
-
-    Examples
-    --------
-    >>> round(1 / (0.001 * counts_per_unit(1572, "rpm")), 3)
-    38.168
-    """
-    if not (math.isfinite(counts_per_rev) and counts_per_rev > 0):
-        raise SettingError(
-            f"expected counts_per_rev finite and above 0, got {counts_per_rev}; "
-            "give the encoder's counts per revolution after its 4-fold evaluation"
-        )
-    factor = REVOLUTIONS_PER_SECOND.get(unit.lower())
-    if factor is None:
-        raise SettingError(
-            f"expected a speed unit out of {', '.join(REVOLUTIONS_PER_SECOND)}, got {unit!r}; "
-            "convert the speed to one of them"
-        )
-    return counts_per_rev * factor

@@ -126,7 +126,8 @@ class Comparison(Plotted):
         if scored is None:
             return "every model runs away on these data"
         data = ", ".join(f"{e.name} [{e.range_text}]" for e in scored.experiments)
-        return f"{len(self)} models on {data}, {scored.n} samples scored"
+        several = "model" if len(self) == 1 else "models"
+        return f"{len(self)} {several} on {data}, {scored.n} samples scored"
 
     def _table(self) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:
         unit = f" [{self.unit}]" if self.unit else ""

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from .errors import SettingError, not_installed, unwritable
 from .storage import replace_file
 from .tables import Table
+from .units import SPEEDS, spelled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -373,12 +374,11 @@ CYCLE = ("measured", "model", "oe", "arx_raw", "arx", "truth")
 """Looks of series that are alike, in their order; each has a line style of its own."""
 FINE = 1.2
 """Line width where lines do not cover each other."""
-_SPEEDS = ("rpm", "rad/s", "1/min", "min^-1", "1/s", "hz", "deg/s", "°/s")
 
 
 def quantity(unit: str) -> str:
     """`speed [RPM]`, `output [mm]`, or `output` of an unknown unit."""
-    name = "speed" if unit.lower() in _SPEEDS else "output"
+    name = "speed" if spelled(unit) in (*SPEEDS, "hz") else "output"
     return lettered(f"{name} [{unit}]" if unit else name)
 
 
@@ -542,8 +542,12 @@ class Picture:
 
 def svg(figure: Figure, key: str, alt: str) -> str:
     """The figure as inline SVG whose identifiers are its own on a page of many."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    # savefig would draw the figure twice, the first time for a size that is known here
+    canvas: Any = FigureCanvasSVG(figure)  # matplotlib gives this no types
+    canvas.print_svg(buffer, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)

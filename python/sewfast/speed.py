@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import _core
-from .arrays import FloatArray, counts_per_unit, runs
+from .arrays import FloatArray, runs
 from .errors import DataError, SettingError
+from .units import counts_per_unit
 
 Method: TypeAlias = Literal["difference", "savgol", "kalman"]
 

@@ -9,7 +9,6 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
-from .arrays import REVOLUTIONS_PER_SECOND
 from .control.controller import SampledController
 from .control.defaults import default_references
 from .control.loop import (
@@ -30,6 +29,7 @@ from .evidence.questions import OUTSIDE
 from .evidence.region import placed
 from .gains import real
 from .models import Model
+from .units import revolutions_per_second
 
 # --- Disagreement: how far members of an ensemble part under one controller and reference ---------
 
@@ -186,7 +186,7 @@ def _forced(run: ClosedLoopRun, part: slice) -> FloatArray:
     """What may be taken off, as columns: a straight line and the shaft's orders, shape (n, c)."""
     n = part.stop - part.start
     columns = [np.ones(n), np.linspace(-1.0, 1.0, n)]
-    per_unit = REVOLUTIONS_PER_SECOND.get(run.units["y"].lower())
+    per_unit = revolutions_per_second(run.units["y"])
     if per_unit is not None:
         turns = np.cumsum(run.y[part]) * per_unit * run.Ts
         travelled = abs(float(turns[-1] - turns[0]))

@@ -13,11 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sewfast as api
-from cli import refused, sewfast
+from cli import call_refused as refused
+from cli import called as sewfast
 from sewfast.cli.project import NAME, find, load
 from sewfast.errors import SettingError
 from sewfast.readers import read_table, roles
-from sewfast.readers.containers import split_unit, unit_in_name
+from sewfast.units import split_unit, unit_in_name
 
 LIMITS = "volt = 8\nspeed = 3500\nacceleration = 40000\ncurrent = 15\n"
 

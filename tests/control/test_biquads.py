@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from sewfast.cli import main
 from sewfast.control import forms
 from sewfast.control.margins import loop_response
 from sewfast.control.systems import LinearLoop, response, simulate
-from sewfast.frequency import FrequencyResponse, propose
+from sewfast.frequency import FrequencyResponse, ShaftFit, propose
 from sewfast.link import Plan, VirtualDevice, connect
 
 TS = 1e-3
@@ -213,6 +214,11 @@ def two_masses() -> tuple[LinearOE, FrequencyResponse]:
     )  # fmt: skip
 
 
+@cache
+def fitted_shaft() -> ShaftFit:
+    return fit_shaft(two_masses()[1])
+
+
 def test_notches_are_searched_with_the_gains_under_ms_on_the_response() -> None:
     model, measured = two_masses()
     gains = Gains.standard(0.002, 0.1, 0.0)
@@ -260,7 +266,7 @@ def test_a_response_alone_or_a_variable_of_no_notch_is_refused() -> None:
 
 def test_filters_are_proposed_where_the_shaft_swings() -> None:
     _, measured = two_masses()
-    fit = fit_shaft(measured)
+    fit = fitted_shaft()
     assert fit.has_resonance
     own = fit.notch()
     assert own.named()["frequency"] == pytest.approx(60.0, rel=0.02)
@@ -290,7 +296,7 @@ def test_filters_are_proposed_where_the_shaft_swings() -> None:
 
 def test_what_cannot_be_proposed_for_is_refused() -> None:
     _, measured = two_masses()
-    fit = fit_shaft(measured)
+    fit = fitted_shaft()
     for Ms in (1.0, 0.5, math.nan, math.inf):
         with pytest.raises(SettingError, match=r"Ms"):
             propose(fit, Ms=Ms)

@@ -287,3 +287,29 @@ def test_a_region_of_an_older_version_is_not_known_and_no_error() -> None:
     card = aged.check(_recorded(steps(600, np.random.default_rng(3), 20.0)))
     assert not card.distances
     assert card.line("outside training region").verdict == "info"
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("pole", [1.0, 0.9998])
+def test_an_axis_at_rest_is_at_home_wherever_it_has_been(seed: int, pole: float) -> None:
+    """A record that goes there and back never rests at its ends."""
+    rng = np.random.default_rng(seed)
+    a = np.poly([pole, 0.95])[1:]
+    sizes = np.repeat(rng.uniform(0.3, 0.8, 60), 4) * np.tile([1.0, -1.0, -1.0, 1.0], 60)
+
+    def data(u: FloatArray) -> Dataset:
+        y = _filtered(a, [0.0, 0.05], u) + 0.01 * rng.normal(size=len(u))
+        return Dataset.from_arrays(u, y, 0.002, input_units="V", output_unit="mm")
+
+    record = data(np.concatenate([np.zeros(60), np.repeat(sizes, 30)]))
+    model = sewfast.identify(record[:5000], model="oe", na=2, nb=1, nk=1)
+    region = stored_region(model)
+    assert region is not None
+    assert region.integrates
+    rest = 0.8 * float(np.abs(record.experiments[0].y[:5000]).max())
+    assert region.holds(np.zeros(1), rest)
+    there = np.concatenate([np.full(16, 0.8), np.zeros(400), np.full(16, -0.8), np.zeros(400)])
+    assert model.check(data(there)).outside < 0.05
+    assert model.check(data(2.0 * np.repeat(sizes, 30)[5000:])).outside > 0.5
+    # farther than it has ever been, however slowly
+    assert model.check(data(np.full(4000, 0.3))).outside > 0.5

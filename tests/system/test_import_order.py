@@ -13,7 +13,7 @@ from pathlib import Path
 import sewfast
 
 ORDER = """
-    errors kinds arrays storage tables plotting progress threads speed signals
+    errors kinds units arrays storage tables plotting progress threads speed signals
     writers recordfile dataset readers benchmarks machine live gains recording
     dynamic_model validation comparison evidence models
     motorfit identification sklearn

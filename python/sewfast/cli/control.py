@@ -172,7 +172,7 @@ def _show_run(
     if args.plot is not None:
         found.plot(file=args.plot)
         summary["plot"] = str(args.plot)
-        lines.append(f"drawn to {args.plot}")
+        lines.append(f"written to {args.plot}")
     write_columns(
         args.out, found.columns(), found.units, summary, [*str(found).splitlines(), *lines],
         as_json=args.json, written=place,
@@ -216,9 +216,9 @@ def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
     SettingError, DataError
         For a text that is neither, a file without r, one at another sample time or in another unit.
     """
-    from ..arrays import REVOLUTIONS_PER_SECOND
     from ..readers import read
     from ..signals import REFERENCES
+    from ..units import ANGULAR_SPEEDS, spelled
 
     if text.replace("-", "_").lower() in REFERENCES:
         return text
@@ -235,8 +235,8 @@ def reference_of(text: str, Ts: float, unit: str) -> str | FloatArray:
             remedy="resample the reference",
         )  # fmt: skip
     given = data.input_units[0]
-    speeds = {given.lower(), unit.lower()}
-    if len(speeds) > 1 and speeds <= REVOLUTIONS_PER_SECOND.keys():
+    speeds = {spelled(given), spelled(unit)}
+    if len(speeds) > 1 and speeds <= ANGULAR_SPEEDS:
         raise DataError(
             f"{text}: expected r in {unit}, the loop's unit, got {given}; convert the column"
         )
@@ -342,7 +342,7 @@ def _show(args: argparse.Namespace, found: HostLoopRun) -> None:
     if args.plot is not None:
         found.plot(file=args.plot)
         summary["plot"] = str(args.plot)
-        lines.append(f"drawn to {args.plot}")
+        lines.append(f"written to {args.plot}")
     if args.out is None and args.samples is not None:
         print_json(summary) if args.json else print("\n".join(lines))
         return

@@ -327,7 +327,7 @@ def _show(
     for path, other in zip(others, model.alternatives, strict=False):
         print(f"alternative: {other!r} in {path}")
     if args.plot is not None:
-        print(f"drawn to {args.plot}")
+        print(f"written to {args.plot}")
     print(f"written to {args.out}; score it on another recording: sewfast validate {args.out} DATA")
 
 

@@ -279,9 +279,11 @@ def with_units(table: Table, args: argparse.Namespace) -> Table:
         return table
     from dataclasses import replace
 
+    from ..units import spelled
+
     for name, unit in known.items():
         stated = table.units.get(name, "")
-        if stated and stated != unit:
+        if stated and spelled(stated) != spelled(unit):
             raise SettingError(
                 name=f"{table.path}: column {name!r}", expected=f"the unit of {NAME}, {unit}",
                 received=f"{stated}", remedy="correct one of them",

@@ -478,7 +478,7 @@ def _show_gains(args: argparse.Namespace, controller: SampledController) -> None
             "--counts-per-rev puts an encoder in the loop"
         )
     if args.plot is not None:
-        print(f"drawn to {args.plot}")
+        print(f"written to {args.plot}")
     print(f"written to {args.out}; try it: sewfast run {args.out} {args.model[0]}")
 
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from .. import _core, storage
-from ..arrays import counts_per_unit
 from ..errors import SettingError
 from ..gains import Gains, real, whole
 from ..storage import Fields
 from ..tables import html_of
+from ..units import counts_per_unit
 from .biquad import MOST, NUMBERS, Biquad
 
 GAIN_NAMES = ("Kp", "Ti", "Td")

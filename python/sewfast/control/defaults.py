@@ -17,11 +17,12 @@ import numpy as np
 from .. import _core, signals
 from ..dataset import FloatArray
 from ..errors import DataError, FitError, SettingError
-from ..evidence.operating import linearise
-from ..evidence.residuals import representative
+from ..evidence.operating import integrating_pole
+from ..evidence.region import stored_region
 from ..gains import real
 from ..models import Model
 from ..rules import Fopdt, fit_fopdt
+from ..units import spelled
 from .controller import SampledController
 
 NAMES = ("trapezoid", "trapezoids", "random")
@@ -35,8 +36,9 @@ _MOST_FILTERED = 64
 _STEP_SHARES = (0.25, 0.5, 0.1)
 """Shares of the larger limit that the step response is looked for at."""
 _STEP_SAMPLES = (4_000, 16_000)
-_INTEGRATES = 1e-4
-"""Distance of a pole from 1 below which a step takes longer than these."""
+_MOVES_ON = 0.15
+"""Share of a step's response in the second half of the longest one, above which it is a motion: a
+lag that settles in time has less there, so that every model is either."""
 _TRAVEL, _TRAVEL_SAMPLES = 10.0, 500
 """Longest way of a position: what it goes at the limit in so many time constants, or in so many
 samples where a drive has hardly a time constant."""
@@ -48,6 +50,8 @@ _RECORDED = 0.9
 """Top of the references in shares of the recorded output, beyond which the model is a guess."""
 _SLOW_RUN = 0.3
 """Lowest level in shares of the top for a drive that cannot brake: it coasts down to that."""
+_HELD = 0.95
+"""Distance of a level that is held from the record's mean, in shares of the region's bound."""
 _MARGIN = 0.1
 """Share of the output at the limit that the ramps leave to the controller."""
 _EDGES = 8
@@ -208,7 +212,8 @@ def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
         Where that of no step does.
     """
     size = u_max if u_max >= -u_min else u_min
-    if not _integrates(model) or not _moves_on(model, _STEP_SHARES[0] * size):
+    pole = integrating_pole(model)
+    if pole is None or not _moves_on(model, _STEP_SHARES[0] * size):
         return None
     reason: Exception | None = None
     for share in _STEP_SHARES:
@@ -218,7 +223,9 @@ def rate_step(model: Model, u_min: float, u_max: float) -> DriveStep | None:
             u[at:] = share * size
             y = model.core.simulate(u[:, None], model.core.rest_state())
             try:
-                fopdt = fit_fopdt(u[1:], np.diff(y) / model.Ts, Ts=model.Ts)
+                # what a pole a little below 1 forgets is no part of the rate
+                rate = (y[1:] - y[0] - pole * (y[:-1] - y[0])) / model.Ts
+                fopdt = fit_fopdt(u[1:], rate, Ts=model.Ts)
             except (DataError, FitError) as error:
                 reason = error
                 continue
@@ -236,16 +243,6 @@ def _slowest(fopdt: Fopdt, y: FloatArray, Ts: float) -> float:
     return max(fopdt.T, (int(outside[-1]) + 1) * Ts / 3.0 if len(outside) else 0.0)
 
 
-def _integrates(model: Model) -> bool:
-    """Whether a pole lies at 1, or so near that no step within reach settles.
-
-    A record of a position gives it to within its noise.
-    """
-    small = linearise(representative(model).core, np.zeros(1))
-    finite = bool(np.isfinite(small.A).all())
-    return finite and bool(np.any(np.abs(np.linalg.eigvals(small.A) - 1.0) < _INTEGRATES))
-
-
 def _moves_on(model: Model, size: float) -> bool:
     """Whether a step is still felt as much at its end as before.
 
@@ -256,7 +253,7 @@ def _moves_on(model: Model, size: float) -> bool:
     # not from the first sample on, which would be taken for the command before the step
     u[samples // 20 :] = size
     y = model.core.simulate(u, model.core.rest_state())
-    return bool(abs(y[-1] - y[samples // 2]) > 0.25 * abs(y[-1] - y[0]))
+    return bool(abs(y[-1] - y[samples // 2]) > _MOVES_ON * abs(y[-1] - y[0]))
 
 
 @dataclass(frozen=True)
@@ -275,7 +272,7 @@ def catalogue_fits(model: Any, u_min: float, u_max: float, unit: str) -> bool:
 
     A plant that stores no range of its record is taken for one that they suit.
     """
-    if unit.lower() != "rpm" or not math.isclose(model.Ts, signals.TS, rel_tol=1e-9):
+    if spelled(unit) != "rpm" or not math.isclose(model.Ts, signals.TS, rel_tol=1e-9):
         return False
     known = _output_range(model) if isinstance(model, Model) else None
     if known is None:
@@ -298,7 +295,8 @@ def drive_references(
     The top is .9 of the recorded output or .7 of the steady output at the limit of the command,
     whichever is less; the fastest edge takes what the command has left, and at least half a
     time constant and ten dead times. Where the command cannot brake (limits on one side of 0), the
-    references stay above .3 of the top and fall no faster than the drive coasts. Where the record
+    references stay above .3 of the top, and as high as the model's training region asks of a level
+    that is held, and fall no faster than the drive coasts. Where the record
     goes both ways, `random` does as well.
 
     Parameters
@@ -352,7 +350,9 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
             remedy="give wider ones, or the references as samples",
         )  # fmt: skip
     strong, weak = (max(reach), -min(reach)) if sign > 0 else (-min(reach), max(reach))
-    slow = 0.0 if weak > 0.25 * x else _SLOW_RUN * x
+    slow = 0.0
+    if weak <= 0.25 * x:
+        slow = max(_SLOW_RUN * x, _lowest_held(model, fopdt, rest, sign))
     # a record that never came near rest: no lower than it went
     floor = (low - rest if sign > 0 else rest - high) + 0.1 * (high - low)
     slow = min(max(slow, floor), 0.6 * x) if math.isfinite(floor) else slow
@@ -366,6 +366,20 @@ def _span(model: Model, u_min: float, u_max: float, pace: float | None) -> _Span
     )
     both = other if other > 0.25 * x else 0.0
     return _Span(rest, rest + sign * slow, rest + sign * x, rest - sign * both, edge)
+
+
+def _lowest_held(model: Model, fopdt: Fopdt, rest: float, sign: float) -> float:
+    """The lowest level above rest at which the model's training region has been for long [y].
+
+    A record of steps comes by every level and stays at the lowest ones for less time than a
+    reference does.
+    """
+    region = stored_region(model)
+    if region is None:
+        return 0.0
+    (u, y), (far_u, far_y) = region.centre, _HELD * region.level
+    levels = (fopdt.K * (u - sign * np.sign(fopdt.K) * far_u) + fopdt.offset, y - sign * far_y)
+    return max(sign * (float(level) - rest) for level in levels)
 
 
 def _way(step: DriveStep, u_min: float, u_max: float, low: float, high: float, Ts: float) -> _Span:

@@ -20,6 +20,7 @@ from ..gains import Gains, vector
 from ..machine import VirtualMachine
 from ..models import Ensemble, Model
 from ..tables import Table, percent, significant
+from ..units import spelled
 from .controller import Controller, SampledController, pid_of
 from .defaults import default_references, drive_references
 
@@ -375,7 +376,7 @@ def reference_samples(
         return vector("reference", reference).copy()
     samples = signals.reference(reference, seed)
     unit, Ts = controller.y_unit, controller.Ts
-    if unit.lower() == "rpm" and math.isclose(Ts, signals.TS, rel_tol=1e-9):
+    if spelled(unit) == "rpm" and math.isclose(Ts, signals.TS, rel_tol=1e-9):
         return samples
     if isinstance(plant, Model):
         made = drive_references(
@@ -421,7 +422,7 @@ def require_units(gains: Gains | SampledController, units: tuple[str, str]) -> N
     """
     own = (gains.u_unit, gains.y_unit)
     for what, theirs, ours in zip(("input", "output"), units, own, strict=True):
-        if theirs and ours and theirs.lower() != ours.lower():
+        if theirs and ours and spelled(theirs) != spelled(ours):
             raise SettingError(
                 name="plant", expected=f"its {what} in the controller's unit {ours!r}",
                 received=repr(theirs), remedy="give the gains in the plant's units",

@@ -24,6 +24,10 @@ _RUN = 2000
 _NEWTON = 30
 
 
+INTEGRATES = 2.5e-4
+"""Distance of a pole from 1 below which a step takes longer than 16,000 samples to settle."""
+
+
 @dataclass(frozen=True, eq=False)
 class Linearised:
     """x+ = A x + B v, y = C x + D v in small signals, v(k) = u(k - delay); in the data's units.
@@ -76,6 +80,22 @@ def linearise(
     if "nx" in settings:
         return _state_space(core, settings, u, state, level)
     raise SettingError(f"linearise: expected a model of sewfast, received {type(core).__name__}")
+
+
+def integrating_pole(model: DynamicModel) -> float | None:
+    """The pole at 1, or so near that no step within reach settles; None where there is none.
+
+    A record of a position gives it to within its noise and its friction.
+    """
+    try:
+        small = linearise(representative(model).core, np.zeros(len(model.input_names)))
+    except SettingError:
+        return None
+    if not (small.A.size and np.isfinite(small.A).all()):
+        return None
+    poles = np.linalg.eigvals(small.A)
+    nearest = poles[np.argmin(np.abs(poles - 1.0))]
+    return float(nearest.real) if abs(nearest - 1.0) < INTEGRATES else None
 
 
 # --- lagged models -------------------------------------------------------------------------------

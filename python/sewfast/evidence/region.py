@@ -15,6 +15,10 @@ kind, ensembles included. A sample lies outside where any of three distances exc
 - *peak*: the largest deviation within the last few lags, the time that a sample stays in the
   model's memory.
 
+Where a model integrates, as that of a position does, the output is no part of the point: at rest
+an axis is the same everywhere, and a record that goes there and back never rests at its ends. Level
+and peak bound its output as any other's.
+
 A two-level input makes the regressor's points degenerate (they lie on a few planes), and any
 ellipsoid or whitening of them turns rounding into distance. Here nothing is whitened: every
 coordinate is divided by half its own range.
@@ -147,7 +151,8 @@ class TrainingRegion:
     Attributes
     ----------
     nearest : Region
-        Of the points (inputs, output, change of the output over `lag`).
+        Of the points (inputs, output, change of the output over `lag`), of one that integrates
+        without the output.
     centre, level, peak : array, shape (nu + 1,)
         Means of the inputs and the output; the bounds of rms and peak about them.
     lag, window : int
@@ -162,16 +167,18 @@ class TrainingRegion:
     window: int
 
     @classmethod
-    def of(cls, runs: Sequence[Signals]) -> TrainingRegion:
+    def of(cls, runs: Sequence[Signals], *, integrates: bool = False) -> TrainingRegion:
         """Of runs on training data.
 
         Parameters
         ----------
         runs : sequence of (u, y)
             Inputs, shape (N, nu), and output, shape (N,), of each experiment.
+        integrates : bool
+            Whether the output is as good as any other where it rests.
         """
         lag = max(1, int(np.median([_lag(y) for _, y in runs])))
-        points = np.concatenate([_points(u, y, lag) for u, y in runs])
+        points = np.concatenate([_points(u, y, lag, integrates) for u, y in runs])
         signals = [np.column_stack(run) for run in runs]
         together = np.concatenate(signals)
         centre = together.mean(axis=0)
@@ -202,17 +209,23 @@ class TrainingRegion:
             At most 1000.
         """
         y = np.nan_to_num(y, nan=1e300, posinf=1e300, neginf=-1e300)
-        near = self.nearest.distance(_points(u, y, self.lag)) / self.nearest.radius
+        points = _points(u, y, self.lag, self.integrates)
+        near = self.nearest.distance(points) / self.nearest.radius
         signals = np.column_stack([u, y]) - self.centre
         size = _size(signals, self.level, self.peak, self.lag, self.window)
         return np.minimum(np.maximum(near, size), _FARTHEST)
 
     def holds(self, u: FloatArray, y: float) -> bool:
         """Whether the training data came near a steady state: inputs (nu,) and output at rest."""
-        point = np.concatenate([u, [y, 0.0]])
-        if not np.isfinite(point).all():
+        if not (np.isfinite(u).all() and np.isfinite(y)):
             return False
+        point = np.concatenate([u, [0.0] if self.integrates else [y, 0.0]])
         return bool(self.nearest.distance(point[None])[0] <= self.nearest.radius)
+
+    @property
+    def integrates(self) -> bool:
+        """Whether the points are without the output."""
+        return len(self.nearest.mean) == len(self.centre)
 
     @property
     def n_inputs(self) -> int:
@@ -245,17 +258,25 @@ class TrainingRegion:
         centre, level, peak = (_array(values, k) for k in ("centre", "level", "peak"))
         lag, window = (int(_positive(values, k)) for k in ("lag", "window"))
         shapes = {centre.shape, level.shape, peak.shape}
-        if shapes != {(len(inner.mean) - 1,)} or not ((level > 0.0) & (peak > 0.0)).all():
+        ragged = len(shapes) != 1 or len(inner.mean) - len(centre) not in (0, 1)
+        if ragged or not ((level > 0.0) & (peak > 0.0)).all():
             raise ValueError(
-                f"expected centre, level and peak of shape ({len(inner.mean) - 1},), received "
-                f"{shapes}"
+                f"expected centre, level and peak of one shape, with {len(inner.mean)} or one less "
+                f"for the coordinates of a point, received {shapes}"
             )
         return cls(inner, centre, level, peak, max(lag, 1), max(window, 1))
 
 
 def training_region(model: DynamicModel, data: Dataset) -> dict[str, Any]:
     """The region that a model passes through on its training data, for its `training["region"]`."""
-    return TrainingRegion.of(_runs(model, data, INIT)).to_json()
+    return _region(model, data).to_json()
+
+
+def _region(model: DynamicModel, data: Dataset) -> TrainingRegion:
+    from .operating import integrating_pole
+
+    runs = _runs(model, data, INIT)
+    return TrainingRegion.of(runs, integrates=integrating_pole(model) is not None)
 
 
 def stored_region(model: DynamicModel) -> TrainingRegion | None:
@@ -298,7 +319,7 @@ def placed(
     None where there is neither.
     """
     if training is not None:
-        known: TrainingRegion | None = TrainingRegion.of(_runs(model, training, INIT))
+        known: TrainingRegion | None = _region(model, training)
     else:
         known = stored_region(model)
     return None if known is None else Place(known, _runs(model, data, init))
@@ -312,14 +333,14 @@ def _runs(model: DynamicModel, data: Dataset, init: int) -> list[Signals]:
 # --- the nearest training point -------------------------------------------------------------------
 
 
-def _points(u: FloatArray, y: FloatArray, lag: int) -> FloatArray:
-    """Inputs, output and its change over the lag, (N, nu + 2)."""
+def _points(u: FloatArray, y: FloatArray, lag: int, integrates: bool) -> FloatArray:
+    """Inputs, output and its change over the lag, (N, nu + 2); or without the output."""
     change = np.zeros(len(y))
     if len(y) > 1:
         lag = min(lag, len(y) - 1)
         change[lag:] = y[lag:] - y[:-lag]
         change[:lag] = change[lag]
-    return np.column_stack([u, y, change])
+    return np.column_stack([u, change] if integrates else [u, y, change])
 
 
 def _lag(y: FloatArray) -> int:

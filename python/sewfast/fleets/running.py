@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 import signal
@@ -35,6 +36,8 @@ _RETRIES = 50
 """Workers that may die over one recording before it is taken for the cause."""
 _PATIENCE, _LOOK = 120.0, 5.0
 """How long no worker may be there at all, and how often that is looked at [s]."""
+_STARTING = 5.0
+"""Times as long where processes of workers are there and not ready yet, as on a busy computer."""
 
 
 @shown_in_notebooks("fleet", "share failed")
@@ -258,13 +261,40 @@ def _ended(running: Collection[Any], connected: Any) -> Any:
             # since when none has been seen: on a busy computer a look itself takes its time
             none = not connected.scheduler_info(n_workers=-1)["workers"]
             without = min(without, time.monotonic()) if none else math.inf
-            if time.monotonic() - without >= _PATIENCE:
-                missed = f"workers: expected one at least, got none for {_PATIENCE:g} s"
+            starting = _replaced(connected) if none else False
+            patience = _PATIENCE * (_STARTING if starting else 1.0)
+            if time.monotonic() - without >= patience:
+                missed = f"workers: expected one at least, got none for {patience:g} s"
+                if starting:
+                    missed += ", while their processes keep starting (a busy computer, or memory "
+                    missed += "that does not suffice to start)"
         except CancelledError:
             missed = "scheduler: expected it to stay, got a connection that is closed"
     raise SettingError(
         f"{missed}; start it again and repeat the call: with `out` it goes on from what is done"
     )
+
+
+def _replaced(connected: Any) -> bool:
+    """Have the client's own cluster start the workers that it is to have; whether any is starting.
+
+    A LocalCluster gives a worker up that has been away for 15 s (`lost-worker-timeout`), on a busy
+    computer one that is merely starting again, and one whose start has failed; it looks for what is
+    missing only where it is scaled.
+    """
+    cluster: Any = getattr(connected, "cluster", None)
+    if not (hasattr(cluster, "worker_spec") and hasattr(cluster, "scale")):
+        return False
+    keepers = dict(cluster.workers)
+    ended = [name for name, keeper in keepers.items() if keeper.status.name in ("closed", "failed")]
+
+    def scale() -> None:
+        for name in ended:
+            cluster.workers.pop(name, None)
+        cluster.scale(len(cluster.worker_spec))
+
+    cluster.loop.add_callback(scale)
+    return any(getattr(keeper, "pid", None) is not None for keeper in keepers.values())
 
 
 def _rows_of(
@@ -287,7 +317,7 @@ def _connected(
     except ImportError as error:
         raise SettingError(
             "expected Dask to work on several recordings at once, got none; pip install "
-            "'sewfast[fleet]', or give workers=0"
+            "'sewfast[fleet]', or give workers=0 (--workers 0)"
         ) from error
     if scheduler is not None:
         try:
@@ -306,13 +336,20 @@ def _connected(
         raise SettingError(
             f"memory: expected a size such as '500MB', got {memory!r}; state its unit"
         ) from error
-    # a worker that was killed is no fault of the recording it was at
-    with dask.config.set({"distributed.scheduler.allowed-failures": _RETRIES}):
+    kept = {
+        # a worker that was killed is no fault of the recording it was at
+        "distributed.scheduler.allowed-failures": _RETRIES,
+        # and is started again, however long that takes on a busy computer
+        "distributed.deploy.lost-worker-timeout": "1 day",
+    }
+    with dask.config.set(kept):
         options = {
             "n_workers": workers or os.cpu_count() or 1,
             "threads_per_worker": 1,
             "memory_limit": memory,
             "dashboard_address": None,
+            # what its processes say of each other while they end is nobody's business here
+            "silence_logs": logging.CRITICAL,
         }
         with _workers_without_ctrl_c():
             cluster = distributed.LocalCluster(**options)

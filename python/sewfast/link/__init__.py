@@ -5,17 +5,20 @@ Read in this order: `ports` (transports, their failures), `wire` (what bodies st
 (what a run is to do, and what became of it) and `settings` (what must fit before it moves), `run`
 (the pump of a run with its way out), `record` (into memory, a file and a live view). Then
 `host_loop` and `host_run` (a controller on this computer), `doctor` and `access`, `virtual` and
-`emulated` (devices without a motor), and `boards` (drives of other makers, polled over text).
+`emulated` (devices without a motor), and `boards` with `odrive` and `simplefoc` (drives of other
+makers, polled over text).
 """
 
-from .boards import ODrive, PolledBoard, SimpleFOC
+from .boards import PolledBoard
 from .clock import ClockBounds
 from .doctor import Diagnosis, Finding, examine
 from .drive import Drive, connect
 from .host_loop import at_period, run_on_host
 from .host_run import HostLoopRun, Jitter
+from .odrive import ODrive
 from .plan import Layout, Outcome, Plan, Sink
 from .ports import Port, PortInfo, list_ports, open_port
+from .simplefoc import SimpleFOC
 from .virtual import VirtualDevice
 from .wire import Channel, Event, Identity, Limits, Status
 

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import _core, signals
-from ..arrays import FloatArray, counts_per_unit
+from ..arrays import FloatArray
 from ..control.controller import Controller
 from ..control.loop import reference_samples, require_controller
 from ..errors import Interrupted, LinkError, SettingError
+from ..units import counts_per_unit, spelled
 from . import wire
 from .drive import Drive
 from .host_run import HostLoopRun, Jitter
@@ -193,7 +194,7 @@ def _reference(reference: str | ArrayLike, controller: Controller, seed: int) ->
     named = isinstance(reference, str)
     if not named or step <= 1 or not math.isclose(step * signals.TS, controller.Ts, rel_tol=1e-6):
         return reference_samples(reference, controller, seed)
-    if controller.gains.y_unit.lower() != "rpm":
+    if spelled(controller.gains.y_unit) != "rpm":
         raise SettingError(
             name="controller", expected=f"one in RPM for the reference {reference!r}",
             received=repr(controller.gains.y_unit), remedy="give the reference as samples",

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ..arrays import counts_per_unit
 from ..control.controller import Controller, SampledController
 from ..errors import LinkError, SettingError
 from ..gains import Gains, real
+from ..units import counts_per_unit, spelled
 from . import wire
 from .connection import Connection
 from .wire import Channel, Identity, Kind
@@ -129,7 +129,7 @@ def gains(controller: Controller, streamed: Sequence[Channel], identity: Identit
 
 
 def _require_units(given: str, device: str, what: str) -> None:
-    if given.lower() != device.lower():
+    if spelled(given) != spelled(device):
         raise SettingError(
             name="controller", expected=f"one whose {what} is in {device}, as the device's",
             received=given, remedy="convert its gains",

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray, counts_per_unit
+from ..arrays import FloatArray
 from ..errors import DataError, SettingError
+from ..units import counts_per_unit
 
 # --- Memory: the numbers of a feed's ring, in this process or shared with another one -------------
 

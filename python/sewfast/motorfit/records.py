@@ -9,18 +9,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import REVOLUTIONS_PER_SECOND, FloatArray, as_column, runs
+from ..arrays import FloatArray, as_column, runs
 from ..dataset import Dataset
 from ..errors import DataError, SettingError
 from ..recording import Recording
+from ..units import REVOLUTIONS_PER_SECOND, revolutions_per_second
 
 SHORTEST = 50
 """Samples of a piece between gaps; a shorter one says less than its unknown start costs."""
 LEAST = 200
 """Samples of all pieces."""
-_SPELLINGS = {"rps": "rev/s", "1/s": "rev/s", "°/s": "deg/s"} | dict.fromkeys(
-    ("r/min", "rev/min", "1/min", "min-1", "min^-1", "min⁻¹", "u/min", "upm", "tr/min"), "rpm"
-)
 SPIKE = 8.0
 """Standard deviations from the median of its neighbours, from which a sample is a spike."""
 
@@ -89,15 +87,13 @@ class Records:
 
 def rad_per_second(unit: str) -> float:
     """How many rad/s one of a unit of speed is."""
-    known: Mapping[str, float] = REVOLUTIONS_PER_SECOND
-    key = unit.strip().lower()
-    key = _SPELLINGS.get(key, key)
-    if key not in known:
+    turns = revolutions_per_second(unit)
+    if turns is None:
         raise SettingError(
-            f"expected a speed in {', '.join(known)}, received the unit {unit!r}; say which it is: "
-            "speed_unit='rpm'"
+            f"expected a speed in {', '.join(REVOLUTIONS_PER_SECOND)}, received the unit {unit!r}; "
+            "say which it is: speed_unit='rpm'"
         )
-    return 2.0 * math.pi * known[key]
+    return 2.0 * math.pi * turns
 
 
 def records_of(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import io
 import math
-import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ import numpy as np
 
 from ..dataset import FloatArray
 from ..errors import DataError, SettingError, not_installed, printable
+from ..units import split_unit, unit_in_name
 
 # --- Table: the named columns of one file, and why others cannot be used --------------------------
 
@@ -108,60 +108,6 @@ class Table:
     def row(self, k: int) -> str:
         """Where sample `k` stands in the file, for messages."""
         return f"sample {k} (0-based)" if self.lines is None else f"line {self.lines[k]}"
-
-
-def split_unit(header: str) -> tuple[str, str]:
-    """`u [V]`, `u (V)`, `u, V`, `u in V` or `u / V` -> `("u", "V")`; no unit gives an empty one."""
-    match = re.fullmatch(r"\s*(\S.*?)[\s/]*(?:\[([^\]]*)\]|\(([^)]*)\))\s*", header)
-    if match is not None:
-        return match[1], (match[2] or match[3] or "").strip()
-    text = header.strip()
-    for between in _BEFORE_UNIT.finditer(text):
-        name, unit = text[: between.start()], text[between.end() :]
-        # `speed m/s` is no `speed m` in seconds
-        if name and is_unit(unit) and not is_unit(text[len(name.rpartition(" ")[0]) :]):
-            return name, unit
-    return text, ""
-
-
-_UNITS = frozenset(
-    re.split(
-        " ",
-        "s sec second seconds ms us µs ns min v volt volts mv a amp ampere amperes ma rpm rev "
-        "rev/s u/min upm tr/min r/min min-1 min^-1 min⁻¹ 1/min rad rad/s deg deg/s ° °/s nm n "
-        "m cm mm m/s cm/s mm/s m/min km/h w hz khz % °c degc counts counts/s",
-    )
-)
-"""Units that oscilloscopes, loggers and people write behind or below a name, in lower case."""
-_BEFORE_UNIT = re.compile(r"\s+in\s+|\s*/\s*|\s*,\s+")
-
-
-def is_unit(text: str) -> bool:
-    """Whether a text is one of the units that measurements have."""
-    return text.strip().lower() in _UNITS
-
-
-_SUFFIX = {
-    "V": "V", "mV": "mV", "A": "A", "mA": "mA", "rpm": "RPM", "RPM": "RPM", "radps": "rad/s",
-    "rad_s": "rad/s", "degps": "deg/s", "deg_s": "deg/s", "deg": "deg", "rad": "rad", "Nm": "Nm",
-    "mm": "mm", "Hz": "Hz", "rad_per_s": "rad/s", "deg_per_s": "deg/s", "m_s": "m/s",
-    "mm_s": "mm/s", "m_per_s": "m/s", "mm_per_s": "mm/s", "mps": "m/s", "percent": "%", "pct": "%",
-    "volt": "V", "volts": "V",
-}  # fmt: skip
-_CURRENT = re.compile(r"i|curr(ent)?|strom|amps?|i_?motor|motor_?current")
-_SUFFIXED = re.compile(rf"(.+)[_ ]({'|'.join(sorted(_SUFFIX, key=len, reverse=True))})")
-
-
-def unit_in_name(name: str) -> tuple[str, str]:
-    """`speed_rpm` -> `("speed", "RPM")`; a name that ends with no unit gives an empty one.
-
-    Only endings that hardly mean anything else count. A lone `A` is also a phase or a channel, so
-    that it is a unit only behind a word for a current.
-    """
-    match = _SUFFIXED.fullmatch(name)
-    if match is None or (match[2] == "A" and not _CURRENT.fullmatch(match[1].lower())):
-        return name, ""
-    return match[1], _SUFFIX[match[2]]
 
 
 def split_units(headers: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -13,7 +13,8 @@ import numpy as np
 
 from ..dataset import FloatArray
 from ..errors import DataError
-from .containers import MAX_COLUMNS, Table, from_headers, is_unit, split_unit
+from ..units import is_unit, split_unit
+from .containers import MAX_COLUMNS, Table, from_headers
 from .stamps import is_moment, seconds_of_texts
 
 MAX_LINE = 1_000_000

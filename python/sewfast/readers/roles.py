@@ -9,16 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..dataset import is_reference
-from .containers import Table, unit_in_name
+from ..units import SPEEDS, unit_in_name
+from .containers import Table
 from .timebase import time_column
-
-_SPEEDS = frozenset(
-    re.split(
-        ",",
-        "rpm,1/min,min-1,min^-1,r/min,u/min,upm,tr/min,rev/s,rps,rad/s,deg/s,°/s,"
-        "m/s,mm/s,cm/s,m/min,km/h",
-    )
-)
 
 
 @dataclass(frozen=True)
@@ -45,7 +38,7 @@ _OUTPUTS = (
     _sort(
         "y out output speed rpm velocity vel omega drehzahl geschwindigkeit vitesse tacho tach "
         "position pos angle theta winkel weg istwert velocidad velocità",
-        (*_SPEEDS, "rad", "deg", "°", "rev", "m", "mm"),
+        (*SPEEDS, "rad", "deg", "°", "rev", "m", "mm"),
     ),
     _sort("temperature temp temperatur", ("°c", "degc", "k")),
 )
@@ -108,8 +101,11 @@ def _moves(table: Table, name: str) -> bool:
 
 
 def _counts_rows(table: Table, name: str) -> bool:
-    steps = np.diff(table[name])
-    return _NUMBER.fullmatch(name.lower()) is not None and bool((steps == steps[0]).all())
+    if _NUMBER.fullmatch(name.lower()) is None:
+        return False
+    with np.errstate(invalid="ignore"):  # between two infinities
+        steps = np.diff(table[name])
+    return bool((steps == steps[0]).all())
 
 
 def _stem(name: str) -> str:

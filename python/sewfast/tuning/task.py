@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import _core
-from ..arrays import REVOLUTIONS_PER_SECOND
 from ..control.controller import GAIN_NAMES, NOTCH_NAMES, Controller, SampledController
 from ..control.defaults import (
     beyond_record,
@@ -40,6 +39,7 @@ from ..gains import Gains, real, vector, whole
 from ..models import Model
 from ..rules import Fopdt, Rule, table_1
 from ..threads import available
+from ..units import revolutions_per_second, spelled
 from .objective import Constraints, Cost, LoadStep
 
 Progress: TypeAlias = Callable[[int, int, float], object]
@@ -515,7 +515,7 @@ def _units(plant: Model, stated: str | None) -> tuple[str, str]:
     u_unit, y_unit = plant_units(plant)
     if stated is not None and not isinstance(stated, str):
         raise SettingError(f"expected a unit as text for output_unit, got {stated!r}")
-    if stated and y_unit and stated.lower() != y_unit.lower():
+    if stated and y_unit and spelled(stated) != spelled(y_unit):
         raise SettingError(
             f"expected the output in the model's unit {y_unit!r}, got output_unit = {stated!r}; "
             "leave it out, or identify the model from converted data"
@@ -533,7 +533,7 @@ def _encoder(plant: Model, stated: Encoder, unit: str) -> float | None:
                 f"{stated!r}"
             )
         counts = plant.counts[1] if plant.counts else None
-        if unit.lower() not in REVOLUTIONS_PER_SECOND:
+        if revolutions_per_second(unit) is None:
             return None
     if counts is not None and not unit:
         raise SettingError(

@@ -1,0 +1,171 @@
+"""`ODrive`: an axis of an ODrive with firmware 0.5, over its ASCII protocol.
+
+Written from the maker's documents and sources; never run on hardware (docs/boards.md).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from contextlib import suppress
+
+from ..errors import LinkError, SettingError
+from .boards import WATCHDOG, Clock, PolledBoard
+from .ports import Port
+
+IDLE, CLOSED_LOOP = 1, 8
+"""States of an axis."""
+TORQUE, PASSTHROUGH = 1, 1
+"""Its control mode and input mode."""
+GIMBAL = 2
+"""The motor type whose commands are voltages."""
+ARMS_WITHIN = 2.0
+
+
+class ODrive(PolledBoard):
+    """An axis of an ODrive with firmware 0.5, over its ASCII protocol (USB or UART).
+
+    The command is a torque [N m], or a voltage [V] where the motor is configured as a gimbal motor:
+    `unit` says which; recordings name the column `u [V]` either way. Calibrate the motor, set
+    `vel_limit` and `current_lim` and have the axis at rest in IDLE first.
+
+    Parameters
+    ----------
+    port, Ts, volt, speed, baud, clock
+        As `PolledBoard`; `volt` is in N m, or V of a gimbal motor.
+    axis : int
+        0 or 1.
+    counts_per_rev : float, optional
+        By default what the axis' encoder is configured for.
+
+    Notes
+    -----
+    During a run the axis' own watchdog is set to 0.2 s: where this computer dies, the ODrive
+    switches the motor off by itself. Afterwards control mode, input mode and watchdog are as
+    before.
+    """
+
+    def __init__(
+        self,
+        port: str | Port,
+        *,
+        volt: float,
+        speed: float,
+        Ts: float = 0.01,
+        axis: int = 0,
+        counts_per_rev: float | None = None,
+        baud: int = 115_200,
+        clock: Clock = time,
+    ) -> None:
+        if axis not in (0, 1) or isinstance(axis, bool):
+            raise SettingError(name="axis", expected="0 or 1", received=repr(axis))
+        self._axis, self._asks_counts = axis, counts_per_rev is None
+        self._before: dict[str, float] = {}
+        self.unit = "N m"
+        super().__init__(
+            port, Ts=Ts, volt=volt, speed=speed, counts_per_rev=counts_per_rev or 1.0, baud=baud,
+            clock=clock,
+        )  # fmt: skip
+
+    @property
+    def name(self) -> str:
+        return f"ODrive axis {self._axis}"
+
+    def _prepare(self) -> None:
+        version = [round(self._read(f"fw_version_{part}")) for part in ("major", "minor")]
+        if version != [0, 5]:
+            raise SettingError(
+                name=self._port.url, expected="an ODrive with firmware 0.5",
+                received=f"firmware {version[0]}.{version[1]}",
+                remedy="others name their properties differently; `sewfast.Machine` takes your own",
+            )  # fmt: skip
+        if self._asks_counts:
+            self.counts_per_rev = self._read(f"{self._place}.encoder.config.cpr")
+        if round(self._read(f"{self._place}.motor.config.motor_type")) == GIMBAL:
+            self.unit = "V"
+        if round(self._read(f"{self._place}.current_state")) != IDLE:
+            raise LinkError(
+                name=self.name, expected="an axis in IDLE", received="one that something drives",
+                remedy="end what drives it, and request IDLE",
+            )  # fmt: skip
+        self._require_no_error()
+
+    @property
+    def _place(self) -> str:
+        return f"axis{self._axis}"
+
+    def _read(self, what: str) -> float:
+        answer = self._ask(f"r {what}")
+        try:
+            return float(answer)
+        except ValueError:
+            raise self._unexpected(f"the number {what}", answer) from None
+
+    def _write(self, what: str, value: float) -> None:
+        """Without an answer, unless it is refused; that is seen by the next question."""
+        self._tell(f"w {self._place}.{what} {value:g}")
+
+    def _require_no_error(self) -> None:
+        error = round(self._read(f"{self._place}.error"))
+        if error:
+            raise LinkError(
+                name=self.name, expected="an axis without errors", received=f"error 0x{error:x}",
+                remedy="see dump_errors(odrv0) in odrivetool, and clear them",
+            )  # fmt: skip
+
+    def _arm(self) -> None:
+        self._require_no_error()
+        for what, value in (
+            ("controller.config.control_mode", TORQUE),
+            ("controller.config.input_mode", PASSTHROUGH),
+            ("config.watchdog_timeout", WATCHDOG),
+        ):
+            self._before.setdefault(what, self._read(f"{self._place}.{what}"))
+            self._write(what, value)
+        self._apply(0.0)
+        self._write("config.enable_watchdog", 1)
+        self._write("requested_state", CLOSED_LOOP)
+        deadline = self._clock.monotonic() + ARMS_WITHIN
+        while round(self._read(f"{self._place}.current_state")) != CLOSED_LOOP:
+            self._apply(0.0)
+            if self._clock.monotonic() > deadline:
+                self._require_no_error()
+                raise LinkError(
+                    name=self.name, expected="closed-loop control when asked for",
+                    received="another state", remedy="calibrate motor and encoder first",
+                )  # fmt: skip
+            self._clock.sleep(0.005)
+
+    def _disarm(self) -> None:
+        self._write("requested_state", IDLE)
+        deadline = self._clock.monotonic() + ARMS_WITHIN
+        while round(self._read(f"{self._place}.current_state")) != IDLE:
+            if self._clock.monotonic() > deadline:
+                raise LinkError(
+                    name=self.name, expected="IDLE when asked for", received="another state"
+                )
+            self._clock.sleep(0.005)
+        self._write("config.enable_watchdog", 0)
+        for what, value in self._before.items():
+            self._write(what, value)
+        self._before.clear()
+
+    def _require_running(self) -> None:
+        if round(self._read(f"{self._place}.current_state")) != CLOSED_LOOP:
+            self._require_no_error()
+            raise LinkError(
+                name=self.name, expected="closed-loop control", received="an axis that left it",
+                remedy="see dump_errors(odrv0) in odrivetool",
+            )  # fmt: skip
+
+    def _apply(self, u: float) -> None:
+        self._tell(f"c {self._axis} {u:.6f}")
+
+    def _position(self) -> float:
+        answer = self._ask(f"f {self._axis}")
+        found = re.fullmatch(r"(\S+) (\S+)", answer)
+        with suppress(ValueError):
+            if found is not None and math.isfinite(turns := float(found[1])):
+                return turns
+        raise self._unexpected("position and velocity", answer)

@@ -1,0 +1,153 @@
+"""Units as people and instruments write them: one table of spellings, and units in a column's name.
+
+A unit is kept as it was written; only comparing and converting look here.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+
+from .errors import SettingError
+
+# --- Units of angular speed and the encoder's resolution in each ----------------------------------
+
+
+REVOLUTIONS_PER_SECOND: dict[str, float] = {
+    "rpm": 1.0 / 60.0,
+    "rev/s": 1.0,
+    "rad/s": 1.0 / math.tau,
+    "deg/s": 1.0 / 360.0,
+}
+"""Revolutions per second that one of each unit stands for."""
+_WRITTEN = {
+    "rpm": "r/min rev/min 1/min min-1 min^-1 min⁻¹ u/min upm tr/min",
+    "rev/s": "rps 1/s turn/s turns/s",
+    "rad/s": "rad/sec",
+    "deg/s": "°/s deg/sec",
+    "v": "volt volts",
+    "a": "amp amps ampere amperes",
+    "s": "sec second seconds",
+    "%": "percent pct",
+}
+"""How else a unit is written, in lower case; `u` are German turns, `tr` French."""
+_SPELLINGS = {other: unit for unit, others in _WRITTEN.items() for other in others.split()}
+ANGULAR_SPEEDS = frozenset(REVOLUTIONS_PER_SECOND) | frozenset(
+    other for other, unit in _SPELLINGS.items() if unit in REVOLUTIONS_PER_SECOND
+)
+SPEEDS = ANGULAR_SPEEDS | frozenset(["m/s", "cm/s", "mm/s", "m/min", "km/h"])
+
+
+def spelled(unit: str) -> str:
+    """A unit in lower case and in the package's own spelling: two that are equal mean the same.
+
+    Examples
+    --------
+    >>> spelled("U/min"), spelled("RPM"), spelled("mm/s")
+    ('rpm', 'rpm', 'mm/s')
+    """
+    key = unit.strip().lower()
+    return _SPELLINGS.get(key, key)
+
+
+def revolutions_per_second(unit: str) -> float | None:
+    """Revolutions per second that one of `unit` stands for; None where it is no angular speed."""
+    return REVOLUTIONS_PER_SECOND.get(spelled(unit))
+
+
+def counts_per_unit(counts_per_rev: float, unit: str = "rpm") -> float:
+    """Encoder counts that pass in one second at a speed of one ``unit``.
+
+    A change of ``n`` counts in ``Ts`` seconds is a speed of ``n / (Ts * counts_per_unit)``.
+    With 1,572 counts/rev and 1 ms one count is 38.168 RPM.
+
+    Parameters
+    ----------
+    counts_per_rev
+        Counts per revolution [counts/rev], above zero.
+    unit
+        One of ``rpm``, ``rev/s``, ``rad/s``, ``deg/s``, in any usual spelling.
+
+    Returns
+    -------
+    float
+        Counts per (unit x second).
+
+    Raises
+    ------
+    SettingError
+        For a resolution that is not finite and above zero, or an unknown unit.
+
+    Examples
+    --------
+    >>> round(1 / (0.001 * counts_per_unit(1572, "rpm")), 3)
+    38.168
+    """
+    if not (math.isfinite(counts_per_rev) and counts_per_rev > 0):
+        raise SettingError(
+            f"expected counts_per_rev finite and above 0, got {counts_per_rev}; "
+            "give the encoder's counts per revolution after its 4-fold evaluation"
+        )
+    factor = revolutions_per_second(unit)
+    if factor is None:
+        raise SettingError(
+            f"expected a speed unit out of {', '.join(REVOLUTIONS_PER_SECOND)}, got {unit!r}; "
+            "convert the speed to one of them"
+        )
+    return counts_per_rev * factor
+
+
+# --- Units in the names of columns ----------------------------------------------------------------
+
+
+_UNITS = SPEEDS | frozenset(
+    re.split(
+        " ",
+        "s sec second seconds ms us µs ns min v volt volts mv a amp ampere amperes ma rev "
+        "rad deg ° nm n m cm mm w hz khz % °c degc counts counts/s",
+    )
+)
+"""Units that oscilloscopes, loggers and people write behind or below a name, in lower case."""
+_BEFORE_UNIT = re.compile(r"\s+in\s+|\s*/\s*|\s*,\s+")
+
+
+def split_unit(header: str) -> tuple[str, str]:
+    """`u [V]`, `u (V)`, `u, V`, `u in V` or `u / V` -> `("u", "V")`; no unit gives an empty one."""
+    match = re.fullmatch(r"\s*(\S.*?)[\s/]*(?:\[([^\]]*)\]|\(([^)]*)\))\s*", header)
+    if match is not None:
+        return match[1], (match[2] or match[3] or "").strip()
+    text = header.strip()
+    for between in _BEFORE_UNIT.finditer(text):
+        name, unit = text[: between.start()], text[between.end() :]
+        # `speed m/s` is no `speed m` in seconds
+        if name and is_unit(unit) and not is_unit(text[len(name.rpartition(" ")[0]) :]):
+            return name, unit
+    return text, ""
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text is one of the units that measurements have."""
+    return text.strip().lower() in _UNITS
+
+
+_SUFFIX = {
+    "V": "V", "mV": "mV", "A": "A", "mA": "mA", "rpm": "RPM", "RPM": "RPM", "radps": "rad/s",
+    "rad_s": "rad/s", "degps": "deg/s", "deg_s": "deg/s", "deg": "deg", "rad": "rad", "Nm": "Nm",
+    "mm": "mm", "Hz": "Hz", "rad_per_s": "rad/s", "deg_per_s": "deg/s", "m_s": "m/s",
+    "mm_s": "mm/s", "m_per_s": "m/s", "mm_per_s": "mm/s", "mps": "m/s", "percent": "%", "pct": "%",
+    "volt": "V", "volts": "V",
+}  # fmt: skip
+_CURRENT = re.compile(r"i|curr(ent)?|strom|amps?|i_?motor|motor_?current")
+_SUFFIXED = re.compile(rf"(.+)[_ ]({'|'.join(sorted(_SUFFIX, key=len, reverse=True))})")
+
+
+def unit_in_name(name: str) -> tuple[str, str]:
+    """`speed_rpm` -> `("speed", "RPM")`; a name that ends with no unit gives an empty one.
+
+    Only endings that hardly mean anything else count. A lone `A` is also a phase or a channel, so
+    that it is a unit only behind a word for a current.
+    """
+    match = _SUFFIXED.fullmatch(name)
+    if match is None or (match[2] == "A" and not _CURRENT.fullmatch(match[1].lower())):
+        return name, ""
+    return match[1], _SUFFIX[match[2]]
