@@ -23,8 +23,8 @@ from .folds import Errors, Split, compared, errors_of, folds, free_runs, thinned
 from .task import Provenance, Task, documented, finite, wrap
 
 TERMS = ("lag", "delay", "coulomb", "offset", "drop", "stribeck", "limit")
-IF_CLEAR = ("stribeck_difference", "sag")
-"""Of a motor: those that do not ask where a turn begins."""
+IF_CLEAR = ("sag",)
+"""Of a motor: one that does not ask where a turn begins."""
 HIDDEN = 4
 """Units of the network that is tried."""
 STARTS = 2

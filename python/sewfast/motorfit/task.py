@@ -66,8 +66,8 @@ STARTS = 5
 """Steps at most by which the pieces' starts are settled: dry friction bends what one step takes for
 straight where the start is on the wrong side of a standstill."""
 AMMETER = 1e-3
-"""Of the current's root mean square: the error down to which it is believed, and of its scale. That
-of a simulator has none, and what the model leaves of it, at reversals, then outweighs all speeds."""
+"""Of the current's root mean square: the error down to which it is believed; and of its scale. A
+simulator's has none, and what the model leaves of it, at reversals, then outweighs all speeds."""
 TIMING = 0.01
 """Of a sample: standard deviation of the instant from which a command acts, which no residual
 shows. It moves delay and time constants, of a motor without noise by more than all the rest."""

@@ -245,7 +245,7 @@ def _with_clear(task: Task, state: State, terms: tuple[str, ...]) -> State:
 
 def _clear(task: Task, state: State, terms: tuple[str, ...]) -> list[str]:
     """Those without which the fit is clearly worse, by their scores (Rao 1948)."""
-    bumpy = "stribeck" in state.terms and state.value("w_s") >= _slowest(task)
+    bumpy = "stribeck" in state.terms and _parts_sides(task, state.value("w_s"))
     tried = [t for t in terms if t not in state.terms and (bumpy or t != "stribeck_difference")]
     if not tried:
         return []
@@ -264,9 +264,13 @@ def _clear(task: Task, state: State, terms: tuple[str, ...]) -> list[str]:
     return clear
 
 
-def _slowest(task: Task) -> float:
-    """Speed [rad/s] over which friction falls off, from which either direction shows its own."""
-    return max(2.0 * task.stribeck_speeds()[0], task.records.quantum)
+def _parts_sides(task: Task, w_s: float) -> bool:
+    """Whether friction that falls off over this speed [rad/s] can show its own in each direction.
+
+    Slower, there is no sample to show it; faster, the difference is a constant load.
+    """
+    least, usual = task.stribeck_speeds()
+    return max(2.0 * least, task.records.quantum) <= w_s <= 0.3 * usual
 
 
 def _shown_terms(
@@ -294,7 +298,7 @@ def _shown_terms(
         if "stribeck" in kept and x[names.index("w_s")] > 0.99 * fast:
             shown["stribeck"] = 0.0  # it falls off nowhere: that is Coulomb's friction
         if "stribeck_difference" in kept:  # it has the shape of the other
-            if x[names.index("w_s")] < _slowest(task):
+            if not _parts_sides(task, x[names.index("w_s")]):
                 shown["stribeck_difference"] = 0.0
             shown["stribeck"] = max(shown["stribeck"], shown["stribeck_difference"])
         weakest = min(shown, key=lambda t: shown[t] / needed[t], default=None)
