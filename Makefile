@@ -11,7 +11,6 @@ export PYO3_PYTHON := $(BIN)/python
 export CARGO_TARGET_DIR := $(CURDIR)/target
 # cargo is not to look for the job server of a make that runs checks side by side: make keeps it from other programs
 export CARGO_MAKEFLAGS :=
-export PYTHONDONTWRITEBYTECODE := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # one version of each tool and library, so that no release of theirs fails a build (make constraints)
 export PIP_CONSTRAINT := $(CURDIR)/packaging/constraints.txt
@@ -23,11 +22,12 @@ endif
 RUST := $(shell find rust -name '*.rs' -o -name 'Cargo.toml') Cargo.toml Cargo.lock
 BUILT := $(VENV)/built.stamp
 REPORT := $(VENV)/report.stamp
+LIBRARIES := $(VENV)/libraries.stamp
 DEV := $(VENV)/dev.stamp
 MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures publishable accuracy battery strangers commissioning drives motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
+.PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -37,6 +37,8 @@ demo: $(REPORT) ## the whole experiment on the virtual machine; the report goes 
 
 $(OUT)/results.json: | $(REPORT)
 	$(BIN)/sewfast demo --out $(OUT)
+
+dev: $(DEV) ## what the checks need, built and installed (--jobs=2: side by side)
 
 # two checks at a time: a compiler that optimises one crate keeps one processor busy
 test: $(DEV) ## every check; ends with pytest's summary
@@ -149,6 +151,7 @@ firmware: ## the example firmware for emulated boards, Cortex-M4 and M7 (Debian:
 	  arm-none-eabi-size target/bare/$$1.elf; \
 	done
 
+# first the tests that compute, then those that wait
 python-test: $(DEV) ## pytest, with every snippet of the documentation and every example
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not alone'
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m alone
@@ -238,6 +241,7 @@ bench-device: ## what a control period of the device costs on this machine
 clean: ## removes everything that was built; the virtual environment too
 	rm -rf target site demo dist $(VENV)
 	rm -f python/sewfast/_core*.so
+	find benches docs examples python tests -name __pycache__ -prune -exec rm -rf {} +
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
@@ -245,8 +249,12 @@ $(VENV)/bin/python:
 	@command -v cargo >/dev/null || { echo 'Rust is needed: https://rustup.rs'; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-$(BUILT): $(RUST) pyproject.toml | $(VENV)/bin/python
-	$(BIN)/pip install --quiet 'maturin>=1.9,<2'
+# numpy as well: maturin installs what sewfast itself needs, and not while another pip does
+$(VENV)/maturin.stamp: | $(VENV)/bin/python
+	$(BIN)/pip install --quiet 'maturin>=1.9,<2' numpy
+	@touch $@
+
+$(BUILT): $(RUST) pyproject.toml | $(VENV)/maturin.stamp
 	@echo 'compiling the core; the first time this takes some minutes'
 	@# pip would name every extra that is not asked for
 	PIP_QUIET=1 VIRTUAL_ENV=$(VENV) $(BIN)/maturin develop --release --quiet
@@ -257,7 +265,13 @@ $(REPORT): $(BUILT)
 	$(BIN)/pip install --quiet 'sewfast[report,link]'
 	@touch $@
 
-$(DEV): $(BUILT)
+# with --jobs=2 while the core is compiled, which keeps one processor busy
+$(LIBRARIES): pyproject.toml packaging/constraints.txt | $(VENV)/maturin.stamp
+	$(BIN)/python packaging/extras.py dev docs > $(VENV)/libraries.txt
+	$(BIN)/pip install --quiet -r $(VENV)/libraries.txt
+	@touch $@
+
+$(DEV): $(BUILT) $(LIBRARIES)
 	$(BIN)/pip install --quiet 'sewfast[dev,docs]'
 	@touch $@
 

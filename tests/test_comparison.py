@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import sewfast
-from cli import refused
-from cli import sewfast as command
+from cli import call_refused as refused
+from cli import called as command
 from plants import bent_data, linear_data
 from sewfast import Dataset, Model, SettingError, _core
 from sewfast.models import LinearOE

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli import sewfast
+from cli import called as sewfast
 from sewfast import fit_fopdt, write_table
 from sewfast.control import Fopdt
 

@@ -13,8 +13,8 @@ import pytest
 
 import result_folder
 import sewfast
-from cli import refused
-from cli import sewfast as command
+from cli import call_refused as refused
+from cli import called as command
 from plants import bent_data, linear_data
 from sewfast import Dataset, Model, VirtualMachine
 from sewfast.errors import SettingError

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cli import sewfast as command
+from cli import called as command
 from loops import QUIET, drive
 from sewfast import Ensemble, VirtualMachine, identify, paper_controller, run, signals, tune
 from sewfast.control import Gains

@@ -542,8 +542,12 @@ class Picture:
 
 def svg(figure: Figure, key: str, alt: str) -> str:
     """The figure as inline SVG whose identifiers are its own on a page of many."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    # savefig would draw the figure twice, the first time for a size that is known here
+    canvas: Any = FigureCanvasSVG(figure)  # matplotlib gives this no types
+    canvas.print_svg(buffer, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)

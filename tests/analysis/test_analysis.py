@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import result_folder
-from cli import sewfast as command
+from cli import called as command
 from loops import QUIET, drive
 from sewfast import Cost, Ensemble, VirtualMachine, _core, identify, run
 from sewfast.analysis import Analysis, analyse, changes, run_under_load

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 import sewfast as api
-from cli import PROGRAM, environment, sewfast
+from cli import PROGRAM, environment
+from cli import called as sewfast
+from cli import sewfast as started
 
 
 def lagged(u: np.ndarray) -> np.ndarray:
@@ -40,7 +42,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, seed in (("one", 1), ("two", 2)):
         api.write_table(folder / f"{name}.csv", recording(seed), units=UNITS)
     columns = ("--input", "u", "--output", "speed")
-    sewfast(folder, "identify", "one.csv", *columns, "--model", "oe", "-o", "drive.json")
+    started(folder, "identify", "one.csv", *columns, "--model", "oe", "-o", "drive.json")
     gains = api.Gains.standard(0.001, 0.02)
     api.Controller(gains, u_min=-20, u_max=20, counts_per_rev=1572).save(folder / "c.json")
     return folder
@@ -71,7 +73,7 @@ COMMANDS = [
 
 
 def test_help_lists_every_command_and_exit_code(tmp_path: Path) -> None:
-    text = sewfast(tmp_path, "--help").out
+    text = started(tmp_path, "--help").out
     for word in (*COMMANDS, "exit codes", "130"):
         assert word in text
 
@@ -94,7 +96,7 @@ def test_each_command_teaches(tmp_path: Path, command: str) -> None:
 
 
 def test_version(tmp_path: Path) -> None:
-    assert sewfast(tmp_path, "--version").out == f"sewfast {api.__version__}\n"
+    assert started(tmp_path, "--version").out == f"sewfast {api.__version__}\n"
 
 
 # --- record, signals ----------------------------------------------------------------------------
@@ -124,7 +126,7 @@ def test_record_writes_every_format(tmp_path: Path, suffix: str) -> None:
 
 
 def test_record_without_file_prints_csv(tmp_path: Path) -> None:
-    found = sewfast(tmp_path, "record", "--on", "virtual", "--signal", "step")
+    found = started(tmp_path, "record", "--on", "virtual", "--signal", "step")
     lines = found.out.splitlines()
     assert lines[0] == "t [s],u [V],counts,y [RPM],speed_true [RPM]"
     assert len(lines) == 3001
@@ -348,7 +350,7 @@ def test_progress_is_drawn_on_a_terminal_only(tmp_path: Path, walk: Path) -> Non
 
     arguments = ["identify", str(walk / "one.csv"), "--input", "u", "--output", "speed"]
     arguments += ["--model", "neural-oe", "-o", "m.json", "--json"]
-    quiet = sewfast(tmp_path, *arguments)
+    quiet = started(tmp_path, *arguments)
     assert quiet.err == ""
     ours, theirs = pty.openpty()
     with subprocess.Popen(

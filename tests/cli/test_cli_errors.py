@@ -14,7 +14,10 @@ import numpy as np
 import pytest
 
 import sewfast as api
-from cli import PROGRAM, environment, refused, sewfast
+from cli import PROGRAM, environment
+from cli import call_refused as refused
+from cli import called as sewfast
+from cli import sewfast as started
 from sewfast import cli
 
 IDENTIFY = ("identify", "run.csv", "--input", "u", "--output", "y", "-o", "m.json")
@@ -356,6 +359,7 @@ needs_sigint = pytest.mark.skipif(sys.platform == "win32", reason="needs SIGINT"
 
 
 @needs_sigint
+@pytest.mark.alone
 def test_ctrl_c_keeps_the_best_model(folder: Path) -> None:
     api.write_table(folder / "run.csv", recording(4000))
     settings = ("--model", "neural-oe", "--hidden", "40", "--starts", "100000")
@@ -365,6 +369,7 @@ def test_ctrl_c_keeps_the_best_model(folder: Path) -> None:
 
 
 @needs_sigint
+@pytest.mark.alone
 def test_ctrl_c_keeps_the_best_controller(folder: Path) -> None:
     t = 0.001 * np.arange(400_000)
     api.write_table(folder / "long.npz", {"t": t, "r": 1000.0 + 500.0 * np.sin(t)})
@@ -420,7 +425,7 @@ def _start_up(folder: Path) -> float:
     """What a short command takes of the processor [s]."""
     resource = pytest.importorskip("resource")
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    sewfast(folder, "validate", "drive.json", "run.csv")
+    started(folder, "validate", "drive.json", "run.csv")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return float(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli import refused, sewfast
+from cli import call_refused as refused
+from cli import called as sewfast
 from sewfast import load_controller, margins, write_table
 from sewfast.control import Fopdt
 

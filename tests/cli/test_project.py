@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sewfast as api
-from cli import refused, sewfast
+from cli import call_refused as refused
+from cli import called as sewfast
 from sewfast.cli.project import NAME, find, load
 from sewfast.errors import SettingError
 from sewfast.readers import read_table, roles

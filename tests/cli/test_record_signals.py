@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli import refused, sewfast
+from cli import call_refused as refused
+from cli import called as sewfast
 from sewfast import signals
 from sewfast.link import VirtualDevice, connect
 from sewfast.readers import read_table

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import signal
 import threading
 from collections.abc import Iterator
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cli import sewfast
+from cli import called as sewfast
 from commissioned import SMALL, short
 from moments import once_on
 from sewfast import (
@@ -62,11 +63,24 @@ def whole(_short: None) -> Commissioning:
     return commission(VirtualMachine(), **SMALL)
 
 
+@pytest.fixture(scope="module")
+def saved(whole: Commissioning, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its folder, written once; a test that changes it takes a copy."""
+    folder = tmp_path_factory.mktemp("whole") / "out"
+    assert whole.save(folder) == folder / "report.html"
+    return folder
+
+
+@pytest.fixture
+def out(saved: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(saved, tmp_path / "out"))
+
+
 # --- whole --------------------------------------------------------------------------------------
 
 
 def test_the_page_has_margins_as_predicted_and_as_measured(
-    whole: Commissioning, tmp_path: Path
+    whole: Commissioning, saved: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("matplotlib", reason="needs the report extra")
     response = bode(VirtualMachine(), speed=1000.0, realisations=1, periods=2)
@@ -82,7 +96,7 @@ def test_the_page_has_margins_as_predicted_and_as_measured(
         assert shown in page
     again = load_response(tmp_path / "with" / "analysis" / "response.json")
     np.testing.assert_array_equal(again.value, response.value)
-    assert "Margins, predicted" not in whole.save(tmp_path / "without").read_text(encoding="utf-8")
+    assert "Margins, predicted" not in (saved / "report.html").read_text(encoding="utf-8")
 
 
 def test_it_is_drawn_and_shown(whole: Commissioning, tmp_path: Path) -> None:
@@ -132,7 +146,7 @@ def test_the_gains_bear_what_is_required_beside_the_cost(whole: Commissioning) -
     assert "recovery" in str(whole)
 
 
-def test_report_card_and_judgement_are_evidence(whole: Commissioning, tmp_path: Path) -> None:
+def test_report_card_and_judgement_are_evidence(whole: Commissioning, saved: Path) -> None:
     assert whole.card is not None
     assert whole.card.data.startswith("levels")
     assert whole.judgement is not None
@@ -141,7 +155,7 @@ def test_report_card_and_judgement_are_evidence(whole: Commissioning, tmp_path: 
     }
     told = whole.numbers()["evidence"]
     assert told["report card"]["verdict"] == whole.card.verdict
-    page = whole.save(tmp_path / "out").read_text()
+    page = (saved / "report.html").read_text()
     assert "training region" in page
     assert "Required besides the cost" in page
 
@@ -389,10 +403,9 @@ def test_an_interrupted_search_keeps_its_best_gains(
 
 
 def test_the_folder_holds_everything_and_its_page_is_written_anew(
-    whole: Commissioning, tmp_path: Path
+    whole: Commissioning, out: Path
 ) -> None:
-    page = whole.save(tmp_path / "out")
-    out = tmp_path / "out"
+    page = out / "report.html"
     told = json.loads((out / "commissioning.json").read_text())
     assert (told["format"], told["version"]) == ("sewfast.commissioning", 1)
     assert told["measured_cost"] == pytest.approx(whole.measured_cost)
@@ -411,26 +424,25 @@ def test_the_folder_holds_everything_and_its_page_is_written_anew(
     assert page.read_text() == text
 
 
-def test_a_linear_rival_is_asked_and_shown(whole: Commissioning, tmp_path: Path) -> None:
+def test_a_linear_rival_is_asked_and_shown(whole: Commissioning, out: Path) -> None:
     assert whole.rival is not None
     assert whole.rival.is_fit
     assert whole.tuning is not None
     assert whole.tuning.opinion is not None
     assert whole.notes == ()
-    text = whole.save(tmp_path / "out").read_text()
-    assert "A second opinion." in text
+    assert "A second opinion." in (out / "report.html").read_text()
     # a folder of before, without what is told of the rival
-    numbers = tmp_path / "out" / "commissioning.json"
+    numbers = out / "commissioning.json"
     told = json.loads(numbers.read_text())
     assert told["second_opinion"]["taken"] == 0
     for name in ("rival", "second_opinion", "notes", "simulated_at_s"):
         del told[name]
     del told["models"]["kind"]
     numbers.write_text(json.dumps(told))
-    assert "A second opinion." not in report(tmp_path / "out").read_text()
+    assert "A second opinion." not in report(out).read_text()
     told["notes"] = ["tuned on <the> linear model"]
     numbers.write_text(json.dumps(told))
-    assert "tuned on &lt;the&gt; linear model" in report(tmp_path / "out").read_text()
+    assert "tuned on &lt;the&gt; linear model" in report(out).read_text()
 
 
 def test_a_folder_of_somebody_else_is_left_alone(whole: Commissioning, tmp_path: Path) -> None:
@@ -441,11 +453,11 @@ def test_a_folder_of_somebody_else_is_left_alone(whole: Commissioning, tmp_path:
     assert (tmp_path / "models" / "mine.json").read_text() == "mine"
 
 
-def test_nothing_of_an_earlier_commissioning_stays(whole: Commissioning, tmp_path: Path) -> None:
-    whole.save(tmp_path)
-    replace(whole, comparisons=(), recordings={}).save(tmp_path)
-    assert not list((tmp_path / "runs").iterdir())
-    assert not list((tmp_path / "recordings").iterdir())
+def test_nothing_of_an_earlier_commissioning_stays(whole: Commissioning, out: Path) -> None:
+    assert list((out / "runs").iterdir())
+    replace(whole, comparisons=(), recordings={}).save(out)
+    assert not list((out / "runs").iterdir())
+    assert not list((out / "recordings").iterdir())
 
 
 def test_the_command_fills_a_folder(tmp_path: Path) -> None:

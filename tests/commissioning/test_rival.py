@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cli import refused, sewfast
+from cli import call_refused as refused
+from cli import called as sewfast
 from sewfast import _core, load_controller, signals
 from sewfast.commissioning.demands import demands
 from sewfast.commissioning.gains import SENSITIVE, sensible

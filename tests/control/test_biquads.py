@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from sewfast.cli import main
 from sewfast.control import forms
 from sewfast.control.margins import loop_response
 from sewfast.control.systems import LinearLoop, response, simulate
-from sewfast.frequency import FrequencyResponse, propose
+from sewfast.frequency import FrequencyResponse, ShaftFit, propose
 from sewfast.link import Plan, VirtualDevice, connect
 
 TS = 1e-3
@@ -213,6 +214,11 @@ def two_masses() -> tuple[LinearOE, FrequencyResponse]:
     )  # fmt: skip
 
 
+@cache
+def fitted_shaft() -> ShaftFit:
+    return fit_shaft(two_masses()[1])
+
+
 def test_notches_are_searched_with_the_gains_under_ms_on_the_response() -> None:
     model, measured = two_masses()
     gains = Gains.standard(0.002, 0.1, 0.0)
@@ -258,15 +264,15 @@ def test_a_response_alone_or_a_variable_of_no_notch_is_refused() -> None:
         )  # fmt: skip
 
 
-def test_a_notch_is_proposed_where_the_shaft_swings() -> None:
+def test_filters_are_proposed_where_the_shaft_swings() -> None:
     _, measured = two_masses()
-    fit = fit_shaft(measured)
+    fit = fitted_shaft()
     assert fit.has_resonance
     own = fit.notch()
     assert own.named()["frequency"] == pytest.approx(60.0, rel=0.02)
     found = propose(fit, Ms=1.7, u_max=20.0)
-    (notch,) = found.controller.biquads
-    assert 40.0 < notch.named()["frequency"] < 90.0
+    shaft = found.controller.biquads[0].named()
+    assert 40.0 < shaft.get("frequency", shaft.get("zero_frequency")) < 90.0
     assert found.margins.stable
     assert found.margins.Ms <= 1.7 * 1.01
     assert measured.margins(found.controller).Ms_band[1] <= 1.7 * 1.03
@@ -276,6 +282,10 @@ def test_a_notch_is_proposed_where_the_shaft_swings() -> None:
     plain = propose(fit, Ms=1.7, u_max=20.0, notch=False)
     assert plain.controller == found.without.controller
     assert plain.without is None
+    # above the lines that were measured the loop's gain is low, whatever the fit says there
+    above = np.geomspace(measured.hertz[measured.coherence > 0.5].max(), 0.49 / TS, 200)
+    L = loop_response(found.controller, fit.to_model(), 2.0 * np.pi * above)
+    assert np.abs(L).max() < 0.45
     # a larger Ms lets the loop answer faster
     assert propose(fit, Ms=2.2).bandwidth_hertz > found.bandwidth_hertz
     # what is stated is what the loop does
@@ -286,7 +296,7 @@ def test_a_notch_is_proposed_where_the_shaft_swings() -> None:
 
 def test_what_cannot_be_proposed_for_is_refused() -> None:
     _, measured = two_masses()
-    fit = fit_shaft(measured)
+    fit = fitted_shaft()
     for Ms in (1.0, 0.5, math.nan, math.inf):
         with pytest.raises(SettingError, match=r"Ms"):
             propose(fit, Ms=Ms)

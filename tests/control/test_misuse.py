@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cli import sewfast as command
+from cli import called as command
 from loops import QUIET, drive
 from refusals import refuses
 from sewfast import (

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import sewfast
-from cli import refused
-from cli import sewfast as program
+from cli import call_refused as refused
+from cli import called as program
 from sewfast import Constraints, StateFeedback, load_controller, signals
 from sewfast.analysis import analyse
 from sewfast.control.files import load_pid

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import sewfast as api
-from cli import refused, sewfast
+from cli import call_refused as refused
+from cli import called as sewfast
 from sewfast.dataset import Dataset, FloatArray
 from sewfast.dataset.rates import rate_unit
 from sewfast.errors import DataError, SettingError

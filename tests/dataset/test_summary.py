@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import sewfast as api
-from cli import refused, sewfast
+from cli import call_refused as refused
+from cli import called as sewfast
 from sewfast.dataset import Dataset
 from sewfast.dataset.outliers import band, power_spectrum, usual_threshold
 from sewfast.dataset.summary import nice

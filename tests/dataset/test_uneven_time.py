@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import sewfast
-from cli import sewfast as command
+from cli import called as command
 from refusals import refuses
 from sewfast import read, read_table
 from sewfast.dataset import Dataset, FloatArray

@@ -125,7 +125,7 @@ def test_identify_and_validate_use_the_same_words_for_noise_alone() -> None:
     rng = np.random.default_rng(2)
     u = np.repeat(rng.uniform(-1.0, 1.0, 80), 20)
     data = Dataset.from_arrays(u, rng.normal(size=1600), 0.01)
-    model = identify(data)
+    model = identify(data, nx=1, nk=1, hidden=4, starts=2, iterations=30)
     assert model.training["verdict"]["grade"] == "useless"
     assert validate(model, data).grade == "useless"
 

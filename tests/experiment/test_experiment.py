@@ -3,7 +3,6 @@
 Training and tuning are cut short: what is tested is how the pieces fit, not how well they do.
 """
 
-import functools
 import json
 import math
 import shutil
@@ -13,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sewfast import commission, identification, signals
-from sewfast.commissioning import training
+from commissioned import short_experiment
+from sewfast import Commissioning, signals
 from sewfast.control import Controller, Gains, load_controller
 from sewfast.errors import DataError, SettingError
 from sewfast.experiment import STAGES, loops, run_demo
@@ -31,13 +30,7 @@ SCORES = ("rmse_rpm", "fit_percent")
 
 @pytest.fixture(autouse=True, scope="module")
 def _short() -> Any:
-    with pytest.MonkeyPatch.context() as patch:
-        quick = functools.partial(identification.identify, iterations=3, starts=1)
-        patch.setattr(loops, "identify", quick)
-        able = functools.partial(identification.seeded, iterations=15)
-        patch.setattr(training, "seeded", able)
-        short = functools.partial(commission, members=2, evaluations=25)
-        patch.setattr(loops, "commission", short)
+    with short_experiment():
         yield
 
 
@@ -47,11 +40,28 @@ def stages() -> list[tuple[int, int, str]]:
 
 
 @pytest.fixture(scope="module")
+def commissioned() -> list[Commissioning]:
+    """What the experiment below has commissioned."""
+    return []
+
+
+@pytest.fixture(scope="module")
 def demo(
-    tmp_path_factory: pytest.TempPathFactory, _short: None, stages: list[tuple[int, int, str]]
+    tmp_path_factory: pytest.TempPathFactory,
+    _short: None,
+    stages: list[tuple[int, int, str]],
+    commissioned: list[Commissioning],
 ) -> Path:
     out = tmp_path_factory.mktemp("demo") / "results"
-    run_demo(out, seed=3, progress=lambda *told: stages.append(told))
+    commission = loops.commissioned
+
+    def kept(*given: Any) -> Commissioning:
+        commissioned.append(commission(*given))
+        return commissioned[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loops, "commissioned", kept)
+        run_demo(out, seed=3, progress=lambda *told: stages.append(told))
     return out
 
 
@@ -143,7 +153,11 @@ def _timeless(text: str) -> list[str]:
     return [line for line in text.splitlines() if "seconds" not in line]
 
 
-def test_an_interruption_leaves_an_earlier_experiment_as_it_was(demo: Path) -> None:
+def test_an_interruption_leaves_an_earlier_experiment_as_it_was(
+    demo: Path, commissioned: list[Commissioning], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # what comes before the writing has been tested above
+    monkeypatch.setattr(loops, "commissioned", lambda *_: commissioned[0])
     before = {p: p.read_bytes() for p in demo.rglob("*") if p.is_file()}
 
     def interrupt(done: int, total: int, name: str) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import sewfast as api
-from cli import refused, sewfast
+from cli import call_refused as refused
+from cli import called as sewfast
 from sewfast import DataError, Dataset, SettingError, _core
 from sewfast.identification.delays import LaggedRegression
 from sewfast.identification.order_table import Structure, lipschitz_index

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sewfast
-from cli import sewfast as command
+from cli import called as command
 from sewfast import Dataset, _core
 from sewfast.errors import Interrupted, ModelFileError, SettingError
 from sewfast.identification import structured

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import sewfast
-from cli import sewfast as command
+from cli import called as command
 from sewfast import Dataset, Model, _core, identify
 from sewfast.errors import DataError, Interrupted, SewfastError
 from sewfast.identification import choice, entry

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import sewfast as api
-from cli import refused, sewfast
+from cli import call_refused as refused
+from cli import called as sewfast
 from recordings_made import header
 from refusals import refuses
 from sewfast.cli import main

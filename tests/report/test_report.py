@@ -127,6 +127,11 @@ def test_every_figure_says_in_words_what_it_shows(structure: Structure) -> None:
     assert all({"role", "aria-label"} <= set(names) for names in structure.figures)
 
 
+def test_a_page_has_no_section_for_what_is_not_in_its_folder(page: str) -> None:
+    for title in ("Can the default network be trusted?", "Physical parameters"):
+        assert title not in page
+
+
 def test_the_assumptions_about_the_paper_are_stated(page: str) -> None:
     for word in ("floor", "per sample", "±20 V", "too coarsely", "L/T", "free run", "rest"):
         assert word in page

@@ -1,4 +1,8 @@
-"""A terminal in which a page's reader types: `sewfast ...`, `export NAME=VALUE`, a trailing `&`."""
+"""A terminal in which a page's reader types: `sewfast ...`, `export NAME=VALUE`, a trailing `&`.
+
+What ends by itself is called in the test's own process: to start an interpreter for each of some
+hundred commands takes longer than most of them.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,10 @@ import os
 import shlex
 import subprocess
 from collections.abc import Callable
+from pathlib import Path
 from types import TracebackType
 
-from cli import PROGRAM, environment
+from cli import PROGRAM, call, environment
 from documents import Command
 
 
@@ -37,13 +42,11 @@ class Terminal:
         assert program == "sewfast", f"{self._page}: only sewfast is run here: {command.text!r}"
         if arguments[-1] == "&":
             return self._begin(arguments[:-1])
-        done = subprocess.run(
-            [*PROGRAM, *arguments], env=environment(), capture_output=True, text=True
-        )
-        said = f"{self._page}: {command.text}\n{done.stdout}{done.stderr}"
-        assert done.returncode == (2 if command.refusal_is_shown else 0), said
+        done = call(Path.cwd(), *arguments)
+        said = f"{self._page}: {command.text}\n{done.out}{done.err}"
+        assert done.code == (2 if command.refusal_is_shown else 0), said
         if command.shown:
-            printed = done.stderr if command.refusal_is_shown else done.stdout
+            printed = done.err if command.refusal_is_shown else done.out
             assert command.shows(printed), f"{said}\nshown:\n{command.shown}"
         return None
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli import refused
-from cli import sewfast as command
+from cli import call_refused as refused
+from cli import called as command
 from refusals import refuses
 from sewfast import _core
 from sewfast.errors import DataError

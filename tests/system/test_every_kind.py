@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import sewfast
-from cli import sewfast as command
+from cli import called as command
 from kinds import CASES, TS, levels, model_of, recording
 from sewfast import Controller, Dataset, Ensemble, Gains, Model
 from sewfast.errors import DataError, ModelFileError, SettingError, SewfastError

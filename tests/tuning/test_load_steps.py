@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cli import sewfast
+from cli import called as sewfast
 from loops import QUIET, drive
 from sewfast import (
     Constraints,

@@ -177,7 +177,10 @@ def _scale(means: list[FloatArray], past: int, record: float, seconds: float) ->
     if not moving[-1] or not moving[:-1].any():
         return None
     inputs = np.flatnonzero(moving[:-1])
-    scaled = [(m - middle)[:, moving] / size[moving] for m in means]
+    with np.errstate(over="ignore"):
+        scaled = [(m - middle)[:, moving] / size[moving] for m in means]
+    # an input where the output is missing had no part in the scale: its square could overflow
+    scaled = [np.where(np.abs(m) < LARGEST, m, np.nan) for m in scaled]
     changes = np.concatenate([np.diff(m[:, -1]) for m in scaled])
     spread = _deviation(changes)
     rows = np.concatenate([_rows(m, past, record, spread) for m in scaled])
