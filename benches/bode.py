@@ -151,7 +151,7 @@ def main() -> None:
         cases = [drawn(s, shaft=True) for s in range(args.count)]
         cases += [drawn(s, shaft=False) for s in range(args.count // 2)]
     errors: dict[str, list[float]] = {}
-    shafts = found = false = inside = lines = 0
+    shafts = found = false = second = inside = lines = 0
     took = []
     for machine, truth in cases:
         began = time.perf_counter()
@@ -162,6 +162,7 @@ def main() -> None:
             print(f"refused: {refused}", flush=True)
             continue
         took.append(time.perf_counter() - began)
+        second += fit.resonances > 1
         row = [f"{k} {v:.4g}" for k, v in truth.items()]
         if isinstance(machine, VirtualMachine):
             exact = small_signals(machine, response.hertz, SPEED)
@@ -183,6 +184,7 @@ def main() -> None:
         print("; ".join([*row, "found" if fit.has_resonance else "rigid"]), flush=True)
     rigid = len(took) - shafts
     print(f"shafts found {found} of {shafts}; rigid machines with a shaft {false} of {rigid}")
+    print(f"machines with a second shaft, which none has, {second} of {len(took)}")
     for name, values in errors.items():
         a, b, c = np.percentile(values, [50, 90, 100])
         print(f"{name:<22} median {a:.3g}, 90 % {b:.3g}, worst {c:.3g}")

@@ -6,6 +6,7 @@
     python benches/physics.py --coverage 200         how often intervals hold the truth
     python benches/physics.py --race 3               one joint against mujoco.sysid, same optimum
     python benches/physics.py --friction 20          Stribeck's and LuGre's friction
+    python benches/physics.py --turning 20           cogging, ripple, sag, an encoder out of true
     python benches/physics.py --tracked 24           followed online: false alarms, J +10 % seen
 
 Errors are in percent of the truth (delay in samples); `inside` counts 95 % intervals that hold it.
@@ -25,6 +26,7 @@ import sewfast
 from sewfast import _core
 from sewfast.errors import DataError, FitError
 from sewfast.greybox import Tracker
+from sewfast.motorfit import WAVES
 from sewfast.speed import speed_from_counts
 
 SI = ("resistance_ohm", "motor_constant", "inertia", "coulomb_torque", "viscous_friction")
@@ -388,6 +390,103 @@ def friction(count: int, first: int, seconds: float) -> None:
               f"{np.median(ratios):.2f} median, {max(ratios):.2f} worst")  # fmt: skip
 
 
+OPTIONAL = ("stribeck_difference", "sag", "eccentricity")
+
+
+def turning(
+    seeds: Sequence[int], run: int, seconds: float
+) -> list[tuple[sewfast.Recording, dict[str, float], np.ndarray]]:
+    """Motors that vary over the turn, their truths and true speeds [rpm]; 1 kHz, 4,000 counts.
+
+    Every third is even: no cogging, no ripple, a rigid supply, an encoder that runs true and
+    friction that is the same in both directions. The others have one to three orders of cogging.
+    """
+    Ts, per, found = 0.001, 20, []
+    h = Ts / per
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        k_v = 10 ** rng.uniform(-2, -1.3)
+        k_a, tau = 10 ** rng.uniform(-1.8, -0.7) * k_v, rng.uniform(0.5e-3, 3e-3)
+        k_s, w_s = rng.uniform(0.2, 0.8), rng.uniform(0.02, 0.08) * 8.0 / k_v
+        k_t, varies = k_s * rng.uniform(0.4, 1.0), float(seed % 3 > 0)
+        k_d = varies * k_t * rng.uniform(0.2, 0.6)
+        sag = varies * rng.uniform(0.05, 0.2) / 8.0**2
+        eccentric = varies * rng.uniform(0.005, 0.02)
+        orders = rng.choice(np.arange(5, 40), 1 + seed % 3, replace=False)
+        cogging = varies * k_s * rng.uniform(0.1, 0.4, len(orders))
+        ripple_order = int(rng.choice([4, 6, 12]))
+        ripple = varies * rng.uniform(0.02, 0.06)
+        phases = rng.uniform(0.0, math.tau, 6)
+        sizes = np.random.default_rng([seed, run]).choice([2.0, 4.0, 8.0], math.ceil(seconds / 2))
+        u = steps(seconds, Ts, 1000 * run + seed, 1.0)
+        u = u * np.repeat(sizes, 2000)[: len(u)]
+        w = angle = x = 0.0
+        share = 1.0 - math.exp(-h / tau)
+        angles = np.empty(len(u))
+        cogs = [
+            (float(a), int(n), float(f)) for a, n, f in zip(cogging, orders, phases, strict=False)
+        ]
+        for k, command in enumerate(u.tolist()):
+            angles[k] = angle
+            for _ in range(per):
+                gain = 1.0 + ripple * math.cos(ripple_order * angle + phases[5])
+                load = sum(a * math.cos(n * angle + f) for a, n, f in cogs)
+                x += share * (command * (1.0 - sag * command * x) - x - k_v * gain * w)
+                free = w + h / k_a * (gain * x - load)
+                bump = (k_t + math.copysign(k_d, free)) / (1.0 + (w / w_s) ** 2)
+                w = math.copysign(max(abs(free) - h / k_a * (k_s + bump), 0.0), free)
+                angle += h * w
+        shown = angles + eccentric * np.sin(angles + phases[4])
+        counts = np.floor(shown / math.tau * 4000)
+        recording = sewfast.Recording(
+            u, counts, speed_from_counts(counts, Ts, 4000.0), None, Ts, 4000.0, "steps"
+        )
+        truth = {"k_v": k_v, "k_a": k_a, "k_s": k_s, "electrical_lag": tau, "stribeck": k_t}
+        if varies:
+            truth |= {f"load_{n}": a for a, n, _ in cogs}
+            truth |= {"stribeck_difference": k_d, "sag": sag, "eccentricity": eccentric}
+            truth["torque_ripple"] = ripple
+        found.append((recording, truth, np.diff(angles, prepend=0.0) / math.tau * 60 / Ts))
+    return found
+
+
+def varying(count: int, first: int, seconds: float) -> None:
+    """Terms of the turn and of the supply: found, missed, wrong; free run on another record."""
+    usual, all_of, missed, wrong, ratios = Tally(), Tally(), 0, 0, []
+    plain = [t for t in sewfast.greybox.fit.STRUCTURES["dcmotor"] if t not in WAVES]
+    seeds = range(first, first + count)
+    pairs = [turning(seeds, run, seconds) for run in (0, 1)]
+    for seed, (record, truth, _), (other, _, speed) in zip(seeds, *pairs, strict=True):
+        errors = []
+        for structure in (plain, "dcmotor", ["dcmotor", *OPTIONAL]):
+            start = time.process_time()
+            motor = sewfast.physics(record, structure=structure)
+            took = time.process_time() - start
+            model = motor.simulate(other.u)
+            mean = np.concatenate([[0.0], 0.5 * (model[1:] + model[:-1])])
+            errors.append(float(np.sqrt(np.mean((mean - speed) ** 2))))
+            if structure == "dcmotor":
+                usually = motor
+            if structure is not plain:
+                tally = usual if structure == "dcmotor" else all_of
+                tally.add(motor, truth, record.Ts)
+                tally.seconds.append(took)
+        waves = {n for n in usually.parameters if n.startswith("load_")} - {"load_1", "load_2"}
+        extra = {n for n in (*OPTIONAL, "torque_ripple") if n in usually.parameters}
+        true = {n for n in truth if n.startswith("load_")}
+        missed += len(true - waves)
+        wrong += len(waves - true) + len(extra - set(truth))
+        ratios.append([errors[1] / errors[0], errors[2] / errors[0]])
+        print(f"  seed {seed}: {errors[0]:.2f}, {errors[1]:.2f}, {errors[2]:.2f} RPM; "
+              f"true {sorted(true)}, found {sorted(waves)} {sorted(extra)}")  # fmt: skip
+    usual.show("dcmotor", count)
+    all_of.show(f"with {', '.join(OPTIONAL)}", count)
+    middle, worst = np.median(ratios, axis=0), np.max(ratios, axis=0)
+    print(f"waves missed {missed}, terms that are not there {wrong}; error over that without "
+          f"{middle[0]:.2f} median {worst[0]:.2f} worst, "
+          f"with all {middle[1]:.2f}, {worst[1]:.2f}")  # fmt: skip
+
+
 def tracked(count: int, seconds: float) -> None:
     """Machines followed once their estimate is sure, then also with a tenth more inertia."""
     false, seen, share, waited = dict.fromkeys(("k_v", "k_a", "k_s"), 0), [], [], []
@@ -438,6 +537,7 @@ def main() -> None:
     parser.add_argument("--coverage", type=int, default=0)
     parser.add_argument("--race", type=int, default=0)
     parser.add_argument("--friction", type=int, default=0)
+    parser.add_argument("--turning", type=int, default=0)
     args = parser.parse_args()
     if args.count:
         virtual(args.count, args.first, args.seconds)
@@ -445,6 +545,8 @@ def main() -> None:
         simulated(args.mujoco, args.seconds)
     if args.friction:
         friction(args.friction, args.first, args.seconds)
+    if args.turning:
+        varying(args.turning, args.first, args.seconds)
     if args.tracked:
         tracked(args.tracked, 120.0)
     if args.coverage:

@@ -109,13 +109,13 @@ GREYBOX_PARAMETERS: list[str]
 
 def greybox_run(
     theta: _F, free: Sequence[int], u: _F, *, Ts: float, steps: int, speed: float = 0.0,
-    mean: bool = False, angle: _F | None = None,
+    mean: bool = False, angle: _F | None = None, orders: Sequence[int] = ...,
 ) -> tuple[_F, _F, _F, _F]:
     """Speed [rad/s] and drive [command] (N,), and their derivatives by the free parameters (N, n_free)."""
 def greybox_normal(
     theta: _F, free: Sequence[int], u: _F, y: _F, used: NDArray[np.bool_], *, Ts: float, steps: int,
     filter: _F, speed: float = 0.0, mean: bool = False, angle: _F | None = None,
-    current: tuple[_F, _F, float] | None = None,
+    orders: Sequence[int] = ..., current: tuple[_F, _F, float] | None = None,
 ) -> tuple[float, _F, _F]:
     """Cost, gradient (n,) and Gram matrix (n, n) of filtered errors, by the free and last the resistance.
 

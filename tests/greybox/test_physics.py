@@ -392,7 +392,7 @@ def test_a_file_holds_all_and_reads_strictly(alone: Motor, tmp_path: Path) -> No
     assert np.array_equal(again.simulate(np.ones(500)), alone.simulate(np.ones(500)))
     whole = json.loads(path.read_text())
     for change in (
-        {"version": 3},
+        {"version": 4},
         {"theta": {}},
         {"theta": {**whole["theta"], "k_a": -1.0}},
         {"parameters": []},

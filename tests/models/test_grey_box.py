@@ -154,7 +154,7 @@ def test_the_core_refuses_what_is_no_motor() -> None:
     for change, words in (
         ({"theta": whole["theta"][1:]}, "parameters of the motor"), ({"unit": 0.0}, "unit"),
         ({"values": load}, "load_1"), ({"speed_scale": np.nan}, "speed_scale"),
-        ({"values": load[:3]}, "18 values"), ({"free": [99, *whole["free"][1:]]}, "places"),
+        ({"values": load[:3]}, "30 values"), ({"free": [99, *whole["free"][1:]]}, "places"),
     ):  # fmt: skip
         with pytest.raises(SettingError, match=words):
             _core.GreyBox(**{**whole, **change})

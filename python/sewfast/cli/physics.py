@@ -51,8 +51,13 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--structure", default="dcmotor", metavar="LIST",
-        help="dcmotor (all terms, those that are not shown go), or terms: lag,delay,coulomb,offset,"
-        "drop,stribeck,load_1,load_2,inertia_2,limit",
+        help="dcmotor (the usual terms, those that are not shown go), or terms: lag,delay,coulomb,"
+        "offset,drop,stribeck,load_1,load_2,inertia_2,cogging,torque_ripple,limit; dcmotor,sag "
+        "adds one of stribeck_difference,sag,eccentricity",
+    )  # fmt: skip
+    parser.add_argument(
+        "--intervals", choices=("curvature", "profile"), default="curvature",
+        help="95 %% intervals by the curvature of the cost, or as profile likelihood (seconds)",
     )  # fmt: skip
     parser.add_argument(
         "--speed-unit", metavar="UNIT", help="of the output: rpm, rad/s, rev/s, deg/s"
@@ -98,10 +103,11 @@ def command(args: argparse.Namespace) -> None:
     structure = args.structure
     motor = physics(
         _data(args),
-        structure=structure if structure == "dcmotor" else structure.split(","),
+        structure=structure.split(","),
         current=args.current,
         volts=args.volts,
         speed_unit=args.speed_unit,
+        intervals=args.intervals,
     )
     text = "" if target is None else motor.export(target, winding=args.winding, gear=args.gear)
     if args.out is not None:

@@ -1,11 +1,12 @@
-"""`propose`: gains, and notches where a shaft swings, for a machine that was shaken.
+"""`propose`: gains, and filters where a shaft swings, for a machine that was shaken.
 
 The loop is to fight disturbances down to as high a frequency as a largest sensitivity allows:
 maximised is the bandwidth of the sensitivity, the frequency at which |S| comes to 1/sqrt(2), over
-gain, integral and derivative time, lag of the feedback and, with a notch, its frequency, depth and
-width. Ms is held to on the fitted machine, which says whether the loop is stable, and on the
-measured lines with their 95 % circles, which know what the fit does not. The same without a notch
-is always tried: one that is not worth it is left out.
+gain, integral and derivative time, lag of the feedback and the filters' frequencies and dampings.
+Ms is held to on the fitted machine, which says whether the loop is stable, and on the measured
+lines with their 95 % circles, which know what the fit does not. Above the measured lines nobody
+knows the machine, and the loop's gain is kept low there. No filter, a notch, a biquad whose zeros
+and poles are free, and two of them are tried in turn: what is not worth it is left out.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -30,13 +32,17 @@ from .shaft import ShaftFit
 MS = 1.7
 """Largest sensitivity unless another is asked for."""
 WORTH = 1.05
-"""Times the bandwidth without it, that a notch has to bring."""
+"""Times the bandwidth without it, that a filter has to bring."""
+BLIND = 1.25
+"""Times its gain on the fit, that a loop may have above the lines that were measured."""
+BESIDE = (0.6, 1.5)
+"""Of the first filter's frequency: where a second one begins, which does nothing yet."""
 GRID = 400
 """Frequencies at which the bandwidth is looked for."""
 ROUNDS = 3
 """Of the search, each from the best of the one before."""
-STEPS = 220
-"""Of one round."""
+STEPS = 50
+"""Of one round, for each number that is searched."""
 OUTSIDE = 30.0
 """Weight of an Ms above the limit, relative to it, against the logarithm of the bandwidth."""
 SLOWEST = 8.0
@@ -45,6 +51,10 @@ that stays is not fought down, whatever the bandwidth."""
 QUIET = 0.05
 """Of the command's limit, that the encoder's rounding may move it by (rms)."""
 DERIVATIVE_FILTER = 10.0
+DEPTH, WIDTH, DAMPING = (0.005, 1.0), (0.02, 5.0), (1e-3, 3.0)
+"""Least and largest numbers of filters."""
+INVERSE = 0.3
+"""Damping that the inverse of a shaft gives to the poles on its antiresonance, at the start."""
 HALF = 1.0 / math.sqrt(2.0)
 
 
@@ -60,7 +70,7 @@ class Proposal:
     margins : Margins
         On the fitted machine.
     without : Proposal or None
-        The best without a notch, where there is one.
+        The best without filters, where there are some.
     """
 
     controller: Controller
@@ -77,7 +87,8 @@ class Proposal:
     def __str__(self) -> str:
         first = f"disturbances weakened up to {self.bandwidth_hertz:.3g} Hz"
         if self.without is not None:
-            first += f", without the notch up to {self.without.bandwidth_hertz:.3g} Hz"
+            what = "filter" if len(self.controller.biquads) == 1 else "filters"
+            first += f", without the {what} up to {self.without.bandwidth_hertz:.3g} Hz"
         return "\n".join([first, str(self.margins), str(self.controller)])
 
 
@@ -90,7 +101,7 @@ def propose(
     counts_per_rev: float | None = None,
     u_max: float = math.inf,
 ) -> Proposal:
-    """PID gains of the largest bandwidth under a largest sensitivity, with a notch if that pays.
+    """PID gains of the largest bandwidth under a largest sensitivity, with filters if they pay.
 
     Parameters
     ----------
@@ -99,7 +110,7 @@ def propose(
     Ms : float
         Largest sensitivity, on the fit and on the measured lines with their bands.
     notch : bool
-        Whether a notch may be used.
+        Whether filters may be used: a notch, or one or two biquads of free zeros and poles.
     like : Controller, optional
         Limits, moving average, encoder and units of this one; by default a mean of 4 samples.
     counts_per_rev, u_max : float, optional
@@ -134,10 +145,7 @@ def propose(
     plain = _best(task, task.starts(2))
     best = plain
     if notch and fit.has_resonance:
-        levelled = np.log(fit.notch().numbers)
-        starts = [plain[1], *task.starts(1)]
-        found = _best(task, [np.concatenate([x, levelled]) for x in starts])
-        best = found if found[0] - plain[0] > math.log(WORTH) else plain
+        best = _filtered(task, plain)
     if not math.isfinite(best[0]):
         raise FitError(
             name="Ms", expected=f"gains under which the loop is stable with at most {Ms:g}",
@@ -145,6 +153,31 @@ def propose(
         )  # fmt: skip
     without = None if best is plain else _proposal(task, plain[1])
     return replace(_proposal(task, best[1]), without=without)
+
+
+def _filtered(task: _Task, plain: Point) -> Point:
+    """The best with as few filters as pay."""
+    p = {name: found.value for name, found in task.fit.parameters.items()}
+    levelled = np.log(task.fit.notch().numbers)
+    starts = [plain[1], *task.starts(1)]
+    notch = _best(task, [np.concatenate([x, levelled]) for x in starts])
+    gains, (f, depth, width) = notch[1][:4], np.exp(notch[1][4:])
+    # the same notch, and the inverse of the shaft
+    same = np.log([f, 0.5 * depth * width, f, 0.5 * width])
+    inverse = np.log([
+        p["resonance_hertz"], 2.0 * p["resonance_damping"], p["antiresonance_hertz"], INVERSE,
+    ])  # fmt: skip
+    one = _best(task, [np.concatenate([gains, x]) for x in (same, inverse)])
+    idle = [np.log([f * beside, 0.7, f * beside, 0.7]) for beside in BESIDE]
+    if task.fit.resonances > 1:
+        f, depth, width = task.fit.notch(2).numbers
+        idle.append(np.log([f, 0.5 * depth * width, f, 0.5 * width]))
+    two = _best(task, [np.concatenate([one[1], x]) for x in idle])
+    best = plain
+    for found in (notch, one, two):
+        if found[0] - best[0] > math.log(WORTH):
+            best = found
+    return best
 
 
 def _proposal(task: _Task, x: FloatArray) -> Proposal:
@@ -179,8 +212,12 @@ class _Task:
         return cls(fit, like, Ms, hertz, fit.at(hertz), model, quiet)
 
     def controller(self, x: FloatArray) -> Controller:
-        """From logarithms of Kp, Ti, Td, the lag, and frequency, depth, width of a notch."""
-        Kp, Ti, Td, lag, *notch = np.exp(np.clip(x, -40.0, 40.0))
+        """From logarithms of Kp, Ti, Td, the lag, and of filters.
+
+        Of a notch frequency, depth, width; of one or two biquads frequency and damping of the
+        zeros, frequency and damping of the poles.
+        """
+        Kp, Ti, Td, lag, *filters = np.exp(np.clip(x, -40.0, 40.0))
         g = self.like.gains
         Ts = self.like.Ts
         gains = Gains.standard(
@@ -190,18 +227,24 @@ class _Task:
             u_unit=g.u_unit,
             y_unit=g.y_unit,
         )
-        biquads: tuple[Biquad, ...] = ()
-        if notch:
-            f, depth, width = notch
-            biquads = (
-                Biquad.notch(
-                    float(min(max(f, 0.01 / Ts / 100), 0.49 / Ts)),
-                    float(min(max(depth, 0.005), 1.0)), float(min(max(width, 0.02), 5.0)),
-                ),
-            )  # fmt: skip
+        biquads: list[Biquad] = []
+        low, high = 1e-4 / Ts, 0.49 / Ts
+        if len(filters) == 3:
+            f, depth, width = filters
+            biquads.append(
+                Biquad.notch(_within(f, low, high), _within(depth, *DEPTH), _within(width, *WIDTH))
+            )
+        else:
+            for zero, damped, pole, pole_damped in np.reshape(filters, (-1, 4)):
+                biquads.append(
+                    Biquad.resonance(
+                        _within(zero, low, high), _within(damped, *DAMPING),
+                        _within(pole, low, high), _within(pole_damped, *DAMPING),
+                    )
+                )  # fmt: skip
         return replace(
             self.like, gains=gains, alpha=0.0, beta=0.0, N=DERIVATIVE_FILTER,
-            filter_time=_or_none(lag, Ts), biquads=biquads,
+            filter_time=_or_none(lag, Ts), biquads=tuple(biquads),
             notes="proposed from a frequency response",
         )  # fmt: skip
 
@@ -250,7 +293,7 @@ class _Task:
         found = _core.margins(loop_path(controller), *self.model)
         if not found["stable"]:
             return -math.inf
-        worst = max(float(found["Ms"]), self._measured(controller))
+        worst = max(float(found["Ms"]), self._measured(controller), self._unmeasured(controller))
         excess = max(0.0, worst / self.Ms - 1.0)
         bandwidth = self.bandwidth(controller)
         slow = controller.gains.Ti * 2.0 * math.pi * bandwidth / SLOWEST
@@ -267,19 +310,41 @@ class _Task:
         distance = np.abs(1.0 + of.value * feedback) - of.radius() * np.abs(feedback)
         return float(1.0 / np.maximum(distance[seen], 1e-6).min())
 
+    def _unmeasured(self, controller: Controller) -> float:
+        """The largest sensitivity above the measured lines, by the loop's gain alone."""
+        above = self.hertz > self.response_ends
+        if not above.any():
+            return 1.0
+        gain = np.abs(self.plant[above] * self._feedback(controller, self.hertz[above]))
+        return float(1.0 / (1.0 - min(BLIND * float(gain.max()), 0.999)))
+
+    @property
+    def response_ends(self) -> float:
+        """The highest frequency of which the output shows the command [Hz]."""
+        of = self.fit.response
+        return float(of.hertz[of.coherence > 0.5].max())
+
+
+def _within(value: float, low: float, high: float) -> float:
+    return float(min(max(value, low), high))
+
 
 def _or_none(time: float, Ts: float) -> float:
     """A time of less than a tenth of a sample is none."""
     return 0.0 if time < 0.1 * Ts else float(min(time, 100.0 * Ts))
 
 
-def _best(task: _Task, starts: list[FloatArray]) -> tuple[float, FloatArray]:
+Point: TypeAlias = tuple[float, FloatArray]
+"""Of the search: merit and logarithms of the numbers."""
+
+
+def _best(task: _Task, starts: list[FloatArray]) -> Point:
     """The best of a simplex search from each start, begun again at its end."""
     found = (-math.inf, starts[0])
     for start in starts:
         x, spread = start, 0.4
         for _ in range(ROUNDS):
-            merit, x = simplex(task.merit, x, spread, STEPS)
+            merit, x = simplex(task.merit, x, spread, STEPS * len(x))
             spread *= 0.5
             if merit > found[0]:
                 found = (merit, x)

@@ -29,6 +29,8 @@ from ..models import LinearOE
 from ..tables import html_of
 from .response import Complex, FrequencyResponse
 
+RIGID, SHAFT = 4, 4
+"""Parameters of a rigid machine, and of each shaft."""
 LEAST = 20
 """Frequencies for a fit."""
 CLEAR = 100.0
@@ -71,7 +73,7 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ShaftFit:
-    """A rigid machine or two masses, with intervals.
+    """A rigid machine, two masses or three, with intervals.
 
     Attributes
     ----------
@@ -79,7 +81,8 @@ class ShaftFit:
         `gain` [y/u], `delay` [s] beyond the hold, `lag_1`, `lag_2` [s] if the lags are real,
         otherwise `swing_hertz`, `swing_damping`; with a shaft also `resonance_hertz` and
         `resonance_damping`, to which the motor's back-EMF adds, `antiresonance_hertz`,
-        `antiresonance_damping`, `inertia_ratio` (load over motor).
+        `antiresonance_damping`, `inertia_ratio` (all loads over the motor), with a second shaft
+        `resonance_2_hertz` and so on.
     misfit : float
         Root of the mean squared error over its standard deviation: 1 if noise explains everything.
     response : FrequencyResponse
@@ -97,7 +100,12 @@ class ShaftFit:
     @property
     def has_resonance(self) -> bool:
         """Whether a shaft between two masses was found."""
-        return len(self._theta) == 8
+        return self.resonances > 0
+
+    @property
+    def resonances(self) -> int:
+        """Shafts that were found: 0 of a rigid machine, 1 of two masses, 2 of three."""
+        return (len(self._theta) - RIGID) // SHAFT
 
     def at(self, hertz: Any) -> Complex:
         """The fitted response of the measured quantity, at `hertz`."""
@@ -109,33 +117,35 @@ class ShaftFit:
         of = self.response
         return sampled_model(self._theta, of.Ts, of.u_unit, of.y_unit)
 
-    def notch(self) -> Biquad:
-        """The notch that cancels the resonance: its zeros are the poles of the oscillation.
+    def notch(self, number: int = 1) -> Biquad:
+        """The notch that cancels a resonance, by default the lowest.
 
+        Its zeros are the poles of the oscillation.
         At w_r the shaft lifts the gain by g = (w_r/w_a)^2 |A/R|; a depth of 1/g takes that back,
         and with a width of 2 z_r g the notch's zeros are damped as the resonance is.
 
         Raises
         ------
         FitError
-            For a rigid machine, or a resonance beyond half the sample rate.
+            For a resonance that the machine does not have, as a rigid one has none, or one beyond
+            half the sample rate.
         """
-        if not self.has_resonance:
+        if not 1 <= number <= self.resonances:
+            kind = f"one of {self.resonances}" if self.resonances else "a rigid one"
             raise FitError(
-                name="notch", expected="a machine with a resonance", received="a rigid one",
-                remedy="leave the notch out, or give Biquad.notch(frequency)",
+                name="notch", expected=f"a machine with {number} or more resonances",
+                received=kind, remedy="leave the notch out, or give Biquad.notch(frequency)",
             )  # fmt: skip
-        p = {name: found.value for name, found in self.parameters.items()}
-        fr, fa, zr = p["resonance_hertz"], p["antiresonance_hertz"], p["resonance_damping"]
+        p, mark = self.parameters, _mark(number)
+        fr, fa = p[f"resonance{mark}_hertz"].value, p[f"antiresonance{mark}_hertz"].value
+        zr, za = p[f"resonance{mark}_damping"].value, p[f"antiresonance{mark}_damping"].value
         if fr * self.response.Ts >= 0.5:
             raise FitError(
                 name="notch", expected="a resonance below half the sample rate",
                 received=f"one at {fr:.4g} Hz", remedy="sample faster",
             )  # fmt: skip
         ratio = fa / fr
-        rises = abs(ratio**2 - 1.0 + 2j * p["antiresonance_damping"] * ratio) / (
-            2.0 * zr * ratio**2
-        )
+        rises = abs(ratio**2 - 1.0 + 2j * za * ratio) / (2.0 * zr * ratio**2)
         depth, width = 1.0 / max(rises, 1.0), 2.0 * zr * max(rises, 1.0)
         low, high = DEPTHS
         return Biquad.notch(fr, min(max(depth, low), high), min(max(width, WIDTHS[0]), WIDTHS[1]))
@@ -155,7 +165,7 @@ class ShaftFit:
         return f"<{str(self).splitlines()[0]}>"
 
     def __str__(self) -> str:
-        kind = "two masses and a shaft" if self.has_resonance else "rigid"
+        kind = ("rigid", "two masses and a shaft", "three masses and two shafts")[self.resonances]
         width = max(map(len, self.parameters))
         rows = [f"  {name:<{width}}  {p}" for name, p in self.parameters.items()]
         found = [f"{kind}, misfit {self.misfit:.3g} (95 % intervals)", *rows]
@@ -164,11 +174,11 @@ class ShaftFit:
                 f"  a resonance beyond {self.response.hertz[-1]:.4g} Hz, near "
                 f"{self.beyond_hertz:.3g} Hz by its flank: sample faster, or raise f_max"
             )
-        return "\n".join([*found, f"  {self.notch()}"] if self.has_resonance else found)
+        return "\n".join([*found, *(f"  {self.notch(k + 1)}" for k in range(self.resonances))])
 
 
 def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> ShaftFit:
-    """Fit a rigid machine, or two masses and a shaft, to the frequency response of its speed.
+    """Fit a rigid machine, or two or three masses on shafts, to the response of its speed.
 
     Parameters
     ----------
@@ -177,7 +187,8 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
         are omitted.
     resonance : bool, optional
         Whether there is a shaft. None finds out: a shaft is accepted if it explains 100 times the
-        mean squared error of a frequency, is damped below .5 and lies within what was measured.
+        mean squared error of a frequency, is damped below .5 and lies within what was measured. A
+        second shaft is looked for where there is one, and has to do the same.
 
     Raises
     ------
@@ -207,9 +218,14 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
             )  # fmt: skip
         if shaft is not None and (resonance or _is_better(task, shaft[0], rigid[0])):
             best = shaft
+            found = [_solved(task, x) for x in _shaft_starts(task, shaft[1], few=True)]
+            second = min((s for s in found if _is_shaft(s[1], f)), key=lambda s: s[0], default=None)
+            if second is not None and _is_better(task, second[0], shaft[0]):
+                best = second
         elif best is rigid:
             beyond = _beyond(task, rigid)
     cost, theta, covariance = best
+    theta, covariance = _in_order(theta, covariance)
     if not math.isfinite(cost):
         raise FitError(
             name="response", expected="a fit that converges", received="none",
@@ -228,11 +244,29 @@ def _polynomials(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Numerator and denominator of G without its delay; theta: logarithms, but for the delay."""
     K, a1, a2 = np.exp(theta[:3])
     num, den = np.array([K]), np.array([a2, a1, 1.0])
-    if len(theta) == 8:
-        wr, zr, wa, za = np.exp(theta[4:])
-        num = K * np.array([1.0, 2.0 * za * wa, wa * wa]) * (wr / wa) ** 2
+    for wr, zr, wa, za in _shafts(theta):
+        num = np.convolve(num, [1.0, 2.0 * za * wa, wa * wa]) * (wr / wa) ** 2
         den = np.convolve(den, [1.0, 2.0 * zr * wr, wr * wr])
     return num, den
+
+
+def _shafts(theta: FloatArray) -> FloatArray:
+    """Of each shaft frequency [rad/s] and damping of resonance and antiresonance, (shafts, 4)."""
+    found: FloatArray = np.exp(theta[RIGID:]).reshape(-1, SHAFT)
+    return found
+
+
+def _in_order(theta: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """With the lowest resonance first."""
+    order = np.argsort(theta[RIGID::SHAFT], kind="stable")
+    places = [RIGID + SHAFT * k + j for k in order for j in range(SHAFT)]
+    at = np.array([*range(RIGID), *places])
+    return theta[at], covariance[np.ix_(at, at)]
+
+
+def _mark(number: int) -> str:
+    """In the names of a shaft's parameters."""
+    return "" if number == 1 else f"_{number}"
 
 
 def _terms(
@@ -342,13 +376,14 @@ def _rigid_starts(task: _Task) -> list[FloatArray]:
     ]
 
 
-def _shaft_starts(task: _Task, rigid: FloatArray) -> list[FloatArray]:
-    """Where the response rises most above the rigid machine's, and a few places more."""
+def _shaft_starts(task: _Task, rigid: FloatArray, *, few: bool = False) -> list[FloatArray]:
+    """Where the response rises most above that of a fit, and unless `few` a few places more."""
     f = task.hertz
     ratio = np.abs(task.value) / np.abs(_sampled(rigid, f, task.Ts, task.counted))
     inner = np.flatnonzero((ratio[1:-1] >= ratio[:-2]) & (ratio[1:-1] >= ratio[2:])) + 1
     peaks = inner[np.argsort(-ratio[inner])][:4]
-    places = [*f[peaks], *np.geomspace(max(2.0 * f[0], f[-1] / 60.0), 0.9 * f[-1], STARTS)]
+    spread = np.geomspace(max(2.0 * f[0], f[-1] / 60.0), 0.9 * f[-1], STARTS)
+    places = [*f[peaks], *(() if few else spread)]
     starts = []
     for place in places:
         left = (f > 0.3 * place) & (f < 0.98 * place)
@@ -378,7 +413,12 @@ def _beyond(task: _Task, rigid: tuple[float, FloatArray, FloatArray]) -> float |
 
 
 def _is_shaft(theta: FloatArray, f: FloatArray) -> bool:
-    wr, zr, wa, za = np.exp(theta[4:])
+    """Whether each pair of zeros and poles can be a shaft, and was measured."""
+    return all(_is_one(shaft, f) for shaft in _shafts(theta))
+
+
+def _is_one(shaft: FloatArray, f: FloatArray) -> bool:
+    wr, zr, wa, za = shaft
     inside = f[0] < wa / (2 * math.pi) and wr / (2 * math.pi) < f[-1]
     shown = (f > wa / (2 * math.pi) / NEAR) & (f < wr / (2 * math.pi) * NEAR)
     inside &= int(shown.sum()) >= SHOWN
@@ -390,7 +430,7 @@ def _is_shaft(theta: FloatArray, f: FloatArray) -> bool:
 
 def _is_better(task: _Task, shaft: float, rigid: float) -> bool:
     """Whether the shaft explains clearly more, measured by what it leaves itself."""
-    freedom = max(2 * len(task.hertz) - 8, 1)
+    freedom = max(2 * len(task.hertz) - RIGID - SHAFT, 1)
     return (rigid - shaft) > CLEAR * shaft / freedom
 
 
@@ -425,13 +465,18 @@ def _parameters(
     else:
         found["swing_hertz"] = derived(lambda x: math.exp(-0.5 * x[2]) / (2 * math.pi), "Hz")
         found["swing_damping"] = derived(lambda x: 0.5 * math.exp(x[1] - 0.5 * x[2]), "")
-    if len(theta) == 8:
-        turn = 1.0 / (2.0 * math.pi)
-        found["resonance_hertz"] = positive(4, "Hz", turn)
-        found["resonance_damping"] = positive(5, "")
-        found["antiresonance_hertz"] = positive(6, "Hz", turn)
-        found["antiresonance_damping"] = positive(7, "")
-        found["inertia_ratio"] = derived(lambda x: math.exp(2.0 * (x[4] - x[6])) - 1.0, "")
+    turn, shafts = 1.0 / (2.0 * math.pi), range((len(theta) - RIGID) // SHAFT)
+    for k in shafts:
+        at, mark = RIGID + SHAFT * k, _mark(k + 1)
+        found[f"resonance{mark}_hertz"] = positive(at, "Hz", turn)
+        found[f"resonance{mark}_damping"] = positive(at + 1, "")
+        found[f"antiresonance{mark}_hertz"] = positive(at + 2, "Hz", turn)
+        found[f"antiresonance{mark}_damping"] = positive(at + 3, "")
+    if shafts:  # far below all shafts the motor carries everything, far above itself alone
+        found["inertia_ratio"] = derived(
+            lambda x: math.exp(2.0 * float(np.sum(x[RIGID::SHAFT] - x[RIGID + 2 :: SHAFT]))) - 1.0,
+            "",
+        )
     return found
 
 

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import overload
+from typing import Literal, TypeAlias, get_args, overload
 
 from numpy.typing import ArrayLike
 
 from ..dataset import Dataset
 from ..errors import SettingError
-from ..motorfit import TERMS, estimated, records_of
+from ..motorfit import OPTIONAL, TERMS, WAVES, estimated, records_of
 from ..recording import Recording
 from .equations import EquationFit, Equations, fit_equations
-from .motor import Estimate, Motor, motor_of
+from .motor import Motor, motor_of
 
-STRUCTURES = {"dcmotor": tuple(TERMS)}
+Intervals: TypeAlias = Literal["curvature", "profile"]
+
+STRUCTURES = {
+    "dcmotor": tuple(t for t in TERMS if t not in OPTIONAL),
+    "cogging": WAVES[:3],
+}
+"""Names that stand for several terms."""
 
 
 @overload
@@ -26,6 +32,7 @@ def physics(
     current: str | ArrayLike | None = None,
     volts: float | None = None,
     speed_unit: str | None = None,
+    intervals: Intervals = "curvature",
 ) -> Motor: ...
 
 
@@ -48,6 +55,7 @@ def physics(
     current: str | ArrayLike | None = None,
     volts: float | None = None,
     speed_unit: str | None = None,
+    intervals: Intervals = "curvature",
     equations: Equations | None = None,
     parameters: Mapping[str, float | Sequence[float]] | None = None,
     states: int = 1,
@@ -68,14 +76,21 @@ def physics(
         show most; several experiments are fitted together.
     structure : "dcmotor" or sequence of str
         Terms that may be in it, of `lag`, `delay`, `coulomb`, `offset`, `drop`, `stribeck`,
-        `load_1`, `load_2`, `inertia_2` (varying once, twice per turn) and `limit`. "dcmotor" tries
-        all; a term that the record does not show is omitted.
+        `load_1`, `load_2`, `inertia_2` (varying once, twice per turn), `cogging` and
+        `torque_ripple` (of orders per turn that are found), `limit`, `stribeck_difference` (by
+        direction), `sag` (of the supply) and `eccentricity` (of the encoder). "dcmotor" stands for
+        all of them, the last three only where they stand out clearly; ``["dcmotor", "sag"]`` looks
+        for one of them in any case. A term that the record does not show is omitted.
     current : str or array, shape (N,), optional
         Motor current [A]: a channel of the data set, or its samples.
     volts : float, optional
         Volts on the winding per unit of command; 1 if the command is that voltage.
     speed_unit : str, optional
         rpm, rad/s, rev/s or deg/s, if the data set does not say.
+    intervals : "curvature" or "profile"
+        How the 95 % intervals are found: by the curvature of the cost, or as profile likelihood,
+        which follows a cost that is no parabola: ends of their own to either side, for some
+        seconds.
     equations : callable, optional
         Your own equations in place of the motor's: ``f(x, u, p)`` returns the derivatives of the
         state ``x``, shape (states,), under the command ``u``; ``p`` has the parameters by name. The
@@ -120,20 +135,20 @@ def physics(
             )  # fmt: skip
         records = records_of(data, None, speed_unit)
         return fit_equations(records, equations, parameters, states=states, substeps=substeps)
+    if intervals not in get_args(Intervals):
+        raise SettingError(
+            name="intervals", expected="curvature or profile", received=repr(intervals),
+            remedy="profile takes some seconds more, and has ends of their own to either side",
+        )  # fmt: skip
     terms = _terms(structure)
     if volts is not None and not (
         isinstance(volts, (int, float)) and math.isfinite(volts) and volts > 0
     ):
         raise SettingError(f"expected volts per unit of command above 0, received {volts!r}")
     records = records_of(data, current, speed_unit)
-    found = estimated(records, terms)
-    state, task = found.state, found.task
-    estimate = Estimate(
-        state.theta, state.resistance, tuple(state.names()), found.covariance, tuple(state.terms)
-    )
-    return motor_of(
-        estimate, found.records, task.outcome(state), found.reasons, volts, task.converged
-    )
+    usual = structure == "dcmotor" or "dcmotor" in structure
+    found = estimated(records, terms, if_clear=OPTIONAL if usual else ())
+    return motor_of(found, volts, profile=intervals == "profile")
 
 
 def _terms(structure: str | Sequence[str]) -> tuple[str, ...]:
@@ -144,8 +159,11 @@ def _terms(structure: str | Sequence[str]) -> tuple[str, ...]:
                 f"{structure!r}; terms are {', '.join(TERMS)}"
             )
         return STRUCTURES[structure]
-    given = list(structure)
-    for t in given:
+    wanted: list[str] = []
+    for t in structure:
+        wanted += STRUCTURES.get(t, (t,))
+    for t in wanted:
         if t not in TERMS:
-            raise SettingError(f"expected terms of {', '.join(TERMS)}, received {t!r}")
-    return tuple(t for t in TERMS if t in given)
+            known = ", ".join([*STRUCTURES, *TERMS])
+            raise SettingError(f"expected terms of {known}, received {t!r}")
+    return tuple(t for t in TERMS if t in wanted)

@@ -17,8 +17,10 @@ from ..errors import DataError, SettingError
 from ..frequency.shaft import Parameter, sampled_model
 from ..machine import VirtualMachine
 from ..models import LinearOE
+from ..motorfit import WAVES, Estimated, rad_per_second
 from ..motorfit.intervals import CONFIDENCE
-from ..motorfit.records import Records, rad_per_second
+from ..motorfit.profiles import Values, profiled, slope_of, values_of
+from ..motorfit.task import State
 from ..plotting import LOOKS, Drawing
 from ..tables import html_of
 from .exports import Target, Winding, export
@@ -27,16 +29,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 FORMAT = "sewfast-motor"
-VERSION = 2
-"""Version 1 has `untold` for `undetermined`, and is read."""
+VERSION = 3
+"""Version 1 has `untold` for `undetermined`, version 2 no `orders`; both are read."""
 NAMES = tuple(_core.GREYBOX_PARAMETERS)
+OLDER = NAMES.index("limit") + 1
+"""From here on, parameters that files before version 3 lack."""
 VAGUE = 1.0
 """Of its value: the half-width of an interval from which a parameter is not printed."""
 
 APART = 10.0
 """Of its value: the half-width from which others can stand for it."""
-
-Values: TypeAlias = Mapping[str, float]
 
 _SI = ("resistance", "motor_constant", "inertia", "viscous_friction", "coulomb_torque")
 _NO_CURRENT = (
@@ -46,17 +48,6 @@ _NO_VOLTS = (
     "it scales with the volts on the winding per unit of command; pass volts (1 where the command "
     "is that voltage)"
 )
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """A point of the search: all parameters, the free ones and their covariance."""
-
-    theta: FloatArray
-    resistance: float | None
-    names: tuple[str, ...]
-    covariance: FloatArray
-    terms: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -69,9 +60,10 @@ class Motor:
         Value, 95 % interval and unit. `k_v`, `k_a`, `k_s`: command per speed, per acceleration and
         against dry friction; `time_constant`; of the detectable terms `electrical_lag`,
         `delay` beyond the hold, `offset`, `drop` (dead zone of the inverter), `stribeck` and
-        `stribeck_speed`, `load_1`, `load_2` (amplitude once, twice per turn), `inertia_2`
-        (relative), `limit`. With a current also `k_e`, `k_b` (back-EMF, viscous) and `resistance`
-        per unit of command; with volts R, Ke, J, friction and inductance in SI units.
+        `stribeck_speed`, `load_1`, `load_2`, `load_6` .. (amplitude once, twice, six times per
+        turn), `inertia_2`, `torque_ripple` (relative), `limit`, `stribeck_difference`, `sag`,
+        `eccentricity`. With a current also `k_e`, `k_b` (back-EMF, viscous) and `resistance` per
+        unit of command; with volts R, Ke, J, friction and inductance in SI units.
     undetermined : mapping of str by name
         Parameters that the record does not determine, and why.
     terms : tuple of str
@@ -99,6 +91,8 @@ class Motor:
     volts: float | None
     resistance: float | None
     theta: FloatArray
+    orders: tuple[int, ...] = (0,) * len(WAVES)
+    """How often per turn cogging, three of them, and the torque ripple repeat; 0 for none."""
     shown: tuple[FloatArray, FloatArray] | None = field(default=None)
     """Speed, measured and in the free run [rad/s], for the picture; not in a file."""
 
@@ -131,8 +125,9 @@ class Motor:
         factor = rad_per_second(self.speed_unit)
         steps = int(np.clip(math.ceil(step / self._fine()), 1, 10_000))
         y, *_ = _core.greybox_run(
-            self.theta, [], as_column(u, "u"), Ts=step, steps=steps, speed=factor * float(speed)
-        )
+            self.theta, [], as_column(u, "u"), Ts=step, steps=steps, speed=factor * float(speed),
+            orders=self.orders,
+        )  # fmt: skip
         return np.asarray(y / factor)
 
     def _fine(self) -> float:
@@ -153,7 +148,9 @@ class Motor:
         """A virtual machine with this behaviour: a twin to tune and rehearse on.
 
         If R, Ke and J are not known individually, it has values that give the same speed; its
-        current then has no unit. It has no dead time beyond the hold.
+        current then has no unit. It has no dead time beyond the hold, no cogging of an order above
+        2, no sag of its supply, an encoder that runs true, and friction that falls off alike in
+        both directions; a torque ripple is in it if it repeats four times per turn.
 
         Parameters
         ----------
@@ -207,11 +204,14 @@ class Motor:
             "load_first_angle": math.atan2(of["load_1s"], of["load_1c"]),
             "load_second": second * torque,
             "load_second_angle": 0.5 * math.atan2(of["load_2s"], of["load_2c"]),
-            "torque_ripple": 0.0,
+            "torque_ripple": math.hypot(of["torque_ripple_c"], of["torque_ripple_s"]),
+            "torque_ripple_angle": 0.25 * math.atan2(of["torque_ripple_s"], of["torque_ripple_c"]),
             "encoder_phase": 0.5,
             "counts_per_rev": self.counts_per_rev or 1572.0,
         }
         values["u_limit"] = min(bus / volts, 1000.0) if u_limit is None else u_limit
+        if self.orders[WAVES.index("torque_ripple")] != 4:
+            values["torque_ripple"] = 0.0
         machine = VirtualMachine(parameters=values)
         machine.set_load(of["offset"] * torque)
         return machine
@@ -247,9 +247,9 @@ class Motor:
     def turn_load(self, angle: ArrayLike) -> FloatArray:
         """Command that holds the shaft against what varies over the turn, at angles [rad], (N,).
 
-        Loads once and twice per turn, without the constant load: as a feed-forward it takes them
-        out of the speed. The angle is that of the record: of a `Recording` its
-        counts.
+        Loads once, twice and, of cogging, more often per turn, without the constant load: as a
+        feed-forward it takes them out of the speed. The angle is that of the record: of a
+        `Recording` its counts.
 
         Raises
         ------
@@ -257,7 +257,7 @@ class Motor:
             If the angles are not finite, one-dimensional numbers.
         """
         at, of = as_column(angle, "angle"), self.of
-        waves = ((1, "load_1"), (2, "load_2"))
+        waves = [(1, "load_1"), (2, "load_2"), *zip(self.orders, WAVES[:3], strict=False)]
         sums = [of[w + "c"] * np.cos(n * at) + of[w + "s"] * np.sin(n * at) for n, w in waves]
         return np.asarray(np.sum(sums, axis=0))
 
@@ -288,10 +288,11 @@ class Motor:
             "u_unit": self.u_unit,
             "speed_unit": self.speed_unit,
             "theta": dict(zip(NAMES, [v if v is None else float(v) for v in theta], strict=True)),
+            "orders": list(self.orders),
         }
 
     def plot(self, ax: Any = None, *, file: str | os.PathLike[str] | None = None) -> Any:
-        """Measured speed and free run, and the command needed to hold a speed.
+        """Measured speed and free run, the command needed to hold a speed, and cogging if there is.
 
         Arguments and result are those of `Dataset.plot`.
         """
@@ -318,20 +319,30 @@ class Motor:
             usual = 100.0 if self.shown is None else float(np.abs(self.shown[0]).max())
             top = min(usual, 15.0 * of["w_s"]) if of["k_t"] else usual
             half = np.linspace(1e-4 * top, top, 400)
-            dry = of["k_s"] + of["drop"] + of["k_t"] / (1.0 + (half / of["w_s"]) ** 2)
-            viscous = (of["k_e"] + of["k_b"]) * half
-            speeds = np.concatenate([-half[::-1], half]) / factor
-            for look, sizes, label in (
+            speeds = np.concatenate([-half[::-1], half])
+            sign = np.sign(speeds)
+            bump = (of["k_t"] + of["k_d"] * sign) / (1.0 + (speeds / of["w_s"]) ** 2)
+            dry = sign * (of["k_s"] + of["drop"] + bump) + of["offset"]
+            viscous = (of["k_e"] + of["k_b"]) * speeds
+            for look, hold, label in (
                 ("model", dry + viscous, "to hold the speed"),
                 ("measured", dry, "of it dry friction, dead zone, constant load"),
             ):
-                hold = np.concatenate([-sizes[::-1], sizes]) + of["offset"]
-                ax.plot(speeds, hold, label=label, **LOOKS[look])
+                ax.plot(speeds / factor, hold, label=label, **LOOKS[look])
             ax.set_xlabel(f"speed [{self.speed_unit}]")
             ax.set_ylabel(f"command [{self.u_unit}]")
             ax.legend(loc="upper left")
 
+        def turn_panel(ax: Axes) -> None:
+            angle = np.linspace(0.0, 2.0 * math.pi, 1000)
+            ax.plot(np.degrees(angle), self.turn_load(angle), **LOOKS["model"])
+            ax.set_xlabel("angle of the shaft [deg]")
+            ax.set_ylabel(f"load [{self.u_unit}]")
+            ax.set_xlim(0.0, 360.0)
+
         panels = (friction_panel,) if self.shown is None else (run_panel, friction_panel)
+        if any(self.orders[:3]):
+            panels = (*panels, turn_panel)
         heights = (2.4,) * len(panels)
         return Drawing(tuple((p,) for p in panels), heights, share_x=False)
 
@@ -398,9 +409,13 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
     ModelFileError
         For any other file.
     """
-    document = storage.read(path, FORMAT, (1, VERSION))
+    document = storage.read(path, FORMAT, (1, 2, VERSION))
     if document["version"] == 1 and "untold" in document:
         document["undetermined"] = document.pop("untold")
+    if document["version"] < VERSION:  # terms that it did not know
+        document.setdefault("orders", [0] * len(WAVES))
+        if isinstance(document.get("theta"), dict):
+            document["theta"] = dict.fromkeys(NAMES[OLDER:], 0.0) | document["theta"]
     fields = storage.Fields(str(path), document)
     fields.require_only(
         [
@@ -412,6 +427,7 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
             "u_unit",
             "speed_unit",
             "theta",
+            "orders",
         ]
     )
     parameters, undetermined, unit = findings(fields)
@@ -420,6 +436,9 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
     values = [math.inf if n == "limit" and theta.any(n) is None else theta.number(n) for n in NAMES]
     for name in ("k_a", "ripple", "w_s"):
         theta.positive(name)
+    orders = fields.items("orders")
+    if len(orders) != len(WAVES) or not all(type(n) is int and 0 <= n <= 10_000 for n in orders):
+        raise fields.refuse("orders", f"{len(WAVES)} whole numbers from 0 to 10,000", orders)
     terms = fields.items("terms")
     if not all(isinstance(t, str) for t in terms):
         raise fields.refuse("terms", "names", terms)
@@ -440,37 +459,30 @@ def load_motor(path: str | os.PathLike[str]) -> Motor:
         fields.optional_number("volts"),
         fields.optional_number("resistance"),
         np.array(values),
+        tuple(orders),
     )
 
 
 # --- From the estimate to what is printed ---------------------------------------------------------
 
 
-def motor_of(
-    estimate: Estimate,
-    records: Records,
-    outcome: tuple[FloatArray, ...],
-    reasons: Mapping[str, str],
-    volts: float | None,
-    converged: bool,
-) -> Motor:
+def motor_of(found: Estimated, volts: float | None, *, profile: bool) -> Motor:
     """What the estimate says, each parameter with its interval or the reason why it has none."""
-    known = {**dict(zip(NAMES, estimate.theta, strict=True)), "R": estimate.resistance or math.nan}
-    at = np.array([known[n] for n in estimate.names])
+    estimate, records, reasons = found.state, found.records, found.reasons
+    known, names = values_of(estimate), estimate.names()
+    spreads = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
     parameters: dict[str, Parameter] = {}
     undetermined: dict[str, str] = {}
-    hidden = {name for term in reasons for name in _OF_TERM[term]}
+    of_term = _OF_TERM | {
+        t: (f"load_{n}",) for t, n in zip(WAVES[:3], estimate.orders, strict=False)
+    }
+    hidden = {name for term in reasons for name in of_term[term]}
     for name, unit, of in _quantities(estimate, records.u_unit, volts):
         if name in hidden:
             continue
         value = of(known)
-        slope = np.zeros(len(at))
-        sd = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
-        for j, free in enumerate(estimate.names):
-            h = 1e-4 * abs(at[j]) or max(min(1e-3 * float(sd[j]), 1e-6), 1e-12)
-            more, less = (of({**known, free: at[j] + s * h}) for s in (1.0, -1.0))
-            slope[j] = (more - less) / (2.0 * h)
-        half = CONFIDENCE * math.sqrt(max(float(slope @ estimate.covariance @ slope), 0.0))
+        slope = slope_of(known, of, names, spreads)
+        half = CONFIDENCE * math.sqrt(max(float(slope @ found.covariance @ slope), 0.0))
         vague = half >= VAGUE * abs(value)
         if name == "delay":  # that there is none is an answer
             vague = half >= APART * max(value, records.Ts)
@@ -483,17 +495,21 @@ def motor_of(
                 "as its value"
             )
             continue
-        low = value - half if name in _SIGNED else max(value - half, 0.0)
-        parameters[name] = Parameter(value, low, value + half, unit)
+        low, high = value - half, value + half
+        if profile and half > 0.0:
+            low, high = profiled(found, of, slope, half)
+        if name not in _SIGNED:
+            low = max(low, 0.0)
+        parameters[name] = Parameter(value, low, high, unit)
     for term, why in reasons.items():
-        for name in _OF_TERM[term]:
+        for name in of_term[term]:
             undetermined.setdefault(name, why)
     missing = _NO_CURRENT if estimate.resistance is None else _NO_VOLTS
     if estimate.resistance is None or volts is None:
         undetermined |= {"resistance_ohm" if n == "resistance" else n: missing for n in _SI}
     if volts is not None and estimate.resistance is not None:
         parameters["volts"] = Parameter(volts, volts, volts, f"V/{records.u_unit}".rstrip("/"))
-    y, model = outcome
+    y, model = found.task.outcome(estimate)
     error, factor = y - model, rad_per_second(records.speed_unit)
     spread = float(np.linalg.norm(y - y.mean()))
     return Motor(
@@ -502,7 +518,7 @@ def motor_of(
         estimate.terms,
         100.0 * (1.0 - float(np.linalg.norm(error)) / max(spread, 1e-300)),
         float(np.sqrt(np.mean(error**2))) / factor,
-        converged,
+        found.task.converged,
         len(y),
         records.spikes,
         records.Ts,
@@ -513,11 +529,12 @@ def motor_of(
         volts,
         estimate.resistance,
         estimate.theta,
+        estimate.orders,
         (y, model),
     )
 
 
-_SIGNED = ("offset", "k_b", "viscous_friction")
+_SIGNED = ("offset", "k_b", "viscous_friction", "stribeck_difference", "sag")
 
 _OF_TERM = {
     "inertia": ("k_a", "time_constant", "inertia"),
@@ -531,12 +548,17 @@ _OF_TERM = {
     "load_2": ("load_2",),
     "inertia_2": ("inertia_2",),
     "limit": ("limit",),
+    "stribeck_difference": ("stribeck_difference",),
+    "sag": ("sag",),
+    "eccentricity": ("eccentricity",),
+    "cogging": ("cogging",),
+    "torque_ripple": ("torque_ripple",),
 }
 
 Quantity: TypeAlias = tuple[str, str, Callable[[Values], float]]
 
 
-def _quantities(estimate: Estimate, u: str, volts: float | None) -> list[Quantity]:
+def _quantities(estimate: State, u: str, volts: float | None) -> list[Quantity]:
     """Name, unit and value of everything that may be printed."""
     u = u or "command"
     found: list[Quantity] = [
@@ -560,7 +582,19 @@ def _quantities(estimate: Estimate, u: str, volts: float | None) -> list[Quantit
             ("inertia_2", "1", lambda p: math.hypot(p["inertia_2c"], p["inertia_2s"]) / p["k_a"])
         ],
         "limit": [("limit", u, lambda p: p["limit"])],
+        "stribeck_difference": [("stribeck_difference", u, lambda p: p["k_d"])],
+        "sag": [("sag", f"1/{u}^2", lambda p: p["sag"])],
+        "eccentricity": [
+            ("eccentricity", "1", lambda p: math.hypot(p["eccentric_c"], p["eccentric_s"]))
+        ],
+        "torque_ripple": [
+            ("torque_ripple", "1", lambda p: math.hypot(p["torque_ripple_c"], p["torque_ripple_s"]))
+        ],
     }
+    for term, order in zip(WAVES[:3], estimate.orders, strict=False):
+        of_terms[term] = [
+            (f"load_{order}", u, lambda p, t=term: math.hypot(p[t + "c"], p[t + "s"]))  # type: ignore[misc]
+        ]
     for term in estimate.terms:
         found += of_terms[term]
     if estimate.resistance is None:

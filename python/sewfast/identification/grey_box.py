@@ -23,7 +23,8 @@ from .folds import Errors, Split, compared, errors_of, folds, free_runs, thinned
 from .task import Provenance, Task, documented, finite, wrap
 
 TERMS = ("lag", "delay", "coulomb", "offset", "drop", "stribeck", "limit")
-"""Of a motor: those that do not ask where a turn begins."""
+IF_CLEAR = ("sag",)
+"""Of a motor: one that does not ask where a turn begins."""
 HIDDEN = 4
 """Units of the network that is tried."""
 STARTS = 2
@@ -214,7 +215,7 @@ def _is_better(more: MotorCandidate, alone: MotorCandidate) -> bool:
 
 def _motor(data: Dataset, look: Look | None = None) -> _core.GreyBox:
     """The equations alone, at the least squares of the free run."""
-    found = estimated(records_of(data, None, None), TERMS, _at_any_time(look))
+    found = estimated(records_of(data, None, None), TERMS, _at_any_time(look), if_clear=IF_CLEAR)
     state, records = found.state, found.records
     free = [n for n in state.names() if n not in ("k_b", "delay")]
     y, model = found.task.outcome(state)

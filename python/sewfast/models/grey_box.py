@@ -101,7 +101,7 @@ class GreyBox(SingleModel):
             raise fields.refuse("free", f"names of {', '.join(NAMES)}, each once", free)
         limit = fields.optional_number("limit")
         return _core.GreyBox(
-            values=np.append(fields.vector("values"), math.inf if limit is None else limit),
+            values=_completed(fields.vector("values"), math.inf if limit is None else limit),
             free=[NAMES.index(name) for name in free],
             steps=fields.integer("steps"),
             mean=fields.flag("mean"),
@@ -117,10 +117,19 @@ class GreyBox(SingleModel):
             f"k_s {of['k_s']:.4g} {u}",
         ]
         named = {"tau": ("lag", "s"), "delay": ("delay", "s"), "drop": ("drop", u)}
+        named |= {"sag": ("sag", f"1/{u}^2")}
         parts += [f"{text} {of[n]:.3g} {unit}" for n, (text, unit) in named.items() if of[n]]
         units = self.settings["hidden"]
         network = f"{units} tanh for what they leave" if units else "no network beside them"
         return [f"motor: {', '.join(parts)}", network]
+
+
+def _completed(values: FloatArray, limit: float) -> FloatArray:
+    """All parameters; older files end before `limit`, and know no term that comes after it."""
+    at = NAMES.index("limit")
+    if len(values) == at:
+        values = np.append(values, np.zeros(len(NAMES) - at - 1))
+    return np.insert(values, min(at, len(values)), limit)
 
 
 _NUMBERS = (

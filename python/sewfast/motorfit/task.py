@@ -29,8 +29,20 @@ TERMS: dict[str, tuple[str, ...]] = {
     "load_2": ("load_2c", "load_2s"),
     "inertia_2": ("inertia_2c", "inertia_2s"),
     "limit": ("limit",),
+    "stribeck_difference": ("k_d",),
+    "sag": ("sag",),
+    "eccentricity": ("eccentric_c", "eccentric_s"),
+    "cogging_1": ("cogging_1c", "cogging_1s"),
+    "cogging_2": ("cogging_2c", "cogging_2s"),
+    "cogging_3": ("cogging_3c", "cogging_3s"),
+    "torque_ripple": ("torque_ripple_c", "torque_ripple_s"),
 }
 """Parts of a motor beside back-EMF and inertia, and the parameters of each."""
+WAVES = ("cogging_1", "cogging_2", "cogging_3", "torque_ripple")
+"""Terms that repeat as often per turn as the record says, in the order of `State.orders`."""
+OPTIONAL = ("stribeck_difference", "sag", "eccentricity")
+"""Terms that few motors have, and each of which makes the others less sure: they are fitted where
+they are asked for, or stand out clearly."""
 VISCOUS, VISCOUS_SPREAD = 0.05, 0.15
 """Of k_v: viscous friction that is expected where no current parts it from back-EMF, and how far
 from that it may well be. Nothing in its place would be a certainty: the dead zone sees the current
@@ -54,11 +66,11 @@ STARTS = 5
 """Steps at most by which the pieces' starts are settled: dry friction bends what one step takes for
 straight where the start is on the wrong side of a standstill."""
 AMMETER = 1e-3
-"""Of the current's root mean square: the error down to which it is believed. That of a simulator
-has none, and what the model leaves of it, at reversals, then outweighs all speeds."""
+"""Of the current's root mean square: the error down to which it is believed; and of its scale. A
+simulator's has none, and what the model leaves of it, at reversals, then outweighs all speeds."""
 TIMING = 0.01
 """Of a sample: standard deviation of the instant from which a command acts, which no residual
-shows. It moves delay and time constant, of a motor without noise by more than everything else."""
+shows. It moves delay and time constants, of a motor without noise by more than all the rest."""
 WHITE = 12
 """Order of the autoregression that says how what is left over hangs together."""
 
@@ -70,6 +82,8 @@ class State:
     theta: FloatArray
     resistance: float | None
     terms: tuple[str, ...]
+    orders: tuple[int, ...] = (0,) * len(WAVES)
+    """How often per turn each of `WAVES` repeats; 0 where there is none."""
 
     def names(self) -> list[str]:
         free = ["k_e", "k_a", "k_b", *(["R"] if self.resistance is not None else [])]
@@ -91,7 +105,7 @@ class State:
                 resistance = float(value)
             else:
                 theta[PLACE[name]] = value
-        return State(theta, resistance, self.terms)
+        return replace(self, theta=theta, resistance=resistance)
 
     def having(self, terms: Sequence[str], **values: float) -> State:
         """With other terms: those that go are set to nothing."""
@@ -101,7 +115,7 @@ class State:
                 theta[PLACE[p]] = NOTHING[PLACE[p]]
         for name, value in values.items():
             theta[PLACE[name]] = value
-        return State(theta, self.resistance, tuple(t for t in TERMS if t in terms))
+        return replace(self, theta=theta, terms=tuple(t for t in TERMS if t in terms))
 
 
 NOTHING = np.array(
@@ -137,7 +151,7 @@ class Task:
         return [
             _core.greybox_run(
                 state.theta, places, p.u, Ts=r.Ts, steps=self.steps, speed=p.speed, mean=r.mean,
-                angle=p.angle,
+                angle=p.angle, orders=state.orders,
             )
             for p in r.pieces
         ]  # fmt: skip
@@ -217,7 +231,7 @@ class Task:
             one, slope, gram = _core.greybox_normal(
                 state.theta, places, p.u, p.y, p.used, Ts=r.Ts, steps=self.steps,
                 filter=self.speed_filter, speed=p.speed, mean=r.mean, angle=p.angle,
-                current=current,
+                orders=state.orders, current=current,
             )  # fmt: skip
             cost += one
             gradient = slope + (gradient if gradient.size else 0.0)
@@ -355,10 +369,13 @@ class Task:
             channels=2 if self.has_current else 1, known=self._expected(state)[2],
         )  # fmt: skip
         timing = (TIMING * self.records.Ts) ** 2
-        for name, size in (("k_a", k_v), ("delay", 1.0)):
+        for name, size in (("k_a", k_v), ("delay", 1.0), ("tau", 1.0)):
             if name in state.names():
                 at = state.names().index(name)
                 whole[at, at] += size**2 * timing
+        if state.resistance is not None:
+            at = state.names().index("R")
+            whole[at, at] += (AMMETER * state.resistance) ** 2
         return whole[:n, :n]
 
 

@@ -7,8 +7,9 @@ free run. All terms are then fitted together, those that the record does not sho
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,8 @@ from ..arrays import FloatArray
 from .intervals import inverse
 from .records import Records
 from .starts import started
-from .task import FINE, NEAR, TERMS, State, Task, fitted, least_inertia
+from .task import FINE, NEAR, TERMS, WAVES, State, Task, fitted, least_inertia
+from .waves import CLEAR, with_waves
 
 ORDERS = {"load_1": 1, "load_2": 2, "inertia_2": 2}
 """How often a term repeats in a turn."""
@@ -33,6 +35,8 @@ SHOWN = 1.0
 """Wald's statistic of a single parameter from which its term stays: one that is larger than its
 standard deviation makes the others worse by its absence than by its uncertainty (Toro-Vizcarrondo
 and Wallace 1968, JASA 63). Whether it is printed is a question of its own interval."""
+SURE = 16.0
+"""The same of a term that is fitted only where it stands out."""
 UNEXPLAINED = 0.005
 """Share of the speed's variance, from which a limit is looked for with all parameters free."""
 LIMITED = 0.9
@@ -75,11 +79,16 @@ class Estimated:
 
 
 def estimated(
-    records: Records, terms: tuple[str, ...], look: Callable[[], object] = lambda: None
+    records: Records,
+    terms: tuple[str, ...],
+    look: Callable[[], object] = lambda: None,
+    *,
+    if_clear: tuple[str, ...] = (),
 ) -> Estimated:
     """The parameters, and which of the terms the records show.
 
-    `look` is called from time to time; what it raises ends the fit.
+    Terms in `if_clear` are fitted where what is left over without them shows them clearly. `look`
+    is called from time to time; what it raises ends the fit.
 
     Raises
     ------
@@ -108,17 +117,34 @@ def estimated(
     first.leave_out_spikes(state)
     state = _with_limit(first, fitted(first, state), terms)
     first.leave_out_spikes(state)
-    state = _all_terms(first, state, terms)
-    if part is records:
-        records = first.records  # with the starts that were settled
+    state = _all_terms(first, state, tuple(t for t in terms if t not in WAVES))
+    given = terms
+    state = _with_clear(first, state, if_clear)
+    true = functools.partial(_trued, c=state.value("eccentric_c"), s=state.value("eccentric_s"))
+    first.records = true(first.records)
+    before, state = state, with_waves(first, state, terms)
+    if state is not before:  # what hid behind the waves may be clear now
+        state = fitted(first, state)
+        first.weigh(state)
+        state = _with_clear(first, state, if_clear)
+    terms = tuple(t for t in TERMS if t in (*terms, *state.terms))
+    needed = {t: SHOWN if t in given and t not in WAVES else SURE for t in terms}
+    # with the starts that were settled, where they are the same
+    records = first.records if part is records else true(records)
     task = Task(records, first.steps, k_v=first.k_v, look=look)
     task.settle_starts(state)
     task.leave_out_spikes(state)
-    state, shares, covariance = _shown_terms(task, state, terms, steps)
+    state, shares, covariance = _shown_terms(task, state, needed, steps)
     reasons |= {
-        t: f"not shown, if there is any (Wald's statistic {shares[t]:.2g}, it takes {SHOWN:g})"
-        for t in shares
+        t: f"not shown, if there is any (Wald's statistic {share:.2g}, it takes {needed[t]:g})"
+        for t, share in shares.items()
+        if t in given and (t not in WAVES or state.orders[WAVES.index(t)])
     }
+    missing = "no wave over the turn stands out from what is left over"
+    if set(WAVES[:3]) <= set(terms) and not any(state.orders[:3]):
+        reasons["cogging"] = missing
+    if WAVES[3] in terms and not state.orders[3]:
+        reasons["torque_ripple"] = missing
     if state.value("k_a") <= 1.01 * least_inertia(task, state) or task.is_slow(state):
         reasons["inertia"] = (
             "the record does not show how the motor speeds up; record steps, several samples in "
@@ -126,6 +152,20 @@ def estimated(
         )
     records = replace(task.records, spikes=records.spikes + first.spikes + task.spikes)
     return Estimated(state, covariance, reasons, records, task)
+
+
+def _trued(records: Records, *, c: float, s: float) -> Records:
+    """With angles of the shaft in place of those that an eccentric encoder shows.
+
+    A wave of order n would else have sidebands at n - 1 and n + 1.
+    """
+    if c == 0.0 and s == 0.0:
+        return records
+    pieces = [
+        replace(p, angle=p.angle - c * np.sin(p.angle) + s * np.cos(p.angle))
+        for p in records.pieces
+    ]
+    return replace(records, pieces=tuple(pieces))
 
 
 def _turns_both_ways(records: Records) -> bool:
@@ -180,7 +220,6 @@ def _all_terms(task: Task, state: State, terms: tuple[str, ...]) -> State:
     _, fast = task.stribeck_speeds()
     starts = {
         "drop": 0.2 * size, "ripple": 0.2 * size, "k_t": 0.2 * size, "w_s": 0.1 * fast,
-        "load_1c": 0.0, "load_1s": 0.0, "load_2c": 0.0, "load_2s": 0.0,
     }  # fmt: skip
     whole = [t for t in terms if t != "limit" or "limit" in state.terms]
     new = {p for t in set(whole) - set(state.terms) for p in TERMS[t]}
@@ -196,14 +235,52 @@ def _all_terms(task: Task, state: State, terms: tuple[str, ...]) -> State:
     )
 
 
+def _with_clear(task: Task, state: State, terms: tuple[str, ...]) -> State:
+    """With those of the terms that what is left over shows clearly, one after the other."""
+    while clear := _clear(task, state, terms):
+        state = fitted(task, state.having([*state.terms, *clear]))
+        task.weigh(state)
+    return state
+
+
+def _clear(task: Task, state: State, terms: tuple[str, ...]) -> list[str]:
+    """Those without which the fit is clearly worse, by their scores (Rao 1948)."""
+    bumpy = "stribeck" in state.terms and _parts_sides(task, state.value("w_s"))
+    tried = [t for t in terms if t not in state.terms and (bumpy or t != "stribeck_difference")]
+    if not tried:
+        return []
+    whole = state.having([*state.terms, *tried])
+    cost, gradient, matrix = task.normal(whole)
+    names, variance, clear = whole.names(), max(cost / task.count, 1e-300), []
+    rest = [names.index(n) for n in state.names()]
+    known, _ = inverse(matrix[np.ix_(rest, rest)])
+    for t in tried:
+        at = [names.index(n) for n in TERMS[t]]
+        across = matrix[np.ix_(at, rest)]
+        left = matrix[np.ix_(at, at)] - across @ known @ across.T
+        slope = gradient[at] - across @ known @ gradient[rest]
+        if float(slope @ np.linalg.pinv(left) @ slope) > CLEAR * variance:
+            clear.append(t)
+    return clear
+
+
+def _parts_sides(task: Task, w_s: float) -> bool:
+    """Whether friction that falls off over this speed [rad/s] can show its own in each direction.
+
+    Slower, there is no sample to show it; faster, the difference is a constant load.
+    """
+    least, usual = task.stribeck_speeds()
+    return max(2.0 * least, task.records.quantum) <= w_s <= 0.3 * usual
+
+
 def _shown_terms(
-    task: Task, start: State, terms: tuple[str, ...], steps: int
+    task: Task, start: State, needed: Mapping[str, float], steps: int
 ) -> tuple[State, dict[str, float], FloatArray]:
     """All terms fitted together, then without those that are not shown, in as many steps as needed.
 
-    Returns the state, the statistics of the terms left out, and the covariance of what is free. It
-    counts in that a dead zone or Stribeck's friction which is not shown may still be there, hidden
-    in the resistance or in dry friction.
+    `needed` has the statistic from which each stays. Returns the state, the statistics of the terms
+    left out, and the covariance of what is free. It counts in that a dead zone or Stribeck's
+    friction which is not shown may still be there, hidden in the resistance or in dry friction.
     """
     task.weigh(start)
     state = fitted(task, start, NEAR)
@@ -213,15 +290,19 @@ def _shown_terms(
     _, fast = task.stribeck_speeds()
     explained: dict[str, float] = {}
     whole = task.covariance(state)
-    kept, out = list(state.terms), {t: 0.0 for t in terms if t not in state.terms}
+    kept, out = list(state.terms), {t: 0.0 for t in needed if t not in state.terms}
     names, covariance, x = state.names(), whole, state.vector()
     while True:
         wald = {t: _wald(t, names, x, covariance) for t in kept if t not in ALWAYS}
         shown = {t: max(v, explained.get(t, 0.0)) for t, v in wald.items()}
         if "stribeck" in kept and x[names.index("w_s")] > 0.99 * fast:
             shown["stribeck"] = 0.0  # it falls off nowhere: that is Coulomb's friction
-        weakest = min(shown, key=lambda t: shown[t], default=None)
-        if weakest is None or shown[weakest] >= SHOWN:
+        if "stribeck_difference" in kept:  # it has the shape of the other
+            if not _parts_sides(task, x[names.index("w_s")]):
+                shown["stribeck_difference"] = 0.0
+            shown["stribeck"] = max(shown["stribeck"], shown["stribeck_difference"])
+        weakest = min(shown, key=lambda t: shown[t] / needed[t], default=None)
+        if weakest is None or shown[weakest] >= needed[weakest]:
             break
         if weakest in SHAPED and shown[weakest] > 0.0 and weakest not in explained:
             explained[weakest] = _explained(task, state, weakest, whole)

@@ -5,12 +5,17 @@
 //! shaft angle `th`:
 //!
 //! ```text
-//! tau dx/dt = u(t - delay) - drop x / sqrt(x^2 + ripple^2) - x - k_e w,          |x| <= limit
-//! k_a(th) dw/dt = x - offset - load(th) - k_b w - k_a'(th) w^2 / 2 - friction
-//! friction = sign(w) (k_s + k_t / (1 + (w / w_s)^2)), and what holds the shaft at standstill
-//! load(th) = load_1c cos th + load_1s sin th + load_2c cos 2 th + load_2s sin 2 th
+//! tau dx/dt = v - drop x / sqrt(x^2 + ripple^2) - x - k_e g(th) w,          |x| <= limit
+//! k_a(th) dw/dt = x g(th) - offset - load(th) - k_b w - k_a'(th) w^2 / 2 - friction
+//! friction = sign(w) (k_s + (k_t + k_d sign(w)) / (1 + (w / w_s)^2)), and what holds the shaft at standstill
+//! v = u (1 - sag u x) with u late by the delay: a supply of finite resistance, which gives the current u x / (R u_0)
+//! load(th) = load_1c cos th + load_1s sin th + load_2c cos 2 th + load_2s sin 2 th + cogging of up to three orders
+//! g(th) = 1 + torque_ripple_c cos n th + torque_ripple_s sin n th
 //! k_a(th) = k_a + inertia_2c cos 2 th + inertia_2s sin 2 th
 //! ```
+//!
+//! An encoder that runs out of true shows `w (1 + eccentric_c cos th + eccentric_s sin th)`.
+//!
 //!
 //! With a resistance R \[command/A\], a motor constant K and G volts per unit of command, `k_e = K/G`,
 //! `k_a = J R/K`, `k_b = B R/K`, `k_s = T R/K`. Derivatives are carried along with the values, as dual numbers
@@ -26,7 +31,7 @@ use crate::simd::{self, F64x8, Kernel};
 use crate::{Error, Monitor, Result};
 
 /// Names of the parameters, in their order.
-pub const PARAMETERS: [&str; 18] = [
+pub const PARAMETERS: [&str; 30] = [
     "k_e",
     "k_b",
     "k_a",
@@ -45,10 +50,38 @@ pub const PARAMETERS: [&str; 18] = [
     "inertia_2s",
     "delay",
     "limit",
+    "k_d",
+    "sag",
+    "eccentric_c",
+    "eccentric_s",
+    "cogging_1c",
+    "cogging_1s",
+    "cogging_2c",
+    "cogging_2s",
+    "cogging_3c",
+    "cogging_3s",
+    "torque_ripple_c",
+    "torque_ripple_s",
 ];
 
+/// Loads and inertia once and twice per turn.
 const FIRST_OVER_THE_TURN: usize = 10;
 const LAST_OVER_THE_TURN: usize = 15;
+const DELAY: usize = 16;
+const LIMIT: usize = 17;
+const UNEVEN: usize = 18;
+const SAG: usize = 19;
+const ECCENTRIC: usize = 20;
+/// The first of two coefficients for each order in [`Run::orders`].
+const WAVES: usize = 22;
+
+/// Orders of cogging, and that of the torque ripple.
+pub const ORDERS: usize = 4;
+
+/// Whether a parameter belongs to something that varies over the turn.
+fn varies(place: usize) -> bool {
+    (FIRST_OVER_THE_TURN..=LAST_OVER_THE_TURN).contains(&place) || place >= ECCENTRIC
+}
 
 /// Newton's steps for the voltage drop at most; the function is monotone and its start is the value before.
 const NEWTON: usize = 3;
@@ -133,6 +166,8 @@ pub struct Run<'a> {
     pub mean: bool,
     /// Shaft angle at the samples \[rad\]; integrated from zero where it is not known.
     pub angle: Option<&'a [f64]>,
+    /// How often per turn cogging repeats, and the torque ripple; 0 for none.
+    pub orders: [u32; ORDERS],
 }
 
 /// What a motor did.
@@ -162,7 +197,8 @@ pub fn run(task: Run<'_>, u: &[f64], monitor: &Monitor) -> Result<Found> {
         5..=8 => simd::run(Carried::<8>(task, u, monitor)),
         9..=12 => simd::run(Carried::<12>(task, u, monitor)),
         13..=16 => simd::run(Carried::<16>(task, u, monitor)),
-        _ => simd::run(Carried::<20>(task, u, monitor)),
+        17..=20 => simd::run(Carried::<20>(task, u, monitor)),
+        _ => simd::run(Carried::<32>(task, u, monitor)),
     };
     if monitor.stopped() {
         return Err(Error::fit(
@@ -205,11 +241,17 @@ fn check(task: &Run<'_>, u: &[f64]) -> Result<()> {
             task.free.len()
         )));
     }
-    let varies = |j: &usize| (FIRST_OVER_THE_TURN..=LAST_OVER_THE_TURN).contains(j);
-    if task.angle.is_none() && task.free.iter().any(varies) {
+    if task.angle.is_none() && task.free.iter().any(|&j| varies(j)) {
         return Err(Error::setting(
             "expected the shaft's angle for derivatives by what varies over the turn, got none; pass angle",
         ));
+    }
+    let order = |j: usize| j >= WAVES && task.orders[(j - WAVES) / 2] == 0;
+    if let Some(&j) = task.free.iter().find(|&&j| order(j)) {
+        return Err(Error::setting(format!(
+            "expected in orders how often {} repeats per turn, got 0",
+            PARAMETERS[j]
+        )));
     }
     if !(task.sample_time.is_finite()
         && task.sample_time > 0.0
@@ -220,10 +262,10 @@ fn check(task: &Run<'_>, u: &[f64]) -> Result<()> {
             task.sample_time, task.steps
         )));
     }
-    if task.theta[16] / task.sample_time >= 1e9 {
+    if task.theta[DELAY] / task.sample_time >= 1e9 {
         return Err(Error::setting(format!(
             "expected a delay below a billion samples, got {} s",
-            task.theta[16]
+            task.theta[DELAY]
         )));
     }
     if !task.speed.is_finite() || u.iter().any(|u| !u.is_finite()) {
@@ -257,6 +299,11 @@ struct Equations<const N: usize> {
     per_w_s: Dual<N>,
     turn: [Dual<N>; LAST_OVER_THE_TURN - FIRST_OVER_THE_TURN + 1],
     limit: Option<Dual<N>>,
+    /// Terms that few motors need: where they are none, they cost nothing.
+    uneven: Option<Dual<N>>,
+    sag: Option<Dual<N>>,
+    eccentric: Option<[Dual<N>; 2]>,
+    waves: [Option<Wave<N>>; ORDERS],
     /// What of its way the drive goes in a step, `1 - exp(-h / tau)`.
     share: Dual<N>,
     /// What of the start remains in its mean over a step.
@@ -268,12 +315,37 @@ struct Equations<const N: usize> {
     step: f64,
 }
 
+/// `c cos(order th) + s sin(order th)`.
+#[derive(Clone, Copy, Debug)]
+struct Wave<const N: usize> {
+    order: f64,
+    c: Dual<N>,
+    s: Dual<N>,
+}
+
+impl<const N: usize> Wave<N> {
+    /// Its mean while the shaft turns by `turned` about `angle`: what repeats several times in a sample cancels.
+    #[inline(always)]
+    fn mean(&self, angle: f64, turned: f64) -> Dual<N> {
+        let (s, c) = (self.order * angle).sin_cos();
+        let half = 0.5 * self.order * turned;
+        let share = if half.abs() > 1e-4 {
+            half.sin() / half
+        } else {
+            1.0
+        };
+        self.c.scaled(share * c).plus(share * s, &self.s)
+    }
+}
+
 /// What depends on the angle.
 #[derive(Clone, Copy, Debug)]
 struct Turn<const N: usize> {
     per_inertia: Dual<N>,
     half_slope: Dual<N>,
     load: Dual<N>,
+    /// Torque per current, and back-EMF per speed, over their means.
+    gain: Option<Dual<N>>,
 }
 
 impl<const N: usize> Equations<N> {
@@ -285,6 +357,7 @@ impl<const N: usize> Equations<N> {
             }
             dual
         };
+        let some = |j: usize| task.theta[j] != 0.0 || task.free.contains(&j);
         let tau = one(3);
         // a lag far below the step is none; its derivative is nothing then, not infinite
         let lag = tau.scaled(1.0 / step);
@@ -312,7 +385,18 @@ impl<const N: usize> Equations<N> {
             k_t: one(8),
             per_w_s: one(9).inverse(),
             turn: std::array::from_fn(|j| one(FIRST_OVER_THE_TURN + j)),
-            limit: task.theta[17].is_finite().then(|| one(17)),
+            limit: task.theta[LIMIT].is_finite().then(|| one(LIMIT)),
+            uneven: some(UNEVEN).then(|| one(UNEVEN)),
+            sag: some(SAG).then(|| one(SAG)),
+            eccentric: (some(ECCENTRIC) || some(ECCENTRIC + 1))
+                .then(|| [one(ECCENTRIC), one(ECCENTRIC + 1)]),
+            waves: std::array::from_fn(|j| {
+                (task.orders[j] > 0).then(|| Wave {
+                    order: f64::from(task.orders[j]),
+                    c: one(WAVES + 2 * j),
+                    s: one(WAVES + 2 * j + 1),
+                })
+            }),
             share,
             memory,
             bend,
@@ -320,8 +404,9 @@ impl<const N: usize> Equations<N> {
         }
     }
 
+    /// In a sample in which the shaft turns by `turned` about `angle`.
     #[inline(always)]
-    fn at(&self, angle: f64) -> Turn<N> {
+    fn at(&self, angle: f64, turned: f64) -> Turn<N> {
         let (s1, c1) = angle.sin_cos();
         let (s2, c2) = (2.0 * s1 * c1, (c1 - s1) * (c1 + s1));
         let [first_c, first_s, second_c, second_s, c, s] = &self.turn;
@@ -333,30 +418,53 @@ impl<const N: usize> Equations<N> {
         } else {
             Dual::constant(least)
         };
+        let [cogging @ .., ripple] = &self.waves;
+        let load = self
+            .offset
+            .plus(c1, first_c)
+            .plus(s1, first_s)
+            .plus(c2, second_c)
+            .plus(s2, second_s);
         Turn {
             per_inertia: inertia.inverse(),
             half_slope: Dual::ZERO.plus(-s2, c).plus(c2, s),
-            load: self
-                .offset
-                .plus(c1, first_c)
-                .plus(s1, first_s)
-                .plus(c2, second_c)
-                .plus(s2, second_s),
+            load: cogging
+                .iter()
+                .flatten()
+                .fold(load, |load, wave| load.plus(1.0, &wave.mean(angle, turned))),
+            gain: ripple.map(|wave| Dual::constant(1.0).plus(1.0, &wave.mean(angle, turned))),
         }
     }
 
-    /// Dry friction without its sign.
+    /// What an encoder shows of a speed at an angle.
     #[inline(always)]
-    fn dry(&self, speed: &Dual<N>) -> Dual<N> {
-        if self.k_t.value == 0.0 && self.k_t.by == [0.0; N] {
+    fn seen(&self, speed: Dual<N>, angle: f64) -> Dual<N> {
+        match &self.eccentric {
+            Some([c, s]) => {
+                let (sin, cos) = angle.sin_cos();
+                let factor = Dual::constant(1.0).plus(cos, c).plus(sin, s);
+                speed.times(&factor)
+            }
+            None => speed,
+        }
+    }
+
+    /// Dry friction without its sign, against a motion in this direction.
+    #[inline(always)]
+    fn dry(&self, speed: &Dual<N>, direction: f64) -> Dual<N> {
+        if self.k_t.value == 0.0 && self.k_t.by == [0.0; N] && self.uneven.is_none() {
             return self.k_s;
         }
+        let bump = match &self.uneven {
+            Some(k_d) => self.k_t.plus(direction, k_d),
+            None => self.k_t,
+        };
         let ratio = speed.times(&self.per_w_s);
         let shape = ratio
             .times(&ratio)
             .plus(1.0, &Dual::constant(1.0))
             .inverse();
-        self.k_s.plus(1.0, &self.k_t.times(&shape))
+        self.k_s.plus(1.0, &bump.times(&shape))
     }
 
     /// The speed after `time` under a drive, with what depends on the speed taken at `middle`.
@@ -372,12 +480,16 @@ impl<const N: usize> Equations<N> {
         middle: &Dual<N>,
         time: f64,
     ) -> Dual<N> {
-        let smooth = drive
+        let torque = turn.gain.map_or(*drive, |gain| drive.times(&gain));
+        let smooth = torque
             .plus(-1.0, &turn.load)
             .plus(-1.0, &self.k_b.times(middle))
             .plus(-1.0, &turn.half_slope.times(&middle.times(middle)));
         let free = from.plus(time, &smooth.times(&turn.per_inertia));
-        let most = self.dry(middle).times(&turn.per_inertia).scaled(time);
+        let most = self
+            .dry(middle, free.value.signum())
+            .times(&turn.per_inertia)
+            .scaled(time);
         if free.value.abs() <= most.value {
             return Dual::ZERO;
         }
@@ -443,8 +555,13 @@ impl<const N: usize> Equations<N> {
         u: &Dual<N>,
     ) -> (Dual<N>, Dual<N>) {
         let middle = self.moved(turn, w, x, w, 0.5 * self.step);
-        let goal = u.plus(-1.0, &self.k_e.times(&middle));
-        let change = self.k_e.times(&w.plus(-1.0, &middle)).scaled(2.0);
+        let k_e = turn.gain.map_or(self.k_e, |gain| self.k_e.times(&gain));
+        let mut voltage = *u;
+        if let Some(sag) = &self.sag {
+            voltage = voltage.plus(-1.0, &sag.times(x).times(&u.times(u)));
+        }
+        let goal = voltage.plus(-1.0, &k_e.times(&middle));
+        let change = k_e.times(&w.plus(-1.0, &middle)).scaled(2.0);
         let (after, mean) = self.driven(x, &goal, &change);
         (after, self.moved(turn, w, &mean, &middle, self.step))
     }
@@ -470,9 +587,9 @@ impl<const N: usize> Kernel for Carried<'_, N> {
             speed_by: Vec::with_capacity(n * m),
             drive_by: Vec::with_capacity(n * m),
         };
-        let delay = task.theta[16] / task.sample_time;
+        let delay = task.theta[DELAY] / task.sample_time;
         let (whole, part) = (delay.floor() as usize, delay.fract());
-        let late = task.free.iter().position(|&j| j == 16);
+        let late = task.free.iter().position(|&j| j == DELAY);
         let at = |k: usize, back: usize| u[k.saturating_sub(back)];
         let mut w = Dual::<N>::constant(task.speed);
         let mut x = match u.first() {
@@ -489,11 +606,12 @@ impl<const N: usize> Kernel for Carried<'_, N> {
             found.drive.push(x.value);
             found.speed_by.extend_from_slice(&shown.by[..m]);
             found.drive_by.extend_from_slice(&x.by[..m]);
-            let middle = match task.angle {
-                Some(known) => 0.5 * (known[k] + known[(k + 1).min(n - 1)]),
-                None => angle + 0.5 * w.value * task.sample_time,
+            let (from, turned) = match task.angle {
+                Some(known) => (known[k], known[(k + 1).min(n - 1)] - known[k]),
+                None => (angle, w.value * task.sample_time),
             };
-            let turn = is.at(middle);
+            let middle = from + 0.5 * turned;
+            let turn = is.at(middle, turned);
             let (now, before) = (at(k, whole), at(k, whole + 1));
             let mut mean = Dual::ZERO;
             for j in 0..task.steps {
@@ -509,7 +627,11 @@ impl<const N: usize> Kernel for Carried<'_, N> {
             }
             let mean = mean.scaled(1.0 / task.steps as f64);
             angle += mean.value * task.sample_time;
-            shown = if task.mean { mean } else { w };
+            shown = if task.mean {
+                is.seen(mean, middle)
+            } else {
+                is.seen(w, from + turned)
+            };
         }
         found
     }
@@ -524,9 +646,10 @@ mod tests {
     }
     use crate::random::Random;
 
-    const THETA: [f64; 18] = [
+    const THETA: [f64; 30] = [
         0.019, 0.0006, 0.0049, 0.0073, 0.08, 0.06, 0.25, 0.03, 0.12, 9.0, 0.14, -0.06, 0.05, 0.02,
-        2e-4, -1e-4, 0.0013, 6.0,
+        2e-4, -1e-4, 0.0013, 6.0, 0.04, 4e-4, 0.01, -0.02, 0.05, 0.02, -0.03, 0.04, 0.02, 0.03,
+        0.03, -0.02,
     ];
 
     fn commands(n: usize) -> Vec<f64> {
@@ -542,7 +665,7 @@ mod tests {
             .collect()
     }
 
-    fn task<'a>(theta: &'a [f64; 18], free: &'a [usize], angle: Option<&'a [f64]>) -> Run<'a> {
+    fn task<'a>(theta: &'a [f64; 30], free: &'a [usize], angle: Option<&'a [f64]>) -> Run<'a> {
         Run {
             theta,
             free,
@@ -551,6 +674,7 @@ mod tests {
             speed: 20.0,
             mean: true,
             angle,
+            orders: [3, 6, 12, 4],
         }
     }
 
@@ -559,9 +683,9 @@ mod tests {
     fn derivatives_are_those_of_the_values() {
         let u = commands(400);
         let angle: Vec<f64> = (0..400).map(|k| 0.1 * k as f64).collect();
-        let free: Vec<usize> = (0..18).collect();
+        let free: Vec<usize> = (0..30).collect();
         let found = run(task(&THETA, &free, Some(&angle)), &u).unwrap();
-        for j in 0..18 {
+        for j in 0..30 {
             let h = 1e-6 * THETA[j].abs();
             let beside = |sign: f64| {
                 let mut theta = THETA;
@@ -573,8 +697,12 @@ mod tests {
                 (&found.speed_by, [&more.speed, &less.speed]),
                 (&found.drive_by, [&more.drive, &less.drive]),
             ] {
-                let column: Vec<f64> = (0..400).map(|k| by[18 * k + j]).collect();
+                let column: Vec<f64> = (0..400).map(|k| by[30 * k + j]).collect();
                 let scale = column.iter().fold(0.0_f64, |most, d| most.max(d.abs()));
+                if (ECCENTRIC..WAVES).contains(&j) && std::ptr::eq(by, &found.drive_by) {
+                    assert_eq!(scale, 0.0); // the encoder shows it, the motor has none of it
+                    continue;
+                }
                 assert!(scale > 0.0, "{} moves nothing", PARAMETERS[j]);
                 let off = (0..400)
                     .filter(|&k| ((a[k] - b[k]) / (2.0 * h) - column[k]).abs() > 2e-4 * scale)
@@ -586,7 +714,7 @@ mod tests {
 
     #[test]
     fn a_linear_motor_reaches_its_steady_speed_with_its_time_constants() {
-        let mut theta = [0.0; 18];
+        let mut theta = [0.0; 30];
         theta[..6].copy_from_slice(&[0.02, 0.001, 0.004, 0.005, 0.0, 1.0]);
         theta[9] = 1.0;
         theta[17] = f64::INFINITY;
@@ -616,7 +744,7 @@ mod tests {
     #[test]
     fn the_drive_is_that_of_the_sample() {
         for tau in [0.0, 5e-4, 0.02] {
-            let mut theta = [0.0; 18];
+            let mut theta = [0.0; 30];
             theta[..6].copy_from_slice(&[0.02, 0.001, 0.0012, tau, 0.0, 1.0]);
             theta[9] = 1.0;
             theta[17] = f64::INFINITY;
@@ -638,12 +766,51 @@ mod tests {
     fn friction_holds_what_it_can_and_no_more() {
         let mut theta = THETA;
         theta[10..16].fill(0.0);
+        theta[UNEVEN..].fill(0.0);
         let mut of = task(&theta, &[], None);
         of.speed = 0.0;
         let held = run(of, &[0.38; 500]).unwrap(); // below k_s + k_t + offset, drop included
         assert!(held.speed.iter().all(|&w| w == 0.0));
         let moving = run(of, &[0.6; 500]).unwrap();
         assert!(moving.speed[499] > 1.0);
+    }
+
+    /// What repeats several times within a sample cancels: as one sample of many, so many of one.
+    #[test]
+    fn a_wave_acts_by_its_mean_over_a_sample() {
+        let theta = {
+            let mut theta = [0.0; 30];
+            theta[..6].copy_from_slice(&[0.02, 0.0, 0.004, 0.0, 0.0, 1.0]);
+            (theta[9], theta[LIMIT]) = (1.0, f64::INFINITY);
+            (theta[WAVES], theta[WAVES + 1]) = (0.3, -0.2);
+            theta
+        };
+        let after = |samples: usize| {
+            let (speed, ts) = (200.0, 0.004 / samples as f64);
+            let angle: Vec<f64> = (0..=samples).map(|k| 0.3 + speed * ts * k as f64).collect();
+            let mut of = task(&theta, &[], Some(&angle));
+            (of.orders, of.mean, of.speed) = ([12, 0, 0, 0], false, speed);
+            (of.sample_time, of.steps) = (ts, 1 + 64 / samples);
+            // the command that holds the speed, so that only the wave changes it
+            run(of, &vec![4.0; samples + 1]).unwrap().speed[samples]
+        };
+        let (once, often) = (after(1) - 200.0, after(64) - 200.0);
+        assert!(once.abs() > 1e-3, "{once}");
+        assert!((once - often).abs() < 0.02 * once.abs(), "{once} {often}");
+    }
+
+    #[test]
+    fn an_order_of_none_is_no_wave() {
+        let (u, angle) = (commands(50), vec![0.4; 50]);
+        let mut of = task(&THETA, &[WAVES], Some(&angle));
+        of.orders = [0; ORDERS];
+        assert!(run(of, &u).unwrap_err().message.contains("orders"));
+        of.free = &[];
+        let mut none = THETA;
+        none[WAVES..].fill(0.0);
+        let mut even = of;
+        even.theta = &none;
+        assert_eq!(run(of, &u).unwrap(), run(even, &u).unwrap());
     }
 
     #[test]
@@ -663,9 +830,9 @@ mod tests {
     fn the_width_of_the_derivatives_changes_no_value() {
         let u = commands(200);
         let angle = vec![0.4; 200];
-        let free: Vec<usize> = (0..18).collect();
+        let free: Vec<usize> = (0..30).collect();
         let plain = run(task(&THETA, &[], Some(&angle)), &u).unwrap();
-        for count in [3, 7, 11, 15, 18] {
+        for count in [3, 7, 11, 15, 18, 30] {
             let found = run(task(&THETA, &free[..count], Some(&angle)), &u).unwrap();
             assert_eq!(found.speed, plain.speed);
             assert_eq!(found.drive, plain.drive);
@@ -675,7 +842,7 @@ mod tests {
     #[test]
     fn what_cannot_be_simulated_is_refused() {
         let u = commands(10);
-        let refused = |change: &dyn Fn(&mut [f64; 18])| {
+        let refused = |change: &dyn Fn(&mut [f64; 30])| {
             let mut theta = THETA;
             change(&mut theta);
             run(task(&theta, &[], None), &u).unwrap_err().message

@@ -4,7 +4,7 @@ use numpy::{PyArray1, PyArray2, PyReadonlyArray1};
 use pyo3::prelude::*;
 use sewfast_control::{Listening, TRACKED, Tracker as Core};
 use sewfast_core::Error;
-use sewfast_core::greybox::{self, Current, Measured, PARAMETERS, Run};
+use sewfast_core::greybox::{self, Current, Measured, ORDERS, PARAMETERS, Run};
 
 use crate::arrays::{array1, array2, raise, slice};
 use crate::watch::watched_over;
@@ -25,7 +25,7 @@ type Found<'py> = (
 );
 
 #[pyfunction]
-#[pyo3(signature = (theta, free, u, *, Ts, steps, speed=0.0, mean=false, angle=None))]
+#[pyo3(signature = (theta, free, u, *, Ts, steps, speed=0.0, mean=false, angle=None, orders=[0; ORDERS]))]
 #[allow(non_snake_case, clippy::too_many_arguments)]
 fn greybox_run<'py>(
     py: Python<'py>,
@@ -37,6 +37,7 @@ fn greybox_run<'py>(
     speed: f64,
     mean: bool,
     angle: Option<PyReadonlyArray1<'py, f64>>,
+    orders: [u32; ORDERS],
 ) -> PyResult<Found<'py>> {
     let u = slice(&u, "u")?;
     let angle = angle.as_ref().map(|a| slice(a, "angle")).transpose()?;
@@ -50,6 +51,7 @@ fn greybox_run<'py>(
             speed,
             mean,
             angle,
+            orders,
         };
         greybox::run(task, u, monitor)
     })?;
@@ -80,7 +82,7 @@ type Sums<'py> = (f64, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);
 type Amperes<'py> = (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>, f64);
 
 #[pyfunction]
-#[pyo3(signature = (theta, free, u, y, used, *, Ts, steps, filter, speed=0.0, mean=false, angle=None, current=None))]
+#[pyo3(signature = (theta, free, u, y, used, *, Ts, steps, filter, speed=0.0, mean=false, angle=None, orders=[0; ORDERS], current=None))]
 #[allow(non_snake_case, clippy::too_many_arguments)]
 fn greybox_normal<'py>(
     py: Python<'py>,
@@ -95,6 +97,7 @@ fn greybox_normal<'py>(
     speed: f64,
     mean: bool,
     angle: Option<PyReadonlyArray1<'py, f64>>,
+    orders: [u32; ORDERS],
     current: Option<Amperes<'py>>,
 ) -> PyResult<Sums<'py>> {
     let u = slice(&u, "u")?;
@@ -123,6 +126,7 @@ fn greybox_normal<'py>(
             speed,
             mean,
             angle,
+            orders,
         };
         greybox::normal(task, u, measured, monitor)
     })?;

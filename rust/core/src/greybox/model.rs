@@ -10,7 +10,7 @@
 //! the sample that ends, so that it depends on the command `v(k) = u(k - nk)`, `nk` being a sample and the whole samples of
 //! the delay. What depends on the angle of the shaft has no place here: a record of the speed does not say where it begins.
 
-use super::{Dual, Equations, PARAMETERS, Run, Turn, check};
+use super::{DELAY, Dual, Equations, ORDERS, PARAMETERS, Run, Turn, check, varies};
 use crate::closed_loop::Plant;
 use crate::embedded::Embedded;
 use crate::lagged::finite;
@@ -30,7 +30,6 @@ pub const MOST_UNITS: usize = 6;
 /// What an initial state costs beside a squared error, in its distance from what the first outputs say.
 const PRIOR: f64 = 1e-2;
 const STATE_STEPS: usize = 20;
-const DELAY: usize = 16;
 
 /// What a grey box is beside its free parameters.
 #[derive(Clone, Debug, PartialEq)]
@@ -108,11 +107,11 @@ impl GreyBox {
         let network = network.as_chunks::<WEIGHTS>().0.to_vec();
         let made = Self { frame, network };
         check(&made.run(), &[])?;
-        let turns = made.frame.values[10..16].iter().any(|v| *v != 0.0);
-        if turns || made.frame.free.iter().any(|j| (10..=16).contains(j)) {
+        let turns = (0..PARAMETERS.len()).any(|j| varies(j) && made.frame.values[j] != 0.0);
+        if turns || made.frame.free.iter().any(|&j| varies(j) || j == DELAY) {
             return Err(Error::setting(
-                "expected a motor without loads over the turn and with a fixed delay, got others; leave load_1, load_2 and \
-                 inertia_2 out",
+                "expected a motor without loads over the turn and with a fixed delay, got others; leave load_1, load_2, \
+                 inertia_2, cogging, torque_ripple and eccentricity out",
             ));
         }
         Ok(made)
@@ -148,6 +147,7 @@ impl GreyBox {
             speed: 0.0,
             mean: frame.mean,
             angle: None,
+            orders: [0; ORDERS],
         }
     }
 
@@ -261,7 +261,7 @@ impl<const N: usize> Stepper<N> {
             dual
         };
         Self {
-            turn: equations.at(0.0),
+            turn: equations.at(0.0, 0.0),
             equations,
             network: model
                 .network

@@ -169,6 +169,7 @@ mod tests {
             speed: 0.0,
             mean: true,
             angle: None,
+            orders: [0; crate::greybox::ORDERS],
         }
     }
 

@@ -2,7 +2,7 @@ use super::*;
 use crate::random::Random;
 
 fn frame(delay: f64) -> Frame {
-    let mut values = [0.0; 18];
+    let mut values = [0.0; PARAMETERS.len()];
     values[..10].copy_from_slice(&[0.02, 1e-3, 0.004, 0.006, 0.06, 0.2, 0.25, 0.05, 0.1, 9.0]);
     values[DELAY] = delay;
     values[17] = f64::INFINITY;
