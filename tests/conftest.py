@@ -35,10 +35,22 @@ hypothesis.settings.load_profile("untimed")
 
 ALONE = re.compile(
     r"test_(link|live|device|virtual_device|doctor|drive_runs|host_loop|keeping|locks|soak|two_hosts"
-    r"|watchdog|deaf_host|recordfile_kill|commissioning_process|studio_drive|firmware|emulated"
-    r"|choice|cli)"
+    r"|watchdog|deaf_host|recordfile_kill|studio_drive|firmware|emulated)"
 )
-"""Files whose tests wait for processes and ports, or bind to a time budget: marked `alone`."""
+"""Files whose tests wait for processes and ports: marked `alone`."""
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave a file unread where `-m` can choose nothing in it: every worker reads them all."""
+    if not collection_path.name.startswith("test_") or collection_path.suffix != ".py":
+        return None
+    waits = ALONE.match(collection_path.name) is not None
+    if config.option.markexpr == "not alone":
+        return waits or None
+    if config.option.markexpr == "alone":
+        some = waits or "mark.alone" in collection_path.read_text(encoding="utf-8")
+        return None if some else True
+    return None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -123,30 +123,6 @@ def test_tuning_by_keyboard(tuned: Studio, browser: Any) -> None:
 
 
 @pytest.mark.alone
-def test_from_the_demo_to_a_verified_controller(tuned: Studio, browser: Any) -> None:
-    def at(name: str) -> Any:
-        return browser.find_element("id", name)
-
-    browser.get(tuned.address)
-    until(lambda: browser.execute_script(NUMBER, "Ms"))
-    at("view-commission").click()
-    for name, value in (("machine-seed", "1"), ("networks", "1"), ("commission-tries", "100")):
-        at(name).clear()
-        at(name).send_keys(value)
-    at("commission-start").click()
-    until(lambda: "verified" in at("commission-verdict").text, 300)
-    stages = at("stages").text
-    assert stages.startswith("first motion")
-    assert "verification" in stages
-    assert len(browser.find_elements("css selector", "#loops canvas")) == 4
-    if "STUDIO_PICTURES" in os.environ:
-        _take_pictures(browser, Path(os.environ["STUDIO_PICTURES"]), "commission", (1200,))
-    browser.set_window_size(600, 900)
-    assert browser.execute_script(WIDE) <= 0
-    assert browser.get_log("browser") == []
-
-
-@pytest.mark.alone
 def test_a_loop_that_diverges_leaves_no_old_curve(
     tuned: Studio, browser: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -293,6 +269,14 @@ def test_the_whole_way_by_keyboard(studio: Studio, browser: Any) -> None:
     keys.write("commission-tries", "100")
     keys.press("commission-start")
     until(lambda: "verified" in text("commission-verdict"), 300.0)
+    assert text("stages").startswith("first motion")
+    assert "verification" in text("stages")
+    assert len(browser.find_elements("css selector", "#loops canvas")) == 4
+    if "STUDIO_PICTURES" in os.environ:
+        _take_pictures(browser, Path(os.environ["STUDIO_PICTURES"]), "commission", (1200,))
+    browser.set_window_size(600, 900)
+    assert browser.execute_script(WIDE) <= 0
+    browser.set_window_size(1200, 900)
     keys.press("report")
     until(lambda: browser.find_element("id", "report-link").is_displayed(), 300.0)
     keys.press("report-link")

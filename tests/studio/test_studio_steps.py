@@ -15,6 +15,7 @@ import pytest
 
 import sewfast
 from cli import environment
+from commissioned import SMALL, short
 from moments import until
 from sewfast.frequency import load_response
 from sewfast.studio import Commission, Project, Step, Studio
@@ -447,17 +448,16 @@ def test_a_csv_without_times_is_read_with_its_sample_time(folder: Path) -> None:
     assert "--ts=0.001" in found["commands"]
 
 
-@pytest.mark.alone
 def test_a_report_is_made_and_served_in_a_sandbox(tuned: Studio) -> None:
     import http.client
 
     pytest.importorskip("matplotlib")
-    brief = {"machine": "virtual:1", "seed": 0, "members": 1, "evaluations": 100}
     place = tuned.project.folder / "commissioned" / "report.html"
     with Page(tuned) as page:
         assert "commission a machine first" in page.ask("report")["error"]
-        page.ask("commission", **brief)
-        page.hear(lambda m: m.get("event") == "commissioned", 300)
+        with short():
+            sewfast.commission(sewfast.VirtualMachine(1), **SMALL).save(place.parent)
+        place.unlink()
         page.ask("report")
         found = page.hear(lambda m: m.get("event") == "reported", 300)["found"]
 
