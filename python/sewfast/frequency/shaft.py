@@ -14,7 +14,7 @@ the encoder counts it; the fit compares that, exactly, by partial fractions.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -42,6 +42,9 @@ FLOOR = 0.005
 which would else outweigh a resonance that is seen less well."""
 STARTS = 6
 """Frequencies, evenly in their logarithm, at which a resonance is looked for beside the peaks."""
+LIFTED = 50.0
+"""Squared errors over their mean, in as many lines as a shaft needs, from which a second one is
+looked for there; noise makes 16 of it, give or take 6."""
 DAMPED = 0.5
 """Damping ratio from which two poles are no resonance."""
 RATIOS = (0.03, 30.0)
@@ -218,7 +221,7 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
             )  # fmt: skip
         if shaft is not None and (resonance or _is_better(task, shaft[0], rigid[0])):
             best = shaft
-            found = [_solved(task, x) for x in _shaft_starts(task, shaft[1], few=True)]
+            found = [_solved(task, x) for x in _second_starts(task, shaft)]
             second = min((s for s in found if _is_shaft(s[1], f)), key=lambda s: s[0], default=None)
             if second is not None and _is_better(task, second[0], shaft[0]):
                 best = second
@@ -376,21 +379,40 @@ def _rigid_starts(task: _Task) -> list[FloatArray]:
     ]
 
 
-def _shaft_starts(task: _Task, rigid: FloatArray, *, few: bool = False) -> list[FloatArray]:
-    """Where the response rises most above that of a fit, and unless `few` a few places more."""
+def _shaft_starts(task: _Task, rigid: FloatArray) -> list[FloatArray]:
+    """Where the response rises most above the rigid machine's, and a few places more."""
     f = task.hertz
     ratio = np.abs(task.value) / np.abs(_sampled(rigid, f, task.Ts, task.counted))
     inner = np.flatnonzero((ratio[1:-1] >= ratio[:-2]) & (ratio[1:-1] >= ratio[2:])) + 1
     peaks = inner[np.argsort(-ratio[inner])][:4]
-    spread = np.geomspace(max(2.0 * f[0], f[-1] / 60.0), 0.9 * f[-1], STARTS)
-    places = [*f[peaks], *(() if few else spread)]
-    starts = []
+    places = [*f[peaks], *np.geomspace(max(2.0 * f[0], f[-1] / 60.0), 0.9 * f[-1], STARTS)]
+    return _starts_at(task, rigid, ratio, places)
+
+
+def _second_starts(task: _Task, shaft: tuple[float, FloatArray, FloatArray]) -> list[FloatArray]:
+    """Where the response rises above that of one shaft, over as many lines as a shaft needs."""
+    cost, theta, _ = shaft
+    f, fit = task.hertz, _sampled(theta, task.hertz, task.Ts, task.counted)
+    usual = cost / max(2 * len(f) - len(theta), 1)
+    off = np.abs((task.value - fit) / task.sigma) ** 2 / max(usual, 1e-300)
+    unexplained = np.convolve(off, np.ones(SHOWN), "same")
+    ratio = np.abs(task.value) / np.abs(fit)
+    inner = np.flatnonzero((ratio[1:-1] >= ratio[:-2]) & (ratio[1:-1] >= ratio[2:])) + 1
+    inner = inner[unexplained[inner] > LIFTED]
+    return _starts_at(task, theta, ratio, f[inner[np.argsort(-ratio[inner])][:4]])
+
+
+def _starts_at(
+    task: _Task, fit: FloatArray, ratio: FloatArray, places: Iterable[float]
+) -> list[FloatArray]:
+    """The fit and a shaft at each place, its antiresonance at the valley before and beside it."""
+    f, starts = task.hertz, []
     for place in places:
         left = (f > 0.3 * place) & (f < 0.98 * place)
         valley = f[left][ratio[left].argmin()] if left.any() else 0.75 * place
         for antiresonance in (valley, 0.75 * place):
             shaft = np.log([2 * math.pi * place, 0.03, 2 * math.pi * antiresonance, 0.03])
-            starts.append(np.concatenate([rigid, shaft]))
+            starts.append(np.concatenate([fit, shaft]))
     return starts
 
 
