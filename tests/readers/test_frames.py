@@ -320,3 +320,19 @@ def test_levels_of_an_index_that_have_names_are_columns() -> None:
 def test_a_structured_array_is_a_table() -> None:
     fields = np.rec.fromarrays([T, U, U, U], names="t,u,speed,true")
     assert read(fields).Ts == pytest.approx(TS)
+
+
+def test_columns_that_show_what_they_are_need_no_names() -> None:
+    pandas = pytest.importorskip("pandas")
+    k = np.arange(200)
+    table = pandas.DataFrame(
+        {"time_ms": 2.0 * k, "speed [rpm]": k % 7, "voltage [V]": k % 5, "status": 0.0 * k}
+    )
+    data = sewfast.read(table)
+    assert (data.input_names, data.output_name) == (("voltage",), "speed")
+    assert (data.Ts, data.input_units, data.output_unit) == (0.002, ("V",), "rpm")
+    np.testing.assert_array_equal(data.experiments[0].y, k % 7)
+    with refuses(DataError, expected="which is the input", received="a, b", remedy="name both"):
+        sewfast.read(pandas.DataFrame({"a": k % 3, "b": k % 5}), Ts=0.1)
+    with refuses(SettingError):  # one of two is no doubt to settle
+        sewfast.read(table, output="speed")

@@ -16,11 +16,11 @@ import numpy as np
 
 from ..control.controller import Controller
 from ..dataset import Dataset
-from ..errors import DataError, SettingError, SewfastError, printable
+from ..errors import SettingError, SewfastError, printable
 from ..evidence import Residuals, estimate
 from ..identification import identify
 from ..models import Model
-from ..readers import left_out, read, read_table, roles
+from ..readers import read, read_table
 from ..validation import validate
 from .table import Row
 
@@ -219,13 +219,7 @@ def _read(job: Job) -> Dataset:
     table = read_table(job.path)
     if job.inputs:
         return read(table, inputs=job.inputs, output=job.output, Ts=job.Ts)
-    found = roles(table)
-    if found is None:
-        raise DataError(
-            name=str(table.path), expected="columns that show which is the input and which the "
-            "output", received=", ".join(table.names), remedy=f"name both{left_out(table)}",
-        )  # fmt: skip
-    return read(table, inputs=found.input, output=found.output, Ts=job.Ts)
+    return read(table, Ts=job.Ts)
 
 
 def _physical(model: Model, data: Dataset) -> dict[str, float]:

@@ -23,6 +23,7 @@ from .delimited import read_delimited
 from .frames import collected, of_arrow, table_of
 from .installed import read_installed
 from .logs import is_log, read_log
+from .roles import recognised
 from .timebase import TOLERANCE, Grid, time_base
 
 LOG = logging.getLogger("sewfast")
@@ -163,7 +164,7 @@ def _bytes(path: Path) -> bytes:
 def read(
     path: Any,
     *,
-    inputs: str | Sequence[str],
+    inputs: str | Sequence[str] | None = None,
     output: str | None = None,
     Ts: float | None = None,
     counts: str | None = None,
@@ -180,8 +181,9 @@ def read(
     path : path or table
         CSV, `.mat`, `.npz`, Parquet or MCAP; a table of pandas, polars, pyarrow or xarray, a
         mapping of name to array, or a `Table`; see `read_table`.
-    inputs : str or sequence of str
-        Column names of the inputs.
+    inputs : str or sequence of str, or None
+        Column names of the inputs. None, without `output` and `counts`: input and output are
+        recognised by their names and units, as on the command line.
     output : str or None
         Column name of the output. None, without `counts`, leaves the output NaN: enough to
         simulate from rest.
@@ -219,7 +221,10 @@ def read(
         If the sample time is missing or settings contradict each other.
     """
     table = path if isinstance(path, Table) else read_table(path)
-    names = (
+    if inputs is None and output is None and counts is None:
+        found = recognised(table)
+        inputs, output = found.input, found.output
+    names: tuple[Any, ...] = (
         (inputs,) if isinstance(inputs, str) or not isinstance(inputs, Iterable) else tuple(inputs)
     )
     for role, one in [*(("inputs", n) for n in names), ("output", output), ("counts", counts)]:

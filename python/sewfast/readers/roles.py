@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..dataset import is_reference
+from ..errors import DataError
 from ..units import SPEEDS, unit_in_name
 from .containers import Table
 from .timebase import time_column
@@ -93,6 +94,23 @@ def roles(table: Table) -> Roles | None:
     if given is None or found is None or given == found:
         return None
     return Roles(given, found)
+
+
+def recognised(table: Table) -> Roles:
+    """Input and output of a table, as `roles`.
+
+    Raises
+    ------
+    DataError
+        Where its names and units leave a doubt.
+    """
+    found = roles(table)
+    if found is None:
+        raise DataError(
+            name=str(table.path), expected="columns that show which is the input and which the "
+            "output", received=", ".join(table.names), remedy=f"name both{left_out(table)}",
+        )  # fmt: skip
+    return found
 
 
 def _moves(table: Table, name: str) -> bool:
