@@ -139,6 +139,19 @@ def test_structure_and_intervals_are_checked(case: Any) -> None:
         physics(case[0], structure=["dcmotor", "cogs"])
 
 
+@pytest.mark.parametrize(
+    "structure",
+    ["cogging", ["cogging", "torque_ripple"], ["lag", "stribeck_difference"], ["sag", "coulomb"]],
+)  # fmt: skip
+def test_any_terms_alone_are_a_fit(case: Any, structure: Any) -> None:
+    recording = sewfast.Recording(
+        case[0].u[:6000], case[0].counts[:6000], case[0].y[:6000], None, 0.001, 4000.0, "part"
+    )
+    motor = physics(recording, structure=structure)
+    assert math.isfinite(motor.rmse)
+    assert "k_v" in {*motor.parameters, *motor.undetermined}
+
+
 def test_the_command_takes_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     machine = VirtualMachine(7)
     recording, _ = recorded(machine, steps(5.0, 0.001, 7))

@@ -152,18 +152,18 @@ def physics(
 
 
 def _terms(structure: str | Sequence[str]) -> tuple[str, ...]:
-    if isinstance(structure, str):
-        if structure not in STRUCTURES:
-            raise SettingError(
-                f"expected structure {', '.join(STRUCTURES)} or a list of terms, received "
-                f"{structure!r}; terms are {', '.join(TERMS)}"
-            )
-        return STRUCTURES[structure]
+    known = ", ".join([*STRUCTURES, *(t for t in TERMS if t not in WAVES[:3])])
+    if isinstance(structure, str) and structure not in STRUCTURES:
+        raise SettingError(
+            f"expected structure {', '.join(STRUCTURES)} or a list of terms, received "
+            f"{structure!r}; terms are {known}"
+        )
     wanted: list[str] = []
-    for t in structure:
+    for t in [structure] if isinstance(structure, str) else structure:
         wanted += STRUCTURES.get(t, (t,))
     for t in wanted:
         if t not in TERMS:
-            known = ", ".join([*STRUCTURES, *TERMS])
             raise SettingError(f"expected terms of {known}, received {t!r}")
+    if "stribeck_difference" in wanted:
+        wanted.append("stribeck")
     return tuple(t for t in TERMS if t in wanted)

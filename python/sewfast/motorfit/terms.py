@@ -100,7 +100,7 @@ def estimated(
     reasons = _too_fast(records, terms)
     terms = tuple(t for t in terms if t not in reasons)
     if "stribeck" in terms and _never_slow(records):
-        terms = tuple(t for t in terms if t != "stribeck")
+        terms = tuple(t for t in terms if t not in ("stribeck", "stribeck_difference"))
         reasons["stribeck"] = "the record is hardly ever slow; add reversals"
     if "offset" in terms and not _turns_both_ways(records):
         terms = tuple(t for t in terms if t != "offset")
@@ -297,10 +297,10 @@ def _shown_terms(
         shown = {t: max(v, explained.get(t, 0.0)) for t, v in wald.items()}
         if "stribeck" in kept and x[names.index("w_s")] > 0.99 * fast:
             shown["stribeck"] = 0.0  # it falls off nowhere: that is Coulomb's friction
-        if "stribeck_difference" in kept:  # it has the shape of the other
+        if "stribeck_difference" in kept:
             if not _parts_sides(task, x[names.index("w_s")]):
                 shown["stribeck_difference"] = 0.0
-            shown["stribeck"] = max(shown["stribeck"], shown["stribeck_difference"])
+            shown["stribeck"] = math.inf  # the difference has its shape, and goes first
         weakest = min(shown, key=lambda t: shown[t] / needed[t], default=None)
         if weakest is None or shown[weakest] >= needed[weakest]:
             break

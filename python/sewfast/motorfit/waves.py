@@ -8,7 +8,9 @@ The fit with all of them decides which are there.
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,10 +118,13 @@ def _moved(task: Task, state: State, candidates: list[tuple[int, str]]) -> Float
         size = 1 << (len(p.u) + sum(map(len, kernels))).bit_length()
         through, electrical = (np.fft.fft(k, size) for k in kernels)
         columns = []
+        emf_of, waves = p.y * state.value("k_e"), _waves(p, task.records.quantum)
+        wave, at = next(waves), 1
         for order, kind in candidates:
-            wave = _wave(p, order, task.records.quantum)
+            while at < order:
+                wave, at = next(waves), at + 1
             if kind == RIPPLE:  # torque per current, and back-EMF, which the current follows late
-                emf = np.fft.fft(wave * p.y * state.value("k_e"), size) * electrical
+                emf = np.fft.fft(wave * emf_of, size) * electrical
                 force = np.fft.fft(wave * drive, size) - emf
             else:
                 force = -np.fft.fft(wave, size)
@@ -129,14 +134,19 @@ def _moved(task: Task, state: State, candidates: list[tuple[int, str]]) -> Float
     return np.concatenate(parts)
 
 
-def _wave(p: Piece, order: int, quantum: float) -> NDArray[np.complex128]:
-    """Its mean over each sample, cosine and sine as one complex number, (N,)."""
+def _waves(p: Piece, quantum: float) -> Iterator[NDArray[np.complex128]]:
+    """Of order 1, 2, .. the mean over each sample, cosine and sine as one complex number, (N,)."""
     turned = np.diff(p.angle, append=p.angle[-1:])
-    share = np.sinc(order * turned / (2.0 * math.pi))
-    wave: NDArray[np.complex128] = share * np.exp(1j * order * (p.angle + 0.5 * turned))
+    once, half = np.exp(1j * (p.angle + 0.5 * turned)), np.exp(0.5j * turned)
     # at a standstill dry friction holds the shaft, whatever the wave
-    wave[(turned == 0.0) & (np.abs(p.y) <= quantum)] = 0.0
-    return wave
+    once[(turned == 0.0) & (np.abs(p.y) <= quantum)] = 0.0
+    within = np.where(turned == 0.0, 1.0, turned)
+    wave, edge = once, half
+    for order in itertools.count(1):
+        # the sine of half the angle over that, 1 for none
+        share = np.where(turned == 0.0, 1.0, 2.0 * edge.imag / (order * within))
+        yield share * wave
+        wave, edge = wave * once, edge * half
 
 
 def _responses(state: State, Ts: float, taps: FloatArray) -> tuple[FloatArray, FloatArray]:
