@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -163,6 +164,8 @@ def require_one_input(model: Model) -> None:
         )  # fmt: skip
 
 
+# the start of a search asks for it, and so does what its references ask for
+@lru_cache(maxsize=8)
 def drive_step(model: Model, u_min: float, u_max: float) -> DriveStep:
     """The step response at the first size and length at which it settles.
 
@@ -241,6 +244,16 @@ def _slowest(fopdt: Fopdt, y: FloatArray, Ts: float) -> float:
         return fopdt.T
     outside = np.flatnonzero(np.abs(y - y[-1]) > 0.05 * abs(y[-1] - y[0]))
     return max(fopdt.T, (int(outside[-1]) + 1) * Ts / 3.0 if len(outside) else 0.0)
+
+
+def moves_on(model: Model, u_min: float, u_max: float) -> bool:
+    """Whether the output moves for as long as a command acts, so that no step settles."""
+    size = u_max if u_max >= -u_min else u_min
+    return (
+        bool(np.isfinite(size))
+        and integrating_pole(model) is not None
+        and _moves_on(model, _STEP_SHARES[0] * size)
+    )
 
 
 def _moves_on(model: Model, size: float) -> bool:

@@ -19,6 +19,7 @@ from ..control.defaults import (
     default_references,
     drive_step,
     filter_length,
+    moves_on,
     rate_step,
     require_one_input,
 )
@@ -172,7 +173,7 @@ def out_of_reach(task: TuningTask) -> str | None:
     """
     (plant, *_), start = task.plants, task.start
     gain = min(gain for gain, _ in task.variations)
-    if not isinstance(plant, Model) or gain >= 1.0:
+    if not isinstance(plant, Model) or gain >= 1.0 or moves_on(plant, start.u_min, start.u_max):
         return None
     try:
         fopdt = drive_step(plant, start.u_min, start.u_max).fopdt
