@@ -48,21 +48,8 @@ def with_waves(task: Task, state: State, terms: tuple[str, ...]) -> State:
     if not candidates:
         return state
     moved = _moved(task, state, candidates)
-    runs = task.simulated(state, [n for n in state.names() if n != "R"])
-    left, slopes = (
-        np.concatenate(parts, axis=-1)
-        for parts in zip(
-            *(
-                (
-                    filtered(p.y - y, p.used, task.speed_filter),
-                    filtered(by.T, p.used, task.speed_filter),
-                )
-                for p, (y, _, by, _) in zip(task.records.pieces, runs, strict=True)
-            ),
-            strict=True,
-        )
-    )
-    basis = np.linalg.qr(slopes.T)[0]
+    left, slopes = _left_over(task, state)
+    basis = np.linalg.qr(slopes)[0]
     moved -= basis @ (basis.T @ moved)
     pairs = moved.T.reshape(len(candidates), 2, -1)
     orders, taken, values = list(state.orders), list[str](), dict[str, float]()
@@ -70,7 +57,8 @@ def with_waves(task: Task, state: State, terms: tuple[str, ...]) -> State:
         grams = pairs @ pairs.transpose(0, 2, 1)
         by = pairs @ left
         sizes = np.einsum("mij,mj->mi", np.linalg.pinv(grams, rcond=1e-8, hermitian=True), by)
-        gains = np.einsum("mi,mi->m", sizes, by) * max(task.records.used, 1) / float(left @ left)
+        variance = max(float(left @ left) / max(task.records.used, 1), 1e-300)
+        gains = np.einsum("mi,mi->m", sizes, by) / variance
         open_ = np.array([any(_is_kind(t, kind) for t in free) for _, kind in candidates])
         best = int(np.argmax(np.where(open_, gains, 0.0)))
         if gains[best] < max(CLEAR, ABOVE_OTHERS * float(np.median(gains))) or not open_[best]:
@@ -89,6 +77,16 @@ def with_waves(task: Task, state: State, terms: tuple[str, ...]) -> State:
         return state
     widened = State(state.theta, state.resistance, state.terms, tuple(orders))
     return widened.having([*state.terms, *taken], **values)
+
+
+def _left_over(task: Task, state: State) -> tuple[FloatArray, FloatArray]:
+    """What the fit leaves of the speeds, (N,), and its derivatives, (N, n), whitened."""
+    left, slopes = [], []
+    runs = task.simulated(state, [n for n in state.names() if n != "R"])
+    for p, (y, _, by, _) in zip(task.records.pieces, runs, strict=True):
+        left.append(filtered(p.y - y, p.used, task.speed_filter))
+        slopes.append(filtered(by.T, p.used, task.speed_filter).T)
+    return np.concatenate(left), np.concatenate(slopes)
 
 
 def _is_kind(term: str, kind: str) -> bool:
