@@ -26,7 +26,7 @@ from ..control.margins import Margins, loop_path, margins, sampled
 from ..errors import FitError, SettingError
 from ..gains import Gains, real
 from ..tables import html_of
-from .response import Complex
+from .response import Complex, FrequencyResponse
 from .shaft import ShaftFit
 
 MS = 1.7
@@ -39,10 +39,14 @@ BESIDE = (0.6, 1.5)
 """Of the first filter's frequency: where a second one begins, which does nothing yet."""
 GRID = 400
 """Frequencies at which the bandwidth is looked for."""
-ROUNDS = 3
-"""Of the search, each from the best of the one before."""
+SPREADS = (0.4, 0.2, 0.1)
+"""Sizes of the simplex in a round of the search, each from the best of the one before."""
+ROUNDS, FURTHER = 2, 1.01
+"""At most, and what a round has to gain in bandwidth for another one."""
 STEPS = 50
 """Of one round, for each number that is searched."""
+SAME = 1e-4
+"""Between the best and the worst point of a simplex, in the logarithm of the bandwidth: its end."""
 OUTSIDE = 30.0
 """Weight of an Ms above the limit, relative to it, against the logarithm of the bandwidth."""
 SLOWEST = 8.0
@@ -196,6 +200,11 @@ class _Task:
     Ms: float
     hertz: FloatArray
     plant: Complex
+    everywhere: FrequencyResponse
+    """Ones on the grid, and then at the measured lines that show the command: for feedback."""
+    lines: Complex
+    circles: FloatArray
+    """What was measured at these lines, and the radius of its 95 % circles."""
     model: tuple[FloatArray, FloatArray]
     quiet: float
 
@@ -209,7 +218,13 @@ class _Task:
         known = per_unit > 0.0 and math.isfinite(reach)
         # a speed is the difference of two roundings of variance 1/12
         quiet = QUIET * reach * math.sqrt(6.0) * per_unit * of.Ts if known else math.inf
-        return cls(fit, like, Ms, hertz, fit.at(hertz), model, quiet)
+        seen = of.coherence > 0.5
+        places = np.concatenate([hertz, of.hertz[seen]])
+        everywhere = replace(of, hertz=places, value=np.ones(len(places), dtype=np.complex128))
+        return cls(
+            fit, like, Ms, hertz, fit.at(hertz), everywhere, of.value[seen], of.radius()[seen],
+            model, quiet,
+        )  # fmt: skip
 
     def controller(self, x: FloatArray) -> Controller:
         """From logarithms of Kp, Ti, Td, the lag, and of filters.
@@ -270,7 +285,10 @@ class _Task:
 
     def bandwidth(self, controller: Controller) -> float:
         """Where |S| first comes to 1/sqrt(2) [Hz]."""
-        S = 1.0 / np.abs(1.0 + self.plant * self._feedback(controller, self.hertz))
+        return self._bandwidth(self._feedback(controller)[0])
+
+    def _bandwidth(self, feedback: Complex) -> float:
+        S = 1.0 / np.abs(1.0 + self.plant * feedback)
         above = np.flatnonzero(S >= HALF)
         if not len(above) or above[0] == 0:
             return float(self.hertz[0 if len(above) else -1])
@@ -278,11 +296,10 @@ class _Task:
         share = math.log(HALF / S[k - 1]) / math.log(S[k] / S[k - 1])
         return float(self.hertz[k - 1] * (self.hertz[k] / self.hertz[k - 1]) ** share)
 
-    def _feedback(self, controller: Controller, hertz: FloatArray) -> Complex:
-        of = replace(
-            self.fit.response, hertz=hertz, value=np.ones(len(hertz), dtype=np.complex128)
-        )  # fmt: skip
-        return of.loop(controller)
+    def _feedback(self, controller: Controller) -> tuple[Complex, Complex]:
+        """On the grid, and at the measured lines that show the command."""
+        found = self.everywhere.loop(controller)
+        return found[: len(self.hertz)], found[len(self.hertz) :]
 
     def merit(self, x: FloatArray) -> float:
         """Logarithm of the bandwidth, less what an Ms beyond the limit costs; -inf if unstable."""
@@ -293,9 +310,10 @@ class _Task:
         found = _core.margins(loop_path(controller), *self.model)
         if not found["stable"]:
             return -math.inf
-        worst = max(float(found["Ms"]), self._measured(controller), self._unmeasured(controller))
+        on_grid, at_lines = self._feedback(controller)
+        worst = max(float(found["Ms"]), self._measured(at_lines), self._unmeasured(on_grid))
         excess = max(0.0, worst / self.Ms - 1.0)
-        bandwidth = self.bandwidth(controller)
+        bandwidth = self._bandwidth(on_grid)
         slow = controller.gains.Ti * 2.0 * math.pi * bandwidth / SLOWEST
         noise = float(found["noise_gain"]) / self.quiet
         return (
@@ -303,26 +321,18 @@ class _Task:
             - max(0.0, math.log(noise) if noise > 0.0 else 0.0)
         )  # fmt: skip
 
-    def _measured(self, controller: Controller) -> float:
+    def _measured(self, feedback: Complex) -> float:
         """The largest sensitivity that the measured lines allow, their 95 % circles included."""
-        of = self.fit.response
-        feedback, seen = self._feedback(controller, of.hertz), of.coherence > 0.5
-        distance = np.abs(1.0 + of.value * feedback) - of.radius() * np.abs(feedback)
-        return float(1.0 / np.maximum(distance[seen], 1e-6).min())
+        distance = np.abs(1.0 + self.lines * feedback) - self.circles * np.abs(feedback)
+        return float(1.0 / np.maximum(distance, 1e-6).min())
 
-    def _unmeasured(self, controller: Controller) -> float:
+    def _unmeasured(self, feedback: Complex) -> float:
         """The largest sensitivity above the measured lines, by the loop's gain alone."""
-        above = self.hertz > self.response_ends
+        above = self.hertz > self.everywhere.hertz[-1]
         if not above.any():
             return 1.0
-        gain = np.abs(self.plant[above] * self._feedback(controller, self.hertz[above]))
-        return float(1.0 / (1.0 - min(BLIND * float(gain.max()), 0.999)))
-
-    @property
-    def response_ends(self) -> float:
-        """The highest frequency of which the output shows the command [Hz]."""
-        of = self.fit.response
-        return float(of.hertz[of.coherence > 0.5].max())
+        gain = float(np.abs(self.plant * feedback)[above].max())
+        return float(1.0 / (1.0 - min(BLIND * gain, 0.999)))
 
 
 def _within(value: float, low: float, high: float) -> float:
@@ -342,12 +352,15 @@ def _best(task: _Task, starts: list[FloatArray]) -> Point:
     """The best of a simplex search from each start, begun again at its end."""
     found = (-math.inf, starts[0])
     for start in starts:
-        x, spread = start, 0.4
-        for _ in range(ROUNDS):
-            merit, x = simplex(task.merit, x, spread, STEPS * len(x))
-            spread *= 0.5
-            if merit > found[0]:
-                found = (merit, x)
+        x, merit, before = start, -math.inf, -math.inf
+        for k in range(ROUNDS * len(SPREADS)):
+            if k % len(SPREADS) == 0:
+                if k and not merit - before > math.log(FURTHER):
+                    break
+                before = merit
+            merit, x = simplex(task.merit, x, SPREADS[k % len(SPREADS)], STEPS * len(x))
+        if merit > found[0]:
+            found = (merit, x)
     within = found[0] > -math.inf and _core.margins(
         loop_path(task.controller(found[1])), *task.model
     )["Ms"] <= task.Ms * (1.0 + 1e-2)
@@ -364,6 +377,8 @@ def simplex(
     for _ in range(steps):
         order = np.argsort(values, kind="stable")[::-1]
         points, values = [points[i] for i in order], [values[i] for i in order]
+        if values[0] - values[-1] < SAME:
+            break
         middle = np.mean(points[:-1], axis=0)
         away = middle - points[-1]
         tried = middle + away
