@@ -165,23 +165,28 @@ def _filtered(task: _Task, plain: Point) -> Point:
     levelled = np.log(task.fit.notch().numbers)
     starts = [plain[1], *task.starts(1)]
     notch = _best(task, [np.concatenate([x, levelled]) for x in starts])
-    gains, (f, depth, width) = notch[1][:4], np.exp(notch[1][4:])
+    gains, own = notch[1][:4], np.exp(notch[1][4:])
     # the same notch, and the inverse of the shaft
-    same = np.log([f, 0.5 * depth * width, f, 0.5 * width])
+    same = _freed(*own)
     inverse = np.log([
         p["resonance_hertz"], 2.0 * p["resonance_damping"], p["antiresonance_hertz"], INVERSE,
     ])  # fmt: skip
     one = _best(task, [np.concatenate([gains, x]) for x in (same, inverse)])
-    idle = [np.log([f * beside, 0.7, f * beside, 0.7]) for beside in BESIDE]
+    more = [np.log([own[0] * beside, 0.7, own[0] * beside, 0.7]) for beside in BESIDE]
     if task.fit.resonances > 1:
-        f, depth, width = task.fit.notch(2).numbers
-        idle.append(np.log([f, 0.5 * depth * width, f, 0.5 * width]))
-    two = _best(task, [np.concatenate([one[1], x]) for x in idle])
+        more.append(_freed(*task.fit.notch(2).numbers))
+    two = _best(task, [np.concatenate([one[1], x]) for x in more])
     best = plain
     for found in (notch, one, two):
         if found[0] - best[0] > math.log(WORTH):
             best = found
     return best
+
+
+def _freed(frequency: float, depth: float, width: float) -> FloatArray:
+    """A notch as a biquad of free zeros and poles, in logarithms."""
+    found: FloatArray = np.log([frequency, 0.5 * depth * width, frequency, 0.5 * width])
+    return found
 
 
 def _proposal(task: _Task, x: FloatArray) -> Proposal:
@@ -352,13 +357,13 @@ def _best(task: _Task, starts: list[FloatArray]) -> Point:
     """The best of a simplex search from each start, begun again at its end."""
     found = (-math.inf, starts[0])
     for start in starts:
-        x, merit, before = start, -math.inf, -math.inf
-        for k in range(ROUNDS * len(SPREADS)):
-            if k % len(SPREADS) == 0:
-                if k and not merit - before > math.log(FURTHER):
-                    break
-                before = merit
-            merit, x = simplex(task.merit, x, SPREADS[k % len(SPREADS)], STEPS * len(x))
+        x, merit = start, -math.inf
+        for _ in range(ROUNDS):
+            before = merit
+            for spread in SPREADS:
+                merit, x = simplex(task.merit, x, spread, STEPS * len(x))
+            if not merit - before > math.log(FURTHER):
+                break
         if merit > found[0]:
             found = (merit, x)
     within = found[0] > -math.inf and _core.margins(

@@ -20,6 +20,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import FloatArray
 from ..control.biquad import Biquad
@@ -212,8 +213,7 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
     rigid = min((_solved(task, x) for x in _rigid_starts(task)), key=lambda s: s[0])
     best, beyond = rigid, None
     if resonance is not False:
-        found = [_solved(task, x) for x in _shaft_starts(task, rigid[1])]
-        shaft = min((s for s in found if _is_shaft(s[1], f)), key=lambda s: s[0], default=None)
+        shaft = _best_shaft(task, _shaft_starts(task, rigid[1]))
         if shaft is None and resonance:
             raise FitError(
                 name="resonance", expected="one within the measured frequencies", received="none",
@@ -221,8 +221,7 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
             )  # fmt: skip
         if shaft is not None and (resonance or _is_better(task, shaft[0], rigid[0])):
             best = shaft
-            found = [_solved(task, x) for x in _second_starts(task, shaft)]
-            second = min((s for s in found if _is_shaft(s[1], f)), key=lambda s: s[0], default=None)
+            second = _best_shaft(task, _second_starts(task, shaft))
             if second is not None and _is_better(task, second[0], shaft[0]):
                 best = second
         elif best is rigid:
@@ -383,9 +382,10 @@ def _shaft_starts(task: _Task, rigid: FloatArray) -> list[FloatArray]:
     """Where the response rises most above the rigid machine's, and a few places more."""
     f = task.hertz
     ratio = np.abs(task.value) / np.abs(_sampled(rigid, f, task.Ts, task.counted))
-    inner = np.flatnonzero((ratio[1:-1] >= ratio[:-2]) & (ratio[1:-1] >= ratio[2:])) + 1
-    peaks = inner[np.argsort(-ratio[inner])][:4]
-    places = [*f[peaks], *np.geomspace(max(2.0 * f[0], f[-1] / 60.0), 0.9 * f[-1], STARTS)]
+    places = [
+        *f[_peaks(ratio)[:4]],
+        *np.geomspace(max(2.0 * f[0], f[-1] / 60.0), 0.9 * f[-1], STARTS),
+    ]
     return _starts_at(task, rigid, ratio, places)
 
 
@@ -397,9 +397,15 @@ def _second_starts(task: _Task, shaft: tuple[float, FloatArray, FloatArray]) -> 
     off = np.abs((task.value - fit) / task.sigma) ** 2 / max(usual, 1e-300)
     unexplained = np.convolve(off, np.ones(SHOWN), "same")
     ratio = np.abs(task.value) / np.abs(fit)
+    peaks = _peaks(ratio)
+    return _starts_at(task, theta, ratio, f[peaks[unexplained[peaks] > LIFTED][:4]])
+
+
+def _peaks(ratio: FloatArray) -> NDArray[np.intp]:
+    """Places of the local maxima, the largest first."""
     inner = np.flatnonzero((ratio[1:-1] >= ratio[:-2]) & (ratio[1:-1] >= ratio[2:])) + 1
-    inner = inner[unexplained[inner] > LIFTED]
-    return _starts_at(task, theta, ratio, f[inner[np.argsort(-ratio[inner])][:4]])
+    found: NDArray[np.intp] = inner[np.argsort(-ratio[inner])]
+    return found
 
 
 def _starts_at(
@@ -432,6 +438,14 @@ def _beyond(task: _Task, rigid: tuple[float, FloatArray, FloatArray]) -> float |
         if above and inertias and max(zr, za) < DAMPED and _is_better(task, cost, rigid[0]):
             found.append((cost, float(wr / (2.0 * math.pi))))
     return min(found, default=(0.0, None))[1]
+
+
+def _best_shaft(
+    task: _Task, starts: list[FloatArray]
+) -> tuple[float, FloatArray, FloatArray] | None:
+    """The best fit from these starts that can be of shafts; None where there is none."""
+    found = [s for s in (_solved(task, x) for x in starts) if _is_shaft(s[1], task.hertz)]
+    return min(found, key=lambda s: s[0], default=None)
 
 
 def _is_shaft(theta: FloatArray, f: FloatArray) -> bool:

@@ -146,8 +146,7 @@ def physics(
     ):
         raise SettingError(f"expected volts per unit of command above 0, received {volts!r}")
     records = records_of(data, current, speed_unit)
-    usual = structure == "dcmotor" or "dcmotor" in structure
-    found = estimated(records, terms, if_clear=OPTIONAL if usual else ())
+    found = estimated(records, terms, if_clear=OPTIONAL if "dcmotor" in structure else ())
     return motor_of(found, volts, profile=intervals == "profile")
 
 

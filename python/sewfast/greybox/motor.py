@@ -179,9 +179,9 @@ class Motor:
         constant = of["k_e"] * volts  # V s/rad, which is N m/A
         torque = constant * volts / ohms  # N m per unit of command
         drop, pwm, bus = of["drop"] * volts, 1e4, 2000.0
-        first = math.hypot(of["load_1c"], of["load_1s"])
-        second = math.hypot(of["load_2c"], of["load_2s"])
-        wave = math.hypot(of["inertia_2c"], of["inertia_2s"])
+        first = _amplitude("load_1")(of)
+        second = _amplitude("load_2")(of)
+        wave = _amplitude("inertia_2")(of)
         current = of["limit"] * volts / ohms
         values = {
             "amplifier_gain": volts,
@@ -204,7 +204,7 @@ class Motor:
             "load_first_angle": math.atan2(of["load_1s"], of["load_1c"]),
             "load_second": second * torque,
             "load_second_angle": 0.5 * math.atan2(of["load_2s"], of["load_2c"]),
-            "torque_ripple": math.hypot(of["torque_ripple_c"], of["torque_ripple_s"]),
+            "torque_ripple": _amplitude("torque_ripple_")(of),
             "torque_ripple_angle": 0.25 * math.atan2(of["torque_ripple_s"], of["torque_ripple_c"]),
             "encoder_phase": 0.5,
             "counts_per_rev": self.counts_per_rev or 1572.0,
@@ -558,6 +558,11 @@ _OF_TERM = {
 Quantity: TypeAlias = tuple[str, str, Callable[[Values], float]]
 
 
+def _amplitude(wave: str) -> Callable[[Values], float]:
+    """Of cosine and sine together."""
+    return lambda p: math.hypot(p[wave + "c"], p[wave + "s"])
+
+
 def _quantities(estimate: State, u: str, volts: float | None) -> list[Quantity]:
     """Name, unit and value of everything that may be printed."""
     u = u or "command"
@@ -576,25 +581,17 @@ def _quantities(estimate: State, u: str, volts: float | None) -> list[Quantity]:
             ("stribeck", u, lambda p: p["k_t"]),
             ("stribeck_speed", "rad/s", lambda p: p["w_s"]),
         ],
-        "load_1": [("load_1", u, lambda p: math.hypot(p["load_1c"], p["load_1s"]))],
-        "load_2": [("load_2", u, lambda p: math.hypot(p["load_2c"], p["load_2s"]))],
-        "inertia_2": [
-            ("inertia_2", "1", lambda p: math.hypot(p["inertia_2c"], p["inertia_2s"]) / p["k_a"])
-        ],
+        "load_1": [("load_1", u, _amplitude("load_1"))],
+        "load_2": [("load_2", u, _amplitude("load_2"))],
+        "inertia_2": [("inertia_2", "1", lambda p: _amplitude("inertia_2")(p) / p["k_a"])],
         "limit": [("limit", u, lambda p: p["limit"])],
         "stribeck_difference": [("stribeck_difference", u, lambda p: p["k_d"])],
         "sag": [("sag", f"1/{u}^2", lambda p: p["sag"])],
-        "eccentricity": [
-            ("eccentricity", "1", lambda p: math.hypot(p["eccentric_c"], p["eccentric_s"]))
-        ],
-        "torque_ripple": [
-            ("torque_ripple", "1", lambda p: math.hypot(p["torque_ripple_c"], p["torque_ripple_s"]))
-        ],
+        "eccentricity": [("eccentricity", "1", _amplitude("eccentric_"))],
+        "torque_ripple": [("torque_ripple", "1", _amplitude("torque_ripple_"))],
     }
     for term, order in zip(WAVES[:3], estimate.orders, strict=False):
-        of_terms[term] = [
-            (f"load_{order}", u, lambda p, t=term: math.hypot(p[t + "c"], p[t + "s"]))  # type: ignore[misc]
-        ]
+        of_terms[term] = [(f"load_{order}", u, _amplitude(term))]
     for term in estimate.terms:
         found += of_terms[term]
     if estimate.resistance is None:
