@@ -1,8 +1,6 @@
 //! The host's end of the link to a drive (docs/PROTOCOL.md), as parts without a port of their own.
 
 pub mod anomalies;
-#[cfg(test)]
-mod bench;
 pub mod bodies;
 pub mod client;
 pub mod host_loop;
@@ -18,3 +16,45 @@ pub use client::Client;
 pub use receiver::Receiver;
 pub use samples::{Channel, Encoding};
 pub use upload::Upload;
+
+/// A device for the tests of the host's end: two channels, a period of a millisecond.
+#[cfg(test)]
+mod bench {
+    use sewfast_control::link::{Channel, Encoding, Identity, Limits, Source, capability};
+
+    pub static CHANNELS: [Channel; 2] = [
+        Channel {
+            encoding: Encoding::Counts,
+            steps_per_unit: 1,
+            name: "counts",
+            unit: "1",
+            source: Source::Counts,
+        },
+        Channel {
+            encoding: Encoding::Steps,
+            steps_per_unit: 1000,
+            name: "u",
+            unit: "V",
+            source: Source::Command,
+        },
+    ];
+
+    pub fn identity() -> Identity {
+        Identity {
+            boot_id: 3,
+            entropy: 0,
+            name: "bench",
+            firmware: "1",
+            period: 1000,
+            counts_per_rev: 1572.0,
+            capabilities: capability::DRIVE,
+            ceilings: Limits {
+                volt: 20.0,
+                speed: 5000.0,
+                acceleration: f32::INFINITY,
+                current: f32::INFINITY,
+            },
+            channels: &CHANNELS,
+        }
+    }
+}
