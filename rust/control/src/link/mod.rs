@@ -25,11 +25,7 @@ mod profile;
 mod session;
 mod stream;
 mod transmit;
-mod watchdog;
 pub mod wire;
-
-#[cfg(test)]
-mod dice;
 
 pub use device::{Device, Measurement, Output, Reason, State};
 pub use frame::{Deframer, Frame, HEADER, Header, MAX_BODY, MAX_FRAME, MAX_WIRE, Rejected, encode};
