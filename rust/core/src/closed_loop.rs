@@ -12,8 +12,8 @@ pub use signals::Signals;
 
 use sewfast_control::{AnyController, Refused};
 
-use crate::encoder::Encoder;
 use crate::simd;
+use crate::speed::Encoder;
 use crate::{Error, Monitor, Result};
 use scalar::{LoopController, ScalarLoop};
 

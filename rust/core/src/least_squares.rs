@@ -8,7 +8,6 @@
 mod confirm;
 mod point;
 mod radius;
-mod spread;
 mod triangle;
 mod trust;
 
@@ -18,7 +17,7 @@ use std::cmp::Ordering;
 
 use crate::descent::descend;
 use crate::{Error, Monitor, Result};
-use spread::Spread;
+use point::Spread;
 use trust::TrustRegion;
 
 /// Residuals and their derivatives.

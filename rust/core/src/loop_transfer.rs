@@ -9,16 +9,14 @@
 //!
 //! [`margins`] says how far the loop is from instability, [`peak_sensitivity`] only `max |S|`, fast enough for a search.
 
-mod curve;
 mod margins;
-mod measured;
 mod path;
 mod plant;
 mod states;
 
 pub use margins::{Margins, margins, peak_sensitivity};
-pub use measured::Measured;
 pub use path::Path;
+pub use plant::Measured;
 pub use plant::Plant;
 
 use nalgebra::Complex;

@@ -10,10 +10,8 @@ mod link;
 mod loop_transfer;
 mod machine;
 mod models;
-mod rules;
 mod search;
 mod signals;
-mod speed;
 mod watch;
 
 use pyo3::prelude::*;
@@ -27,14 +25,12 @@ fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     search::register(module)?;
     signals::register(module)?;
     machine::register(module)?;
-    speed::register(module)?;
-    greybox::register(module)?;
     host_loop::register(module)?;
     models::register(module)?;
+    greybox::register(module)?;
     least_squares::register(module)?;
     control::register(module)?;
     loop_transfer::register(module)?;
-    rules::register(module)?;
     link::register(module)?;
     device::register(module)
 }

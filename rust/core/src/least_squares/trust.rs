@@ -1,8 +1,7 @@
 //! The trust-region method: scaling, steps within radius and bounds, tests that call for confirmation.
 
-use super::point::Point;
+use super::point::{Point, nonzero};
 use super::radius::{Promise, Radius, scaled_length};
-use super::spread::nonzero;
 use super::{Residuals, Settings};
 use crate::Monitor;
 use crate::descent::{Method, Outcome, Proposal, Termination, Verdict};

@@ -2,7 +2,7 @@
 
 use std::f64::consts::TAU;
 
-use super::check::{below_nyquist, finite, samples};
+use super::{below_nyquist, finite, samples};
 use crate::{Error, Result};
 
 /// How the frequency goes from start to end.

@@ -1,6 +1,6 @@
 //! Large jumps that drive a motor into its current limit while its speed stays within a range.
 
-use super::check::{finite, not_negative, ordered, samples};
+use super::{finite, not_negative, ordered, samples};
 use crate::random::Random;
 use crate::{Error, Result};
 

@@ -1,6 +1,6 @@
 //! Limits of amplitude, rate and slew, kept exactly.
 
-use super::check::{ordered, sample_time};
+use super::{ordered, sample_time};
 use crate::{Error, Result};
 
 /// The limits of a signal `x`: `low <= x(k) <= high`, `|x(k) - x(k-1)| <= rate Ts` and

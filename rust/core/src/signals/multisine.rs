@@ -2,7 +2,7 @@
 
 use std::f64::consts::TAU;
 
-use super::check::{below_nyquist, finite, not_negative, ordered, samples};
+use super::{below_nyquist, finite, not_negative, ordered, samples};
 use crate::random::Random;
 use crate::{Error, Result};
 

@@ -1,6 +1,6 @@
 //! Step, staircase and trapezoid.
 
-use super::check::{MAX_SAMPLES, finite, not_negative, samples};
+use super::{MAX_SAMPLES, finite, not_negative, samples};
 use crate::{Error, Result};
 
 /// `low` before time `at`, `high` from then on.

@@ -1,13 +1,11 @@
 //! Speed from encoder counts: difference, Savitzky-Golay, Kalman/RTS smoother.
 
 mod counts;
-mod gains;
 mod kalman;
 mod ripple;
 mod savgol;
-mod search;
 
-pub use counts::{Scale, unwrap};
+pub use counts::{Encoder, Scale, unwrap};
 pub use kalman::Kalman;
 pub use savgol::savgol;
 

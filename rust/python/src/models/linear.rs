@@ -5,7 +5,7 @@ use std::sync::Arc;
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use sewfast_core::lagged::Lagged;
-use sewfast_core::{Error, arx, iv, linear, linear_fit, oe};
+use sewfast_core::{Error, arx, iv, linear, oe};
 
 use super::{Kind, Model, Rows, Values};
 use crate::arrays::{Experiments, array1, array2, raise, records, rows, samples, slice};
@@ -99,7 +99,7 @@ impl LinearModel {
 /// A fitted linear model with the story of its fit.
 #[pyclass(frozen, module = "sewfast._core")]
 pub struct LinearFit {
-    inner: linear_fit::LinearFit,
+    inner: linear::LinearFit,
 }
 
 fit_methods!(LinearFit {
