@@ -7,21 +7,19 @@
 //! L = R E G,    S = 1/(1 + L),    T = L/(1 + L),    u = -R/(1 + L) n    (n: noise on the measured output)
 //! ```
 //!
-//! [`margins`] says how far the loop is from instability, [`peak_sensitivity`] only `max |S|`, fast enough for a search.
+//! [`Path`] is `R E`, [`Plant`] and [`Measured`] are `G`. [`margins`] says how far the loop is from instability, [`peak_sensitivity`] only `max |S|`, fast enough for a search.
 
 mod margins;
-mod path;
 mod plant;
 mod states;
 
-pub use margins::{Margins, margins, peak_sensitivity};
-pub use path::Path;
-pub use plant::Measured;
-pub use plant::Plant;
-
 use nalgebra::Complex;
+use sewfast_control::{Biquad, CAPACITY, Cascade, Refused, Standard};
 
 use crate::{Error, Result};
+
+pub use margins::{Margins, margins, peak_sensitivity};
+pub use plant::{Measured, Plant};
 
 /// A place on the unit circle: `z^-1 = exp(-j theta)` and `1 - z^-1`, which keeps its digits at small angles.
 #[derive(Clone, Copy, Debug)]
@@ -73,6 +71,155 @@ impl<'a> Loop<'a> {
 
     fn at(&self, place: &Place) -> Complex<f64> {
         self.path.response(place) * self.path.encoder_response(place) * self.plant.response(place)
+    }
+}
+
+/// What of a controller lies in the loop, in plain numbers; alpha, beta and the limits do not.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Path {
+    /// Gains in standard form.
+    pub gains: Standard<f64>,
+    /// Gain that a schedule adds to the proportional one \[u/y\]: where `Kp` depends on the output, `-Kp alpha r` does too,
+    /// and `alpha r dKp/dy` acts on the output's deviation.
+    pub slope: f64,
+    /// The derivative is filtered with time constant `Td/N`; infinite for no filter.
+    pub n: f64,
+    /// Samples of the moving average; 1 for none.
+    pub filter_samples: usize,
+    /// Time constant of the lag \[s\]; 0 for none.
+    pub filter_time: f64,
+    /// Time constant of the alpha-beta observer \[s\]; 0 for none.
+    pub observer_time: f64,
+    /// Notches and the like on the feedback.
+    pub biquads: Cascade<f64>,
+    /// Whether the output is measured as a difference of positions: the mean over the sample before.
+    pub encoder: bool,
+    /// Sample time \[s\].
+    pub ts: f64,
+}
+
+impl Path {
+    /// Gains at a sample time, without filters.
+    pub fn new(gains: Standard<f64>, ts: f64) -> Self {
+        Self {
+            gains,
+            slope: 0.0,
+            n: f64::INFINITY,
+            filter_samples: 1,
+            filter_time: 0.0,
+            observer_time: 0.0,
+            biquads: Cascade::NONE,
+            encoder: false,
+            ts,
+        }
+    }
+
+    pub(super) fn check(&self) -> Result<()> {
+        self.gains.checked()?;
+        let unless = |holds: bool, name, expected, received| match holds {
+            true => Ok(()),
+            false => Err(Error::from(Refused {
+                name,
+                expected,
+                received,
+            })),
+        };
+        let time = |t: f64| t >= 0.0 && t.is_finite();
+        let finite_time = "a finite time of 0 s or more";
+        let average = (1..=CAPACITY).contains(&self.filter_samples);
+        unless(
+            self.ts > 0.0 && self.ts.is_finite(),
+            "Ts",
+            "a sample time above 0 s",
+            self.ts,
+        )?;
+        unless(self.n > 0.0, "N", "a number above 0, or inf", self.n)?;
+        unless(self.slope.is_finite(), "slope", "a finite gain", self.slope)?;
+        unless(
+            average,
+            "filter_samples",
+            "1 to 64 samples",
+            self.filter_samples as f64,
+        )?;
+        unless(
+            time(self.filter_time),
+            "filter_time",
+            finite_time,
+            self.filter_time,
+        )?;
+        unless(
+            time(self.observer_time),
+            "observer_time",
+            finite_time,
+            self.observer_time,
+        )
+    }
+
+    /// Gain on the sum of errors, `Kp Ts/Ti`.
+    pub(super) fn ki(&self) -> f64 {
+        self.gains.kp * self.ts / self.gains.ti
+    }
+
+    /// Gain on the difference of the output, `Kp Td/(Td/N + Ts)`.
+    pub(super) fn kd(&self) -> f64 {
+        self.gains.kp * self.gains.td / (self.gains.td / self.n + self.ts)
+    }
+
+    /// Pole of the derivative's filter, `(Td/N)/(Td/N + Ts)`.
+    pub(super) fn pole(&self) -> f64 {
+        let filter = self.gains.td / self.n;
+        filter / (filter + self.ts)
+    }
+
+    /// Weight of the newest sample in the lag, `Ts/(Ts + filter_time)`.
+    pub(super) fn weight(&self) -> f64 {
+        self.ts / (self.ts + self.filter_time)
+    }
+
+    /// `exp(-Ts/observer_time)`, both poles of the observer.
+    pub(super) fn theta(&self) -> f64 {
+        (-self.ts / self.observer_time).exp()
+    }
+
+    /// From the measured output to the command, with its sign turned:
+    ///
+    /// ```text
+    /// R = (Kp + slope + Ki/(1 - 1/z) + Kd (1 - 1/z)/(1 - pole/z)) F,
+    /// F = (1 - z^-n)/(n (1 - 1/z))  w/(1 - (1 - w)/z)  ((1 - theta)/(1 - theta/z))^2  H,
+    /// H = product of 1 + (1 - 1/z) (c0 + c1/z)/(1 + a1/z + a2/z^2) over the biquads
+    /// ```
+    pub(super) fn response(&self, at: &Place) -> Complex<f64> {
+        let (d, one) = (at.difference, Complex::new(1.0, 0.0));
+        let lag = |pole: f64| one * (1.0 - pole) / (d * pole + (1.0 - pole));
+        let pole = self.pole();
+        let mut response = Complex::new(self.gains.kp + self.slope, 0.0)
+            + d * self.kd() / (d * pole + (1.0 - pole));
+        if self.ki() != 0.0 {
+            response += one * self.ki() / d;
+        }
+        // at frequency 0 the mean is 1
+        if self.filter_samples > 1 && at.theta > 0.0 {
+            let n = self.filter_samples as f64;
+            response *= Place::at(n * at.theta).difference / (d * n);
+        }
+        if self.filter_time > 0.0 {
+            response *= lag(1.0 - self.weight());
+        }
+        if self.observer_time > 0.0 {
+            let once = lag(self.theta());
+            response *= once * once;
+        }
+        for &Biquad { c0, c1, a1, a2 } in self.biquads.sections() {
+            let poles = one + at.back * a1 + at.back * at.back * a2;
+            response *= one + d * (at.back * c1 + c0) / poles;
+        }
+        response
+    }
+
+    /// The encoder: `(1 + 1/z)/2`, as the output runs straight between samples.
+    pub(super) fn encoder_response(&self, at: &Place) -> Complex<f64> {
+        let half = if self.encoder { 0.5 } else { 0.0 };
+        Complex::new(1.0, 0.0) - at.difference * half
     }
 }
 

@@ -214,8 +214,9 @@ pub(crate) fn several<M: Send, I: Sync, R: Send>(
     results.into_iter().flatten().collect()
 }
 
-/// `work` on every item; the results are in the items' order, whichever thread computed them.
-fn each<M: Send, I: Sync, R: Send>(
+/// `work` on every item, by as many threads as there are memories; the results are in the items' order, whichever thread
+/// computed them.
+pub(crate) fn each<M: Send, I: Sync, R: Send>(
     memories: &mut [M],
     items: &[I],
     work: impl Fn(&mut M, &I) -> R + Sync,

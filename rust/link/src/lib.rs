@@ -1,6 +1,5 @@
 //! The host's end of the link to a drive (docs/PROTOCOL.md), as parts without a port of their own.
 
-pub mod anomalies;
 pub mod bodies;
 pub mod client;
 pub mod host_loop;
@@ -11,9 +10,8 @@ pub mod sequence;
 pub mod server;
 pub mod upload;
 
-pub use anomalies::{Anomaly, Counters, Kind};
 pub use client::Client;
-pub use receiver::Receiver;
+pub use receiver::{Anomaly, Counters, Kind, Receiver};
 pub use samples::{Channel, Encoding};
 pub use upload::Upload;
 

@@ -20,9 +20,8 @@ use sewfast_core::rules::{self, Costs, Outside, Rule};
 use sewfast_core::speed::Encoder;
 use sewfast_core::{Error, Record, Result};
 
-use crate::arrays::{array1, raise, slice};
-use crate::machine::Machine;
-use crate::watch::{watched, watched_over};
+use crate::device::Machine;
+use crate::seam::{array1, raise, slice, watched, watched_over};
 
 pub use controller::{AnyGiven, Controller};
 

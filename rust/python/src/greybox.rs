@@ -9,9 +9,8 @@ use sewfast_control::{Listening, TRACKED, Tracker as Core};
 use sewfast_core::Error;
 use sewfast_core::greybox::{self, Current, Frame, Measured, ORDERS, PARAMETERS, Run};
 
-use crate::arrays::{array1, array2, raise, rows, slice};
 use crate::models::{Kind, Model, Rows, Values};
-use crate::watch::watched_over;
+use crate::seam::{array1, array2, raise, rows, slice, watched_over};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("GREYBOX_PARAMETERS", PARAMETERS)?;

@@ -7,9 +7,8 @@ use sewfast_control::Standard;
 use sewfast_core::Result;
 use sewfast_core::loop_transfer::{self, Loop, Path, Plant};
 
-use crate::arrays::{array1, raise, slice};
 use crate::control::controller::{Section, cascade};
-use crate::watch::watched;
+use crate::seam::{array1, raise, slice, watched};
 
 type Values<'py> = PyReadonlyArray1<'py, f64>;
 

@@ -12,8 +12,7 @@ use sewfast_core::guard::{Unsound, verdict};
 use sewfast_core::linearised::Linearised;
 use sewfast_core::{Error, Result, model};
 
-use crate::arrays::{array1, array2, raise, rows, slice};
-use crate::watch::watched;
+use crate::seam::{array1, array2, raise, rows, slice, watched};
 use linear::LinearModel;
 use neural::NeuralOE;
 use neural_ss::{Experiments, NeuralSS, recordings};

@@ -6,7 +6,7 @@ use sewfast_core::signals::{self, Chirp, Jumps, Limits, Multisine, RandomSteps, 
 use sewfast_core::speed::{self, Kalman, Scale};
 use sewfast_core::{Error, Result};
 
-use crate::arrays::{array1, raise, slice};
+use crate::seam::{array1, raise, slice};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(step, module)?)?;

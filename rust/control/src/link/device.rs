@@ -37,8 +37,7 @@ use super::guard::Guard;
 use super::identity::{Identity, Limits, capability};
 use super::profile::Profile;
 use super::session::{Session, Watchdog};
-use super::stream::Stream;
-use super::transmit::{Transmit, Weight};
+use super::stream::{Stream, Transmit, Weight};
 use super::{Body, Deframer};
 use crate::{AnyController, Refused};
 

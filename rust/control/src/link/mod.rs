@@ -24,7 +24,6 @@ pub mod identity;
 mod profile;
 mod session;
 mod stream;
-mod transmit;
 pub mod wire;
 
 pub use device::{Device, Measurement, Output, Reason, State};

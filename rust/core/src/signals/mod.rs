@@ -1,20 +1,16 @@
 //! Excitation signals and references: seeded, validated, sampled at `k Ts`.
 
-mod chirp;
-mod jumps;
 mod limit;
-mod multisine;
 mod random_steps;
 mod shapes;
+mod sines;
 
 use crate::{Error, Result};
 
-pub use chirp::{Chirp, Sweep};
-pub use jumps::Jumps;
 pub use limit::Limits;
-pub use multisine::{Multisine, crest_factor};
-pub use random_steps::{RandomSteps, prbs, register_length};
-pub use shapes::{Trapezoid, staircase, step};
+pub use random_steps::{RandomSteps, prbs};
+pub use shapes::{Jumps, Trapezoid, staircase, step};
+pub use sines::{Chirp, Multisine, Sweep, crest_factor};
 
 /// The longest signal that is generated: 100 million samples, 800 MB.
 pub const MAX_SAMPLES: usize = 100_000_000;

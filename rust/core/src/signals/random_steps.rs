@@ -120,7 +120,7 @@ const fn mask(taps: &[u32]) -> u32 {
 }
 
 /// The shortest register whose period `2^n - 1` covers `bits`.
-pub fn register_length(bits: usize) -> u32 {
+fn register_length(bits: usize) -> u32 {
     (2..=27).find(|&n| (1usize << n) > bits).unwrap_or(27)
 }
 

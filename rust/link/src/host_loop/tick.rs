@@ -6,9 +6,9 @@ use sewfast_core::Result;
 
 use super::history::{Age, History};
 use super::{Outcome, Settings, Tick, Ticks};
-use crate::anomalies::Counters;
 use crate::bodies::{self, Beat, Status};
 use crate::client::{Client, Event, Reply, kind};
+use crate::receiver::Counters;
 use crate::samples::Channel;
 
 /// How long after the usual arrival of samples a tick comes \[us\]: what their delay may vary by.

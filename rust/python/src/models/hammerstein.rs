@@ -10,8 +10,7 @@ use sewfast_core::lagged::{Lagged, Lags};
 use sewfast_core::output_error::Fit;
 
 use super::{Kind, Model, Values};
-use crate::arrays::{Experiments, array1, array2, raise, records, slice};
-use crate::watch::watched;
+use crate::seam::{Experiments, array1, array2, raise, records, slice, watched};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<HammersteinWiener>()?;

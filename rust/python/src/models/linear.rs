@@ -8,8 +8,7 @@ use sewfast_core::lagged::Lagged;
 use sewfast_core::{Error, arx, iv, linear, oe};
 
 use super::{Kind, Model, Rows, Values};
-use crate::arrays::{Experiments, array1, array2, raise, records, rows, samples, slice};
-use crate::watch::watched;
+use crate::seam::{Experiments, array1, array2, raise, records, rows, samples, slice, watched};
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<LinearModel>()?;

@@ -14,7 +14,7 @@ use sewfast_core::{Error, Monitor, Result, loop_transfer as linear};
 
 use super::super::controller::AnyGiven;
 use super::super::{AnyPlant, Model, Values};
-use crate::arrays::{raise, slice};
+use crate::seam::{raise, slice};
 
 /// A variable by its name, with its bounds unless they are the usual ones.
 type Wanted = (String, Option<(f64, f64)>);
