@@ -10,7 +10,6 @@ pub mod filter;
 pub mod gains;
 pub mod link;
 pub mod model;
-pub mod observer;
 pub mod pid;
 pub mod pid_controller;
 pub mod real;
@@ -19,9 +18,8 @@ pub mod tracker;
 
 pub use biquad::{BIQUADS, Biquad, Cascade};
 pub use controller::*;
-pub use filter::{CAPACITY, Feedback, Ramp};
+pub use filter::{CAPACITY, Feedback, Observer, Ramp};
 pub use gains::{Parallel, PerSample, Standard};
-pub use observer::Observer;
 pub use pid::{Pid, Settings, Terms};
 pub use pid_controller::{Design, Numbers, PidController};
 pub use real::Real;

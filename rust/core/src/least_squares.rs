@@ -7,7 +7,6 @@
 
 mod confirm;
 mod point;
-mod radius;
 mod triangle;
 mod trust;
 

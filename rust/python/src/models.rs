@@ -86,14 +86,12 @@ macro_rules! started_fit_methods {
     };
 }
 
-mod hammerstein;
 pub mod linear;
 pub mod neural;
 pub mod neural_ss;
 
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Model>()?;
-    hammerstein::register(module)?;
     linear::register(module)?;
     neural::register(module)?;
     neural_ss::register(module)?;

@@ -6,8 +6,7 @@ use std::f64::consts::PI;
 
 use nalgebra::Complex;
 
-use super::states::States;
-use super::{Loop, Place};
+use super::{Loop, Place, States};
 
 /// Points per decade to begin with.
 const DENSITY: f64 = 16.0;

@@ -317,7 +317,7 @@ proptest! {
         num.extend([0.06 * (1.0 - fast), 0.04 * (1.0 - fast)]);
         let plant = Plant::new(&num, &[1.0, -slow - fast, slow * fast]).unwrap();
         let closed = Loop::new(&path, &plant).unwrap();
-        let pole = states::States::of(&closed).unwrap().largest_pole();
+        let pole = States::of(&closed).unwrap().largest_pole();
         prop_assume!((pole - 1.0).abs() > 1e-6);
         let found = margins(&closed);
         prop_assert_eq!(found.stable, pole < 1.0);

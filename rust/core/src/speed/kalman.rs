@@ -3,8 +3,8 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::counts::{Scale, check};
 use super::ripple::{MAX_ORDERS, Noises, Turn, with_ripple};
+use super::{Scale, check};
 use crate::{Error, Result};
 
 /// Variance of a position known to one count (count^2).
