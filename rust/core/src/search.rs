@@ -2,6 +2,8 @@
 //!
 //! Candidates are judged in batches over threads. Who judges what has no part in the result: a seed gives the same
 //! bits at any number of threads.
+//!
+//! To read: [`cma_es`] and [`genetic`] for the least, with the quadratic `model` that both ask, [`nsga2`] for a front.
 
 pub mod cma_es;
 pub mod genetic;

@@ -2,6 +2,9 @@
 //!
 //! A candidate's cost is taken over every plant and every reference, with encoder, filter and limits in the loop;
 //! [`search`](crate::search) finds the least, or the front of what can be had ([`pareto`]).
+//!
+//! To read: `variable` (what is searched), `cost` (what a run costs, what it must keep to), `load` (steps of the load), `bench`
+//! (the runs of one thread), `front`.
 
 mod bench;
 mod cost;
@@ -9,8 +12,7 @@ mod front;
 mod load;
 mod variable;
 
-pub use cost::{Constraints, Sensitivity};
-pub use cost::{Cost, Terms, Weights, terms};
+pub use cost::{Constraints, Cost, Sensitivity, Terms, Weights, terms};
 pub use front::{Front, Objective, pareto};
 pub use load::{LoadLimit, LoadStep};
 pub use variable::{Parameter, Variable};

@@ -4,7 +4,8 @@
 //! (docs/PROTOCOL.md, mode 2), so that the jitter of its kernel and of the link is in the loop. What that jitter was is part
 //! of the result; that it stays within a bound is promised by nobody.
 //!
-//! [`HostLoop::tick`] is the loop without port or clock; [`run`] is the thread around it.
+//! Here is what goes in and comes out. [`HostLoop::tick`] (`tick`) is the loop without port or clock; [`run`] (`port`) is the
+//! thread around it; `history` holds the samples that came.
 
 mod history;
 #[cfg(unix)]

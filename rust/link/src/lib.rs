@@ -1,4 +1,8 @@
 //! The host's end of the link to a drive (docs/PROTOCOL.md), as parts without a port of their own.
+//!
+//! To read: [`bodies`] (what is said), [`receiver`] with [`sequence`] and [`samples`] (what has come, in order, as columns),
+//! [`client`] (a session), [`upload`] (values ahead of a run), [`host_loop`] (a controller on the host); [`server`] is the other
+//! end, the virtual sewing machine behind a port.
 
 pub mod bodies;
 pub mod client;

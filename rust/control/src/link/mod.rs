@@ -1,4 +1,8 @@
-//! The link between a drive and its host: frames and their fields (docs/PROTOCOL.md).
+//! The link between a drive and its host (docs/PROTOCOL.md).
+//!
+//! To read: [`frame`] with [`cobs`] and [`crc`] (bytes), [`wire`] and `command` (fields of a body), [`identity`] (what a device is),
+//! then [`device`] with what it asks: `session` (who speaks), `guard` (the motor's limits), `profile` (values to play), `stream`
+//! (what goes to the host).
 //!
 //! ```
 //! use sewfast_control::link::{Deframer, Header, MAX_WIRE, encode};

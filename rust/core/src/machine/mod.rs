@@ -1,6 +1,7 @@
 //! The virtual sewing machine: a physical model of drive, crank and load.
 //!
-//! Equations, parameters and derived figures are in `docs/CONVENTIONS.md`; the equations also in [`dynamics`].
+//! Equations, parameters and derived figures are in `docs/CONVENTIONS.md`; the equations also in [`dynamics`], the
+//! values and their spread in [`parameters`]. Here is the machine that is advanced, sample by sample and regime by regime.
 
 mod dynamics;
 mod parameters;

@@ -1,4 +1,7 @@
 //! Excitation signals and references: seeded, validated, sampled at `k Ts`.
+//!
+//! Here is what every signal asks of its arguments; `shapes` (steps, trapezoids, jumps), `sines` and `random_steps` make signals,
+//! `limit` keeps them within amplitude, rate and slew.
 
 mod limit;
 mod random_steps;

@@ -2,6 +2,9 @@
 //!
 //! A [`Server`] owns a thread that serves the drive until it is stopped. Time is real, or advances by the host's credit; faults
 //! and the rate of a serial line lie between device and port.
+//!
+//! To read: `rig` (the device), `port` and `pty` (where a host connects), `line` and `faults` (what lies between), `serving` (the
+//! loop that moves bytes), `trace` (its account of the output).
 
 mod faults;
 mod line;
