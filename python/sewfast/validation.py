@@ -426,9 +426,8 @@ def validate(
     for e in data.experiments:
         if len(e) - e.unmeasured <= init:
             raise DataError(
-                f"{e.name}: expected more than init = {init} samples, received "
-                f"{e.counted}: nothing is left to score; lower init (--init) or give a "
-                "longer range"
+                f"{e.name}: expected more than init = {init} samples, received {e.counted}: "
+                "nothing is left to score; lower init (--init) or give a longer range"
             )
     series = zip(
         given.experiments,

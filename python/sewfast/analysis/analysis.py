@@ -395,9 +395,8 @@ def _response_line(r: Responses) -> str:
     if r.kind == "reference":
         return (
             f"reference step of {in_unit(f'{r.size:.4g}', r.y_unit)} at "
-            f"{in_unit(f'{r.level:.4g}', r.y_unit)}: "
-            f"rise {span([m['rise_ms'] for m in found])} ms, overshoot "
-            f"{span([m['overshoot_percent'] for m in found])} %, settled within "
+            f"{in_unit(f'{r.level:.4g}', r.y_unit)}: rise {span([m['rise_ms'] for m in found])} "
+            f"ms, overshoot {span([m['overshoot_percent'] for m in found])} %, settled within "
             f"{span([m['settling_ms'] for m in found])} ms"
         )
     return (

@@ -202,8 +202,7 @@ class Experiment:
         if len(known) < init:
             raise DataError(
                 f"{self.name}: expected at least init = {init} samples to start from, received "
-                f"{self.counted}; lower init (--init), 0 to start from rest, or give a "
-                "longer range"
+                f"{self.counted}; lower init (--init), 0 to start from rest, or give a longer range"
             )
         return int(known[init - 1]) + 1 if init else 0
 

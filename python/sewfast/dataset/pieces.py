@@ -127,9 +127,8 @@ def require_excited(data: Dataset) -> None:
     for i, name in enumerate(data.input_names):
         if all(np.min(e.u[:, i]) == np.max(e.u[:, i]) for e in data.experiments):
             raise DataError(
-                f"{data.source}: input {name!r} is constant at "
-                f"{data.experiments[0].u[0, i]:g}; expected an input that moves; "
-                "record with an excitation (`sewfast signals`)"
+                f"{data.source}: input {name!r} is constant at {data.experiments[0].u[0, i]:g}; "
+                "expected an input that moves; record with an excitation (`sewfast signals`)"
             )
     ranges = [range_of(e.y) for e in data.experiments]
     if not any(low < high for low, high in ranges):

@@ -207,20 +207,8 @@ class DelayEstimate:
 
         Parameters
         ----------
-        ax : Axes or sequence of Axes, optional
-            One shows the errors of the first input; several take as many panels.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the panels of a new figure.
-
-        Raises
-        ------
-        SettingError
-            If matplotlib is not installed, or the file cannot be written.
+        ax, file
+            As for `Drawing.plot`; one panel shows the errors of the first input.
         """
         panels: list[Any] = []
         for found in self.inputs:

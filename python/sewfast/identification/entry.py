@@ -13,7 +13,7 @@ from ..dataset.experiment import in_effect
 from ..dataset.pieces import LARGEST_FITTED, require_fittable, require_sane
 from ..dynamic_model import INIT
 from ..errors import DataError, FitError, Interrupted, SettingError
-from ..evidence import remembered
+from ..evidence import with_training_evidence
 from ..kinds import KINDS, Kind, spelled
 from ..models import Model
 from ..models.files import STRUCTURED
@@ -217,7 +217,7 @@ def identify(
         if "verdict" not in found.training:
             own = verdict_by_name(found, task.data, task.validation)
             found = with_provenance(found, {"verdict": own})
-        return remembered(found, _excerpt(found, task))
+        return with_training_evidence(found, _excerpt(found, task))
     except KeyboardInterrupt:
         raise Interrupted(found) from None
 

@@ -128,20 +128,8 @@ class OrderTable:
 
         Parameters
         ----------
-        ax : Axes or sequence of Axes, optional
-            One panel.
-        file : path, optional
-            Where to write the figure: PNG, SVG or PDF by its ending.
-
-        Returns
-        -------
-        Axes or array of Axes
-            `ax`, or the panels of a new figure.
-
-        Raises
-        ------
-        SettingError
-            If matplotlib is not installed, or the file cannot be written.
+        ax, file
+            As for `Drawing.plot`.
         """
         return stacked([self._draw], (2.8,)).plot(ax, file)
 
