@@ -94,7 +94,7 @@ def detrend(
     else:
         raise SettingError(f"detrend: expected order 0, 1 or 'steady', received {order!r}")
     pairs = list(zip(data.experiments, trends, strict=True))
-    notes = [f"{e.name} [{e.range_text}]: {how} taken off, {_told(e, t, data)}" for e, t in pairs]
+    notes = [f"{e.name} [{e.range_text}]: {how} taken off, {_shown(e, t, data)}" for e, t in pairs]
     experiments = tuple(_without(e, t) for e, t in pairs)
     return replace(data, experiments=experiments, notes=(*data.notes, *notes))
 
@@ -231,7 +231,7 @@ def _offset_of(like: Dataset, data: Dataset) -> Trend:
     return first
 
 
-def _told(e: Experiment, trend: Trend, data: Dataset) -> str:
+def _shown(e: Experiment, trend: Trend, data: Dataset) -> str:
     def one(name: str, level: float, slope: float) -> str:
         first = level + slope * e.start
         if slope == 0.0:

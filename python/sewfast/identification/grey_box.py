@@ -17,7 +17,7 @@ from ..errors import DataError, FitError, SettingError
 from ..models import Model
 from ..models.grey_box import MOST_UNITS, GreyBox
 from ..motorfit import PLACE, estimated, rad_per_second, records_of
-from ..motorfit.marquardt import Normal, minimised
+from ..motorfit.estimation import Normal, minimised
 from .folds import Errors, Split, compared, errors_of, folds, free_runs, thinned
 from .task import Look, Pool, Provenance, Task, documented, finite, wrap
 

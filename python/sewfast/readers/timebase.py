@@ -391,6 +391,9 @@ def _grid(table: Table, name: str, t: FloatArray, period: float, given: float | 
 
 # --- Moments as text or objects -> seconds --------------------------------------------------------
 
+# Loggers and spreadsheets write a date and a time of day, `2026-03-14 10:00:00.010`, or the time of
+# day alone. Only differences matter here, so every column counts from its first moment.
+
 
 _MOMENT = re.compile(
     r"(?:(?P<ymd>\d{4}[-/.]\d\d?[-/.]\d\d?)|(?P<other>\d\d?[./-]\d\d?[./-]\d{4}))?[T ]*"
