@@ -566,8 +566,8 @@ def _best_shaft(
 def _is_shaft(theta: FloatArray, f: FloatArray) -> bool:
     """Whether each pair of zeros and poles is a plausible shaft within the measured range.
 
-    Command and speed belong to the same mass, so antiresonances and resonances alternate. Poles next
-    to the zeros of another shaft only describe a line or two that fit badly.
+    Command and speed belong to the same mass, so antiresonances and resonances alternate. Poles
+    next to the zeros of another shaft only describe a line or two that fit badly.
     """
     shafts = _shafts(theta)
     alternate = (shafts[1:, 2] / shafts[:-1, 0]) ** 2 - 1.0 > RATIOS[0]
