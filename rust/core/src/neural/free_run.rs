@@ -2,9 +2,19 @@
 //!
 //! A run waits for itself: each output needs the one before. What does not depend on it, the inputs' share of the hidden
 //! units' arguments, is computed for a block of samples beforehand, and a second run fits into the waiting.
+//!
+//! ```text
+//!   z(k) = [ W1u u(k) + b1 ]                     drive     a block at once, off the chain
+//!        + [ W1y_na y(k-na) + .. + W1y_2 y(k-2) ]  older     known a sample before
+//!        + W1y_1 y(k-1)                            the chain: one product,
+//!   y(k) = direct(k) + w2' tanh(z(k))              one tanh, one sum of eight lanes
+//! ```
+//!
+//! Networks of one group of hidden units and up to four past outputs keep weights and past outputs in registers ([`together`]); the
+//! others go through memory ([`Chain::alone`]). Two runs side by side take 102 cycles a sample where one takes 76 (AVX-512; with AVX2
+//! 117 and 90, on the baseline 234 and 139: docs/PERFORMANCE.md), which pays where Levenberg and Marquardt try two dampings at once.
 
-use super::network::Network;
-use super::regressor;
+use super::network::{self, Network};
 use crate::Monitor;
 use crate::data::weighted_squares;
 use crate::limit::Limit;
@@ -77,7 +87,7 @@ impl<const RUNS: usize> Kernel for FreeRuns<'_, RUNS> {
                 return [None; RUNS];
             }
             for (entry, values) in inputs.iter_mut().enumerate() {
-                regressor::inputs(lags, u, first + start, entry, &mut values[..count]);
+                network::input_entry(lags, u, first + start, entry, &mut values[..count]);
             }
             for chain in chains.iter_mut().filter(|chain| chain.runs) {
                 chain.drive::<V>(&inputs, count);

@@ -25,8 +25,7 @@
 //! are written once and never read back. Known numbers of past outputs keep these values in registers and not in an array: `na` = 2
 //! instead of any number saves 9 % of a training, `na` = 3 as much (12 hidden units 6 %); `na` = 1 saved 3 % and is not there.
 
-use super::network::{Network, Shape};
-use super::regressor;
+use super::network::{self, Network, Shape};
 use crate::Monitor;
 use crate::gram::{BLOCK, Gram};
 use crate::simd::{self, F64x8, Kernel, LANES, Lanes};
@@ -151,10 +150,10 @@ impl Block {
         for (c, entry) in self.scales[..n_phi].iter_mut().enumerate() {
             let entry = &mut entry[..count];
             if c < lags.na {
-                regressor::outputs(recursion.run, recursion.state, start, c + 1, entry);
+                network::output_entry(recursion.run, recursion.state, start, c + 1, entry);
             } else {
                 let start = recursion.first + start;
-                regressor::inputs(lags, recursion.u, start, c - lags.na, entry);
+                network::input_entry(lags, recursion.u, start, c - lags.na, entry);
             }
         }
         let direct = if self.shape.bypass { n_phi } else { 0 };

@@ -1,4 +1,13 @@
 //! The model's equations in scaled units: one step, and the slopes of one step.
+//!
+//! ```text
+//!   h  = tanh(Wx x + Wu v + bh)          a lane is a hidden unit, eight to a group
+//!   x+ = A x + B v + E h                 [E; G] h: sums over lanes, a row at a time
+//!   s  = C x + D v + c + G h
+//! ```
+//!
+//! [`Network::step`] takes any sizes; [`Network::step_small`] one output and sizes that the compiler knows, 6 % faster (47 against 50 ns a
+//! sample on an Intel Xeon at 2.5 GHz).
 
 use super::output::OutputFunction;
 use super::shape::Shape;

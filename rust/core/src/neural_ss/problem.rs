@@ -108,7 +108,7 @@ pub(super) struct Training<'a> {
     monitor: &'a Monitor,
     pub network: Network,
     pub decay: Decay,
-    /// KernelPlant outputs, each by its weight.
+    /// Known outputs, each by its weight.
     samples: f64,
     attempts: &'a Attempts,
     gram: Gram,

@@ -1,6 +1,11 @@
 //! The network in a loop: for eight regressors side by side, and for one.
 //!
-//! Loops count by hand: the calls of an iterator that the compiler leaves would empty the wide registers.
+//! In [`Network::next_in_lanes`] a lane is a loop, hidden units come one after the other, and a weight is spread over the lanes. In
+//! [`Network::next`] there is one loop and a lane is a hidden unit, as in a free run. So eight sums of units side by side stand for the
+//! eight lanes of one sum: both add in the same order, and a loop has the same bits in either.
+//!
+//! Loops count by hand: the calls of an iterator that the compiler leaves would empty the wide registers. A regressor of known length
+//! (`N` = 4) takes 14 to 17 % off a candidate (Zen 4, `candidates` of the kernels' example).
 
 use super::Network;
 use crate::simd::{F64x8, LANES, Lanes};
