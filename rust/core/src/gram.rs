@@ -250,9 +250,9 @@ impl Kernel for Fold<'_> {
 
     #[inline(always)]
     fn run<V: F64x8>(mut self) {
-        match V::TILE {
-            (8, _) => self.wide::<V>(),
-            (4, _) => self.narrow::<V, 6>(),
+        match V::TILE_ROWS {
+            8 => self.wide::<V>(),
+            6 => self.narrow::<V, 6>(),
             _ => self.narrow::<V, 2>(),
         }
     }

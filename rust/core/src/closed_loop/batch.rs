@@ -25,8 +25,7 @@
 //! the caller's, one for a group.
 //!
 //! A lane does the operations of a loop that runs alone, in the same order: on one level it gives the bits of
-//! [`Run::record_by`](super::Run::record_by) as a lane. A loop that runs alone for its own sake takes a
-//! shorter way around a network of two past outputs and two inputs without delay.
+//! [`Run::record`](super::Run::record).
 
 mod controllers;
 
@@ -220,7 +219,7 @@ impl<'a, V: F64x8, C: LaneController<V>> Loops<'a, V, C> {
         u64::from(!sound)
     }
 
-    /// LoopController on the commands.
+    /// Decides on the commands.
     #[inline(always)]
     fn decide(&mut self, signals: &Signals<'_>, k: usize, r: f64, notes: &mut impl Notes) {
         let y = self.plants.output();

@@ -33,8 +33,7 @@ impl KernelPlant<'_> {
     }
 }
 
-/// One plant inside a kernel, where the whole loop is compiled for one processor; `R` holds its regressor. `BITS` asks for
-/// those of a lane, else a network's output is there sooner (where its [`SecondOrder`] is taken).
+/// One plant inside a kernel, where the whole loop is compiled for one processor; `R` holds its regressor.
 pub(super) struct ScalarPlant<'a, V, R> {
     known: KernelPlant<'a>,
     regressor: R,
@@ -249,7 +248,6 @@ impl<'a> BatchPlant<'a> {
             Form::Network(network) => network.next_in_lanes::<V, N>(phi, meanwhile),
         };
         let moved = V::splat(self.known.ts).mul(newest.add(y));
-        // a product with 1/2 is as exact as the quotient
         let moved = moved.mul(V::splat(0.5));
         V::load(&self.position.0)
             .add(moved)

@@ -212,9 +212,9 @@ impl Advance<'_> {
         self.clip();
         let mut next = 0;
         while next < self.block.columns.len() {
-            next += match (V::TILE.0, self.block.columns.len() - next) {
+            next += match (V::TILE_ROWS, self.block.columns.len() - next) {
                 (2, _) | (_, 1) => self.columns::<V, NA, 1>(next),
-                (4, _) | (_, 2) => self.columns::<V, NA, 2>(next),
+                (6, _) | (_, 2) => self.columns::<V, NA, 2>(next),
                 (_, 3 | 6) => self.columns::<V, NA, 3>(next),
                 _ => self.columns::<V, NA, 4>(next),
             };

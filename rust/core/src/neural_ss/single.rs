@@ -216,7 +216,7 @@ impl Block {
     ) {
         let mut i = 0;
         // In the order of the columns: where a group has fewer than eight, it writes over the next one's first.
-        while V::TILE.0 == LANES && i + 2 <= states.len() {
+        while V::TILE_ROWS == LANES && i + 2 <= states.len() {
             let sources = [source(i), source(i + 1)];
             let starts = [start(i), start(i + 1)];
             self.pass::<V, NX, 2>(count, &mut states[i..i + 2], sources, starts, rows);

@@ -1,6 +1,6 @@
 //! Eight numbers as the baseline of any processor has them.
 
-use super::{Arithmetic, Choice, F64x8, LANES, tanh};
+use super::{Arithmetic, F64x8, LANES, tanh};
 
 #[derive(Clone, Copy)]
 pub(super) struct Plain([f64; LANES]);
@@ -29,6 +29,8 @@ impl Plain {
 }
 
 impl Arithmetic for Plain {
+    const ALL: u8 = u8::MAX;
+
     #[inline(always)]
     fn splat(value: f64) -> Self {
         Self([value; LANES])
@@ -55,29 +57,6 @@ impl Arithmetic for Plain {
     }
 
     #[inline(always)]
-    fn add_product(self, a: Self, b: Self) -> Self {
-        // 64-bit ARM has it in its baseline; elsewhere it would be a call.
-        if cfg!(target_arch = "aarch64") {
-            return self.each(|i, v| a.0[i].mul_add(b.0[i], v));
-        }
-        self.add(a.mul(b))
-    }
-
-    #[inline(always)]
-    fn at_most(self, limit: f64) -> Self {
-        self.each(|_, v| if v > limit { limit } else { v })
-    }
-
-    #[inline(always)]
-    fn at_least(self, limit: f64) -> Self {
-        self.each(|_, v| if v < limit { limit } else { v })
-    }
-}
-
-impl Choice for Plain {
-    const ALL: u8 = u8::MAX;
-
-    #[inline(always)]
     fn load(values: &[f64; LANES]) -> Self {
         Self(*values)
     }
@@ -98,11 +77,6 @@ impl Choice for Plain {
     }
 
     #[inline(always)]
-    fn floor(self) -> Self {
-        self.each(|_, v| floor(v))
-    }
-
-    #[inline(always)]
     fn if_less(self, other: Self, yes: Self, no: Self) -> Self {
         self.each(|i, v| if v < other.0[i] { yes.0[i] } else { no.0[i] })
     }
@@ -119,7 +93,21 @@ impl Choice for Plain {
 }
 
 impl F64x8 for Plain {
-    const TILE: (usize, usize) = (2, 1);
+    const TILE_ROWS: usize = 2;
+
+    #[inline(always)]
+    fn add_product(self, a: Self, b: Self) -> Self {
+        // 64-bit ARM has it in its baseline; elsewhere it would be a call.
+        if cfg!(target_arch = "aarch64") {
+            return self.each(|i, v| a.0[i].mul_add(b.0[i], v));
+        }
+        self.add(a.mul(b))
+    }
+
+    #[inline(always)]
+    fn floor(self) -> Self {
+        self.each(|_, v| floor(v))
+    }
 
     #[inline(always)]
     fn store(self, values: &mut [f64; LANES]) {
@@ -130,12 +118,6 @@ impl F64x8 for Plain {
     fn sum(self) -> f64 {
         let v = self.0;
         ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7]))
-    }
-
-    #[inline(always)]
-    fn abs_up_to(self, limit: f64) -> Self {
-        // A comparison rather than `min`, which would turn NaN into a number.
-        self.each(|_, v| if v.abs() > limit { limit } else { v.abs() })
     }
 
     #[inline(always)]
@@ -174,10 +156,73 @@ fn floor(v: f64) -> f64 {
     let shift = WHOLE.copysign(v);
     let nearest = (v + shift) - shift;
     let below = if nearest > v { nearest - 1.0 } else { nearest };
-    // 0 keeps the sign of what it came from
     if v.abs() < WHOLE {
         below.copysign(v)
     } else {
         v
+    }
+}
+
+impl Arithmetic for f64 {
+    const ALL: u8 = 1;
+
+    #[inline(always)]
+    fn splat(value: f64) -> Self {
+        value
+    }
+
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        self + other
+    }
+
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        self - other
+    }
+
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        self * other
+    }
+
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        self / other
+    }
+
+    #[inline(always)]
+    fn load(values: &[f64; LANES]) -> Self {
+        values[0]
+    }
+
+    #[inline(always)]
+    fn at_most_each(self, limits: Self) -> Self {
+        if self > limits { limits } else { self }
+    }
+
+    #[inline(always)]
+    fn at_least_each(self, limits: Self) -> Self {
+        if self < limits { limits } else { self }
+    }
+
+    #[inline(always)]
+    fn abs(self) -> Self {
+        self.abs()
+    }
+
+    #[inline(always)]
+    fn if_less(self, other: Self, yes: Self, no: Self) -> Self {
+        if self < other { yes } else { no }
+    }
+
+    #[inline(always)]
+    fn if_equal(self, other: Self, yes: Self, no: Self) -> Self {
+        if self == other { yes } else { no }
+    }
+
+    #[inline(always)]
+    fn are_less(self, other: Self) -> u8 {
+        u8::from(self < other)
     }
 }

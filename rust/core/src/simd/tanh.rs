@@ -27,9 +27,7 @@
 //! 21.86 without). It may go when that is so on the processors that the figures are kept for.
 
 #[cfg(target_arch = "x86_64")]
-pub(super) mod pieces;
-#[cfg(target_arch = "x86_64")]
-pub(super) mod sums;
+pub(super) mod tables;
 
 use sewfast_control::model::tanh::{
     self, DENOMINATOR, NEAR_DENOMINATOR, NEAR_NUMERATOR, NUMERATOR,
@@ -97,7 +95,6 @@ fn far<V: F64x8>(x: V) -> V {
         Parts::of(&NUMERATOR, s, s2, s4),
         Parts::of(&DENOMINATOR, s, s2, s4),
     );
-    // x is taken into the numerator where there is time for it.
     let numerator = x.mul(p.low).add_product(x.mul(s4), p.high);
     let denominator = q.low.add_product(s4, q.high);
     numerator.div(denominator).at_most(1.0).at_least(-1.0)
@@ -157,7 +154,7 @@ pub(super) fn rise<V: F64x8>(x: V) -> V {
 #[inline(always)]
 fn growth<V: F64x8>(x: V) -> V {
     let one = V::splat(1.0);
-    let size = x.abs_up_to(FLAT);
+    let size = x.abs().at_most(FLAT);
     let twice = size.add(size);
     let shifted = V::splat(ROUND).add_product(twice, V::splat(std::f64::consts::LOG2_E));
     let n = shifted.sub(V::splat(ROUND));

@@ -1,10 +1,12 @@
 //! Eight numbers in one AVX-512 register, or in two of AVX2.
 //!
-//! The intrinsics are only reached through [`wide`] and [`half`], whose callers have asked the processor.
+//! Why the `unsafe` of this file is sound, once for all: an intrinsic needs a processor that has it, and loads and stores need
+//! room for eight numbers. The types are private to `simd`, and values of them come about only in [`wide`] and [`half`], whose caller
+//! has asked the processor; the room is in the type, `[f64; LANES]`.
 
 use std::arch::x86_64::*;
 
-use super::{Arithmetic, Choice, F64x8, Kernel, LANES, Lanes, tanh};
+use super::{Arithmetic, F64x8, Kernel, LANES, Lanes, tanh};
 
 /// What is beyond the nearest quarter; half way between two of them, beyond the even one.
 const BEYOND_QUARTERS: i32 = 2 << 4 | _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
@@ -77,6 +79,8 @@ impl Wide {
 }
 
 impl Arithmetic for Wide {
+    const ALL: u8 = u8::MAX;
+
     #[inline(always)]
     fn splat(value: f64) -> Self {
         // SAFETY: only run where the processor has AVX-512, here and below.
@@ -108,28 +112,6 @@ impl Arithmetic for Wide {
     }
 
     #[inline(always)]
-    fn add_product(self, a: Self, b: Self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe { Self(_mm512_fmadd_pd(a.0, b.0, self.0)) }
-    }
-
-    #[inline(always)]
-    fn at_most(self, limit: f64) -> Self {
-        // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand.
-        unsafe { Self(_mm512_min_pd(_mm512_set1_pd(limit), self.0)) }
-    }
-
-    #[inline(always)]
-    fn at_least(self, limit: f64) -> Self {
-        // SAFETY: as `at_most`.
-        unsafe { Self(_mm512_max_pd(_mm512_set1_pd(limit), self.0)) }
-    }
-}
-
-impl Choice for Wide {
-    const ALL: u8 = u8::MAX;
-
-    #[inline(always)]
     fn load(values: &[f64; LANES]) -> Self {
         // SAFETY: eight readable numbers; only run where the processor has AVX-512.
         unsafe { Self(_mm512_loadu_pd(values.as_ptr())) }
@@ -137,13 +119,11 @@ impl Choice for Wide {
 
     #[inline(always)]
     fn at_most_each(self, limits: Self) -> Self {
-        // SAFETY: as `at_most`.
         unsafe { Self(_mm512_min_pd(limits.0, self.0)) }
     }
 
     #[inline(always)]
     fn at_least_each(self, limits: Self) -> Self {
-        // SAFETY: as `at_most`.
         unsafe { Self(_mm512_max_pd(limits.0, self.0)) }
     }
 
@@ -151,12 +131,6 @@ impl Choice for Wide {
     fn abs(self) -> Self {
         // SAFETY: as `splat`.
         unsafe { Self(_mm512_abs_pd(self.0)) }
-    }
-
-    #[inline(always)]
-    fn floor(self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe { Self(_mm512_roundscale_pd::<DOWN>(self.0)) }
     }
 
     #[inline(always)]
@@ -185,7 +159,19 @@ impl Choice for Wide {
 }
 
 impl F64x8 for Wide {
-    const TILE: (usize, usize) = (8, 3);
+    const TILE_ROWS: usize = 8;
+
+    #[inline(always)]
+    fn add_product(self, a: Self, b: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_fmadd_pd(a.0, b.0, self.0)) }
+    }
+
+    #[inline(always)]
+    fn floor(self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm512_roundscale_pd::<DOWN>(self.0)) }
+    }
 
     #[inline(always)]
     fn store(self, values: &mut [f64; LANES]) {
@@ -203,16 +189,6 @@ impl F64x8 for Wide {
     }
 
     #[inline(always)]
-    fn abs_up_to(self, limit: f64) -> Self {
-        // SAFETY: as `splat`.
-        unsafe {
-            let (size, limit) = (_mm512_abs_pd(self.0), _mm512_set1_pd(limit));
-            let larger = _mm512_cmp_pd_mask::<_CMP_GT_OQ>(size, limit);
-            Self(_mm512_mask_blend_pd(larger, size, limit))
-        }
-    }
-
-    #[inline(always)]
     fn power_of_two(self) -> Self {
         // SAFETY: as `splat`.
         unsafe {
@@ -224,17 +200,17 @@ impl F64x8 for Wide {
 
     #[inline(always)]
     fn tanh_in_chain(self) -> Self {
-        tanh::pieces::tanh(self)
+        tanh::tables::in_chain(self)
     }
 
     #[inline(always)]
     fn tanh_of_four(x: [Self; 4]) -> [Self; 4] {
-        tanh::sums::of_four(x)
+        tanh::tables::of_four(x)
     }
 
     #[inline(always)]
     fn tanh_as_of_four(self) -> Self {
-        tanh::sums::of_neighbours(self)
+        tanh::tables::of_neighbours(self)
     }
 
     /// The sum is not waited for: halves are added, then neighbours, and the two sums that are left go into the arguments
@@ -259,6 +235,8 @@ impl F64x8 for Wide {
 pub(super) struct Halves(__m256d, __m256d);
 
 impl Arithmetic for Halves {
+    const ALL: u8 = u8::MAX;
+
     #[inline(always)]
     fn splat(value: f64) -> Self {
         // SAFETY: only run where the processor has AVX2 and FMA, here and below.
@@ -311,35 +289,6 @@ impl Arithmetic for Halves {
     }
 
     #[inline(always)]
-    fn add_product(self, a: Self, b: Self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe {
-            Self(
-                _mm256_fmadd_pd(a.0, b.0, self.0),
-                _mm256_fmadd_pd(a.1, b.1, self.1),
-            )
-        }
-    }
-
-    #[inline(always)]
-    fn at_most(self, limit: f64) -> Self {
-        // SAFETY: as `splat`. Where one is NaN the instruction gives its second operand.
-        let one = |v: __m256d| unsafe { _mm256_min_pd(_mm256_set1_pd(limit), v) };
-        Self(one(self.0), one(self.1))
-    }
-
-    #[inline(always)]
-    fn at_least(self, limit: f64) -> Self {
-        // SAFETY: as `at_most`.
-        let one = |v: __m256d| unsafe { _mm256_max_pd(_mm256_set1_pd(limit), v) };
-        Self(one(self.0), one(self.1))
-    }
-}
-
-impl Choice for Halves {
-    const ALL: u8 = u8::MAX;
-
-    #[inline(always)]
     fn load(values: &[f64; LANES]) -> Self {
         let start = values.as_ptr();
         // SAFETY: eight readable numbers; only run where the processor has AVX2 and FMA.
@@ -348,7 +297,6 @@ impl Choice for Halves {
 
     #[inline(always)]
     fn at_most_each(self, limits: Self) -> Self {
-        // SAFETY: as `at_most`.
         unsafe {
             Self(
                 _mm256_min_pd(limits.0, self.0),
@@ -359,7 +307,6 @@ impl Choice for Halves {
 
     #[inline(always)]
     fn at_least_each(self, limits: Self) -> Self {
-        // SAFETY: as `at_most`.
         unsafe {
             Self(
                 _mm256_max_pd(limits.0, self.0),
@@ -373,12 +320,6 @@ impl Choice for Halves {
         // SAFETY: as `splat`.
         let one = |v: __m256d| unsafe { _mm256_andnot_pd(_mm256_set1_pd(-0.0), v) };
         Self(one(self.0), one(self.1))
-    }
-
-    #[inline(always)]
-    fn floor(self) -> Self {
-        // SAFETY: as `splat`.
-        unsafe { Self(_mm256_floor_pd(self.0), _mm256_floor_pd(self.1)) }
     }
 
     #[inline(always)]
@@ -415,7 +356,24 @@ impl Choice for Halves {
 }
 
 impl F64x8 for Halves {
-    const TILE: (usize, usize) = (4, 1);
+    const TILE_ROWS: usize = 6;
+
+    #[inline(always)]
+    fn add_product(self, a: Self, b: Self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe {
+            Self(
+                _mm256_fmadd_pd(a.0, b.0, self.0),
+                _mm256_fmadd_pd(a.1, b.1, self.1),
+            )
+        }
+    }
+
+    #[inline(always)]
+    fn floor(self) -> Self {
+        // SAFETY: as `splat`.
+        unsafe { Self(_mm256_floor_pd(self.0), _mm256_floor_pd(self.1)) }
+    }
 
     #[inline(always)]
     fn store(self, values: &mut [f64; LANES]) {
@@ -431,17 +389,6 @@ impl F64x8 for Halves {
     fn sum(self) -> f64 {
         // SAFETY: as `splat`.
         unsafe { sum(_mm256_add_pd(self.0, self.1)) }
-    }
-
-    #[inline(always)]
-    fn abs_up_to(self, limit: f64) -> Self {
-        // SAFETY: as `splat`.
-        let one = |v: __m256d| unsafe {
-            let size = _mm256_andnot_pd(_mm256_set1_pd(-0.0), v);
-            let limit = _mm256_set1_pd(limit);
-            _mm256_blendv_pd(size, limit, _mm256_cmp_pd::<_CMP_GT_OQ>(size, limit))
-        };
-        Self(one(self.0), one(self.1))
     }
 
     #[inline(always)]

@@ -4,18 +4,18 @@ use sewfast_control::{
     AnyController, Controller, Numbers, PidController, STATES, StateDesign, StateFeedback,
 };
 
-use crate::simd::{Choice, LANES};
+use crate::simd::{Arithmetic, LANES};
 
 /// A kind of controller that runs in lanes.
 pub(crate) trait InLanes: Controller<f64> {
     /// Eight of them, or a single one.
-    type Lanes<V: Choice>: LaneController<V>;
+    type Lanes<V: Arithmetic>: LaneController<V>;
 
     /// Whether this one can.
     fn fits(&self) -> bool;
 
     /// The first eight of `controllers`, at rest; missing ones are the first again.
-    fn in_lanes<V: Choice>(controllers: &[&Self]) -> Self::Lanes<V>;
+    fn in_lanes<V: Arithmetic>(controllers: &[&Self]) -> Self::Lanes<V>;
 }
 
 /// What a loop asks of the controllers in its lanes: in two parts, between which other work can be done.
@@ -71,14 +71,14 @@ fn all<'a, C: InLanes>(
 }
 
 impl InLanes for PidController<f64> {
-    type Lanes<V: Choice> = Controllers<V>;
+    type Lanes<V: Arithmetic> = Controllers<V>;
 
     fn fits(&self) -> bool {
         self.numbers().is_some()
     }
 
     #[inline(always)]
-    fn in_lanes<V: Choice>(controllers: &[&Self]) -> Controllers<V> {
+    fn in_lanes<V: Arithmetic>(controllers: &[&Self]) -> Controllers<V> {
         Controllers::new(controllers)
     }
 }
@@ -121,7 +121,7 @@ pub(crate) struct Controllers<V> {
     pub filtered: V,
 }
 
-impl<V: Choice> Controllers<V> {
+impl<V: Arithmetic> Controllers<V> {
     /// The first eight of `controllers`, at rest; missing ones are the first again.
     #[inline(always)]
     pub fn new(controllers: &[&PidController<f64>]) -> Self {
@@ -174,7 +174,7 @@ impl<V: Choice> Controllers<V> {
     }
 }
 
-impl<V: Choice> LaneController<V> for Controllers<V> {
+impl<V: Arithmetic> LaneController<V> for Controllers<V> {
     #[inline(always)]
     fn take(&mut self, first: bool, measured: V) {
         self.filtered = self.filter(first, measured);
@@ -192,7 +192,7 @@ impl<V: Choice> LaneController<V> for Controllers<V> {
     }
 }
 
-impl<V: Choice> Controllers<V> {
+impl<V: Arithmetic> Controllers<V> {
     #[inline(always)]
     fn filter(&mut self, first: bool, x: V) -> V {
         let x = self.average.step(first, x);
@@ -277,14 +277,14 @@ impl<V: Choice> Controllers<V> {
 }
 
 impl InLanes for StateFeedback<f64> {
-    type Lanes<V: Choice> = StateLanes<V>;
+    type Lanes<V: Arithmetic> = StateLanes<V>;
 
     fn fits(&self) -> bool {
         true
     }
 
     #[inline(always)]
-    fn in_lanes<V: Choice>(controllers: &[&Self]) -> StateLanes<V> {
+    fn in_lanes<V: Arithmetic>(controllers: &[&Self]) -> StateLanes<V> {
         StateLanes::new(controllers)
     }
 }
@@ -316,7 +316,7 @@ pub(crate) struct StateLanes<V> {
     observed: V,
 }
 
-impl<V: Choice> StateLanes<V> {
+impl<V: Arithmetic> StateLanes<V> {
     /// The first eight of `controllers`, at rest; missing ones are the first again.
     #[inline(always)]
     fn new(controllers: &[&StateFeedback<f64>]) -> Self {
@@ -353,7 +353,7 @@ impl<V: Choice> StateLanes<V> {
     }
 }
 
-impl<V: Choice> LaneController<V> for StateLanes<V> {
+impl<V: Arithmetic> LaneController<V> for StateLanes<V> {
     #[inline(always)]
     fn take(&mut self, first: bool, measured: V) {
         if first {
@@ -414,7 +414,7 @@ impl<V: Choice> LaneController<V> for StateLanes<V> {
 
 /// The nearest value in `[low, high]`; NaN stays NaN.
 #[inline(always)]
-fn limited<V: Choice>(value: V, low: V, high: V) -> V {
+fn limited<V: Arithmetic>(value: V, low: V, high: V) -> V {
     value.at_least_each(low).at_most_each(high)
 }
 
@@ -431,7 +431,7 @@ struct Averages<V> {
     nexts: V,
 }
 
-impl<V: Choice> Averages<V> {
+impl<V: Arithmetic> Averages<V> {
     #[inline(always)]
     fn new(lengths: [usize; LANES]) -> Self {
         let longest = lengths.into_iter().max().unwrap_or(1);
