@@ -42,6 +42,7 @@ pub trait Plant {
 /// # Errors
 /// `ErrorKind::Setting` for counts that are negative or not finite, or a phase outside 0 to 1.
 pub fn encoder(counts_per_unit: f64, phase: f64) -> Result<Option<Encoder>> {
+    // Written so that NaN is refused.
     if !(counts_per_unit >= 0.0 && counts_per_unit.is_finite() && (0.0..1.0).contains(&phase)) {
         return Err(Error::setting(format!(
             "expected counts per unit of 0 or more and a phase from 0 to below 1, got {counts_per_unit} and {phase}; \
@@ -56,6 +57,8 @@ pub fn encoder(counts_per_unit: f64, phase: f64) -> Result<Option<Encoder>> {
 #[inline(always)]
 fn counts(plant: &(impl Plant + ?Sized), encoder: Option<&Encoder>, since: f64) -> Option<f64> {
     let encoder = plant.encoder().or(encoder)?;
+    // -Ts before the first sample: the counter is taken to have run at this output until now, so that the first difference
+    // is its speed and not 0.
     let position = plant.position() + since * plant.output();
     Some(encoder.count(position))
 }
@@ -146,6 +149,7 @@ pub enum Outcome {
 }
 
 /// No drive's output is that large in any unit.
+// Not infinity: a loop that grows by 10 % a sample takes 7,000 samples to get there, and its squares overflow half way.
 const RUNAWAY: f64 = 1e15;
 /// Samples between two looks at a stop request, a few milliseconds of work.
 const WATCHED: usize = 2048;
@@ -202,6 +206,8 @@ impl Run {
         monitor: &Monitor,
     ) {
         match plant.known() {
+            // The whole loop inside one kernel: controller, encoder and plant are compiled for one processor, with no
+            // call from sample to sample.
             Some(known) => simd::run(ScalarLoop {
                 run: self,
                 known,
@@ -210,6 +216,8 @@ impl Run {
                 encoder,
                 monitor,
             }),
+            // Plants that only step themselves (the virtual machine, a state-space model): compiled for the baseline
+            // here, with kernels of their own inside.
             None => self.fill(plant, controller, signals, encoder, monitor),
         }
     }
@@ -224,6 +232,8 @@ impl Run {
         monitor: &Monitor,
     ) {
         // Room for all at once: a call to make more, even one that never comes, empties the registers at every sample.
+        // Compiled into its two callers: into the kernel of `ScalarLoop` with that one's registers, and for plants that
+        // step themselves.
         let samples = signals.reference.len();
         self.u.resize(samples, 0.0);
         self.y.resize(samples, 0.0);
@@ -246,11 +256,14 @@ impl Run {
         monitor: &Monitor,
     ) -> (usize, Outcome) {
         let samples = signals.reference.len();
+        // Slices as long as the loop, for the compiler: every k is within them.
         let commands = &mut self.u[..samples];
         let (outputs, feedback) = (&mut self.y[..samples], &mut self.feedback[..samples]);
         plant.reset();
         controller.reset();
         let ts = controller.ts();
+        // A difference of counters over Ts and counts per unit is the mean speed of the last sample time: an encoder
+        // gives no more.
         let scale = plant.encoder().or(encoder).map(Encoder::counts_per_unit);
         let per_speed = ts * scale.unwrap_or(1.0);
         let mut before = counts(plant, encoder, -ts);
@@ -260,17 +273,25 @@ impl Run {
                 (Some(before), Some(now)) => (now - before) / per_speed,
                 _ => y,
             };
+            // The counter itself is kept and not the position: what an encoder has rounded off once is not measured
+            // later either.
             before = now;
+            // Written so that NaN ends the run. What is measured counts, too: with many counts a unit the counter overflows
+            // where the output does not.
             if !(y.abs() < RUNAWAY && measured.is_finite()) {
                 return (k, Outcome::Diverged(k));
             }
+            // A power of two, so a mask; a look is an atomic read.
             if k % WATCHED == 0 && monitor.stopped() {
                 return (k, Outcome::Interrupted(k));
             }
+            // The command is held until the next sample: it acts on y(k+1) at the earliest, which is why a plant has a
+            // delay of 1 or more.
             let u = controller.decide(k == 0, r, measured, signals.feedforward_at(k));
             commands[k] = u;
             outputs[k] = y;
             feedback[k] = controller.filtered();
+            // Behind the controller and its limits, so that neither the anti-windup nor the record sees it.
             plant.advance(signals.disturbance_at(k).map_or(u, |added| u + added));
         }
         (samples, Outcome::Completed)

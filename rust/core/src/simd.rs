@@ -35,6 +35,8 @@ pub(crate) const LANES: usize = 8;
 
 /// Eight numbers in memory, on a cache line of their own.
 #[derive(Clone, Copy, Debug, PartialEq)]
+// Aligned because a load of 64 bytes from anywhere else touches two cache lines and takes two accesses. Tables, weights
+// and states are `Lanes`; slices of plain numbers are read through `F64x8::first`, wherever they begin.
 #[repr(C, align(64))]
 pub(crate) struct Lanes(pub [f64; LANES]);
 
@@ -55,6 +57,8 @@ pub(crate) trait Arithmetic: Copy {
     fn sub(self, other: Self) -> Self;
     fn mul(self, other: Self) -> Self;
     fn div(self, other: Self) -> Self;
+    // Limits are comparisons and not `f64::min`, which turns NaN into the limit: a run that has left the finite numbers
+    // would go on as if its output were merely limited.
     /// The smaller of `self` and `limits`, one by one; NaN in `self` stays NaN.
     fn at_most_each(self, limits: Self) -> Self;
     /// The larger of `self` and `limits`, one by one; NaN in `self` stays NaN.
@@ -140,6 +144,8 @@ pub(crate) trait F64x8: Arithmetic {
     /// that it leads to; rounded as is shortest here.
     #[inline(always)]
     fn fed_back(self, second: Self, direct: Self, rest: Self, weights: Self) -> (f64, Self) {
+        // Eight lanes to one number, and one number to eight lanes: `x86::Wide` has the order without this way through a
+        // scalar.
         let y = direct.add_product(second, self).sum();
         (y, rest.add_product(weights, Self::splat(y)))
     }
@@ -149,6 +155,8 @@ pub(crate) trait F64x8: Arithmetic {
     fn first(values: &[f64]) -> Self {
         match values.first_chunk() {
             Some(values) => Self::load(values),
+            // NaN rather than a panic: it reaches the cost, and leaves no call in a kernel, around which registers would
+            // be emptied.
             None => Self::splat(f64::NAN),
         }
     }
@@ -167,6 +175,9 @@ pub(crate) trait Kernel {
     type Output;
 
     /// Does the work; `#[inline(always)]`, as everything it calls that uses `V`.
+    // `x86::wide` and `x86::half` carry the processor's features, and only what is compiled into them has these too. A
+    // function that stays a call is compiled for the baseline: each intrinsic in it is a call itself then, with its
+    // operands in memory.
     fn run<V: F64x8>(self) -> Self::Output;
 }
 
@@ -177,6 +188,8 @@ pub(crate) fn run<K: Kernel>(kernel: K) -> K::Output {
 
 /// Does the work on a level that this processor has.
 fn run_at<K: Kernel>(level: Level, kernel: K) -> K::Output {
+    // One branch for a whole kernel, not for an operation: what is chosen here is which of three copies of the kernel
+    // runs.
     #[cfg(target_arch = "x86_64")]
     match level {
         // SAFETY: levels that are handed on are those of the processor.
@@ -224,6 +237,7 @@ impl Level {
 
     /// Whether this processor has it.
     pub fn is_here(self) -> bool {
+        // Processor and operating system: a register that the system does not save at a change of threads is not there.
         #[cfg(target_arch = "x86_64")]
         let (half, wide) = (
             is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
@@ -234,6 +248,7 @@ impl Level {
         match self {
             Self::Baseline => true,
             Self::Avx2 => half,
+            // The ends of wide kernels (sums of eight) are instructions of AVX2, so that both have to be there.
             Self::Avx512 => half && wide,
         }
     }
@@ -267,6 +282,7 @@ fn named(name: &str) -> Result<Level> {
     let known = Level::ALL.into_iter().find(|level| level.name() == name);
     match known {
         Some(level) if level.is_here() => Ok(level),
+        // Refused and not lowered: a test that is to run on a level would pass without having run on it.
         Some(_) => Err(Error::setting(format!(
             "expected a processor with {name} for {VARIABLE}={name}, got one without; its best is {}",
             Level::best().name()
@@ -281,6 +297,9 @@ fn named(name: &str) -> Result<Level> {
 #[inline]
 fn in_use() -> Level {
     static IN_USE: OnceLock<Level> = OnceLock::new();
+    // Asked once: a model that is trained on one level and judged on another would differ in its last bits. A wrong name
+    // is no error here, where no caller could take it: `level`, which the Python module asks when it is loaded, reports
+    // it.
     *IN_USE.get_or_init(|| asked_for().unwrap_or_else(|_| Level::best()))
 }
 

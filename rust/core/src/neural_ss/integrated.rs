@@ -37,6 +37,8 @@ impl Speed {
             integrator: false,
             ..position
         };
+        // The network of the speed is trained in units of its own, so that its outputs have the size that start weights
+        // and decay are made for.
         let mut experiments: Vec<Experiment> = experiments.iter().map(differences).collect();
         let scale = root_mean_square(experiments.iter().flat_map(|e| e.y.iter().copied()));
         if scale <= 0.0 {
@@ -60,6 +62,12 @@ impl Speed {
         let (nx, hidden, inputs) = (self.shape.nx, self.shape.hidden, self.shape.inputs);
         let (from, to) = (self.shape.parts(), position.parts());
         let mut theta = vec![0.0; position.parameters()];
+        //   speed      w(k)  = C x + D v + c + G h        x+ = A x + B v + E h
+        //   position   p+ = p + w,  y = p + w: the last state p, whose row of [A B E] and the output's row of [C D G] are w's
+        //   A' = | A 0 |   B' = | B |   E' = | E 0 |   C' = [C 1]   D' = D   G' = [G c/tanh(1)]
+        //        | C 1 |        | D |        | G c/tanh(1) |
+        // with C, D, G and c times `scale`. The unit behind the last has no weights and the bias 1, so that its output is
+        // tanh(1) at every sample.
         let mut copy = |from: usize, to: usize, count: usize, factor: f64| {
             let values = theta[to..][..count].iter_mut().zip(&speed[from..][..count]);
             values.for_each(|(to, from)| *to = factor * from);
@@ -75,6 +83,7 @@ impl Speed {
             let (e, own) = (from.e.start + i * hidden, to.e.start + i * position.hidden);
             copy(e, own, hidden, 1.0);
         }
+        // Rows are one number longer: the position is no argument of the hidden units.
         for i in 0..hidden {
             copy(from.wx.start + i * nx, to.wx.start + i * (nx + 1), nx, 1.0);
         }
@@ -100,7 +109,9 @@ impl Speed {
         theta[to.bh.end - 1] = 1.0;
         theta[to.e.end - 1] = constant;
         theta[to.g.end - 1] = constant;
+        // The pole of 1, and the zeros through which the position would act on anything.
         position.hold(&mut theta);
+        // Behind theta stand the experiments' initial states; each gets a position of 0 at its end.
         for state in speed[from.g.end..].chunks_exact(nx) {
             theta.extend(state.iter().chain([&0.0]));
         }
@@ -111,6 +122,7 @@ impl Speed {
 /// Each output less the one before; not known where one of them is not.
 fn differences(experiment: &Experiment) -> Experiment {
     let y = &experiment.y;
+    // NaN less anything is NaN: a gap takes the difference behind it along.
     let steps = y.iter().zip(y.iter().skip(1)).map(|(y, next)| next - y);
     Experiment {
         y: [f64::NAN].into_iter().take(y.len()).chain(steps).collect(),
@@ -131,6 +143,7 @@ pub(super) struct Leak {
 impl Leak {
     /// The filter for positions of this pace; none where nothing moves.
     pub fn new(experiments: &[Experiment], pace: usize) -> Option<Self> {
+        // 1/(1 - p) samples are the time constant; at least two, p = 1/2.
         let pole = 1.0 - 1.0 / (MEMORY * pace as f64).max(2.0);
         let mut filtered: Vec<Experiment> = experiments.iter().map(|e| behind(pole, e)).collect();
         let scale = root_mean_square(filtered.iter().flat_map(|e| e.y.iter().copied()));
@@ -150,6 +163,7 @@ impl Leak {
     /// Parameters and states for the filtered outputs: the position begins at 0, as those do.
     pub fn entered(&self, theta: &mut [f64], shape: Shape) {
         self.scaled(theta, shape, 1.0 / self.scale);
+        // H has no gain at rest: the constant part of the output is gone, c with it.
         theta[shape.parts().constant].fill(0.0);
         theta[shape.pole()] = self.pole;
         for state in theta[shape.parameters()..].chunks_exact_mut(shape.nx) {
@@ -179,6 +193,7 @@ fn behind(pole: f64, experiment: &Experiment) -> Experiment {
         if y.is_nan() {
             return f64::NAN;
         }
+        // z(k) = p z(k-1) + y(k) - y(k-1), the difference over a gap as one jump.
         sum = pole * sum + (y - last.unwrap_or(*y));
         last = Some(*y);
         sum

@@ -19,8 +19,10 @@ use crate::simd::{Arithmetic, F64x8, Lanes};
 use super::tanh as quotients;
 
 /// Adding this rounds to quarters, whose number is then found in the low bits.
+// 1.5 * 2^50: numbers of this size are spaced by 2^(50 - 52), a quarter. The half in front keeps the sum in that range.
 const QUARTERS: f64 = 1_688_849_860_263_936.0;
 /// Below this size [`near`] holds.
+// 15.5 quarters: from here on the nearest one could be the 16th, which the tables do not have.
 const NEAR: f64 = 3.875;
 
 /// `tanh(x)` at any size.
@@ -28,6 +30,8 @@ const NEAR: f64 = 3.875;
 pub(in crate::simd) fn in_chain(x: Wide) -> Wide {
     let (size, limit) = (x.abs(), Wide::splat(NEAR));
     let near = near(x);
+    // A branch and not a selection alone: a processor that foretells it goes on with the polynomial, and neither the
+    // comparison nor the quotients are on the chain.
     if size.are_less(limit) == Wide::ALL {
         return near;
     }
@@ -41,6 +45,8 @@ pub(in crate::simd) fn in_chain(x: Wide) -> Wide {
 #[inline(always)]
 fn near(x: Wide) -> Wide {
     let size = x.abs();
+    // Rounded as the addition of QUARTERS rounds, to the even one of two as near: number and remainder belong together.
+    // The remainder is computed from |x| itself, so that it does not wait for the number.
     let t = size.beyond_quarters();
     let t2 = t.mul(t);
     let t4 = t2.mul(t2);
@@ -49,7 +55,10 @@ fn near(x: Wide) -> Wide {
         t,
         t2,
     };
+    //   four(i) = (c_i + c_(i+1) t) + t^2 (c_(i+2) + c_(i+3) t)
+    //   sum of c_i t^i = four(0) + t^4 (four(4) + t^4 four(8))
     let high = piece.four(4).add_product(piece.four(8), t4);
+    // Of |x|, so never negative: the sign is put on by an OR. tanh is odd to the last bit this way.
     piece.four(0).add_product(high, t4).with_sign_of(x)
 }
 
@@ -64,6 +73,7 @@ struct Piece {
 impl Piece {
     #[inline(always)]
     fn coefficient(self, power: usize) -> Wide {
+        // Only the low four bits are looked at: the sum's bits serve as an index as they are.
         self.number.pick(&PIECES[power])
     }
 
@@ -109,6 +119,8 @@ pub(in crate::simd) fn of_four(x: [Wide; 4]) -> [Wide; 4] {
     let [a, b, c, d] = x;
     let parts = [Parts::of(a), Parts::of(b), Parts::of(c), Parts::of(d)];
     let [p, q, r, s] = parts;
+    // Both denominators are 1 + A B with 0 <= A < 1 and |B| < 1/8, between .87 and 1.13: their product is as good a
+    // divisor as each of them, and loses no range.
     let (first, last) = (p.share(q), r.share(s));
     let near = [
         p.beside(q, first),
@@ -116,6 +128,7 @@ pub(in crate::simd) fn of_four(x: [Wide; 4]) -> [Wide; 4] {
         r.beside(s, last),
         s.beside(r, last),
     ];
+    // Where one argument of a pair is large, its lookup is of no meaning, and so is the division that both share.
     if p.are_near() & q.are_near() & r.are_near() & s.are_near() == Wide::ALL {
         return near;
     }
@@ -131,6 +144,9 @@ pub(in crate::simd) fn of_four(x: [Wide; 4]) -> [Wide; 4] {
 #[inline(always)]
 pub(in crate::simd) fn of_neighbours(x: Wide) -> Wide {
     let own = Parts::of(x);
+    // A register of hidden units, one group of a loop that runs alone, where `of_four` has four registers of loops: units
+    // 2i and 2i+1 are partners there, neighbours here. There is one division either way, so that nothing is saved; it is
+    // done for the bits, by which a search judges a loop alone as it does in lanes.
     let other = own.of_neighbours();
     let near = own.beside(other, own.share(other));
     if own.are_near() == Wide::ALL {
@@ -158,10 +174,12 @@ impl Parts {
         let quarters = size.add(Wide::splat(QUARTERS)).pick(&OF_QUARTERS);
         let t = size.beyond_quarters();
         let t2 = t.mul(t);
+        // Horner and not Estrin: one product less, and four of these run side by side, so that nobody waits.
         let mut share = Wide::splat(BEYOND[4]);
         for power in [3, 2, 1, 0] {
             share = Wide::splat(BEYOND[power]).add_product(share, t2);
         }
+        // t + t^3 p: t itself is exact, and what is added is at most 1/192 of it, so that its rounding does not count.
         let beyond = t.add_product(t.mul(t2), share);
         Self {
             x,
@@ -196,6 +214,7 @@ impl Parts {
     /// `tanh(x)` where both are near.
     #[inline(always)]
     fn beside(self, other: Self, share: Wide) -> Wide {
+        // sum / below = sum * (other.below / (below other.below)): two products for what a division of its own would be.
         self.sum.mul(other.below.mul(share)).with_sign_of(self.x)
     }
 
@@ -203,6 +222,8 @@ impl Parts {
     #[inline(always)]
     fn at_any_size(self, other: Self, near: Wide) -> Wide {
         let (limit, own) = (Wide::splat(NEAR), quotients(self.x));
+        // A lane whose partner is large takes its own quotient. That depends on the partner, and not on the other lanes:
+        // these are other samples or loops, which must not matter.
         let near = other.size.if_less(limit, near, own);
         self.size.if_less(limit, near, own)
     }
