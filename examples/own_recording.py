@@ -10,7 +10,7 @@ import sewfast
 with tempfile.TemporaryDirectory() as name:
     folder = Path(name)
 
-    # stands for your recording: a fan that takes volts and answers, with noise, in rad/s
+    # in place of your recording: a fan, from volts to rad/s, with noise
     random = np.random.default_rng(0)
     u = np.repeat(random.uniform(0.0, 12.0, 200), 20)
     y = np.zeros_like(u)

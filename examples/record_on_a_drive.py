@@ -1,4 +1,4 @@
-"""A drive behind a port, a virtual one here: examined, limited, recorded, tripped, identified."""
+"""A drive behind a port, here a virtual one: examine, set limits, record, trip, identify."""
 
 import tempfile
 from pathlib import Path
@@ -12,7 +12,7 @@ from sewfast.link import VirtualDevice, connect, examine
 t = 0.001 * np.arange(8000)
 gentle = 2.5 + 1.5 * np.sin(2 * np.pi * 0.5 * t) + np.where(t % 0.4 < 0.2, 0.4, -0.4)
 
-# in the place of the virtual device: port = "/dev/ttyUSB0"
+# for a real drive, leave out the virtual device: port = "/dev/ttyUSB0"
 with VirtualDevice(fast=True) as device, tempfile.TemporaryDirectory() as name:
     port, file = device.port, Path(name) / "gentle.mcap"
 
@@ -21,13 +21,13 @@ with VirtualDevice(fast=True) as device, tempfile.TemporaryDirectory() as name:
         print(f"{finding.verdict:5} {finding.name}")
     assert found.verdict != "fail", found
 
-    # whatever happens in here, the motor is stopped when the block ends
+    # the motor is stopped when this block ends, after an exception too
     with connect(port) as drive:
         drive.set_limits(volt=8.0, speed_rpm=3500.0, acceleration=40_000.0, current=15.0)
         recording = sewfast.record(drive, gentle, name="gentle", file=file)
         print(recording)
 
-        # a limit that is passed trips: the output is safe, and what came is kept
+        # exceeding a limit trips the drive: its output is off, the samples so far are kept
         drive.set_limits(speed_rpm=500.0)
         try:
             sewfast.record(drive, gentle, name="too fast", file=Path(name) / "tripped.mcap")

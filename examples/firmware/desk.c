@@ -1,9 +1,9 @@
-/* A board that is a computer: a pseudo-terminal instead of a UART, a computed motor instead of a drive. It lets the firmware be
- * tried with `sewfast doctor PORT`, `record` and `run` before there is any hardware (POSIX only; built by `make c-test`).
+/* A board on a computer: a pseudo-terminal instead of a UART, a simulated motor instead of a drive. With it, the firmware can be
+ * tested with `sewfast doctor PORT`, `record` and `run` before there is any hardware (POSIX only; built by `make c-test`).
  *
- * The first line that it prints is `port NAME`. A computer does not keep a millisecond: where it was late, the periods are made
- * up for one after the other, each with the time at which it was due. What came meanwhile is spread over them, as nobody knows
- * when it came: read after them, a host's heartbeats would all be late, and before them, all early. */
+ * The first line that it prints is `port NAME`. A computer cannot keep a period of 1 ms: if it was late, the missed periods are
+ * computed one after the other, each with its due time. Bytes received meanwhile are spread over them, because their times of
+ * arrival are unknown: read after the periods, a host's heartbeats would all be late, and before them, all early. */
 #define _XOPEN_SOURCE 600
 
 #include "board.h"
@@ -27,7 +27,7 @@ static int port = -1;
 static uint64_t sampled, now;
 static double speed, turns; /* RPM, revolutions */
 static double applied;      /* V */
-static uint8_t held[4096];  /* has come, and waits for its turn */
+static uint8_t held[4096];  /* received, not yet handed over */
 static size_t held_count;
 
 static uint64_t real_time(void) {
@@ -38,7 +38,7 @@ static uint64_t real_time(void) {
     return (uint64_t)((t.tv_sec - start.tv_sec) * 1000000LL + (t.tv_nsec - start.tv_nsec) / 1000);
 }
 
-/* Periods that are due and have not been sampled. */
+/* Periods that are due and not yet sampled. */
 static uint64_t behind(void) {
     return (real_time() - sampled) / PERIOD;
 }
@@ -94,8 +94,8 @@ size_t board_write(const uint8_t *bytes, size_t count) {
     return taken > 0 ? (size_t)taken : 0;
 }
 
-/* Without memory that outlives the program, entropy: the same low 16 bits as at the boot before come once in 65536 boots. A drive has a
- * counter in non-volatile memory instead, which never gives them. */
+/* Entropy, because no memory outlives the program: one boot in 65536 has the same low 16 bits as the previous one. A drive uses a
+ * counter in non-volatile memory instead, which never repeats them. */
 static uint32_t drawn(void) {
     uint32_t id = (uint32_t)time(NULL) * 2654435761u ^ (uint32_t)getpid();
     FILE *source = fopen("/dev/urandom", "rb");
@@ -121,7 +121,7 @@ void board_identity(sewfast_identity *identity) {
     identity->counts_per_rev = COUNTS_PER_REV;
     identity->capabilities =
         SEWFAST_CAN_PROFILE | SEWFAST_CAN_PID | SEWFAST_CAN_DRIVE | SEWFAST_CAN_DESIGN | SEWFAST_CAN_BIQUADS;
-    identity->ceilings = (sewfast_limits){20.0f, 4000.0f, 60000.0f, INFINITY}; /* what the machine bears */
+    identity->ceilings = (sewfast_limits){20.0f, 4000.0f, 60000.0f, INFINITY}; /* what the machine can withstand */
     identity->channels = channels;
     identity->channel_count = sizeof channels / sizeof channels[0];
 }

@@ -1,4 +1,4 @@
-/* A drive's firmware around the sewfast device: everything that is not the board.
+/* The firmware of a drive around the sewfast device: everything except the board.
  *
  *     int main(void) {
  *         board_init();
@@ -15,7 +15,7 @@ static union {
 
 static sewfast_device *device;
 
-/* False where the board's identity is refused. */
+/* False if the board's identity is refused. */
 bool firmware_init(void) {
     sewfast_identity identity = {0};
     board_identity(&identity);
@@ -47,7 +47,7 @@ static void communicate(void) {
     }
 }
 
-/* Once round the main loop, many times a period; the sample goes first. */
+/* One pass of the main loop, many times a period; the sample comes first. */
 void firmware_step(void) {
     sewfast_measurement measurement;
     uint64_t when;

@@ -1,9 +1,9 @@
-/* A board that is an emulated Cortex-M4 or Cortex-M7: QEMU's mps2-an386 or mps2-an500, with UART0 as port and a computed motor
+/* An emulated board, Cortex-M4 or Cortex-M7: QEMU's mps2-an386 or mps2-an500, with UART0 as port and a simulated motor
  * with dry friction as drive (built by `make firmware`, started by `sewfast pil`).
  *
- * It runs on credit unless told otherwise: once a host has opened a session, its time stands still but for what the host grants,
- * so that a busy computer changes no recording. A serial line does not tell that the host has gone: time then stands until the
- * next host. */
+ * It runs on credit unless real time is requested: once a host has opened a session, its time advances only as far as the host
+ * grants, so that the load of the computer changes no recording. A serial line does not show that the host has gone: time then
+ * stops until the next host. */
 #include "board.h"
 
 #include <math.h>
@@ -27,16 +27,16 @@ static timer_registers *const TIMER = (timer_registers *)0x40000000u;
 static volatile uint32_t *const ENABLE_INTERRUPTS = (volatile uint32_t *)0xE000E100u;
 static volatile uint32_t *const COPROCESSORS = (volatile uint32_t *)0xE000ED88u;
 
-/* Memory that the computer reads and writes as a file; python/sewfast/link/emulated.py has the same layout. The stack lies
- * behind it, so that its depth can be seen from there too. All zeros where no file is given. */
+/* Memory that the computer reads and writes as a file; python/sewfast/link/emulated.py has the same layout. The stack is
+ * next to it, so that its depth can be read from there too. All zeros if no file is given. */
 typedef struct {
     uint32_t boot_id, entropy;
     uint32_t real_time;   /* from the computer: 1 offers no credit */
     uint32_t samples;     /* control steps so far, and their ticks from measurement to output */
     uint32_t least, most;
     uint64_t total;
-    uint64_t heard;       /* us: when bytes came last */
-    uint64_t safe;        /* us: when the output was switched off last */
+    uint64_t heard;       /* us: when bytes last arrived */
+    uint64_t safe;        /* us: when the output was last switched off */
     uint32_t enabled;
 } shared_memory;
 __attribute__((section(".shared"))) static volatile shared_memory shared;
@@ -50,10 +50,10 @@ static float applied;     /* V */
 static float speed;       /* RPM */
 static float fraction;    /* counts */
 static int32_t counts;
-static uint32_t measured; /* ticks: when the measurement was handed over that has no output yet */
+static uint32_t measured; /* ticks: when the last measurement without an output was handed over */
 static bool pending;
 
-/* A byte that the ring has no room for stays in the UART, which takes no other one then. */
+/* A byte for which the ring has no room stays in the UART, which then accepts no other. */
 static void pump(void) {
     while ((UART->state & 2u) != 0 && written - taken < RING) {
         ring[written % RING] = (uint8_t)UART->data;
@@ -61,7 +61,7 @@ static void pump(void) {
     }
 }
 
-/* Acknowledged before it is emptied: a byte that came between the two would otherwise never be read. */
+/* Acknowledge before emptying: otherwise a byte that arrives between the two would never be read. */
 void UART_Handler(void) {
     UART->interrupt = 2;
     pump();
@@ -130,16 +130,16 @@ static void count_the_step(void) {
 }
 
 void board_apply(sewfast_output output) {
-    /* a sample's output holds from the sample on, also where the sample is made up for late */
+    /* an output holds from its sample on, even if the sample is computed late */
     if (shared.enabled && !output.enabled) shared.safe = pending ? sampled : board_time();
     if (pending) count_the_step();
     shared.enabled = output.enabled;
     applied = output.enabled ? output.u : 0.0f;
 }
 
-/* Periods behind real time, where the computer did not let the emulator run. They are made up for one after the other, and
- * meanwhile the board's time is that of the period, earlier than a message that asks for it. So messages wait for the last
- * one; not for ever, as a computer that is too slow never gets there. */
+/* Periods behind real time, after the computer has paused the emulator. They are computed one after the other, and
+ * meanwhile the board's time is that of the period, earlier than the messages that request it. So messages wait for the last
+ * period; not for ever, because a computer that is too slow never reaches it. */
 static bool catching_up(void) {
     uint64_t until;
     if (on_credit(&until)) return false;
@@ -150,7 +150,7 @@ static bool catching_up(void) {
 
 size_t board_read(uint8_t *bytes, size_t size) {
     size_t count = 0;
-    const uint32_t come = written; /* before the clock is looked at: a pause may lie between the two */
+    const uint32_t come = written; /* before the clock is read: the emulator can be paused between the two */
     if (catching_up()) return 0;
     while (count < size && taken != come) {
         bytes[count++] = ring[taken % RING];
@@ -158,7 +158,7 @@ size_t board_read(uint8_t *bytes, size_t size) {
     }
     if (count > 0) shared.heard = board_time();
     __asm__ volatile("cpsid i" ::: "memory");
-    pump(); /* what had no room */
+    pump(); /* bytes that had no room */
     __asm__ volatile("cpsie i" ::: "memory");
     return count;
 }
@@ -199,7 +199,7 @@ void Reset_Handler(void) {
     TIMER->reload = TIMER->value = last = 0xFFFFFFFFu;
     TIMER->control = 1;
     UART->divider = 16;
-    UART->control = 1u | 2u | 8u; /* send, receive, interrupt where a byte has come */
+    UART->control = 1u | 2u | 8u; /* send, receive, interrupt when a byte arrives */
     *ENABLE_INTERRUPTS = 1;
     if (firmware_init()) {
         for (;;) firmware_step();

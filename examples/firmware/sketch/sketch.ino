@@ -1,7 +1,7 @@
-// A speed controller on an Arduino: the two files of `sewfast deploy controller.json sketch` lie beside this one.
+// A speed controller on an Arduino: the two files of `sewfast deploy controller.json sketch` are next to this one.
 //
-// It suits a board with a unit for single precision, as a Teensy, an ESP32 or a Nano 33 BLE: an AVR takes longer than the
-// sample time. Set the three figures of your drive below.
+// Use a board with single precision in hardware, such as a Teensy, an ESP32 or a Nano 33 BLE: an AVR takes longer than the
+// sample time. Set the three numbers of your drive below.
 #include "controller.h"
 
 const int PIN_A = 2, PIN_B = 3, PIN_FORWARD = 5, PIN_BACK = 6;
