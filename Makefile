@@ -24,7 +24,7 @@ BUILT := $(VENV)/built.stamp
 REPORT := $(VENV)/report.stamp
 LIBRARIES := $(VENV)/libraries.stamp
 DEV := $(VENV)/dev.stamp
-MARKED := test lint rust-lint rust-test no-std c-test python-lint types stubs python-test docs package
+MARKED := test checks lint rust-lint rust-test rust-units rust-rest no-std c-test python-lint types stubs python-test python-computes python-waits docs package
 
 .DEFAULT_GOAL := help
 .PHONY: help dev demo pictures publishable accuracy battery strangers commissioning drives motors fleet fuzz-logs studio studio-hour studio-kills bits bode notches physics aarch64 constraints licences killed laws instructions bench bench-parts counts bench-device firmware clean $(MARKED)
@@ -38,12 +38,17 @@ demo: $(REPORT) ## the whole experiment on the virtual machine; the report goes 
 $(OUT)/results.json: | $(REPORT)
 	$(BIN)/sewfast demo --out $(OUT)
 
-dev: $(DEV) ## what the checks need, built and installed (--jobs=2: side by side)
+dev: $(DEV) ## builds and installs what the checks need (--jobs=2: in parallel)
 
-# two checks at a time: a compiler that optimises one crate keeps one processor busy
-test: $(DEV) ## every check; ends with pytest's summary
-	$(MAKE) --no-print-directory --jobs=2 $(if $(filter output-sync,$(.FEATURES)),--output-sync=target) rust-test docs lint no-std c-test package
-	$(MAKE) --no-print-directory python-test
+# Compilers and tests that compute fill both processors; tests that wait leave them idle, and the checks step back for them.
+SYNC := $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
+test: ## every check; ends with pytest's summary
+	$(MAKE) --no-print-directory --jobs=3 $(SYNC) dev rust-units
+	$(MAKE) --no-print-directory --jobs=2 $(SYNC) python-waits checks
+	$(MAKE) --no-print-directory python-computes
+
+checks: $(DEV) # what runs beside tests that wait
+	nice -n 19 $(MAKE) --no-print-directory rust-rest docs lint no-std c-test counts package
 
 lint: rust-lint python-lint types stubs ## formatting, clippy, ruff, mypy, stubs
 
@@ -64,11 +69,19 @@ stubs: $(DEV)
 # the seed of every property comes from the commit: a build that passed passes again, and the next commit tries others
 SEED ?= $(shell printf '%d' "0x$$(git rev-parse HEAD 2>/dev/null | cut -c1-8 | grep . || echo 1)")
 
-rust-test: $(DEV) ## unit, property and documentation tests of the crates (SEED=N; by default of the commit)
-	@echo "properties with PROPTEST_RNG_SEED=$(SEED)"
-	PROPTEST_RNG_SEED=$(SEED) cargo test --workspace --profile checked --quiet
+rust-test: rust-units rust-rest ## unit, property and documentation tests of the crates (SEED=N; by default of the commit)
 
-fleet: $(DEV) ## 2,000 recordings on one worker and on two, and with a worker killed every 10 s
+# What depends on the core takes it as the extension has compiled it; the core's own tests are compiled for themselves.
+WITH_CORE := sewfast-core sewfast-control
+rust-units:
+	@echo "properties with PROPTEST_RNG_SEED=$(SEED)"
+	PROPTEST_RNG_SEED=$(SEED) cargo test $(WITH_CORE:%=--package %) --lib --profile checked --quiet
+
+rust-rest: $(DEV)
+	PROPTEST_RNG_SEED=$(SEED) cargo test --workspace $(WITH_CORE:%=--exclude %) --release --quiet
+	cargo test --workspace --doc --release --quiet
+
+fleet: $(DEV) ## 2,000 recordings on one worker, on two, and with a worker killed every 10 s
 	$(BIN)/python benches/fleet.py
 
 studio: $(DEV) ## the studio in a real browser: from a slider's event to painted plots, from Esc to output off
@@ -84,16 +97,16 @@ studio-kills: $(DEV) ## browser killed, hung, frozen or closed, studio killed, l
 fuzz-logs: $(DEV) ## damaged logs of every format, refused or read (COUNT=100000; SECONDS= for each; ONLY="mf4 tdms"; hours)
 	$(BIN)/python tests/support/fuzzed_logs.py --count $(or $(COUNT),100000) $(if $(SECONDS),--seconds $(SECONDS)) $(if $(ONLY),--only $(ONLY))
 
-bits: $(DEV) ## deployed code against the core over ten million samples of every kind (an hour)
+bits: $(DEV) ## compares deployed code with the core over ten million samples of every kind (an hour)
 	$(BIN)/python tests/support/deployed.py
 
-instructions: $(DEV) ## what deployed code costs on an emulated Cortex-M4: instructions, code, memory (docs/deploy.md)
+instructions: $(DEV) ## counts instructions, code and memory of deployed code on an emulated Cortex-M4 (docs/deploy.md)
 	$(BIN)/python tests/support/deployed.py --costs
 
 laws: $(DEV) ## every property of the crates under 20 seeds with 10,000 cases each (hours; SEEDS=, CASES=, ONLY=word)
 	$(BIN)/python tests/support/laws.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(CASES),--cases $(CASES)) $(if $(ONLY),--only $(ONLY))
 
-no-std: ## links the controller crate without the standard library, and its frames without a path that panics
+no-std: ## links the controller crate without the standard library, and its frames without a path that can panic
 	cargo build --package sewfast-control --release --quiet
 	rustc --edition 2024 --crate-type staticlib -C panic=abort -D warnings \
 	  --extern sewfast_control=target/release/libsewfast_control.rlib \
@@ -104,7 +117,7 @@ ifeq ($(shell uname),Linux)
 	  --out-dir target/bare rust/control/tests/bare/no_panic.rs
 endif
 
-c-test: ## the C library and the example firmware, with board, motor and host in memory; nothing in it panics
+c-test: ## tests the C library and the example firmware, with board, motor and host in memory; no path panics
 	cargo rustc --package sewfast-capi --profile firmware --crate-type staticlib --quiet
 	mkdir -p target/bare
 	$(CC) -std=c99 -Wall -Wextra -Werror -pedantic -O1 -I rust/capi/include -I examples/firmware \
@@ -129,7 +142,7 @@ constraints: ## packaging/constraints.txt, the newest versions that fit together
 	uv pip compile pyproject.toml --extra dev --extra docs --extra bench --extra release --universal --python-version 3.10 \
 	  --upgrade --no-annotate --no-emit-index-url -o packaging/constraints.txt
 
-licences: ## LICENSE-THIRD-PARTY, from what the crates of a wheel say
+licences: ## LICENSE-THIRD-PARTY, from the licences of the crates in a wheel
 	$(PYTHON) tests/support/licences.py
 
 killed: firmware ## kills the host of the emulated board 100 times; its output goes off in time
@@ -151,9 +164,12 @@ firmware: ## the example firmware for emulated boards, Cortex-M4 and M7 (Debian:
 	  arm-none-eabi-size target/bare/$$1.elf; \
 	done
 
-# first the tests that compute, then those that wait
-python-test: $(DEV) ## pytest, with every snippet of the documentation and every example
+python-test: python-waits python-computes ## pytest, with every snippet of the documentation and every example
+
+python-computes: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not alone'
+
+python-waits: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m alone
 
 docs: $(DEV) $(OUT)/results.json ## the site, in site/index.html, its pictures drawn from demo/; works offline
@@ -175,7 +191,7 @@ package: $(DEV) ## source archive -> wheel -> import in a clean environment
 	cd target/package/venv && bin/python -I $(CURDIR)/tests/support/clean_import.py
 
 # actionlint is no Python package: it is asked where it is installed
-publishable: package $(VENV)/release.stamp ## what a release is made of: archives, crates, workflows (twine, cargo publish --dry-run, zizmor, actionlint)
+publishable: package $(VENV)/release.stamp ## checks the parts of a release: archives, crates, workflows (twine, cargo publish --dry-run, zizmor, actionlint)
 	$(BIN)/twine check --strict target/package/sewfast-*.tar.gz target/package/wheels/*.whl
 	$(BIN)/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml
 	$(BIN)/check-jsonschema --builtin-schema vendor.renovate renovate.json
@@ -189,10 +205,10 @@ bench: $(VENV)/bench.stamp ## sewfast and its rivals in one run; writes docs/PER
 bench-parts: $(VENV)/bench.stamp ## every benchmark by itself, with its spread (pytest-benchmark)
 	$(BIN)/python -m pytest benches --benchmark-enable --benchmark-only -o python_files='bench_*.py' -s
 
-pictures: $(DEV) $(OUT)/results.json ## the pictures of README and pages that are checked in, from demo/
+pictures: $(DEV) $(OUT)/results.json ## draws the checked-in pictures of README and pages from demo/
 	$(BIN)/python docs/pictures.py $(OUT)
 
-accuracy: $(DEV) ## accuracy of the default configuration on public records, beside published figures (SEWFAST_DATA)
+accuracy: $(DEV) ## accuracy of the default configuration on public recordings, compared with published figures (SEWFAST_DATA)
 	$(BIN)/python benches/accuracy.py
 
 battery: $(VENV)/bench.stamp ## identify on simulated systems of known truth (SPLIT=rules|held|all, FAMILIES=, SEEDS=, RUNS=, QUICK=1)
@@ -200,10 +216,10 @@ battery: $(VENV)/bench.stamp ## identify on simulated systems of known truth (SP
 	  $(if $(FAMILIES),--families $(FAMILIES)) $(if $(SEEDS),--seeds $(SEEDS)) $(if $(RUNS),--runs $(RUNS)) \
 	  $(if $(QUICK),--quick) $(if $(JSON),--json $(JSON))
 
-strangers: $(DEV) ## twelve files as strangers have them, to a controller with three commands (SEEDS="0 1", ONLY=counts,iso)
+strangers: $(DEV) ## takes twelve files in users' formats to a controller with three commands (SEEDS="0 1", ONLY=counts,iso)
 	$(BIN)/python benches/strangers.py $(if $(SEEDS),--seeds $(SEEDS)) $(if $(ONLY),--only $(ONLY))
 
-commissioning: $(DEV) ## figures of commissioning on five virtual machines, beside an oracle (docs/RESULTS.md)
+commissioning: $(DEV) ## commissioning on five virtual machines, compared with an oracle (docs/RESULTS.md)
 	$(BIN)/python benches/commissioning.py
 
 bode: $(VENV)/bench.stamp ## frequency responses and shafts of machines whose truth is known (docs/bode.md)
@@ -212,7 +228,7 @@ bode: $(VENV)/bench.stamp ## frequency responses and shafts of machines whose tr
 	$(BIN)/python benches/records.py --held
 	$(BIN)/python benches/records.py --held --feedback
 
-notches: $(VENV)/bench.stamp ## what a notch brings on machines with a shaft (docs/bode.md)
+notches: $(VENV)/bench.stamp ## gain of a notch on machines with a shaft (docs/bode.md)
 	$(BIN)/python benches/notches.py
 	$(BIN)/python benches/notches.py --held --again --count 20
 
@@ -222,23 +238,22 @@ physics: $(VENV)/bench.stamp ## parameters of motors whose truth is known (docs/
 drives: $(VENV)/bench.stamp ## commissioning on drives of another simulator (ONLY="shaft60 lash", SEEDS=)
 	$(BIN)/python benches/drives.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))
 
-motors: $(DEV) ## commissioning on 20 motors of MuJoCo, beside an oracle (ONLY="3 7", SEEDS=)
+motors: $(DEV) ## commissioning on 20 motors of MuJoCo, compared with an oracle (ONLY="3 7", SEEDS=)
 	$(BIN)/python benches/mujoco_motors.py $(if $(ONLY),--only $(ONLY)) $(if $(SEEDS),--seeds $(SEEDS))
 
-SOAKED := tests/system/test_soak.py tests/link/test_watchdog.py tests/recordfile/test_recordfile_kill.py tests/recordfile/test_recordfile_damage.py \
-  tests/link/test_link_connection.py tests/link/test_link_drive.py tests/link/test_link_virtual.py
+SOAKED := $(shell grep -rl --include='test_*.py' 'import FULL' tests)
 
-soak: $(DEV) ## the link's figures at full count: hours of faults, kills, flips, hostile bytes (docs/RESULTS.md)
+soak: $(DEV) ## every case, seed and second of the tests that take a part otherwise: faults, kills, flips, hostile bytes, searches (hours)
 	SEWFAST_SOAK=1 cargo test --package sewfast-control --package sewfast-link --release --quiet
 	SEWFAST_SOAK=1 $(BIN)/python -m pytest -s $(SOAKED)
 
-counts: $(DEV) ## instructions of the kernels beside those kept in benches/counts.json (valgrind; Linux)
+counts: $(DEV) ## compares the kernels' instruction counts with those in benches/counts.json (valgrind; Linux)
 	$(BIN)/python benches/counts.py
 
-bench-device: ## what a control period of the device costs on this machine
+bench-device: ## time of a control period of the device on this computer
 	cargo run --release --quiet --package sewfast-control --example device_step
 
-clean: ## removes everything that was built; the virtual environment too
+clean: ## removes everything that was built, including the virtual environment
 	rm -rf target site demo dist $(VENV)
 	rm -f python/sewfast/_core*.so
 	find benches docs examples python tests -name __pycache__ -prune -exec rm -rf {} +

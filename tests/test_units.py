@@ -13,7 +13,7 @@ from sewfast import Controller, Gains
 from sewfast.cli import main
 from sewfast.cli.control import reference_of
 from sewfast.errors import DataError, SettingError
-from sewfast.link.settings import require_units
+from sewfast.link.plan import require_units
 from sewfast.link.wire import Channel
 from sewfast.motorfit import rad_per_second
 from sewfast.plotting import quantity

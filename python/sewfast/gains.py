@@ -1,4 +1,4 @@
-"""`Gains`: three numbers with the form and the units they are in."""
+"""`Gains` of a PID with their form and units; checks of single numbers and vectors."""
 
 from __future__ import annotations
 
@@ -210,7 +210,7 @@ class Gains:
 
     @property
     def units(self) -> dict[str, str]:
-        """The unit of each number by name; u and y stand for unknown units."""
+        """The unit of each gain by name; u and y stand for unknown units."""
         u, y = self.u_unit or "u", self.y_unit or "y"
         ratio = f"{u}/{y}"
         if self.form == "standard":
@@ -220,13 +220,13 @@ class Gains:
         return {"Kp": ratio, "Ki": ratio, "Kd": ratio, "Ts": "s"}
 
     def to_dict(self) -> dict[str, Any]:
-        """Form and numbers by their names in that form."""
+        """The form, and the gains by their names in it."""
         values = (self.Kp, self.integral, self.derivative, self.Ts)
         return {"form": self.form, **dict(zip(_FIELDS[self.form], values, strict=False))}
 
     @staticmethod
     def fields_of(form: str) -> tuple[str, ...] | None:
-        """Names of the numbers of a form; None for an unknown one."""
+        """Names of the gains in a form; None for an unknown form."""
         return _FIELDS.get(form)
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""The virtual sewing machine: what an experiment is recorded on where there is no machine."""
+"""The virtual sewing machine, for experiments without a real one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ._core import Machine
-from .errors import DataError, SettingError
+from .errors import SettingError
+from .gains import real, vector
 
 __all__ = ["MachineRun", "VirtualMachine"]
 
@@ -20,14 +21,14 @@ _LARGEST_SEED = 2**64 - 1
 
 @dataclass(frozen=True, eq=False)
 class MachineRun:
-    """What a machine did under a command, at the instants at which each sample starts to act.
+    """The response of a machine, at the instants at which each command starts to act.
 
     Attributes
     ----------
     counts
         Encoder counts since the reset, (N,); whole numbers unless quantisation is off.
     speed_rpm
-        True speed [RPM], (N,). An experiment cannot see it; it is there for tests and scores.
+        True speed [RPM], (N,). A real experiment cannot measure it; it is for tests and scores.
     """
 
     counts: NDArray[np.float64]
@@ -44,7 +45,7 @@ class VirtualMachine:
     seed
         None is the nominal machine; a whole number gives another machine of the same type.
     u_limit
-        Largest command to either side [V].
+        Largest command in either direction [V].
     angle_dependence
         Whether load, inertia and torque vary over the turn of the crank.
     quantisation
@@ -63,7 +64,7 @@ class VirtualMachine:
     Raises
     ------
     SettingError
-        For a seed, a parameter's name or a value that cannot be used.
+        For an invalid seed, parameter name or value.
     """
 
     Ts = 0.001
@@ -95,12 +96,12 @@ class VirtualMachine:
         }
         given = {name: value for name, value in shaft.items() if value is not None}
         values.update(given)
-        self._core = Machine(_checked_values(values))
+        self._core = Machine({name: real(name, value) for name, value in values.items()})
         self._name = _name(seed, {**(parameters or {}), **given})
 
     @classmethod
     def from_name(cls, name: str) -> VirtualMachine:
-        """The machine of a command line: ``virtual``, or ``virtual:SEED`` for another of the type.
+        """The machine by its name: ``virtual``, or ``virtual:SEED`` for another of the same type.
 
         Parameters may follow: ``virtual?load_inertia=0.002&shaft_stiffness=150``.
 
@@ -120,7 +121,7 @@ class VirtualMachine:
 
     @property
     def core(self) -> Machine:
-        """The compiled arithmetic; `sewfast.control.loop` uses it as a plant."""
+        """The compiled machine; `sewfast.control.loop` uses it as a plant."""
         return self._core
 
     @property
@@ -130,7 +131,7 @@ class VirtualMachine:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Every parameter by name; :meth:`units` has their units."""
+        """Every parameter by name; :meth:`units` gives their units."""
         return self._core.parameters
 
     @staticmethod
@@ -145,17 +146,17 @@ class VirtualMachine:
 
     @property
     def counts(self) -> float:
-        """The encoder's counter now."""
+        """The encoder's present count."""
         return self._core.counts
 
     @property
     def speed_rpm(self) -> float:
-        """The true speed now [RPM]."""
+        """The present true speed [RPM]."""
         return self._core.speed_rpm
 
     @property
     def current(self) -> float:
-        """The motor current now [A]."""
+        """The present motor current [A]."""
         return self._core.current
 
     def reset(self) -> None:
@@ -163,7 +164,7 @@ class VirtualMachine:
         self._core.reset()
 
     def set_load(self, torque: float) -> None:
-        """Load the shaft with a constant torque [N m] from now on, through resets as well.
+        """Load the shaft with a constant torque [N m] from now on; a reset does not remove it.
 
         It brakes if it has the sign of the speed; 0 removes it.
 
@@ -190,18 +191,18 @@ class VirtualMachine:
         Parameters
         ----------
         u
-            Commands [V], (N,). Beyond ``u_limit`` they are clipped, as the drive does.
+            Commands [V], (N,), clipped to ``u_limit`` as by the drive.
 
         Raises
         ------
         DataError
             If ``u`` is not a one-dimensional array of finite numbers.
         """
-        counts, speed = self._core.run(_commands(u))
+        counts, speed = self._core.run(vector("u", u))
         return MachineRun(counts, speed)
 
     def linearise(self, speed_rpm: float = 1500.0) -> dict[str, float]:
-        """Small signals at a steady speed: command [V], current [A], gain [RPM/V], T1, T2 [s].
+        """Linearise at a steady speed: command [V], current [A], gain [RPM/V], T1, T2 [s].
 
         Raises
         ------
@@ -215,7 +216,7 @@ class VirtualMachine:
 
 
 def _name(seed: int | None, parameters: Mapping[str, float]) -> str:
-    """What `VirtualMachine.from_name` makes the machine of again."""
+    """The name from which `VirtualMachine.from_name` builds the same machine."""
     name = "virtual" if seed is None else f"virtual:{int(seed)}"
     query = "&".join(f"{key}={float(value)!r}" for key, value in parameters.items())
     return f"{name}?{query}" if query else name
@@ -242,26 +243,3 @@ def _checked_seed(seed: int) -> int:
     if not 0 <= seed <= _LARGEST_SEED:
         raise SettingError(name="seed", expected=f"0 to {_LARGEST_SEED}", received=str(seed))
     return int(seed)
-
-
-def _checked_values(values: Mapping[str, float]) -> dict[str, float]:
-    checked = {}
-    for name, value in values.items():
-        try:
-            checked[name] = float(value)
-        except (TypeError, ValueError):
-            raise SettingError(name=name, expected="a number", received=repr(value)) from None
-    return checked
-
-
-def _commands(u: ArrayLike) -> NDArray[np.float64]:
-    try:
-        commands = np.ascontiguousarray(u, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise DataError(name="u", expected="numbers", received=type(u).__name__) from None
-    if np.ndim(u) != 1:
-        raise DataError(
-            name="u", expected="shape (N,)", received=str(np.shape(u)),
-            remedy="use u[:, 0] for one column",
-        )  # fmt: skip
-    return commands

@@ -1,8 +1,7 @@
 """Pictures of results: the look of every figure, `plot`.
 
-What a result looks like is a `Drawing`: panels, each a function that draws into axes. `plot` puts
-them into a new figure, into axes that the caller has, or into a file; the report puts the same
-panels into its page.
+The picture of a result is a `Drawing`: panels, each a function that draws into axes. `plot` draws
+them into a new figure, into given axes, or into a file; the report uses the same panels.
 """
 
 from __future__ import annotations
@@ -36,18 +35,18 @@ else:
     Panel: TypeAlias = object
 
 
-# --- The canvas: the look of every figure, thinning of long series, figures as inline SVG ---------
+# --- The look of every figure, thinning of long series --------------------------------------------
 
 
 Float = NDArray[np.float64]
 
 SHADE = "#e6e6e6"
-"""Of a range that a line may be in."""
+"""Colour of an uncertainty range."""
 WIDTH = 9.2
-"""Of every figure [inch]."""
+"""Width of every figure [inch]."""
 
 BUCKETS = 700
-"""A series is drawn by the smallest and largest value in each of at most this many buckets."""
+"""A long series is drawn by the smallest and largest value in each of this many buckets."""
 
 # Okabe and Ito's colours; the line style distinguishes them without colour
 LOOKS: dict[str, dict[str, Any]] = {
@@ -88,12 +87,12 @@ _STYLE: dict[str, Any] = {
 
 
 def require() -> None:
-    """Refuse with a remedy where matplotlib or Jinja2 is not installed."""
+    """Raise with a remedy if matplotlib or Jinja2 is not installed."""
     _require("the report", "matplotlib", "jinja2")
 
 
 def require_matplotlib() -> None:
-    """Refuse with a remedy where matplotlib is not installed."""
+    """Raise with a remedy if matplotlib is not installed."""
     _require("figures", "matplotlib")
 
 
@@ -107,10 +106,10 @@ def _require(what: str, *modules: str) -> None:
 
 @contextlib.contextmanager
 def style() -> Iterator[None]:
-    """The look of the figures drawn and written inside."""
+    """The look of figures drawn and saved inside the `with` block."""
     import matplotlib
 
-    # keys are a type of their own in the latest matplotlib only
+    # only the latest matplotlib has a type of its own for the keys
     settings: Any = _STYLE | {"svg.hashsalt": "sewfast"}
     with matplotlib.rc_context(settings):
         yield
@@ -136,8 +135,7 @@ def panels(
 def thin(x: Float, y: Float, buckets: int = BUCKETS) -> tuple[Float, Float]:
     """The smallest and largest value of each bucket, in their order: no peak is lost.
 
-    A gap (NaN) that fills half of a bucket or more is a gap of the line; a shorter one would not be
-    seen.
+    A gap (NaN) of half a bucket or more is a gap in the line; a shorter one would not be visible.
 
     Parameters
     ----------
@@ -146,7 +144,7 @@ def thin(x: Float, y: Float, buckets: int = BUCKETS) -> tuple[Float, Float]:
     Returns
     -------
     x, y : array, shape (M,), M at most 3 `buckets` + 2
-        The series itself where it is short; its first and last sample always.
+        The series itself if it is short; the first and last samples are always included.
     """
     n = len(y)
     if n <= 2 * buckets:
@@ -169,7 +167,7 @@ def draw(
     ax: Axes, x: Float, y: Float, look: str, label: str | None = None, *,
     width: float | None = None, held: bool = False,
 ) -> None:  # fmt: skip
-    """A thinned line in the look of its role, or another width; `held` as steps."""
+    """A thinned line in the look of its role, optionally of another width; `held` as steps."""
     changed: dict[str, Any] = {"lw": width} if width else {}
     if held:
         changed["drawstyle"] = "steps-post"
@@ -177,14 +175,14 @@ def draw(
 
 
 def legend(ax: Axes, columns: int = 6) -> None:
-    """A legend above the axes, where it covers nothing."""
+    """A legend above the axes, so that it covers nothing."""
     ax.legend(
         loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.1,
         handlelength=2.8, columnspacing=1.4,
     )  # fmt: skip
 
 
-# --- Drawing: what a result looks like, in a notebook, in axes of the caller's, in a file ---------
+# --- Drawing: the picture of a result, for a notebook, given axes or a file -----------------------
 
 
 FILES = (".png", ".svg", ".pdf")
@@ -194,21 +192,21 @@ DPI = 150
 
 @dataclass(frozen=True)
 class Drawing:
-    """What a result looks like.
+    """The picture of a result.
 
     Attributes
     ----------
     rows : tuple of tuple of Panel or None
         Functions that draw into axes, row by row; None leaves a place empty.
     heights, widths : tuple of float
-        Of the rows [inch] and of the columns, relative to each other.
+        Heights of the rows [inch]; widths of the columns, relative to each other.
     share_x : bool
-        Whether the panels of a column have one axis in common.
+        Whether the panels of a column share their x axis.
     main : int
-        The panel, counted row by row, that is drawn where there are axes for one.
+        The panel, counted row by row, to draw if there are axes for only one.
     legend : int
         Columns of a legend above the figure for the labels of the first panel; 0: the panels have
-        legends of their own.
+        their own legends.
     """
 
     rows: tuple[tuple[Panel | None, ...], ...]
@@ -220,11 +218,11 @@ class Drawing:
 
     @property
     def panels(self) -> list[Panel]:
-        """All of them in reading order."""
+        """All panels in reading order."""
         return [panel for row in self.rows for panel in row if panel is not None]
 
     def figure(self) -> Figure:
-        """A figure of its own, which no window or notebook shows: for pages and files."""
+        """A new figure that no window or notebook shows, for pages and files."""
         from matplotlib.figure import Figure
 
         require_matplotlib()
@@ -241,17 +239,17 @@ class Drawing:
         ax : Axes or sequence of Axes, optional
             One takes the main panel; several take as many panels, in reading order.
         file : path, optional
-            PNG, SVG or PDF by its ending; replaced in one step where it exists.
+            PNG, SVG or PDF by its ending; an existing file is replaced in one step.
 
         Returns
         -------
         Axes or array of Axes
-            `ax` where it was given, else the panels, shape (panels,).
+            `ax` if given, else the panels, shape (panels,).
 
         Raises
         ------
         SettingError
-            Where matplotlib is not installed, `ax` is none, or the file cannot be written.
+            If matplotlib is not installed, `ax` is not axes, or the file cannot be written.
         """
         if isinstance(ax, (str, os.PathLike)):
             raise SettingError(
@@ -315,7 +313,7 @@ class Drawing:
             panels = [panels[self.main]]
         for panel, ax in zip(panels, axes, strict=False):
             panel(ax)
-            # above the axes, as in a figure of its own, it could cover what is the caller's
+            # a legend above the axes, as in a new figure, could cover something of the caller's
             if ax.get_legend() is not None or (self.legend and ax is axes[0]):
                 ax.legend()
         return given
@@ -335,7 +333,7 @@ class Drawing:
 
 
 class Plotted(ABC):
-    """A result that draws itself: what is in the figure, its `drawing` says."""
+    """A result that can draw itself; `drawing` defines the figure."""
 
     @abstractmethod
     def drawing(self) -> Drawing:
@@ -347,23 +345,18 @@ class Plotted(ABC):
 
 
 def require_file(path: Path) -> None:
-    """Refuse a name that stands for no format of a figure.
-
-    Raises
-    ------
-    SettingError
-    """
+    """Raise `SettingError` for a file name without an ending of a figure's format."""
     if path.suffix.lower() not in FILES:
         raise SettingError(f"expected a figure ending in .png, .svg or .pdf, got {path.name!r}")
 
 
 def stacked(panels: Sequence[Panel], heights: Sequence[float], **settings: Any) -> Drawing:
-    """Panels below each other over one axis."""
+    """Panels below each other with a common x axis."""
     return Drawing(tuple((panel,) for panel in panels), tuple(heights), **settings)
 
 
 def lettered(text: str) -> str:
-    r"""A text for a figure as it is: a dollar begins no formula there, as `$\frac{1}{` is none."""
+    r"""A text for a figure, with dollars escaped: matplotlib would read `$...$` as a formula."""
     return text.replace("$", r"\$")
 
 
@@ -371,20 +364,20 @@ def lettered(text: str) -> str:
 
 
 CYCLE = ("measured", "model", "oe", "arx_raw", "arx", "truth")
-"""Looks of series that are alike, in their order; each has a line style of its own."""
+"""Looks of series of the same kind, in this order; each has its own line style."""
 FINE = 1.2
 """Line width where lines do not cover each other."""
 
 
 def quantity(unit: str) -> str:
-    """`speed [RPM]`, `output [mm]`, or `output` of an unknown unit."""
+    """`speed [RPM]`, `output [mm]`, or `output` if the unit is unknown."""
     name = "speed" if spelled(unit) in (*SPEEDS, "hz") else "output"
     return lettered(f"{name} [{unit}]" if unit else name)
 
 
 @dataclass(frozen=True)
 class Trace:
-    """A closed loop as it is drawn: time [s], reference, command and output, shape (N,) each."""
+    """A closed loop to draw: time [s], reference, command and output, shape (N,) each."""
 
     t: Float
     r: Float
@@ -395,19 +388,19 @@ class Trace:
 
     @classmethod
     def of(cls, columns: Mapping[str, Float], look: str, label: str) -> Trace:
-        """Of columns t, r, u, y."""
+        """From the columns t, r, u, y."""
         return cls(columns["t"], columns["r"], columns["u"], columns["y"], look, label)
 
 
 def loop_panels(
     traces: Sequence[Trace], y_unit: str, u_unit: str, limits: tuple[float, float] | None = None
 ) -> tuple[Panel, Panel, Panel]:
-    """Output over the reference, error and command of closed loops; the first lies on top.
+    """Output and reference, error and command of closed loops; the first loop lies on top.
 
     Parameters
     ----------
     limits : (float, float), optional
-        Of the command, marked where a loop reaches one.
+        Limits of the command, marked if a loop reaches one.
     """
     first = traces[0]
 
@@ -450,13 +443,13 @@ def fit_panels(
     Parameters
     ----------
     Ts : float or None
-        Sample time [s]; None: samples are counted.
+        Sample time [s]; None to count samples.
     measured : sequence of array, shape (N,)
         One per experiment.
     computed, errors : mapping of label to sequence of array, shape (N,)
         One look per label, the same in both.
     label : str
-        Of the output, with its unit.
+        Label of the output, with its unit.
     """
     looks = {name: CYCLE[i % len(CYCLE)] for i, name in enumerate({**computed, **errors})}
     when = "sample" if Ts is None else "time [s]"
@@ -496,7 +489,7 @@ def _over_time(ax: Axes, name: str, when: str = "time [s]") -> None:
 
 
 def _one_after_the_other(parts: Sequence[Float], step: float) -> tuple[Float, list[float]]:
-    """Times of `_joined`, and where one experiment ends and the next begins."""
+    """Times of `_joined`, and the times at which one experiment ends and the next begins."""
     counts = np.cumsum([len(part) for part in parts])
     times = [
         step * np.append(np.arange(end - len(part), end), end - 0.5)
@@ -522,13 +515,13 @@ class Picture:
     key : str
         Its anchor on the page.
     number : str
-        `Fig. 8` for the paper's Fig. 8; `Fig. A` and so on for those that the paper has not.
+        `Fig. 8` for the paper's Fig. 8; `Fig. A` and so on for figures that are not in the paper.
     title, alt, caption : str
-        What it shows; what a reader sees in it; what to look at.
+        Its title, a description for readers who cannot see it, and what to look for.
     svg : str
         Inline SVG.
     numbers : Table or None
-        The numbers that belong to it.
+        Its numbers as a table.
     """
 
     key: str
@@ -541,12 +534,12 @@ class Picture:
 
 
 def svg(figure: Figure, key: str, alt: str) -> str:
-    """The figure as inline SVG whose identifiers are its own on a page of many."""
+    """The figure as inline SVG with identifiers that are unique on a page of many."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     buffer = io.StringIO()
-    # savefig would draw the figure twice, the first time for a size that is known here
-    canvas: Any = FigureCanvasSVG(figure)  # matplotlib gives this no types
+    # savefig would draw the figure twice, the first time for its size, which is known here
+    canvas: Any = FigureCanvasSVG(figure)  # not typed by matplotlib
     canvas.print_svg(buffer, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
@@ -560,13 +553,13 @@ def svg(figure: Figure, key: str, alt: str) -> str:
 
 
 def _rounded(match: re.Match[str]) -> str:
-    """Coordinates to a hundredth of a point: finer than any printer, half the size."""
+    """Coordinates rounded to a hundredth of a point: finer than any printer, half the size."""
     short = re.sub(r"-?\d+\.\d+", lambda m: f"{float(m[0]):.2f}".rstrip("0").rstrip("."), match[0])
     return short.replace(" \n", " ").replace("\n", " ")
 
 
 def _renamed(text: str, key: str) -> str:
-    """Identifiers numbered in their order: matplotlib's hash the last bits of the layout."""
+    """Identifiers numbered in order: matplotlib's vary with the last bits of the layout."""
     numbers: dict[str, str] = {}
     return re.sub(
         r'(\bid="|href="#|url\(#)([^")]+)',

@@ -1,6 +1,6 @@
-"""How far long work is: a bar in a terminal, a bar in a notebook, a line now and then elsewhere.
+"""Progress of long work: a bar in a terminal or a notebook, an occasional line elsewhere.
 
-Whoever turns on Python's logger `sewfast` at level INFO finds those lines in the log instead.
+With Python's logger `sewfast` at level INFO, these lines go to the log instead.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable
 from functools import wraps
 from importlib import import_module
-from types import TracebackType
 from typing import Any, ParamSpec, TypeVar
 
 P = ParamSpec("P")
@@ -23,27 +22,27 @@ R = TypeVar("R")
 LOG = logging.getLogger(__package__)
 _WIDTH = 24
 _FIRST_LINE, _LATER = 10.0, 1.5
-"""Where stderr is no terminal: seconds until the first line, and the factor to each next one."""
+"""Without a terminal: time of the first line [s], and the factor from each line to the next."""
 _FIRST_BAR, _BETWEEN = 0.5, 0.2
-"""In a notebook: seconds until the bar appears, and at least between two pictures of it."""
+"""In a notebook: time until the bar appears, and shortest time between two updates [s]."""
 _shown = threading.local()
-"""Whether a bar is shown already: work that starts other work shows one bar, its own."""
+"""Whether a bar is shown already: work that starts other work shows only its own bar."""
 
 
 class Progress:
-    """Shows `done/total`, the best cost or the stage, and the seconds so far.
+    """Shows `done/total`, the best cost or the stage, and the elapsed seconds.
 
-    On a terminal a line is drawn anew. In a notebook a bar appears after half a second and goes
-    when the work ends. Elsewhere (a file, a pipe, a build's log) a line is printed after 10 s and
-    then at growing intervals, so that nobody takes long work for a hang. Use it in a `with`, which
-    wipes line and bar at the end.
+    On a terminal it redraws one line. In a notebook a bar appears after half a second and goes when
+    the work ends. Elsewhere (a file, a pipe, a build's log) a line is printed after 10 s and then
+    at growing intervals, so that long work does not look like a hang. Use it in a `with` block,
+    whose end clears the line and the bar.
 
     Parameters
     ----------
     title : str
-        Of the work, such as `identify`.
+        Name of the work, such as `identify`.
     value : str
-        Name of the number that comes with the counts.
+        Name of the number shown with the counts.
     quiet : bool
         Show nothing.
     """
@@ -57,7 +56,7 @@ class Progress:
         self._next = math.inf if quiet else _FIRST_LINE
 
     def __call__(self, done: int, total: int, best: float | str) -> None:
-        """Show steps and, with them, a number (a cost) or a text (a stage)."""
+        """Show the steps done, with a number (a cost) or a text (a stage)."""
         if isinstance(best, str):
             text = best
         else:
@@ -65,11 +64,11 @@ class Progress:
         self._show(done / max(total, 1), f"{done}/{total}", text)
 
     def count(self, done: int, total: int) -> None:
-        """Show work that has steps but no cost."""
+        """Show the steps done, without a cost."""
         self._show(done / max(total, 1), f"{done}/{total}", "")
 
     def say(self, text: str) -> None:
-        """Show a stage that has no steps to count."""
+        """Show a stage without steps."""
         self._show(None, "", text)
 
     def _show(self, share: float | None, count: str, text: str) -> None:
@@ -94,18 +93,13 @@ class Progress:
         print(text, file=sys.stderr, flush=True)
 
     def _draw(self, line: str) -> None:
-        # back to the first column, the line, then clear what an older one left
+        # back to the first column, the line, then clear the rest of a longer, older line
         print(f"\r{line}\x1b[K", end="", file=sys.stderr, flush=True)
 
     def __enter__(self) -> Progress:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         if self._bar is not None:
             self._bar.remove()
         elif self._on:
@@ -113,7 +107,7 @@ class Progress:
 
 
 def in_notebook() -> bool:
-    """Whether this code runs in a cell of a notebook: IPython is there, with a kernel."""
+    """Whether this code runs in a notebook: IPython with a kernel."""
     shell: Any = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return getattr(shell, "kernel", None) is not None
 
@@ -121,11 +115,11 @@ def in_notebook() -> bool:
 def shown_in_notebooks(
     title: str, value: str = "best"
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a function with `progress`: where it is left out, a notebook shows a bar, and the
-    logger `sewfast` gets a line now and then if its level is INFO. It logs what the work took, too.
+    """Decorate a function with a `progress` argument to show progress when a caller omits it.
 
-    Only in the main thread, where a cell runs, and once: work that starts other work shows its own
-    progress. `progress=None` shows none.
+    A notebook shows a bar; at level INFO the logger `sewfast` gets an occasional line, and the
+    duration at the end. This happens only in the main thread, where cells run, and only for the
+    outermost work. `progress=None` shows nothing.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -152,7 +146,7 @@ def shown_in_notebooks(
 
 
 class _Logged(Progress):
-    """Lines of the log."""
+    """Progress as lines of the log."""
 
     def __init__(self, title: str, value: str) -> None:
         super().__init__(title, value)
@@ -163,7 +157,7 @@ class _Logged(Progress):
 
 
 class _Bar:
-    """A bar below a notebook's cell, drawn anew in its place."""
+    """A bar below a notebook's cell, redrawn in place."""
 
     def __init__(self) -> None:
         self._handle: Any = None
@@ -187,7 +181,7 @@ class _Bar:
 
     def _put(self, content: dict[str, str]) -> None:
         if self._handle is None:
-            # a notebook runs, so it is there
+            # IPython is installed, as a notebook runs
             self._handle = import_module("IPython.display").DisplayHandle()
             self._handle.display(content, raw=True)
         else:

@@ -1,4 +1,4 @@
-"""`Recording`: what an excitation did on a machine, column by column."""
+"""`Recording`: command, counts and speed of one run, as columns."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .speed import Method, speed_from_counts
 from .writers import write_table
 
 UNITS: Mapping[str, str] = {"t": "s", "u": "V", "y": "RPM", "speed_true": "RPM"}
-"""Of the columns; counts are pure numbers."""
+"""Units of the columns; counts have none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +37,11 @@ class Recording:
     y : array, shape (N,)
         Speed [RPM] estimated from the counts.
     speed_true : array, shape (N,), or None
-        The virtual machine's true speed [RPM], for scores only; None if there is no such speed.
+        The virtual machine's true speed [RPM], for scores only; None for a real machine.
     Ts, counts_per_rev : float
         Sample time [s], counts of one turn.
     name : str
-        Of the excitation.
+        Name of the excitation.
 
     Notes
     -----
@@ -68,27 +68,27 @@ class Recording:
         speed_true: FloatArray | None = None,
         method: Method = "kalman",
     ) -> Recording:
-        """A recording from what a logger wrote: commands and counts, one of each per sample.
+        """A recording from logged commands and counts, one of each per sample.
 
         Parameters
         ----------
         u : array, shape (N,)
             Command [V], held from sample k to k + 1.
         counts : array, shape (N,)
-            Accumulated encoder counts, read before `u[k]` acts; they are counted from the first.
+            Accumulated encoder counts, read before `u[k]` acts; the first is subtracted.
         Ts, counts_per_rev : float
             Sample time [s], counts of one turn.
         name : str
-            Of the excitation.
+            Name of the excitation.
         speed_true : array, shape (N,), optional
             As in the class.
         method : "kalman", "savgol" or "difference"
-            How the speed is estimated (`speed_from_counts`).
+            Method of the speed estimate (`speed_from_counts`).
 
         Raises
         ------
         DataError
-            For commands and counts of different lengths, what is no finite number, or too few.
+            For commands and counts of different lengths, values that are not finite, or too few.
         """
         command, seen = vector("u", u).copy(), vector("counts", counts).copy()
         if command.shape != seen.shape:
@@ -140,9 +140,9 @@ class Recording:
         Parameters
         ----------
         device : mapping, optional
-            What it was recorded on; the virtual machine by default.
+            The device recorded; the virtual machine by default.
         **settings
-            What is needed to record it again.
+            Settings needed to repeat the recording.
         """
         return Header(
             self.name,
@@ -155,14 +155,14 @@ class Recording:
         )
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the columns as CSV, `.npz`, `.mat`, Parquet or MCAP, whole or not at all.
+        """Write the columns as CSV, `.npz`, `.mat`, Parquet or MCAP, completely or not at all.
 
         Parameters
         ----------
         path : path
             An existing file is replaced in one step, except a recording of a drive.
         overwrite : bool
-            Whether to replace such a recording as well.
+            Whether to replace a recording of a drive as well.
 
         Raises
         ------

@@ -39,14 +39,14 @@ class Fopdt:
     u_unit, y_unit : str
         Units of input and output.
     K_se, T_se, L_se : float
-        Standard errors, for residuals of any colour; NaN where it was not fitted.
+        Standard errors, valid for coloured residuals; NaN without a fit.
     limited : int
         Samples on a limit of the output, which had no weight.
     moving : bool
         Whether the machine was not at rest before the step: its free response was fitted as well.
     overshoot_percent : float
-        How far the response goes beyond where it settles, in percent of its rise; 0 where that does
-        not stand out from the noise. Such a response is of no first order.
+        Overshoot of the response in percent of its rise; 0 if it does not stand out from the noise.
+        A response with an overshoot is not of first order.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def fit_fopdt(
 
 @dataclass(frozen=True)
 class Rule:
-    """What a tuning rule gives.
+    """The result of a tuning rule.
 
     Attributes
     ----------
@@ -160,9 +160,9 @@ class Rule:
     alpha, beta : float
         Shares of the reference taken out of the proportional and of the derivative term.
     name : str
-        Of the rule.
+        Name of the rule.
     costs : dict
-        Of Eq. 12 with `K = T = 1`: `disturbance_cost`, `reference_cost`, and `Ms` of the loop in
+        For Eq. 12 with `K = T = 1`: `disturbance_cost`, `reference_cost`, and `Ms` of the loop in
         continuous time; empty for other rules.
     """
 
@@ -183,8 +183,8 @@ def table_1(fopdt: Fopdt, *, outside: Literal["error", "nearest"] = "error") -> 
     ----------
     fopdt : Fopdt
     outside : "error" or "nearest"
-        What to do if L/T is not in .1 to 1. The nearest row below .1 is the row for `L = .1 T`,
-        a longer dead time than the plant's: conservative. Above 1 it is not.
+        What to do if L/T is not in .1 to 1. Below .1, the nearest row is that of `L = .1 T`, a
+        longer dead time than the plant's: conservative. Above 1 it is not.
 
     Raises
     ------
@@ -199,16 +199,16 @@ def table_1(fopdt: Fopdt, *, outside: Literal["error", "nearest"] = "error") -> 
 
 
 def eq_12(fopdt: Fopdt, *, Ms: float = math.inf) -> Rule:
-    """Gains of the least Eq. 12 for any L/T from .01 to 2; Table 1 is its print at ten ratios.
+    """Gains that minimise Eq. 12, for any L/T from .01 to 2; Table 1 lists them for ten ratios.
 
-    The gains minimise the paper's integral after a step of the disturbance, alpha and beta that
-    after a step of the reference. Without a limit the loops are fragile: Ms is 2 to 3.2.
+    The gains minimise the paper's integral after a step of the disturbance; alpha and beta minimise
+    it after a step of the reference. Without a limit the loops are fragile: Ms is 2 to 3.2.
 
     Parameters
     ----------
     fopdt : Fopdt
     Ms : float
-        Largest |S| that is allowed, in continuous time; 1.4 to 2 is usual, inf for none.
+        Largest allowed |S| in continuous time; 1.4 to 2 is usual, inf for no limit.
 
     Raises
     ------
@@ -223,21 +223,21 @@ def eq_12(fopdt: Fopdt, *, Ms: float = math.inf) -> Rule:
 
 
 def simc(fopdt: Fopdt, *, tau_c: float | None = None, kind: Literal["PI", "PID"] = "PI") -> Rule:
-    """SIMC: the closed loop is to be a lag of time constant `tau_c` behind the dead time.
+    """SIMC: aims at a closed loop of first order with time constant `tau_c` and the dead time.
 
     Parameters
     ----------
     fopdt : Fopdt
     tau_c : float, optional
-        [s]; smaller is faster and less robust. By default L for PI, and L/2 for PID, which gives
-        about the same Ms of 1.6 to 1.7.
+        Closed-loop time constant [s]; smaller is faster and less robust. By default L for PI, and
+        L/2 for PID, which gives about the same Ms of 1.6 to 1.7.
     kind : "PI" or "PID"
-        PID adds a derivative of L/3 on the output; from series to standard form exactly.
+        PID adds a derivative of L/3 on the output, converted exactly from series to standard form.
 
     Raises
     ------
     SettingError
-        For K = 0, T <= 0, another kind, or a tau_c that is negative, or 0 where L is.
+        For K = 0, T <= 0, another kind, a negative tau_c, or tau_c = L = 0.
 
     References
     ----------
@@ -254,7 +254,7 @@ def simc(fopdt: Fopdt, *, tau_c: float | None = None, kind: Literal["PI", "PID"]
 
 
 def amigo(fopdt: Fopdt) -> Rule:
-    """AMIGO: PID gains fitted to what is best for integral error with Ms and Mt of at most 1.4.
+    """AMIGO: fitted to the PID gains of least integral error with Ms and Mt of at most 1.4.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all; JSON files, strict when read, field by field."""
+"""Atomic writing of files; JSON files, read strictly and field by field."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from .errors import ModelFileError, unreadable, unwritable
 
 LOG = logging.getLogger(__package__)
 
-# --- Files that appear whole or not at all --------------------------------------------------------
+# --- Atomic writing -------------------------------------------------------------------------------
 
 
 def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
-    """Put `content` in place of a file: a temporary name first, renamed once it is whole.
+    """Write `content` to a temporary file in the same folder, then rename it to `path`.
 
     Raises
     ------
     OSError
-        Where the folder does not exist or cannot be written to, or what is there is no file but a
-        folder, a device or a pipe, which must not be replaced; nothing is left behind.
+        If the folder does not exist or is not writable, or if `path` is a folder, a device or a
+        pipe, which must not be replaced; nothing is left behind.
     """
     replace_files({path: content})
 
 
 def replace_files(contents: Mapping[Any, bytes]) -> None:
-    """Put several files in place together: none is renamed before the last one is written.
+    """Write several files together: none is renamed before the last one is written.
 
     Raises
     ------
     OSError
-        As `replace_file`, with the name of the file that it failed on; none is changed then.
+        As `replace_file`, with the name of the file that failed; then no file is changed.
     """
     staged: list[tuple[Path, Path]] = []
     try:
@@ -65,7 +65,7 @@ def replace_files(contents: Mapping[Any, bytes]) -> None:
 
 
 def _names(path: str | os.PathLike[str]) -> tuple[Path, Path]:
-    """A free temporary name in the folder of a file, and where it goes."""
+    """A free temporary name in the folder of a file, and the file's final name."""
     if "\0" in os.fspath(path):
         raise OSError(errno.EINVAL, "a name cannot hold the character 0")
     target = Path(path).resolve()
@@ -76,11 +76,11 @@ def _names(path: str | os.PathLike[str]) -> tuple[Path, Path]:
     return target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp"), target
 
 
-# --- JSON files of the package: whole or not at all when written, strict when read ----------------
+# --- JSON files of the package --------------------------------------------------------------------
 
 
 LARGEST_FILE = 16 * 1024 * 1024
-"""Bytes that a file may have: a larger one is none of the package's."""
+"""Most bytes of a file: the package writes none that is larger."""
 
 
 def write(
@@ -93,14 +93,14 @@ def write(
     path
         File to write; an existing one is replaced in one step.
     format, version
-        Name and number that :func:`read` asks for, stored as ``format`` and ``version``.
+        Name and number that :func:`read` checks, stored as ``format`` and ``version``.
     payload
-        Values that JSON knows: dicts with string keys, lists, text, booleans, None, finite numbers.
+        JSON values: dicts with string keys, lists, text, booleans, None, finite numbers.
 
     Raises
     ------
     ModelFileError
-        A value is not finite or is none that JSON knows, or the folder cannot be written to.
+        If a value is not finite or not a JSON value, or the folder is not writable.
     """
     try:
         document = {"format": format, "version": version, **payload}
@@ -113,12 +113,12 @@ def write(
 
 
 def replace(path: str | os.PathLike[str], content: str | bytes) -> None:
-    """Put ``content`` in place of a file: a temporary name first, renamed once it is whole.
+    """As :func:`replace_file`, with an error that has a remedy.
 
     Raises
     ------
     ModelFileError
-        The folder does not exist or cannot be written to.
+        If the folder does not exist or is not writable.
     """
     try:
         replace_file(path, content.encode() if isinstance(content, str) else content)
@@ -132,13 +132,13 @@ def read(path: str | os.PathLike[str], format: str, versions: Collection[int]) -
     Returns
     -------
     dict
-        The whole document, ``version`` included and ``format`` left out.
+        The document, including ``version`` but not ``format``.
 
     Raises
     ------
     ModelFileError
-        The file is missing, larger than 16 MB, no JSON, holds a number that is not finite or a key
-        twice, or is of another format or of an unknown version.
+        If the file is missing, larger than 16 MB or not JSON, contains a number that is not finite
+        or a key twice, or has another format or an unknown version.
     """
     document = _parse(path, _text(path))
     if not isinstance(document, dict):
@@ -160,7 +160,7 @@ def read(path: str | os.PathLike[str], format: str, versions: Collection[int]) -
 
 
 def format_of(path: str | os.PathLike[str]) -> str:
-    """The format that a file states; empty where it is no such document."""
+    """The format stated in a file; empty if it is not a JSON document with one."""
     try:
         document = _parse(path, _text(path))
     except ModelFileError:
@@ -174,7 +174,7 @@ def _text(path: str | os.PathLike[str]) -> str:
         with Path(path).open("rb") as file:
             data = file.read(LARGEST_FILE + 1)
     except (OSError, ValueError) as error:
-        # a name with the character 0 is a ValueError
+        # open raises a ValueError for a name with the character 0
         raise unreadable(ModelFileError, path, error) from error
     if len(data) > LARGEST_FILE:
         raise ModelFileError(f"{path}: expected a file of at most 16 MB, got a larger one")
@@ -246,7 +246,7 @@ class Fields:
         )
 
     def require_only(self, known: Collection[str]) -> None:
-        """Raise where a field is missing or unknown."""
+        """Raise if a field is missing or unknown."""
         for name in self.values:
             if name not in known:
                 raise self.refuse(name, f"one of {', '.join(known)}", self.values[name])
@@ -330,7 +330,7 @@ class Fields:
 
 
 def entries(shapes: Mapping[str, tuple[int, ...]]) -> tuple[str, ...]:
-    """The name of every entry of matrices that stand one after the other, row by row."""
+    """The name of every entry of matrices stored one after the other, row by row."""
     return tuple(
         name + (f"[{','.join(map(str, index))}]" if index else "")
         for name, shape in shapes.items()

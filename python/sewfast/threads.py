@@ -1,4 +1,4 @@
-"""How many threads work is spread over, and work on threads, processes or a cluster."""
+"""The number of threads to use, and work spread over threads, processes or a cluster."""
 
 from __future__ import annotations
 
@@ -8,37 +8,32 @@ from typing import Any, Protocol, TypeAlias, TypeVar, cast
 
 from .errors import SettingError
 
-# --- How many threads work is spread over unless a caller says so ---------------------------------
-
-
 VARIABLE = "SEWFAST_THREADS"
-"""Environment variable with the most threads that are taken unasked."""
+"""Environment variable that limits the default number of threads."""
 
 
 def available() -> int:
-    """The processors that this process may use, at most as many as `SEWFAST_THREADS` allows.
+    """The processors available to this process, at most as many as `SEWFAST_THREADS` allows.
 
     Raises
     ------
     SettingError
-        Where the variable holds something else than a whole number of 1 or more.
+        If the variable is not a whole number of 1 or more.
     """
-    may = getattr(os, "sched_getaffinity", None)
-    here = len(may(0)) if may is not None else os.cpu_count() or 1
-    most = os.environ.get(VARIABLE, "").strip()
-    return min(here, _most(most)) if most else here
-
-
-def _most(text: str) -> int:
-    if not (text.isdecimal() and int(text) >= 1):
+    affinity = getattr(os, "sched_getaffinity", None)
+    processors = len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+    limit = os.environ.get(VARIABLE, "").strip()
+    if not limit:
+        return processors
+    if not (limit.isdecimal() and int(limit) >= 1):
         raise SettingError(
-            f"{VARIABLE}: expected a whole number of 1 or more, received {text!r}; unset it to use "
-            "every processor"
+            f"{VARIABLE}: expected a whole number of 1 or more, received {limit!r}; unset it to "
+            "use every processor"
         )
-    return int(text)
+    return min(processors, int(limit))
 
 
-# --- Work spread over whatever maps a function over a list: threads, processes, a cluster ---------
+# --- Work spread by a `map`: over threads, processes, a cluster -----------------------------------
 
 
 J = TypeVar("J")
@@ -56,7 +51,7 @@ Workers: TypeAlias = Mapper | Callable[..., Iterable[Any]]
 
 
 def require_workers(workers: object) -> None:
-    """Something that maps, or a `SettingError`."""
+    """Raise `SettingError` unless `workers` is None or can map."""
     if workers is None or callable(getattr(workers, "map", None)) or callable(workers):
         return
     raise SettingError(
@@ -69,8 +64,8 @@ def require_workers(workers: object) -> None:
 def spread(workers: Workers, function: Callable[[J], R], jobs: Sequence[J]) -> list[R]:
     """`function` of every job, in the order of the jobs.
 
-    Jobs and results are pickled where the workers are other processes. Futures, as a Dask client's
-    `map` returns them, are waited for.
+    Other processes receive and return pickled objects. Futures, which the `map` of a Dask client
+    returns, are waited for.
     """
     mapped = cast(Callable[..., Iterable[Any]], getattr(workers, "map", workers))
     return [_result(r) for r in mapped(function, jobs)]

@@ -26,7 +26,7 @@ from sewfast import (
     commission,
     read_table,
 )
-from sewfast.commissioning.checkpoint import Taken, prepare
+from sewfast.commissioning.checkpoint import Checkpoint, prepare
 from sewfast.commissioning.result import require_own
 from sewfast.control.loop import run as closed_loop
 from sewfast.control.machine import MachineBench, RecordedRun, Watch, record
@@ -118,7 +118,7 @@ def taken(folder: Path, kind: str = "virtual") -> Recording:
     """A recording that lies in a folder, of a commissioning on what `kind` says."""
     recording = record(VirtualMachine(), np.full(300, 2.0), name="step")
     prepare(folder)
-    files = Taken(folder, {"kind": kind, "name": "bench 2"}, {"u_max": 9.0})
+    files = Checkpoint(folder, {"kind": kind, "name": "bench 2"}, {"u_max": 9.0})
     files.begin()
     files.keep("step response", "step", "key", recording, None)
     return recording
@@ -153,7 +153,7 @@ def test_files_of_others_are_neither_repeatable_nor_cleared(tmp_path: Path) -> N
     recording.save(mine)
     with pytest.raises(SettingError, match="choose another folder"):
         require_own(tmp_path, overwrite=False)
-    Taken(tmp_path, {}, {}).begin()
+    Checkpoint(tmp_path, {}, {}).begin()
     assert list((tmp_path / "unfinished").iterdir()) == [mine]
 
 
@@ -180,7 +180,7 @@ def test_a_whole_commissioning_stays_beside_an_unfinished_one(
 
 def test_a_recording_that_cannot_be_written_does_not_end_a_commissioning(tmp_path: Path) -> None:
     recording = taken(tmp_path)
-    files = Taken(tmp_path / "missing", {"kind": "virtual"}, {})
+    files = Checkpoint(tmp_path / "missing", {"kind": "virtual"}, {})
     with pytest.warns(RuntimeWarning, match="goes on, its recordings are in memory alone"):
         files.keep("limits", "pulses", "key", recording, None)
     # once: a second warning would be an error here
@@ -199,7 +199,7 @@ def test_references_have_files_of_their_own(names: list[str], message: str) -> N
 def test_a_reference_does_not_replace_a_recording_of_its_name(tmp_path: Path) -> None:
     recording = taken(tmp_path)
     controller, machine = Controller(Gains.standard(0.01, 0.1)), VirtualMachine()
-    files = Taken(tmp_path, {"kind": "virtual"}, {})
+    files = Checkpoint(tmp_path, {"kind": "virtual"}, {})
     files.keep(
         "verification", "step", "key", recording, closed_loop(controller, machine, np.zeros(300))
     )

@@ -14,7 +14,7 @@ from commissioned import SMALL, short
 from loops import QUIET, drive
 from sewfast import Controller, Gains, VirtualMachine, commission, run
 from sewfast.commissioning import Refusal
-from sewfast.commissioning.bench import Aborted, Guard, NotedBench
+from sewfast.commissioning.bench import Aborted, Guard, RecordedBench
 from sewfast.commissioning.verification import Watching, measure, predict
 from sewfast.control.controller import SampledController
 from sewfast.control.machine import WATCHED, MachineBench, RecordedRun, SteppedBench, Watch
@@ -130,7 +130,7 @@ def test_what_was_recorded_is_kept_and_a_machine_that_cannot_be_watched_runs_on(
     predicted = predict(QUIET, Ensemble.of([drive()]), {"hold": R})
     for machine, name in ((Watched(), "hold_aborted"), (Own(), "hold")):
         kept.clear()
-        on = NotedBench(machine, note, lambda *_: None, lambda *_: None)
+        on = RecordedBench(machine, note, lambda *_: None, lambda *_: None)
         with pytest.raises(Refusal, match=r"the controller is not verified|limits most"):
             measure(QUIET, on, predicted, {"hold": R}, lambda _: None)
         assert list(kept) == [name]

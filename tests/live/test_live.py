@@ -137,7 +137,7 @@ def test_memory_does_not_grow() -> None:
     finally:
         tracemalloc.stop()
     assert grown < 32_000
-    assert len(f.said()) == 64
+    assert len(f.notes()) == 64
 
 
 def test_reader_never_sees_a_torn_sample() -> None:

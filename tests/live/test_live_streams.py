@@ -107,11 +107,11 @@ def test_status_lines_are_sent_once() -> None:
     f = feed()
     tail = Tail(f)
     f.say("one")
-    assert list(tail.said()) == ["one"]
+    assert list(tail.notes()) == ["one"]
     f.say("two")
     f.say("three")
-    assert list(tail.said()) == ["two", "three"]
-    assert list(tail.said()) == []
+    assert list(tail.notes()) == ["two", "three"]
+    assert list(tail.notes()) == []
 
 
 # PlotJuggler

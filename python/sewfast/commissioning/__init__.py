@@ -1,9 +1,10 @@
 """Commissioning: from a machine at rest to a verified controller.
 
-Read in this order: `procedure` (`commission`, its stages one after the other), `demands` (what is
-asked and allowed, `Refusal`), `bench` (what is put around a machine); the stages: `excitations`,
+Read in this order: `procedure` (`commission`, its stages one after the other), `demands` (settings
+and limits, `Refusal`), `bench` (wrappers around a machine); the stages: `excitations`,
 `small_signal`, `gains`, `training`, `slow`, `verification`; `result` (the value and its folder).
-Beside them: `shaking`, `records` (`bode` of a machine, of a record), `fmu` (an FMU as a machine).
+Apart from these: `shaking`, `records` (`bode` of a machine, of a record), `fmu` (an FMU as a
+machine).
 """
 
 from .bench import Bench, Followed, Stepped, SteppedBench

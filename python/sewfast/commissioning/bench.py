@@ -1,4 +1,4 @@
-"""What commissioning puts around a `Machine`: whole runs only, and recordings that are kept."""
+"""Wrappers around a `Machine` for commissioning: complete runs, saved recordings, a guard."""
 
 from __future__ import annotations
 
@@ -39,22 +39,22 @@ from .demands import Refusal
 __all__ = ["Bench", "Followed", "MachineBench", "Stepped", "SteppedBench"]
 
 Bench = Machine
-"""`sewfast.Machine` by its earlier name."""
+"""Earlier name of `sewfast.Machine`."""
 
 
 ABORTED = "_aborted"
-"""Ends the name of the recording of a run that was ended on the way."""
+"""Suffix of the names of recordings of aborted runs."""
 
 
 class Aborted(Refusal):
-    """A run that was ended on the way.
+    """A run that was ended early.
 
     Attributes
     ----------
     recording : Recording
-        What it had recorded.
+        The recording until then.
     frequency : float or None
-        Of a command that went from limit to limit [Hz].
+        Frequency of a command that swung from limit to limit [Hz].
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Aborted(Refusal):
         *,
         frequency: float | None = None,
     ) -> Aborted:
-        """Of a run by its name, after these commands [V] and counts."""
+        """The error for a run of this name, from its commands [V] and counts until then."""
         counts, u = counts - counts[0], u.copy()
         y = speed_or_nan(counts, like.Ts, counts_per_rev, "kalman")
         return cls(
@@ -86,22 +86,25 @@ class Aborted(Refusal):
 
 
 LARGE, NEAR, WAYS, SPAN = 0.5, 0.05, 8, 0.25
-"""Of the largest command that moves any motor; of the range between the limits, within which a
-command is at one; ways from limit to limit that are a swing; time of a motor that does not move,
-and between two of these ways [s]. A device guards itself by the same (docs/PROTOCOL.md, 9 and 12).
+"""Bounds of the guard, the same as those of a device (docs/PROTOCOL.md, 9 and 12).
+
+A command of `LARGE` times the largest one moves every motor. A command within `NEAR` of a limit, as
+a share of the range between the limits, counts as at that limit. More than `WAYS` swings from one
+limit to the other in a row are an oscillation. `SPAN` is the longest time of a motor that does not
+move, and between two such swings [s].
 """
 
 
 class Guard:
     """Ends a loop whose motor or encoder has failed, and one that swings from limit to limit.
 
-    Under feedback a lost encoder is a motor at full speed for as long as the reference lasts.
+    Under feedback, a lost encoder means a motor at full speed until the end of the reference.
 
     Parameters
     ----------
     controller : Controller or StateFeedback
     name : str
-        Of the run.
+        Name of the run.
     counts_per_rev : float
     """
 
@@ -117,11 +120,12 @@ class Guard:
         self._still, self._side, self._ways = 0, 0, [0]
 
     def __call__(self, first: int, u: FloatArray, counts: FloatArray) -> None:
-        """Samples `first`, `first + 1`, ...
+        """Check samples `first`, `first + 1`, ...
 
         Raises
         ------
         Aborted
+            If the encoder stands still under a large command, or the command swings.
         """
         self._u.append(u.copy())
         self._counts.append(counts.copy())
@@ -140,7 +144,7 @@ class Guard:
                 self._turn(side)
 
     def _turn(self, side: int) -> None:
-        """The command has come to another limit than it was at before."""
+        """Count a swing: the command has reached the opposite limit."""
         now = self._done
         in_row = self._side != 0 and now - self._ways[-1] <= self._span
         self._side, self._ways = side, [*self._ways, now] if in_row else [now]
@@ -161,8 +165,8 @@ class Guard:
 
 
 @dataclass
-class Around:
-    """A machine around another one, whose members it has."""
+class MachineWrapper:
+    """A wrapper that forwards all members of a machine."""
 
     inner: Machine
 
@@ -200,16 +204,16 @@ class Around:
 
 
 @dataclass
-class DriveBench(Around):
-    """A drive behind a port, whose limits have been set, and of whose runs nothing is missing.
+class DriveBench(MachineWrapper):
+    """A drive behind a port with its limits set, which returns complete runs only.
 
-    What the link has lost of a run that ended well is no danger to the machine: the run is made
-    once more, from rest as every run.
+    If the link has lost samples of a run that ended well, the run is repeated once: every run
+    starts from rest, and lost samples do not endanger the machine.
 
     Attributes
     ----------
     cancel : threading.Event or None
-        Ends a run as Ctrl-C does.
+        Set it to end a run as Ctrl-C does.
     """
 
     cancel: threading.Event | None = field(default=None, kw_only=True)
@@ -250,11 +254,11 @@ class DriveBench(Around):
 
 
 @dataclass
-class NotedBench(Around):
-    """A machine that hands every recording to `note` as it comes, with the run where a loop ran.
+class RecordedBench(MachineWrapper):
+    """A machine that hands every recording to `note`, together with the run of a closed loop.
 
-    What an earlier attempt has recorded under the same name of the very same command, or of the
-    same controller and reference, is not recorded again: `kept` finds it by its key.
+    A recording that an earlier attempt made under the same name with exactly the same command, or
+    the same controller and reference, is not made again: `kept` finds it by its key.
     """
 
     note: Callable[[str, str, Recording, ClosedLoopRun | None], object]
@@ -286,7 +290,7 @@ class NotedBench(Around):
             try:
                 found = super().follow(controller, r, name, watch=both)
             except Aborted as stop:
-                # of another name: whoever goes on is to run it again, and whole
+                # under another name, so that a resumed commissioning repeats the run
                 self.note(f"{name}{ABORTED}", key, stop.recording, None)
                 raise
             _require_run(self.inner, name, len(r), found)
@@ -295,14 +299,14 @@ class NotedBench(Around):
 
 
 def require_record(machine: Machine, name: str, samples: int, found: object) -> None:
-    """Refuse what a machine of the user's own hands back, where nothing can be learned from it.
+    """Refuse an unusable recording of a user's own machine.
 
     Raises
     ------
     SettingError
-        For what is no recording.
+        For anything but a recording.
     DataError
-        For one of other samples than were asked for, or with numbers that are not finite.
+        For another number of samples than asked for, or values that are not finite.
     """
     if not isinstance(found, Recording):
         raise SettingError(
@@ -321,7 +325,7 @@ def require_record(machine: Machine, name: str, samples: int, found: object) -> 
 
 
 def _require_run(machine: Machine, name: str, samples: int, found: object) -> None:
-    """The same of a loop."""
+    """The same for a closed loop."""
     if not isinstance(found, RecordedRun):
         raise SettingError(
             name=f"{machine.name}, {name}", expected="a RecordedRun", received=type(found).__name__,
@@ -335,7 +339,7 @@ def _require_run(machine: Machine, name: str, samples: int, found: object) -> No
 def _require_columns(
     where: str, columns: Mapping[str, FloatArray], samples: int, each: str
 ) -> None:
-    """As many finite values in every column as were asked for."""
+    """Refuse a column with a missing sample or a value that is not finite."""
     for column, values in columns.items():
         if np.shape(values) != (samples,):
             raise DataError(
@@ -346,13 +350,13 @@ def _require_columns(
 
 
 def key_of(signal: FloatArray, controller: SampledController | None = None) -> str:
-    """What tells a command, or a reference with its controller, from any other."""
+    """A hash that identifies a command, or a reference with its controller."""
     design = "" if controller is None else json.dumps(controller.to_dict(), sort_keys=True)
     return hashlib.sha256(np.ascontiguousarray(signal).tobytes() + design.encode()).hexdigest()
 
 
-def told_of(bench: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Device and conditions, as recordings state them."""
+def description_of(bench: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Description of the device, and conditions, for recordings."""
     if isinstance(bench, DriveBench):
         return device_of(bench.drive), conditions_of(bench.drive)
     kind = "virtual" if isinstance(bench, MachineBench) else "bench"
@@ -363,12 +367,12 @@ def told_of(bench: Machine) -> tuple[dict[str, Any], dict[str, Any]]:
 def bench_of(
     on: object, u_max: float | None, cancel: threading.Event | None = None
 ) -> Iterator[Machine]:
-    """A machine as commissioning takes it; a drive's volt limit is at most `u_max` meanwhile.
+    """The machine to commission; for a drive, with a volt limit of at most `u_max` meanwhile.
 
     Raises
     ------
     SettingError
-        For what is no machine.
+        For anything but a machine.
     """
     machine = machine_of(on)
     if not is_streaming(machine):

@@ -1,4 +1,4 @@
-"""`Taken`: the recordings of a commissioning as files, each written as soon as it is there."""
+"""`Checkpoint`: the recordings of a commissioning as files, each written as soon as it is made."""
 
 from __future__ import annotations
 
@@ -33,24 +33,24 @@ STAGES = (
 )
 
 FOLDER = "unfinished"
-"""Of its own, so that a killed commissioning and an earlier whole one never mix."""
+"""A folder of its own, so that a killed commissioning never mixes with an earlier complete one."""
 _MARK = "commissioning"
-"""The setting that tells these files from any others."""
+"""The setting by which these files are recognised."""
 
 
 @dataclass
-class Taken:
-    """Without it a process that is killed, or a computer without power, loses what a machine did.
+class Checkpoint:
+    """Saves each recording, so that a killed process or a power failure loses none.
 
     Parameters
     ----------
     folder : Path
-        Of the commissioning; the files lie in its `unfinished` until `folder.write` has written
-        the tables that hold the same.
+        Folder of the commissioning; the files lie in its subfolder `unfinished` until
+        `Commissioning.save` replaces them by tables.
     device, conditions : mapping
-        What the recordings are made on, and under which settings.
+        Device and settings of the recordings.
     resume : bool
-        Whether what lies there is of an attempt that this one goes on from.
+        Whether to reuse the recordings that an earlier attempt left there.
     """
 
     folder: Path
@@ -60,11 +60,12 @@ class Taken:
     _has_warned: bool = field(default=False, init=False)
 
     def begin(self) -> None:
-        """Make the place; files of an earlier commissioning would pass for this one's.
+        """Create the folder, and delete the files of an earlier commissioning unless it resumes.
 
         Raises
         ------
         DataError
+            If either fails.
         """
         try:
             if not self.resume:
@@ -80,9 +81,9 @@ class Taken:
     def keep(
         self, stage: str, name: str, key: str, recording: Recording, run: ClosedLoopRun | None
     ) -> None:
-        """Write one; an earlier one of that name was not good enough.
+        """Write a recording; it replaces an earlier one of that name, which was not good enough.
 
-        A file that cannot be written is warned of, once: what the machine did is in memory as well.
+        If a file cannot be written, there is one warning: the recordings are also in memory.
         """
         columns = recording.columns()
         del columns["t"]
@@ -107,12 +108,12 @@ class Taken:
 
     def _place(self, stage: str, name: str) -> Path:
         if stage == STAGES[-1]:
-            # a reference may have the name of an excitation
+            # a reference can have the name of an excitation
             name = f"{stage}_{name}"
         return self.folder / FOLDER / f"{file_name(name)}{ENDING}"
 
     def found(self, stage: str, name: str, key: str) -> Recording | None:
-        """What an earlier attempt has recorded of the very same, whole; None where it has not."""
+        """The complete recording of an earlier attempt with the same key; None without one."""
         file = self._found(stage, name, key)
         if file is None:
             return None
@@ -125,7 +126,7 @@ class Taken:
     def found_run(
         self, stage: str, name: str, key: str, controller: SampledController, plant: str
     ) -> RecordedRun | None:
-        """The same of a closed loop."""
+        """The same for a closed loop."""
         file, recording = self._found(stage, name, key), self.found(stage, name, key)
         if file is None or recording is None:
             return None
@@ -149,11 +150,12 @@ class Taken:
 
 
 def prepare(folder: Path) -> None:
-    """Make the folder, so that one that cannot be made is refused before the machine moves.
+    """Create the folder, before the machine moves.
 
     Raises
     ------
     DataError
+        If it cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -165,18 +167,18 @@ def prepare(folder: Path) -> None:
 
 
 def clear(folder: Path) -> None:
-    """Take the files away: of an earlier commissioning, or of one whose tables are there."""
+    """Delete the files: of an earlier commissioning, or of one that has been saved as tables."""
     place = folder / FOLDER
     for file in _inside(place):
         if _is_own(file):
             file.unlink()
     with suppress(OSError):
-        # what somebody else has put there stays
+        # a folder with other files stays
         place.rmdir()
 
 
 def require_repeatable(folder: Path) -> None:
-    """Refuse files there that a virtual machine could not make again.
+    """Refuse a folder with files other than recordings of a virtual machine.
 
     Raises
     ------
@@ -197,7 +199,7 @@ def _inside(place: Path) -> list[Path]:
 
 
 def _is_own(file: Path) -> bool:
-    """Such a file, or what was being written of one when its process was killed."""
+    """Whether it is such a file, or the temporary file of one whose process was killed."""
     if not file.is_file():
         return False
     if file.name.startswith(".") and f"{ENDING}." in file.name and file.suffix == ".tmp":

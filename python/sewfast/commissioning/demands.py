@@ -1,4 +1,4 @@
-"""What is asked and allowed; `Refusal`: evidence that is not good enough."""
+"""`Demands`: the checked settings of a commissioning; `Refusal`: not enough evidence."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 
 class Refusal(FitError):
-    """What was expected, what was seen, what to do; the machine is at rest.
+    """Commissioning stops, as the evidence is not good enough; the machine is at rest.
 
     Attributes
     ----------
     stage : str
-        Where it stopped.
+        The stage at which it stopped.
     so_far : Commissioning or None
-        What had been recorded, identified and tuned until then.
+        Recordings, models and gains until then.
     """
 
     stage: str = ""
@@ -36,31 +36,26 @@ class Refusal(FitError):
 
 
 def require(met: bool, message: str) -> None:
-    """Stop with a reason.
-
-    Raises
-    ------
-    Refusal
-    """
+    """Raise `Refusal` with this message unless the condition is met."""
     if not met:
         raise Refusal(message)
 
 
-# --- `Demands`: what a machine is commissioned for, and what commissioning may do -----------------
+# --- `Demands` ------------------------------------------------------------------------------------
 
 
 LONGEST_NAME = 100
-"""Of a reference's file [bytes]; file systems take 255, of which endings need some."""
+"""Longest name of a reference's file [bytes]; file systems allow 255, including the endings."""
 
 MOST_MEMBERS = 100
 MS = 2.0
-"""Largest sensitivity unless said otherwise."""
+"""Default of the largest sensitivity."""
 OVER = 1.25
-"""Training reaches this many times the top of the working range: the loop overshoots it."""
+"""Training covers this multiple of the top of the working range, as the loop overshoots it."""
 
 
 SAMPLE_TIMES = (1e-5, 0.1)
-"""Of machines that can be commissioned [s]: signals are planned in seconds."""
+"""Shortest and longest sample time of a machine [s]: the signals are planned in seconds."""
 
 
 @dataclass(frozen=True)
@@ -70,22 +65,24 @@ class Demands:
     Attributes
     ----------
     u_max : float
-        Largest command to either side [V].
+        Largest command in either direction [V].
     speed : float
         Top of the working range [RPM].
     references : mapping of name to array, or None
-        What to verify on [RPM]; None for those of `references.standard`.
+        References for the verification [RPM]; None for those of `excitations.standard`.
     practice : mapping of name to array, or None
-        What to tune on [RPM]; None for the references, or shorter ones of the standard kind.
+        References for tuning [RPM]; None for the same, or for shorter versions of the standard
+        ones.
     members, evaluations : int
         Models in the ensemble; controllers that the search tries.
     seed, threads : int
     load : float or None
-        What the load step takes [V]; None for a share of `u_max`, 0 for no such requirement.
+        Size of the load step in command [V]; None for a share of `u_max`, 0 for no such
+        requirement.
     Ms : float or None
         Largest sensitivity on the small signals; None for no such requirement.
     time_budget : float or None
-        Of the search [s].
+        Longest time of the search [s].
     """
 
     u_max: float
@@ -102,12 +99,12 @@ class Demands:
 
     @property
     def top(self) -> float:
-        """Largest speed that is planned [RPM]."""
+        """Largest speed of the planned signals [RPM]."""
         return OVER * self.speed
 
 
 def demands(
-    bench: Machine,
+    machine: Machine,
     *,
     u_max: float | None,
     speed: float | None,
@@ -121,22 +118,23 @@ def demands(
     Ms: float | None = MS,
     time_budget: float | None = None,
 ) -> Demands:
-    """The demands, checked against what the bench allows.
+    """The demands, checked against the machine's limits.
 
     Raises
     ------
     SettingError
+        For a value outside its range or beyond a limit.
     """
-    _require_machine(bench)
-    volt = bench.volt if u_max is None else real("u_max", u_max)
+    _require_machine(machine)
+    volt = machine.volt if u_max is None else real("u_max", u_max)
     if not 0.0 < volt < math.inf:
         raise SettingError(
             name="u_max", expected="above 0 V", received=f"{volt:g}",
             remedy="give the amplifier's limit",
         )  # fmt: skip
-    if volt > bench.volt * (1.0 + 1e-6):
+    if volt > machine.volt * (1.0 + 1e-6):
         raise SettingError(
-            name="u_max", expected=f"within the machine's limit of {bench.volt:g} V",
+            name="u_max", expected=f"within the machine's limit of {machine.volt:g} V",
             received=f"{volt:g}",
         )  # fmt: skip
     asked = [*(references or {}).values(), *(practice or {}).values()]
@@ -149,12 +147,12 @@ def demands(
             name="references", expected=f"none beyond the top speed of {top:g} RPM",
             received=f"one up to {named:g}", remedy="raise speed, or lower that reference",
         )  # fmt: skip
-    if top * OVER > bench.speed:
+    if top * OVER > machine.speed:
         raise SettingError(
             name="speed",
             expected=f"a limit of the machine of {OVER:g} times that, {OVER * top:g} RPM, as "
             "training goes beyond the working range",
-            received=f"{bench.speed:g}", remedy="raise that limit, or lower speed",
+            received=f"{machine.speed:g}", remedy="raise that limit, or lower speed",
         )  # fmt: skip
     return Demands(
         volt,
@@ -171,17 +169,17 @@ def demands(
     )
 
 
-def _require_machine(bench: Machine) -> None:
-    """Refuse numbers of a machine that no command can be planned from, before it moves."""
+def _require_machine(machine: Machine) -> None:
+    """Refuse a machine with impossible figures before it moves."""
     for name, low, high in (("Ts", *SAMPLE_TIMES), ("counts_per_rev", 1.0, 1e9)):
-        value = real(name, getattr(bench, name))
+        value = real(name, getattr(machine, name))
         if not low <= value <= high:
             raise SettingError(
                 name=name, expected=f"{low:g} to {high:g} of the machine", received=f"{value:g}",
                 remedy="see what its controller and its encoder are set to",
             )  # fmt: skip
     for name in ("volt", "speed"):
-        value = real(name, getattr(bench, name))
+        value = real(name, getattr(machine, name))
         if not value > 0.0:
             raise SettingError(
                 name=name, expected="a limit of the machine above 0", received=f"{value:g}",
@@ -202,7 +200,7 @@ def _load(load: float | None, volt: float) -> float | None:
 
 
 def _fixed(references: Mapping[str, FloatArray] | None) -> Mapping[str, FloatArray] | None:
-    """Each is a file as well, of a name of its own."""
+    """The references, whose names must also be distinct file names."""
     if references is None:
         return None
     files: dict[str, str] = {}

@@ -15,21 +15,21 @@ from ..recording import Recording
 from ..rules import Fopdt, fit_fopdt
 from .demands import Demands, Refusal, require
 
-# --- First motion: which command moves the machine, which way, and about how fast -----------------
+# --- First motion: the command that moves the machine, its direction, and a rough speed -----------
 
 
 SHARES = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.0)
-"""Commands that are tried, in shares of the largest, the smallest first."""
+"""Commands to try, as shares of the largest, the smallest first."""
 HOLD = 0.8
-"""How long each is held [s]."""
+"""Duration of each [s]."""
 MOVED = 0.02
 """Turns that count as motion."""
 ENOUGH = 0.2
 """Share of the top speed at which the trials end."""
 LEAST_TURNS = 1.0
-"""Travel within which a load over the turn may stop the machine."""
+"""Travel within which a load over the turn can stop the machine."""
 STALLS, STALLING = 3, 0.2
-"""How often, and up to which share of the largest command, it may."""
+"""Number of such stalls that are allowed, and the largest share of the command for them."""
 
 
 @dataclass(frozen=True)
@@ -41,34 +41,34 @@ class Motion:
     gain : float
         [RPM/V]
     threshold : float
-        Command that friction takes [V].
+        Command that friction uses up [V].
     """
 
     gain: float
     threshold: float
 
     def command(self, speed: float) -> float:
-        """What holds about that speed [V]."""
+        """The command that holds about that speed [V]."""
         return self.threshold + speed / self.gain
 
 
-def first_motion(bench: Machine, demands: Demands) -> Motion:
+def first_motion(machine: Machine, demands: Demands) -> Motion:
     """Try commands from small to large until the machine turns at a fair speed.
 
     Raises
     ------
     Refusal
-        Where nothing moves, the machine turns the wrong way or is stopped in its way, or its
-        largest command does not bring a fair speed.
+        If nothing moves, the machine turns the wrong way or gets stuck, or its largest command
+        does not reach a fair speed.
     """
     levels: list[tuple[float, float]] = []
     stalls = 0
     for share in SHARES:
         u = share * demands.u_max
-        recording = bench.excite(_pulse(u, bench.Ts), f"motion_{100 * share:g}")
+        recording = machine.excite(_pulse(u, machine.Ts), f"motion_{100 * share:g}")
         speed = _judged(recording, u, may_stall=stalls < STALLS and share < STALLING)
         if speed is None:
-            stalls += int(np.ptp(recording.counts) >= MOVED * bench.counts_per_rev)
+            stalls += int(np.ptp(recording.counts) >= MOVED * machine.counts_per_rev)
             continue
         levels.append((u, speed))
         if speed >= ENOUGH * demands.speed:
@@ -96,7 +96,7 @@ def _pulse(u: float, Ts: float) -> FloatArray:
 
 
 def _judged(recording: Recording, u: float, *, may_stall: bool) -> float | None:
-    """The speed at the end [RPM]; None where it did not move, or stopped and may have."""
+    """The speed at the end [RPM]; None if it did not move, or stalled and was allowed to."""
     turns = (recording.counts - recording.counts[0]) / recording.counts_per_rev
     if np.max(np.abs(turns)) < MOVED:
         return None
@@ -123,7 +123,7 @@ def _judged(recording: Recording, u: float, *, may_stall: bool) -> float | None:
 
 
 def _motion(levels: list[tuple[float, float]]) -> Motion:
-    """The line through the last two levels; through the origin where there is one."""
+    """The line through the last two levels, or through the origin and the only one."""
     u, speed = levels[-1]
     if len(levels) == 1:
         return Motion(speed / u, 0.0)
@@ -132,29 +132,29 @@ def _motion(levels: list[tuple[float, float]]) -> Motion:
     return Motion(gain, max(0.0, u - speed / gain))
 
 
-# --- The step response: gain, time constant and dead time, with the evidence for them -------------
+# --- The step response: gain, time constant and dead time -----------------------------------------
 
 
 SHARE = 0.6
-"""Of the top speed that the step aims at."""
+"""Target of the step as a share of the top speed."""
 DURATIONS = (2.0, 6.0, 20.0)
-"""Tried until the response settles [s]."""
+"""Durations to try until the response settles [s]."""
 LEAST_FIT = 80.0
-"""Percent; below it the machine is no first order with dead time."""
+"""Least fit [%]; below it the machine is not of first order with dead time."""
 
 
-def step_response(bench: Machine, demands: Demands, motion: Motion) -> Fopdt:
+def step_response(machine: Machine, demands: Demands, motion: Motion) -> Fopdt:
     """Record steps until one settles, and fit it.
 
     Raises
     ------
     Refusal
-        Where none settles, the fit is poor, or the top speed is out of the command's reach.
+        If none settles, the fit is poor, or the command cannot reach the top speed.
     """
     u = min(motion.command(SHARE * demands.speed), demands.u_max)
     reason: Exception | None = None
     for seconds in DURATIONS:
-        recording = bench.excite(step(u, seconds, bench.Ts), "step")
+        recording = machine.excite(step(u, seconds, machine.Ts), "step")
         try:
             fopdt = fit_fopdt(recording.u, recording.y, Ts=recording.Ts)
         except (DataError, FitError) as error:
@@ -185,26 +185,26 @@ def _checked(fopdt: Fopdt, demands: Demands) -> None:
     )
 
 
-# --- Signals for a machine that is known as a first order with dead time only ---------------------
+# --- Signals for a machine of which only a first order with dead time is known --------------------
 
 
 SPANS = 0.02, 0.01, 0.005
-"""Over which a change of speed is an acceleration and not the encoder's noise [s]; the shorter ones
-where a fast machine's pulses are shorter."""
+"""Spans for differences of speed, long enough to average the encoder's noise [s]; the shorter ones
+are for fast machines, whose pulses are shorter."""
 FIRST_SHARE, FAIR_SHARE = 0.2, 0.35
-"""Of the top speed, that a single pulse is planned for and that ends the series."""
+"""Shares of the top speed: aim of the first single pulse, and speed that ends the series."""
 LONGEST_PULSE = 1.0
-"""Of the series [s]."""
+"""Longest pulse of the series [s]."""
 LEAST_HARD = 50
-"""Samples near the largest command from which an acceleration is told."""
+"""Samples near the largest command needed for an estimate of the acceleration."""
 LONGEST = 60.0
-"""Of any excitation [s]."""
+"""Longest excitation [s]."""
 PULSES = 20.0
 """Length of the pulses in time constants."""
 HARD = 0.25
-"""Least size of a pulse in shares of the largest command: a current limit is met halfway."""
+"""Least size of a pulse as a share of the largest command; a current limit takes about half."""
 SLOW = 0.15
-"""Speed between the trapezoids in shares of the top: a shaft that friction holds tells nothing."""
+"""Speed between the trapezoids as a share of the top: a shaft held by friction shows nothing."""
 TRAPEZOIDS = (
     (0.45, 0.12, 0.12),
     (0.90, 0.40, 0.25),
@@ -214,19 +214,19 @@ TRAPEZOIDS = (
     (0.30, 0.06, 0.30),
     (0.80, 0.25, 0.15),
 )
-"""Height in shares of the top, accelerations up and down in shares of what the limit allows."""
+"""Heights as shares of the top speed, accelerations up and down as shares of the largest."""
 
 
 def acceleration(fopdt: Fopdt, demands: Demands) -> float:
-    """What the largest command would give at rest without a current limit [RPM/s]."""
+    """Acceleration at rest under the largest command without a current limit [RPM/s]."""
     return fopdt.K * demands.u_max / fopdt.T
 
 
 def acceleration_shown(recording: Recording, demands: Demands) -> float:
-    """What the machine does when it speeds up under the largest commands [RPM/s]: the ninth decile
-    of its changes of speed; inf where there are no such commands.
+    """Measured acceleration under the largest commands [RPM/s]; inf without such commands.
 
-    How it brakes is not asked: friction helps there as much as it hinders here.
+    It is the ninth decile of the changes of speed. Braking does not count: friction helps there as
+    much as it hinders here.
     """
     hard = recording.u >= 0.7 * demands.u_max
     for span in (max(1, round(seconds / recording.Ts)) for seconds in SPANS):
@@ -237,19 +237,18 @@ def acceleration_shown(recording: Recording, demands: Demands) -> float:
     return float("inf")
 
 
-def acceleration_from_rest(bench: Machine, fastest: float, demands: Demands) -> float:
-    """The same from single pulses of the largest command [RPM/s], each twice as long as the one
-    before, until one brings a fair speed.
+def acceleration_from_rest(machine: Machine, fastest: float, demands: Demands) -> float:
+    """The same from single pulses of the largest command [RPM/s], until one reaches a fair speed.
 
-    Where pulses between speeds are planned with far more acceleration than a drive's current limit
-    allows, they are over within milliseconds.
+    Each is twice as long as the one before. Pulses between speeds do not help if they are planned
+    with far more acceleration than a drive's current limit allows: they last only milliseconds.
     """
-    samples = max(1, round(FIRST_SHARE * demands.top / (fastest * bench.Ts)))
+    samples = max(1, round(FIRST_SHARE * demands.top / (fastest * machine.Ts)))
     while True:
-        seconds = samples * bench.Ts
-        recording = bench.excite(_single(demands.u_max, samples, bench.Ts), f"limit_{samples}")
+        seconds = samples * machine.Ts
+        recording = machine.excite(_single(demands.u_max, samples, machine.Ts), f"limit_{samples}")
         reached = float(np.max(recording.y))
-        # a pulse of twice the length brings at most about twice the speed
+        # a pulse of twice the length reaches at most about twice the speed
         if reached >= FAIR_SHARE * demands.top or seconds >= LONGEST_PULSE:
             return max(reached, 1e-3 * demands.top) / seconds
         samples *= 2
@@ -263,7 +262,7 @@ def _single(u: float, samples: int, Ts: float) -> FloatArray:
 
 
 def step(u: float, seconds: float, Ts: float) -> FloatArray:
-    """From 0 to `u` after a tenth."""
+    """A step from 0 to `u` after a tenth of the time."""
     return _core.step(duration=seconds, Ts=Ts, at=0.1 * seconds, low=0.0, high=u)
 
 
@@ -291,7 +290,7 @@ def trapezoids(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float) -> Flo
 
 
 def levels(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float, seed: int) -> FloatArray:
-    """A reference of random levels over the working range, to judge models by [RPM]."""
+    """A reference of random levels over the working range, for judging models [RPM]."""
     change = max(0.8 * fopdt.T, 4.0 * demands.speed / fastest)
     return _core.random_steps(
         duration=min(25.0 * change, LONGEST),
@@ -309,8 +308,8 @@ def levels(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float, seed: int)
 def pulses(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float, seed: int) -> FloatArray:
     """Short commands near the largest, between speeds of the working range [V].
 
-    A drive limits its current there, which no gentle loop reaches and every fast one does. Planned
-    with a larger acceleration than the machine has, they stay below the speeds of the plan.
+    There a drive limits its current: fast loops reach that limit, gentle ones do not. Pulses
+    planned with a larger acceleration than the machine's stay below the planned speeds.
     """
     T = fopdt.T
     return _core.jumps(
@@ -330,40 +329,40 @@ def pulses(fopdt: Fopdt, fastest: float, demands: Demands, Ts: float, seed: int)
     )
 
 
-# --- References that a drive is verified on, and shorter ones of the same kind to tune on ---------
+# --- References for the verification, and shorter ones of the same kind for tuning ----------------
 
 
 GENTLE = 0.75
-"""Largest share of the machine's acceleration that the standard references ask for."""
+"""Largest acceleration of the standard references as a share of the machine's."""
 BRIEF = 2.5
-"""Slowness up to which the ones to tune on last longer; beyond it they cover less."""
+"""Largest pace at which the references for tuning still get longer; beyond it they cover less."""
 SHORT = 0.35
-"""Length of the sweeps to tune on, in shares of those to verify on."""
+"""Length of the sweeps for tuning as a share of those for the verification."""
 
 
 def pace_of(fastest: float, demands: Demands) -> float:
-    """How many times longer everything lasts than on a machine that is fast enough."""
+    """Factor by which all references are stretched for a slow machine; 1 for a fast one."""
     return max(1.0, demands.speed / 0.4 / (GENTLE * fastest))
 
 
 def standard(fastest: float, demands: Demands, Ts: float, *, short: bool) -> dict[str, FloatArray]:
     """Trapezoid, chirps of shrinking and of growing amplitude, random levels [RPM].
 
-    At 2,000 RPM and a machine that is fast enough: 0 to 2,000 RPM in .4 s; .1 to 3 Hz in 20 s to
-    2,000 RPM and to 600; random levels of 200 to 2,000 RPM, 10 s. Other top speeds to scale; where
-    the machine is too slow for that all of it lasts longer.
+    At 2,000 RPM and for a fast machine: 0 to 2,000 RPM in .4 s; .1 to 3 Hz in 20 s up to 2,000 RPM
+    and up to 600; random levels of 200 to 2,000 RPM, 10 s. They are scaled to other top speeds, and
+    stretched for a machine that is too slow.
 
     Parameters
     ----------
     fastest : float
-        What the machine accelerates with at the limit of its command [RPM/s].
+        Acceleration of the machine at the limit of its command [RPM/s].
     short : bool
-        Whether to tune on: shorter sweeps, other random levels.
+        Whether they are for tuning: shorter sweeps, other random levels.
     """
     pace = pace_of(fastest, demands)
     size = demands.speed / 2000.0
     share = SHORT if short else 1.0
-    # a slow machine's whole sweeps would be minutes of every loop that a search simulates
+    # the complete sweeps of a slow machine would take minutes in every loop that a search simulates
     brief = min(pace, BRIEF) if short else pace
     # the change of random levels is half a cosine, steepest in its middle
     change = max(0.2 * pace, 0.5 * math.pi * 1800.0 * size / (GENTLE * fastest))

@@ -21,10 +21,10 @@ from ..errors import ModelFileError, SettingError, not_installed
 from .fmu_process import FmuProcess
 
 MOST_BYTES = 2 * 1024**3
-"""Of all files of an FMU, unpacked."""
+"""Most bytes of all files of an FMU, unpacked."""
 MOST_FILES = 20_000
 MOST_XML = 64 * 1024**2
-"""Bytes of a model description."""
+"""Most bytes of a model description."""
 _TURNS = {"rad": 1.0 / (2.0 * math.pi), "deg": 1.0 / 360.0, "turn": 1.0, "rev": 1.0}
 _RPM = {
     "RPM": 1.0, "rpm": 1.0, "1/min": 1.0, "rev/min": 1.0, "rad/s": 30.0 / math.pi,
@@ -40,28 +40,28 @@ class FmuMachine:
     path : path
         FMU of version 1.0, 2.0 or 3.0 with a binary for this platform.
     Ts : float
-        Sample time [s]; the FMU is asked for steps of it.
+        Sample time [s], and communication step of the FMU.
     input : str, optional
-        Variable that takes the command; the only input where there is one.
+        Variable that takes the command; by default the only input.
     speed, angle, counts : str, optional
-        Variables to measure, at least one; where none is named, the only output is the speed.
-        Counts are read as they are, else made from the angle, else from the integral of the speed.
+        Variables to measure, at least one; by default the only output is the speed. Counts are
+        read, or computed from the angle, or from the integral of the speed.
     speed_unit, angle_unit : str, optional
-        Units of those where the FMU states none: `RPM`, `rad/s`, `deg/s`, `rev/s`; `rad`, `deg`,
+        Units of those if the FMU states none: `RPM`, `rad/s`, `deg/s`, `rev/s`; `rad`, `deg`,
         `rev`.
     counts_per_rev : float
         Encoder counts per turn.
     start : mapping, optional
-        Values of further variables at the beginning.
+        Initial values of further variables.
     timeout : float
-        Longest time that the FMU may take to begin, or for a step [s].
+        Longest time for the FMU to start, or for a step [s].
 
     Raises
     ------
     ModelFileError
-        For a file that is no FMU, is damaged, hostile or for another platform.
+        For a file that is not an FMU, is damaged, malicious or for another platform.
     SettingError
-        For variables that are not there, units that are not known, and without FMPy.
+        For missing variables or unknown units, and without FMPy.
     """
 
     def __init__(
@@ -193,12 +193,12 @@ class FmuMachine:
         return known[unit]
 
     def reset(self) -> None:
-        """A new run: the FMU is begun again.
+        """Start a new run of the FMU.
 
         Raises
         ------
         SettingError
-            Where the FMU refuses, crashes, or does not answer in time.
+            If the FMU refuses, crashes, or does not answer in time.
         """
         self._measured = self._process.begin()
         self._sample, self._turned = 0, 0.0
@@ -210,7 +210,7 @@ class FmuMachine:
         Raises
         ------
         SettingError
-            Where the FMU refuses the step, crashes, or does not answer in time.
+            If the FMU refuses the step, crashes, or does not answer in time.
         """
         before = self.speed_rpm
         self._measured = self._process.step(u, self._sample)
@@ -232,7 +232,7 @@ class FmuMachine:
 
     @property
     def counts(self) -> float:
-        """What the encoder shows."""
+        """Encoder counts."""
         counts, angle, _ = self._measured
         if self._counts is not None:
             return counts
@@ -241,7 +241,7 @@ class FmuMachine:
 
     @property
     def speed_rpm(self) -> float:
-        """True speed [RPM]; not a number where the FMU does not show it."""
+        """True speed [RPM]; NaN if the FMU does not provide it."""
         return self._measured[2] * self._rpm
 
     def close(self) -> None:
@@ -265,9 +265,9 @@ def fmu_bench(
     path, Ts, counts_per_rev
         As of `FmuMachine`.
     volt : float
-        Largest command that it takes to either side; larger ones are clipped.
+        Largest command in either direction; larger ones are clipped.
     limit : float
-        Speed beyond which it stops by itself [RPM].
+        Speed above which it stops by itself [RPM].
     **variables
         Further arguments of `FmuMachine`: `input`, `speed`, `angle`, `counts`, units, `start`,
         `timeout`.
@@ -300,7 +300,7 @@ def fmu_of(text: str) -> SteppedBench:
     Raises
     ------
     ModelFileError, SettingError
-        As `fmu_bench`, and for arguments that are none.
+        As `fmu_bench`, and for unknown arguments.
     """
     path, _, query = text.partition("?")
     given: dict[str, Any] = {}
@@ -334,7 +334,7 @@ def _library() -> Any:
 
 
 def _require_fmu(path: Path) -> None:
-    """Refuse what is no FMU or would do harm as it is unpacked; nothing of it is executed."""
+    """Refuse a file that is not an FMU or would do harm when unpacked; nothing is executed."""
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
@@ -369,7 +369,7 @@ def _require_fmu(path: Path) -> None:
             name=str(path), expected="a model description without entities", received="some",
             remedy="an FMU needs none",
         )  # fmt: skip
-    # FMI asks for UTF-8: in another encoding, which could hide entities, no version is found
+    # FMI requires UTF-8: in another encoding, which could hide entities, no version is found
     version = re.search(rb"""\bfmiVersion\s*=\s*["']([^"']{0,20})""", text)
     if version is None or not re.fullmatch(rb"[12]\.0|3\..*", version[1]):
         raise ModelFileError(

@@ -1,4 +1,4 @@
-"""The process in which an FMU runs: a crash there, or a step without end, is an error here.
+"""The process in which an FMU runs: a crash there, or an endless step, becomes an error here.
 
 Requests and answers are structs over the process's standard input and output.
 """
@@ -22,9 +22,10 @@ from typing import Any, NoReturn
 from ..errors import SettingError
 
 _REQUEST = struct.Struct("<cd")
-"""`r`, begin again, or `s`, a step, and the command."""
+"""`r` for a new run or `s` for a step, and the command."""
 _ANSWER = struct.Struct("<?3d")
-"""Whether it succeeded, and the measured variables; where it did not, first a message's size."""
+"""Whether it succeeded, and the measured variables; after a failure, the first is the size of the
+message that follows."""
 _FAREWELL = 5.0
 """Time for an FMU to end by itself [s]."""
 
@@ -37,17 +38,17 @@ class FmuProcess:
     path : path
         The FMU, for messages.
     folder : path
-        Where it is unpacked.
+        The folder of the unpacked FMU.
     input : int
         Reference of the variable that takes the command.
     measured : sequence of int or None
-        References of three variables to read after every step; not a number where there is none.
+        References of three variables to read after every step; None reads as NaN.
     start : mapping
-        First values of further variables, by reference.
+        Initial values of further variables, by reference.
     Ts : float
         Sample time [s].
     timeout : float
-        Longest time that a call may take [s].
+        Longest time of a call [s].
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class FmuProcess:
         self._process = subprocess.Popen(
             [sys.executable, "-c", program, given],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0,
-            start_new_session=True,  # Ctrl-C is the caller's
+            start_new_session=True,  # keep Ctrl-C for the caller
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         )  # fmt: skip
         assert self._process.stdin is not None
@@ -76,17 +77,17 @@ class FmuProcess:
         self._ended: BaseException | None = None
 
     def begin(self) -> tuple[float, ...]:
-        """Begin a run; the variables at its beginning.
+        """Begin a run; return the variables at its beginning.
 
         Raises
         ------
         SettingError
-            Where the FMU refuses, crashes, or does not answer in time.
+            If the FMU refuses, crashes, or does not answer in time.
         """
         return self._ask(b"r", 0.0, "an instance that begins")
 
     def step(self, u: float, sample: int) -> tuple[float, ...]:
-        """Hold a command for a sample; the variables after it. Raises as `begin`."""
+        """Hold a command for a sample; return the variables after it. Raises as `begin`."""
         return self._ask(b"s", u, f"a step of {self.Ts:g} s from {sample * self.Ts:g} s")
 
     def close(self) -> None:
@@ -102,7 +103,7 @@ class FmuProcess:
 
     def _ask(self, kind: bytes, u: float, what: str) -> tuple[float, ...]:
         if self._ended is not None:
-            raise self._ended  # a bench that stops its machine meets the reason again
+            raise self._ended  # stopping the machine afterwards raises the same reason
         try:
             self._requests.write(_REQUEST.pack(kind, u))
             until = time.monotonic() + self.timeout
@@ -143,7 +144,7 @@ class FmuProcess:
     def _read(self, size: int, until: float) -> bytes:
         whole = b""
         while len(whole) < size:
-            # only POSIX waits for pipes; elsewhere there is no end to an FMU without one
+            # only POSIX can wait for pipes; elsewhere an endless step is not ended
             if os.name == "posix":
                 left = until - time.monotonic()
                 if not select.select([self._answers], [], [], max(left, 0.0))[0]:
@@ -159,9 +160,9 @@ class FmuProcess:
 
 
 def serve() -> None:
-    """Answer requests until there are no more; `sys.argv[1]` has what `FmuProcess` was given."""
+    """Answer requests until the input ends; `sys.argv[1]` holds the arguments of `FmuProcess`."""
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
-    os.dup2(2, 1)  # what an FMU prints is for the user
+    os.dup2(2, 1)  # an FMU's own output goes to the user
     _end_with_the_caller()
     folder, taken, measured, start, Ts = json.loads(sys.argv[1])
     slave, sample = _Slave(folder), 0
@@ -184,7 +185,7 @@ def serve() -> None:
 
 
 def _end_with_the_caller() -> None:
-    """A caller that is killed takes an FMU without end along."""
+    """End this process when the caller is killed, even within an endless step."""
     if sys.platform == "linux":
         import ctypes
 
@@ -193,7 +194,7 @@ def _end_with_the_caller() -> None:
 
 
 class _Slave:
-    """An instance in FMPy, whatever the version."""
+    """An instance in FMPy, of any version of FMI."""
 
     def __init__(self, folder: str) -> None:
         import fmpy

@@ -1,4 +1,4 @@
-"""First gains, the search, and what is required beside its cost."""
+"""First gains by rule, the search, its requirements, and the cautious trial of new gains."""
 
 from __future__ import annotations
 
@@ -31,48 +31,48 @@ from .excitations import pace_of
 from .slow import Thinning
 from .small_signal import SHAKEN_AT, Resonance, SmallSignal
 
-# --- Gains: first ones by rule from the step response, then by search on the ensemble -------------
+# --- Gains: by rule from the step response, then by search on the ensemble ------------------------
 
 
 FILTER = 8e-3
-"""Of the feedback's moving average [s]: one count a millisecond of 1,572 a turn is 38 RPM."""
+"""Length of the feedback's moving average [s]: one count of 1,572 per ms is 38 RPM."""
 DERIVATIVE_FILTER = 10.0
 FIRST_MS, SAFE_MS = 1.8, 2.0
-"""Of the first gains on first order with dead time; the largest on the machine's small signals."""
+"""Ms of the first gains for first order with dead time; largest Ms for the small signals' model."""
 LOWER, STEPS = 0.85, 29
-"""Factor by which gains are lowered, and how often."""
+"""Factor from one trial of lower gains to the next, and the number of trials."""
 SEARCHED = ("Kp", "Ti", "Td", "alpha", "beta", "N", "filter_samples", "filter_time")
-"""What is searched: the feedback's filter is worth as much as the gains."""
+"""Variables of the search: the feedback's filter matters as much as the gains."""
 NOTCH_DEPTHS, NOTCH_WIDTHS = (0.05, 0.2), (0.3, 0.6, 1.2)
-"""Of a notch among which the first one is chosen; the search goes on from there."""
+"""Depths and widths to try for the first notch; the search starts from the best."""
 WORTH = 1.2
-"""Times the integral gain without it, that a notch has to allow."""
+"""Least gain in the integral gain for which a notch is used."""
 ALPHAS, BETAS = (0.0, 0.1, 0.2, 0.4), (-1.0, 0.0, 0.5)
-"""Among which the search's start is chosen."""
+"""Values to try for the start of the search."""
 RATIOS = (0.01, 2.0)
-"""L/T between which Eq. 12 is solved."""
+"""Range of L/T in which Eq. 12 is solved."""
 
 
 def first_gains(
-    fopdt: Fopdt, bench: Machine, demands: Demands, small: SmallSignal | None = None
+    fopdt: Fopdt, machine: Machine, demands: Demands, small: SmallSignal | None = None
 ) -> Controller:
     """Gains by Eq. 12 with a limit of Ms; the feedback filter's delay counts as dead time.
 
-    Where the small signals show more than first order with dead time, the gains are lowered until
-    the Ms of their model is within the limit, too; where that has a resonance, with a notch there.
+    With a model of the small signals, the gains are lowered until its Ms is within the limit, too;
+    if it has a resonance, with a notch there.
     """
-    samples = max(1, min(64, round(FILTER / bench.Ts)))
-    rule = _rule(fopdt, (samples - 1) / 2 * bench.Ts, FIRST_MS)
+    samples = max(1, min(64, round(FILTER / machine.Ts)))
+    rule = _rule(fopdt, (samples - 1) / 2 * machine.Ts, FIRST_MS)
     found = Controller(
         gains=rule.gains,
-        Ts=bench.Ts,
+        Ts=machine.Ts,
         alpha=rule.alpha,
         beta=rule.beta,
         N=DERIVATIVE_FILTER,
         u_min=-demands.u_max,
         u_max=demands.u_max,
         filter_samples=samples,
-        counts_per_rev=bench.counts_per_rev,
+        counts_per_rev=machine.counts_per_rev,
         notes=f"{rule.name} on the recorded step response",
     )
     if small is None:
@@ -83,10 +83,10 @@ def first_gains(
 
 
 def notched(controller: Controller, plant: Model, resonance: Resonance, Ms: float) -> Controller:
-    """The controller lowered to this Ms, with the notch on the resonance that leaves most of it.
+    """The controller lowered to this Ms, with the notch that allows the largest gains.
 
-    What is left is measured by the integral gain, which fights disturbances down. A notch that
-    is not worth it costs phase for nothing and is left out.
+    They are compared by the integral gain, which rejects disturbances. A notch that gains too
+    little is left out, as it costs phase.
     """
     tried = [()] + [
         (Biquad.notch(resonance.frequency, depth, width),)
@@ -112,12 +112,17 @@ def _integral(controller: Controller) -> float:
 
 
 def lowered(controller: Controller, plant: Model, Ms: float) -> Controller:
-    """The controller with its gains lowered until the loop with `plant` has this Ms: together, and
-    where that does not do, with a longer Ti.
+    """The controller with its gains lowered until the loop with `plant` has this Ms.
+
+    It lowers Kp alone first; if that is not enough, it also lengthens Ti by the same factor.
+
+    Raises
+    ------
+    Refusal
+        If no gains reach this Ms.
     """
     shares = LOWER ** np.arange(STEPS)
-    # at the same Ti a lower gain costs phase on a plant that is slow against it; with Kp Ti as it
-    # was it does not
+    # at the same Ti, a lower Kp costs phase on a plant slower than Ti; at the same Kp Ti not
     tried = [scaled(controller, s) for s in shares] + [stretched(controller, s) for s in shares]
     for found in tried:
         if margins(found, plant).Ms <= Ms:
@@ -130,7 +135,7 @@ def lowered(controller: Controller, plant: Model, Ms: float) -> Controller:
 
 
 def scaled(controller: Controller, share: float) -> Controller:
-    """The same controller with a share of its gain."""
+    """The same controller with Kp times `share`."""
     if share == 1.0:
         return controller
     g = controller.gains.to("standard")
@@ -139,16 +144,16 @@ def scaled(controller: Controller, share: float) -> Controller:
 
 
 def stretched(controller: Controller, share: float) -> Controller:
-    """The same controller with a share of its gain and a Ti that is longer by as much."""
+    """The same controller with Kp times `share` and Ti divided by it."""
     g = controller.gains.to("standard")
     own = Gains.standard(share * g.Kp, g.Ti / share, g.Td, u_unit=g.u_unit, y_unit=g.y_unit)
     return replace(controller, gains=own)
 
 
 def ruled(fopdt: Fopdt, like: Controller) -> Controller:
-    """Eq. 12's gains with an Ms of at most 2, in the surroundings of another controller.
+    """Eq. 12's gains with an Ms of at most 2, and all other settings of another controller.
 
-    Without that limit the short dead time of small signals asks for gains that move the command by
+    Without that limit, the short dead time of small signals leads to gains that move the command by
     volts for every count of the encoder.
     """
     rule = _rule(fopdt, (like.filter_samples - 1) / 2 * like.Ts + like.filter_time, SAFE_MS)
@@ -159,10 +164,10 @@ def ruled(fopdt: Fopdt, like: Controller) -> Controller:
 
 
 def _rule(fopdt: Fopdt, late: float, Ms: float) -> Rule:
-    """Eq. 12 for a feedback that is late.
+    """Eq. 12 for a feedback that is `late` [s]; SIMC's PI above the largest L/T of Eq. 12.
 
-    Below its least ratio of dead time to time constant that one is taken, which is a longer dead
-    time than the plant's: conservative. Beyond its largest SIMC's PI stands for it.
+    Below the smallest L/T of Eq. 12 that ratio is used, a longer dead time than the plant's:
+    conservative.
     """
     L = max(fopdt.L + late, min(RATIOS) * fopdt.T)
     if max(RATIOS) < L / fopdt.T:
@@ -177,8 +182,9 @@ def start_of(
     cost: Cost,
     threads: int,
 ) -> Controller:
-    """Where the search begins: the rule's loop with the alpha and beta of a coarse grid that cost
-    least. The rule's own are for a step of the reference, far from what a slow one asks for.
+    """The start of the search: the rule's gains, with alpha and beta of least cost on a grid.
+
+    The rule's own alpha and beta are for a step of the reference; slow references need others.
     """
     tried = [replace(rule, alpha=a, beta=b) for a, b in product(ALPHAS, BETAS)]
     found = costs([rule, *tried], models, list(references.values()), cost=cost, threads=threads)
@@ -186,9 +192,10 @@ def start_of(
 
 
 def cost_of(references: Mapping[str, FloatArray], Ts: float, demands: Demands) -> Cost:
-    """Tracking, chatter and overshoot as the virtual machine's figures weigh them, to scale.
+    """Weights of tracking, chatter and overshoot: the virtual machine's, scaled.
 
-    A cost is a mean over the references; the overshoot is to be that over those that have an edge.
+    A cost is a mean over all references; the overshoot's weight is scaled to make it the mean over
+    the references with an edge.
     """
     edges = sum(_has_edge(r, Ts) for r in references.values())
     size = demands.speed / 2000.0
@@ -224,12 +231,12 @@ def search(
 ) -> TuningResult:
     """The gains of least cost over all members, each with the usual gain spread and delay.
 
-    A `rival` gives its second opinion on them.
+    A `rival` gives a second opinion on them.
 
     Raises
     ------
     Refusal
-        Where every loop tried diverges, or none meets the requirements.
+        If every loop tried diverges, or none meets the requirements.
     Interrupted
         On Ctrl-C; its `best` is the best controller so far.
     """
@@ -259,35 +266,35 @@ def search(
         ) from error
 
 
-# --- Requirements: what tuned gains must bear whatever they cost ----------------------------------
+# --- Requirements of tuned gains besides their cost -----------------------------------------------
 
 
 LOAD = 0.1
-"""Of the largest command: the load that comes on unless another is asked for."""
+"""Default of the load step as a share of the largest command."""
 LEVEL = 0.75
-"""Of the top speed, where it comes on and where networks are linearised."""
+"""Speed of the load step, and of the linearisation of networks, as a share of the top speed."""
 RECOVERED = 0.01
-"""Of what the load would do to the speed without control."""
+"""Band of recovery as a share of the load's effect on the speed without control."""
 HAIR = 1.001
-"""What a limit taken from the rule's own gains leaves above them, so that these meet it."""
+"""Margin of a limit taken from the rule's own gains, so that these meet it."""
 SENSITIVE = 2.0
-"""Times the Ms of the small signals' model under the rule's gains, above which a network is wrong
-about small signals. Of 44 networks of eleven commissionings 41 had .7 to 1.7 times, three 2.6 and
-more: one of `weak`, two of `heavy`."""
+"""Largest Ms of a network under the rule's gains, as a multiple of that of the small signals'
+model: above it the network is wrong about small signals. Of 44 networks of eleven commissionings 41
+had .7 to 1.7 times, three 2.6 and more: one of `weak`, two of `heavy`."""
 AS_IT_IS = ((1.0, 0),)
-"""Variations of a member: none, its own gain and no more delay."""
+"""Variations of a member: only its own gain, without added delay."""
 
 
 @dataclass(frozen=True)
 class Requirements:
-    """A load step that no member recovers from later than under the rule's gains; a largest Ms.
+    """A largest Ms, and a load step with a recovery no slower than under the rule's gains.
 
     Attributes
     ----------
     loads : tuple of LoadStep
-        Empty where none is required.
+        Empty if none is required.
     rival : Controller or None
-        The rule's gains; None where a member runs away under these.
+        The rule's gains; None if a member diverges under them.
     constraints : Constraints
     """
 
@@ -305,13 +312,13 @@ class Requirements:
         demands: Demands,
         small: SmallSignal | None,
     ) -> Requirements:
-        """What is required of gains for these members."""
+        """The requirements for gains on these members."""
         loads = _load_steps(fopdt, fastest, demands)
         bears = bool(loads) and _bears(rival, ensemble, loads)
         linear: list[Model] = []
         if demands.Ms is not None:
-            # what answers within milliseconds is in no network of a drive, as it is learned from
-            # slow records: on `fast02` and `knocking` their Ms is 1.2 to 6 times the small signals'
+            # networks are trained on slow records and miss dynamics of milliseconds: on `fast02`
+            # and `knocking` their Ms is 1.2 to 6 times that of the small signals
             linear = (
                 _linear(ensemble.members, demands, rival.Ts) if small is None else [small.model]
             )
@@ -319,7 +326,7 @@ class Requirements:
         is_stiff = small is None or small.resonance is None
         own = [margins(rival, m, speed=speed).Ms for m in linear] if bears and is_stiff else []
         constraints = Constraints(
-            # gains that are no slower than the rule's are hardly less sensitive
+            # gains as fast as the rule's can hardly have a smaller Ms
             Ms=_limit(demands.Ms, own) if linear else None,
             recovery=rival if bears else None,
             plant=linear or None,
@@ -328,14 +335,14 @@ class Requirements:
         return cls(loads if bears else (), rival if bears else None, constraints)
 
     def met(self, controller: Controller, ensemble: Ensemble) -> dict[str, Any]:
-        """What a controller does of it on the members as they are, as JSON values."""
+        """How a controller meets them on the members without variations, as JSON values."""
         members = self.constraints.plant or ()
-        told: dict[str, Any] = {
+        found: dict[str, Any] = {
             "Ms_limit": self.constraints.Ms,
             "Ms": [margins(controller, m, speed=self.constraints.speed).Ms for m in members],
         }
         if self.rival is None:
-            return told | {"load": None}
+            return found | {"load": None}
         step = self.loads[0]
         of = {"tuned": controller, "rule": self.rival}
         recovery = {
@@ -343,18 +350,18 @@ class Requirements:
             for name, c in of.items()
         }
         load = {"level": step.level, "disturbance": step.disturbance, "band": step.band}
-        return told | {"load": load, "recovery_ms": recovery}
+        return found | {"load": load, "recovery_ms": recovery}
 
 
 def _limit(asked: float | None, own: Sequence[float]) -> float | None:
-    """The limit of Ms that was asked for, or a hair above the rule's own where that is larger."""
+    """The limit of Ms asked for, or just above that of the rule's gains if that is larger."""
     if asked is None:
         return None
     return max([asked, *(HAIR * x for x in own if math.isfinite(x))])
 
 
 def _load_steps(fopdt: Fopdt, fastest: float, demands: Demands) -> tuple[LoadStep, ...]:
-    """One that brakes, at three quarters of the top speed."""
+    """A braking load step at three quarters of the top speed."""
     volt = LOAD * demands.u_max if demands.load is None else demands.load
     if volt == 0.0:
         return ()
@@ -368,7 +375,7 @@ def _load_steps(fopdt: Fopdt, fastest: float, demands: Demands) -> tuple[LoadSte
 
 
 def _bears(rival: Controller, ensemble: Ensemble, loads: Sequence[LoadStep]) -> bool:
-    """Whether the rule's gains can be measured by: no member runs away under them."""
+    """Whether the rule's gains can serve as a yardstick: no member diverges under them."""
     try:
         return bool(np.isfinite(recoveries(rival, ensemble, loads)).all())
     except FitError:
@@ -378,10 +385,10 @@ def _bears(rival: Controller, ensemble: Ensemble, loads: Sequence[LoadStep]) -> 
 def sensible(
     rule: Controller, ensemble: Ensemble, small: SmallSignal | None, demands: Demands
 ) -> Ensemble:
-    """The ensemble without members that are far more sensitive than the machine's small signals.
+    """The ensemble without members whose Ms is far above that of the machine's small signals.
 
-    All agree on slow references, and the one that is wrong about fast signals would set the limit
-    of recovery for the gains of all.
+    All agree on slow references, but a member that is wrong about fast signals would set the limit
+    of recovery for all.
     """
     if small is None or demands.Ms is None:
         return ensemble
@@ -389,12 +396,12 @@ def sensible(
     most = SENSITIVE * margins(rule, small.model).Ms
     wrong = [m for m in known if not margins(rule, m, speed=LEVEL * demands.speed).Ms <= most]
     kept = [m for m in ensemble.members if not any(m is other for other in wrong)]
-    # where most are, it may be the small signals
+    # if most members deviate, the small signals may be wrong instead
     return Ensemble.of(kept) if wrong and 2 * len(kept) >= len(ensemble.members) else ensemble
 
 
 def _linear(members: Sequence[Model], demands: Demands, Ts: float) -> list[Model]:
-    """Members that can be linearised where the load comes on."""
+    """The members that can be linearised at the speed of the load step."""
     found = []
     for member in members:
         with suppress(SettingError):
@@ -403,38 +410,38 @@ def _linear(members: Sequence[Model], demands: Demands, Ts: float) -> list[Model
     return found
 
 
-# --- Caution: new gains meet the machine in steps, on a short hold, before anything longer is run -
+# --- Caution: new gains are tried in steps on a short hold before anything longer -----------------
 
 
 SHARES = (0.25, 0.5, 1.0)
-"""Of the gains, one hold after the other."""
+"""Shares of the gains to try, one hold after the other."""
 HOLD = 0.4
-"""How long the level is held [s], at least; a swing is told from that."""
+"""Least duration of the hold in which an oscillation is looked for [s]."""
 GENTLY = 12.0
-"""Times as slowly as the step response promises that the level is reached. A current limit allows a
-fifth of that promise, and a loop that was at a limit swings back for reasons of its own."""
+"""The ramp takes this many times as long as at the acceleration of the step response. A current
+limit can allow only a fifth of that, and a loop that comes off a limit swings back anyway."""
 SETTLE = 0.2
-"""Least time after the ramp, before that [s]."""
+"""Least time between the ramp and the hold [s]."""
 PERIODS = 100
-"""Samples that it is held at the least."""
+"""Least samples of the hold."""
 CHATTER = 0.12
-"""Standard deviation of a quiet loop's command at a held speed, over the largest command."""
+"""Largest standard deviation of a quiet loop's command, as a share of the largest command."""
 EXPECTED = 2.0
-"""Times the models' own, which is the encoder's, that it may be in any case."""
+"""The same as a multiple of the models' own, due to the encoder; the larger one counts."""
 RAILED = 0.05
-"""Share of the held samples at a limit."""
+"""Largest share of the held samples at a limit."""
 BACK = 0.5
-"""Of the gains that swung, what is kept."""
+"""Share that is kept of gains that oscillated."""
 
 
 @dataclass(frozen=True)
 class Swing:
-    """What a loop that swings does while it should hold a speed.
+    """An oscillation of a loop that should hold a speed.
 
     Attributes
     ----------
     share : float
-        Of the gains.
+        Share of the gains.
     frequency : float
         [Hz]
     command, railed : float
@@ -448,7 +455,7 @@ class Swing:
 
 
 def held(demands: Demands, fastest: float, Ts: float) -> tuple[FloatArray, int]:
-    """A reference to a working speed [RPM], and the sample from which it has settled."""
+    """A ramp to a working speed and a hold [RPM], and the sample at which the hold begins."""
     level = SHAKEN_AT * demands.speed
     rise = max(round(GENTLY * level / fastest / Ts), 20)
     settle = rise + max(round(0.5 * rise), round(SETTLE / Ts), PERIODS // 2)
@@ -459,16 +466,16 @@ def held(demands: Demands, fastest: float, Ts: float) -> tuple[FloatArray, int]:
 def swing_of(
     found: ClosedLoopRun, settled: int, share: float = 1.0, expected: float = 0.0
 ) -> Swing | None:
-    """Whether the command swings at a held speed; None for a quiet loop.
+    """The oscillation of the command at a held speed; None for a quiet loop.
 
-    `expected` is what models say of its standard deviation [V].
+    `expected` is its standard deviation according to the models [V].
     """
     u, limits = found.u[settled:], found.controller
     u = u[np.isfinite(u)]
     reach = 0.5 * (limits.u_max - limits.u_min)
     railed = float(np.mean((u >= limits.u_max - 1e-9) | (u <= limits.u_min + 1e-9)))
     k = np.arange(len(u))
-    # what still settles is no swing
+    # a command that is still settling is not an oscillation
     rest = u - np.polyval(np.polyfit(k, u, 2), k)
     deviation = float(rest.std())
     if deviation <= max(CHATTER * reach, EXPECTED * expected) and railed <= RAILED:
@@ -479,7 +486,7 @@ def swing_of(
 
 
 def cautious(
-    bench: Machine,
+    machine: Machine,
     controller: Controller,
     demands: Demands,
     fastest: float,
@@ -488,24 +495,24 @@ def cautious(
     models: Ensemble | None = None,
     thinning: Thinning | None = None,
 ) -> tuple[Controller, Swing | None]:
-    """The gains that hold a speed quietly, of those asked for, and the swing that was met.
+    """The largest share of the gains that holds a speed quietly, and the oscillation met, if any.
 
-    `models` know how far the encoder's counts alone move the command; they run at the samples that
-    `thinning` leaves.
+    The `models` predict how far the encoder's counts alone move the command; they run at the
+    samples that `thinning` leaves.
 
     Raises
     ------
     Refusal
-        Where a quarter of the gains swings already.
+        If the loop oscillates even with a quarter of the gains.
     """
-    r, settled = held(demands, fastest, bench.Ts)
+    r, settled = held(demands, fastest, machine.Ts)
     for share in SHARES:
         tried = scaled(controller, share)
         expected = 0.0
         if models is not None:
             expected = _chatter(tried, models, r, settled, thinning or Thinning())
         try:
-            found = bench.follow(tried, r, f"{name}_{100 * share:g}")
+            found = machine.follow(tried, r, f"{name}_{100 * share:g}")
             swing = swing_of(found, settled, share, expected)
         except Aborted as stop:
             if stop.frequency is None:
@@ -526,7 +533,7 @@ def cautious(
 def _chatter(
     controller: Controller, models: Ensemble, r: FloatArray, settled: int, thinning: Thinning
 ) -> float:
-    """Standard deviation of the command at the held speed, the largest of any model [V]."""
+    """Standard deviation of the command at the held speed, the largest among the models [V]."""
     with suppress(FitError):
         coarse, k = thinning.coarse(controller), thinning.k
         return max(float(run(coarse, m, r[::k]).u[settled // k :].std()) for m in models.members)
@@ -534,7 +541,7 @@ def _chatter(
 
 
 def cause(swing: Swing, small: SmallSignal | None) -> str:
-    """What makes a loop swing, as far as it is known, and what to do."""
+    """The likely cause of an oscillation, and its remedy."""
     remedy = "stiffen the shaft or the coupling, take the play out of it, or ask for less speed"
     if small is not None and small.resonance is not None:
         return f"the machine has {small.resonance}; {remedy}"

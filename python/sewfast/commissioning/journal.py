@@ -1,4 +1,4 @@
-"""`Journal`: a commissioning under way, its stages and what came so far."""
+"""`Journal`: the stages and the results of a running commissioning."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from .checkpoint import STAGES
 from .result import Commissioning
 
 Progress: TypeAlias = Callable[[int, int, str], object]
-"""Called with stages done, stages in all, and what comes now."""
+"""Called with the stages done, their total, and the present stage."""
 
 
 class Journal:
-    """Collects results; a `Commissioning` can be had at any time.
+    """Collects the results; `result` makes a `Commissioning` of them at any time.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class Journal:
 
     @property
     def fopdt(self) -> Fopdt:
-        """Of the step response."""
+        """The fit to the step response."""
         found: Fopdt = self._values["fopdt"]
         return found
 
@@ -55,68 +55,63 @@ class Journal:
         return found
 
     def recording(self, name: str) -> Recording:
-        """One that was noted."""
+        """A recording by its name."""
         found: Recording = self._values["recordings"][name]
         return found
 
     @property
     def stage(self) -> str:
-        """The one that is on."""
+        """The present stage."""
         return self._began[-1][0] if self._began else STAGES[0]
 
     def enter(self, stage: str) -> None:
         """Begin a stage."""
-        # begun before it is told: whoever is told may stop
+        # register it first: the callbacks can raise to stop
         self._began.append((stage, time.perf_counter()))
-        self._tell(STAGES.index(stage), stage)
+        self._report(STAGES.index(stage), stage)
         self.pause(stage)
-        # a person's time is not the stage's
+        # the time that a person took does not count for the stage
         self._began[-1] = (stage, time.perf_counter())
 
     def pause(self, following: str) -> None:
-        """Say what comes next, with what there is; whoever listens may take time over it."""
+        """Call `between` with the next step and the results so far; it can wait for a person."""
         if self._between is not None:
             self._between(following, self.result("under way"))
         self.heed()
 
     def heed(self) -> None:
-        """End where that was asked for.
-
-        Raises
-        ------
-        KeyboardInterrupt
-        """
+        """Raise `KeyboardInterrupt` if `cancel` is set."""
         if self._cancel is not None and self._cancel.is_set():
             raise KeyboardInterrupt
 
     def within(self, done: int, total: int) -> None:
-        """Tell how far the stage is."""
+        """Report progress within the stage."""
         self.heed()
-        self._tell(STAGES.index(self.stage), f"{self.stage} {done}/{total}")
+        self._report(STAGES.index(self.stage), f"{self.stage} {done}/{total}")
 
     def finish(self) -> None:
-        """All stages are through."""
-        self._tell(len(STAGES), "done")
+        """Report that all stages are done."""
+        self._report(len(STAGES), "done")
 
-    def _tell(self, done: int, text: str) -> None:
+    def _report(self, done: int, text: str) -> None:
         if self._progress is not None:
             self._progress(done, len(STAGES), text)
 
     def keep(self, **values: Any) -> None:
-        """Results."""
+        """Store results."""
         self._values |= values
 
     def say(self, note: str) -> None:
-        """What went otherwise than usual."""
+        """Add a note on something unusual."""
         self._values["notes"] = (*self._values.get("notes", ()), note)
 
     def note(self, name: str, recording: Recording) -> None:
-        """A recording, but for those along the references, which are runs."""
+        """Store a recording, except those along the references, which are stored as runs."""
         if self.stage != STAGES[-1] or name.startswith("hold_") or name.endswith(ABORTED):
             self._values["recordings"] = {**self._values["recordings"], name: recording}
 
     def result(self, verdict: str, reason: str = "") -> Commissioning:
-        """What there is."""
+        """The results so far."""
         ends = [t for _, t in self._began[1:]] + [time.perf_counter()]
         seconds = {s: end - t for (s, t), end in zip(self._began, ends, strict=True)}
         return Commissioning(

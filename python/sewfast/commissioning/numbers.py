@@ -1,4 +1,4 @@
-"""The numbers of a commissioning as JSON values, as `commissioning.json` holds them."""
+"""The numbers of a commissioning as JSON values, for `commissioning.json`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FOPDT = ("K", "T", "L", "offset", "u_low", "u_high", "fit_percent")
 
 
 def numbers(c: Commissioning) -> dict[str, Any]:
-    """`commissioning.json`; null where there is nothing yet."""
+    """The content of `commissioning.json`; null for results that are missing."""
     return {
         "machine": c.machine,
         "verdict": c.verdict,
@@ -69,7 +69,7 @@ def numbers(c: Commissioning) -> dict[str, Any]:
 
 
 def _finite(found: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Numbers of JSON: an infinite margin is null."""
+    """The values with null for an infinite margin, which JSON lacks."""
     if found is None:
         return None
 
@@ -84,7 +84,7 @@ def _finite(found: Mapping[str, Any] | None) -> dict[str, Any] | None:
 
 
 def _small_signals(c: Commissioning) -> dict[str, Any] | None:
-    """Order and first-order description of the machine about a working speed; its resonance."""
+    """Order, first-order description and resonance of the machine about a working speed."""
     found = c.small_signal
     if found is None:
         return None
@@ -101,7 +101,7 @@ def _kind(c: Commissioning) -> str | None:
 
 
 def _opinion(c: Commissioning) -> dict[str, Any] | None:
-    """What the gains tuned on models, rival and both cost on either; null where a loop diverges."""
+    """Costs of the gains tuned on models, rival and both, on either; null if a loop diverges."""
     opinion = None if c.tuning is None else c.tuning.opinion
     if opinion is None:
         return None
@@ -110,7 +110,7 @@ def _opinion(c: Commissioning) -> dict[str, Any] | None:
 
 
 def _gains(controller: Controller) -> dict[str, Any]:
-    """As in its file, in standard form, infinity as null."""
+    """The controller as in its file, with gains in standard form."""
     return {**controller.to_dict(), "gains": controller.gains.to("standard").to_dict()}
 
 
@@ -124,7 +124,7 @@ def _comparison(c: Comparison) -> dict[str, Any]:
 
 
 def run_numbers(found: ClosedLoopRun) -> dict[str, float | None]:
-    """What a run's metrics are called in result files."""
+    """The metrics of a run by their names in result files."""
     metrics = found.metrics()
     return {
         "rmse_rpm": metrics["rmse"],

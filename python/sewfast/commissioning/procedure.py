@@ -1,4 +1,4 @@
-"""`commission`: what an engineer does to a drive, one stage after the other."""
+"""`commission`: an engineer's procedure for a drive, one stage after the other."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from ..tuning.objective import Cost
 from ..tuning.search import TuningResult
 from ..tuning.task import GAINS
 from . import excitations
-from .bench import NotedBench, bench_of, told_of
-from .checkpoint import STAGES, Taken
+from .bench import RecordedBench, bench_of, description_of
+from .checkpoint import STAGES, Checkpoint
 from .demands import MS, Demands, Refusal, demands
 from .excitations import first_motion, standard, step_response
 from .gains import (
@@ -58,9 +58,9 @@ __all__ = ["STAGES", "commission"]
 MEMBERS = 4
 EVALUATIONS = 3000
 SHORTEST = 2 * WATCHED
-"""Samples of a reference: of fewer no loop can be judged."""
+"""Least samples of a reference: fewer cannot be judged."""
 FALLS_SHORT = 0.7
-"""Of the planned acceleration: below it a drive limits its current."""
+"""Share of the planned acceleration; a drive that reaches less limits its current."""
 
 References = Mapping[str, ArrayLike] | Sequence[str]
 Between = Callable[[str, Commissioning], object]
@@ -105,13 +105,13 @@ def commission(
         The machine; a drive's limits must have been set. It turns forward only, except for what a
         controller does at the end of a reference.
     u_max : float, optional
-        Largest command to either side [V]; the machine's own limit by default.
+        Largest command in either direction [V]; the machine's own limit by default.
     speed : float, optional
         Top of the working range [RPM]: by default the largest reference, or 2,000. Plan for a
         quarter more.
     references : mapping of name to array, or sequence of names, optional
-        What to verify on [RPM] at the machine's sample time; names are those of `sewfast.signals`.
-        By default `sewfast.commissioning.excitations.standard`.
+        References for the verification [RPM] at the machine's sample time; names are those of
+        `sewfast.signals`. By default `sewfast.commissioning.excitations.standard`.
     practice : mapping of name to array, or sequence of names, optional
         References for tuning. By default the references above, or shorter versions of the standard
         ones.
@@ -124,42 +124,40 @@ def commission(
     evaluations : int
         Controllers that the search tries.
     load : float, optional
-        A load that brakes, in volts of command [V]: under the tuned gains no member of the
-        ensemble recovers later from it than under Eq. 12's. By default a tenth of `u_max`; 0 for no
-        such requirement.
+        A braking load, in volts of command [V]: no member of the ensemble may recover from it later
+        under the tuned gains than under Eq. 12's. By default a tenth of `u_max`; 0 for no such
+        requirement.
     Ms : float or None
-        Largest sensitivity on the machine's small signals, or where these show nothing on every
+        Largest sensitivity on the model of the machine's small signals or, without one, on every
         member linearised at three quarters of the top speed; that of Eq. 12's gains if it is larger
         and a load is required.
     time_budget : float, optional
-        Time of the search [s], after which the best gains so far are taken. A seed then no longer
-        gives the same gains again.
+        Time of the search [s], after which the best gains so far are used. Then the same seed no
+        longer gives the same gains.
     seed : int
-        Of the random signals, the networks' starts and the search.
+        Seed of the random signals, the networks' initial weights and the search.
     threads : int, optional
         All processors by default.
     progress : callable(done, total, stage), optional
-        Called as each stage begins, within long ones, and at the end.
-        In a notebook a bar is shown where this is left out; None shows none.
+        Called as each stage begins, within long ones, and at the end. By default a notebook shows a
+        bar; None shows nothing.
     folder : path, optional
-        Folder in which every recording is written as soon as it is taken, as
-        `unfinished/NAME.mcap`, so that a process that is killed does not lose it;
-        `Commissioning.save` into the same folder replaces them by tables. If one cannot be
-        written, there is a warning.
+        Folder in which every recording is written as soon as it is made, as
+        `unfinished/NAME.mcap`, so that a killed process does not lose it; `Commissioning.save` into
+        the same folder replaces them by tables. If one cannot be written, there is a warning.
     overwrite : bool
         See `Commissioning.save`.
     resume : bool
         Continue from the recordings that an earlier attempt left in `folder`: those of exactly the
-        same commands and references on a machine of this name are not taken again. With the same
-        settings the controller is, bit by bit, that of an attempt without interruption on the same
-        recordings.
+        same commands and references on a machine of this name are not made again. With the same
+        settings and recordings, the controller is bit by bit that of an uninterrupted attempt.
     cancel : threading.Event, optional
-        Set in another thread, it ends the commissioning as Ctrl-C does: a drive that runs is
-        stopped at once, everything else at its next step.
+        Set it in another thread to end the commissioning as Ctrl-C does: a running drive is stopped
+        at once, everything else at its next step.
     between : callable(next, so_far), optional
         Called as each stage begins, before it moves the machine, and once more with
-        ``"references"`` when the loops of the verification are predicted (`so_far.comparisons`) and
-        not run yet. It may wait for a person; a KeyboardInterrupt out of it ends the
+        ``"references"`` when the loops of the verification are predicted (`so_far.comparisons`) but
+        have not run yet. It can wait for a person; a KeyboardInterrupt raised in it ends the
         commissioning.
 
     Returns
@@ -173,21 +171,21 @@ def commission(
     Refusal
         If the evidence is not good enough; `so_far` holds it.
     SettingError
-        For demands that contradict the machine's limits, or a folder with files from another
-        source, before anything moves.
+        Before anything moves, for demands beyond the machine's limits, or a folder with files from
+        another source.
     LinkError
         If port or drive failed or tripped; the motor is stopped.
     Interrupted
         On Ctrl-C or `cancel`; the motor is stopped, `best` is the `Commissioning` so far.
     """
     _require_kinds(cost, progress, cancel, between)
-    with bench_of(on, u_max, cancel) as bench:
+    with bench_of(on, u_max, cancel) as machine:
         asked = demands(
-            bench,
+            machine,
             u_max=u_max,
             speed=speed,
-            references=_samples(references, bench, seed),
-            practice=_samples(practice, bench, seed),
+            references=_samples(references, machine, seed),
+            practice=_samples(practice, machine, seed),
             members=members,
             evaluations=evaluations,
             seed=seed,
@@ -196,37 +194,37 @@ def commission(
             Ms=Ms,
             time_budget=time_budget,
         )
-        journal = Journal(bench.name, progress, cancel, between)
+        journal = Journal(machine.name, progress, cancel, between)
         if resume and folder is None:
             raise SettingError(
                 name="folder", expected="that of the attempt to resume", received="none",
                 remedy="give folder='DIR'",
             )  # fmt: skip
-        taken = (
+        checkpoint = (
             None
             if folder is None
-            else _place(folder, bench, asked, overwrite=overwrite, resume=resume)
+            else _place(folder, machine, asked, overwrite=overwrite, resume=resume)
         )
-        if taken is not None:
-            journal.keep(recorded_in=taken.folder)
+        if checkpoint is not None:
+            journal.keep(recorded_in=checkpoint.folder)
 
         def note(name: str, key: str, recording: Recording, run: ClosedLoopRun | None) -> None:
             journal.note(name, recording)
-            if taken is not None:
-                taken.keep(journal.stage, name, key, recording, run)
+            if checkpoint is not None:
+                checkpoint.keep(journal.stage, name, key, recording, run)
 
         def kept(name: str, key: str) -> Recording | None:
             journal.heed()
-            return None if taken is None else taken.found(journal.stage, name, key)
+            return None if checkpoint is None else checkpoint.found(journal.stage, name, key)
 
         def kept_run(name: str, key: str, controller: SampledController) -> RecordedRun | None:
             journal.heed()
-            if taken is None:
+            if checkpoint is None:
                 return None
-            return taken.found_run(journal.stage, name, key, controller, bench.name)
+            return checkpoint.found_run(journal.stage, name, key, controller, machine.name)
 
         try:
-            return _carry_out(NotedBench(bench, note, kept, kept_run), asked, cost, journal)
+            return _carry_out(RecordedBench(machine, note, kept, kept_run), asked, cost, journal)
         except Refusal as refusal:
             refusal.stage = journal.stage
             refusal.so_far = journal.result("refused", str(refusal))
@@ -241,7 +239,7 @@ def commission(
 
 
 def _require_kinds(cost: Any, progress: Any, cancel: Any, between: Any) -> None:
-    """Refuse what cannot be used for these, before anything moves."""
+    """Refuse arguments of the wrong type before anything moves."""
     for name, given, expected, is_one in (
         ("cost", cost, "a Cost", isinstance(cost, Cost)),
         ("progress", progress, "a function", callable(progress)),
@@ -256,9 +254,9 @@ def _require_kinds(cost: Any, progress: Any, cancel: Any, between: Any) -> None:
 
 
 def _place(
-    name: str | os.PathLike[str], bench: Machine, asked: Demands, *, overwrite: bool, resume: bool
-) -> Taken:
-    """Where the recordings go as they come, made before anything moves."""
+    name: str | os.PathLike[str], machine: Machine, asked: Demands, *, overwrite: bool, resume: bool
+) -> Checkpoint:
+    """The checkpoint for the recordings, created before anything moves."""
     if not isinstance(name, (str, os.PathLike)) or not str(name) or "\0" in str(name):
         raise SettingError(
             name="folder", expected="a folder's name", received=repr(name),
@@ -266,52 +264,52 @@ def _place(
         )  # fmt: skip
     folder = Path(name)
     require_own(folder, overwrite=overwrite or resume)
-    device, conditions = told_of(bench)
+    device, conditions = description_of(machine)
     own = {
         "u_max": asked.u_max, "speed": asked.speed, "seed": asked.seed,
-        "machine": bench.name, "Ts": bench.Ts, "counts_per_rev": bench.counts_per_rev,
+        "machine": machine.name, "Ts": machine.Ts, "counts_per_rev": machine.counts_per_rev,
     }  # fmt: skip
-    taken = Taken(folder, device, {**own, **conditions}, resume)
-    taken.begin()
-    return taken
+    checkpoint = Checkpoint(folder, device, {**own, **conditions}, resume)
+    checkpoint.begin()
+    return checkpoint
 
 
 def _carry_out(
-    bench: NotedBench, asked: Demands, cost: Cost | None, journal: Journal
+    machine: RecordedBench, asked: Demands, cost: Cost | None, journal: Journal
 ) -> Commissioning:
-    """The stages."""
+    """Run the stages."""
     journal.enter("first motion")
-    motion = first_motion(bench, asked)
+    motion = first_motion(machine, asked)
     journal.keep(motion=motion)
 
     journal.enter("step response")
-    step = step_response(bench, asked, motion)
+    step = step_response(machine, asked, motion)
     journal.keep(fopdt=step)
 
     journal.enter("small signals")
-    small = small_signal(bench, asked, motion, step)
+    small = small_signal(machine, asked, motion, step)
     journal.keep(small_signal=small)
-    # the step response's dead time and constant have friction and the current limit in them
+    # prefer the small signals: friction and the current limit distort the step response
     fopdt = step if small is None or small.fopdt is None else small.fopdt
-    first = first_gains(fopdt, bench, asked, small)
+    first = first_gains(fopdt, machine, asked, small)
     journal.keep(first=first, controller=first)
 
     journal.enter("limits")
-    fastest, pulses = _pulses(bench, step, asked)
+    fastest, pulses = _pulses(machine, step, asked)
     journal.keep(acceleration=fastest)
 
     journal.enter("closed loop")
-    first, _ = cautious(bench, first, asked, fastest, "hold_first", small)
+    first, _ = cautious(machine, first, asked, fastest, "hold_first", small)
     journal.keep(first=first, controller=first)
-    r = excitations.trapezoids(step, fastest, asked, bench.Ts)
-    trapezoids = bench.follow(first, r, "trapezoids")
+    r = excitations.trapezoids(step, fastest, asked, machine.Ts)
+    trapezoids = machine.follow(first, r, "trapezoids")
     require_unsaturated(trapezoids)
-    r = excitations.levels(step, fastest, asked, bench.Ts, asked.seed)
-    levels = bench.follow(first, r, "levels")
+    r = excitations.levels(step, fastest, asked, machine.Ts, asked.seed)
+    levels = machine.follow(first, r, "levels")
 
     journal.enter("training")
-    thinning = Thinning.of(fopdt, bench.Ts, small)
-    journal.keep(sample_time=thinning.k * bench.Ts)
+    thinning = Thinning.of(fopdt, machine.Ts, small)
+    journal.keep(sample_time=thinning.k * machine.Ts)
     thin, judge = thinning.recording, thinning.recording(levels.recording)
     learned = [thin(r) for r in (journal.recording("step"), trapezoids.recording, *pulses)]
     gentle = [thin(trapezoids.recording), thin(journal.recording("small_signals"))]
@@ -323,7 +321,7 @@ def _carry_out(
         trained = _instead(rival, judge, refusal, journal)
     journal.keep(models=trained.ensemble, rmse=trained.rmse, card=trained.card)
     if thinning.k > 1:
-        # there is no resonance to keep clear of
+        # a thinned drive has no resonance to avoid
         small = None if rival is None else SmallSignal(rival.model, None, None)
     load = None
     if small is not None:
@@ -333,13 +331,13 @@ def _carry_out(
     journal.keep(turn_load=load)
 
     journal.enter("tuning")
-    verify, practice = _references(fastest, asked, bench)
-    weights = cost_of(practice, bench.Ts, asked) if cost is None else cost
+    verify, practice = _references(fastest, asked, machine)
+    weights = cost_of(practice, machine.Ts, asked) if cost is None else cost
     journal.keep(cost=weights)
-    pushes = thinning.pushes(load, practice, bench.Ts)
+    pushes = thinning.pushes(load, practice, machine.Ts)
     plan = _Plan(
         thinning.references(practice), pushes, asked, thinning.cost(weights),
-        thinning.plant(fopdt, bench.Ts), fastest, small, rival, thinning,
+        thinning.plant(fopdt, machine.Ts), fastest, small, rival, thinning,
     )  # fmt: skip
     try:
         ensemble, controller = _tuned(trained, plan, journal)
@@ -352,7 +350,7 @@ def _carry_out(
 
     journal.enter("verification")
     controller, swing = cautious(
-        bench, controller, asked, fastest, "hold_tuned", small, ensemble, thinning
+        machine, controller, asked, fastest, "hold_tuned", small, ensemble, thinning
     )
     if swing is not None:
         note = (
@@ -364,14 +362,14 @@ def _carry_out(
         journal.say(note)
     comparisons = predict(
         thinning.coarse(controller), ensemble, thinning.references(verify),
-        thinning.pushes(load, verify, bench.Ts),
+        thinning.pushes(load, verify, machine.Ts),
     )  # fmt: skip
     journal.keep(comparisons=comparisons, judgement=judged(comparisons, ensemble))
     journal.pause("references")
-    measure(controller, bench, comparisons, verify, lambda new: journal.keep(comparisons=new))
+    measure(controller, machine, comparisons, verify, lambda new: journal.keep(comparisons=new))
     if small is not None and small.resonance is not None:
         speed = SHAKEN_AT * asked.speed
-        at_work = margins_at_work(bench, controller, small.model, speed, asked.seed)
+        at_work = margins_at_work(machine, controller, small.model, speed, asked.seed)
         if at_work is not None:
             journal.keep(margins=at_work[0], response=at_work[1])
         else:
@@ -387,7 +385,7 @@ def _instead(rival: Rival | None, judge: Recording, refusal: Refusal, journal: J
     Raises
     ------
     Refusal
-        That of the networks, where the rival is no better.
+        That of the networks, if the rival does not predict well enough either.
     """
     if rival is None or not rival.is_fit:
         raise refusal
@@ -395,29 +393,29 @@ def _instead(rival: Rival | None, judge: Recording, refusal: Refusal, journal: J
     return rival.alone(judge)
 
 
-def _pulses(bench: Machine, fopdt: Fopdt, asked: Demands) -> tuple[float, list[Recording]]:
+def _pulses(machine: Machine, fopdt: Fopdt, asked: Demands) -> tuple[float, list[Recording]]:
     """The acceleration at the command's limit [RPM/s], and recordings of pulses.
 
-    The first ones are planned without a current limit, and where there is one they fall short of
-    the speeds; then others are planned with the acceleration that these have shown.
+    The first pulses are planned without a current limit. With one, they fall short of the planned
+    speeds; then more are planned with the acceleration just measured.
     """
     fastest = excitations.acceleration(fopdt, asked)
-    u = excitations.pulses(fopdt, fastest, asked, bench.Ts, asked.seed)
-    found = [bench.excite(u, "pulses")]
+    u = excitations.pulses(fopdt, fastest, asked, machine.Ts, asked.seed)
+    found = [machine.excite(u, "pulses")]
     shown = excitations.acceleration_shown(found[0], asked)
     if math.isinf(shown):
-        shown = excitations.acceleration_from_rest(bench, fastest, asked)
+        shown = excitations.acceleration_from_rest(machine, fastest, asked)
     if shown > FALLS_SHORT * fastest:
         return min(shown, fastest), found
-    u = excitations.pulses(fopdt, shown, asked, bench.Ts, asked.seed + 1)
-    found.append(bench.excite(u, "pulses_limited"))
+    u = excitations.pulses(fopdt, shown, asked, machine.Ts, asked.seed + 1)
+    found.append(machine.excite(u, "pulses_limited"))
     again = excitations.acceleration_shown(found[1], asked)
     return shown if math.isinf(again) else again, found
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """What gains are searched for, on what, and what is known of the machine."""
+    """The settings of the search, and the knowledge of the machine that it uses."""
 
     practice: Mapping[str, FloatArray]
     pushes: Sequence[FloatArray] | None
@@ -431,15 +429,15 @@ class _Plan:
 
     @property
     def second(self) -> Model | None:
-        """The rival, where it predicts well enough to be asked."""
+        """The rival, if it predicts well enough for a second opinion."""
         return self.rival.model if self.rival is not None and self.rival.is_fit else None
 
 
 def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, Controller]:
-    """The gains, and the members that agree on what they do."""
+    """The tuned gains, and the members that agree on their loop."""
     asked, practice, cost = plan.asked, plan.practice, plan.cost
     first, small = plan.thinning.coarse(journal.first), plan.small
-    # Eq. 12's gains would wake a resonance: the first gains are what is known to be quiet there
+    # Eq. 12's gains would excite a resonance; the first gains are known to be quiet there
     rival = ruled(plan.fopdt, first) if small is None or small.resonance is None else first
     second = plan.second
     is_alone = plan.rival is not None and plan.rival.model is trained.ensemble.members[0]
@@ -447,7 +445,7 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
         second = None
 
     def of(ensemble: Ensemble) -> tuple[Requirements, TuningResult]:
-        # alpha and beta do not matter to a load, but for what they leave when it comes on
+        # alpha and beta do not affect the response to a load, only the error when it comes on
         start = start_of(rival, ensemble, practice, cost, asked.threads)
         required = Requirements.of(ensemble, plan.fopdt, plan.fastest, start, asked, small)
         if required.rival is None:
@@ -461,7 +459,7 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
     required, tuning = of(alike)
     ensemble = agreeing(tuning.pid, alike, practice)
     if ensemble is not alike:
-        # one that parts from the others has had its say in these gains
+        # a deviating member has influenced these gains: search again without it
         required, tuning = of(ensemble)
     journal.keep(models=ensemble, rmse=trained.errors_of(ensemble))
     plants = "a linear model" if is_alone else "an ensemble of networks"
@@ -474,24 +472,24 @@ def _tuned(trained: Trained, plan: _Plan, journal: Journal) -> tuple[Ensemble, C
 
 
 def _references(
-    fastest: float, asked: Demands, bench: Machine
+    fastest: float, asked: Demands, machine: Machine
 ) -> tuple[Mapping[str, FloatArray], Mapping[str, FloatArray]]:
-    """To verify on, and to tune on.
+    """References for the verification, and for tuning.
 
-    Gains are tuned on plants of down to .8 of the gain, which has as much less acceleration: at the
-    pace of the verification these are at the current limit, no gains help there, and the search
-    looks for the least windup instead (drive `weak`, seed 5: 13.7 RPM on the machine, 4.96 so).
+    Gains are tuned on plants with down to .8 of the gain, which accelerate less. At the pace of the
+    verification these would reach the current limit, where no gains help, and the search would
+    minimise windup instead (drive `weak`, seed 5: 13.7 RPM on the machine; 4.96 with slower ones).
     """
     if asked.references is not None:
         return asked.references, asked.practice or asked.references
     return (
-        standard(fastest, asked, bench.Ts, short=False),
-        asked.practice or standard(min(GAINS) * fastest, asked, bench.Ts, short=True),
+        standard(fastest, asked, machine.Ts, short=False),
+        asked.practice or standard(min(GAINS) * fastest, asked, machine.Ts, short=True),
     )
 
 
 def _samples(
-    references: References | None, bench: Machine, seed: int
+    references: References | None, machine: Machine, seed: int
 ) -> Mapping[str, FloatArray] | None:
     if references is None:
         return None
@@ -503,16 +501,16 @@ def _samples(
         )  # fmt: skip
     if isinstance(references, Mapping):
         return {str(name): _whole(str(name), r) for name, r in references.items()}
-    if abs(bench.Ts - signals.TS) > 1e-9:
+    if abs(machine.Ts - signals.TS) > 1e-9:
         raise SettingError(
             name="references", expected=f"names on a machine at {signals.TS} s only",
-            received=f"one at {bench.Ts:g} s", remedy="give references as samples",
+            received=f"one at {machine.Ts:g} s", remedy="give references as samples",
         )  # fmt: skip
     return {name: signals.reference(name, seed) for name in references}
 
 
 def _whole(name: str, reference: ArrayLike) -> FloatArray:
-    """A reference with samples that are numbers."""
+    """The samples of a reference, checked."""
     samples = vector(name, reference).copy()
     if not np.all(np.isfinite(samples)):
         raise DataError(

@@ -1,4 +1,4 @@
-"""`bode` of a record, and what in it a linear response does not describe."""
+"""`bode` of a record, with cautions about parts that are not linear."""
 
 from __future__ import annotations
 
@@ -19,20 +19,21 @@ from ..speed import speed_from_counts
 RecordMethod: TypeAlias = Literal["segments", "local"]
 
 LEAST_RUN = 3
-"""Equal samples in a row at the largest or smallest value, from which a command is at a limit."""
+"""Equal samples in a row at the largest or smallest value that count as a command at a limit."""
 MOVES = 0.9
-"""Share of its other samples that differ from the one before, of a command that is no staircase."""
+"""Least share of the other samples that differ from the one before; a staircase has fewer."""
 REVERSED = 0.02
-"""Of the largest speed, that a mean over 20 ms must have on the other side for a reversal."""
+"""A mean speed over 20 ms in the opposite direction counts as a reversal from this share of the
+largest speed on."""
 MEAN = 0.02
 OUTSIDE = 1.0, 99.0
-"""Percentiles of the second half of a record, outside of which it begins with a run-up."""
+"""Percentiles of the second half of a record; one that begins outside them has a run-up."""
 
 
 def of_record(
     on: Recording | Dataset, reference: str | None, method: str | None, segment: int | None
 ) -> FrequencyResponse:
-    """`bode` of a record; its arguments are as there."""
+    """`bode` of a record, with the same arguments."""
     if method not in (None, *get_args(RecordMethod)):
         raise SettingError(
             name="method", expected=" or ".join(get_args(RecordMethod)), received=repr(method)
@@ -90,7 +91,7 @@ def _one_of(on: Dataset) -> Experiment:
 
 
 def _cautions(u: FloatArray, y: FloatArray, Ts: float, *, is_speed: bool) -> dict[str, Any]:
-    """What a record has in it that a linear response does not describe."""
+    """Cautions about parts of a record that a linear response does not describe."""
     found = []
     at = _limited(np.asarray(u, dtype=np.float64))
     if len(at):
@@ -120,7 +121,7 @@ def _cautions(u: FloatArray, y: FloatArray, Ts: float, *, is_speed: bool) -> dic
 
 
 def _limited(u: FloatArray) -> Any:
-    """Samples at which a command that moves otherwise rests at an extreme."""
+    """Samples at which a command rests at an extreme, unless it is a staircase anyway."""
     if len(u) < LEAST_RUN or not np.isfinite(u).all():
         return np.zeros(0, dtype=np.intp)
     extreme = (u == u.max()) | (u == u.min())
@@ -134,16 +135,16 @@ def _limited(u: FloatArray) -> Any:
 
 
 def unsmoothed(source: str | os.PathLike[str], data: Dataset) -> Dataset:
-    """The same record with the difference of counts as its speed, which `bode` can use.
+    """The same record with the difference of counts as its speed, for `bode`.
 
-    A speed that is estimated with later counts hides the delay.
+    A speed estimated with the help of later counts hides the delay.
 
     Parameters
     ----------
     source : path
         The recording that the data were read from; columns after a colon as on the command line.
     data : Dataset
-        With a speed from counts.
+        A data set with a speed from counts.
 
     Raises
     ------

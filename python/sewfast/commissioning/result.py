@@ -1,4 +1,4 @@
-"""`Commissioning`: everything that came of one."""
+"""`Commissioning`: the result of a commissioning, and its folder."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from .verification import Comparison
 VERIFIED, VERIFIED_POORLY = "verified", "verified, prediction poor"
 VERDICTS = (VERIFIED, VERIFIED_POORLY, "refused", "interrupted")
 POOR = 2.0
-"""Measured cost over the predicted one from which the prediction is poor."""
+"""Ratio of measured to predicted cost above which the prediction is poor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,19 +52,20 @@ class Commissioning:
     verdict : str
         ``verified``: run on the machine, which behaved as predicted; ``verified, prediction poor``:
         the speeds agree with the prediction, but the cost is more than twice as high. ``refused``,
-        ``interrupted``: ended at `stage`; results up to then are here, the rest is None or empty.
+        ``interrupted``: ended at `stage`; it holds the results until then, the rest is None or
+        empty.
     stage, reason : str
         The last stage, and why it ended there.
     seconds : mapping of stage to float
     recordings : mapping of name to Recording
-        Of the machine, for `identify`.
+        Recordings of the machine, for `identify`.
     motion : Motion or None
     fopdt : Fopdt or None
         From the step response.
     small_signal : SmallSignal or None
         Linear model about a working speed, including the resonance if there is one.
     acceleration : float or None
-        Measured at the limit of the command [RPM/s].
+        Acceleration measured at the limit of the command [RPM/s].
     turn_load : TurnLoad or None
         The load over the turn, as a command; None if none was seen.
     first : Controller or None
@@ -74,29 +75,29 @@ class Commissioning:
     rival : Rival or None
         The linear model that competes with the networks.
     rmse : tuple of float
-        Of each member on the recording `levels`, not used for training [RPM].
+        Error of each member on the recording `levels`, which is not used for training [RPM].
     controller : Controller or None
         The best so far: the tuned one, or else the first.
     tuning : TuningResult or None
     cost : Cost or None
-        What counted how much.
+        Weights of the search.
     met : mapping or None
-        How the gains meet the requirements besides the cost: `Ms` on the small signals, or of the
-        members linearised where there are none, `recovery_ms` of each member under the load step,
-        tuned and with the rule's gains.
+        How the gains meet the requirements besides the cost: `Ms` on the small signals or, without
+        these, on the linearised members; `recovery_ms` of each member after the load step, with the
+        tuned gains and with the rule's.
     card : ReportCard or None
-        How far the best member can be trusted, on the recording `levels`.
+        Report card of the best member on the recording `levels`.
     judgement : Judgement or None
-        Objections to the predicted loops.
+        Verdicts on the predicted loops.
     comparisons : tuple of Comparison
         Prediction compared with measurement, per reference.
     margins : mapping or None
-        Of a machine with a resonance: `predicted` by its small signals and `measured` on it, at
+        For a machine with a resonance: `predicted` by its small signals and `measured` on it, at
         `speed` [RPM]: `Ms`, `phase_margin_deg`, `gain_margin`.
     response : FrequencyResponse or None
-        From which the measured margins were read.
+        The response that the measured margins were computed from.
     sample_time : float or None
-        Of what is simulated [s]: for a slow drive a multiple of the machine's.
+        Sample time of the simulations [s]: for a slow drive a multiple of the machine's.
     notes : tuple of str
         Anything unusual: networks that failed, models that contradict each other, gains that were
         lowered.
@@ -139,13 +140,13 @@ class Commissioning:
 
     @property
     def is_predicted_poorly(self) -> bool:
-        """Whether the machine costs more than twice what was predicted."""
+        """Whether the measured cost is more than twice the predicted one."""
         predicted, measured = self.predicted_cost, self.measured_cost
         return predicted is not None and measured is not None and measured > POOR * predicted
 
     @property
     def predicted_cost(self) -> float | None:
-        """Over the references [RPM]."""
+        """Predicted cost over the references [RPM]."""
         if self.cost is None or not self.comparisons:
             return None
         thinning = Thinning()
@@ -155,7 +156,7 @@ class Commissioning:
 
     @property
     def measured_cost(self) -> float | None:
-        """Over the references, on the machine [RPM]."""
+        """Measured cost over the references [RPM]."""
         runs = [c.measured for c in self.comparisons if c.measured is not None]
         if self.cost is None or not runs or len(runs) < len(self.comparisons):
             return None
@@ -163,7 +164,6 @@ class Commissioning:
 
     def numbers(self) -> dict[str, Any]:
         """Every number as JSON values."""
-
         return numbers(self)
 
     def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
@@ -186,9 +186,8 @@ class Commissioning:
         SettingError
             For a folder with files from another source.
         DataError
-            If it cannot be made.
+            If it cannot be created.
         """
-
         return write(self, Path(folder), overwrite=overwrite)
 
     def plot(
@@ -203,14 +202,14 @@ class Commissioning:
         Parameters
         ----------
         ax, file
-            As for `Drawing.plot`. One shows the output, further ones the error and the command.
+            As for `Drawing.plot`. One axes shows the output; further axes show error and command.
         reference : str, optional
             One of `comparisons`; by default the first.
 
         Raises
         ------
         SettingError
-            For another reference, if it ended before any loop was predicted, or as `Drawing.plot`.
+            For another reference, if no loop was predicted yet, or as `Drawing.plot`.
         """
         found = {c.reference: c for c in self.comparisons}
         name = next(iter(found), None) if reference is None else reference
@@ -255,7 +254,7 @@ class Commissioning:
             )
         lines += [f"  note           {note}" for note in self.notes]
         lines += _evidence(self)
-        lines += [_told(c) for c in self.comparisons]
+        lines += [_comparison(c) for c in self.comparisons]
         if self.measured_cost is not None and self.predicted_cost is not None:
             lines.append(
                 f"  cost           predicted {self.predicted_cost:.4g}, measured "
@@ -268,7 +267,7 @@ class Commissioning:
 
 
 def _evidence(c: Commissioning) -> list[str]:
-    """Report card, judgement and what was required beside the cost, a line each."""
+    """Lines for the report card, the judgement and the requirements besides the cost."""
     lines = []
     if c.card is not None:
         lines.append(f"  report card    {c.card.verdict}{_named(c.card.lines)}")
@@ -302,13 +301,13 @@ def _margins(found: Mapping[str, Any]) -> str:
 
 
 def _named(lines: Sequence[Line]) -> str:
-    """The first two questions that were not passed, and how many others."""
+    """The first two checks that were not passed, and the number of the others."""
     names = [x.name for x in lines if x.verdict in ("warn", "fail")]
     more = f" and {len(names) - 2} more" if len(names) > 2 else ""
     return ": " + ", ".join(names[:2]) + more if names else ""
 
 
-def _told(c: Comparison) -> str:
+def _comparison(c: Comparison) -> str:
     predicted = c.predicted.metrics()["rmse"]
     text = f"  {c.reference:<14} error predicted {predicted:.4g}"
     if c.measured is None:
@@ -318,16 +317,16 @@ def _told(c: Comparison) -> str:
     )
 
 
-# --- The folder of a commissioning: every artefact written whole, commissioning.json last ---------
+# --- The folder of a commissioning: complete files only, commissioning.json last ------------------
 
 
 _FOLDERS = ("recordings", "models", "controllers", "runs", "analysis")
 _SHORT = 5.0
-"""References of up to this are analysed on [s]."""
+"""Longest reference for the analysis [s]."""
 
 
 def require_own(folder: Path, *, overwrite: bool) -> None:
-    """Refuse a folder whose files would be lost and are of no commissioning of a virtual machine.
+    """Refuse a folder with files that a commissioning of a virtual machine cannot repeat.
 
     Raises
     ------
@@ -366,7 +365,7 @@ def _may_be_replaced(folder: Path) -> bool:
 
 
 def numbers_in(file: Path) -> dict[str, Any]:
-    """What a file of results says, as far as it is one: nothing where it is damaged or missing."""
+    """The content of a file of results; empty if it is damaged or missing."""
     try:
         found = json.loads(file.read_bytes())
     except (OSError, ValueError):
@@ -375,11 +374,10 @@ def numbers_in(file: Path) -> dict[str, Any]:
 
 
 def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
-    """Put the artefacts in place of those of an earlier commissioning; then the page.
+    """Replace the artefacts of an earlier commissioning; then write the page.
 
-    Without `commissioning.json` a folder is refused by the report: an interruption in between
-    leaves no mixture that looks whole. What was written there as the recordings came stays until
-    then.
+    The report refuses a folder without `commissioning.json`, so an interruption in between leaves
+    no mixture that looks complete. The checkpoint's recordings stay there until then.
     """
     if not overwrite:
         _require_own_artefacts(folder)
@@ -389,7 +387,7 @@ def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
     for name in _FOLDERS:
         place = folder / name
         place.mkdir(exist_ok=True)
-        # artefacts of an earlier one that this one has not would pass for its own
+        # files of an earlier commissioning must not pass for this one's
         for old in place.iterdir():
             if old.suffix in (".csv", ".json", ".npz", ".svg"):
                 old.unlink()
@@ -400,17 +398,17 @@ def write(found: Commissioning, folder: Path, *, overwrite: bool) -> Path:
     storage.write(folder / NUMBERS, FORMAT, VERSION, {"sewfast": __version__, **numbers(found)})
     own = found.recorded_in is not None and found.recorded_in.resolve() == folder.resolve()
     if own and found.is_verified:
-        # of any other there is something to resume
+        # any other verdict leaves the checkpoint for a resumed attempt
         with suppress(OSError):
-            # they hold nothing that the tables have not; the page is worth more than their absence
+            # the tables hold the same: a failure here must not cost the page
             clear(folder)
     return _page(folder)
 
 
 def _artefacts(found: Commissioning, folder: Path) -> None:
-    """What the machine's minutes were for, a few kB, comes first: a disk may be full by the tables.
+    """Write controllers and models first, a few kB: the tables can fill the disk.
 
-    A table that has no room does not keep the others from being written.
+    All tables are tried, even if one does not fit.
 
     Raises
     ------
@@ -447,7 +445,7 @@ def _artefacts(found: Commissioning, folder: Path) -> None:
 
 
 def _analysis(found: Commissioning, folder: Path) -> None:
-    """The loop from every side, for the page; an extra as that one is."""
+    """The analysis of the loop for the page; optional, as the page is."""
     from ..analysis import analyse
 
     if found.controller is None or found.models is None:
@@ -467,5 +465,5 @@ def _page(folder: Path) -> Path:
     try:
         return report(folder)
     except SettingError:
-        # the page is an extra; `sewfast report DIR` writes it once its packages are there
+        # the page is optional; `sewfast report DIR` writes it once its packages are installed
         return folder / NUMBERS

@@ -1,8 +1,8 @@
-"""`bode`: the frequency response of a machine that is shaken about a working speed, or of a record.
+"""`bode`: the frequency response of a machine excited about a working speed, or of a record.
 
-A machine is brought to a speed and shaken by a multisine: sines of random phases at odd lines, so
-that even distortion falls between them, whole periods, so that nothing leaks, and none near
-multiples of the turn, where the load over the turn would be taken for a response.
+A machine is brought to a speed and excited by a multisine: sines of random phases at odd lines, so
+that even distortion falls between them; in complete periods, so that there is no leakage; and none
+near multiples of the turn, where the load over the turn would look like a response.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ from .bench import bench_of
 from .records import RecordMethod, of_record
 
 SHARE = 0.6
-"""Of what the command has left beside the working point, that the multisine takes."""
+"""Default amplitude of the multisine as a share of the command left at the working point."""
 STEPS = 0.05
-"""Of the working speed, that the reference is shaken by under a controller."""
+"""Default amplitude of the reference under a controller, as a share of the working speed."""
 HIGHEST = 0.4
-"""Of the sample rate, up to which lines are excited."""
+"""Highest excited frequency as a share of the sample rate."""
 HARMONICS, APART = 8, 1.0
-"""Multiples of the turn that lines keep off, and how far [Hz]."""
+"""Multiples of the turn that lines avoid, and the least distance from them [Hz]."""
 HOLD, LONGEST = 2.0, 32.0
-"""How long a command is held to see its speed, at first and at the most [s]."""
+"""First and longest hold of a command for measuring its speed [s]."""
 NEAR, SETTLED = 0.03, 0.02
-"""Of the speed: how near the working point has to be, and what still counts as settled."""
+"""Tolerance of the working point, and of a settled speed, as shares of the speed."""
 TRIES = 8
 CLIPPING = 0.8
-"""Of its peak, at which a multisine is clipped again and again to lower its crest factor."""
+"""Share of its peak at which a multisine is repeatedly clipped to lower its crest factor."""
 ROUNDS = 100
 SWING, MOST = 0.5, 0.8
-"""Of the working speed, by which it may swing as predicted: by itself, and if somebody asks for it.
-Nearer to standstill friction would act like a step."""
+"""Largest predicted swing as a share of the working speed: by default, and on request. Nearer to
+standstill, friction would act like a step."""
 
 
 @overload
@@ -90,32 +90,34 @@ def bode(
     ----------
     on : machine, Recording or Dataset
         A machine (`VirtualMachine`, drive, `SteppedBench`) is excited about a working speed. A
-        recording or a data set is taken as it is, with whatever moved its input; `reference`,
-        `method` and `segment` apply to these only.
+        recording or a data set is used as it is, with any input; `reference`, `method` and
+        `segment` apply to these only.
     speed : float or sequence of float, optional
         Working speed [RPM], required for a machine. It turns at this speed, and a little faster and
-        slower. Of several speeds, the response about each.
+        slower. For several speeds, the response about each.
     amplitude : float, optional
-        Peak of the multisine [V]; six tenths of what the command has left at that speed. Under a
-        controller the peak of the reference's [RPM], a twentieth of the speed.
+        Peak of the multisine [V]; by default six tenths of the command left at that speed. Under a
+        controller, the peak of the reference's variation [RPM], by default a twentieth of the
+        speed.
     controller : Controller, optional
         Excite the reference of this loop instead of the command. The response is still that of the
-        plant, not disturbed by the feedback; `response.margins(controller)` are those of the loop.
+        plant, without bias from the feedback; `response.margins(controller)` gives those of the
+        loop.
     period : float
-        Of the multisine [s]; its lines lie two over it apart.
+        Period of the multisine [s]; its lines are 2 / period apart.
     realisations, periods : int
-        How many multisines with other phases, and how often each is repeated after a first period,
+        Number of multisines with different phases, and number of periods of each after a first one,
         in which the machine settles.
     f_min, f_max : float
         Lowest and highest frequency [Hz]; the highest is four tenths of the sample rate by default.
     seed : int
-        Of the phases.
+        Seed of the phases.
     reference : str, optional
-        Column of a record that the controller follows: without it the response of a record under
-        feedback is biased.
+        Column of a record with the controller's reference: without it the response of a record
+        under feedback is biased.
     method : "segments" or "local", optional
-        Of a record: spectra averaged over segments (`sewfast.frequency.spectral`, the default), or
-        local polynomials, which take the leakage of beginning and end out
+        For a record: spectra averaged over segments (`sewfast.frequency.spectral`, the default), or
+        local polynomials, which remove the leakage of beginning and end
         (`sewfast.frequency.local_polynomial`).
     segment : int, optional
         Samples; see `sewfast.frequency.spectral`.
@@ -123,21 +125,21 @@ def bode(
     Returns
     -------
     FrequencyResponse or ResponsesOverSpeed
-        From the command [V] to the mean speed over the sample before [RPM] where counts are known,
-        else to the record's output. Of a drive that trips while it is excited, what its samples up
-        to then show: `provenance["incomplete"]` says so, and why. Of several speeds, those that
-        could be measured.
+        From the command [V] to the mean speed over the sample before [RPM] if counts are known,
+        else to the record's output. If a drive trips, the response is that of the samples until
+        then, and `provenance["incomplete"]` holds the reason. For several speeds, those that could
+        be measured.
 
     Raises
     ------
     SettingError
-        For a machine without a speed, a speed or an amplitude out of reach, parameters that do not
-        belong together.
+        For a machine without a speed, a speed or an amplitude out of reach, and arguments that do
+        not go together.
     DataError
-        If the machine comes near to standstill, a command is clipped, nothing of the multisine
-        is seen in the counts, or a record cannot be used.
+        If the machine comes near standstill, a command is clipped, the counts show no response, or
+        a record cannot be used.
     LinkError
-        If a drive fails or trips before there is anything to keep.
+        If a drive fails or trips before enough was recorded.
 
     Notes
     -----
@@ -172,12 +174,12 @@ def bode(
         )  # fmt: skip
     design = (period, realisations, periods, f_min, f_max, seed)
     if np.ndim(speed) == 0:
-        with bench_of(on, None) as bench:
-            plan = _Plan.of(bench, real("speed", speed), *design)
-            return _shaken(bench, plan, amplitude, controller)
-    with bench_of(on, None) as bench:
+        with bench_of(on, None) as machine:
+            plan = _Plan.of(machine, real("speed", speed), *design)
+            return _shaken(machine, plan, amplitude, controller)
+    with bench_of(on, None) as machine:
         return _over_speeds(
-            bench, [_Plan.of(bench, s, *design) for s in _rising(speed)], amplitude, controller
+            machine, [_Plan.of(machine, s, *design) for s in _rising(speed)], amplitude, controller
         )
 
 
@@ -192,14 +194,14 @@ def _rising(speed: Any) -> list[float]:
 
 
 def _over_speeds(
-    bench: Machine, plans: list[_Plan], amplitude: float | None, controller: Controller | None
+    machine: Machine, plans: list[_Plan], amplitude: float | None, controller: Controller | None
 ) -> ResponsesOverSpeed:
-    """One after the other: a speed that cannot be measured does not cost the others."""
+    """The responses one after the other; a speed that cannot be measured is skipped."""
     found: dict[float, FrequencyResponse] = {}
     refused: dict[float, str] = {}
     for i, plan in enumerate(plans):
         try:
-            found[plan.speed] = _shaken(bench, plan, amplitude, controller)
+            found[plan.speed] = _shaken(machine, plan, amplitude, controller)
         except (DataError, SettingError) as error:
             if i == len(plans) - 1 and not found:
                 raise
@@ -219,52 +221,51 @@ def _over_speeds(
 
 
 def _shaken(
-    bench: Machine, plan: _Plan, amplitude: float | None, controller: Controller | None,
+    machine: Machine, plan: _Plan, amplitude: float | None, controller: Controller | None,
     *, is_whole: bool = False,
 ) -> FrequencyResponse:  # fmt: skip
-    """The response about one speed; with `is_whole` none of a run that broke off."""
+    """The response about one speed; with `is_whole` only from a complete run."""
     if controller is None:
-        return _in_open_loop(bench, plan, amplitude, is_whole=is_whole)
-    return _under_feedback(bench, plan, amplitude, controller, is_whole=is_whole)
+        return _in_open_loop(machine, plan, amplitude, is_whole=is_whole)
+    return _under_feedback(machine, plan, amplitude, controller, is_whole=is_whole)
 
 
 # --- Margins, predicted and measured --------------------------------------------------------------
 
 
 AGAIN, LEAST_SHAKEN = 0.5, 0.2
-"""What is left of the amplitude where the command came to a limit; the least share of it."""
+"""Factor for the amplitude if the command reached a limit; the least share of it to try."""
 MARGINS = ("Ms", "phase_margin_deg", "gain_margin")
 UNBOUNDED = 1e6
 
 
 def margins_at_work(
-    bench: Machine, controller: Controller, plant: Any, speed: float, seed: int
+    machine: Machine, controller: Controller, plant: Any, speed: float, seed: int
 ) -> tuple[dict[str, Any], FrequencyResponse] | None:
-    """Margins of a loop as a linear plant predicts them and as the machine shows them at a speed,
-    and the response that they were read from.
+    """Margins of a loop, predicted by a linear plant and measured on the machine at a speed.
 
-    The reference is shaken by a multisine, half a minute in all. None where the answer is too
-    small, the command comes to its limits however little it is shaken, or the machine cannot be
-    shaken at that speed.
+    The reference is varied by a multisine for half a minute. Returns the margins and the measured
+    response; None if the response is too small, the command reaches its limits even at a small
+    amplitude, or the machine cannot be excited at that speed.
     """
     share = 1.0
     while share >= LEAST_SHAKEN:
         try:
-            plan = _Plan.of(bench, speed, 2.0, 2, 4, 1.0, None, seed)
-            response = _shaken(bench, plan, share * STEPS * abs(speed), controller, is_whole=True)
+            plan = _Plan.of(machine, speed, 2.0, 2, 4, 1.0, None, seed)
+            response = _shaken(machine, plan, share * STEPS * abs(speed), controller, is_whole=True)
             measured = response.margins(controller, speed=speed)
         except DataError:
             share *= AGAIN
             continue
         except SettingError:
-            # a machine or a sample time that cannot be shaken so
+            # this machine or sample time cannot be excited so
             return None
         predicted = margins(controller, plant, speed=speed)
         found = {
             "speed": speed,
             "predicted": {name: getattr(predicted, name) for name in MARGINS},
             "measured": {name: getattr(measured, name) for name in MARGINS}
-            # a circle that holds -1 bounds nothing
+            # a confidence circle that contains -1 gives no bound
             | {"Ms_band": [x if x < UNBOUNDED else math.inf for x in measured.Ms_band]},
         }
         return found, response
@@ -276,7 +277,7 @@ def margins_at_work(
 
 @dataclass(frozen=True)
 class _Plan:
-    """Lines and repetitions."""
+    """Lines and repetitions of an experiment."""
 
     speed: float
     samples: int
@@ -289,7 +290,7 @@ class _Plan:
     @classmethod
     def of(
         cls,
-        bench: Machine,
+        machine: Machine,
         speed: float,
         period: float,
         realisations: int,
@@ -298,11 +299,11 @@ class _Plan:
         f_max: float | None,
         seed: int,
     ) -> _Plan:
-        Ts = bench.Ts
-        if speed == 0.0 or not abs(speed) < bench.speed:
+        Ts = machine.Ts
+        if speed == 0.0 or not abs(speed) < machine.speed:
             raise SettingError(
                 name="speed",
-                expected=f"a working speed other than 0 and below {bench.speed:g} RPM",
+                expected=f"a working speed other than 0 and below {machine.speed:g} RPM",
                 received=f"{speed:g}",
             )  # fmt: skip
         for name, count, least in (("realisations", realisations, 1), ("periods", periods, 1)):
@@ -357,18 +358,18 @@ class _Plan:
         return found
 
     def signal(self) -> FloatArray:
-        """All realisations, each with the period in which the machine settles."""
+        """All realisations, each with a leading period in which the machine settles."""
         parts = [np.tile(self.multisine(m), self.periods + 1) for m in range(self.realisations)]
         return np.concatenate(parts)
 
     def blocks(self, signal: FloatArray, start: int) -> FloatArray:
-        """Shape (realisations, periods, samples), without what settles."""
+        """Shape (realisations, periods, samples), without the periods of settling."""
         shape = (self.realisations, self.periods + 1, self.samples)
         kept: FloatArray = signal[start : start + math.prod(shape)].reshape(shape)[:, 1:]
         return kept
 
     def left(self, samples: int) -> _Plan | None:
-        """What of it so many samples hold whole; None for fewer than two periods."""
+        """The part of the plan that fits into so many samples; None for fewer than two periods."""
         whole = samples // ((self.periods + 1) * self.samples)
         if whole * self.periods >= 2:
             return replace(self, realisations=min(whole, self.realisations))
@@ -377,12 +378,12 @@ class _Plan:
 
 
 def _in_open_loop(
-    bench: Machine, plan: _Plan, amplitude: float | None, *, is_whole: bool
+    machine: Machine, plan: _Plan, amplitude: float | None, *, is_whole: bool
 ) -> FrequencyResponse:
-    level, lead, time = _working_point(bench, plan.speed)
-    left = bench.volt - abs(level)
+    level, lead, time = _working_point(machine, plan.speed)
+    left = machine.volt - abs(level)
     swing = _swing(plan, plan.speed / level, time)
-    room = min(abs(plan.speed), bench.speed - abs(plan.speed))
+    room = min(abs(plan.speed), machine.speed - abs(plan.speed))
     peak = min(SHARE * left, SWING * room / swing)
     if amplitude is not None:
         peak = real("amplitude", amplitude)
@@ -398,20 +399,20 @@ def _in_open_loop(
     u = np.concatenate([np.full(lead, level), level + peak * plan.signal()])
     more: dict[str, Any] = {"level": level, "amplitude": peak}
     try:
-        recording = bench.excite(u, "multisine")
+        recording = machine.excite(u, "multisine")
     except LinkError as error:
         recording = _kept(error, lead, plan, is_whole=is_whole)
         more["incomplete"] = f"{error}"
-    return _response(bench, plan, recording, lead, None, more)
+    return _response(machine, plan, recording, lead, None, more)
 
 
 def _kept(error: LinkError, lead: int, plan: _Plan, *, is_whole: bool) -> Recording:
-    """What a run that broke off has recorded, up to the first gap, if that is a period or more.
+    """The recording of an aborted run up to its first gap, if that is a period or more.
 
     Raises
     ------
     LinkError
-        The error itself, where it is not.
+        The given error, if it is less.
     """
     found = getattr(error.recording, "recording", error.recording)
     if is_whole or not isinstance(found, Recording):
@@ -427,7 +428,7 @@ def _kept(error: LinkError, lead: int, plan: _Plan, *, is_whole: bool) -> Record
 
 
 def _swing(plan: _Plan, gain: float, time: float) -> float:
-    """Largest deviation of the speed for each volt of the multisine's peak [RPM/V], for one lag."""
+    """Largest deviation of the speed per volt of the multisine's peak [RPM/V], by a first order."""
     hertz = np.arange(plan.samples // 2 + 1) / (plan.samples * plan.Ts)
     lag = gain / (1.0 + 2j * math.pi * hertz * time)
     multisines = (plan.multisine(m) for m in range(plan.realisations))
@@ -437,7 +438,12 @@ def _swing(plan: _Plan, gain: float, time: float) -> float:
 
 
 def _under_feedback(
-    bench: Machine, plan: _Plan, amplitude: float | None, controller: Controller, *, is_whole: bool
+    machine: Machine,
+    plan: _Plan,
+    amplitude: float | None,
+    controller: Controller,
+    *,
+    is_whole: bool,
 ) -> FrequencyResponse:
     peak = STEPS * abs(plan.speed) if amplitude is None else real("amplitude", amplitude)
     if not 0.0 < peak <= MOST * abs(plan.speed):
@@ -453,25 +459,25 @@ def _under_feedback(
     limits = (controller.u_min, controller.u_max)
 
     def watch(first: int, u: FloatArray, counts: FloatArray) -> None:
-        """End at the first sample at a limit: nothing that follows could be used."""
+        """End the run at the first sample at a limit: the rest would be useless."""
         limited = np.isin(u[max(0, lead - first) :], limits)
         if limited.any():
             raise _limited(limited, max(first, lead), plan.Ts)
 
-    watched: dict[str, Any] = {"watch": watch} if is_watched(bench) else {}
+    watched: dict[str, Any] = {"watch": watch} if is_watched(machine) else {}
     try:
-        recording = bench.follow(controller, r, "multisine", **watched).recording
+        recording = machine.follow(controller, r, "multisine", **watched).recording
     except LinkError as error:
         recording = _kept(error, lead, plan, is_whole=is_whole)
         more["incomplete"] = f"{error}"
     limited = np.isin(recording.u[lead:], limits)
     if limited.any():
         raise _limited(limited, lead, plan.Ts)
-    return _response(bench, plan, recording, lead, r, more)
+    return _response(machine, plan, recording, lead, r, more)
 
 
 def _limited(limited: NDArray[np.bool_], first: int, Ts: float) -> DataError:
-    """Samples at a limit, of those from `first` on."""
+    """The error for samples at a limit; the first of them is sample `first` of the run."""
     return DataError(
         name="amplitude", expected="a command within its limits",
         received=f"{limited.sum()} samples at one, the first at "
@@ -481,7 +487,7 @@ def _limited(limited: NDArray[np.bool_], first: int, Ts: float) -> DataError:
 
 
 def _response(
-    bench: Machine,
+    machine: Machine,
     plan: _Plan,
     recording: Recording,
     lead: int,
@@ -501,8 +507,8 @@ def _response(
     labels: dict[str, Any] = {
         "u_unit": "V", "y_unit": "RPM", "from_counts": True,
         "provenance": {
-            "machine": bench.name, "speed": plan.speed, "seed": plan.seed,
-            "counts_per_rev": bench.counts_per_rev, **more,
+            "machine": machine.name, "speed": plan.speed, "seed": plan.seed,
+            "counts_per_rev": machine.counts_per_rev, **more,
         },
     }  # fmt: skip
     left, n = plan.left(len(y) - lead), len(y)
@@ -524,21 +530,21 @@ def _response(
     return found
 
 
-def _working_point(bench: Machine, speed: float) -> tuple[float, int, float]:
-    """Command that holds the speed [V], samples after which it does, time constant [s].
+def _working_point(machine: Machine, speed: float) -> tuple[float, int, float]:
+    """The command that holds the speed [V], the samples until it does, the time constant [s].
 
-    By the secant method: a machine is less linear than a straight line between two speeds.
+    It is found by the secant method, as a machine is not linear.
     """
     tried: list[tuple[float, float]] = [(0.0, 0.0)]
-    u, hold = math.copysign(0.15 * bench.volt, speed), HOLD
+    u, hold = math.copysign(0.15 * machine.volt, speed), HOLD
     for _ in range(TRIES):
-        held = _held(bench, u, hold)
+        held = _held(machine, u, hold)
         while not held.settled and hold < LONGEST:
             hold *= 2.0
-            held = _held(bench, u, hold)
+            held = _held(machine, u, hold)
         reached = held.speed
         if abs(reached - speed) <= NEAR * abs(speed):
-            return u, round(hold / bench.Ts), held.time
+            return u, round(hold / machine.Ts), held.time
         if abs(reached) < 0.02 * abs(speed):  # not broken away
             tried = [(u, 0.0)]
             u *= 2.0
@@ -546,10 +552,10 @@ def _working_point(bench: Machine, speed: float) -> tuple[float, int, float]:
             tried = sorted([*tried, (u, reached)], key=lambda point: abs(point[1] - speed))[:2]
             (u0, n0), (u1, n1) = tried
             u = u0 + (speed - n0) * (u1 - u0) / (n1 - n0) if n1 != n0 else 1.5 * u0
-        if not abs(u) < bench.volt:
+        if not abs(u) < machine.volt:
             break
     raise SettingError(
-        name="speed", expected=f"one that a steady command of up to {bench.volt:g} V holds",
+        name="speed", expected=f"one that a steady command of up to {machine.volt:g} V holds",
         received=f"{speed:g} RPM",
         remedy=f"the nearest was {min(tried, key=lambda p: abs(p[1] - speed))[1]:.4g} RPM",
     )  # fmt: skip
@@ -557,17 +563,26 @@ def _working_point(bench: Machine, speed: float) -> tuple[float, int, float]:
 
 @dataclass(frozen=True)
 class _Held:
-    """What a steady command does: speed of the last quarter [RPM], whether that of the quarter
-    before was the same, and when two thirds of it were reached [s]."""
+    """The response to a steady command.
+
+    Attributes
+    ----------
+    speed : float
+        Mean of the last quarter [RPM].
+    settled : bool
+        Whether the mean of the quarter before was the same.
+    time : float
+        Time until 63 % of the speed were reached [s].
+    """
 
     speed: float
     settled: bool
     time: float
 
 
-def _held(bench: Machine, u: float, hold: float) -> _Held:
-    n = round(hold / bench.Ts)
-    recording = bench.excite(np.full(n, u), "hold")
+def _held(machine: Machine, u: float, hold: float) -> _Held:
+    n = round(hold / machine.Ts)
+    recording = machine.excite(np.full(n, u), "hold")
     counts = recording.counts
     at = [counts[n // 2], counts[3 * n // 4], counts[-1]]
     if not np.isfinite(at).all():
@@ -576,7 +591,7 @@ def _held(bench: Machine, u: float, hold: float) -> _Held:
             remedy="see `sewfast doctor`",
         )  # fmt: skip
     before, last = np.diff(at) / np.diff([n // 2, 3 * n // 4, n - 1])
-    speed = float(last * 60.0 / (bench.counts_per_rev * bench.Ts))
+    speed = float(last * 60.0 / (machine.counts_per_rev * machine.Ts))
     reached = np.flatnonzero(np.abs(recording.y) >= 0.63 * abs(speed))
-    time = float(reached[0] * bench.Ts) if len(reached) else hold
+    time = float(reached[0] * machine.Ts) if len(reached) else hold
     return _Held(speed, bool(abs(last - before) <= SETTLED * abs(last) + 1e-9), time)

@@ -1,4 +1,4 @@
-"""Loads over a turn of the shaft; slow drives, of which every k-th sample is enough."""
+"""Loads over a turn of the shaft; slow drives, for which every k-th sample is enough."""
 
 from __future__ import annotations
 
@@ -19,33 +19,32 @@ from ..speed import speed_from_counts
 from ..tuning.objective import Cost
 from .small_signal import SmallSignal
 
-# --- What a turn does: the load over the angle, which no model of command and speed holds ---------
+# --- The load over the angle, which a model from command to speed cannot contain ------------------
 #
-# Cams, cranks, an eccentric load and cogging push at the same angles turn after turn. What the
-# first closed loops leave unexplained is taken apart over the angle that the encoder shows, as a
-# command that would have had the same effect, and is put back where loops are simulated. Behind a
-# gear the load turns with the output shaft: how often in a turn of the encoder's is told from the
-# line that it leaves in what is unexplained, drawn over the angle.
+# Cams, cranks, an eccentric load and cogging push at the same angles turn after turn. The models'
+# residual of the first closed loops is fitted over the encoder's angle, as a command that would
+# have the same effect, and added in simulated loops. Behind a gear the load turns with the output
+# shaft: the ratio is found from the line of the load in the residual's spectrum over the angle.
 
 
 HARMONICS = 6
-"""Of a turn that are told apart."""
+"""Harmonics of a turn that are fitted."""
 WORTH_IT = 0.97
-"""The load must bring what is unexplained on a recording that it was not taken from below this."""
+"""Largest ratio of the residuals with and without the load, on a recording not used for the fit."""
 SLOW = 0.5
-"""Span of the moving mean that is taken away before [s], for a load on the encoder's shaft."""
+"""Span of the moving mean removed before the fit [s], for a load on the encoder's shaft."""
 SLOW_TURNS = 2.0
-"""The same in turns of a load behind a gear."""
+"""The same for a load behind a gear, in turns of the load."""
 LEAST_TURNS = 8.0
-"""Of a load in the recordings that it is taken from: fewer cannot be told from friction."""
+"""Least turns of a load in the recordings: fewer cannot be distinguished from friction."""
 GEARED = 0.95
-"""Largest turns of a load in one of the encoder's shaft that count as behind a gear."""
+"""Largest ratio (turns of the load per turn of the encoder) of a load behind a gear."""
 BIWEIGHT, REWEIGHTED = 4.685, 5
-"""Deviations at which a sample counts for nothing, the usual number; rounds of it."""
+"""Cut-off of the biweight in standard deviations, the usual value; rounds of reweighting."""
 CELLS = 32
-"""Of a turn of the encoder's shaft, by which a line is looked for: a load turns less often."""
+"""Cells per turn of the encoder's shaft in the search for a line; a load turns less often."""
 REFINED = 15
-"""Ratios that are tried between two of those that the record can tell apart."""
+"""Ratios tried within the resolution of the record."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +54,9 @@ class TurnLoad:
     Attributes
     ----------
     cosine, sine : array, shape (HARMONICS,)
-        [V]
+        Coefficients [V].
     ratio : float
-        Turns of the load in one of the encoder's shaft: below 1 behind a gear.
+        Turns of the load per turn of the encoder's shaft: below 1 behind a gear.
     """
 
     cosine: FloatArray
@@ -75,7 +74,7 @@ class TurnLoad:
 
     @property
     def rms(self) -> float:
-        """Over a turn [V]."""
+        """Rms over a turn [V]."""
         return float(np.sqrt(0.5 * (self.cosine @ self.cosine + self.sine @ self.sine)))
 
 
@@ -92,18 +91,18 @@ def turn_load(
     judge: Recording,
     k: int = 1,
 ) -> TurnLoad | None:
-    """The load over the turn, where a recording that it was not taken from shows it too.
+    """The load over the turn, if it also shows in a recording not used for the fit.
 
     Parameters
     ----------
     ensemble : Ensemble
-        Its median's free run is what is explained.
+        The load explains the residual of the median of its free runs.
     plant : Model
-        From command to speed about a working speed: what a push does.
+        Response from command to speed about a working speed.
     learned, judge : Recordings
-        To take it from, and to ask whether it is there.
+        Recordings for the fit, and the one to judge it by.
     k : int
-        Samples of the recordings in one of the models.
+        Samples of the recordings per sample of the models.
     """
     try:
         known = [_Unexplained.of(ensemble, r, k) for r in learned]
@@ -126,7 +125,7 @@ def turn_load(
 
 @dataclass(frozen=True, eq=False)
 class _Unexplained:
-    """What models leave of a recording's speed, with the angle at every sample of the machine."""
+    """The models' residual of a recording's speed, and the angle at every sample of the machine."""
 
     rest: FloatArray
     turns: FloatArray
@@ -135,12 +134,12 @@ class _Unexplained:
 
     @classmethod
     def of(cls, ensemble: Ensemble, whole: Recording, k: int) -> _Unexplained:
-        """Of the median's free run.
+        """The residual of the median of the members' free runs.
 
         Raises
         ------
         FitError
-            Where a member runs away.
+            If a member diverges.
         """
         thinning = Thinning(k)
         recording = thinning.recording(whole)
@@ -149,8 +148,10 @@ class _Unexplained:
         return cls(recording.y - np.median(runs, axis=0), turns, recording.Ts, thinning)
 
     def span(self, ratio: float) -> float:
-        """Of the moving mean that is taken away [s]: friction that changes with warmth is no load
-        over the turn, but what a slow output shaft does is.
+        """Span of the moving mean to remove [s].
+
+        It removes slow changes such as friction that varies with temperature, but keeps the load of
+        a slow output shaft.
         """
         rate = float(self.turns[-1]) / (len(self.rest) * self.Ts)
         return max(SLOW, SLOW_TURNS / max(ratio * rate, 1e-9)) if ratio < 1.0 else SLOW
@@ -158,9 +159,7 @@ class _Unexplained:
     def parts(
         self, plant: Model, ratio: float, span: float, harmonics: int = HARMONICS
     ) -> tuple[FloatArray, FloatArray]:
-        """What each harmonic would do to the speed, and what is unexplained [RPM]; both without
-        what is slow.
-        """
+        """Response of the speed to each harmonic, and the residual [RPM]; without slow parts."""
         core, zero = plant.core, np.zeros(plant.core.na)
         still = core.simulate(np.zeros((len(self.rest), 1)), zero)
         waves = basis(ratio * self.turns, harmonics).T
@@ -173,10 +172,10 @@ class _Unexplained:
 def _robust(rows: FloatArray, rest: FloatArray) -> FloatArray:
     """Least squares with Tukey's biweight (Huber and Ronchetti, Robust Statistics, 2009, ch. 4).
 
-    What a model misses at a current limit is many times what the load does, and no wave over the
-    angle. With all samples alike, drive `weak` had 9.3 V of load by its linear model, where it has
-    .12; so it has .18. Of nine drives, what is unexplained on the random levels falls to .82
-    (median; .69 to 1.15) of that before.
+    The error of a model at a current limit is many times the effect of the load, and not a wave
+    over the angle. With equal weights, the linear model of drive `weak` gave 9.3 V of load instead
+    of .12; with the biweight it gives .18. On nine drives, the residual on the random levels falls
+    to .82 (median; .69 to 1.15) of that with equal weights.
     """
     weight: FloatArray = np.ones(len(rest))
     for _ in range(1 + REWEIGHTED):
@@ -188,11 +187,11 @@ def _robust(rows: FloatArray, rest: FloatArray) -> FloatArray:
 
 
 def _behind_a_gear(plant: Model, known: Sequence[_Unexplained]) -> list[float]:
-    """Turns of a load in one of the encoder's shaft, where a line says so: one at most.
+    """Turns of a load per turn of the encoder's shaft, if a line shows one: a list of one at most.
 
-    The line is looked for on the longest recording over the angle, and its place is refined by how
-    much of what is unexplained the load would explain: over hundreds of turns a ratio that is off
-    by a thousandth has come out of step.
+    The line is searched in the spectrum over the angle of the longest recording, and its place is
+    refined by the residual that the load would leave: over hundreds of turns, a ratio that is off
+    by a thousandth gets out of phase.
     """
     longest = max(known, key=lambda u: len(u.rest))
     total = float(longest.turns[-1])
@@ -208,9 +207,9 @@ def _behind_a_gear(plant: Model, known: Sequence[_Unexplained]) -> list[float]:
 
 
 def _lines(turns: FloatArray, rest: FloatArray, total: float) -> FloatArray:
-    """Power of what swings 0, 1, 2, .. times in twice the total of turns.
+    """Power of waves with 0, 1, 2, .. periods in twice the total of turns.
 
-    One transform of what falls into each cell of angle, where a sum over all samples for each of
+    This is one Fourier transform of sums over cells of angle; sums over all samples for each of
     thousands of ratios took four seconds of a slow drive's commissioning.
     """
     cells = math.ceil(CELLS * total)
@@ -220,14 +219,14 @@ def _lines(turns: FloatArray, rest: FloatArray, total: float) -> FloatArray:
 
 
 def _left(plant: Model, known: _Unexplained, ratio: float) -> float:
-    """What a load with this ratio, of one harmonic, leaves unexplained."""
+    """Share of the residual that remains with a load of this ratio, of one harmonic."""
     rows, rest = known.parts(plant, ratio, known.span(ratio), 1)
     solution, *_ = np.linalg.lstsq(rows, rest, rcond=1e-6)
     return float(np.mean((rest - rows @ solution) ** 2) / max(float(np.mean(rest**2)), 1e-30))
 
 
 def _fast(x: FloatArray, span: int) -> FloatArray:
-    """Without the moving mean over a span, which is shorter at the ends."""
+    """The signal less its moving mean over a span, which is shorter at the ends."""
     total, k = np.concatenate([[0.0], np.cumsum(x)]), np.arange(len(x))
     begin, end = np.maximum(k - span // 2, 0), np.minimum(k - span // 2 + span, len(x))
     mean: FloatArray = (total[end] - total[begin]) / (end - begin)
@@ -236,21 +235,21 @@ def _fast(x: FloatArray, span: int) -> FloatArray:
 
 # --- Slow drives: training and tuning on every k-th sample, so that effort follows the dynamics ---
 #
-# A drive whose time constant is ten times longer takes ten times more samples for the same content,
-# and its poles come so close to 1 that networks are hard to train. So all that is simulated runs on
-# every k-th sample, k in proportion to the time constant. The machine is always run at its own
-# sample time: gains in standard form are in seconds, and so is the feedback's filter.
+# A drive with a ten times longer time constant needs ten times more samples for the same content,
+# and its poles come so close to 1 that networks are hard to train. So all simulations run on every
+# k-th sample, with k in proportion to the time constant. The machine always runs at its own sample
+# time: gains in standard form are in seconds, and so is the feedback's filter.
 
 
 PER_CONSTANT = 200
-"""Samples of a time constant that are kept: as many as the nominal machine has at 1 ms."""
+"""Samples kept per time constant: as many as the nominal machine has at 1 ms."""
 MOST = 10
-"""Samples of which one is kept, at most."""
+"""Largest k."""
 LONGEST_FILTER = 64
-"""Of the feedback's moving average [samples]."""
+"""Longest moving average of the feedback [samples]."""
 SHARPEST = 50.0
-"""Derivative filter N of a coarse controller whose own sample time filters more than it asks for;
-the largest that is searched."""
+"""Largest derivative filter N of the search; a coarse controller gets it if its sample time alone
+filters more than its N."""
 
 
 @dataclass(frozen=True)
@@ -267,21 +266,20 @@ class Thinning:
 
     @classmethod
     def of(cls, fopdt: Fopdt, Ts: float, small: SmallSignal | None) -> Thinning:
-        """What a drive's time constant allows; a resonance is not to be folded into it."""
+        """The k for a drive's time constant; 1 with a resonance, which would alias."""
         if small is not None and small.resonance is not None:
             return cls()
         return cls(max(1, min(MOST, int(fopdt.T / (PER_CONSTANT * Ts) + 1e-9))))
 
     @classmethod
     def between(cls, coarse: float, fine: float) -> Thinning:
-        """That between two sample times [s]."""
+        """The k between two sample times [s]."""
         return cls(max(1, round(coarse / fine)))
 
     def recording(self, r: Recording) -> Recording:
-        """The mean command over k samples, and the speed from the counts that are left.
+        """The mean command over k samples, and the speed from every k-th count.
 
-        A command that is picked instead of averaged would be another one than the machine saw: a
-        closed loop's changes at every sample.
+        The command is averaged and not picked, as in a closed loop it changes at every sample.
         """
         if self.k == 1:
             return r
@@ -299,15 +297,15 @@ class Thinning:
     ) -> list[FloatArray] | None:
         """The load's command along references at the machine's sample time, thinned.
 
-        Its harmonics lie beyond half of the coarse rate at high speeds: they are averaged, and not
-        folded into slow ones.
+        At high speeds its harmonics lie above half the coarse sample rate: averaging keeps them
+        from aliasing.
         """
         if load is None:
             return None
         return [self.mean(load.along(r, Ts)) for r in references.values()]
 
     def mean(self, u: FloatArray) -> FloatArray:
-        """Over each k samples; over those that are left at the end."""
+        """Means over each k samples, and over the remaining ones at the end."""
         if self.k == 1:
             return u
         begins = np.arange(0, len(u), self.k)
@@ -316,9 +314,10 @@ class Thinning:
         return means
 
     def coarse(self, c: Controller) -> Controller:
-        """The controller as it is simulated.
+        """The controller for simulations at the coarse sample time.
 
-        The encoder's difference over k samples is the mean of k speeds.
+        Its moving average is k times shorter, as a difference of counts over k samples is already
+        the mean of k speeds.
         """
         if self.k == 1:
             return c
@@ -330,11 +329,11 @@ class Thinning:
         )
 
     def fine(self, c: Controller) -> Controller:
-        """The controller as the machine runs it.
+        """The controller for the machine at its own sample time.
 
-        A coarse sample filters the derivative by itself: a change is divided by Td / N and the
-        sample time. At the machine's sample time the same `N` would answer every count of the
-        encoder with k times the command.
+        A coarse sample time itself filters the derivative: a change is divided by the sum of Td / N
+        and the sample time. At the machine's sample time, the same `N` would give k times the
+        command for every count of the encoder.
         """
         if self.k == 1:
             return c
@@ -347,33 +346,33 @@ class Thinning:
         )
 
     def plant(self, fopdt: Fopdt, Ts: float) -> Fopdt:
-        """First order with dead time as a loop at coarse samples sees it, `Ts` [s] the machine's.
+        """First order with dead time in a loop at coarse samples; `Ts` [s] is the machine's.
 
-        Its command is held, and its speed taken, over k samples instead of one: half of the rest
-        each.
+        Holding the command and averaging the speed over k samples instead of one each add half of
+        (k - 1) Ts to the dead time.
         """
         return fopdt if self.k == 1 else replace(fopdt, L=fopdt.L + (self.k - 1) * Ts)
 
     def variations(self) -> Sequence[tuple[float, int]] | None:
-        """Gain and delay of the plants that are tuned on; None for the usual ones.
+        """Gain and delay of the plants for tuning; None for the usual ones.
 
-        The coarse sample time itself is more delay than the usual ones add.
+        The coarse sample time alone is more delay than the usual ones add.
         """
         return None if self.k == 1 else ((1.0, 0), (0.8, 0), (1.25, 0))
 
     def cost(self, cost: Cost) -> Cost:
-        """The same cost of what is simulated.
+        """The same cost for simulations.
 
         A command that follows the encoder's counts changes more from one coarse sample to the next
-        than from one sample to the next: with the square root of k, as whatever is random does.
-        Measured were .55 to .72 of the coarse change at k = 2, .19 to .34 at k = 10.
+        than between the machine's samples: by the square root of k, as a random signal does. The
+        measured ratio of fine to coarse change was .55 to .72 at k = 2, .19 to .34 at k = 10.
         """
         if self.k == 1 or cost.chatter is None:
             return cost
         return replace(cost, chatter=cost.chatter / math.sqrt(self.k))
 
     def run(self, found: ClosedLoopRun) -> ClosedLoopRun:
-        """What the machine did, as it compares with what was simulated."""
+        """A run of the machine at the samples of the simulation, for comparison."""
         if self.k == 1:
             return found
         kept = {n: np.ascontiguousarray(x[:: self.k]) for n, x in found.columns().items()}
@@ -384,7 +383,7 @@ class Thinning:
 
 
 def _derivative_filter(c: Controller, longer: float) -> float:
-    """`N` of a derivative filter whose time constant is so much longer [s]."""
+    """`N` of a derivative filter with a time constant longer by `longer` [s]."""
     Td = c.gains.to("standard").Td
     if Td <= 0.0:
         return c.N

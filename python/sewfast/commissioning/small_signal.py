@@ -1,11 +1,11 @@
-"""Small signals about a working speed: how fast the machine answers, and whether a shaft swings.
+"""Small signals about a working speed: linear dynamics, delay and resonance of the machine.
 
-A step response says little of the first milliseconds and nothing of a resonance: friction, load and
-the current limit are in it. A small random command about a held speed shows the linear dynamics
-that a controller's gains meet, delay, electrical pole and shaft, within a few seconds.
+A step response shows little of the first milliseconds and nothing of a resonance, because friction,
+load and current limit dominate it. A small random command about a held speed shows the linear
+dynamics that matter for the gains (delay, electrical pole and shaft) within a few seconds.
 
-A load over the turn swings, too, and behind a gear slower than the shaft that the encoder sees. It
-is told from a resonance by its frequency at two speeds: that of a load moves with the speed.
+A load over the turn oscillates, too, behind a gear even slower than the encoder's shaft. Two speeds
+distinguish it from a resonance: the frequency of a load moves with the speed.
 """
 
 from __future__ import annotations
@@ -29,38 +29,38 @@ from .demands import Demands
 from .excitations import Motion
 
 SHAKEN_AT = 0.5
-"""Of the top speed, at which the machine is shaken."""
+"""Working speed as a share of the top speed."""
 FASTER = 0.8
-"""Of the top speed, at which it is shaken again where something swings."""
+"""Second working speed, used if something oscillates, as a share of the top speed."""
 NEAR = 0.1
-"""How far from its place a frequency is looked for, in shares of it: the levels lie further apart,
-so that one that stays and one that moves with the speed are told apart."""
+"""Search range about a frequency, as a share of it. The two speeds lie further apart, so that fixed
+frequencies and those that move with the speed stay separate."""
 CLEAR = 4.0
-"""Times the power at the place where a resonance would be, and of the surroundings, of a load."""
+"""Least power of a load over the power at the place of a resonance, and over its surroundings."""
 TWICE = 2.0
-"""Swings in a record, at the least: fewer cannot be told from a drift."""
+"""Least number of periods in a record: fewer cannot be distinguished from drift."""
 SHARE, MOST = 0.1, 60.0
-"""Of what is unexplained, that a line must be to be asked about; its largest frequency [Hz]."""
+"""Least share of a spectral line in the residual for a second look; its largest frequency [Hz]."""
 BESIDE = (0.4, 0.8), (1.25, 1.8)
-"""Surroundings of a line, in shares of its frequency."""
+"""Surroundings of a line, as shares of its frequency."""
 LOADS = 4
-"""Of the turn, at the most, that are taken out one after the other."""
+"""Most rounds of removing loads over the turn."""
 SIZE = 0.1
-"""Of the largest command: small against what friction and the current limit bend."""
+"""Amplitude as a share of the largest command: small enough for linear dynamics."""
 SAMPLES, LONGEST = 4_000, 12.0
-"""Samples that are shaken; not longer than that [s]."""
+"""Samples of the random command, and its longest duration [s]."""
 HOLD = 2
 """Samples that each random value is held: power up to a quarter of the sample rate."""
 ITERATIONS = 60
 ORDERS = (1, 2, 3, 4, 5)
 LEAST_GAIN = math.log(1.005)
-"""A difference in error that counts as none, however well it is known."""
+"""A smaller difference in (log) error does not count, however significant."""
 SWINGS = 0.3
 """Damping ratio below which a pair of poles is a resonance."""
 LOWEST, HIGHEST = 2.0, 0.4
-"""Frequencies looked at: from so many Hz to that share of the sample rate."""
+"""Range of resonances: least frequency [Hz], largest as a share of the sample rate."""
 LEAST_FIT = 90.0
-"""Percent at which the model's own step response is one of first order with dead time."""
+"""Least fit of first order with dead time to the model's own step response [%]."""
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,9 @@ class Resonance:
     Attributes
     ----------
     frequency : float
-        Undamped [Hz].
+        Undamped frequency [Hz].
     damping : float
-        Ratio.
+        Damping ratio.
     """
 
     frequency: float
@@ -91,9 +91,9 @@ class SmallSignal:
     model : Model
         Command [V] to speed [RPM], of the simplest order that explains the record.
     resonance : Resonance or None
-        The least damped one.
+        The one with the highest peak.
     fopdt : Fopdt or None
-        The model's step response as first order with dead time; None where it is none.
+        The model's step response as first order with dead time; None if that does not fit.
     """
 
     model: Model
@@ -102,21 +102,21 @@ class SmallSignal:
 
 
 def small_signal(
-    bench: Machine, demands: Demands, motion: Motion, fopdt: Fopdt
+    machine: Machine, demands: Demands, motion: Motion, fopdt: Fopdt
 ) -> SmallSignal | None:
-    """Shake the machine about half its top speed; None where that shows nothing.
+    """Excite the machine about half its top speed; None if the record shows no dynamics.
 
-    Where a pair of poles swings, or a line stands out from what a first order leaves unexplained,
-    it is shaken at a higher speed as well. What has moved in proportion with the speed is a load
-    over the turn: it is taken out, and no resonance.
+    If a pair of poles is lightly damped, or a line stands out from the residual of a first order,
+    the machine is also excited at a higher speed. A frequency that has moved in proportion with the
+    speed is a load over the turn and not a resonance: it is removed.
     """
-    u, settled = shaking(demands, motion, fopdt, bench.Ts, SHAKEN_AT)
-    slow = Shaken.of(bench.excite(u, "small_signals"), settled)
+    u, settled = shaking(demands, motion, fopdt, machine.Ts, SHAKEN_AT)
+    slow = Shaken.of(machine.excite(u, "small_signals"), settled)
     found = explained(slow, fopdt)
     if found is None or not _suspects(found.model, slow):
         return found
-    u, settled = shaking(demands, motion, fopdt, bench.Ts, FASTER)
-    fast = Shaken.of(bench.excite(u, "small_signals_faster"), settled)
+    u, settled = shaking(demands, motion, fopdt, machine.Ts, FASTER)
+    fast = Shaken.of(machine.excite(u, "small_signals_faster"), settled)
     for _ in range(LOADS):
         loads = [turns_of(f, slow, fast) for f in _suspects(found.model, slow)]
         taken = [ratio for ratio in loads if ratio is not None]
@@ -137,9 +137,9 @@ class Shaken:
     Attributes
     ----------
     u, speed : array, shape (N,)
-        [V, RPM], the latter as counted.
+        Command [V], and speed by differences of counts [RPM].
     turns : array, shape (N,)
-        Of the shaft that the encoder sees.
+        Angle of the encoder's shaft [turns].
     Ts : float
         [s]
     name : str
@@ -153,7 +153,7 @@ class Shaken:
 
     @classmethod
     def of(cls, recording: Recording, settled: int) -> Shaken:
-        """From the sample on from which the command is random."""
+        """The part of a recording from sample `settled`, at which the random command begins."""
         counts, per = recording.counts, 60.0 / (recording.counts_per_rev * recording.Ts)
         speed = np.diff(counts, prepend=counts[0]) * per
         turns = (counts[settled:] - counts[settled]) / recording.counts_per_rev
@@ -169,16 +169,16 @@ class Shaken:
         return float(self.turns[-1] - self.turns[0]) / self.seconds
 
     def dataset(self) -> Dataset:
-        """For fits."""
+        """Command and speed as a data set."""
         return Dataset.from_arrays(
             self.u, self.speed, self.Ts, input_units="V", output_unit="RPM", name=self.name
         )
 
     def without(self, ratios: Sequence[float]) -> Shaken:
-        """Without what swings so many times a turn, command and speed alike.
+        """With the waves of these frequencies per turn removed from both command and speed.
 
-        A linear machine answers a sine with one of the same frequency: what is left of its speed
-        is what is left of its command makes of it.
+        A linear machine answers a sine with a sine of the same frequency, so the rest of the speed
+        is still the response to the rest of the command.
         """
         waves = [w for ratio in ratios for w in _waves(ratio * self.turns)]
         columns = np.column_stack([np.ones(len(self.u)), *waves])
@@ -191,7 +191,7 @@ class Shaken:
 def shaking(
     demands: Demands, motion: Motion, fopdt: Fopdt, Ts: float, level: float
 ) -> tuple[FloatArray, int]:  # fmt: skip
-    """The command [V] about a level of the top speed, and the sample from which it is random."""
+    """The command [V] about a share of the top speed, and the sample at which it becomes random."""
     held = min(motion.command(level * demands.speed), (1.0 - SIZE) * demands.u_max)
     settle = max(1, round(min(4.0 * fopdt.T, LONGEST) / Ts))
     samples = int(min(SAMPLES, max(500, LONGEST / Ts)))
@@ -204,7 +204,7 @@ def shaking(
 
 
 def explained(shaken: Shaken, fopdt: Fopdt) -> SmallSignal | None:
-    """The simplest linear model of what was shaken."""
+    """The simplest linear model of a record."""
     data = shaken.dataset()
     part = folds(data)[0]
     tried = {order: fitted(part, order) for order in ORDERS}
@@ -219,7 +219,7 @@ def explained(shaken: Shaken, fopdt: Fopdt) -> SmallSignal | None:
 
 
 def fitted(part: Split, order: int) -> tuple[_core.LinearModel, Errors] | None:
-    """The better of output error and instrumental variables: a resonance makes local minima."""
+    """The better of output error and instrumental variables, as a resonance causes local minima."""
     tried = []
     for fit in (_core.fit_oe, _core.fit_iv):
         try:
@@ -243,7 +243,7 @@ def simplest(found: dict[int, tuple[_core.LinearModel, Errors]]) -> int:
 
 
 def _resonance(core: _core.LinearModel, Ts: float) -> Resonance | None:
-    """Of the lightly damped pairs of poles within the frequencies looked at, the highest peak."""
+    """The lightly damped pair of poles with the highest peak within the range of frequencies."""
     poles = core.poles()[:, 0] + 1j * core.poles()[:, 1]
     found: list[tuple[float, Resonance]] = []
     for p in poles[poles.imag > 0.0]:
@@ -259,17 +259,17 @@ def _resonance(core: _core.LinearModel, Ts: float) -> Resonance | None:
 
 
 def _suspects(model: Model, shaken: Shaken) -> list[float]:
-    """Frequencies that a load over the turn may have [Hz]: of poles that swing, and of the line."""
+    """Possible frequencies of a load over the turn [Hz]: of lightly damped poles, and of a line."""
     line = _line(shaken)
     return [*_swinging(model, shaken), *([] if line is None else [line])]
 
 
 def _line(shaken: Shaken) -> float | None:
-    """The frequency at which most of what is unexplained is, where that is a line [Hz]."""
+    """The frequency with the most power in the residual, if it is a spectral line [Hz]."""
     rest = _unexplained(shaken)
     if rest is None:
         return None
-    # over the angle: a load is a line there, also while the command shakes the speed
+    # over the angle, a load is a line even while the command varies the speed
     per_turn = np.arange(TWICE, MOST * shaken.seconds, 0.25) / (shaken.seconds * shaken.rate)
     powers = np.array([_power(ratio * shaken.turns, rest) for ratio in per_turn])
     best = int(np.argmax(powers))
@@ -278,7 +278,7 @@ def _line(shaken: Shaken) -> float | None:
 
 
 def _swinging(model: Model, shaken: Shaken) -> list[float]:
-    """Frequencies of the pairs of poles that swing, growing ones too [Hz]."""
+    """Frequencies of the lightly damped or unstable pairs of poles [Hz]."""
     poles = model.core.poles()[:, 0] + 1j * model.core.poles()[:, 1]
     s = np.log(poles[poles.imag > 0.0]) / shaken.Ts
     frequencies = np.abs(s) / (2.0 * math.pi)
@@ -288,10 +288,10 @@ def _swinging(model: Model, shaken: Shaken) -> list[float]:
 
 
 def turns_of(frequency: float, slow: Shaken, fast: Shaken) -> float | None:
-    """How many times a turn a load swings that was seen with a frequency [Hz] at the slow speed.
+    """Periods per turn of a load that was seen at a frequency [Hz] at the slow speed.
 
-    None where the frequency has stayed at the fast one, or is not seen there at a place that
-    moves with the speed: by the slow record alone nothing is taken for a load.
+    None if the frequency is the same at the fast speed, or if nothing there has moved with the
+    speed: the slow record alone does not prove a load.
     """
     before, rest = _unexplained(slow), _unexplained(fast)
     if before is None or rest is None:
@@ -309,7 +309,7 @@ def turns_of(frequency: float, slow: Shaken, fast: Shaken) -> float | None:
 
 
 def _unexplained(shaken: Shaken) -> FloatArray | None:
-    """What a first order leaves of the speed: loads that the command has no part in, and shafts."""
+    """The residual of a first-order fit to the speed: loads, and dynamics of the shaft."""
     data = shaken.dataset()
     try:
         core = _core.fit_oe(arrays(data), na=1, nb=2, nk=1, max_iterations=ITERATIONS).model
@@ -327,12 +327,12 @@ def _waves(turns: FloatArray) -> list[FloatArray]:
 
 
 def _power(turns: FloatArray, rest: FloatArray) -> float:
-    """Of what swings once a turn in a signal; twice that is its mean square."""
+    """Power of the wave of one period per turn in a signal; twice that is its mean square."""
     return float(sum(np.mean(wave * rest) ** 2 for wave in _waves(turns)))
 
 
 def _first_order(core: _core.LinearModel, Ts: float, recorded: Fopdt) -> Fopdt | None:
-    """First order with dead time of the model's step response, over five recorded constants."""
+    """Fit of first order with dead time to the model's step response over five time constants."""
     u = _core.step(duration=6.0 * recorded.T, Ts=Ts, at=0.5 * recorded.T, low=0.0, high=1.0)
     try:
         y = core.simulate(u[:, None], np.zeros(core.na)) - core.simulate(

@@ -1,4 +1,4 @@
-"""The ensemble: several networks from the same recordings, and which of them are fit to tune on."""
+"""The ensemble: several networks from the same recordings, those that predict well enough."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from ..dataset import Dataset, Experiment
 from ..errors import FitError
-from ..evidence import ReportCard, check, remembered
+from ..evidence import ReportCard, check, with_training_evidence
 from ..identification import seeded
 from ..identification.folds import folds, thinned
 from ..identification.task import wrap
@@ -23,15 +23,15 @@ from .demands import Demands, require
 from .small_signal import SIZE, fitted, simplest
 
 WORST = 2.0
-"""Members with a larger multiple of the best one's error on data not trained on are left out."""
+"""Members with a larger multiple of the best one's error on held-out data are left out."""
 LEAST_FIT = 85.0
-"""Percent of the best member in free run on data not trained on."""
+"""Least fit of the best member in free run on held-out data [%]."""
 MOST_SAMPLES = 80_000
-"""Trained on: of a slow machine blocks from all over its long recordings."""
+"""Most training samples; from longer recordings, blocks spread over them are used."""
 CLOSE = 0.02
-"""Of the span of that recording: members that are within it stay, whatever the best one does."""
+"""Members with an error within this share of the recording's span stay in any case."""
 DRAWN = 2
-"""Networks that are trained for each one that is wanted."""
+"""Networks trained for each member."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +42,13 @@ class Trained:
     ----------
     ensemble : Ensemble
     rmse : tuple of float
-        Of each member in free run on the recording to judge by [RPM].
+        Error of each member in free run on the held-out recording [RPM].
     fit_percent : float
-        Of the best one.
+        Fit of the best one.
     dropped : int
-        Members that were left out.
+        Number of members left out.
     card : ReportCard
-        Of the best one on that recording.
+        Report card of the best one on that recording.
     """
 
     ensemble: Ensemble
@@ -58,7 +58,7 @@ class Trained:
     card: ReportCard
 
     def errors_of(self, some: Ensemble) -> tuple[float, ...]:
-        """`rmse` of those members that are in `some`."""
+        """`rmse` of the members in `some`."""
         pairs = zip(self.ensemble.members, self.rmse, strict=True)
         return tuple(e for m, e in pairs if any(m is other for other in some.members))
 
@@ -69,12 +69,12 @@ def train(
     demands: Demands,
     progress: Callable[[int, int], object],
 ) -> Trained:
-    """Train members that differ in their seeds; keep those that predict what they have not seen.
+    """Train members with different seeds; keep those that predict held-out data.
 
     Raises
     ------
     Refusal
-        Where members differ too much, or none predicts.
+        If no network can be trained, or the best one does not predict well enough.
     Interrupted
         On Ctrl-C.
     """
@@ -109,7 +109,7 @@ def train(
 
 
 def validate_member(model: Model, data: Dataset) -> tuple[float, float]:
-    """Error and fit of the free run from rest; infinite where it runs away."""
+    """Error and fit of the free run from rest; infinite if it diverges."""
     try:
         found = validate(model, data, init=0).simulation
     except FitError:
@@ -120,10 +120,10 @@ def validate_member(model: Model, data: Dataset) -> tuple[float, float]:
 def _members(
     data: Dataset, demands: Demands, progress: Callable[[int, int], object]
 ) -> list[Model]:
-    """Networks by seed, side by side; a Ctrl-C ends all of them.
+    """Networks by seed, trained in parallel; Ctrl-C ends all of them.
 
-    Twice as many are trained as are wanted, as some end in a poor minimum: the better half by the
-    error on their own training data stays.
+    Twice as many are trained as needed, as some end in a poor minimum; the better half by the error
+    on the training data stays.
     """
     stopped = threading.Event()
     seeds = [demands.seed + i for i in range(DRAWN * demands.members)]
@@ -148,12 +148,12 @@ def _members(
             progress(len(done), len(seeds))
         trained = [m for m in done if m is not None]
         trained.sort(key=lambda m: validate_member(m, data)[0])
-        kept = list(pool.map(lambda m: remembered(m, data), trained[: demands.members]))
+        kept = list(pool.map(lambda m: with_training_evidence(m, data), trained[: demands.members]))
     except FitError:
         kept = []
     except BaseException:
         stopped.set()
-        # the evidence that follows a training cannot be stopped, nor is it waited for
+        # the evidence that follows a training cannot be stopped: do not wait for it
         pool.shutdown(wait=False, cancel_futures=True)
         raise
     pool.shutdown()
@@ -162,37 +162,36 @@ def _members(
 
 # --- The linear rival: a model of another kind, from the same recordings --------------------------
 #
-# Networks are fitted by a search that may end in a poor minimum, and they are free to bend where
-# nothing was recorded. A linear output-error model can do neither. It stands in where networks
-# fail, and gives a second opinion on gains that were tuned on them. It is not tuned on beside
-# networks that agree: what it cannot hold, the current limit above all, would cost the gains
-# something on drives whose networks are right.
+# The search that fits networks can end in a poor minimum, and networks can bend anywhere outside
+# the recorded range. A linear output-error model does neither. It replaces networks that fail, and
+# gives a second opinion on gains tuned on them. Networks that agree are used without it: effects
+# that it cannot represent, above all the current limit, would make the gains worse.
 
 
 ORDERS = (1, 2, 3)
 THINNED = (1,)
-"""Of a model at every k-th sample: what is faster than that is the delay between its inputs. Of
-drive `slow10` order 3 fits no better (97.86 % for 97.87 %) and makes up a pair of poles under which
-sound gains have an Ms of 8."""
+"""Orders of a model at every k-th sample: faster dynamics only appear as delay. For drive `slow10`,
+order 3 fits no better (97.86 % instead of 97.87 %) and invents a pair of poles under which sound
+gains have an Ms of 8."""
 LINEAR = 1.25 * SIZE
-"""Of the largest command: how far it may be from what holds the speed. The small signals reach
-`SIZE`; beyond, a drive that limits its current answers less. With the stretches beyond it the
-free-run fit on the random levels is 1 % instead of 97 % (drive `weak` of benches/drives.py), with
-the pulses 18 to 38 % instead of 98.5 % (`lash`, `shaft60`); where no limit is reached (`nominal`,
-`heavy`) the cut makes no difference."""
+"""Largest distance of the command from the one that holds the speed, as a share of the largest
+command. The small signals reach `SIZE`; beyond it a drive that limits its current responds less.
+With stretches beyond it, the free-run fit on the random levels is 1 % instead of 97 % (drive `weak`
+of benches/drives.py), with the pulses 18 to 38 % instead of 98.5 % (`lash`, `shaft60`); on drives
+that reach no limit (`nominal`, `heavy`) the cut makes no difference."""
 LEAST_RUN = 200
-"""Samples of a stretch: shorter ones are all initial state."""
+"""Least samples of a stretch: in shorter ones the initial state dominates."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """A linear model and how well it predicts what it was not fitted to.
+    """A linear model with its errors on held-out data.
 
     Attributes
     ----------
     model : Model
     rmse : float
-        In free run on the recording to judge by [RPM].
+        Error in free run on the held-out recording [RPM].
     fit_percent : float
     """
 
@@ -202,11 +201,11 @@ class Rival:
 
     @property
     def is_fit(self) -> bool:
-        """Whether it predicts as well as networks have to."""
+        """Whether it predicts as well as is required of networks."""
         return self.fit_percent >= LEAST_FIT
 
     def alone(self, judge: Recording) -> Trained:
-        """What is tuned on where networks cannot be."""
+        """An ensemble of this model alone, if networks fail."""
         return Trained(
             Ensemble.of([self.model]),
             (self.rmse,),
@@ -229,17 +228,17 @@ def linear_rival(
     ----------
     recordings : sequence of Recording
     judge : Recording
-        Not learned from.
+        The held-out recording.
     fopdt : Fopdt
-        Which command holds which speed.
+        Gives the command that holds a speed.
     demands : Demands
     orders : sequence of int
-        Tried.
+        Orders to try.
 
     Returns
     -------
     Rival or None
-        None where none can be fitted.
+        None if none can be fitted.
     """
     found = [part for r in recordings for part in _stretches(r, fopdt, LINEAR * demands.u_max)]
     if not found:
@@ -259,7 +258,7 @@ def linear_rival(
 
 
 def _stretches(recording: Recording, fopdt: Fopdt, reach: float) -> list[Experiment]:
-    """Where the command is within `reach` [V] of the one that holds the speed."""
+    """The stretches with the command within `reach` [V] of the one that holds the speed."""
     holding = (recording.y - fopdt.offset) / fopdt.K
     near = np.concatenate([[False], np.abs(recording.u - holding) <= reach, [False]])
     begins, ends = np.flatnonzero(np.diff(near)).reshape(-1, 2).T

@@ -1,4 +1,4 @@
-"""Verification: the tuned controller on the machine, on members that agree beside it."""
+"""Verification: predictions of the tuned loop by members that agree, and the machine itself."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..dataset import FloatArray
 from ..errors import FitError
 from ..models import Ensemble, Model
 from ..trust import Judgement, judge
-from .bench import Aborted, NotedBench
+from .bench import Aborted, RecordedBench
 from .demands import Refusal, require
 from .slow import Thinning
 
@@ -24,23 +24,23 @@ DISAGREE = 0.05
 
 
 class Disagreement(Refusal):
-    """Networks that do not agree on what a controller does."""
+    """The networks do not agree on a closed loop."""
 
 
 def span(reference: FloatArray) -> float:
-    """Of a reference and the rest that it is begun at, in its unit."""
+    """Range of a reference, including the standstill before it, in its unit."""
     return float(max(reference.max(), 0.0) - min(reference.min(), 0.0))
 
 
 def agreeing(
     controller: Controller, ensemble: Ensemble, references: Mapping[str, FloatArray]
 ) -> Ensemble:
-    """The ensemble without members that part from the others, in a false rest for instance.
+    """The ensemble without members that deviate from the others, for instance in a false rest.
 
     Raises
     ------
     Disagreement
-        Where less than half of the members agree.
+        If less than half of the members agree.
     """
     members = list(ensemble.members)
     apart = np.zeros(len(members))
@@ -61,14 +61,14 @@ def agreeing(
 
 
 def _output(controller: Controller, member: Model, r: FloatArray) -> FloatArray:
-    """Not finite where the member runs away."""
+    """The output of a loop; infinite if the member diverges."""
     try:
         return run(controller, member, r).y
     except FitError:
         return np.full(len(r), np.inf)
 
 
-# --- Verification: the tuned controller on the machine, its prediction beside it ------------------
+# --- Prediction and measurement -------------------------------------------------------------------
 
 
 APART = 0.05
@@ -88,7 +88,7 @@ class Comparison:
     predicted : ClosedLoopRun
         The median of the members' runs, for a slow drive at every k-th sample.
     measured : ClosedLoopRun or None
-        On the machine; None where it was not run.
+        The run of the machine; None before it has run.
     members : tuple of ClosedLoopRun
     """
 
@@ -99,7 +99,7 @@ class Comparison:
 
     @property
     def span(self) -> float:
-        """Of the reference and the rest that it is begun at [RPM]: what errors are judged by."""
+        """Range of the reference, including standstill [RPM]; errors are judged relative to it."""
         return span(self.predicted.r)
 
     @property
@@ -133,13 +133,17 @@ def predict(
     references: Mapping[str, FloatArray],
     pushes: Sequence[FloatArray] | None = None,
 ) -> tuple[Comparison, ...]:
-    """What the ensemble says of every reference, with a command behind the limits for each: that
-    of the load over the turn.
+    """The ensemble's predictions for every reference.
+
+    Parameters
+    ----------
+    pushes : sequence of array, optional
+        For each reference, a command added behind the limits: the load over the turn.
 
     Raises
     ------
     Refusal
-        Where members disagree, or run away.
+        If members disagree or diverge.
     """
     found = []
     for i, (name, r) in enumerate(references.items()):
@@ -172,24 +176,25 @@ def predict(
 
 def measure(
     controller: Controller,
-    bench: NotedBench,
+    machine: RecordedBench,
     predicted: tuple[Comparison, ...],
     references: Mapping[str, FloatArray],
     keep: Callable[[tuple[Comparison, ...]], object],
 ) -> tuple[Comparison, ...]:
-    """The same on the machine: the shortest reference first, each watched while it runs where the
-    machine allows it, and judged as it ends.
+    """Run the references on the machine, the shortest first, and compare each as it ends.
+
+    If the machine allows it, a run is also watched on the way.
 
     Raises
     ------
     Refusal
-        As `require_alike`, before the next reference is run; where `Watching` ends one.
+        As `require_alike`, before the next reference runs; and if `Watching` ends a run.
     """
     found = dict(enumerate(predicted))
     for i in sorted(found, key=lambda i: len(found[i].predicted.r)):
         name = found[i].reference
-        watch = Watching(found[i].predicted, controller, bench.counts_per_rev)
-        run = bench.follow(controller, references[name], name, watch=watch).run
+        watch = Watching(found[i].predicted, controller, machine.counts_per_rev)
+        run = machine.follow(controller, references[name], name, watch=watch).run
         found[i] = replace(found[i], measured=run)
         keep(tuple(found[k] for k in range(len(predicted))))
         require_alike(found[i])
@@ -197,27 +202,27 @@ def measure(
 
 
 WINDOW = 0.25
-"""Over which a command's chatter is taken [s]."""
+"""Window of the command's chatter [s]."""
 TIMES, FLOOR = 4.0, 0.05
-"""Chatter of the command that ends a run: times the largest predicted, at least so much of the
-largest command from sample to sample."""
+"""Chatter that ends a run: a multiple of the largest predicted one, but at least this share of the
+largest command, rms from sample to sample."""
 SURE = 1.1
-"""Times the distance that a verified run may have: beyond it there is no doubt about the rest."""
+"""Multiple of the allowed distance at which a run is hopeless, whatever its rest."""
 
 
 class Watching:
-    """Ends a run that is going wrong, instead of judging it once it is over.
+    """Ends a run that is going wrong, instead of judging it afterwards.
 
-    That is where the command chatters by `TIMES` its predicted chatter, as a loop that swings does,
-    and where the machine is so far from the prediction, or has been at a limit for so long, that
-    the run would be refused whatever came.
+    It ends a run if the command chatters `TIMES` as much as predicted, as in an oscillating loop,
+    or if the machine is so far from the prediction, or has been at a limit for so long, that the
+    run will be refused in any case.
 
     Parameters
     ----------
     predicted : ClosedLoopRun
         At the machine's samples, or for a slow drive at every k-th of them.
     controller : Controller
-        As the machine runs it.
+        The machine's controller.
     counts_per_rev : float
     """
 
@@ -237,11 +242,12 @@ class Watching:
         )
 
     def __call__(self, first: int, u: FloatArray, counts: FloatArray) -> None:
-        """Samples `first`, `first + 1`, ...
+        """Check samples `first`, `first + 1`, ...
 
         Raises
         ------
         Aborted
+            If the run is going wrong.
         """
         end = min(first + len(u), len(self._u))
         if end <= first:
@@ -251,7 +257,7 @@ class Watching:
         self._parts(end)
 
     def _chatter_predicted(self) -> float:
-        """The largest of any window, from sample to sample of the machine [V]."""
+        """The largest predicted chatter in any window, from sample to sample of the machine [V]."""
         changes = np.diff(self._predicted.u, append=self._predicted.u[-1]) / math.sqrt(self._k)
         width = min(len(changes), max(5, self._window // self._k))
         return float(np.sqrt(np.convolve(changes**2, np.ones(width) / width, "valid").max()))
@@ -259,7 +265,7 @@ class Watching:
     def _chatters(self, end: int) -> None:
         recent = self._u[max(0, end - self._window) : end]
         changes = np.diff(recent)
-        # what a link has lost says nothing
+        # ignore samples lost on a link
         chatter = _rms(changes[np.isfinite(changes)]) if np.isfinite(changes).any() else 0.0
         if len(recent) == self._window and chatter > self._most:
             self._end(
@@ -269,7 +275,10 @@ class Watching:
             )  # fmt: skip
 
     def _parts(self, end: int) -> None:
-        """Speeds are means over a block: of single samples the encoder's counts would be noise."""
+        """End a run too far off or too long at a limit.
+
+        Speeds are means over blocks of samples, to average the encoder's noise.
+        """
         p, c = self._predicted, self._controller
         block = WATCHED * self._k
         for begin in range(self._judged, end - block, block):
@@ -301,8 +310,9 @@ class Watching:
 
 
 def judged(predicted: tuple[Comparison, ...], ensemble: Ensemble) -> Judgement:
-    """What speaks against the loops: of the first member on every reference, of all members on the
-    shortest. That all agree on all of them has been required.
+    """Verdicts on the loops: of the first member on every reference, of all on the shortest.
+
+    That all members agree on all references has been checked before.
     """
     shortest = min(predicted, key=lambda c: len(c.predicted.r))
     runs = [m for c in predicted for m in (c.members if c is shortest else c.members[:1])]
@@ -310,12 +320,7 @@ def judged(predicted: tuple[Comparison, ...], ensemble: Ensemble) -> Judgement:
 
 
 def require_alike(c: Comparison) -> None:
-    """Refuse a prediction that the machine has not borne out.
-
-    Raises
-    ------
-    Refusal
-    """
+    """Raise `Refusal` if the machine deviates from the prediction."""
     assert c.measured is not None
     assert c.apart is not None
     require_unsaturated(c.measured)
@@ -329,12 +334,7 @@ def require_alike(c: Comparison) -> None:
 
 
 def require_unsaturated(found: ClosedLoopRun) -> None:
-    """Refuse a loop that leans on the limit of its command.
-
-    Raises
-    ------
-    Refusal
-    """
+    """Raise `Refusal` for a loop that is at the limit of its command for too long."""
     saturated = found.metrics()["saturated"] or 0.0
     require(
         saturated <= SATURATED,

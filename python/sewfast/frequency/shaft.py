@@ -1,14 +1,15 @@
-"""Two masses and the shaft between them, or one rigid machine, fitted to a frequency response.
+"""A rigid machine, or two or three masses on shafts, fitted to a frequency response.
 
 With the electrical and mechanical lag `1 + a1 s + a2 s^2`, the motor's speed under a command is
 
     G(s) = K e^(-s tau) / (1 + a1 s + a2 s^2)  x  (w_r / w_a)^2 A(s) / R(s),
     A(s) = s^2 + 2 z_a w_a s + w_a^2,   R(s) = s^2 + 2 z_r w_r s + w_r^2
 
-The motor stands still at the antiresonance w_a, where the load swings on the shaft alone, and both
-swing against each other at the resonance w_r; their ratio tells the inertias' (Ellis 2012, Control
-System Design Guide, chapter 16). What is sampled is not G but its response to a held command, as
-the encoder counts it; the fit compares that, exactly, by partial fractions.
+The motor stands still at the antiresonance w_a, where the load oscillates on the shaft alone, and
+both oscillate against each other at the resonance w_r; the ratio of the two frequencies gives that
+of the inertias (Ellis 2012, Control System Design Guide, chapter 16). The measured quantity is not
+G but its response to a held command, as counted by the encoder; the fit computes that exactly, by
+partial fractions.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import product
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -31,35 +32,43 @@ from ..tables import html_of
 from .response import Complex, FrequencyResponse
 
 RIGID, SHAFT = 4, 4
-"""Parameters of a rigid machine, and of each shaft."""
+"""Number of parameters of a rigid machine, and of each shaft."""
 LEAST = 20
-"""Frequencies for a fit."""
+"""Least frequencies for a fit."""
 CLEAR = 100.0
-"""Times the mean squared error of a frequency, that a resonance has to explain to be believed."""
+"""Error that a resonance has to explain to be accepted, in mean squared errors of a frequency."""
 NEIGHBOURS = 10
-"""Lines to either side over which the uncertainty is smoothed: a few blocks do not know it well."""
+"""Lines to either side over which the uncertainty is smoothed: few blocks estimate it poorly."""
 FLOOR = 0.005
-"""Of the gain, that no fit has to explain: friction and dead time bend every response a little,
-which would else outweigh a resonance that is seen less well."""
-STARTS = 6
-"""Frequencies, evenly in their logarithm, at which a resonance is looked for beside the peaks."""
+"""Part of the gain that no fit has to explain: friction and dead time distort every response a
+little, which could otherwise outweigh a less visible resonance."""
+ORDERS = 2
+"""Number of rational fits that give starts: of the machine's order, and one order higher."""
+ROUNDS = 12
+"""Iterations of a rational fit, each weighted by the one before."""
+DELAYS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
+"""Delays tried for a start [samples]."""
+FASTEST, SLOWEST, FAST = 1e-2, 1e4, 0.3
+"""Least lag [samples], longest lag [periods of the lowest frequency], least lag of a start."""
+BEGIN, FINISH = 12, 4
+"""Evaluations for every start, and the number of best ones that are followed to the end."""
 LIFTED = 50.0
-"""Squared errors over their mean, in as many lines as a shaft needs, from which a second one is
-looked for there; noise makes 16 of it, give or take 6."""
+"""Squared errors over their mean, summed over as many lines as a shaft needs, above which a second
+shaft is searched; noise gives 16 with a standard deviation of 6."""
 DAMPED = 0.5
-"""Damping ratio from which two poles are no resonance."""
+"""Damping ratio from which two poles do not count as a resonance."""
 RATIOS = (0.03, 30.0)
-"""Of load to motor inertia; beyond them the pair of zeros and poles is something else."""
+"""Limits of the ratio of load to motor inertia of a shaft."""
 NEAR, SHOWN = 1.4, 8
-"""Frequencies within this factor of antiresonance and resonance, and how many must be usable: two
-for each of the shaft's parameters, and so half of them about either. Fewer can be explained by many
-a shaft that is not there."""
+"""Factor around antiresonance and resonance, and least number of usable frequencies within it: two
+for each of the shaft's parameters, half of them around either. Fewer can be explained by many
+spurious shafts."""
 BEYOND, FARTHEST = (1.05, 1.3, 1.8), 1.0
-"""Of the highest measured frequency, where a resonance beyond it is looked for; the farthest that
-is believed, of the sample rate."""
+"""Starts for a resonance beyond the measured range, relative to the highest frequency; and the
+largest one accepted, relative to the sample rate."""
 CONFIDENCE = 1.96
 DEPTHS, WIDTHS = (0.02, 0.7), (0.1, 2.0)
-"""Of a proposed notch."""
+"""Limits of the depth of a proposed notch."""
 
 
 @dataclass(frozen=True)
@@ -88,11 +97,11 @@ class ShaftFit:
         `antiresonance_damping`, `inertia_ratio` (all loads over the motor), with a second shaft
         `resonance_2_hertz` and so on.
     misfit : float
-        Root of the mean squared error over its standard deviation: 1 if noise explains everything.
+        Root mean square of error over standard deviation: 1 if noise explains everything.
     response : FrequencyResponse
-        What was fitted.
+        The fitted response.
     beyond_hertz : float or None
-        Where a resonance seems to lie that is above all measured frequencies, by its flank [Hz].
+        Frequency of a resonance above the measured range, estimated from its flank [Hz].
     """
 
     parameters: Mapping[str, Parameter]
@@ -103,12 +112,12 @@ class ShaftFit:
 
     @property
     def has_resonance(self) -> bool:
-        """Whether a shaft between two masses was found."""
+        """Whether a shaft was found."""
         return self.resonances > 0
 
     @property
     def resonances(self) -> int:
-        """Shafts that were found: 0 of a rigid machine, 1 of two masses, 2 of three."""
+        """Number of shafts: 0 for a rigid machine, 1 for two masses, 2 for three."""
         return (len(self._theta) - RIGID) // SHAFT
 
     def at(self, hertz: Any) -> Complex:
@@ -124,15 +133,14 @@ class ShaftFit:
     def notch(self, number: int = 1) -> Biquad:
         """The notch that cancels a resonance, by default the lowest.
 
-        Its zeros are the poles of the oscillation.
-        At w_r the shaft lifts the gain by g = (w_r/w_a)^2 |A/R|; a depth of 1/g takes that back,
-        and with a width of 2 z_r g the notch's zeros are damped as the resonance is.
+        Its zeros are the poles of the oscillation. At w_r the shaft raises the gain by
+        g = (w_r/w_a)^2 |A/R|; a depth of 1/g cancels that, and with a width of 2 z_r g the notch's
+        zeros have the damping of the resonance.
 
         Raises
         ------
         FitError
-            For a resonance that the machine does not have, as a rigid one has none, or one beyond
-            half the sample rate.
+            For a resonance that the machine does not have, or one beyond half the sample rate.
         """
         if not 1 <= number <= self.resonances:
             kind = f"one of {self.resonances}" if self.resonances else "a rigid one"
@@ -190,9 +198,9 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
         From command to speed, as `sewfast.bode` measures it; lines with a coherence below a half
         are omitted.
     resonance : bool, optional
-        Whether there is a shaft. None finds out: a shaft is accepted if it explains 100 times the
-        mean squared error of a frequency, is damped below .5 and lies within what was measured. A
-        second shaft is looked for where there is one, and has to do the same.
+        Whether there is a shaft. None: a shaft is accepted if it explains 100 times the mean
+        squared error of a frequency, is damped below .5 and lies within the measured range. If
+        there is one, a second shaft is searched under the same conditions.
 
     Raises
     ------
@@ -201,7 +209,7 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
     FitError
         If nothing converges, or a resonance is requested and none is found.
     """
-    usable = response.coherence > 0.5
+    usable = (response.coherence > 0.5) & (response.value != 0.0)
     if usable.sum() < LEAST:
         raise DataError(
             name="response", expected=f"at least {LEAST} frequencies with a coherence above .5",
@@ -221,13 +229,12 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
             )  # fmt: skip
         if shaft is not None and (resonance or _is_better(task, shaft[0], rigid[0])):
             best = shaft
-            second = _best_shaft(task, _second_starts(task, shaft))
-            if second is not None and _is_better(task, second[0], shaft[0]):
-                best = second
+        second = _best_shaft(task, _second_starts(task, shaft))
+        if second is not None and _is_better(task, second[0], best[0]):
+            best = second
         elif best is rigid:
             beyond = _beyond(task, rigid)
     cost, theta, covariance = best
-    theta, covariance = _in_order(theta, covariance)
     if not math.isfinite(cost):
         raise FitError(
             name="response", expected="a fit that converges", received="none",
@@ -243,7 +250,7 @@ def fit_shaft(response: FrequencyResponse, *, resonance: bool | None = None) -> 
 
 
 def _polynomials(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Numerator and denominator of G without its delay; theta: logarithms, but for the delay."""
+    """Numerator and denominator of G without its delay; theta: logarithms, except the delay."""
     K, a1, a2 = np.exp(theta[:3])
     num, den = np.array([K]), np.array([a2, a1, 1.0])
     for wr, zr, wa, za in _shafts(theta):
@@ -253,71 +260,82 @@ def _polynomials(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _shafts(theta: FloatArray) -> FloatArray:
-    """Of each shaft frequency [rad/s] and damping of resonance and antiresonance, (shafts, 4)."""
+    """Frequency [rad/s] and damping of each shaft's resonance and antiresonance, (shafts, 4)."""
     found: FloatArray = np.exp(theta[RIGID:]).reshape(-1, SHAFT)
     return found
 
 
 def _in_order(theta: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """With the lowest resonance first."""
-    order = np.argsort(theta[RIGID::SHAFT], kind="stable")
-    places = [RIGID + SHAFT * k + j for k in order for j in range(SHAFT)]
-    at = np.array([*range(RIGID), *places])
+    """Reordered: the lowest resonance first, each antiresonance with the resonance above it.
+
+    The response does not depend on which pair of zeros belongs to which pair of poles.
+    """
+    at = np.arange(len(theta))
+    for first in (RIGID, RIGID + 2):  # resonances, antiresonances
+        order = np.argsort(theta[first::SHAFT], kind="stable")
+        for j in range(2):
+            at[first + j :: SHAFT] = first + j + SHAFT * order
     return theta[at], covariance[np.ix_(at, at)]
 
 
 def _mark(number: int) -> str:
-    """In the names of a shaft's parameters."""
+    """The mark of a shaft in the names of its parameters."""
     return "" if number == 1 else f"_{number}"
 
 
-def _terms(
-    theta: FloatArray, Ts: float, *, counted: bool
-) -> tuple[int, float, list[tuple[complex, complex]]]:
-    """Whole samples of delay, the rest of it as a share, and poles with their residues.
+def _terms(theta: FloatArray, Ts: float, *, counted: bool) -> tuple[int, float, Complex, Complex]:
+    """Whole samples of delay, its fraction, and poles with their residues.
 
-    Of the speed, or where it is counted of its integral.
+    For the speed, or for its integral if it is counted. The factors are quadratics, so their roots
+    need no eigenvalue problem.
     """
-    num, den = _polynomials(theta)
-    if counted:
-        den = np.concatenate([den, [0.0]])
-    poles = np.roots(den).astype(np.complex128)
-    slope = np.polyder(den)
-    residues = np.polyval(num, poles) / np.polyval(slope, poles)
+    num, _ = _polynomials(theta)
+    a1, a2 = np.exp(theta[1:3])
+    shafts = _shafts(theta)
+    half = np.concatenate([[0.5 * a1 / a2], shafts[:, 1] * shafts[:, 0]])
+    square = np.concatenate([[1.0 / a2], shafts[:, 0] ** 2])
+    root = np.sqrt((half * half - square).astype(np.complex128))
+    # the smaller of two real poles comes from their product, as the difference would lose digits
+    large = -(half + np.where(root.real < 0.0, -root, root))
+    poles = np.concatenate([large, square / large, [0.0] if counted else []])
+    apart = poles[:, None] - poles
+    np.fill_diagonal(apart, 1.0)
+    residues = np.polyval(num, poles) / (a2 * apart.prod(axis=1))
     delay = max(float(theta[3]), 0.0)
     whole = math.floor(delay)
-    return whole, delay - whole, list(zip(poles, residues, strict=True))
+    return whole, delay - whole, poles, residues
 
 
-def _held(p: complex, part: float, Ts: float) -> tuple[complex, complex]:
-    """What a pole has made at a sample's end of this sample's command and of the one before."""
-    if p == 0.0:
-        return (1.0 - part) * Ts, part * Ts
-    now = np.exp(p * (1.0 - part) * Ts)
-    return (now - 1.0) / p, (np.exp(p * Ts) - now) / p
+def _held(p: Complex, part: float, Ts: float) -> tuple[Complex, Complex]:
+    """Contributions of this and the previous command to the poles' states at the sample's end."""
+    still = p == 0.0  # the limit of an integrator
+    per = np.where(still, 1.0, p)
+    now, whole = np.exp(p * (1.0 - part) * Ts), np.exp(p * Ts)
+    return (
+        np.where(still, (1.0 - part) * Ts, (now - 1.0) / per),
+        np.where(still, part * Ts, (whole - now) / per),
+    )
 
 
 def _sampled(theta: FloatArray, hertz: FloatArray, Ts: float, counted: bool) -> Complex:
-    """The response of what is seen: speed at the samples, or its mean over the sample before."""
-    whole, part, terms = _terms(theta, Ts, counted=counted)
+    """Response of the measured quantity: speed at the samples, or its mean between them."""
+    whole, part, poles, residues = _terms(theta, Ts, counted=counted)
     step = np.exp(-2j * np.pi * hertz * Ts)
-    total: Complex = np.zeros(len(hertz), dtype=np.complex128)
-    for p, r in terms:
-        now, before = _held(p, part, Ts)
-        total += r * (now + before * step) * step / (1.0 - np.exp(p * Ts) * step)
-    total *= step**whole
+    now, before = _held(poles, part, Ts)
+    made = np.outer(residues * before, step) + (residues * now)[:, None]
+    total: Complex = (made / (1.0 - np.outer(np.exp(poles * Ts), step))).sum(axis=0)
+    total *= step ** (whole + 1)
     return total * (1.0 - step) / Ts if counted else total
 
 
 def sampled_model(theta: FloatArray, Ts: float, u_unit: str, y_unit: str) -> LinearOE:
-    """G under a held command, at the samples; theta: logarithms, but for the delay in samples."""
-    whole, part, terms = _terms(theta, Ts, counted=False)
-    poles = [np.exp(p * Ts) for p, _ in terms]
+    """G under a held command, at the samples; theta: logarithms, except the delay in samples."""
+    whole, part, continuous, residues = _terms(theta, Ts, counted=False)
+    poles = np.exp(continuous * Ts)
     num: Any = np.zeros(len(poles) + 2, dtype=np.complex128)
-    for j, (p, r) in enumerate(terms):
-        now, before = _held(p, part, Ts)
-        others = np.poly([q for i, q in enumerate(poles) if i != j])
-        num[1:] += r * np.convolve([now, before], np.atleast_1d(others))
+    for j, held in enumerate(zip(*_held(continuous, part, Ts), strict=True)):
+        others = np.poly(np.delete(poles, j))
+        num[1:] += residues[j] * np.convolve(held, np.atleast_1d(others))
     den = np.atleast_1d(np.poly(poles)).real
     delayed = np.concatenate([np.zeros(whole), num.real])
     return LinearOE.from_tf(delayed, den, Ts, input_units=(u_unit,), output_unit=y_unit)  # type: ignore[no-any-return]
@@ -349,23 +367,29 @@ def _smoothed(variance: FloatArray) -> FloatArray:
     return np.exp(around)
 
 
-def _solved(task: _Task, start: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+def _solved(
+    task: _Task, start: FloatArray, evaluations: int = 200
+) -> tuple[float, FloatArray, FloatArray]:
     low, high = np.full(len(start), -40.0), np.full(len(start), 40.0)
     low[3], high[3] = 0.0, 50.0
+    # a lag far below a sample, or far above all measured periods, has no effect on the residuals: a
+    # search that gets there stays there
+    low[1:3] = np.array([1.0, 2.0]) * math.log(FASTEST * task.Ts)
+    high[1:3] = np.array([1.0, 2.0]) * math.log(SLOWEST / task.hertz[0])
     try:
         found = least_squares(
-            task.residuals, start, "3-point", bounds=(low, high), max_nfev=200
+            task.residuals, start, "3-point", bounds=(low, high), max_nfev=evaluations
         )  # fmt: skip
     except DataError:  # no finite residual at the start
         return math.inf, start, np.zeros((len(start), len(start)))
     covariance = found.covariance
     if covariance is None:
         covariance = np.full((len(start), len(start)), math.nan)
-    return 2.0 * found.cost, found.x, covariance
+    return 2.0 * found.cost, *_in_order(found.x, covariance)
 
 
 def _rigid_starts(task: _Task) -> list[FloatArray]:
-    """The corner where the gain has fallen to .7, and lags beyond it."""
+    """Starts with a corner where the gain has fallen to .7, and lags beyond it."""
     size = np.abs(task.value)
     K = float(size[: max(3, len(size) // 50)].max())
     below = np.flatnonzero(size < K / math.sqrt(2.0))
@@ -379,18 +403,22 @@ def _rigid_starts(task: _Task) -> list[FloatArray]:
 
 
 def _shaft_starts(task: _Task, rigid: FloatArray) -> list[FloatArray]:
-    """Where the response rises most above the rigid machine's, and a few places more."""
+    """Starts from rational fits, and where the response is most above the rigid machine's."""
     f = task.hertz
     ratio = np.abs(task.value) / np.abs(_sampled(rigid, f, task.Ts, task.counted))
-    places = [
-        *f[_peaks(ratio)[:4]],
-        *np.geomspace(max(2.0 * f[0], f[-1] / 60.0), 0.9 * f[-1], STARTS),
-    ]
-    return _starts_at(task, rigid, ratio, places)
+    return _rational_starts(task, 1) + _starts_at(task, rigid, ratio, f[_peaks(ratio)[:4]])
 
 
-def _second_starts(task: _Task, shaft: tuple[float, FloatArray, FloatArray]) -> list[FloatArray]:
-    """Where the response rises above that of one shaft, over as many lines as a shaft needs."""
+def _second_starts(
+    task: _Task, shaft: tuple[float, FloatArray, FloatArray] | None
+) -> list[FloatArray]:
+    """Starts from rational fits, and where the response is above that of one shaft.
+
+    The latter over as many lines as a shaft needs.
+    """
+    starts = _rational_starts(task, 2)
+    if shaft is None:
+        return starts
     cost, theta, _ = shaft
     f, fit = task.hertz, _sampled(theta, task.hertz, task.Ts, task.counted)
     usual = cost / max(2 * len(f) - len(theta), 1)
@@ -398,11 +426,95 @@ def _second_starts(task: _Task, shaft: tuple[float, FloatArray, FloatArray]) -> 
     unexplained = np.convolve(off, np.ones(SHOWN), "same")
     ratio = np.abs(task.value) / np.abs(fit)
     peaks = _peaks(ratio)
-    return _starts_at(task, theta, ratio, f[peaks[unexplained[peaks] > LIFTED][:4]])
+    return starts + _starts_at(task, theta, ratio, f[peaks[unexplained[peaks] > LIFTED][:4]])
+
+
+def _rational_starts(task: _Task, shafts: int) -> list[FloatArray]:
+    """Starts from the poles and zeros of rational fits, which themselves need no start.
+
+    Every choice of oscillating poles and zeros in the measured range is a start, if each
+    antiresonance is below its resonance.
+    """
+    starts = []
+    for order in range(2 + 2 * shafts, 2 + 2 * shafts + ORDERS):
+        zeros, poles = (_swinging(q, task) for q in _rational(task, order))
+        for resonances, antiresonances in product(
+            combinations(poles, shafts), combinations(zeros, shafts)
+        ):
+            pairs = list(zip(resonances, antiresonances, strict=True))
+            if all(RATIOS[0] < (r[0] / a[0]) ** 2 - 1.0 < RATIOS[1] for r, a in pairs):
+                starts.append(
+                    _with_lags(task, np.concatenate([np.log([*r, *a]) for r, a in pairs]))
+                )
+    return starts
+
+
+def _with_lags(task: _Task, shafts: FloatArray) -> FloatArray:
+    """A start: these shafts, with the gain, lags and delay that fit best.
+
+    Divided by the shafts, the response is `K / (1 + a1 s + a2 s^2)`, whose inverse is linear in
+    its coefficients; a few values of the delay are tried. Holding the command delays by half a
+    sample, a mean over a sample by another half.
+    """
+    s = 2j * np.pi * task.hertz
+    shape = np.ones(len(s), dtype=np.complex128)
+    for wr, zr, wa, za in np.exp(shafts).reshape(-1, SHAFT):
+        shape *= (s * s + 2.0 * za * wa * s + wa * wa) / (s * s + 2.0 * zr * wr * s + wr * wr)
+        shape *= (wr / wa) ** 2
+    best = math.inf, np.zeros(RIGID)
+    for delay in DELAYS:
+        samples = delay + (1.0 if task.counted else 0.5)
+        inverse = shape * np.exp(-s * samples * task.Ts) / task.value
+        weight = np.abs(task.value) / (task.sigma * np.abs(inverse))
+        rows = weight[:, None] * np.stack([np.ones(len(s)), s, s * s], axis=1)
+        goal = weight * inverse
+        found, left, *_ = np.linalg.lstsq(
+            np.vstack([rows.real, rows.imag]), np.concatenate([goal.real, goal.imag]), rcond=None
+        )
+        cost = float(left[0]) if len(left) else math.inf
+        if cost < best[0] and found[0] > 0.0:
+            a1, a2 = np.maximum(found[1:] / found[0], [FAST * task.Ts, (FAST * task.Ts) ** 2])
+            best = cost, np.array([-math.log(found[0]), math.log(a1), math.log(a2), delay])
+    return np.concatenate([best[1], shafts])
+
+
+def _rational(task: _Task, order: int) -> tuple[FloatArray, FloatArray]:
+    """Numerator and denominator of a rational fit, in powers of a delay of one sample.
+
+    The equation error is linear in the coefficients. Weighted by the denominator of the fit before,
+    it approaches the output error (Sanathanan and Koerner 1963); the best iterate is returned.
+    """
+    delays = np.exp(-2j * np.pi * np.outer(task.hertz * task.Ts, np.arange(order + 3)))
+    columns = np.hstack([delays[:, 1:], -task.value[:, None] * delays[:, 1 : order + 1]])
+    weight, best = 1.0 / task.sigma, (math.inf, np.zeros(1), np.ones(1))
+    for _ in range(ROUNDS):
+        rows, goal = weight[:, None] * columns, weight * task.value
+        found, *_ = np.linalg.lstsq(
+            np.vstack([rows.real, rows.imag]), np.concatenate([goal.real, goal.imag]), rcond=None
+        )
+        num = np.concatenate([[0.0], found[: order + 2]])
+        den = np.concatenate([[1.0], found[order + 2 :]])
+        below = np.abs(delays[:, : order + 1] @ den)
+        weight = 1.0 / (task.sigma * np.maximum(below, 1e-12))
+        off = delays @ num / (delays[:, : order + 1] @ den) - task.value
+        cost = float(np.sum(np.abs(off / task.sigma) ** 2))
+        if cost < best[0]:
+            best = cost, num, den
+    return best[1], best[2]
+
+
+def _swinging(coefficients: FloatArray, task: _Task) -> list[tuple[float, float]]:
+    """Frequency [rad/s] and damping of the roots that a shaft could have, in ascending order."""
+    roots = np.roots(np.trim_zeros(coefficients, "f"))
+    roots = np.log(roots[(roots.imag > 0.0) & (np.abs(roots) > 1e-3)]) / task.Ts
+    sizes = np.abs(roots)
+    inside = (sizes > 2.0 * np.pi * task.hertz[0]) & (sizes < 2.0 * np.pi * task.hertz[-1])
+    found = [(abs(p), max(abs(p.real) / abs(p), 1e-3)) for p in roots[inside]]
+    return sorted((w, z) for w, z in found if z < DAMPED)
 
 
 def _peaks(ratio: FloatArray) -> NDArray[np.intp]:
-    """Places of the local maxima, the largest first."""
+    """Indices of the local maxima, the largest first."""
     inner = np.flatnonzero((ratio[1:-1] >= ratio[:-2]) & (ratio[1:-1] >= ratio[2:])) + 1
     found: NDArray[np.intp] = inner[np.argsort(-ratio[inner])]
     return found
@@ -411,21 +523,21 @@ def _peaks(ratio: FloatArray) -> NDArray[np.intp]:
 def _starts_at(
     task: _Task, fit: FloatArray, ratio: FloatArray, places: Iterable[float]
 ) -> list[FloatArray]:
-    """The fit and a shaft at each place, its antiresonance at the valley before and beside it."""
+    """The fit with a shaft at each place, its antiresonance at the valley before it or close by."""
     f, starts = task.hertz, []
     for place in places:
         left = (f > 0.3 * place) & (f < 0.98 * place)
         valley = f[left][ratio[left].argmin()] if left.any() else 0.75 * place
         for antiresonance in (valley, 0.75 * place):
             shaft = np.log([2 * math.pi * place, 0.03, 2 * math.pi * antiresonance, 0.03])
-            starts.append(np.concatenate([fit, shaft]))
+            starts.append(_with_lags(task, np.concatenate([fit[RIGID:], shaft])))
     return starts
 
 
 def _beyond(task: _Task, rigid: tuple[float, FloatArray, FloatArray]) -> float | None:
-    """The frequency of a resonance above all that were measured [Hz]; None where none is told.
+    """Frequency of a resonance above the measured range [Hz]; None if there is no evidence.
 
-    Its flank has to explain as much as a resonance among them would have to.
+    Its flank has to explain as much as a resonance within the range.
     """
     found = []
     for factor, ratio in product(BEYOND, (0.6, 0.85)):
@@ -443,14 +555,23 @@ def _beyond(task: _Task, rigid: tuple[float, FloatArray, FloatArray]) -> float |
 def _best_shaft(
     task: _Task, starts: list[FloatArray]
 ) -> tuple[float, FloatArray, FloatArray] | None:
-    """The best fit from these starts that can be of shafts; None where there is none."""
-    found = [s for s in (_solved(task, x) for x in starts) if _is_shaft(s[1], task.hertz)]
+    """The best fit from these starts with plausible shafts; None if there is none."""
+    begun = sorted((_solved(task, x, BEGIN) for x in starts), key=lambda s: s[0])
+    found = [
+        s for s in (_solved(task, x) for _, x, _ in begun[:FINISH]) if _is_shaft(s[1], task.hertz)
+    ]
     return min(found, key=lambda s: s[0], default=None)
 
 
 def _is_shaft(theta: FloatArray, f: FloatArray) -> bool:
-    """Whether each pair of zeros and poles can be a shaft, and was measured."""
-    return all(_is_one(shaft, f) for shaft in _shafts(theta))
+    """Whether each pair of zeros and poles is a plausible shaft within the measured range.
+
+    Command and speed belong to the same mass, so antiresonances and resonances alternate. Poles
+    next to the zeros of another shaft only describe a line or two that fit badly.
+    """
+    shafts = _shafts(theta)
+    alternate = (shafts[1:, 2] / shafts[:-1, 0]) ** 2 - 1.0 > RATIOS[0]
+    return bool(alternate.all()) and all(_is_one(shaft, f) for shaft in shafts)
 
 
 def _is_one(shaft: FloatArray, f: FloatArray) -> bool:
@@ -465,7 +586,7 @@ def _is_one(shaft: FloatArray, f: FloatArray) -> bool:
 
 
 def _is_better(task: _Task, shaft: float, rigid: float) -> bool:
-    """Whether the shaft explains clearly more, measured by what it leaves itself."""
+    """Whether the shaft explains clearly more, relative to its own remaining error."""
     freedom = max(2 * len(task.hertz) - RIGID - SHAFT, 1)
     return (rigid - shaft) > CLEAR * shaft / freedom
 
@@ -508,7 +629,7 @@ def _parameters(
         found[f"resonance{mark}_damping"] = positive(at + 1, "")
         found[f"antiresonance{mark}_hertz"] = positive(at + 2, "Hz", turn)
         found[f"antiresonance{mark}_damping"] = positive(at + 3, "")
-    if shafts:  # far below all shafts the motor carries everything, far above itself alone
+    if shafts:  # far below all resonances the motor moves all loads, far above only itself
         found["inertia_ratio"] = derived(
             lambda x: math.exp(2.0 * float(np.sum(x[RIGID::SHAFT] - x[RIGID + 2 :: SHAFT]))) - 1.0,
             "",

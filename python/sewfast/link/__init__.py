@@ -1,12 +1,11 @@
 """The link to a real or virtual drive: ports, sessions, runs (docs/PROTOCOL.md).
 
-Read in this order: `ports` (transports, their failures), `wire` (what bodies stand for),
+Read in this order: `ports` (transports and their failures), `wire` (the frames' bodies as values),
 `connection` (a session: the core's client on a port) and its `clock`, `drive` (`Drive`), `plan`
-(what a run is to do, and what became of it) and `settings` (what must fit before it moves), `run`
-(the pump of a run with its way out), `record` (into memory, a file and a live view). Then
-`host_loop` and `host_run` (a controller on this computer), `doctor` and `access`, `virtual` and
-`emulated` (devices without a motor), and `boards` with `odrive` and `simplefoc` (drives of other
-makers, polled over text).
+(a run's commands, its checks and its outcome), `run` (the loop of a run, and how it ends), `record`
+(into memory, a file and a live view). Then `host_loop` and `host_run` (a controller on this
+computer), `doctor` and `access`, `virtual` and `emulated` (devices without a motor), and `boards`
+with `odrive` and `simplefoc` (boards of other makers, polled over text).
 """
 
 from .boards import PolledBoard

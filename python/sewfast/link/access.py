@@ -1,4 +1,4 @@
-"""What the system knows of a serial port: who may open it, who has it open, its latency timer."""
+"""A serial port as the operating system sees it: permissions, open handles, latency timer."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class Access:
     allowed : bool
         Whether this user may read and write it.
     group : str or None
-        The group that may, where the port's mode gives it that right.
+        The group that may open it, where the port's mode grants that.
     owner : str
     mode : str
-        As ``ls`` writes it.
+        In the notation of ``ls``.
     member : bool
         Whether this process is in the group; a user who has just joined must log in again.
     """
@@ -41,12 +41,12 @@ def access(path: str, user: int | None = None, groups: frozenset[int] | None = N
     Parameters
     ----------
     user, groups : int, frozenset of int, optional
-        Ids to judge for; those of this process.
+        Ids to check; by default those of this process.
 
     Raises
     ------
     OSError
-        Where there is no such port.
+        If there is no such port.
     """
     user = os.geteuid() if user is None else user
     groups = frozenset((os.getegid(), *os.getgroups())) if groups is None else groups
@@ -88,7 +88,7 @@ def _user_name(number: int) -> str:
 
 
 def permission_remedy(found: Access, vid: int | None = None, pid: int | None = None) -> str:
-    """What lets a user open a port: its group, or a rule of udev."""
+    """How a user gets to open a port: by joining its group, or by a udev rule."""
     usb = "" if vid is None or pid is None else (
         f'ATTRS{{idVendor}}=="{vid:04x}", ATTRS{{idProduct}}=="{pid:04x}", '
     )  # fmt: skip
@@ -108,9 +108,9 @@ def permission_remedy(found: Access, vid: int | None = None, pid: int | None = N
 
 
 def holders(path: str, proc: Path = PROC) -> list[tuple[int, str]]:
-    """Number and name of the other processes that have a port open, as far as this user may see.
+    """Number and name of the other processes that hold a port open, as far as this user can see.
 
-    Empty where the system has no /proc.
+    Empty on a system without /proc.
     """
     wanted = os.path.realpath(path)
     found = []
@@ -144,9 +144,9 @@ def _command(folder: Path) -> str:
 
 
 def latency_timer(path: str, root: Path = SYS) -> tuple[int, Path] | None:
-    """Milliseconds for which an FTDI adapter holds bytes back, and the file that says so.
+    """Milliseconds for which an FTDI adapter holds bytes back, and the file to change them in.
 
-    None for an adapter without such a timer, and where the system does not tell.
+    None for an adapter without such a timer, and on a system that does not show it.
     """
     file = root / Path(os.path.realpath(path)).name / "device" / "latency_timer"
     try:

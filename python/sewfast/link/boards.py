@@ -1,11 +1,11 @@
-"""A board of another maker that is polled over lines of text, as a `Machine`: what all share.
+"""A board of another maker, polled over lines of text, as a `Machine`: what all of them share.
 
-`PolledBoard` plays a run sample by sample from this computer, with its limits and its way out; what
-a board is asked and told is in `odrive` and `simplefoc`.
+`PolledBoard` runs sample by sample from this computer, checks the limits and ends every run safely;
+`odrive` and `simplefoc` hold the commands of each board.
 
-The pace is the host's: the position is asked for, the command is sent, and both go over the line in
-every sample. The time of each answer is kept, so that an answer that comes late costs no accuracy,
-and a sample that comes later than a whole period ends the run.
+The host sets the pace: in every sample it reads the position and sends the command. It keeps the
+time of each answer, so that a late answer costs no accuracy; a sample that is late by a whole
+period ends the run.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
-from types import TracebackType
 from typing import Protocol
 
 import numpy as np
@@ -28,45 +27,45 @@ from ..recording import Recording, require_finite
 from .ports import Port, Unique, open_port
 
 SHORTEST_TS, LONGEST_TS = 0.002, 0.5
-"""Sample times [s] for which a host that is no real-time system is good enough."""
+"""Sample times [s] that a host without a real-time system can keep."""
 SHARE = 0.6
-"""Of a period, what asking and telling may take of it: the rest is for the host's own pauses."""
+"""Share of a period that reading and writing may take: the rest is for the host's own pauses."""
 SPEED_WINDOW = 0.05
-"""Time over which the speed is taken that is held against the limit [s]."""
+"""Window of the speed that is compared with the limit [s]."""
 REST = 0.3
-"""Time without a count after which a motor is taken to be at rest [s]."""
+"""Time without a count after which a motor counts as at rest [s]."""
 REST_WITHIN = 20.0
-"""Longest wait for that [s]."""
+"""Longest wait for rest [s]."""
 ANSWER_WITHIN = 0.25
 """Longest wait for a line [s]."""
 QUIET, QUIET_WITHIN = 0.02, 0.5
-"""Time without a byte after which nothing is on its way, and the longest wait for it [s]."""
+"""Time without a byte after which the line counts as quiet, and the longest wait for that [s]."""
 WATCHDOG = 0.2
-"""Time without a command after which a board is to switch the motor off by itself [s]."""
+"""Time without a command after which a board switches the motor off by itself [s]."""
 LONGEST_LINE = 4096
-"""Characters without an end of line after which the other side is no board of this kind."""
+"""A line with more characters does not come from a board of this kind."""
 
 
 class Clock(Protocol):
-    """What says the time and waits: `time`, or a simulated one."""
+    """A clock that can also wait: the module `time`, or a simulated one."""
 
     def monotonic(self) -> float: ...
     def sleep(self, seconds: float, /) -> None: ...
 
 
 class PolledBoard(Unique, ABC):
-    """A board that takes a command and gives its position over lines of text.
+    """A board that takes a command and reports its position over lines of text.
 
     Parameters
     ----------
     port : str or Port
-        What `sewfast.link.open_port` takes, or a port that is open.
+        An address for `sewfast.link.open_port`, or an open port.
     Ts : float
-        Sample time [s], 0.002 to 0.5; refused where the line does not carry it.
+        Sample time [s], 0.002 to 0.5; refused if the line is too slow for it.
     volt : float
-        Largest command to either side, in the unit that the board takes. Larger ones are clipped.
+        Largest command in either direction, in the board's unit. Larger ones are clipped.
     speed : float
-        Speed [RPM] beyond which a run is ended.
+        Speed [RPM] above which a run is ended.
     counts_per_rev : float
         Encoder counts of one turn.
     baud : int
@@ -77,20 +76,20 @@ class PolledBoard(Unique, ABC):
     Attributes
     ----------
     late : float
-        The latest sample of the last run [s], beyond its due time.
+        Largest delay of a sample in the last run [s].
 
     Raises
     ------
     SettingError
-        For a number outside its range, and where a sample takes longer than the line allows.
+        For a number outside its range, and if the line is too slow for the sample time.
     LinkError
-        Where the port does not open, or nothing of this kind answers.
+        If the port does not open, or no such board answers.
 
     Notes
     -----
-    Every run begins at rest and ends with command 0 and the output off, also one that is broken off
-    by an exception, Ctrl-C or a limit. What happens where this computer itself dies is up to the
-    board: see each.
+    Every run begins at rest and ends with command 0 and the output off, even if an exception,
+    Ctrl-C or a limit breaks it off. If this computer itself dies, it is up to the board what
+    happens: see each.
     """
 
     Ts: float
@@ -125,24 +124,24 @@ class PolledBoard(Unique, ABC):
             self._port.close()
             raise
 
-    # --- what each board is ---------------------------------------------------------------------
+    # --- each board's own part ------------------------------------------------------------------
 
     @property
     @abstractmethod
     def name(self) -> str:
-        """Of the machine, for messages and files."""
+        """The machine's name, for messages and files."""
 
     @abstractmethod
     def _prepare(self) -> None:
-        """Find out whether the other side is such a board, and can be used."""
+        """Check that the other side is such a board and can be used."""
 
     @abstractmethod
     def _arm(self) -> None:
-        """Command 0 and the output on."""
+        """Set command 0 and switch the output on."""
 
     @abstractmethod
     def _disarm(self) -> None:
-        """The output off, confirmed."""
+        """Switch the output off, and have that confirmed."""
 
     @abstractmethod
     def _apply(self, u: float) -> None:
@@ -150,12 +149,12 @@ class PolledBoard(Unique, ABC):
 
     @abstractmethod
     def _position(self) -> float:
-        """Ask for the position [turns]."""
+        """Read the position [turns]."""
 
     def _require_running(self) -> None:
-        """Refuse to go on where the board has switched itself off; asked every so often."""
+        """Raise if the board has switched itself off; called from time to time during a run."""
 
-    # --- a machine ------------------------------------------------------------------------------
+    # --- as a machine ---------------------------------------------------------------------------
 
     def excite(self, u: FloatArray, name: str) -> Recording:
         """Apply commands, shape (N,), one per sample.
@@ -165,22 +164,22 @@ class PolledBoard(Unique, ABC):
         DataError
             For a command that is not finite.
         LinkError
-            Where the board fails, is too fast or too late; `recording` holds what came.
+            If the board fails, is too fast or too late; `recording` holds the samples so far.
         Interrupted
-            On Ctrl-C; `best` is the recording up to there.
+            On Ctrl-C; `best` is the recording so far.
         """
         require_finite("command", u)
-        return self._played(lambda k, speed: float(u[k]), len(u), name, None)
+        return self._record_run(lambda k, speed: float(u[k]), len(u), name, None)
 
     def follow(
         self, controller: SampledController, r: FloatArray, name: str, *, watch: Watch | None = None
     ) -> RecordedRun:
-        """Run a controller, which is computed here, along a reference [RPM], shape (N,).
+        """Run a controller on this computer along a reference [RPM], shape (N,).
 
         Raises
         ------
         SettingError
-            For a controller of another sample time.
+            For a controller with another sample time.
         DataError, LinkError, Interrupted
             As `excite`.
         """
@@ -197,7 +196,7 @@ class PolledBoard(Unique, ABC):
             feedback[k] = core.filtered
             return u
 
-        recording = self._played(decide, len(r), name, watch)
+        recording = self._record_run(decide, len(r), name, watch)
         t = np.arange(len(r), dtype=np.float64) * self.Ts
         return RecordedRun(
             t, np.array(r), recording.u, recording.y, feedback, controller, self.name, name,
@@ -205,33 +204,28 @@ class PolledBoard(Unique, ABC):
         )  # fmt: skip
 
     def stop(self) -> None:
-        """Command 0 and the output off, at once.
+        """Set command 0 and switch the output off, at once.
 
         Raises
         ------
         LinkError
-            Where the board does not confirm it: switch its supply off.
+            If the board does not confirm it: switch its supply off.
         """
         self._halt()
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         self._port.close()
 
     def __enter__(self) -> PolledBoard:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
     # --- a run ------------------------------------------------------------------------------
 
-    def _played(
+    def _record_run(
         self, decide: Callable[[int, float], float], samples: int, name: str, watch: Watch | None
     ) -> Recording:
         run = _Samples(samples)
@@ -241,7 +235,7 @@ class PolledBoard(Unique, ABC):
                 self._arm()
                 self._pump(run, decide, watch)
             finally:
-                # whatever has happened: no run leaves the motor driven
+                # no run leaves the motor driven, however it ended
                 self._halt()
         except KeyboardInterrupt as e:
             raise Interrupted(self._recording(run, name)) from e
@@ -275,11 +269,11 @@ class PolledBoard(Unique, ABC):
                 )  # fmt: skip
             asked = clock.monotonic()
             run.turns[k] = self._position()
-            # the board looks at its encoder between question and answer
+            # the board reads its encoder between question and answer
             run.at[k] = 0.5 * (asked + clock.monotonic()) - begun
             self._require_slow(run, k, window)
             if k == len(run.u):
-                break  # what the last command did
+                break  # one position more than commands: the effect of the last one
             if k and k % WATCHED == 0:
                 self._require_running()
                 if watch is not None:
@@ -288,7 +282,7 @@ class PolledBoard(Unique, ABC):
             u = decide(k, run.speed(k))
             run.u[k] = min(max(u, -self.volt), self.volt)
             self._apply(run.u[k])
-            run.told[k] = clock.monotonic() - begun
+            run.sent_at[k] = clock.monotonic() - begun
             run.done = k + 1
         self._require_running()
 
@@ -305,17 +299,17 @@ class PolledBoard(Unique, ABC):
             )  # fmt: skip
 
     def _recording(self, run: _Samples, name: str) -> Recording | None:
-        """What was seen, at even times: those at which the commands were sent.
+        """The run at even times, those at which the commands were sent.
 
-        The positions between two answers lie on a straight line, so that neither the host's jitter
-        nor the time that a command takes on the line is in the speed.
+        Positions are interpolated between the times of the answers, so that neither the host's
+        jitter nor the transmission time of a command appears in the speed.
         """
         if run.done < 5:
             return None
         u = run.u[: run.done].copy()
         grid = np.arange(run.done) * self.Ts
-        grid += float(np.median(run.told[: run.done] - grid))
-        # a run that was broken off has no answer after its last command
+        grid += float(np.median(run.sent_at[: run.done] - grid))
+        # an aborted run has no answer after its last command
         known = run.at[: run.done + 1] > -math.inf
         at, turns = run.at[: run.done + 1][known], run.turns[: run.done + 1][known]
         counts = np.interp(grid, at, turns) * self.counts_per_rev
@@ -324,7 +318,7 @@ class PolledBoard(Unique, ABC):
         )
 
     def _halt(self) -> None:
-        """Command 0, output off. A second Ctrl-C must not keep the motor driven."""
+        """Set command 0, switch the output off; a second Ctrl-C must not prevent that."""
         for attempt in range(3):
             try:
                 try:
@@ -355,12 +349,12 @@ class PolledBoard(Unique, ABC):
                     received="one that turns", remedy="brake it, or wait longer",
                 )  # fmt: skip
             clock.sleep(0.02)
-            # an estimate of an observer moves by less than a count at rest
+            # a board's own position estimate wanders by less than a count at rest
             if abs(self._position() - before) * self.counts_per_rev > 1.5:
                 before, since = self._position(), clock.monotonic()
 
     def _require_pace(self) -> None:
-        """Refuse a sample time that the line does not carry: the worst of some samples."""
+        """Refuse a sample time that is too short for the line, by the slowest of five samples."""
         worst = 0.0
         for _ in range(5):
             began = self._clock.monotonic()
@@ -376,17 +370,17 @@ class PolledBoard(Unique, ABC):
 
     # --- lines of text --------------------------------------------------------------------------
 
-    def _tell(self, text: str) -> None:
+    def _send(self, text: str) -> None:
         self._port.write(text.encode("ascii") + b"\n")
 
     def _ask(self, text: str) -> str:
-        """Send a line and take the next one that comes."""
-        self._tell(text)
+        """Send a line and return the next one received."""
+        self._send(text)
         return self._line(text)
 
     def _number(self, text: str) -> float:
-        """Ask for a number; lines that are none, such as a telemetry's, are passed over."""
-        self._tell(text)
+        """Ask for a number; other lines, such as telemetry, are skipped."""
+        self._send(text)
         for _ in range(20):
             line = self._line(text)
             with suppress(ValueError):
@@ -410,12 +404,12 @@ class PolledBoard(Unique, ABC):
         return line.decode("ascii", "replace").strip()
 
     def _discard(self) -> bool:
-        """Forget what has come: an answer to somebody else, or to what was broken off.
+        """Discard received bytes: answers to an earlier program or an aborted exchange.
 
         Returns
         -------
         bool
-            Whether it has become quiet; a telemetry never does.
+            Whether the line became quiet; with telemetry on, it never does.
         """
         self._waiting = b""
         deadline = self._clock.monotonic() + QUIET_WITHIN
@@ -432,11 +426,11 @@ class PolledBoard(Unique, ABC):
 
 
 class _Samples:
-    """What a run has sent and seen; times in seconds from its start, -inf: not there."""
+    """Commands and positions of a run; times in seconds from its start, -inf if missing."""
 
     def __init__(self, samples: int) -> None:
         self.u = np.zeros(samples)
-        self.told = np.full(samples, -math.inf)
+        self.sent_at = np.full(samples, -math.inf)
         self.turns = np.zeros(samples + 1)
         self.at = np.full(samples + 1, -math.inf)
         self.done = 0

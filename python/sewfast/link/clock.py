@@ -1,4 +1,4 @@
-"""`Clock`: what is certain about a device's clock, from the exchanges with it."""
+"""`Clock`: bounds on a device's clock from the exchanges with it."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_DRIFT = 0.1
-"""What any working oscillator keeps, a microcontroller's RC included."""
+"""Drift that every working oscillator stays within, a microcontroller's RC oscillator included."""
 
 RESOLUTION = 1.2e-6
-"""A device's time is in whole microseconds, of its own, and rounded down."""
+"""A device counts whole microseconds of its own clock, rounded down [s, with the drift]."""
 
 _Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class ClockBounds:
-    """What is certain about the device's clock.
+    """Bounds on the difference between the host's and the device's clock.
 
     Host time is `at + offset + (1 + drift) * (device time - at)`, with `at` the device's time of
     the last exchange.
@@ -32,9 +32,9 @@ class ClockBounds:
     drift_ppm : (float, float)
         How much faster the host's clock runs [1e-6].
     exchanges : int
-        Exchanges that the bounds rest on.
+        Exchanges that the bounds are from.
     consistent : bool
-        False where no offset and drift explain them all: a clock was set or jumped.
+        False if no offset and drift explain them all: a clock was set or jumped.
     """
 
     at_us: int
@@ -52,10 +52,11 @@ class ClockBounds:
 
 
 class Clock:
-    """Collects exchanges: (sent, device's time, received), the device's between the others.
+    """Collects exchanges (sent, device's time, received).
 
-    Each says that the line `host(device)` passes above `sent` and below `received` there. Only the
-    convex hulls of the two sets matter, so that memory stays small however long it listens.
+    The device's time lies between the two host times, so the line `host(device)` passes above
+    `sent` and below `received` there. Only the convex hulls of the two sets matter, so memory stays
+    small in a session of any length.
     """
 
     def __init__(self) -> None:
@@ -91,7 +92,7 @@ class Clock:
 
 
 def _extend(hull: list[tuple[float, float]], point: tuple[float, float], side: float) -> None:
-    """Append to a monotone chain: the upper hull of the sent, the lower one of the received."""
+    """Append to a monotone chain: the upper hull of `sent`, the lower hull of `received`."""
     while len(hull) >= 2 and side * _turn(hull[-2], hull[-1], point) >= 0.0:
         hull.pop()
     if hull and hull[-1][0] == point[0]:
@@ -118,7 +119,10 @@ def _slopes(low: _Points, high: _Points) -> tuple[float, float]:
 
 
 def _offsets(low: _Points, high: _Points, slopes: tuple[float, float]) -> tuple[float, float]:
-    """Least and greatest value at 0 of such a line: at an end of the slopes or along an edge."""
+    """Least and greatest value at 0 of such a line.
+
+    They are reached at the least or greatest slope, or at the slope of an edge of a hull.
+    """
     at = [np.clip(s, *slopes) for s in (*slopes, *_edges(low), *_edges(high))]
     least = min(float(np.max(low[:, 1] - s * low[:, 0])) for s in at)
     greatest = max(float(np.min(high[:, 1] - s * high[:, 0])) for s in at)

@@ -1,4 +1,4 @@
-"""`Connection`: a session with the device behind a port; its turns, commands and way back."""
+"""`Connection`: a session with the device behind a port: its turns, commands and recovery."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from .wire import Event, Identity, Kind, Reply
 WATCHDOG = 0.1
 WATCHDOG_ON_CREDIT = 0.25
 GREETED_WITHIN = 0.1
-"""Longest wait for the answer to one HELLO on a port that came back [s]."""
+"""Longest wait for the answer to one HELLO on a reopened port [s]."""
 RETRY = 0.05
 """Time between two attempts to open a port that vanished [s]."""
 HALTED_WITHIN = 30.0
-"""Longest wait for another thread's run to end; it waits for rest after its STOP [s]."""
+"""Longest wait for another thread's run to end; after its STOP it waits for rest [s]."""
 SILENCE = 0.02
-"""Longest wait for bytes in one turn [s]; Ctrl-C and cancelling are seen at least as often."""
+"""Longest wait for bytes in one turn [s]; Ctrl-C and cancelling are checked at least as often."""
 
 
 @dataclass
 class Loan:
-    """A port and its session in other hands: the descriptor, the session, the last numbers used."""
+    """A port and its session, lent out: descriptor, session, last sequence numbers used."""
 
     descriptor: int
     session: int
@@ -43,24 +43,24 @@ class Loan:
 class Connection(Unique):
     """A session with the device behind a port; one thread uses it.
 
-    Everything happens in `turn`: one read, what came is handed on, what is due is sent. A port that
-    fails shows in the next turn, so that sending never raises.
+    Everything happens in `turn`: it reads once, hands on what arrived and sends what is due. A
+    failure of the port is raised by the next turn, so that sending never raises.
 
     Parameters
     ----------
     port : Port
         Open; the connection closes it.
     watchdog : float or None
-        Time that the device goes on without a word from here [s]; None for the usual.
+        Time that the device runs on without a frame from this host [s]; None for the default.
     patience : float
         How long to wait for the first answer [s]; many boards restart when their port opens.
     resume : float
-        How long to try to get a vanished port back during a run [s].
+        How long to try to reopen a vanished port during a run [s].
 
     Raises
     ------
     LinkError
-        Where nothing answers, or what answers speaks otherwise.
+        If nothing answers, or not in this protocol.
     """
 
     def __init__(
@@ -73,13 +73,13 @@ class Connection(Unique):
         self._client = _core.LinkClient(self.session)
         self.clock = Clock()
         self.events: deque[Event] = deque(maxlen=256)
-        #: Called at the end of each turn; a run takes its samples there and sends heartbeats.
+        #: Called at the end of each turn; a run collects samples and sends heartbeats there.
         self.each_turn: Callable[[], None] | None = None
-        #: Whether a vanished port is to be opened again.
+        #: Whether to reopen a port that vanished.
         self.resumable = False
-        #: Another thread has asked for the end of the run under way.
+        #: Whether another thread has asked to end the current run.
         self.halted = False
-        #: Seconds that the port was away, each time.
+        #: Duration of each loss of the port [s].
         self.outages: list[float] = []
         self._reply: Reply | None = None
         self._greeting: Reply | None = None
@@ -99,30 +99,29 @@ class Connection(Unique):
 
     @property
     def newest(self) -> int:
-        """Greatest time of the device that any of its frames carried [us]."""
+        """Latest device time in any of its frames [us]."""
         return self._client.newest
 
     @property
     def heard(self) -> float:
-        """When any of its frames came last [s]."""
+        """Host time of the last frame received [s]."""
         heard = self._client.heard
         return -math.inf if heard is None else 1e-6 * heard
 
     # --- turns ----------------------------------------------------------------------------------
 
     def turn(self, wait: float = SILENCE) -> bool:
-        """Read once, waiting at most `wait` seconds, hand on what came, send what is due.
+        """Read once, waiting at most `wait` seconds, hand on what arrived, send what is due.
 
         Returns
         -------
         bool
-            Whether anything came.
+            Whether anything arrived.
 
         Raises
         ------
         LinkError
-            Where the port is lost for good, the device has been reset, or a command stays without
-            an answer.
+            If the port is lost for good, the device was reset, or a command is not answered.
         """
         came = False
         try:
@@ -173,17 +172,17 @@ class Connection(Unique):
 
     @property
     def is_busy(self) -> bool:
-        """Whether a command is under way, or its reply has not been taken."""
+        """Whether a command is pending, or its reply has not been fetched."""
         return self._reply is not None or self._client.is_busy
 
     def begin(self, kind: Kind, body: bytes = b"") -> None:
-        """Send a command and return; turns repeat it until `answer` has its reply."""
+        """Send a command and return at once; turns repeat it until its reply arrives."""
         assert not self.is_busy, "one command at a time"
         self._client.begin(kind, body)
         self._transmit()
 
     def answer(self) -> Reply | None:
-        """The reply to the command under way, once; None as long as there is none."""
+        """The reply to the pending command, once; None while there is none."""
         reply, self._reply = self._reply, None
         return reply
 
@@ -193,12 +192,12 @@ class Connection(Unique):
 
     @contextmanager
     def owned(self) -> Iterator[None]:
-        """The connection for this thread alone; a second one is refused, not made to wait.
+        """Use the connection from this thread alone; a second thread is refused, not queued.
 
         Raises
         ------
         SettingError
-            Where another thread uses it: their frames and replies would mix.
+            If another thread uses it: their frames and replies would mix.
         """
         if not self._owner.acquire(blocking=False):
             raise SettingError(
@@ -218,9 +217,9 @@ class Connection(Unique):
         Raises
         ------
         LinkError
-            Where no answer comes or the port fails; a refusal is a reply.
+            If no answer arrives or the port fails; a refusal is a reply.
         SettingError
-            Where another thread uses the connection.
+            If another thread uses the connection.
         """
         with self.owned():
             return self._request(kind, body)
@@ -244,35 +243,36 @@ class Connection(Unique):
         Raises
         ------
         LinkError
-            As `request`, and where the device refuses.
+            As `request`, and if the device refuses.
         """
         return self.request(kind, body).checked()
 
     def status(self) -> wire.Status:
-        """Ask the device how it is."""
+        """Ask the device for its status."""
         return wire.status(self.request(Kind.STATUS))
 
     def stop(self) -> None:
-        """STOP, at once, whatever is under way; returns when the device has confirmed it.
+        """Send STOP at once; return when the device has confirmed it.
 
-        From another thread it ends the run there, which says STOP by itself, and waits for that.
+        Called from another thread, it ends that thread's run, which sends STOP itself, and waits
+        for it.
 
         Raises
         ------
         LinkError
-            Where it was not confirmed: then the device's watchdog stops the motor.
+            If it was not confirmed: then the device's watchdog stops the motor.
         SettingError
-            Where a loop on the host uses the connection, which is ended by Ctrl-C.
+            If a loop on the host uses the connection; Ctrl-C ends that one.
         """
         self._halt()
         with self.owned():
             self._forget()
-            # what an interrupted write has left is closed by a zero
+            # a zero ends the frame that an interrupted write left unfinished
             self._send(b"\0")
             self.ask(Kind.STOP)
 
     def _halt(self) -> None:
-        """Have the thread that uses the connection end its run; nothing where that is this one."""
+        """Make the thread that uses the connection end its run; do nothing if it is this one."""
         if self._owner.acquire(blocking=False):
             self._owner.release()
             return
@@ -299,19 +299,19 @@ class Connection(Unique):
     # --- heartbeats -----------------------------------------------------------------------------
 
     def keep(self) -> None:
-        """Tell the device that the host is there."""
+        """Send a heartbeat."""
         self._send(self._client.keep(_now_us()))
 
     def drive(self, u: float) -> None:
-        """The command of a direct run [V]; a heartbeat too."""
+        """Send the command of a direct run [V]; it is a heartbeat too."""
         self._send(self._client.drive(_now_us(), u))
 
     def grant(self, until: int) -> None:
-        """Let the time of a device on credit advance to `until` [us]; a heartbeat too."""
+        """Let the time of a device on credit advance to `until` [us]; it is a heartbeat too."""
         self._send(self._client.grant(_now_us(), min(until, wire.LATEST)))
 
     def let_pass(self, us: int) -> None:
-        """Grant time to a device on credit; take turns for as long with another."""
+        """Let the device's time advance by `us`: grant it on credit, take turns in real time."""
         if self.identity.on_credit:
             self.grant(self.newest + us)
             return
@@ -320,7 +320,7 @@ class Connection(Unique):
             self.turn(rest)
 
     def _transmit(self) -> None:
-        """The command under way, where it is new or to be repeated."""
+        """Send the pending command if it is new or due to be repeated."""
         frame = self._client.transmit(_now_us())
         if frame:
             self._send(frame)
@@ -334,7 +334,7 @@ class Connection(Unique):
 
     @contextmanager
     def lent(self) -> Iterator[Loan]:
-        """The port and the session's numbers for someone else, who leaves those he reached."""
+        """Lend the port and the session's sequence numbers; the borrower leaves its last ones."""
         loan = Loan(self.port.fileno(), self.session, *self._client.sequences)
         self._forget()
         try:
@@ -342,7 +342,8 @@ class Connection(Unique):
                 self._is_lent = True
                 yield loan
         except BaseException:
-            # numbers may have been used that were not left here: a STOP with one of those is old
+            # the borrower may have used more numbers than it left: skip ahead of them all, as the
+            # device would take a STOP with a used number for an old one
             loan.command += 2**16
             loan.heartbeat += 2**24
             raise
@@ -350,10 +351,10 @@ class Connection(Unique):
             self._is_lent = False
             self._client.go_on(loan.command & 0xFFFFFFFF, loan.heartbeat & 0xFFFFFFFF)
 
-    # --- greeting and return --------------------------------------------------------------------
+    # --- greeting and recovery ------------------------------------------------------------------
 
     def _greet(self, patience: float) -> Identity:
-        """HELLO until it is answered; the same session again changes nothing on the device."""
+        """Repeat HELLO until it is answered; with the same session it changes nothing there."""
         self._greeting = None
         self._client.greet(round(1e6 * patience))
         try:
@@ -383,7 +384,7 @@ class Connection(Unique):
         )  # fmt: skip
 
     def _recover(self, error: LinkError) -> None:
-        """Open the port again and confirm the session; the device may have gone on meanwhile."""
+        """Reopen the port and confirm the session; the device may have run on meanwhile."""
         if not self.resumable or self._is_closed or isinstance(error, DeviceReset):
             raise error
         self._failed = None
@@ -417,15 +418,15 @@ class Connection(Unique):
         raise error
 
     def close(self) -> None:
-        """Give the port back; a run under way in another thread does not open it again."""
+        """Close the port; a run in another thread does not reopen it."""
         self._is_closed = True
         self.port.close()
 
 
 def _now_us() -> int:
-    """The clock of the session [us]."""
+    """The session's clock [us]."""
     return time.monotonic_ns() // 1000
 
 
 class DeviceReset(LinkError):
-    """The device has lost its run and its limits; no way leads back into this session."""
+    """The device has lost its run and its limits; this session cannot go on."""

@@ -1,4 +1,4 @@
-"""`examine`: what is wrong with a port and the device behind it, and what to do; nothing moves."""
+"""`examine` diagnoses a port and the device behind it, with remedies; it moves nothing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .connection import Connection
 from .drive import PATIENCE, Drive
 from .ports import A_PORT, CONNECT_TIMEOUT, Port, list_ports, open_port, transport_of
 
-# --- Diagnosis: what was found wrong with a port and the device behind it, and what to do ---------
+# --- `Diagnosis`: the findings --------------------------------------------------------------------
 
 
 Verdict: TypeAlias = Literal["ok", "warn", "fail"]
@@ -25,18 +25,18 @@ Verdict: TypeAlias = Literal["ok", "warn", "fail"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was examined.
+    """The result of one check.
 
     Parameters
     ----------
     name : str
     verdict : "ok", "warn" or "fail"
     measured : str
-        What was found.
+        The finding as text.
     remedy : str
-        What to do; empty where nothing is to be done.
+        What to do; empty if nothing is needed.
     values : dict
-        The numbers in it, with units in their names.
+        Its numbers, with units in their names.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What `examine` found, in the order in which it looked; a failure may have ended it."""
+    """The findings of `examine` in the order of its checks; a failure can end them early."""
 
     port: str
     findings: tuple[Finding, ...]
@@ -64,7 +64,7 @@ class Diagnosis:
         return "fail" if "fail" in verdicts else "warn" if "warn" in verdicts else "ok"
 
     def __getitem__(self, name: str) -> Finding:
-        """The finding of a name; KeyError where it was not examined."""
+        """The finding of this name; KeyError if that check was not made."""
         for finding in self.findings:
             if finding.name == name:
                 return finding
@@ -93,20 +93,20 @@ class Diagnosis:
         return "\n".join([*map(str, self.findings), f"{self.port}: {ends[self.verdict]}"])
 
 
-# --- What is measured of a device and its link: state, round trips, throughput, loss, clock -------
+# --- measurements of a device and its link: state, round trips, throughput, loss, clock -----------
 
 
 SHORT, LONG = 0, 200
-"""Bytes of the two kinds of echoes; the difference of their times is what the bytes cost."""
+"""Bytes of the two kinds of echoes; the difference of their times is the cost of the bytes."""
 SPARE = 0.4
 """Share of the link that a recording at full rate should leave free."""
 BATCH = 10
 SLOW_TRIP = 0.01
 LOSSY = 0.01
-"""Share of lost frames above which it is no warning any more."""
+"""Share of lost frames above which loss is a failure rather than a warning."""
 DRIFT_PPM = 500.0
 MEASURABLE = 20e-6
-"""Least difference of times that says anything about a rate [s]."""
+"""Least difference of times from which a rate can be computed [s]."""
 
 
 class Metered(Port):
@@ -153,17 +153,17 @@ class Metered(Port):
 
 
 def checkup(port: Metered, echoes: int) -> Iterator[Finding]:
-    """The findings on what is behind an open port, one after the other.
+    """Check the device behind an open port, one finding after the other.
 
     Raises
     ------
     LinkError
-        Where no device answers, or none any more.
+        If no device answers, or it stops answering.
     """
     link = Connection(port, watchdog=0.05, patience=PATIENCE, resume=0.0)
     drive = Drive(link)
     yield _identity(drive)
-    # counted up to the first copy of each STATUS, as the device does: its repeats are none's loss
+    # count frames up to the first copy of each STATUS, as the device does: repeats are no loss
     sent, before = port.frames, drive.status()
     yield _state(before)
     yield _limits(drive)
@@ -240,7 +240,7 @@ def _limits(drive: Drive) -> Finding:
 def _echo(drive: Drive, echoes: int) -> dict[int, list[float]]:
     """Round trips of short and long messages in turn [s]."""
     times: dict[int, list[float]] = {SHORT: [], LONG: []}
-    # no two alike, and every byte value: a line that damages some is found
+    # random bytes, so that a line that damages certain values is found
     content = random.Random(0)
     for _ in range(echoes):
         for size, list_ in times.items():
@@ -262,8 +262,8 @@ def _round_trip(times: dict[int, list[float]]) -> Finding:
 
 
 def _throughput(times: dict[int, list[float]], drive: Drive, port: Port) -> Finding:
-    """What 200 bytes cost each way, against what samples at full rate need."""
-    # the quickest of each are those that nothing else held up
+    """Bytes a second that the link carries, compared with the need of samples at full rate."""
+    # the fastest echo of each size is the one that nothing else delayed
     cost = min(times[LONG]) - min(times[SHORT])
     encodings = [c.encoding for c in drive.channels[:2]]
     size = wire.wire_size(wire.body_size(encodings, BATCH))
@@ -293,7 +293,7 @@ def _throughput(times: dict[int, list[float]], drive: Drive, port: Port) -> Find
 def _loss(
     link: Connection, before: wire.Status, after: wire.Status, sent: int, echoes: int
 ) -> Finding:
-    """Frames that did not arrive, or arrived damaged, either way."""
+    """Frames lost or damaged in either direction."""
     counters = link.receiver.counters
     to_device = max(0, sent - (after.received - before.received))
     damaged = after.refused - before.refused
@@ -347,7 +347,7 @@ def _clock(drive: Drive) -> Finding:
 
 
 def _counters(after: wire.Status, before: wire.Status, drive: Drive) -> Finding:
-    """What the device has counted since its boot."""
+    """The device's own counters since its boot."""
     values = {
         "received": after.received, "refused": after.refused, "dropped": after.dropped,
         "late_us": after.late_us, "foreign": after.foreign,
@@ -373,7 +373,7 @@ def _time(seconds: float) -> str:
     return f"{seconds * 1e3:.3g} ms" if seconds >= 1e-3 else f"{seconds * 1e6:.0f} us"
 
 
-# --- examine: what is wrong with a port and the device behind it, with remedies; nothing moves ----
+# --- `examine` ------------------------------------------------------------------------------------
 
 
 ECHOES = 200
@@ -383,22 +383,22 @@ LATENCY_TIMER_MS = 2
 def examine(url: str, *, baud: int = 115_200, echoes: int = ECHOES) -> Diagnosis:
     """Examine a port and the device behind it.
 
-    The device is greeted and asked, never armed. To greet it opens a new session, which ends a run
-    of another host.
+    The device is queried, never armed. Connecting opens a new session, which ends a run of another
+    host.
 
     Parameters
     ----------
     url : str
-        An address that `open_port` takes.
+        An address for `open_port`.
     baud : int
         Bits per second of a serial port.
     echoes : int
-        Messages sent to and fro, 10 or more; loss below one in so many is not found.
+        Messages sent back and forth, 10 or more; a smaller loss than one in so many is not found.
 
     Raises
     ------
     SettingError
-        For a url, baud or count that cannot be; whatever is wrong with port or device is a finding.
+        For an invalid url, baud or count; a fault of port or device is a finding.
     """
     if isinstance(echoes, bool) or not isinstance(echoes, int) or echoes < 10:
         raise SettingError(
@@ -435,7 +435,7 @@ def _failure(name: str, error: LinkError) -> Finding:
 
 
 def _unopened(url: str, error: LinkError) -> Finding:
-    """Why a port does not open: permission, who has it, which others there are."""
+    """Why a port does not open: permission, or another program; and which other ports exist."""
     finding = _failure("port", error)
     if not _is_local(url):
         return finding
@@ -450,7 +450,7 @@ def _unopened(url: str, error: LinkError) -> Finding:
         measured = f"{url} belongs to {found.owner} with mode {found.mode}; you may not open it"
         return Finding("port", "fail", measured, remedy, {"group": found.group})
     if error.expected == A_PORT:
-        return finding  # who has /dev/null open is every program there is
+        return finding  # not a port: every program holds /dev/null open
     if held := holders(url):
         return _with(finding, f"end {_named(held)}, which has it open", holders=held)
     return finding
@@ -482,13 +482,13 @@ def _opened(url: str, port: Port) -> Finding:
 
 
 def _is_local(url: str) -> bool:
-    """Whether it is a device of this computer, which other programs may have open."""
+    """Whether it is a device of this computer, which other programs can hold open."""
     kind = transport_of(url)
     return kind is None or kind.is_local
 
 
 def _latency(url: str) -> Iterator[Finding]:
-    """Only for adapters that have such a timer; read after opening, which tries to shorten it."""
+    """The latency timer of adapters with one; call it after opening, which tries to shorten it."""
     if not _is_local(url) or (found := latency_timer(url)) is None:
         return
     milliseconds, file = found

@@ -26,11 +26,22 @@ from . import run as profiles
 from . import wire
 from .clock import ClockBounds
 from .connection import Connection, DeviceReset, Loan
-from .plan import Layout, Outcome, Plan, Sink, layout, require_capable
+from .plan import (
+    Layout,
+    Outcome,
+    Plan,
+    Sink,
+    channels,
+    fitting,
+    gains,
+    layout,
+    limit,
+    other_kind,
+    require_capable,
+)
 from .ports import Unique, open_port
 from .record import excite, follow
 from .run import Run, await_measurement, wait_for_rest
-from .settings import channels, fitting, gains, limit, other_kind
 from .wire import Channel, Identity, Kind, Limits, Status
 
 PATIENCE = 3.0
@@ -40,12 +51,12 @@ _Drive = TypeVar("_Drive", bound="Drive")
 
 
 class Drive(Unique):
-    """A motor drive behind a port, made by `connect`; a context manager whose end stops the motor.
+    """A motor drive behind a port, made by `connect`; leaving its context stops the motor.
 
     It is a `sewfast.Machine`.
 
-    One thread uses it; `stop` and `close` may come from another one and end its run. Nothing here
-    starts a motor but `stream`.
+    One thread uses it; `stop` and `close` can be called from another one and end its run. Only
+    `stream`, and what calls it, starts a motor.
 
     Parameters
     ----------
@@ -56,7 +67,7 @@ class Drive(Unique):
     def __init__(self, link: Connection) -> None:
         self._link = link
         self._channels = channels(link)
-        #: What became of the last run, also of one that ended in an exception.
+        #: Outcome of the last run, even of one that ended in an exception.
         self.outcome: Outcome | None = None
         await_measurement(link)
 
@@ -69,7 +80,7 @@ class Drive(Unique):
         watchdog: float | None = None,
         resume: float = 1.0,
     ) -> _Drive:
-        """As `connect`, for a drive of a class of one's own."""
+        """As `connect`, for a subclass."""
         if watchdog is not None and not 0.001 <= real("watchdog", watchdog) <= 10.0:
             raise SettingError(
                 name="watchdog", expected=".001 to 10 s", received=f"{watchdog}",
@@ -98,7 +109,7 @@ class Drive(Unique):
         try:
             self.stop()
         except DeviceReset:
-            # its motor is without command, and whoever ran it has been told
+            # a reset motor has no command, and the run has raised this error already
             pass
         except LinkError:
             if error is None:
@@ -107,19 +118,19 @@ class Drive(Unique):
             self.close()
 
     def close(self) -> None:
-        """Give the port back without a word to the device; what it runs ends by its watchdog."""
+        """Close the port and send the device nothing; its watchdog ends what it runs."""
         self._link.close()
 
     # --- what it is -------------------------------------------------------------------------------
 
     @property
     def identity(self) -> Identity:
-        """Who the device is and what it offers."""
+        """The device's name, firmware and capabilities."""
         return self._link.identity
 
     @property
     def name(self) -> str:
-        """As the device calls itself."""
+        """The device's name for itself."""
         return self.identity.name
 
     @property
@@ -134,22 +145,22 @@ class Drive(Unique):
 
     @property
     def volt(self) -> float:
-        """Largest command to either side [V]: its limit in force, which it is asked for."""
+        """Largest command in either direction [V]: the limit in force, read from the device."""
         return self.limits().values[0]
 
     @property
     def speed(self) -> float:
-        """Speed beyond which it trips [RPM]: its limit in force, which it is asked for."""
+        """Speed above which it trips [RPM]: the limit in force, read from the device."""
         return self.limits().values[1]
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """What it can stream."""
+        """The channels that it can stream."""
         return self._channels
 
     @property
     def clock(self) -> ClockBounds | None:
-        """Bounds of the clocks' difference; None on credit, where there is no wall clock."""
+        """Bounds on the clocks' difference; None on credit, where there is no wall clock."""
         return None if self.identity.on_credit else self._link.clock.bounds()
 
     def __str__(self) -> str:
@@ -161,17 +172,17 @@ class Drive(Unique):
         )
 
     def status(self) -> Status:
-        """Ask the device how it is.
+        """Ask the device for its status.
 
         Raises
         ------
         LinkError
-            Where the port or the device failed; so from every method.
+            If the port or the device fails, as from every method.
         """
         return self._link.status()
 
     def echo(self, data: bytes = b"") -> float:
-        """Seconds until up to 200 bytes come back."""
+        """Time until up to 200 bytes come back [s]."""
         sent = time.monotonic()
         if self._link.ask(Kind.ECHO, data) != data:
             raise LinkError(
@@ -180,7 +191,7 @@ class Drive(Unique):
             )  # fmt: skip
         return time.monotonic() - sent
 
-    # --- what it may do ---------------------------------------------------------------------------
+    # --- limits, controller, states ---------------------------------------------------------------
 
     def limits(self) -> Limits:
         """The limits in force and the device's ceilings."""
@@ -194,13 +205,13 @@ class Drive(Unique):
         acceleration: float | None = None,
         current: float | None = None,
     ) -> Limits:
-        """Set limits that the device enforces at every sample, in this session and until a reset.
+        """Set limits that the device enforces at every sample until a reset or a new session.
 
         Parameters
         ----------
         volt, speed_rpm, acceleration, current : float or None
-            Largest magnitudes [V, RPM, RPM/s, A]; None keeps what is set, or else takes the
-            device's ceiling.
+            Largest magnitudes [V, RPM, RPM/s, A]; None keeps the present limit, or takes the
+            device's ceiling if none is set.
 
         Raises
         ------
@@ -232,24 +243,23 @@ class Drive(Unique):
             return
         body = gains(controller, self.channels, self.identity)
         self._link.ask(Kind.GAINS, body)
-        # GAINS leave none
+        # GAINS removes them
         if controller.biquads:
             self._link.ask(Kind.BIQUADS, wire.biquads(controller.sections()))
 
     def arm(self) -> None:
-        """Make it ready to start; its watchdog takes it back to idle when the host falls silent."""
+        """Make it ready to start; if the host falls silent, its watchdog returns it to idle."""
         self._link.ask(Kind.ARM, wire.arm(self._link.watchdog_us, self._link.identity.key))
 
     def stop(self) -> None:
-        """Command 0 and drive disabled, at once; returns when the device has confirmed it.
+        """Set command 0 and disable the drive at once; return when the device has confirmed it.
 
-        While another thread runs something on the drive, that run is cancelled; this returns when
-        the motor is at rest.
+        A run in another thread is cancelled; then this returns when the motor is at rest.
         """
         self._link.stop()
 
     def clear(self) -> None:
-        """Take a trip back, once its cause is known; the device is idle then."""
+        """Clear a trip, once its cause is known; the device is idle afterwards."""
         self._link.ask(Kind.CLEAR)
 
     def wait_for_rest(self, timeout: float = 10.0) -> None:
@@ -263,7 +273,7 @@ class Drive(Unique):
         Raises
         ------
         LinkError
-            Where the motor still moves then.
+            If the motor still moves after that.
         """
         wait_for_rest(self._link, timeout)
 
@@ -280,7 +290,7 @@ class Drive(Unique):
         Returns
         -------
         int
-            Values that fitted; `stream` sends the rest while it runs.
+            Number of values that fitted; `stream` sends the rest during the run.
         """
         if what not in ("commands", "references"):
             raise SettingError(
@@ -288,29 +298,29 @@ class Drive(Unique):
             )
         plan = Plan("commands", values)  # type: ignore[arg-type]
         run = Run(
-            self._link, plan, Layout(self.channels[:2], 1), self._profile(what, plan), _Nobody()
+            self._link, plan, Layout(self.channels[:2], 1), self._profile(what, plan), _NullSink()
         )
         run.upload()
         assert run.profile is not None
         return run.profile.end
 
     def layout(self, plan: Plan) -> Layout:
-        """The channels that a run of `plan` would stream, and how many samples go into a frame.
+        """The channels that a run of `plan` would stream, and the number of samples in a frame.
 
         Raises
         ------
         SettingError
-            Where the baud rate does not carry the columns asked for; it names those to leave out.
+            If the baud rate is too low for the columns asked for; it names those to leave out.
         """
         return layout(plan, self.channels, self.identity, self._baud())
 
     def columns(self, plan: Plan) -> dict[str, str]:
-        """Name and unit of what a run of `plan` will stream; moves nothing.
+        """Names and units of the columns that a run of `plan` will stream; moves nothing.
 
         Raises
         ------
         SettingError, LinkError
-            Where `stream` would refuse the plan.
+            If `stream` would refuse the plan.
         """
         require_capable(plan, self.identity)
         self._profile_of(plan)
@@ -320,11 +330,11 @@ class Drive(Unique):
     # --- runs -------------------------------------------------------------------------------------
 
     def stream(self, plan: Plan, sink: Sink, *, cancel: threading.Event | None = None) -> Outcome:
-        """Run a plan and hand every sample to `sink` as it comes.
+        """Run a plan and hand every sample to `sink` as it arrives.
 
-        Waits for rest, uploads, arms, starts and takes samples until the end. Whatever goes wrong
-        meanwhile, Ctrl-C included, STOP is the next thing sent; then the motor is given time to
-        come to rest and the exception goes on. `outcome` says what became of the run even then.
+        Waits for rest, uploads, arms, starts and takes samples until the end. On any error,
+        including Ctrl-C, it first sends STOP and waits for the motor to come to rest, then raises
+        the error. `outcome` describes the run even then.
 
         Parameters
         ----------
@@ -336,15 +346,15 @@ class Drive(Unique):
         Returns
         -------
         Outcome
-            A trip is an outcome: `state` is "tripped" and `reason` says why.
+            A trip is an outcome: `state` is "tripped" and `reason` is its cause.
 
         Raises
         ------
         SettingError
-            Before anything moves: no limits set, values beyond them, columns beyond the baud rate,
-            a mode or controller that the device does not take.
+            Before anything moves: no limits set, values beyond them, too many columns for the baud
+            rate, a mode or controller that the device does not offer.
         LinkError
-            Where port or device failed.
+            If port or device fails.
         """
         with self._link.owned():
             return self._stream(plan, sink, cancel)
@@ -361,7 +371,7 @@ class Drive(Unique):
         overwrite: bool = False,
         cancel: threading.Event | None = None,
     ) -> Recording:
-        """Play commands from rest and record them; `sewfast.record` with a drive does this.
+        """Apply commands from rest and record; `sewfast.record` calls this for a drive.
 
         Parameters
         ----------
@@ -394,7 +404,7 @@ class Drive(Unique):
         watch: Watch | None = None,
         cancel: threading.Event | None = None,
     ) -> RecordedRun:
-        """Run a controller on the device along a reference; `sewfast.run` with a drive does this.
+        """Run a controller on the device along a reference; `sewfast.run` calls this for a drive.
 
         Parameters
         ----------
@@ -406,7 +416,7 @@ class Drive(Unique):
         file, live, overwrite, cancel
             As for `sewfast.run`.
         watch : Watch, optional
-            Sees the samples as they come; what it raises stops the motor and goes on.
+            Called with the samples as they arrive; an exception from it stops the motor.
 
         Returns
         -------
@@ -430,7 +440,7 @@ class Drive(Unique):
             wanted = cancel is None or not cancel.is_set()
             if wanted:
                 run.begin()
-            self.outcome = run.finish() if wanted and run.play(cancel) else run.abort(None)
+            self.outcome = run.finish() if wanted and run.pump(cancel) else run.abort(None)
         except BaseException as error:
             self.outcome = run.abort(error)
             self._settle()
@@ -451,14 +461,14 @@ class Drive(Unique):
         return Run(self._link, plan, streamed, profile, sink)
 
     def prepare_direct(self, plan: Plan, controller: Controller) -> Layout:
-        """Everything before a run whose commands `controller` decides elsewhere, up to rest.
+        """Check and prepare a run whose commands `controller` computes on the host; wait for rest.
 
         Raises
         ------
         SettingError
-            Where the device does not take commands, or the controller is in other units.
+            If the device takes no direct commands, or the controller has other units.
         LinkError
-            Where the device is not idle or its motor does not rest.
+            If the device is not idle or its motor does not come to rest.
         """
         require_capable(plan, self.identity)
         fitting(controller, self.channels)
@@ -468,12 +478,12 @@ class Drive(Unique):
         return streamed
 
     def lent(self) -> AbstractContextManager[Loan]:
-        """The port and the session's numbers, for a loop that the interpreter has no part in."""
+        """Lend the port and the session's numbers to a loop outside the interpreter."""
         return self._link.lent()
 
     @property
     def watchdog(self) -> float:
-        """Time that the device goes on without a word from here [s]."""
+        """Time that the device runs on without a frame from this host [s]."""
         return self._link.watchdog
 
     def _profile_of(self, plan: Plan) -> _core.LinkUpload | None:
@@ -508,13 +518,15 @@ class Drive(Unique):
             self.stop()
 
     def _settle(self) -> None:
-        """Rest after a stop, where the device can say so."""
+        """Wait for rest after a stop, if the device still answers."""
         if self.outcome is not None and self.outcome.state != "unknown":
             with suppress(LinkError):
                 self.wait_for_rest()
 
 
-class _Nobody:
+class _NullSink:
+    """Drops what a run delivers."""
+
     def samples(self, first: int, columns: object) -> None: ...
 
     def event(self, kind: str, index: int, **detail: object) -> None: ...
@@ -523,19 +535,19 @@ class _Nobody:
 def connect(
     url: str, *, baud: int = 115_200, watchdog: float | None = None, resume: float = 1.0
 ) -> Drive:
-    """Open a port and greet the drive behind it; sets nothing and moves nothing.
+    """Open a port and connect to the drive behind it; sets nothing and moves nothing.
 
     Parameters
     ----------
     url : str
-        An address that `open_port` takes.
+        An address for `open_port`.
     baud : int
         Bits per second of a serial port.
     watchdog : float or None
         Time after which the device stops a motor whose host has fallen silent, .001 to 10 s. None
-        for .1 s, and .25 s of a computed time on credit, which runs ahead by most of it.
+        is .1 s, or .25 s for a device on credit, whose computed time runs ahead by most of it.
     resume : float
-        How long a run waits for a port that vanished [s]; the motor turns on only as long as
+        How long a run waits for a port that vanished [s]; the motor keeps turning only as long as
         `watchdog` allows.
 
     Returns
@@ -546,7 +558,7 @@ def connect(
     Raises
     ------
     LinkError
-        Where the port does not open or nothing answers; the message says what to do.
+        If the port does not open or nothing answers; the message says what to do.
     SettingError
         For a setting outside its range.
     """

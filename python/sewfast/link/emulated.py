@@ -14,16 +14,15 @@ import time
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Literal
 
 from ..errors import LinkError, SettingError
 
 BOARDS = {"mps2-an386": 0x21000000, "mps2-an500": 0x60000000}
-"""QEMU's boards, a Cortex-M4 and a Cortex-M7, and where the memory lies that they share with us."""
+"""QEMU's boards, a Cortex-M4 and a Cortex-M7, with the address of the memory shared with us."""
 EMULATOR = "qemu-system-arm"
 PACKAGES = "gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm rustc-web rust-web-src"
-"""What Debian calls all that is needed to build and to run the firmware."""
+"""Debian's packages for building and running the firmware."""
 
 # as in examples/firmware/mps2/board.c and board.ld
 _SHARED = struct.Struct("<6I3QI")
@@ -33,7 +32,7 @@ _PAINT = b"\xa5"
 _MEMORY = 16 << 20
 
 _SHIFT = 5
-"""An instruction takes 2**5 ns of the board's time, a tick of its timer 40 ns."""
+"""An instruction takes 2**5 ns of the board's time; a tick of its timer is 40 ns."""
 
 _START = 20.0
 """Time for the emulator to open its port [s]."""
@@ -41,15 +40,15 @@ _START = 20.0
 
 @dataclass(frozen=True)
 class BoardFigures:
-    """What the processor has done since its boot.
+    """Figures of the processor since its boot.
 
     Attributes
     ----------
     steps : int
         Control periods: a measurement handed to the device, an output taken from it.
     instructions : tuple of (float, float, float) or None
-        Least, mean and most instructions of one, within 2; None where the board keeps real time,
-        which says nothing about them.
+        Least, mean and most instructions of a period, within 2; None in real time, where they are
+        not counted.
     stack : int
         Deepest use of the stack [bytes].
     code : int
@@ -86,7 +85,7 @@ def build_firmware(source: str | os.PathLike[str] = ".", *, board: str = "mps2-a
     source : path
         A source checkout of sewfast, or a folder in it.
     board : {"mps2-an386", "mps2-an500"}
-        Whose firmware to return: a Cortex-M4, or a Cortex-M7.
+        The board whose firmware to return: a Cortex-M4, or a Cortex-M7.
 
     Returns
     -------
@@ -96,7 +95,7 @@ def build_firmware(source: str | os.PathLike[str] = ".", *, board: str = "mps2-a
     Raises
     ------
     SettingError
-        Another board; no source checkout; a compiler is missing; it does not compile.
+        For another board, without a source checkout or a compiler, and if it does not compile.
     """
     if board not in BOARDS:
         raise SettingError(name="board", expected=" or ".join(BOARDS), received=repr(board))
@@ -136,21 +135,20 @@ class EmulatedBoard:
     Parameters
     ----------
     firmware : path
-        ELF file, as of `build_firmware`, which says by its addresses for which board it was linked.
+        ELF file, as from `build_firmware`; its addresses show for which board it was linked.
     clock : {"credit", "real"}
         On credit the board's time advances only by what the host grants: a busy computer
         changes no recording, and instructions are counted. In real time its clock is the
         computer's.
     boot_id : int or None
-        What distinguishes this boot from others, and what its random bits begin with; None draws
-        it.
+        Number of this boot, which also seeds its random bits; None draws it.
 
     Raises
     ------
     SettingError
-        No emulator; a file that is no firmware for one of the boards.
+        Without an emulator, and for a file that is not firmware for one of the boards.
     LinkError
-        The emulator ends, or opens no port.
+        If the emulator ends, or opens no port.
 
     Examples
     --------
@@ -190,7 +188,7 @@ class EmulatedBoard:
                 subprocess.Popen(
                     self._command(Path(firmware), Path(folder) / "memory", number),
                     stdin=subprocess.DEVNULL, stdout=self._log, stderr=self._log,
-                    start_new_session=True,  # Ctrl-C is the host's, which stops the motor first
+                    start_new_session=True,  # keep Ctrl-C for the host, which stops the motor first
                 )
             )  # fmt: skip
             opened.callback(self.process.kill)
@@ -199,7 +197,7 @@ class EmulatedBoard:
             self._opened = opened.pop_all()
 
     def _command(self, firmware: Path, memory: Path, number: int) -> list[str]:
-        # QEMU takes a comma in a value where it is doubled
+        # QEMU wants a comma in a value doubled
         place = str(memory).replace(",", ",,")
         command = [EMULATOR, "-M", f"{self.board},memory-backend=shared", "-display", "none"]
         command += ["-monitor", "none", "-kernel", str(firmware)]
@@ -208,7 +206,7 @@ class EmulatedBoard:
         return [*command, "-icount", f"shift={_SHIFT}"] if self._counts else command
 
     def _wait_for(self, number: int) -> None:
-        """Until the port listens; a connection to try would be taken for a host."""
+        """Wait until the port listens; the board would take a trial connection for its host."""
         until = time.monotonic() + _START
         tables = [p for p in (Path("/proc/net/tcp"),) if p.exists()]
         while self.process.poll() is None and time.monotonic() < until:
@@ -226,7 +224,7 @@ class EmulatedBoard:
         )  # fmt: skip
 
     def figures(self) -> BoardFigures:
-        """Instructions, stack and size, as they are now."""
+        """Instructions, stack and size so far."""
         *_, steps, least, most, total, _, _, _ = _SHARED.unpack_from(self._memory)
         counted = None
         if self._counts and steps:
@@ -241,7 +239,7 @@ class EmulatedBoard:
         )
 
     def safe_after(self) -> float | None:
-        """Time from the last bytes that the board heard to its output being off [s].
+        """Time from the last bytes that the board received until its output was off [s].
 
         None while the output is on.
         """
@@ -255,17 +253,12 @@ class EmulatedBoard:
     def __enter__(self) -> EmulatedBoard:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
 
 def _memory(path: Path) -> mmap.mmap:
-    """The board's memory as a file, with a stack that shows how deep it was used."""
+    """The board's memory as a file, its stack painted to show how deep it was used."""
     with path.open("w+b") as file:
         file.truncate(_MEMORY)
         file.seek(_STACK_TOP - _STACK)
@@ -280,7 +273,7 @@ def _examined(firmware: Path) -> tuple[str, int, int]:
     Raises
     ------
     SettingError
-        No 32-bit little-endian ELF file for ARM, or one for another board.
+        For anything but a 32-bit little-endian ELF file for ARM, and for another board.
     """
     remedy = "build one by `make firmware` in a source checkout"
     try:

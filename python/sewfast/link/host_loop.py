@@ -1,4 +1,4 @@
-"""`run_on_host`: a controller on this computer against a drive, for plants slow enough."""
+"""`run_on_host`: a controller on this computer against a drive, for slow plants."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from .run import ARMS_WITHIN, MOVING
 from .wire import refusal
 
 WATCHDOG_PERIODS = 4
-"""Periods that the device goes on without a command, unless its watchdog time is longer."""
+"""Periods that the device runs on without a command, unless its watchdog time is longer."""
 BATCHES = (10, 9, 8, 7, 6, 5)
-"""Samples in a frame; the first that divides a period, so that each tick finds them equally old."""
+"""Samples in a frame: the first that divides a period, so all ticks see equally old samples."""
 PRIORITY = 50
 ORDINARY = "ordinary"
 
@@ -56,19 +56,19 @@ def run_on_host(
     real_time: bool = False,
     progress: Callable[[int, int, float], object] | None = None,
 ) -> HostLoopRun:
-    """Run a controller on this computer against a drive, for plants slow enough.
+    """Run a controller on this computer against a drive, for slow plants.
 
-    The drive applies what it is told and watches over the motor; a thread without Python decides
-    each command from the newest counts. Its jitter and the link's delay are in the loop, and in the
-    result. Where the plant is fast, let the drive run the controller itself.
+    The drive applies the commands and guards the motor; a thread without Python computes each
+    command from the newest counts. Its jitter and the link's delay are part of the loop, and of the
+    result. For a fast plant, let the drive run the controller itself.
 
     Parameters
     ----------
     drive : Drive
         Idle, with limits set, in real time.
     controller : Controller
-        Its sample time is the loop's: a whole number of the drive's, 2 or more; `at_period` makes
-        one of another.
+        Its sample time is the loop's: a whole multiple of the drive's, 2 or more; `at_period`
+        converts one with another sample time.
     reference : str or array, shape (N,)
         Name of a reference (`sewfast.signals`) or its samples at the controller's sample time [y].
     seed : int
@@ -77,15 +77,15 @@ def run_on_host(
         Name of the reference in messages.
     watchdog : float, optional
         Time after which the drive stops without a command, and this computer without a sample
-        [s]; the drive's own, but at least four periods.
+        [s]; by default the drive's own, but at least four periods.
     columns : sequence of str, optional
-        Channels to keep beside `counts` and `u`.
+        Channels to keep besides `counts` and `u`.
     batch : int, optional
         Samples in a frame; fewer are fresher and load the link more.
     real_time : bool
-        Try real-time scheduling and locked memory; what became of it is in `jitter.real_time`.
+        Try real-time scheduling and locked memory; `jitter.real_time` reports the result.
     progress : callable, optional
-        Called with ticks over, ticks in all and a number without meaning.
+        Called with the ticks done, the total and a number to ignore.
 
     Returns
     -------
@@ -95,11 +95,11 @@ def run_on_host(
     Raises
     ------
     SettingError, DataError
-        Before anything moves, for what cannot run.
+        Before anything moves, for settings that cannot run.
     LinkError
-        Where the drive refuses to arm or to start, or does not answer.
+        If the drive refuses to arm or to start, or does not answer.
     Interrupted
-        On Ctrl-C, after STOP; `best` is the run up to there.
+        On Ctrl-C, after STOP; `best` is the run so far.
     """
     call = "run_on_host(drive, controller, reference)"
     require_controller(controller, drive, call)
@@ -141,8 +141,8 @@ def run_on_host(
 def at_period(controller: Controller, Ts: float) -> Controller:
     """The same controller at a longer sample time, its feedback averaged over the same time.
 
-    The gains are kept in standard form. A loop that is stable at its own sample time need not be so
-    at a longer one: try it on a model first.
+    The gains stay the same in standard form. A loop that is stable at its own sample time may be
+    unstable at a longer one: try it on a model first.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def _scale(drive: Drive, controller: Controller) -> float:
 
 @contextmanager
 def _scheduling(wanted: bool) -> Iterator[list[str]]:
-    """Real-time scheduling, where wanted, of this thread and those it starts; what became of it."""
+    """Real-time scheduling, if wanted, of this thread and those it starts; yields the result."""
     if not wanted:
         yield [ORDINARY]
         return
@@ -246,7 +246,7 @@ def _run(
     number = ticks["number"].astype(np.intp)
     reached = int(number[-1]) + 1 if len(number) else 0
     if found["outcome"]["name"] == "completed":
-        # the last ticks may be among those that were missed
+        # the last ticks may have been missed
         reached = len(r)
     at_ticks = {
         k: _spread(ticks[k], number, reached) for k in ("u", "y", "feedback", "late", "age")
@@ -267,14 +267,14 @@ def _run(
 
 
 def _spread(values: FloatArray, number: NDArray[np.intp], reached: int) -> FloatArray:
-    """Values at the ticks that were run, NaN at those that were missed."""
+    """Values at the ticks that ran, NaN at those that were missed."""
     spread = np.full(reached, np.nan)
     spread[number] = values
     return spread
 
 
 def _gaps(times: FloatArray, taken: int | None, Ts: float) -> tuple[tuple[int, int], ...]:
-    """First and count of the missing samples between those that came, and around them."""
+    """(first, count) of each stretch of missing samples, those at both ends included."""
     numbers = np.rint(times / Ts).astype(np.int64)
     end = taken if taken is not None else (int(numbers[-1]) + 1 if len(numbers) else 0)
     edges = np.concatenate([[-1], numbers, [max(end, int(numbers[-1]) + 1 if len(numbers) else 0)]])

@@ -1,4 +1,4 @@
-"""`HostLoopRun`: what a controller on this computer did, and its `Jitter`."""
+"""`HostLoopRun`: the run of a controller on this computer, and its `Jitter`."""
 
 from __future__ import annotations
 
@@ -28,38 +28,38 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 EDGES = np.array([m * 10.0**d for d in range(7) for m in (1.0, 2.0, 5.0)] + [1e7])
-"""Ends of the bins [us], 1 us to 10 s; what lies beyond counts in the first or last one."""
+"""Edges of the bins [us], 1 us to 10 s; values beyond count in the first or last bin."""
 PERCENT = (50.0, 99.0, 99.9)
 BAR = 30
 
 
 @dataclass(frozen=True, eq=False)
 class Jitter(Plotted):
-    """How late a loop awoke, how old its measurements were, and what it missed.
+    """How late a loop woke up, how old its measurements were, and what it missed.
 
-    These are measurements of one run on one computer under its load then: no operating system that
-    is not made for it bounds them.
+    These are measurements of one run on one computer under its load at the time; only a real-time
+    operating system puts a bound on them.
 
     Attributes
     ----------
     late : array, shape (N,)
-        From a deadline to the loop's being awake [us].
+        Time from a deadline until the loop was awake [us].
     age : array, shape (M,)
-        Of the newest sample at a tick [us], less the link's shortest delay.
+        Age of the newest sample at a tick [us], less the link's shortest delay.
     period : float
-        Of the loop [us].
+        Period of the loop [us].
     missed : int
-        Ticks that were skipped, as the loop awoke a period late or more.
+        Ticks skipped because the loop woke up a period late or more.
     blind : int
-        Ticks to which no new sample had come since the one before; the command stayed as it was.
+        Ticks without a new sample since the one before; the command stayed unchanged.
     unsent : int
         Commands that the port did not take.
     round_trip : float or None
-        Shortest time from a command to its answer [us]; the link's delay is within it.
+        Shortest time from a command to its answer [us]; it includes the link's delay.
     device_late : int or None
-        Latest control period of the device [us late], as it says.
+        Largest delay of a control period on the device [us], as it reports.
     real_time : str
-        What became of the wish for real-time scheduling.
+        Result of asking for real-time scheduling.
     """
 
     late: FloatArray
@@ -73,7 +73,7 @@ class Jitter(Plotted):
     real_time: str
 
     def percentiles(self) -> dict[str, dict[str, float]]:
-        """50, 99 and 99.9 % and the worst of lateness and age [us]; NaN where there are none."""
+        """Median, 99 and 99.9 % and worst of lateness and age [us]; NaN if there are none."""
         return {"late_us": _percentiles(self.late), "age_us": _percentiles(self.age)}
 
     def histogram(self) -> dict[str, NDArray[Any]]:
@@ -87,7 +87,7 @@ class Jitter(Plotted):
         return {"edges_us": EDGES.copy(), "late": _counted(self.late), "age": _counted(self.age)}
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything but the single ticks, as JSON values; null for what is not known."""
+        """Everything except the single ticks, as JSON values; null if unknown."""
         return {
             "period_us": self.period,
             "ticks": len(self.late),
@@ -179,7 +179,7 @@ def _table(found: dict[str, dict[str, float]]) -> list[str]:
 
 
 def _bars(counts: dict[str, NDArray[Any]]) -> list[str]:
-    """A line for each bin between the first and the last that hold something."""
+    """A line for each bin from the first to the last that is not empty."""
     both = counts["late"] + counts["age"]
     used = np.flatnonzero(both)
     if not len(used):
@@ -193,45 +193,45 @@ def _bars(counts: dict[str, NDArray[Any]]) -> list[str]:
 
 
 def _bar(count: int, largest: int) -> str:
-    """On a scale of logarithms, as what is rare is what matters."""
+    """A bar on a logarithmic scale, as the rare values matter most."""
     length = round(BAR * math.log1p(count) / math.log1p(largest))
     return f"{'#' * length + (f' {count}' if count else ''):<{BAR + 9}}"
 
 
-# --- HostLoopRun: what a controller on the host did -----------------------------------------------
+# --- HostLoopRun ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class HostLoopRun(Plotted):
-    """What a controller on the host did; entry k belongs to tick k, `t[k]` after the first.
+    """The run of a controller on the host; entry k is tick k, `t[k]` after the first.
 
     Attributes
     ----------
     t, r : array, shape (N,)
-        Time [s] and reference [y] of each tick that was reached. The first tick comes shortly after
-        the first samples, so that each finds fresh ones; the drive is on with command 0 until then.
+        Time [s] and reference [y] of each tick reached. The first tick follows shortly after the
+        first samples, so that each tick has fresh ones; until then the drive is on with command 0.
     u : array, shape (N,)
-        Command after the controller's limits [u]; NaN where the tick was missed.
+        Command after the controller's limits [u]; NaN if the tick was missed.
     y, feedback : array, shape (N,)
         Speed over the last period, from the counts, and the same after the feedback filter [y];
-        y is NaN where no new sample had come.
+        y is NaN without a new sample.
     late, age : array, shape (N,)
-        Lateness of the tick and age of its newest sample [s]; NaN where there is none.
+        Lateness of the tick and age of its newest sample [s]; NaN if there is none.
     samples : mapping
-        Every sample of the device that came, (n,): `t` [s] from the start of the run, then its
+        Every sample received from the device, (n,): `t` [s] from the start of the run, then its
         channels.
     sample_units : mapping
         Their units.
     gaps : tuple of (first, count)
-        Samples of the device that are missing.
+        Missing samples of the device.
     taken : int or None
-        Samples that the device took; None where it could not be asked.
+        Samples that the device took; None if it could not be asked.
     outcome : str
         completed, tripped, ended, silent, reset, port_lost or interrupted.
     message : str
-        What that means and what to do.
+        The outcome explained, and what to do.
     stop_confirmed : bool
-        Whether the device has answered STOP; where not, its watchdog stops the motor.
+        Whether the device confirmed STOP; if not, its watchdog stops the motor.
     jitter : Jitter
     controller : Controller
     device : Identity
@@ -270,7 +270,7 @@ class HostLoopRun(Plotted):
 
     @property
     def is_complete(self) -> bool:
-        """Whether the whole reference was run and every sample that the device took has come."""
+        """Whether the whole reference ran and every sample that the device took arrived."""
         return (
             self.outcome == "completed" and not self.gaps and self.taken == len(self.samples["t"])
         )
@@ -286,12 +286,12 @@ class HostLoopRun(Plotted):
         return {name: getattr(self, name) for name in self.units}
 
     def metrics(self) -> dict[str, float | None]:
-        """How well it tracked and what that took: `ClosedLoopRun.metrics` of the measured output.
+        """Tracking and effort: `ClosedLoopRun.metrics` of the measured output.
 
         Returns
         -------
         dict
-            None for what is not defined: nothing was run, or the reference is no step.
+            None for an undefined figure: nothing ran, or the reference is not a step.
         """
         measured, run = np.isfinite(self.y), np.isfinite(self.u)
         error = (self.r - self.y)[measured]
@@ -317,7 +317,7 @@ class HostLoopRun(Plotted):
         return {name: None if math.isnan(value) else value for name, value in found.items()}
 
     def drawing(self) -> Drawing:
-        """Output over reference, error, command, and how late each tick was."""
+        """Panels of output and reference, error, command, and lateness of the ticks."""
         trace = Trace.of(self.columns(), "measured", self.plant)
         limits = (self.controller.u_min, self.controller.u_max)
         panels = loop_panels([trace], self.units["y"], self.units["u"], limits)
@@ -331,14 +331,14 @@ class HostLoopRun(Plotted):
     def save_samples(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write every sample of the device as CSV, `.npz`, `.mat`, Parquet or MCAP.
 
-        Missing samples are NaN; in MCAP they are gaps. The file appears whole or not at all.
+        Missing samples are NaN; in MCAP they are gaps. The file appears complete or not at all.
 
         Parameters
         ----------
         path : path
             An existing file is replaced in one step, except a recording of a drive.
         overwrite : bool
-            Whether to replace such a recording as well.
+            Whether to replace a recording of a drive as well.
 
         Raises
         ------

@@ -17,9 +17,9 @@ from .ports import Port
 IDLE, CLOSED_LOOP = 1, 8
 """States of an axis."""
 TORQUE, PASSTHROUGH = 1, 1
-"""Its control mode and input mode."""
+"""Control mode and input mode during a run."""
 GIMBAL = 2
-"""The motor type whose commands are voltages."""
+"""Motor type with voltages as commands."""
 ARMS_WITHIN = 2.0
 
 
@@ -37,13 +37,12 @@ class ODrive(PolledBoard):
     axis : int
         0 or 1.
     counts_per_rev : float, optional
-        By default what the axis' encoder is configured for.
+        By default the configured value of the axis's encoder.
 
     Notes
     -----
-    During a run the axis' own watchdog is set to 0.2 s: where this computer dies, the ODrive
-    switches the motor off by itself. Afterwards control mode, input mode and watchdog are as
-    before.
+    During a run the axis's own watchdog is set to 0.2 s: if this computer dies, the ODrive switches
+    the motor off by itself. Afterwards control mode, input mode and watchdog are as before.
     """
 
     def __init__(
@@ -60,7 +59,7 @@ class ODrive(PolledBoard):
     ) -> None:
         if axis not in (0, 1) or isinstance(axis, bool):
             raise SettingError(name="axis", expected="0 or 1", received=repr(axis))
-        self._axis, self._asks_counts = axis, counts_per_rev is None
+        self._axis, self._reads_counts = axis, counts_per_rev is None
         self._before: dict[str, float] = {}
         self.unit = "N m"
         super().__init__(
@@ -80,7 +79,7 @@ class ODrive(PolledBoard):
                 received=f"firmware {version[0]}.{version[1]}",
                 remedy="others name their properties differently; `sewfast.Machine` takes your own",
             )  # fmt: skip
-        if self._asks_counts:
+        if self._reads_counts:
             self.counts_per_rev = self._read(f"{self._place}.encoder.config.cpr")
         if round(self._read(f"{self._place}.motor.config.motor_type")) == GIMBAL:
             self.unit = "V"
@@ -103,8 +102,8 @@ class ODrive(PolledBoard):
             raise self._unexpected(f"the number {what}", answer) from None
 
     def _write(self, what: str, value: float) -> None:
-        """Without an answer, unless it is refused; that is seen by the next question."""
-        self._tell(f"w {self._place}.{what} {value:g}")
+        """Set a property; only a refusal is answered, and the next question reads that answer."""
+        self._send(f"w {self._place}.{what} {value:g}")
 
     def _require_no_error(self) -> None:
         error = round(self._read(f"{self._place}.error"))
@@ -160,7 +159,7 @@ class ODrive(PolledBoard):
             )  # fmt: skip
 
     def _apply(self, u: float) -> None:
-        self._tell(f"c {self._axis} {u:.6f}")
+        self._send(f"c {self._axis} {u:.6f}")
 
     def _position(self) -> float:
         answer = self._ask(f"f {self._axis}")

@@ -1,4 +1,4 @@
-"""`Plan`: what a run is to do; `Outcome`: what became of it; the channels that the link carries."""
+"""`Plan`: the commands of a run, and its checks against the device; `Outcome`: its result."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from typing import Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..control.controller import SampledController
-from ..errors import SettingError
-from ..gains import vector
+from ..control.controller import Controller, SampledController
+from ..errors import LinkError, SettingError
+from ..gains import Gains, real, vector
+from ..units import counts_per_unit, spelled
 from . import wire
 from .clock import ClockBounds
-from .wire import Channel, Identity
+from .connection import Connection
+from .wire import Channel, Identity, Kind
 
 Mode: TypeAlias = Literal["commands", "controller", "direct"]
 Columns: TypeAlias = Mapping[str, NDArray[np.float64]]
@@ -25,7 +27,7 @@ DEFAULTS: dict[str, tuple[str, ...]] = {
     "controller": ("speed_true", "feedback", "r"),
     "direct": ("speed_true",),
 }
-"""Streamed beside `counts` and `u` where the device has them; a low baud rate drops the last."""
+"""Streamed besides `counts` and `u` if the device has them; a low baud rate drops the last."""
 BATCH = 10
 SPARE = 0.1
 _CAPABILITIES = {"commands": wire.PROFILE, "controller": wire.PID, "direct": wire.DIRECT}
@@ -33,20 +35,20 @@ _CAPABILITIES = {"commands": wire.PROFILE, "controller": wire.PID, "direct": wir
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run is to do.
+    """The commands or the references of a run, and what to stream.
 
     Parameters
     ----------
     mode : "commands", "controller" or "direct"
-        Play `values` as commands; run `controller` along them on the device; or send each as a
-        command when its time has come, which is only for slow plants.
+        Upload `values` as commands; run `controller` on the device with them as references; or send
+        each as a command at its time, which suits only slow plants.
     values : array, shape (N,)
         Commands in the unit of channel `u`, or references in the unit of the controller's output.
     controller : Controller, StateFeedback or None
-        Of mode "controller".
+        For mode "controller".
     columns : sequence of str or None
-        Channels to stream beside `counts` and `u`; None for those of the mode that the baud rate
-        carries.
+        Channels to stream besides `counts` and `u`; None for as many of the mode's usual ones as
+        the baud rate carries.
     batch : int or None
         Samples in a frame; None for the smallest number from 10 on that the baud rate carries.
 
@@ -86,10 +88,10 @@ class Plan:
 
 
 class Sink(Protocol):
-    """Takes what a run delivers; called on the thread of the run, so it must be quick."""
+    """Receives the samples and events of a run; called on its thread, so it must be quick."""
 
     def samples(self, first: int, columns: Columns) -> None:
-        """Samples `first`, `first + 1`, ..., no gap between them: arrays (n,) by channel."""
+        """Samples `first`, `first + 1`, ... without a gap: arrays (n,) by channel."""
 
     def event(self, kind: str, index: int, **detail: object) -> None:
         """Something happened at sample `index`.
@@ -101,22 +103,22 @@ class Sink(Protocol):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a run.
+    """The result of a run.
 
     Parameters
     ----------
     state : str
-        Of the device at the end.
+        State of the device at the end.
     reason : str
         "finished", "stopped", "cancelled", "interrupted", "failed", or why the device tripped.
     received : int
         Samples that arrived.
     taken : int or None
-        Samples that the device has taken; None where it could not be asked.
+        Samples that the device took; None if it could not be asked.
     gaps : tuple of (first, count)
-        Samples that are missing.
+        Missing samples.
     anomalies : tuple of (kind, sequence, count)
-        Frames that were not in order: of which kind, from which sequence number, how many.
+        Frames out of order: their kind, first sequence number and count.
     clock : ClockBounds or None
         None on credit, where there is no wall clock.
     columns : tuple of str
@@ -124,7 +126,7 @@ class Outcome:
     batch : int
         Samples in a frame.
     counters : mapping
-        How many frames and samples, in and out of order.
+        Numbers of frames and samples, in and out of order.
     """
 
     state: str
@@ -140,7 +142,7 @@ class Outcome:
 
     @property
     def is_complete(self) -> bool:
-        """Whether every sample that the device took has arrived."""
+        """Whether every sample that the device took arrived."""
         return self.taken == self.received and not self.gaps
 
     def __str__(self) -> str:
@@ -152,7 +154,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Layout:
-    """The channels that a run streams and how many samples go into a frame."""
+    """The channels that a run streams and the number of samples in a frame."""
 
     channels: tuple[Channel, ...]
     batch: int
@@ -167,11 +169,12 @@ class Layout:
 
 
 def require_capable(plan: Plan, identity: Identity) -> None:
-    """Refuse what the device does not offer.
+    """Refuse a plan that the device cannot run.
 
     Raises
     ------
     SettingError
+        For a mode that it does not offer, or a controller with another sample time.
     """
     if not identity.capabilities & _CAPABILITIES[plan.mode]:
         raise SettingError(
@@ -198,7 +201,7 @@ def layout(plan: Plan, channels: Sequence[Channel], identity: Identity, baud: fl
     Raises
     ------
     SettingError
-        Where the columns asked for are unknown or too much; the message names those to leave out.
+        If the columns asked for are unknown or too many; the message names those to leave out.
     """
     names = {c.name: c for c in channels}
     wanted = DEFAULTS[plan.mode] if plan.columns is None else tuple(plan.columns)
@@ -222,7 +225,7 @@ def layout(plan: Plan, channels: Sequence[Channel], identity: Identity, baud: fl
 
 
 def _batch(plan: Plan, chosen: Sequence[Channel], identity: Identity, baud: float) -> int | None:
-    """The smallest batch that fits, or the one asked for if it does."""
+    """The smallest batch that fits, or the one asked for if it fits."""
     encodings = [c.encoding for c in chosen]
     tries = range(BATCH, 101) if plan.batch is None else (plan.batch,)
     fits = (b for b in tries if _fits(encodings, b, identity, baud))
@@ -254,3 +257,128 @@ def _too_much(plan: Plan, out: Sequence[Channel], identity: Identity, baud: floa
         f"{batch}",
         received="more", remedy=f"{leave}, or raise the baud rate of both sides",
     )  # fmt: skip
+
+
+# --- before anything moves: channels, limits and controllers of the device ------------------------
+
+
+def channels(link: Connection) -> tuple[Channel, ...]:
+    """The device's description of its channels.
+
+    Raises
+    ------
+    LinkError
+        If it does not match the device's schema hash.
+    """
+    identity = link.identity
+    bodies = [link.ask(Kind.DESCRIBE, bytes([k])) for k in range(identity.channels)]
+    if wire.schema_hash(identity.version, identity.period_us, bodies) != identity.schema:
+        raise LinkError(
+            name=link.port.url, expected="channels that match the device's schema hash",
+            received="others", remedy="connect again, or fix the firmware",
+        )  # fmt: skip
+    found = tuple(map(wire.channel, bodies))
+    if (found[0].encoding, found[1].encoding) != (0, 1):
+        raise LinkError(
+            name=link.port.url, expected="channel 0 to be counts and 1 the command",
+            received=f"encodings {found[0].encoding} and {found[1].encoding}",
+            remedy="fix the firmware",
+        )  # fmt: skip
+    return found
+
+
+def limit(name: str, value: float | None, present: float, ceiling: float) -> float:
+    """The limit to set: the one asked for, the one in force, or the device's ceiling.
+
+    Raises
+    ------
+    SettingError
+        For a limit that is not above 0 or is above the ceiling.
+    """
+    if value is None:
+        return present if present else ceiling
+    if not 0.0 < real(name, value) <= ceiling * (1.0 + 1e-6):
+        raise SettingError(
+            name=name, expected=f"above 0 and at most {ceiling:g}, the device's ceiling",
+            received=f"{value}", remedy=f"{'lower' if value > ceiling else 'raise'} it",
+        )  # fmt: skip
+    return min(value, ceiling)
+
+
+def require_units(controller: SampledController, streamed: Sequence[Channel]) -> None:
+    """Refuse a controller with other units than the device's.
+
+    Raises
+    ------
+    SettingError
+        If command or output have another unit.
+    """
+    units = {c.name: c.unit for c in streamed}
+    _require_units(controller.u_unit, units.get("u", ""), "command")
+    _require_units(controller.y_unit, units.get("feedback", "RPM"), "output")
+
+
+def fitting(controller: Controller, streamed: Sequence[Channel]) -> Gains:
+    """The controller's gains in standard form; refuses other units as `require_units`."""
+    require_units(controller, streamed)
+    return controller.gains.to("standard")
+
+
+def other_kind(
+    controller: SampledController, streamed: Sequence[Channel], identity: Identity
+) -> bytes:
+    """Body of CONTROLLER for any controller but a PID, with the encoder of the device.
+
+    Raises
+    ------
+    SettingError
+        If it has other units than the device, or the firmware does not know it.
+    """
+    require_units(controller, streamed)
+    if not identity.capabilities & wire.KINDS:
+        raise SettingError(
+            name="controller", expected="a PID (Controller) for this device",
+            received=f"{type(controller).__name__}, which its firmware does not know",
+            remedy="tune a PID (--controller pid), or build the firmware with this sewfast and set "
+            "SEWFAST_CAN_KINDS",
+        )  # fmt: skip
+    kind, numbers = controller.sent()
+    return wire.controller(
+        kind, counts_per_unit(identity.counts_per_rev, controller.y_unit), numbers
+    )
+
+
+def gains(controller: Controller, streamed: Sequence[Channel], identity: Identity) -> bytes:
+    """Body of GAINS for a controller, with the encoder of the device.
+
+    Raises
+    ------
+    SettingError
+        If its gains have other units than the device, or the firmware does not know its parts.
+    """
+    g, c = fitting(controller, streamed), controller
+    named = ("observer_time", bool(c.observer_time)), ("r_rate", c.r_rate != math.inf)
+    further = [name for name, used in (*named, ("schedule", bool(c.schedule))) if used]
+    unknown = [] if identity.capabilities & wire.DESIGN else list(further)
+    if c.biquads and not identity.capabilities & wire.BIQUADS:
+        unknown.append("biquads")
+    if unknown:
+        raise SettingError(
+            name="controller", expected=f"one without {' and '.join(unknown)} for this device",
+            received="one with what its firmware does not know",
+            remedy="leave it out, or build the firmware with this sewfast",
+        )  # fmt: skip
+    values = (
+        g.Kp, g.Ti, g.Td, c.alpha, c.beta, c.N, c.Tt, c.u_min, c.u_max, c.slew, c.filter_time,
+        counts_per_unit(identity.counts_per_rev, g.y_unit),
+    )  # fmt: skip
+    design = (c.observer_time, c.r_rate, c.schedule_rows()) if further else None
+    return wire.gains(values, c.filter_samples, design)
+
+
+def _require_units(given: str, device: str, what: str) -> None:
+    if spelled(given) != spelled(device):
+        raise SettingError(
+            name="controller", expected=f"one whose {what} is in {device}, as the device's",
+            received=given, remedy="convert its gains",
+        )  # fmt: skip

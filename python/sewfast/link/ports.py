@@ -1,8 +1,8 @@
-"""Ports: bytes to a device and back, over a serial line or a network; how each fails, what to do.
+"""Ports: bytes to and from a device over a serial line or a network; their failures and remedies.
 
-Read in this order: `Port`, what every transport has; `SerialPort`, `SocketPort`, `UdpPort`; the
-table `TRANSPORTS`, in which a transport is one row, and `open_port`. A new one is a class and its
-row: its address, how it carries bytes, what its failures mean.
+Read in this order: `Port`, the base class; `SerialPort`, `SocketPort`, `UdpPort`; the table
+`TRANSPORTS` with a row for each, and `open_port`. A new transport is a class (its address, how it
+carries bytes, the meaning of its failures) and a row.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ except ImportError:  # Windows
     _TERMINAL = ()
 
 FAILURES: tuple[type[Exception], ...] = (OSError, ValueError, TypeError, *_TERMINAL)
-"""What opening, reading and writing a port can raise: pyserial's own kind is an OSError, a port
-closed under it is a TypeError, a cable pulled while it is set up a termios.error."""
+"""Exceptions from opening, reading and writing a port: pyserial's own is an OSError, a port closed
+by another thread raises a TypeError, a cable pulled while it is set up a termios.error."""
 
 _MISSING = {errno.ENOENT, errno.ENXIO, errno.ENODEV}
 _DENIED = {errno.EACCES, errno.EPERM}
@@ -43,14 +43,14 @@ _NO_TERMINAL = {errno.ENOTTY, errno.EINVAL, errno.EISDIR}
 _UNREACHABLE = {errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN}
 
 Texts: TypeAlias = tuple[str, str, str]
-"""Of a failure: expected, received, remedy."""
+"""Texts of a failure: expected, received, remedy."""
 
 A_PORT = "a serial port"
-"""What is expected instead of a file, a folder or a device of another kind."""
+"""The expectation in the error for a file, a folder or a device of another kind."""
 
 
 def explain(url: str, doing: Literal["open", "read", "write"], error: BaseException) -> LinkError:
-    """The error as it is raised: expected, received, remedy."""
+    """The `LinkError` to raise for a failure of a port."""
     if isinstance(error, LinkError):
         return LinkError(
             name=url, expected="an open port", received=str(error), remedy="connect again"
@@ -64,7 +64,7 @@ def explain(url: str, doing: Literal["open", "read", "write"], error: BaseExcept
 
 
 def _number(error: BaseException) -> int | None:
-    """The operating system's number of an error; pyserial often keeps it in the text only."""
+    """The operating system's number of an error; pyserial often gives it only in the text."""
     if isinstance(error, OSError) and error.errno is not None:
         return error.errno
     if error.args and isinstance(error.args[0], int):
@@ -85,46 +85,42 @@ def _plain(error: BaseException) -> str:
     return str(text).strip() or type(error).__name__
 
 
-# --- `Unique`: what is open in one place cannot be in two -----------------------------------------
+# --- `Unique`: objects that own a port ------------------------------------------------------------
 
 
 class Unique:
-    """Base of what owns a port: a copy would close the original's when it goes."""
+    """Base class of the owners of a port: a deleted copy would close the original's port."""
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:
-        raise _refusal(self)
-
-
-def _refusal(owner: Any) -> SettingError:
-    name = type(owner).__name__
-    return SettingError(
-        name="port", expected="one owner", received=f"a copy of a {name}",
-        remedy=f"pass the {name} itself on, or connect in the process that uses it",
-    )  # fmt: skip
+        name = type(self).__name__
+        raise SettingError(
+            name="port", expected="one owner", received=f"a copy of a {name}",
+            remedy=f"pass the {name} itself on, or connect in the process that uses it",
+        )  # fmt: skip
 
 
 # --- Ports ----------------------------------------------------------------------------------------
 
 
 CHUNK = 65_536
-"""Bytes asked for at once; a port gives what it has."""
+"""Most bytes to read at once."""
 WRITE_TIMEOUT = 1.0
 CONNECT_TIMEOUT = 5.0
 
 
 class Port(Unique, ABC):
-    """Bytes in and out; every way it can fail is a `LinkError`.
+    """Bytes in and out; every failure is a `LinkError`.
 
-    A transport says how its addresses are written (`form`) and whether they are devices of this
-    computer (`is_local`), opens, reads, writes and closes, and knows what its failures mean
-    (`opening`, `losing`).
+    A transport defines the form of its addresses (`form`) and whether they are devices of this
+    computer (`is_local`), opens, reads, writes and closes, and explains its failures (`opening`,
+    `losing`).
 
     Parameters
     ----------
     url : str
-        What was asked for, as messages repeat it.
+        The address as given, for messages.
     baud : int
-        Bits per second; a socket has none and keeps the number only.
+        Bits per second; a socket only stores the number.
     """
 
     form: ClassVar[str]
@@ -141,50 +137,50 @@ class Port(Unique, ABC):
 
     @abstractmethod
     def read(self, timeout: float) -> bytes:
-        """What has come, as soon as anything has; empty after `timeout` seconds without a byte.
+        """The bytes received, as soon as there are any; empty after `timeout` seconds without one.
 
         Raises
         ------
         LinkError
-            Where the port vanished, the other side closed it, or it is closed.
+            If the port vanished, the other side closed it, or it is closed.
         """
 
     @abstractmethod
     def write(self, data: bytes) -> None:
-        """All of `data`, or an error.
+        """Write all of `data`.
 
         Raises
         ------
         LinkError
-            Where the port vanished or takes no bytes for a second.
+            If the port vanished or takes no bytes for a second.
         """
 
     @abstractmethod
     def fileno(self) -> int:
-        """Its descriptor, for who reads and writes without the interpreter.
+        """Its descriptor, for code that reads and writes outside the interpreter.
 
         Raises
         ------
         LinkError
-            Where it is closed.
+            If it is closed.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Give it back; more than once does no harm, and nothing is raised."""
+        """Close it; a second time does nothing, and nothing is raised."""
 
     @property
     def max_rate(self) -> float:
-        """Bits per second that it carries; inf where nothing bounds them."""
+        """Bits per second that it carries; inf if there is no limit."""
         return self.baud
 
     def describe(self) -> str:
-        """What can be said of it once it is open."""
+        """A description of the open port."""
         return "connected"
 
     @staticmethod
     def opening(url: str, number: int | None, error: BaseException) -> Texts:
-        """What was expected, what came and what to do where it does not open.
+        """Expected, received and remedy for a port that does not open.
 
         Parameters
         ----------
@@ -197,7 +193,7 @@ class Port(Unique, ABC):
 
     @staticmethod
     def losing(url: str, number: int | None, error: BaseException) -> Texts:
-        """The same of one that was open."""
+        """The same for a port that was open."""
         if isinstance(error, TimeoutError) or "timeout" in str(error).lower():
             remedy = "check that the device runs; unplug it if it hangs"
             return "the port to take bytes", f"none taken within {WRITE_TIMEOUT:g} s", remedy
@@ -207,7 +203,7 @@ class Port(Unique, ABC):
         return "an open port", "one that vanished", "check cable and supply, then connect again"
 
     def reopen(self, timeout: float = CONNECT_TIMEOUT) -> None:
-        """Close it and open the same again.
+        """Close the port and open it again.
 
         Parameters
         ----------
@@ -217,7 +213,7 @@ class Port(Unique, ABC):
         Raises
         ------
         LinkError
-            Where it is not there (yet).
+            If it is not there (yet).
         """
         self.close()
         self._patience = timeout
@@ -235,7 +231,7 @@ class Port(Unique, ABC):
 
 
 class SerialPort(Port):
-    """A serial device by its path or COM name; nobody else may open it meanwhile."""
+    """A serial device by its path or COM name, opened exclusively."""
 
     form = "a serial port's path (/dev/ttyUSB0), a COM name (COM3)"
     is_local = True
@@ -300,7 +296,7 @@ class SerialPort(Port):
 
     def close(self) -> None:
         if self._serial is not None:
-            # a port that has vanished cannot be given back
+            # a vanished port cannot be closed
             with suppress(*FAILURES):
                 self._serial.close()
             self._serial = None
@@ -329,7 +325,7 @@ class NetworkPort(Port):
 
     @abstractmethod
     def _received(self, connection: socket.socket) -> bytes:
-        """What a socket that is ready holds."""
+        """Read from a socket that is ready."""
 
     @abstractmethod
     def _sent(self, connection: socket.socket, data: bytes) -> None: ...
@@ -371,7 +367,7 @@ class NetworkPort(Port):
 
 
 class SocketPort(NetworkPort):
-    """A TCP connection; bytes that wait when it opens are kept."""
+    """A TCP connection."""
 
     form = "socket://HOST:PORT"
 
@@ -395,14 +391,14 @@ class SocketPort(NetworkPort):
 
 
 DATAGRAM = 1200
-"""Bytes of a datagram at most: with any header it passes every network in one piece."""
+"""Most bytes of a datagram: with any header it passes every network unfragmented."""
 
 
 class UdpPort(NetworkPort):
-    """Datagrams to one address and from it: those of anybody else are not heard.
+    """Datagrams to and from one address; those from other addresses are ignored.
 
-    Each carries whole frames, so that one that is lost costs no other its frames. What the network
-    loses, repeats or delivers late is seen by the frames' numbers, as on any port.
+    Each holds whole frames, so that losing one damages no frame of another. The frames' sequence
+    numbers show what the network loses, repeats or delivers late, as on any port.
     """
 
     form = "udp://HOST:PORT"
@@ -431,14 +427,14 @@ class UdpPort(NetworkPort):
 
     @staticmethod
     def losing(url: str, number: int | None, error: BaseException) -> Texts:
-        # the other computer says so when a datagram arrives
+        # the other computer refuses only when the first datagram arrives
         if number == errno.ECONNREFUSED:
             return NetworkPort.opening(url, number, error)
         return NetworkPort.losing(url, number, error)
 
 
 def _datagrams(data: bytes) -> Iterator[bytes]:
-    """The bytes in pieces that end where a frame ends; frames end with a zero."""
+    """The bytes in pieces of whole frames; a frame ends with a zero."""
     start = 0
     while start < len(data):
         end = min(start + DATAGRAM, len(data))
@@ -449,11 +445,11 @@ def _datagrams(data: bytes) -> Iterator[bytes]:
 
 
 TRANSPORTS: dict[str, type[Port]] = {"": SerialPort, "socket": SocketPort, "udp": UdpPort}
-"""Transports by what stands before `://` in an address; none is a serial port."""
+"""Transports by the scheme before `://` in an address; without one, it is a serial port."""
 
 
 def transport_of(url: str) -> type[Port] | None:
-    """The transport of an address; None for a name of another kind."""
+    """The transport of an address; None for any other name."""
     scheme, separated, _ = url.partition("://")
     if separated:
         return TRANSPORTS.get(scheme) if scheme else None
@@ -486,9 +482,9 @@ def open_port(url: str, baud: int = 115_200) -> Port:
     Raises
     ------
     LinkError
-        Where it cannot be opened; the message says why and what to do.
+        If it cannot be opened; the message says why and what to do.
     SettingError
-        For a name of another kind, or where pyserial is not installed.
+        For a name that is no address, or if pyserial is not installed.
     """
     if not isinstance(baud, int) or isinstance(baud, bool) or baud <= 0:
         raise SettingError(
@@ -516,14 +512,14 @@ class PortInfo:
     Parameters
     ----------
     path : str
-        What `open_port` takes.
+        Its address for `open_port`.
     description : str
     vid, pid : int or None
         Of a USB port.
     serial_number : str or None
         Of a USB port.
     problem : str or None
-        Why it cannot be opened and what to do; None where nothing speaks against it.
+        Why it cannot be opened and what to do; None if no problem is known.
     """
 
     path: str
@@ -535,19 +531,19 @@ class PortInfo:
 
     @property
     def can_open(self) -> bool:
-        """Whether nothing is known that speaks against opening it."""
+        """Whether no problem with opening it is known."""
         return self.problem is None
 
 
 def list_ports() -> list[PortInfo]:
     """The serial ports of this computer, by path.
 
-    None is opened: that alone would restart many boards.
+    They are not opened: opening alone would restart many boards.
 
     Raises
     ------
     SettingError
-        Where pyserial is not installed.
+        If pyserial is not installed.
     """
     _pyserial()
     from serial.tools.list_ports import comports
@@ -576,7 +572,7 @@ def _pyserial() -> Any:
 
 
 def _permission(url: str) -> str:
-    """Linux gives serial ports to a group; its name differs between distributions."""
+    """The remedy of a denied port: join its group, whose name differs between distributions."""
     group = "dialout"
     try:
         import grp
@@ -605,7 +601,7 @@ def _address(url: str) -> tuple[str, int]:
 
 
 def _read(port: Any, timeout: float) -> bytes | None:
-    """None where the port is ready and gives nothing: a device that is gone."""
+    """The bytes received; None if the port is ready but empty: its device is gone."""
     _require(port)
     if os.name == "nt":
         port.timeout = timeout

@@ -1,4 +1,4 @@
-"""A plan on a drive, into memory, a recording file and a live view."""
+"""Runs of a drive, recorded: into memory, a recording file and a live view."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _OF_A_RUN = ("started", "gap")
-"""Events that say that the device has accepted a start."""
+"""Events that show that the device has accepted a start."""
 
 
 class Recorder:
@@ -42,12 +42,12 @@ class Recorder:
     n : int
         Samples of the run.
     writer : RecordWriter, optional
-        The file, a lazy one: it gets nothing before the run has begun. The samples are then not
-        kept in memory.
+        A lazy file, which is created when the run has begun. With it, the samples are not kept in
+        memory.
     feed : Feed, optional
         Of a live view.
     watch : Watch, optional
-        What it raises ends the run.
+        Called with the samples; an exception from it ends the run.
     """
 
     def __init__(
@@ -69,12 +69,12 @@ class Recorder:
         self._early: list[tuple[str, int | None, dict[str, Any]]] = []
 
     def samples(self, first: int, columns: Mapping[str, FloatArray]) -> None:
-        """A batch that came; called by the thread that owns the link.
+        """Take a batch of samples; called by the thread that owns the link.
 
         Raises
         ------
         DataError
-            Where the file takes no more.
+            If the file cannot be written.
         """
         self._begin()
         if self._file is not None:
@@ -90,78 +90,78 @@ class Recorder:
             self._watch(first, columns["u"], columns["counts"])
 
     def event(self, kind: str, index: int | None = None, **detail: Any) -> None:
-        """Something that happened on the way; see `samples`."""
+        """Take an event; see `samples`."""
         if kind in _OF_A_RUN:
             self._begin()
         if self._begun:
-            self._write_down(kind, index, detail)
+            self._write_event(kind, index, detail)
         else:
             self._early.append((kind, index, detail))
         if self._feed is not None:
             self._feed.say(describe(kind, index, detail))
 
     def _begin(self) -> None:
-        """The run is there: what happened on the way to it belongs to its recording."""
+        """The run has begun: write the events before it, which belong to its recording."""
         if not self._begun:
             self._begun = True
             for event in self._early:
-                self._write_down(*event)
+                self._write_event(*event)
 
-    def _write_down(self, kind: str, index: int | None, detail: Mapping[str, Any]) -> None:
+    def _write_event(self, kind: str, index: int | None, detail: Mapping[str, Any]) -> None:
         if self._file is not None:
             self._file.event(kind, index, **{k: _finite_or_none(v) for k, v in detail.items()})
 
     def columns(self) -> dict[str, FloatArray]:
-        """What came, sample 0 to the last one, NaN in gaps; where there is no file."""
+        """The samples received, 0 to the last one, NaN in gaps; only without a file."""
         return {name: values[: self._end] for name, values in self._kept.items()}
 
     def close(self, outcome: str, taken: int | None) -> None:
-        """Write what waits and close the file.
+        """Flush and close the file.
 
         Parameters
         ----------
         outcome : str
-            How it ended.
+            How the run ended.
         taken : int or None
-            Samples that the device took, where that is known.
+            Samples that the device took; None if unknown.
 
         Raises
         ------
         DataError
-            Where the file could not be written to its end.
+            If the file could not be completed.
         """
         if self._file is not None:
             self._file.close(outcome, taken=taken)
 
 
 def _finite_or_none(value: Any) -> Any:
-    """What JSON can say: a device may send infinity as the value of an event."""
+    """The value, or None for a number that JSON lacks: a device can send infinity."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def describe(kind: str, index: int | None, detail: Mapping[str, Any]) -> str:
     """An event as a line of text."""
     at = "" if index is None else f" at sample {index}"
-    said = ", ".join(f"{name} {value}" for name, value in detail.items())
-    return f"{kind}{at}" + (f": {said}" if said else "")
+    text = ", ".join(f"{name} {value}" for name, value in detail.items())
+    return f"{kind}{at}" + (f": {text}" if text else "")
 
 
-# --- play: a plan on a drive, into memory or a recording file, in front of a live view ------------
+# --- run_plan: a plan on a drive, recorded --------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
-class Played:
-    """What came of a plan.
+class RunResult:
+    """The samples of a run and its outcome.
 
     Attributes
     ----------
     columns : dict of name to array, shape (N,)
-        Row k is sample k of the run; NaN where the link lost it. N is what the device took, the
-        planned number after a whole run.
+        Row k is sample k of the run; NaN if the link lost it. N is the number that the device took,
+        the planned one after a complete run.
     outcome : Outcome
         How it ended.
     file : Path or None
-        The recording that was written, where the run had begun.
+        The recording; None without a file, and if the run never began.
     """
 
     columns: dict[str, FloatArray]
@@ -170,19 +170,19 @@ class Played:
 
 
 class Stopped(Exception):
-    """A run that did not end by itself: `cause` stopped it, `played` is what had come."""
+    """A run that was stopped by `cause`; `run` holds the samples until then."""
 
-    def __init__(self, played: Played, cause: BaseException) -> None:
+    def __init__(self, run: RunResult, cause: BaseException) -> None:
         super().__init__(str(cause))
-        self.played = played
+        self.run = run
         self.cause = cause
 
-    def as_error(self, made: Callable[[Played], Any]) -> BaseException:
-        """`Interrupted` after Ctrl-C, else the cause; both carry what `made` makes of the run."""
-        result = made(self.played)
+    def as_error(self, convert: Callable[[RunResult], Any]) -> BaseException:
+        """`Interrupted` after Ctrl-C, else the cause; both carry the converted run."""
+        result = convert(self.run)
         if isinstance(self.cause, KeyboardInterrupt):
             return Interrupted(result)
-        file = self.played.file
+        file = self.run.file
         kept = f"; what came is in {file}" if file is not None else ""
         error = LinkError(f"{self.cause}{kept}") if kept else self.cause
         if isinstance(error, LinkError):
@@ -190,7 +190,7 @@ class Stopped(Exception):
         return error
 
 
-def play(
+def run_plan(
     drive: Drive,
     plan: Plan,
     *,
@@ -201,7 +201,7 @@ def play(
     settings: Mapping[str, Any] | None = None,
     watch: Watch | None = None,
     cancel: threading.Event | None = None,
-) -> Played:
+) -> RunResult:
     """Run a plan and keep its samples.
 
     Parameters
@@ -211,24 +211,24 @@ def play(
     name : str
         Of the excitation or reference.
     file : path, optional
-        An MCAP recording, written as the samples come; without it they are in memory only. It is
-        made when the device has accepted the start: a run that is refused leaves no file, and one
-        that is there as it was.
+        An MCAP recording, written as the samples arrive; without it they are only in memory. It is
+        created when the device has accepted the start: a refused run leaves no file, and an
+        existing one unchanged.
     live : str or Kind
         See `sewfast.live.open_view`.
     overwrite : bool
-        Whether a recording of a drive may be replaced; one of a virtual machine may.
+        Whether to replace a recording of a drive; one of a virtual machine is replaced anyway.
     settings : mapping, optional
-        What else the file says of the run.
+        Further settings of the run for the file.
     watch : Watch, optional
-        Sees the samples as they come, and ends the run by what it raises.
+        Called with the samples as they arrive; an exception from it ends the run.
     cancel : threading.Event, optional
-        Set in another thread, it ends the run as Ctrl-C does.
+        Set it in another thread to end the run as Ctrl-C does.
 
     Raises
     ------
     Stopped
-        Where a trip, port, device, disk or Ctrl-C ended it; the motor has been stopped and the file
+        If a trip, port, device, disk or Ctrl-C ended it; the motor has been stopped and the file
         closed.
     SettingError, DataError
         Before anything moves.
@@ -243,12 +243,12 @@ def play(
     with open_view(live, feed):
         writer = _writer(file, drive, plan, name, columns, settings or {})
         recorder = Recorder(columns, n, writer=writer, feed=feed, watch=watch)
-        played = _streamed(drive, plan, recorder, writer, cancel)
-    if played.outcome.reason == "cancelled" and cancel is not None and cancel.is_set():
-        raise Stopped(played, KeyboardInterrupt())
-    if played.outcome.reason != "finished":
-        raise Stopped(played, _not_finished(played.outcome, n, drive))
-    return played
+        run = _stream(drive, plan, recorder, writer, cancel)
+    if run.outcome.reason == "cancelled" and cancel is not None and cancel.is_set():
+        raise Stopped(run, KeyboardInterrupt())
+    if run.outcome.reason != "finished":
+        raise Stopped(run, _not_finished(run.outcome, n, drive))
+    return run
 
 
 def excite(
@@ -262,10 +262,10 @@ def excite(
 ) -> Recording:
     """Commands on a drive; see `Drive.excite`."""
 
-    def made(played: Played) -> Recording:
-        return _recording(played.columns, drive, name, method)
+    def convert(run: RunResult) -> Recording:
+        return _recording(run.columns, drive, name, method)
 
-    return _made(drive, Plan("commands", u), made, name=name, settings=settings, **options)
+    return _converted(drive, Plan("commands", u), convert, name=name, settings=settings, **options)
 
 
 def follow(
@@ -273,24 +273,24 @@ def follow(
 ) -> RecordedRun:
     """A controller on a drive along a reference; see `Drive.follow`."""
 
-    def made(played: Played) -> RecordedRun:
-        return _run(played.columns, drive, controller, r, name)
+    def convert(run: RunResult) -> RecordedRun:
+        return _run(run.columns, drive, controller, r, name)
 
-    return _made(drive, Plan("controller", r, controller), made, name=name, **options)
+    return _converted(drive, Plan("controller", r, controller), convert, name=name, **options)
 
 
-def _made(drive: Drive, plan: Plan, made: Callable[[Played], T], **options: Any) -> T:
-    """What `made` makes of the run; an error carries what it makes of what had come."""
+def _converted(drive: Drive, plan: Plan, convert: Callable[[RunResult], T], **options: Any) -> T:
+    """Run a plan and convert its result; an error carries the converted partial run."""
     try:
-        return made(play(drive, plan, **options))
+        return convert(run_plan(drive, plan, **options))
     except Stopped as stopped:
-        raise stopped.as_error(made) from stopped.cause
+        raise stopped.as_error(convert) from stopped.cause
 
 
 def _recording(
     columns: Mapping[str, FloatArray], drive: Drive, name: str, method: Method
 ) -> Recording:
-    """Counts from the first sample on; the speed as far as gaps let it be known."""
+    """Counts from the first sample on; the speed where gaps leave enough samples for it."""
     Ts, per_rev = drive.identity.Ts, drive.identity.counts_per_rev
     counts = columns["counts"]
     known = counts[np.isfinite(counts)]
@@ -306,7 +306,7 @@ def _run(
     r: FloatArray,
     name: str,
 ) -> RecordedRun:
-    """The run as the drive streamed it; what it left out is computed, or is NaN."""
+    """The run as the drive streamed it; a column that is missing is computed, or NaN."""
     recording = _recording(columns, drive, name, "kalman")
     n, true = len(recording), recording.speed_true
     return RecordedRun(
@@ -348,63 +348,59 @@ def _writer(
         settings={"mode": plan.mode, **conditions_of(drive), **controller, **settings},
     )
     place = Path(file)
-    # that it may be replaced where it exists has been asked
+    # whether an existing file may be replaced was checked before
     return RecordWriter(place, header, overwrite=place.exists(), lazy=True)
 
 
 def device_of(drive: Drive) -> dict[str, Any]:
-    """What a recording says of the drive that it was made on."""
+    """The description of a drive in a recording."""
     return {"kind": "drive", **asdict(drive.identity)}
 
 
 def conditions_of(drive: Drive) -> dict[str, Any]:
-    """Limits and watchdog in force, as a recording states them."""
-    return {"limits": _finite(drive.limits().values), "watchdog_s": drive.watchdog}
-
-
-def _finite(limits: tuple[float, ...]) -> dict[str, float | None]:
+    """Limits and watchdog in force, for a recording."""
     names = ("volt", "speed_rpm", "acceleration", "current")
-    pairs = zip(names, limits, strict=True)
-    return {name: value if np.isfinite(value) else None for name, value in pairs}
+    limits = zip(names, drive.limits().values, strict=True)
+    return {
+        "limits": {name: _finite_or_none(value) for name, value in limits},
+        "watchdog_s": drive.watchdog,
+    }
 
 
-def _streamed(
+def _stream(
     drive: Drive,
     plan: Plan,
     recorder: Recorder,
     writer: RecordWriter | None,
     cancel: threading.Event | None,
-) -> Played:
-    """Stream, close the file whatever happens, and give what came."""
-    # of this run, not of one before it
+) -> RunResult:
+    """Stream, close the file in any case, and return the samples received."""
+    # must not be that of an earlier run
     drive.outcome = None
     try:
         outcome = drive.stream(plan, recorder, **cancelled_by(cancel))
     except BaseException as error:
         ended = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-        _closed(recorder, ended, drive.outcome, error)
+        try:
+            recorder.close(ended, None if drive.outcome is None else drive.outcome.taken)
+        except SewfastError as second:
+            # the error of the run tells more than the one of closing
+            if second is not error:
+                error.__context__ = second
         if not isinstance(error, (KeyboardInterrupt, SewfastError)) or drive.outcome is None:
             raise
-        raise Stopped(_played(recorder, writer, drive.outcome), error) from error
-    recorder.close(_word(outcome), outcome.taken)
-    return _played(recorder, writer, outcome)
-
-
-def _closed(recorder: Recorder, ended: str, outcome: Outcome | None, error: BaseException) -> None:
-    """Close the file; the error that is on its way says more than one of closing."""
-    try:
-        recorder.close(ended, None if outcome is None else outcome.taken)
-    except SewfastError as second:
-        if second is not error:
-            error.__context__ = second
+        raise Stopped(_result(recorder, writer, drive.outcome), error) from error
+    ended = "complete" if outcome.reason == "finished" else outcome.reason
+    recorder.close(f"tripped: {ended}" if outcome.state == "tripped" else ended, outcome.taken)
+    return _result(recorder, writer, outcome)
 
 
 _LONGEST = 10.0
-"""Watchdog time of the protocol [s]."""
+"""Longest watchdog time of the protocol [s]."""
 
 
 def _more_time(watchdog: float) -> str:
-    """What a busy computer needs: more than there was, where there is more."""
+    """The remedy for a busy computer: a longer watchdog time, up to the longest."""
     longer = min(max(0.25, 2.0 * watchdog), _LONGEST)
     if longer <= watchdog:
         return ""
@@ -415,11 +411,11 @@ def _more_time(watchdog: float) -> str:
 
 
 _LIMITED = {"speed": (1, "RPM"), "acceleration": (2, "RPM/s"), "current": (3, "A")}
-"""Trips with a limit of their own: its place among the limits, its unit."""
+"""Trips by a limit: its place among the limits, its unit."""
 
 
 def _why(reason: str, drive: Drive) -> str:
-    """The reason of a trip, with what was in force."""
+    """The reason of a trip, with the limit or the time that was in force."""
     if reason == "watchdog":
         return f"{reason}, it had heard nothing for {drive.watchdog * 1e3:g} ms"
     if reason not in _LIMITED:
@@ -431,27 +427,14 @@ def _why(reason: str, drive: Drive) -> str:
         return reason
 
 
-def _word(outcome: Outcome) -> str:
-    """How the recording says that it ended."""
-    if outcome.reason == "finished":
-        return "complete"
-    return f"tripped: {outcome.reason}" if outcome.state == "tripped" else outcome.reason
-
-
-def _played(recorder: Recorder, writer: RecordWriter | None, outcome: Outcome) -> Played:
+def _result(recorder: Recorder, writer: RecordWriter | None, outcome: Outcome) -> RunResult:
+    """The samples, with NaN for those at the end that the device took and the link lost."""
     file = writer.path if writer is not None and writer.is_made else None
     columns = recorder.columns() if file is None else dict(read_recording(file).columns)
-    n = outcome.taken if outcome.taken is not None else len(next(iter(columns.values())))
-    return Played({name: _padded(values, n) for name, values in columns.items()}, outcome, file)
-
-
-def _padded(values: FloatArray, n: int) -> FloatArray:
-    """NaN for samples at the end that the device took and the link lost."""
-    if len(values) >= n:
-        return values
-    padded = np.full(n, np.nan)
-    padded[: len(values)] = values
-    return padded
+    received = len(next(iter(columns.values())))
+    lost = np.full(max(0, (outcome.taken or 0) - received), np.nan)
+    padded = {name: np.concatenate([values, lost]) for name, values in columns.items()}
+    return RunResult(padded, outcome, file)
 
 
 def _not_finished(outcome: Outcome, n: int, drive: Drive) -> LinkError:

@@ -1,4 +1,4 @@
-"""`Run`: one run on a device, from its upload to the last sample, with its way out."""
+"""`Run`: one run on a device, from its upload to the last sample, or to its safe end."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def commands(values: NDArray[np.float64], u: Channel, limits: Limits) -> LinkUpl
     Raises
     ------
     SettingError
-        Where one is beyond the volt limit.
+        If one is beyond the volt limit.
     """
     limit = min(limits.volt, 32_767 / u.steps_per_unit)
     _require_within("commands", values, limit, u.unit)
@@ -38,7 +38,7 @@ def references(values: NDArray[np.float64], limits: Limits) -> LinkUpload:
     Raises
     ------
     SettingError
-        Where one is beyond the speed limit.
+        If one is beyond the speed limit.
     """
     limit = min(limits.speed_rpm, wire.LARGEST)
     _require_within("references", values, limit, "RPM")
@@ -57,41 +57,41 @@ def _require_within(name: str, values: NDArray[np.float64], limit: float, unit: 
 
 
 def _take_reply(profile: LinkUpload, reply: Reply) -> None:
-    """Take the reply to an UPLOAD; raises LinkError where the device refuses the values."""
+    """Take the reply to an UPLOAD; raise LinkError if the device refuses the values."""
     if not profile.answered(reply.result, reply.detail, reply.body):
         wire.uploaded(reply.checked())
 
 
-# --- Run: one run on a device, from its upload to the last sample, with its way out ---------------
+# --- Run ------------------------------------------------------------------------------------------
 
 
 ASK = 0.5
-"""Time between two STATUS in real time [s]; each of them bounds the clocks."""
+"""Time between two STATUS in real time [s]; each one tightens the bounds on the clocks."""
 CREDIT_SHARE = 0.8
-"""Share of the watchdog time that a device on credit may run ahead."""
+"""Share of the watchdog time that a device on credit can run ahead."""
 AGAIN, AT_MOST = 0.002, 0.064
-"""Time after which credit that brought nothing is granted again [s]: twice as long each time, up to
-the second. A device that is slow to read would otherwise drown in grants, with its answers behind
-them."""
+"""Time after which credit is granted again if nothing arrived [s], and its upper bound: it doubles
+each time, as a device that is slow to read would otherwise drown in grants, with its answers stuck
+behind them."""
 ARMED_SILENCE = 0.25
-"""Time within which an armed device says something: every .2 s [s]."""
+"""Longest silence of an armed device, which sends a frame every .2 s [s]."""
 REST_US = 120_000
-"""Device's time without a count after which a motor is taken to be at rest; ARM wants 100 ms."""
+"""Device time without a count after which a motor counts as at rest; ARM requires 100 ms."""
 STEP_US = 20_000
 MEASURED_WITHIN = 1.0
-"""Longest wait for a device that boots to have measured well [s]."""
+"""Longest wait for a booting device to finish its first measurements [s]."""
 ARMS_WITHIN = 10.0
-"""Longest wait for a motor that the device finds still moving [s]."""
+"""Longest wait for a motor that still moves according to the device [s]."""
 MOVING = 11
-"""Result of ARM where the motor moves."""
+"""Result of ARM if the motor moves."""
 _ENDS = ("finished", "stopped", "tripped")
 
 
 def wait_for_rest(link: Connection, timeout: float) -> None:
-    """Wait until the encoder has not moved for a while, as `Drive.wait_for_rest` says."""
+    """Wait until the encoder has not moved for a while; see `Drive.wait_for_rest`."""
     status = link.status()
     since = began = status.time_us
-    # a device on credit that takes none must not be waited for either
+    # the host's clock too: the time of a device that takes no credit stands still
     deadline = time.monotonic() + timeout + (5.0 if link.identity.on_credit else 0.0)
     while status.time_us - since < REST_US:
         if status.time_us - began > timeout * 1e6 or time.monotonic() > deadline:
@@ -106,29 +106,29 @@ def wait_for_rest(link: Connection, timeout: float) -> None:
 
 
 def await_measurement(link: Connection) -> None:
-    """Boot ends by itself after some good samples; a device on credit needs time for them."""
+    """Wait for the end of boot, after some good samples; a device on credit is granted time."""
     deadline = time.monotonic() + MEASURED_WITHIN
     while link.status().state == "boot" and time.monotonic() < deadline:
         link.let_pass(STEP_US)
 
 
 def halted(link: Connection) -> LinkError:
-    """Another thread has ended the run before it began."""
+    """The error if another thread ended the run before it began."""
     return LinkError(
         name=link.port.url, expected="a run to start", received="a stop from another thread"
     )
 
 
 def arm_at_rest(link: Connection) -> None:
-    """ARM, once the device finds its motor at rest.
+    """Repeat ARM until the device finds its motor at rest.
 
-    The device sees every count, and decides. Rest as the host sees it is what STATUS brings every
-    20 ms: a motor that creeps, or swings about an edge of the encoder, may move just before ARM.
+    The device decides, as it sees every count. The host sees only a STATUS every 20 ms: a motor
+    that creeps, or swings about an edge of the encoder, can move just before ARM.
 
     Raises
     ------
     LinkError
-        Where it still moves after 10 s, and where the device refuses for another reason.
+        If it still moves after 10 s, and if the device refuses for another reason.
     """
     body = wire.arm(link.watchdog_us, link.identity.key)
     until = time.monotonic() + ARMS_WITHIN
@@ -140,7 +140,7 @@ def arm_at_rest(link: Connection) -> None:
 
 
 class Run:
-    """One run: `upload`, `begin`, `play`, `finish` in this order, or `abort` at any time.
+    """One run: `upload`, `begin`, `pump`, `finish` in this order, or `abort` at any time.
 
     Parameters
     ----------
@@ -160,9 +160,9 @@ class Run:
         self.length = len(plan.values)
         self.period = link.identity.period_us
         self.run = -1
-        #: The device's time of sample 0 [us]; None before the device has said it.
+        #: The device's time of sample 0 [us]; None until it is known.
         self.start_us: int | None = None
-        #: Index of the sample that comes next.
+        #: Index of the next sample.
         self.next = 0
         self.received = 0
         self.gaps: list[tuple[int, int]] = []
@@ -188,7 +188,7 @@ class Run:
     # --- to the start -----------------------------------------------------------------------------
 
     def upload(self) -> None:
-        """As much of the profile as fits before it is played."""
+        """Send as much of the profile as the idle device has room for."""
         profile = self.profile
         while profile is not None and (piece := profile.piece(self._room())) is not None:
             before = profile.end
@@ -226,8 +226,8 @@ class Run:
 
     # --- the run ----------------------------------------------------------------------------------
 
-    def play(self, cancel: threading.Event | None) -> bool:
-        """Pump until the run has ended; False where it was cancelled."""
+    def pump(self, cancel: threading.Event | None) -> bool:
+        """Take turns until the run has ended; False if it was cancelled."""
         while not self.ended:
             if self.link.halted or (cancel is not None and cancel.is_set()):
                 return False
@@ -264,7 +264,10 @@ class Run:
             self._beat()
 
     def _is_deaf(self, now: float) -> bool:
-        """Whether the device may do anything unheard: then its watchdog is to stop the motor."""
+        """Whether the device has been silent for too long.
+
+        Then heartbeats stop, so that its watchdog stops the motor that nobody sees.
+        """
         after = self._deaf_after
         if self.start_us is None:
             after = max(after, ARMED_SILENCE)
@@ -281,7 +284,7 @@ class Run:
         return self.plan.mode == "direct" and self._command() != self._driven
 
     def _command(self) -> float:
-        """The command whose time has come, by the newest time heard of the device."""
+        """The command that is due at the device's latest known time."""
         if self.start_us is None:
             return 0.0
         k = (self.link.newest - self.start_us) // self.period + 1
@@ -292,7 +295,7 @@ class Run:
             return
         until = self.link.newest + self._lead
         if self.profile is not None and not self.profile.is_whole:
-            # the device must not play what it has not got yet
+            # the device must not run past the end of the uploaded values
             until = min(until, self.start_us + (self.profile.end - 1) * self.period)
         further = until - self._granted
         if self.link.newest > self._brought:
@@ -307,7 +310,7 @@ class Run:
             self.link.grant(until)
 
     def _ask(self, now: float) -> None:
-        """The next command where one is due: a piece of the profile, or STATUS."""
+        """Send the next command if one is due: a piece of the profile, or STATUS."""
         silent = now - max(self._heard, self._asked) >= self._silence
         if silent or (not self._on_credit and now - self._asked >= ASK):
             self._asked = now
@@ -318,7 +321,7 @@ class Run:
             self.link.begin(Kind.UPLOAD, piece)
 
     def _room(self) -> int:
-        """Values that fit: one has room once the one `capacity` before it has been played."""
+        """Values that fit: one fits once the value `capacity` before it has been applied."""
         assert self.profile is not None
         return self.link.identity.capacity + self.next - self.profile.end
 
@@ -326,7 +329,7 @@ class Run:
         if reply.kind == Kind.UPLOAD and self.profile is not None:
             _take_reply(self.profile, reply)
             if reply.result:
-                # the run has ended, or the device sees it otherwise: STATUS comes next
+                # the run has ended, or the device disagrees: ask for STATUS next
                 self._heard = self._asked = -math.inf
         elif reply.kind == Kind.STATUS:
             self._last = wire.status(reply)
@@ -344,13 +347,13 @@ class Run:
         detail = {"reason": event.reason, "state": event.state, "device_us": event.time_us}
         if math.isfinite(event.value):
             detail["value"] = event.value
-        self._tell(event.name, event.samples if mine else 0, **detail)
+        self._notify(event.name, event.samples if mine else 0, **detail)
 
     def _resumed(self) -> None:
         away = self.link.outages[self._outages :]
         self._outages = len(self.link.outages)
-        self._tell("port_lost", self.next)
-        self._tell("resumed", self.next, seconds=sum(away))
+        self._notify("port_lost", self.next)
+        self._notify("resumed", self.next, seconds=sum(away))
         status = self.link.status()
         mine = status.run == self.run
         if mine and status.state in ("armed", "running"):
@@ -369,7 +372,7 @@ class Run:
     # --- samples ----------------------------------------------------------------------------------
 
     def collect(self, start_us: int) -> None:
-        """Hand what the receiver holds to the sink, one call for each stretch without a gap."""
+        """Hand the received samples to the sink, one call for each stretch without a gap."""
         times, columns = self.link.receiver.take()
         n = len(times)
         if not n:
@@ -388,13 +391,13 @@ class Run:
     def _deliver(self, first: int, columns: dict[str, NDArray[np.float64]]) -> None:
         count = len(columns["counts"])
         if first < self.next:
-            # of the run before, or repeated
+            # from the run before, or repeated
             columns = {name: c[self.next - first :] for name, c in columns.items()}
             count, first = count - (self.next - first), self.next
             if count <= 0:
                 return
         if first + count > self.length:
-            # no sample of this run, whatever the device says
+            # beyond the end of this run
             return
         if first > self.next:
             self._gap(first - self.next)
@@ -403,25 +406,25 @@ class Run:
     def _hand_over(self, first: int, count: int, columns: Columns) -> None:
         self.next = first + count
         if not self._sink_works:
-            # they came, but nobody keeps them
+            # the samples arrived, but nothing keeps them
             self.gaps.append((first, count))
             return
         try:
             self.sink.samples(first, columns)
         except BaseException as error:
-            # whether it has them is not known: listed as missing rather than unlisted
+            # the sink may or may not have kept them: list them as missing
             self.gaps.append((first, count))
             self._sink_works = not isinstance(error, Exception)
             raise
         self.received += count
 
     def _gap(self, count: int) -> None:
-        # over before it is told: Ctrl-C in the sink must not have it listed again
+        # step over it before notifying: after Ctrl-C in the sink it must not be listed again
         first, self.next = self.next, self.next + count
         self.gaps.append((first, count))
-        self._tell("gap", first, count=count)
+        self._notify("gap", first, count=count)
 
-    def _tell(self, kind: str, index: int, **detail: object) -> None:
+    def _notify(self, kind: str, index: int, **detail: object) -> None:
         if self._sink_works:
             try:
                 self.sink.event(kind, index, **detail)
@@ -432,12 +435,12 @@ class Run:
     # --- the end ----------------------------------------------------------------------------------
 
     def finish(self, reason: str | None = None) -> Outcome:
-        """Ask the device what it has taken, and list what did not arrive.
+        """Ask the device how many samples it took, and list those that did not arrive.
 
         Parameters
         ----------
         reason : str or None
-            Why the host ended it; None where the device did.
+            Why the host ended it; None if the device did.
         """
         status = self.link.status()
         if self.start_us is not None:
@@ -453,16 +456,16 @@ class Run:
         return self._outcome(status.state, reason or ended, taken)
 
     def abort(self, error: BaseException | None) -> Outcome:
-        """Stop the motor before anything else, then save what has arrived.
+        """Stop the motor before anything else, then collect the samples that arrived.
 
         Parameters
         ----------
         error : BaseException or None
-            Why; None where the run was cancelled.
+            Why; None if the run was cancelled.
         """
         link, resume = self.link, self.link.resume
         link.each_turn = None
-        # a port that comes back while the motor may still turn is given the stop
+        # wait for a vanished port as long as the motor can still turn, to send it STOP
         link.resume = max(resume, link.watchdog)
         reason = "cancelled" if error is None else "failed"
         if isinstance(error, KeyboardInterrupt):
@@ -482,7 +485,7 @@ class Run:
         except LinkError:
             raise
         except Exception:
-            # the sink's error is raised already, or a second one: the motor has stopped
+            # the motor has stopped, and the sink's first error is raised already
             self._sink_works = False
             return self.finish(reason)
 
@@ -491,7 +494,7 @@ class Run:
             if self.start_us is not None:
                 self.collect(self.start_us)
             kind = "reset" if isinstance(failed, DeviceReset) else "stop_unconfirmed"
-            self._tell(kind, self.next, message=str(failed))
+            self._notify(kind, self.next, message=str(failed))
         except Exception:
             self._sink_works = False
         return self._outcome("unknown", reason, None)

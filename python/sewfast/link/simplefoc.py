@@ -18,20 +18,20 @@ from .ports import Port
 class SimpleFOC(PolledBoard):
     """A motor of a SimpleFOC sketch, over its Commander, in torque mode by voltage.
 
-    The sketch registers the motor (`commander.add('M', onMotor, "motor")`) and a time after which
-    it switches the motor off where nothing comes, with a label that holds the word `watchdog`
-    (docs/boards.md shows the ten lines). The motor has no phase resistance set: with one, SimpleFOC
-    takes commands as currents.
+    The sketch registers the motor (`commander.add('M', onMotor, "motor")`) and a time without a
+    command after which it switches the motor off, under a label that contains the word `watchdog`
+    (docs/boards.md shows the ten lines). The motor must have no phase resistance set: with one,
+    SimpleFOC takes commands as currents.
 
     Parameters
     ----------
     port, Ts, volt, speed, counts_per_rev, baud, clock
         As `PolledBoard`; `volt` is in V. `counts_per_rev` is the sensor's, such as 16384.
     motor : str
-        The letter under which the sketch has registered the motor.
+        The letter under which the sketch registers the motor.
     watchdog : bool
-        False where the sketch has none, and somebody stands at the switch: SimpleFOC itself goes on
-        with the last voltage where this computer dies.
+        False if the sketch has none and somebody stands at the switch: if this computer dies,
+        SimpleFOC itself keeps applying the last voltage.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class SimpleFOC(PolledBoard):
     ) -> None:
         if not re.fullmatch(r"[A-Za-z]", str(motor)):
             raise SettingError(name="motor", expected="one letter", received=repr(motor))
-        self._motor, self._wants_watchdog = motor, watchdog
+        self._motor, self._requires_watchdog = motor, watchdog
         self._before: dict[str, float] = {}
         self._watchdog: str | None = None
         super().__init__(
@@ -63,8 +63,8 @@ class SimpleFOC(PolledBoard):
 
     def _prepare(self) -> None:
         # numbers alone, with six decimals
-        self._tell("@1")
-        self._tell("#6")
+        self._send("@1")
+        self._send("#6")
         self._discard()
         registered = self._registered()
         if self._motor not in registered:
@@ -74,13 +74,13 @@ class SimpleFOC(PolledBoard):
                 remedy="add it with commander.add, or name its letter",
             )  # fmt: skip
         self._watchdog = next((c for c, label in registered.items() if "watchdog" in label), None)
-        if self._watchdog is None and self._wants_watchdog:
+        if self._watchdog is None and self._requires_watchdog:
             raise SettingError(
                 name="watchdog", expected="a sketch that stops the motor where nothing comes",
                 received="none",
                 remedy="add its lines (page on drives of other makers), or watchdog=False",
             )  # fmt: skip
-        self._tell(f"{self._motor}MD0")
+        self._send(f"{self._motor}MD0")
         if not self._discard():
             raise LinkError(
                 name=self._port.url, expected="a board that is silent unless asked",
@@ -96,11 +96,11 @@ class SimpleFOC(PolledBoard):
         self._halt()
 
     def _registered(self) -> dict[str, str]:
-        """Letters and labels of what the sketch has registered."""
-        self._tell("?")
+        """Letters and labels that the sketch has registered."""
+        self._send("?")
         found, deadline = {}, self._clock.monotonic() + QUIET_WITHIN
         with suppress(LinkError):
-            # the list has no end but silence
+            # only silence marks the end of the list
             while self._clock.monotonic() < deadline:
                 letter, separator, label = self._line("?").partition(":")
                 if separator and len(letter) == 1:
@@ -112,9 +112,9 @@ class SimpleFOC(PolledBoard):
         wanted = {f"{motor}LU": self.volt}
         if self._watchdog is not None:
             wanted[self._watchdog] = 1e3 * WATCHDOG
-        for told, answer in ((f"{motor}C0", "torque"), (f"{motor}T0", "volt")):
-            if (found := self._ask(told)) != answer:
-                raise self._unexpected(f"{answer!r} in answer to {told!r}", found)
+        for command, answer in ((f"{motor}C0", "torque"), (f"{motor}T0", "volt")):
+            if (found := self._ask(command)) != answer:
+                raise self._unexpected(f"{answer!r} in answer to {command!r}", found)
         for what, value in wanted.items():
             self._before.setdefault(what, self._number(what))
             self._require(f"{what}{value:.6f}", value)
@@ -127,10 +127,10 @@ class SimpleFOC(PolledBoard):
             self._require(f"{what}{value:.6f}", value)
         self._before.clear()
 
-    def _require(self, told: str, wanted: float) -> None:
-        """Tell it and see that it is so."""
-        if not math.isclose(found := self._number(told), wanted, rel_tol=1e-4, abs_tol=1e-4):
-            raise self._unexpected(f"{wanted:g} in answer to {told!r}", f"{found:g}")
+    def _require(self, command: str, wanted: float) -> None:
+        """Send a setting and check that the board confirms it."""
+        if not math.isclose(found := self._number(command), wanted, rel_tol=1e-4, abs_tol=1e-4):
+            raise self._unexpected(f"{wanted:g} in answer to {command!r}", f"{found:g}")
 
     def _require_running(self) -> None:
         if self._number(f"{self._motor}E") != 1.0:

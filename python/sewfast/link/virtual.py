@@ -10,7 +10,6 @@ import warnings
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, TypeAlias
 
 from .._core import DeviceServer
@@ -30,54 +29,54 @@ _BAUD = (300, 100_000_000)
 class VirtualDevice(Unique):
     """The virtual sewing machine served on a port, with the state machine of a real device.
 
-    It is there from the construction to `stop`, the end of the `with`, or the end of the
-    interpreter; a thread without the interpreter serves it.
+    It is served from construction until `stop`, the end of the `with` block, or the end of the
+    interpreter, by a thread without the interpreter.
 
     Parameters
     ----------
     machine
         ``virtual`` or ``virtual:SEED``.
     fast
-        Time advances only by the host's credit while a session is open, as fast as the port
-        carries.
+        While a session is open, time advances only by the host's credit, as fast as the port
+        allows.
     faults
-        What goes wrong: ``"drop=.001,flip=1e-4,stall=1e-4:0.2"``, or a mapping from kind to rate
+        Faults to inject: ``"drop=.001,flip=1e-4,stall=1e-4:0.2"``, or a mapping from kind to rate
         or to (rate, seconds). Kinds are drop, flip, duplicate, reorder, delay, stall, reset,
         unplug; rates are per frame.
     seed
         Seed of the faults.
     baud
-        Bits a second that the port carries each way; None is no limit.
+        Bits a second that the port carries each way; None for no limit.
     endpoint
-        ``"pty"`` or ``"tcp"``; None takes a pty where the system has them.
+        ``"pty"`` or ``"tcp"``; None takes a pty if the system has them.
     link
-        Symbolic link to the pty; None makes one in a temporary folder. It stays the name when the
-        port was unplugged.
+        Symbolic link to the pty; None makes one in a temporary folder. The name stays the same when
+        the port is unplugged and comes back.
     address
         HOST:PORT to listen on; port 0 takes a free one.
     anyone
-        Whether `address` may be one that other computers reach. Whoever reaches the port can start
-        the motor; there is no password.
+        Whether other computers can reach `address`. Anyone who reaches the port can start the
+        motor; there is no password.
     once
-        End when the first host has gone.
+        End when the first host has disconnected.
     duration
-        End after so many seconds.
+        End after this time [s].
     fault_log, trace
-        Files that get a line of JSON for each fault, and for each change of the output and of who
-        is there.
+        Files for one line of JSON for each fault, and for each change of the output or of the
+        connection.
 
     Raises
     ------
     SettingError
-        For a setting that cannot be used.
+        For an invalid setting.
     LinkError
-        Where the port or a file cannot be had, `link` names something that is there, or `address`
-        is reached by others and `anyone` is not set.
+        If the port or a file cannot be opened, `link` names something that exists, or other
+        computers can reach `address` and `anyone` is not set.
 
     Warns
     -----
     UserWarning
-        Where other computers reach the port.
+        If other computers can reach the port.
     """
 
     def __init__(
@@ -144,16 +143,16 @@ class VirtualDevice(Unique):
 
     @property
     def port(self) -> str:
-        """What a host opens: a path, or ``socket://HOST:PORT``."""
+        """Address for the host: a path, or ``socket://HOST:PORT``."""
         return self._server.port
 
     @property
     def running(self) -> bool:
-        """Whether it is being served."""
+        """Whether the device is being served."""
         return not self._server.wait(0.0)
 
     def wait(self, timeout: float) -> bool:
-        """Wait for the end of serving, at most for `timeout` seconds; whether it has come."""
+        """Wait at most `timeout` seconds for the end of serving; return whether it has ended."""
         return self._server.wait(real("timeout", timeout))
 
     def stop(self) -> None:
@@ -162,24 +161,24 @@ class VirtualDevice(Unique):
         Raises
         ------
         LinkError
-            Where serving had died.
+            If serving had failed.
         """
         self._end()
 
     def cause(self, fault: str, seconds: float | None = None) -> None:
-        """Cause a fault: stall, reset, unplug at once, others with the next frame to the host.
+        """Cause a fault: stall, reset and unplug at once, others with the next frame to the host.
 
         Parameters
         ----------
         fault
             Its kind.
         seconds
-            How long a stall lasts or the port is gone; None as long as by default.
+            How long a stall lasts or the port is gone; None for the default.
 
         Raises
         ------
         SettingError
-            For an unknown kind or an unusable time.
+            For an unknown kind or an invalid time.
         """
         if not isinstance(fault, str):
             raise SettingError(
@@ -193,45 +192,40 @@ class VirtualDevice(Unique):
 
     @property
     def faults(self) -> dict[str, int]:
-        """Faults so far by kind, both ways together."""
+        """Faults so far by kind, both directions together."""
         to_host, to_device = self._server.faults().values()
         return {kind: count + to_device[kind] for kind, count in to_host.items()}
 
     @property
     def statistics(self) -> dict[str, int]:
-        """How serving went so far.
+        """Figures of serving so far.
 
-        Counts of ``samples``, of samples ``late`` by a period or more, how late the latest was
-        [us], how often the clock was ``set_back`` because catching up was hopeless, bytes to the
-        host, hosts ``refused`` because one was there.
+        Numbers of ``samples``, of samples ``late`` by a period or more, the largest delay [us], how
+        often the clock was ``set_back`` because it could not catch up, bytes to the host, hosts
+        ``refused`` because one was connected.
         """
         return self._server.statistics()
 
     @property
     def problem(self) -> str | None:
-        """Why a log file ended early, where one did."""
+        """Why a log file ended early; None if none did."""
         return self._server.problem()
 
     def trace(self) -> list[dict[str, Any]]:
-        """The server's account of the output, oldest first.
+        """The server's log of the output, oldest first.
 
         Each entry has ``event`` (on, off, connected, gone, stalled, unplugged, plugged, reset),
-        ``device_us``, ``seconds`` (since the server began), ``state``, and of the last intact
-        heartbeat before it ``heartbeat_us``, ``heartbeat_seconds`` and ``watchdog_us``, None where
-        none had come since the boot. ``late_us`` is how late the server itself was at most since
-        that heartbeat, for want of a processor: the device's clock is the server's and hides it.
+        ``device_us``, ``seconds`` (since the server began), ``state``, and, from the last intact
+        heartbeat before it, ``heartbeat_us``, ``heartbeat_seconds`` and ``watchdog_us``, None if
+        there was none since the boot. ``late_us`` is the server's own largest delay since that
+        heartbeat for lack of a processor: the device's clock is the server's and hides it.
         """
         return self._server.trace()
 
     def __enter__(self) -> VirtualDevice:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.stop()
 
     def __repr__(self) -> str:
@@ -263,14 +257,14 @@ def _require_switches(**values: object) -> None:
 
 
 def _require_place(name: str, place: object) -> None:
-    """Refuse a file that could not be made, before anything is.
+    """Refuse a file that cannot be created, before creating anything.
 
     Raises
     ------
     SettingError
-        For what is no file's name.
+        For anything but a file name.
     LinkError
-        For a folder that is not there.
+        If its folder does not exist.
     """
     if place is None:
         return
@@ -284,12 +278,9 @@ def _require_place(name: str, place: object) -> None:
 
 
 def _require_free(link: Path) -> None:
-    """A link that leads nowhere was left over by a device that was killed, and may be replaced.
+    """Refuse a link to something that exists: the pty of another device, or a user's file.
 
-    Raises
-    ------
-    LinkError
-        Where it leads somewhere: to the pty of another device, or to what somebody keeps there.
+    A dangling link was left over by a killed device, and is replaced.
     """
     if link.is_symlink() and link.exists():
         raise LinkError(

@@ -1,6 +1,6 @@
-"""What the bodies of the link's frames stand for (docs/PROTOCOL.md): values, names, refusals.
+"""The bodies of the link's frames as values, names and refusals (docs/PROTOCOL.md).
 
-Their bytes are the compiled core's, which is one for this client and the loop on the host.
+The compiled core encodes and decodes their bytes, for this client and for the loop on the host.
 """
 
 from __future__ import annotations
@@ -14,18 +14,15 @@ from typing import TypeVar
 from .._core import LinkBodies
 from ..errors import LinkError
 
-# --- Bodies of the link's frames as values, and values as bodies (docs/PROTOCOL.md) ---------------
-
-
 VERSION, MAX_BODY = LinkBodies.VERSION, LinkBodies.MAX_BODY
 LARGEST = 3.4028234e38
-"""Of single precision."""
+"""Largest number in single precision."""
 LATEST = 2**64 - 1
-"""Time that a frame can carry [us]."""
+"""Latest time that a frame can carry [us]."""
 
 
 class Kind(IntEnum):
-    """What the host sends."""
+    """Frames of the host."""
 
     HELLO = 0x01
     DESCRIBE = 0x02
@@ -58,7 +55,7 @@ PROFILE, PID, DIRECT, CREDIT, CURRENT, COMPUTED, DESIGN, BIQUADS, KINDS = (1 << 
 
 
 def name_of(names: Sequence[str], value: int) -> str:
-    """The name of a value; one of a later firmware stays a number."""
+    """The name of a value; an unknown one, of a later firmware, stays a number."""
     return names[value] if value < len(names) else f"unknown ({value})"
 
 
@@ -67,32 +64,32 @@ def name_of(names: Sequence[str], value: int) -> str:
 
 @dataclass(frozen=True)
 class Identity:
-    """Who the device is.
+    """A device's name, firmware and capabilities.
 
     Parameters
     ----------
     name, firmware : str
     version : int
-        Of the protocol that both sides speak.
+        Version of the protocol that both sides use.
     boot : int
-        Its boot id; another one means that it has been reset.
+        Its boot id; another one means that it was reset.
     schema : int
         CRC-32 of its channels.
     state : str
-        When it was asked.
+        Its state at HELLO.
     channels : int
     period_us : int
         Control period [us].
     capabilities : int
-        Bits, docs/PROTOCOL.md.
+        Bits; see docs/PROTOCOL.md.
     capacity : int
-        Values that its profile memory holds.
+        Number of values that its profile memory holds.
     counts_per_rev : float
         Counts of its encoder in one turn.
     session : int
-        Whose HELLO it has answered.
+        Session of the HELLO that it answered.
     key : int
-        What ARM repeats: only a host that hears the device knows it.
+        Repeated in ARM, as proof that the host receives the device's frames.
     """
 
     name: str
@@ -116,12 +113,12 @@ class Identity:
 
     @property
     def tag(self) -> int:
-        """What marks its frames: the low half of the boot id."""
+        """Mark of its frames: the low half of the boot id."""
         return self.boot & 0xFFFF
 
     @property
     def on_credit(self) -> bool:
-        """Whether its time advances only by what the host grants."""
+        """Whether its time advances only as the host grants it."""
         return bool(self.capabilities & CREDIT)
 
     @property
@@ -143,11 +140,11 @@ class Channel:
 
 @dataclass(frozen=True)
 class Status:
-    """What the device says of itself; the run is the present or the last one.
+    """The device's status; the run is the present or the last one.
 
-    `taken` of `length` samples are behind it; the profile ends at `end`. `received`, `refused` and
-    `dropped` count frames, `late_us` is the latest control period [us]; `foreign` counts frames of
-    other sessions.
+    `taken` of `length` samples are done; the profile ends at `end`. `received`, `refused` and
+    `dropped` count frames, `late_us` is the largest delay of a control period [us]; `foreign`
+    counts frames of other sessions.
     """
 
     state: str
@@ -172,7 +169,7 @@ class Status:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits that the device enforces, and its own ceilings; 0 is a limit that is not set."""
+    """Limits that the device enforces, and its own ceilings; 0 means that a limit is not set."""
 
     volt: float
     speed_rpm: float
@@ -187,7 +184,7 @@ class Limits:
 
     @property
     def are_set(self) -> bool:
-        """Whether the device has been given limits in this session."""
+        """Whether limits were set in this session."""
         return any(self.values)
 
 
@@ -220,7 +217,7 @@ class Reply:
         Raises
         ------
         LinkError
-            Where the device refused the command; the message says why and what to do.
+            If the device refused the command; the message says why and what to do.
         """
         if self.result:
             raise refusal(self.kind, self.result, self.detail)
@@ -286,7 +283,7 @@ def limits(body: bytes) -> Limits:
 def event(
     code: int, state: int, reason: int, run: int, samples: int, value: float, time_us: int
 ) -> Event:
-    """An event from its fields, as the core has read them."""
+    """An event from the fields that the core decoded."""
     names = (name_of(EVENTS, code), name_of(STATES, state), name_of(REASONS, reason))
     return Event(*names, run, samples, value, time_us)
 
@@ -314,7 +311,7 @@ def _whole(fields: T | None, body: bytes, name: str) -> T:
 
 
 def _shown(name: str) -> str:
-    """A name that goes to terminals and files."""
+    """A name that is safe to print and to write to files."""
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
 
 
@@ -337,7 +334,7 @@ def wire_size(body: int) -> int:
     return body + around
 
 
-# --- Refusals: what a device's result codes mean and what to do about them ------------------------
+# --- refusals: result codes and remedies ----------------------------------------------------------
 
 
 _FIELDS: dict[int, tuple[str, ...]] = {
@@ -356,7 +353,7 @@ _FIELDS: dict[int, tuple[str, ...]] = {
 
 
 def refusal(kind: int, result: int, detail: int) -> LinkError:
-    """What a device's refusal means and what to do."""
+    """The error for a device's refusal, with its remedy."""
     name = Kind(kind).name if kind in Kind._value2member_map_ else f"command {kind:#04x}"
     reason, _, remedy = _refused(kind, result, detail).partition("; ")
     return LinkError(

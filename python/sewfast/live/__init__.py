@@ -1,7 +1,7 @@
-"""The live view: what a running record or run looks like while it happens.
+"""The live view of a running record or run.
 
 Read in this order: `feed` (the newest samples, between the link's thread and a view), `view` (the
-views, each in a process of its own), `terminal`, `stream` (PlotJuggler and Foxglove).
+views, each in its own process), `terminal`, `stream` (PlotJuggler and Foxglove).
 """
 
 from .feed import Feed

@@ -21,7 +21,7 @@ from ..arrays import FloatArray
 from ..errors import DataError, SettingError
 from ..units import counts_per_unit
 
-# --- Memory: the numbers of a feed's ring, in this process or shared with another one -------------
+# --- Memory: a feed's ring of samples, in this process or shared with another one -----------------
 
 
 _COUNTERS = 4
@@ -36,7 +36,7 @@ class Memory:
     counters : array of int64, shape (4,)
         Claimed, end, received, gaps.
     holds : array of int64, shape (size,)
-        Which sample a place holds, so that a gap costs nothing when it is put; -1 for none.
+        Number of the sample in each place, so that writing after a gap costs nothing; -1 for none.
     rows : array, shape (columns, size)
     """
 
@@ -46,7 +46,7 @@ class Memory:
 
     @classmethod
     def own(cls, columns: int, size: int) -> Memory:
-        """Empty, in this process."""
+        """An empty ring in this process."""
         return cls(
             np.zeros(_COUNTERS, dtype=np.int64),
             np.full(size, -1, dtype=np.int64),
@@ -55,29 +55,29 @@ class Memory:
 
     @classmethod
     def mapped(cls, file: int, columns: int, size: int) -> Memory:
-        """What is in a file that was made by `shared`."""
+        """The ring in a file made by `shared`."""
         buffer = mmap.mmap(file, 8 * (_COUNTERS + (1 + columns) * size))
         whole = np.frombuffer(buffer, dtype=np.int64, count=_COUNTERS + size)
         rows = np.frombuffer(buffer, dtype=np.float64, offset=8 * len(whole))
         return cls(whole[:_COUNTERS], whole[_COUNTERS:], rows.reshape(columns, size))
 
     def shared(self) -> tuple[int, Memory]:
-        """A file without a name [descriptor] and the same numbers in it."""
-        file = _nameless()
+        """The descriptor of an anonymous file, and a copy of this ring in it."""
+        file = _anonymous_file()
         os.ftruncate(file, 8 * (_COUNTERS + len(self.holds) + self.rows.size))
         made = Memory.mapped(file, *self.rows.shape)
         made.counters[:], made.holds[:], made.rows[:] = self.counters, self.holds, self.rows
         return file, made
 
 
-def _nameless() -> int:
+def _anonymous_file() -> int:
     if hasattr(os, "memfd_create"):
         return os.memfd_create("sewfast-live")
     with tempfile.TemporaryFile() as file:
         return os.dup(file.fileno())
 
 
-# --- Speed from the change of counts over a window: what a view can know while a record runs ------
+# --- Speed from the change of counts over a window, without later samples -------------------------
 
 
 def speed_over_window(counts: FloatArray, lag: int, Ts: float, counts_per_rev: float) -> FloatArray:
@@ -97,8 +97,8 @@ def speed_over_window(counts: FloatArray, lag: int, Ts: float, counts_per_rev: f
     Returns
     -------
     array, shape (N - lag,)
-        From the sample `lag` on; NaN where a sample of the window is missing, because a device
-        that was reset in the gap counts from elsewhere.
+        From sample `lag` on; NaN if a sample of the window is missing, because a device that was
+        reset in the gap counts from another origin.
     """
     missing = np.concatenate(([0], np.cumsum(np.isnan(counts))))
     whole = missing[lag + 1 :] == missing[: len(counts) - lag]
@@ -117,27 +117,27 @@ WHOLE_S = 30.0
 """A record of at most this length [s] is kept whole."""
 
 SCROLL_S = 10.0
-"""Of a longer record, or one without a planned end, this much is kept [s]."""
+"""The part kept of a longer record, or of one without a planned end [s]."""
 
 _LEAST, _MOST = 4096, 131_072
-"""Samples of a column that are kept, at 8 bytes each."""
+"""Fewest and most samples kept of a column, at 8 bytes each."""
 
 _SPARE_S = 2.0
-"""Kept beyond what a picture spans, for a view that comes late [s]."""
+"""Kept in addition to the span of a plot, for a slow view [s]."""
 
 
 _CLAIMED, _END, _RECEIVED, _GAPS = range(4)
 
 _LONGEST = 500
-"""Of a line of status; written at once, it is never written in part (POSIX, PIPE_BUF)."""
+"""Most characters of a note: a short write to a pipe is never partial (POSIX, PIPE_BUF)."""
 
 
 class Feed:
-    """Samples from one thread to another, which never makes the first one wait.
+    """Hands samples from one thread to another; the first one never waits.
 
-    `put` copies a batch into a ring of fixed size and returns; it takes no lock, and what a view
-    has not read by the time the ring comes round is lost to the view (never to the recording). Any
-    number of views may read.
+    `put` copies a batch into a ring of fixed size and returns; it takes no lock. Samples that a
+    view has not read when the ring wraps around are lost to the view, never to the recording. Any
+    number of views can read.
 
     Parameters
     ----------
@@ -147,28 +147,28 @@ class Feed:
     Ts : float
         Sample time [s].
     n : int or None
-        Samples that are planned; None where nobody knows.
+        Number of planned samples; None if unknown.
     title : str
-        What is recorded, in a few words.
+        A short title of the record.
     counts_per_rev : float, optional
-        With it and a column `counts`, the column `speed` [RPM] is derived; NaN where a sample of
-        its window is missing.
+        With it and a column `counts`, the column `speed` [RPM] is derived; NaN if a sample of its
+        window is missing.
     speed_window : float
-        What that speed is the mean over [s].
+        Window of that mean speed [s].
 
     Attributes
     ----------
     columns : dict of str to str
-        With the derived speed.
+        Including the derived speed.
     window : int
-        Samples that a picture spans: all planned ones of a short record, else the last seconds.
+        Samples that a plot spans: all planned ones of a short record, else the last seconds.
     closed : threading.Event
-        Set where no sample follows.
+        Set when no more samples follow.
 
     Raises
     ------
     SettingError
-        Without columns, or where a number is outside its range.
+        Without columns, or for a number outside its range.
     """
 
     def __init__(
@@ -204,8 +204,8 @@ class Feed:
             "counts_per_rev": None if counts_per_rev is None else float(counts_per_rev),
             "speed_window": float(speed_window),
         }
-        self._said: deque[tuple[int, str]] = deque(maxlen=64)
-        self._sayings = 0
+        self._notes: deque[tuple[int, str]] = deque(maxlen=64)
+        self._noted = 0
         self.closed = threading.Event()
 
     @property
@@ -221,12 +221,12 @@ class Feed:
 
     @contextmanager
     def share(self, pipe: int) -> Iterator[int]:
-        """Memory that another process may map, as a file's descriptor.
+        """Memory that another process can map, as a file's descriptor.
 
         Parameters
         ----------
         pipe : int
-            Takes the lines of status as JSON; not blocking.
+            Non-blocking descriptor for the notes, as lines of JSON.
         """
         file, self._memory = self._memory.shared()
         self._pipe = pipe
@@ -243,17 +243,17 @@ class Feed:
 
     @property
     def received(self) -> int:
-        """Samples that came."""
+        """Number of samples received."""
         return int(self._memory.counters[_RECEIVED])
 
     @property
     def gaps(self) -> int:
-        """Jumps between batches."""
+        """Number of gaps between batches."""
         return int(self._memory.counters[_GAPS])
 
     @property
     def missing(self) -> int:
-        """Samples up to the newest one that did not come."""
+        """Number of missing samples up to the newest one."""
         return max(self.end - self.received, 0)
 
     def put(self, first: int, columns: Mapping[str, NDArray[np.generic]]) -> None:
@@ -262,10 +262,10 @@ class Feed:
         Parameters
         ----------
         first : int
-            Number of the batch's first sample, from 0 at the start of the record; what lies
-            between it and the sample after the last batch is a gap.
+            Number of the batch's first sample, from 0 at the start of the record; samples between
+            the last batch and this one are a gap.
         columns : mapping of str to array, shape (k,)
-            Copied. A column that is left out is NaN; one that the feed does not know is ignored.
+            Copied. A missing column becomes NaN; an unknown one is ignored.
 
         Raises
         ------
@@ -298,7 +298,7 @@ class Feed:
         columns: Mapping[str, NDArray[np.generic]],
         count: int,
     ) -> None:
-        """Copy what follows the first `skip` samples of a batch into neighbouring places."""
+        """Copy a batch without its first `skip` samples into neighbouring places."""
         width, rows = places.stop - places.start, self._memory.rows
         for name, row in self._streamed.items():
             values = columns.get(name)
@@ -315,28 +315,28 @@ class Feed:
 
     def say(self, text: str) -> None:
         """Add a line of status, such as "tripped: speed limit"; the newest are kept."""
-        self._sayings += 1
-        self._said.append((self._sayings, text))
+        self._noted += 1
+        self._notes.append((self._noted, text))
         if self._pipe is not None:
-            # a view that takes nothing more, or is gone, misses the line
+            # a view that hangs or has ended misses the line
             with suppress(OSError):
                 os.write(self._pipe, json.dumps(text[:_LONGEST]).encode() + b"\n")
 
-    def said(self, after: int = 0) -> list[tuple[int, str]]:
-        """The lines whose number is above `after`, with their numbers, the oldest first."""
+    def notes(self, after: int = 0) -> list[tuple[int, str]]:
+        """The lines of status with numbers above `after`: (number, text), oldest first."""
         for _ in range(3):
             try:
-                return [line for line in self._said if line[0] > after]
-            except RuntimeError:  # one was added meanwhile
+                return [line for line in self._notes if line[0] > after]
+            except RuntimeError:  # another thread added one
                 continue
         return []
 
     def close(self) -> None:
-        """Say that no sample follows; the views finish."""
+        """End the feed: no more samples follow, and the views finish."""
         self.closed.set()
 
     def read(self, start: int, stop: int) -> dict[str, FloatArray]:
-        """Samples `start` to `stop - 1` of every column in `columns`, NaN where there is none.
+        """Samples `start` to `stop - 1` of every column in `columns`, NaN for missing ones.
 
         Parameters
         ----------
@@ -356,7 +356,7 @@ class Feed:
         return found
 
     def _copy(self, start: int, stop: int) -> FloatArray:
-        """The rows of a range; what the writer overtook meanwhile is NaN."""
+        """The rows of a range; NaN for samples that the writer has overwritten meanwhile."""
         wanted = np.arange(start, stop)
         places = wanted % self._size
         rows = self._memory.rows[:, places]
@@ -367,12 +367,12 @@ class Feed:
 
     @property
     def oldest(self) -> int:
-        """The oldest sample that a view can count on until it has read it."""
+        """The oldest sample that will not be overwritten before a view has read it."""
         return max(0, self.end - self._size + self._size // 16)
 
 
 def _extent(Ts: float, n: int | None) -> tuple[int, int]:
-    """Samples in the ring, and of those the samples that a picture spans."""
+    """Samples in the ring, and the number of them that a plot spans."""
     whole = n is not None and n * Ts <= WHOLE_S
     wanted = n if n is not None and whole else math.ceil(SCROLL_S / Ts)
     size = min(max(wanted + math.ceil(_SPARE_S / Ts), _LEAST), _MOST)

@@ -1,4 +1,4 @@
-"""Views over the network: JSON for Foxglove and PlotJuggler, and who may connect."""
+"""Views over the network: JSON for Foxglove and PlotJuggler, and the check of who may connect."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from urllib.parse import urlsplit
 from ..errors import SettingError
 from .feed import Feed
 
-# --- Gate: who may connect to a WebSocket server of this computer, by the head of the request -----
-# A browser lets any page connect to a WebSocket on its own computer and read what it sends; the
-# page's address stands in `Origin`, which a page cannot change. A page whose name was made to lead
-# to this computer (DNS rebinding) gives itself away by `Host`. The server behind, Foxglove's own,
-# looks at neither, so that what passes is handed on to it.
+# --- Gate: checks the head of a request before it reaches the WebSocket server --------------------
+# A browser lets any web page connect to a WebSocket on its own computer and read from it. The
+# header `Origin` holds the page's address, which the page cannot change. A page whose host name was
+# made to resolve to this computer (DNS rebinding) shows in `Host`. Foxglove's own server checks
+# neither header, so the gate checks them and forwards the requests that pass.
 
 
 LONGEST = 16_384
 """Bytes of a request's head."""
 PATIENCE = 5.0
-"""Time for it [s]."""
+"""Longest wait for the head [s]."""
 CONNECTIONS = 16
-"""So many at once; further ones are closed."""
+"""Most connections at once; further ones are closed."""
 _REFUSAL = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 _END = b"\r\n\r\n"
 
 
 def hidden_address() -> str:
-    """Where the server behind listens: where it can, at one of 16 million that nobody is told."""
+    """The address of Foxglove's server: on Linux a random one of 16 million, kept secret."""
     if sys.platform != "linux":
         return "127.0.0.1"
     drawn = random.SystemRandom()
@@ -45,7 +45,7 @@ def hidden_address() -> str:
 
 
 def admits(head: bytes) -> bool:
-    """Whether a request comes from a program, Foxglove or a page of this computer."""
+    """Whether a request comes from a program, from Foxglove or from a page of this computer."""
     fields: dict[str, list[str]] = {}
     for line in head.decode("latin-1").split("\r\n")[1:]:
         name, colon, value = line.partition(":")
@@ -58,7 +58,7 @@ def admits(head: bytes) -> bool:
 
 
 def _may_read(origin: str) -> bool:
-    """Of the desktop program, Foxglove's own pages, or a page that this computer serves."""
+    """Whether it is the desktop program, a page of Foxglove's, or one served by this computer."""
     if origin == "file://" or _is_local(origin):
         return True
     return re.fullmatch(r"https://([a-z0-9-]+\.)*foxglove\.dev", origin) is not None
@@ -72,19 +72,19 @@ def _is_local(address: str) -> bool:
 
 
 class Gate:
-    """Listens, reads the heads of requests and hands on what may pass.
+    """Listens, reads the heads of requests and forwards those that pass.
 
     Parameters
     ----------
     host, port
-        Where it listens; port 0 takes any free one.
+        Address to listen on; port 0 takes any free one.
     behind : pair of text and int
-        The server that gets what passes.
+        Address of the server to forward to.
 
     Raises
     ------
     OSError
-        Where the port is taken.
+        If the port is taken.
     """
 
     def __init__(self, host: str, port: int, behind: tuple[str, int]) -> None:
@@ -101,7 +101,7 @@ class Gate:
     def close(self) -> None:
         """End all connections, and take no further ones."""
         self._closed = True
-        # a thread that waits in accept is not woken by closing alone
+        # closing alone does not wake a thread that waits in accept
         with suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
@@ -165,7 +165,7 @@ class Gate:
 
 
 def _pump(source: socket.socket, target: socket.socket) -> None:
-    """Hand on until one of the two ends; then end both."""
+    """Forward bytes until one of the two connections ends; then end both."""
     with suppress(OSError):
         while piece := source.recv(65_536):
             target.sendall(piece)
@@ -174,25 +174,25 @@ def _pump(source: socket.socket, target: socket.socket) -> None:
             connection.shutdown(socket.SHUT_RDWR)
 
 
-# --- Tail: the samples of a feed as JSON objects, at no more than a set rate ----------------------
+# --- Tail: the samples of a feed as JSON objects, at a limited rate -------------------------------
 
 
 PERIOD_S = 0.02
-"""Between two looks at the feed [s]."""
+"""Time between two reads of the feed [s]."""
 
 RATE = 2500
-"""Samples that a stream sends in a second at most; of a faster record every second one, or
-fewer. What was not used in the last second may be made up for."""
+"""Most samples that a stream sends in a second; of a faster record it sends every second one, or
+fewer. Samples not sent in one second can be made up for in the next."""
 
 
 class Tail:
-    """What has come since the last look.
+    """The samples of a feed since the last read.
 
     Parameters
     ----------
     feed : Feed
     now : callable
-        Seconds of the wall clock; what a sample is stamped with starts from it.
+        The wall clock [s], from which the time stamps of the samples start.
     """
 
     def __init__(self, feed: Feed, now: Callable[[], float] = time.time) -> None:
@@ -201,10 +201,10 @@ class Tail:
         self._looked = now()
         self._allowed = float(RATE)
         self._began: float | None = None
-        self._said = 0
+        self._noted = 0
 
     def rows(self) -> Iterator[tuple[float, dict[str, float]]]:
-        """Wall time [s] and columns of each sample that is sent; a missing value is left out."""
+        """Wall time [s] and columns of each sample to send; a missing value is left out."""
         feed, stop = self._feed, self._feed.end
         self._refill()
         start = max(self._next, feed.oldest)
@@ -214,7 +214,7 @@ class Tail:
             self._began = self._looked - stop * feed.Ts
         stride = math.ceil((stop - start) / max(self._allowed, 1.0))
         self._allowed -= (stop - start) / stride
-        # the same samples whenever the look was: multiples of the stride
+        # multiples of the stride: the same samples, whenever the feed is read
         first = -(-start // stride) * stride
         columns = {name: c[first - start :: stride] for name, c in feed.read(start, stop).items()}
         self._next = stop
@@ -226,24 +226,24 @@ class Tail:
 
     @property
     def now(self) -> float:
-        """Wall time of the last look [s]."""
+        """Wall time of the last read [s]."""
         return self._looked
 
     def _refill(self) -> None:
-        """What may be sent grows with time (a token bucket)."""
+        """Add to the number of samples allowed, by the time passed (a token bucket)."""
         now = self._now()
         passed, self._looked = max(now - self._looked, 0.0), now
         self._allowed = min(self._allowed + RATE * passed, RATE)
 
-    def said(self) -> Iterator[str]:
-        """The lines of status since the last look."""
-        for number, text in self._feed.said(self._said):
-            self._said = number
+    def notes(self) -> Iterator[str]:
+        """The lines of status since the last call."""
+        for number, text in self._feed.notes(self._noted):
+            self._noted = number
             yield text
 
 
 def encode(value: object) -> bytes:
-    """Strict JSON: what is not a number must not be in it."""
+    """Strict JSON: NaN and infinity are refused."""
     return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
 
 
@@ -262,7 +262,7 @@ _LOG = {
         "name": {"type": "string"},
     },
 }
-"""Of Foxglove's own schema foxglove.Log, which its log panel shows."""
+"""The part used of Foxglove's own schema foxglove.Log, which its log panel shows."""
 
 _INFO = 2
 
@@ -273,9 +273,9 @@ class FoxgloveView:
     Parameters
     ----------
     host, port
-        Where the server is bound; port 0 takes any free one.
+        Address to listen on; port 0 takes any free one.
     name : str
-        What clients see.
+        Name shown to clients.
 
     Raises
     ------
@@ -291,15 +291,15 @@ class FoxgloveView:
                 "the Foxglove view expected the package foxglove-sdk, received none; "
                 'pip install "sewfast[foxglove]"'
             ) from e
-        # a client that goes away is no news; who wants it asks Python's logging for it
+        # a client that disconnects is not worth a line; Python's logging can still show it
         logging.getLogger("foxglove").addHandler(logging.NullHandler())
         self._sdk: Any = foxglove
         self._context = foxglove.Context()
-        # for a client that does not read, the server keeps 1,024 messages and drops the oldest
+        # the server keeps 1,024 messages for a client that does not read, then drops the oldest
         behind = hidden_address()
         self._server = foxglove.start_server(name=name, host=behind, port=0, context=self._context)
         try:
-            # it would serve any web page
+            # without the gate, the server would serve any web page
             self._gate = Gate(host, port, (behind, int(self._server.port)))
         except OSError as e:
             self._server.stop()
@@ -310,11 +310,11 @@ class FoxgloveView:
 
     @property
     def port(self) -> int:
-        """Where clients connect."""
+        """Port for clients."""
         return self._gate.port
 
     def run(self, feed: Feed) -> None:
-        """Send until the feed is closed, then what is left."""
+        """Send samples until the feed is closed, then the rest."""
         drive = self._channel("/drive", "sewfast.Drive", _schema(feed))
         log = self._channel("/log", "foxglove.Log", _LOG)
         tail = Tail(feed)
@@ -324,8 +324,8 @@ class FoxgloveView:
             _send(tail, drive, log)
         finally:
             self._gate.close()
-            # waits for a client that does not read, for as long as that stays connected: it must
-            # not be called from the thread that owns the link
+            # this waits as long as a client that does not read stays connected: never call it from
+            # the thread that owns the link
             self._server.stop()
 
     def _channel(self, topic: str, name: str, schema: dict[str, Any]) -> Any:
@@ -347,7 +347,7 @@ def _send(tail: Tail, drive: Any, log: Any) -> None:
     stamp = 0.0
     for stamp, row in tail.rows():
         drive.log(encode(row), log_time=round(stamp * 1e9))
-    for text in tail.said():
+    for text in tail.notes():
         at = round((stamp or tail.now) * 1e9)
         time = {"sec": at // 10**9, "nsec": at % 10**9}
         message = {"timestamp": time, "level": _INFO, "message": text, "name": "sewfast"}
@@ -358,19 +358,19 @@ def _send(tail: Tail, drive: Any, log: Any) -> None:
 
 
 TIMESTAMP = "timestamp"
-"""The field that PlotJuggler is told to use as time [s since 1970]."""
+"""The field to choose as time in PlotJuggler [s since 1970]."""
 
 
 class PlotJugglerView:
-    """One datagram a sample: PlotJuggler takes one time from a message, and reads 2,048 bytes.
+    """One datagram a sample: PlotJuggler takes one time per message, and reads 2,048 bytes.
 
-    A message that is no JSON makes it stop listening, and one without the time makes it use its
-    own clock from then on. Hence a missing value is left out, and the time is always there.
+    A message that is not JSON makes it stop listening, and one without the time makes it use its
+    own clock from then on. So a missing value is left out, and the time is always included.
 
     Parameters
     ----------
     host, port
-        Where PlotJuggler listens.
+        Address that PlotJuggler listens on.
 
     Raises
     ------
@@ -380,7 +380,7 @@ class PlotJugglerView:
 
     def __init__(self, host: str, port: int) -> None:
         try:
-            # IPv4 first: PlotJuggler listens to nothing else
+            # IPv4 first: PlotJuggler listens on nothing else
             found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
         except (OSError, UnicodeError) as e:
             raise SettingError(
@@ -394,7 +394,7 @@ class PlotJugglerView:
         self._socket.setblocking(False)
 
     def run(self, feed: Feed) -> None:
-        """Send until the feed is closed, then what is left."""
+        """Send samples until the feed is closed, then the rest."""
         tail = Tail(feed)
         with self._socket:
             while not feed.closed.wait(PERIOD_S):
@@ -407,5 +407,5 @@ class PlotJugglerView:
             try:
                 self._socket.sendto(message, self._address)
             except OSError:
-                # nobody listens, or the buffer is full: a view may lose what it shows
+                # nobody listens, or the buffer is full: a view may lose samples
                 continue

@@ -1,4 +1,4 @@
-"""A status line on a terminal, written over itself: how far, what is missing, the newest values."""
+"""A status line on a terminal, overwritten in place: progress, missing samples, newest values."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ import numpy as np
 
 from .feed import SPEED, Feed
 
-# --- Tty: a terminal that is written to without waiting for it longer than asked ------------------
+# --- Tty: writing to a terminal without blocking on it --------------------------------------------
 
 
 _SLICE_S = 0.05
-"""How often a wait looks whether it should go on [s]."""
+"""Longest wait before it is checked whether to wait on [s]."""
 
 
 class Tty:
     """The terminal behind a text stream.
 
-    It is opened anew where the system lets it: only then can writing be non-blocking without
-    making the terminal so for everybody who shares it. Elsewhere a write waits as long as the
+    It is opened a second time if the system allows: only then can writes be non-blocking without
+    making the terminal non-blocking for all who share it. Otherwise a write waits as long as the
     terminal is blocked.
 
     Parameters
@@ -44,14 +44,14 @@ class Tty:
 
     @property
     def columns(self) -> int:
-        """80 where the terminal does not say."""
+        """Width of the terminal; 80 if it is unknown."""
         try:
             return os.get_terminal_size(self._stream).columns or 80
         except OSError:
             return 80
 
     def write(self, text: str, wait: Callable[[], bool]) -> None:
-        """Write a text; while the terminal takes none of it, `wait` says whether to go on."""
+        """Write a text; while the terminal takes none of it, `wait` decides whether to go on."""
         rest = memoryview(text.encode(self.encoding, "replace"))
         while rest:
             if written := self._write_some(rest):
@@ -60,8 +60,8 @@ class Tty:
                 return
 
     def _write_some(self, rest: memoryview) -> int:
-        """Bytes written, 0 where the terminal took none for a moment."""
-        # Windows waits for sockets only
+        """Bytes written; 0 if the terminal took none for a moment."""
+        # on Windows, select works for sockets only
         if os.name != "nt" and not select.select([], [self._fd], [], _SLICE_S)[1]:
             return 0
         try:
@@ -73,11 +73,11 @@ class Tty:
         os.close(self._fd)
 
 
-# --- What the line says ---------------------------------------------------------------------------
+# --- The status line ------------------------------------------------------------------------------
 
 
 def status(feed: Feed, width: int) -> str:
-    """How far the record is, what is missing, and the newest values that there is room for."""
+    """Progress, missing samples, and as many of the newest values as there is room for."""
     if feed.end == 0:
         return fitted(f"{feed.title}: waiting for the first sample", width)
     now = f"{feed.end * feed.Ts:.2f}"
@@ -93,13 +93,13 @@ def _received(feed: Feed) -> str:
     if not feed.missing:
         return "all samples received"
     gaps = f"{feed.gaps} gap{'s' * (feed.gaps != 1)}"
-    # rounded down: what is not all must not read as 100 %
+    # round down: an incomplete record must not read as 100 %
     share = np.floor(1e4 * feed.received / feed.end) / 100
     return f"{share:.2f} % received ({feed.missing} missing, {gaps})"
 
 
 def _values(feed: Feed) -> list[str]:
-    """The newest known value of the columns that a status has room for."""
+    """The newest known values of speed and command."""
     newest = feed.read(max(feed.end - 50, 0), feed.end)
     found = []
     for name in (SPEED, "u"):
@@ -111,7 +111,7 @@ def _values(feed: Feed) -> list[str]:
 
 
 def fitted(line: str, width: int) -> str:
-    """A line of others' text without what could move the cursor, cut to `width` cells."""
+    """A line without characters that could move the cursor, cut to `width` cells."""
     kept = "".join(c if _is_one_cell(c) else "?" for c in line)
     return kept if len(kept) <= width else kept[: max(width - 1, 0)] + "~"
 
@@ -121,21 +121,21 @@ def _is_one_cell(c: str) -> bool:
     return c.isprintable() and not wide
 
 
-# --- TerminalView: the line while the feed is open; the last one stays ----------------------------
+# --- TerminalView: the status line while the feed is open -----------------------------------------
 
 
 PERIOD_S = 0.1
-"""Between two lines [s]."""
+"""Time between two lines [s]."""
 
 _PATIENCE_S = 0.2
-"""For a terminal that takes nothing, once the record has ended [s]."""
+"""Longest wait for a blocked terminal once the record has ended [s]."""
 
 
 class TerminalView:
-    """A status line; what happens meanwhile is written above it.
+    """A status line, with the feed's notes written above it.
 
-    Only a carriage return moves the cursor, which every terminal knows, and no mode is changed:
-    whatever ends the program, nothing has to be restored.
+    It moves the cursor only by carriage returns, which every terminal knows, and changes no mode:
+    however the program ends, nothing has to be restored.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ class TerminalView:
 
     def __init__(self, stream: TextIO) -> None:
         self._tty = Tty(stream)
-        self._said = 0
+        self._noted = 0
         self._line = ""
 
     def run(self, feed: Feed) -> None:
@@ -160,14 +160,14 @@ class TerminalView:
     def _write(self, feed: Feed, end: str = "") -> None:
         # a terminal breaks a line that fills its last column
         width = self._tty.columns - 1
-        news = [(number, fitted(text, width)) for number, text in feed.said(self._said)]
+        notes = [(number, fitted(text, width)) for number, text in feed.notes(self._noted)]
         line = status(feed, width)
-        if not (news or end or line != self._line):
+        if not (notes or end or line != self._line):
             return
         before = min(len(self._line), width)
-        above = "".join(f"\r{text:{before}}\r\n" for _, text in news)
-        blank = 0 if news else before
-        self._line, self._said = line, news[-1][0] if news else self._said
+        above = "".join(f"\r{text:{before}}\r\n" for _, text in notes)
+        blank = 0 if notes else before
+        self._line, self._noted = line, notes[-1][0] if notes else self._noted
         self._tty.write(f"{above}\r{line:{blank}}{end}", self._patience(feed))
 
     def _patience(self, feed: Feed) -> Callable[[], bool]:

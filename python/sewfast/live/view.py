@@ -1,4 +1,4 @@
-"""`open_view`: which views there are, and each in a process of its own."""
+"""`open_view`: the kinds of views, each in its own process."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from ..errors import SettingError
 from .feed import Feed
 
-# --- Kind: what a view is and where it is, as the command line names it ---------------------------
+# --- Kind: a view by its name on the command line -------------------------------------------------
 
 
 KINDS = ("auto", "terminal", "none", "plotjuggler[:HOST:PORT]", "foxglove[:PORT]")
@@ -26,7 +26,7 @@ PLOTJUGGLER_PORT = 9870
 FOXGLOVE_PORT = 8765
 
 LOCAL = "127.0.0.1"
-"""Where nobody but this machine listens."""
+"""An address that only this computer reaches."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Kind:
     name : str
         `auto`, `terminal`, `none`, `plotjuggler` or `foxglove`.
     host : str
-        Where PlotJuggler listens; where the Foxglove server is bound.
+        Address of PlotJuggler, or of the Foxglove server.
     port : int
-        Of the stream; 0 for views without one, and for a Foxglove server on any free port.
+        Port of the stream; 0 for views without one, and for a Foxglove server on any free port.
     """
 
     name: str
@@ -49,12 +49,12 @@ class Kind:
 
     @classmethod
     def parse(cls, text: str) -> Kind:
-        """`plotjuggler:HOST:PORT` and its like, as in `KINDS`.
+        """The view named by a text such as `plotjuggler:HOST:PORT`; see `KINDS`.
 
         Raises
         ------
         SettingError
-            For a text that names no view, or a port outside 1 to 65535 (Foxglove: 0 to 65535).
+            For any other text, or a port outside 1 to 65535 (Foxglove: 0 to 65535).
         """
         if not isinstance(text, str):
             raise _refusal(text)
@@ -74,7 +74,7 @@ def _host_and_port(text: str, rest: str) -> tuple[str, int]:
     host, _, port = rest.rpartition(":")
     if not host:
         raise _refusal(text)
-    # brackets are how an IPv6 address keeps its colons apart from the port's
+    # an IPv6 address stands in brackets, to separate its colons from the port's
     return host.strip("[]"), _port(text, port, 1)
 
 
@@ -91,11 +91,11 @@ def _refusal(text: str) -> SettingError:
     )
 
 
-# --- The process that a view runs in: it reads the feed's memory, and lines of status from a pipe -
+# --- The process of a view: it reads the feed's memory, and the notes from a pipe -----------------
 
 
 _NICE = 5
-"""The link goes first where both want the processor."""
+"""Lower priority than the link's when both need the processor."""
 
 
 def main() -> None:
@@ -110,20 +110,16 @@ def main() -> None:
     try:
         view = make(Kind(**json.loads(sys.argv[3])), feed)
     except SettingError as e:
-        _answer_of_viewer({"error": str(e)})
+        print(json.dumps({"error": str(e)}), flush=True)
         return
-    _answer_of_viewer({"port": getattr(view, "port", 0)})
+    print(json.dumps({"port": getattr(view, "port", 0)}), flush=True)
     threading.Thread(target=_listen, args=(feed,), daemon=True).start()
     if view is None:
         return
     try:
         view.run(feed)
     except Exception as e:
-        tell(e)
-
-
-def _answer_of_viewer(value: dict[str, object]) -> None:
-    print(json.dumps(value), flush=True)
+        report_failure(e)
 
 
 def _listen(feed: Feed) -> None:
@@ -132,26 +128,26 @@ def _listen(feed: Feed) -> None:
     feed.close()
 
 
-# --- open_view: a view in a process of its own, for as long as a with lasts -----------------------
+# --- open_view: a view in its own process for the duration of a with ------------------------------
 
 
 CLOSE_S = 0.5
-"""For which the end of a `with` waits for a view that hangs [s]."""
+"""Longest wait at the end of a `with` for a view that hangs [s]."""
 
 START_S = 20.0
-"""For which its beginning waits for a view to be there [s]."""
+"""Longest wait at its beginning for the view to start [s]."""
 
 _PROGRAM = "import sys; sys.path[:] = {path!r}; from sewfast.live.view import main; main()"
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A view that is there.
+    """A running view.
 
     Attributes
     ----------
     port : int
-        Of its server; 0 where it has none.
+        Port of its server; 0 without one.
     """
 
     port: int
@@ -159,53 +155,49 @@ class Shown:
 
 @contextmanager
 def open_view(kind: str | Kind, feed: Feed, *, own_process: bool = True) -> Iterator[Shown | None]:
-    """Show a feed while the `with` lasts.
+    """Show a feed for the duration of a `with`.
 
-    The view is a process of its own with a lower priority, so that it shares neither Python's
-    interpreter lock with the link nor, where both want it, the processor. Leaving the `with`
-    closes the feed and waits for the last line, half a second at most: stop the drive before.
+    The view is a process of its own with a lower priority, so that it does not hold up the link by
+    Python's interpreter lock or by using the processor. Leaving the `with` closes the feed and
+    waits for the last line, half a second at most: stop the drive before.
 
     Parameters
     ----------
     kind : str or Kind
-        `auto` (a status line where standard error is a terminal, else nothing), `terminal`,
-        `none`, `plotjuggler[:HOST:PORT]`, `foxglove[:PORT]`.
+        `auto` (a status line if standard error is a terminal, else nothing), `terminal`, `none`,
+        `plotjuggler[:HOST:PORT]`, `foxglove[:PORT]`.
     feed : Feed
-        Nothing may be put into it before the view is there.
+        Must stay empty until the view has started.
     own_process : bool
-        False: a thread instead, as on systems that cannot hand memory on (Windows).
+        False: a thread instead, as on systems that cannot share the memory (Windows).
 
     Yields
     ------
     Shown or None
-        None where nothing is shown.
+        None if nothing is shown.
 
     Raises
     ------
     SettingError
-        On entry: for another kind, `terminal` where standard error is none, a host without an
+        On entry: for another kind, `terminal` if standard error is not one, a host without an
         address, a port that is taken, a missing package, a view that does not start.
     """
     asked = kind if isinstance(kind, Kind) else Kind.parse(kind)
-    chosen = settled(asked)
+    chosen = resolve(asked)
     with contextlib.ExitStack() as open_things:
         open_things.callback(feed.close)
         shown = None
         try:
             if chosen.name != "none":
-                start = _process if own_process and _can_hand_on() else _thread
+                can_share = os.name != "nt" and bool(sys.executable)
+                start = _process if own_process and can_share else _thread
                 shown = open_things.enter_context(start(chosen, feed))
         except SettingError as e:
-            # nobody asked for this view
+            # a view that the user did not ask for must not stop the record
             if asked.name != "auto":
                 raise
-            tell(e)
+            report_failure(e)
         yield shown
-
-
-def _can_hand_on() -> bool:
-    """Whether another process can be given memory."""
-    return os.name != "nt" and bool(sys.executable)
 
 
 @contextmanager
@@ -228,14 +220,16 @@ def _process(kind: Kind, feed: Feed) -> Iterator[Shown]:
 
 
 def _started(kind: Kind, feed: Feed, memory: int, pipe: int) -> subprocess.Popen[bytes]:
-    """The viewer; the pipe's end is its own from here on."""
+    """Start the viewer, which takes over the read end of the pipe."""
+    encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
     try:
         return subprocess.Popen(
             [sys.executable, "-c", _PROGRAM.format(path=sys.path), str(memory),
              json.dumps(feed.description), json.dumps(asdict(kind))],
             stdin=pipe, stdout=subprocess.PIPE, stderr=_stderr(), pass_fds=[memory],
-            # Ctrl-C is for the record, which then closes the view
-            start_new_session=True, env={**os.environ, "PYTHONIOENCODING": _encoding()},
+            # keep Ctrl-C for the record, which then closes the view
+            start_new_session=True,
+            env={**os.environ, "PYTHONIOENCODING": encoding},
         )  # fmt: skip
     except OSError as e:
         raise SettingError(
@@ -246,15 +240,11 @@ def _started(kind: Kind, feed: Feed, memory: int, pipe: int) -> subprocess.Popen
 
 
 def _stderr() -> int | None:
-    """Standard error as Python has it, where that is a file of the system."""
+    """The descriptor of Python's standard error, if it has one."""
     try:
         return sys.stderr.fileno()
     except (AttributeError, OSError, ValueError):
         return None
-
-
-def _encoding() -> str:
-    return getattr(sys.stderr, "encoding", None) or "utf-8"
 
 
 def _answer(program: subprocess.Popen[bytes]) -> Shown:
@@ -263,10 +253,10 @@ def _answer(program: subprocess.Popen[bytes]) -> Shown:
         ready, _, _ = select.select([pipe], [], [], START_S)
         line = pipe.readline() if ready else b""
     refusal = "live: expected a view that starts, received none; use --live none"
-    said: dict[str, Any] = json.loads(line) if line else {"error": refusal}
-    if "error" in said:
-        raise SettingError(said["error"])
-    return Shown(said["port"])
+    answer: dict[str, Any] = json.loads(line) if line else {"error": refusal}
+    if "error" in answer:
+        raise SettingError(answer["error"])
+    return Shown(answer["port"])
 
 
 def _end(program: subprocess.Popen[bytes]) -> None:
@@ -297,12 +287,12 @@ def _thread(kind: Kind, feed: Feed) -> Iterator[Shown]:
         feed.close()
         thread.join(CLOSE_S)
         for e in failures:
-            tell(e)
+            report_failure(e)
 
 
-def tell(e: Exception) -> None:
-    """A failure of a view costs the record one line."""
-    # standard error may be the very terminal that has gone away
+def report_failure(e: Exception) -> None:
+    """Print a failure of a view, which must not stop the record."""
+    # standard error can be the terminal that has vanished
     with contextlib.suppress(OSError, ValueError):
         print(f"the live view ended early: {type(e).__name__}: {e}", file=sys.stderr, flush=True)
 
@@ -311,20 +301,20 @@ def tell(e: Exception) -> None:
 
 
 class View(Protocol):
-    """What shows a feed."""
+    """Shows a feed."""
 
     def run(self, feed: Feed) -> None:
-        """Show the feed until it is closed; has a thread or a process to itself."""
+        """Show the feed until it is closed; runs in its own thread or process."""
         ...
 
 
-def settled(kind: Kind) -> Kind:
-    """What `auto` stands for here.
+def resolve(kind: Kind) -> Kind:
+    """Replace `auto` by `terminal` or `none`.
 
     Raises
     ------
     SettingError
-        For `terminal` where standard error is none.
+        For `terminal` if standard error is not a terminal.
     """
     terminal = sys.stderr is not None and sys.stderr.isatty()
     if kind.name == "auto":
@@ -343,9 +333,9 @@ def make(kind: Kind, feed: Feed) -> View | None:
     Raises
     ------
     SettingError
-        As `settled`; for a host without an address, a port that is taken, a missing package.
+        As `resolve`; for a host without an address, a port that is taken, a missing package.
     """
-    kind = settled(kind)
+    kind = resolve(kind)
     if kind.name == "terminal":
         from .terminal import TerminalView
 

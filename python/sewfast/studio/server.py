@@ -13,7 +13,6 @@ import secrets
 import threading
 from collections.abc import Mapping
 from importlib.resources import files
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from ..errors import SettingError, not_installed
@@ -175,12 +174,7 @@ class Studio:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
         self._thread.join()
 
